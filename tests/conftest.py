@@ -1,0 +1,47 @@
+import pytest
+import torch
+import warp as wp
+
+import torchrl_loco
+
+TASKS = torchrl_loco.list_envs()
+PROTOCOLS = ("playground", "dm_control")
+
+
+def pytest_configure():
+    wp.config.log_level = wp.LOG_WARNING
+
+
+def pytest_collection_modifyitems(items):
+    if torch.cuda.is_available():
+        return
+    for item in items:
+        if "gpu" in item.keywords:
+            item.add_marker(pytest.mark.skip(reason="no CUDA device here"))
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request):
+    return request.param
+
+
+@pytest.fixture(params=TASKS)
+def task(request):
+    return request.param
+
+
+@pytest.fixture(params=PROTOCOLS)
+def protocol(request):
+    return request.param
+
+
+@pytest.fixture
+def actions():
+    """Draws reproducible actions for an environment: ``actions(env, steps)`` has shape (steps, num_envs, nu)."""
+
+    def draw(env, steps, seed=0):
+        generator = torch.Generator().manual_seed(seed)
+        drawn = torch.rand(steps, *env.action_spec.shape, generator=generator) * 2 - 1
+        return drawn.to(env.device)
+
+    return draw

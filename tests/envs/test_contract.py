@@ -1,0 +1,115 @@
+"""One contract for every registered task, in both protocols, on every device."""
+
+import pytest
+import torch
+from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv, check_env_specs
+
+import torchrl_loco
+
+
+@pytest.fixture
+def env(task, protocol, device):
+    return torchrl_loco.make(task, 5, device, seed=0, protocol=protocol)
+
+
+def test_specs(env):
+    check_env_specs(env)
+
+
+def test_specs_in_transformed_env(env):
+    check_env_specs(TransformedEnv(env, Compose(InitTracker(), RewardSum(), StepCounter())))
+
+
+def test_rollout_keeps_to_the_contract(env):
+    td = env.rollout(20, break_when_any_done=False)
+    observation, reward = td["next", "observation"], td["next", "reward"]
+    assert observation.shape == (5, 20, env.observation_size)
+    assert observation.isfinite().all()
+    assert ((reward >= 0) & (reward <= 1)).all()
+    assert reward.shape == td["next", "done"].shape == td["next", "terminated"].shape == (5, 20, 1)
+    assert not td["next", "done"].any()
+    assert env.action_spec.contains(td["action"][:, 0])
+
+
+def test_what_a_step_returns_is_no_live_buffer(env, actions):
+    """A rollout holds what a loop with copies holds, and no two steps share memory."""
+    moves = actions(env, 6)
+    env.reset()
+    state = env.get_state()
+    td = env.reset(state, set_state=True)
+    copies, originals = [], []
+    for action in moves:
+        td = env.step(td.set("action", action))["next"]
+        originals.append(td)
+        copies.append(td.clone())
+        td = td.exclude("reward")
+    for original, copy in zip(originals, copies, strict=True):
+        assert (original == copy).all()
+    pointers = [td[key].data_ptr() for td in originals for key in ("observation", "reward", "done", "truncated")]
+    assert len(set(pointers)) == len(pointers)
+
+    iterator = iter(moves)
+    rollout = env.rollout(
+        6,
+        policy=lambda td: td.set("action", next(iterator)),
+        tensordict=env.reset(state.select(), set_state=True),
+        auto_reset=False,
+    )
+    torch.testing.assert_close(rollout["next", "observation"], torch.stack([td["observation"] for td in copies], 1))
+    torch.testing.assert_close(rollout["next", "reward"], torch.stack([td["reward"] for td in copies], 1))
+
+
+def test_same_seed_same_rollout(task, protocol, device, actions):
+    def rollout(seed):
+        env = torchrl_loco.make(task, 3, device, seed=seed, protocol=protocol)
+        td, rewards = env.reset(), []
+        for action in actions(env, 10):
+            td = env.step(td.set("action", action))["next"].exclude("action")
+            rewards.append(td.pop("reward"))
+        return td["observation"], torch.stack(rewards)
+
+    tolerance = {"rtol": 0, "atol": 0} if device == "cpu" else {}
+    for first, second in zip(rollout(7), rollout(7), strict=True):
+        torch.testing.assert_close(first, second, **tolerance)
+
+
+def test_truncation_is_exact_and_the_terminal_observation_true(env):
+    env = torchrl_loco.make(type_id(env), 4, env.device, seed=3, protocol=env.protocol, episode_length=7)
+    twin = torchrl_loco.make(type_id(env), 4, env.device, seed=3, protocol=env.protocol)  # never truncated here
+    carried, td = env.reset(), twin.reset()
+    for step in range(1, 8):
+        action = env.action_spec.zero()
+        current, carried = env.step_and_maybe_reset(carried.set("action", action))
+        td = twin.step(td.set("action", action))["next"].exclude("reward")
+        after = current["next"]
+        torch.testing.assert_close(after["observation"], td["observation"], rtol=0, atol=1e-5)
+        assert (after["truncated"] == (step == 7)).all()
+        assert (after["done"] == (step == 7)).all()
+        assert not after["terminated"].any()
+    assert not carried["done"].any()
+    fresh = twin.reset()["observation"]  # the same second episode
+    torch.testing.assert_close(carried["observation"], fresh)
+    if env.body == "walker" or env.protocol == "dm_control":
+        assert (carried["observation"] != after["observation"]).any()
+
+
+def type_id(env):
+    return next(name for name in torchrl_loco.list_envs() if type(env) is torchrl_loco.registry.ENVS[name])
+
+
+def test_default_episode_is_1000_steps():
+    env = torchrl_loco.make("walker_stand", 1, "cpu", seed=0)
+    td = env.rollout(1200, policy=lambda td: td.set("action", env.action_spec.zero()))
+    assert td.shape == (1, 1000)
+    assert td["next", "truncated"].sum() == 1
+    assert td["next", "truncated"][0, -1]
+    assert not td["next", "terminated"].any()
+
+
+@pytest.mark.parametrize("num_envs", [1, 16, 1000])
+def test_batches(task, num_envs):
+    env = torchrl_loco.make(task, num_envs, "cpu", seed=0)
+    td = env.rollout(3)
+    assert td.shape == (num_envs, 3)
+    assert td["next", "observation"].isfinite().all()
+    assert env.sim.overflow.bitwise_and(0b111111111).eq(0).all()  # nothing was dropped; iteration limits are expected

@@ -1,0 +1,65 @@
+"""The loop stays on its device: captures, synchronisation, streams, and agreement of CUDA with the CPU."""
+
+import pytest
+import torch
+
+import torchrl_loco
+
+
+def test_each_graph_is_recorded_once(task, device, actions):
+    env = torchrl_loco.make(task, 3, device, seed=0, episode_length=4)
+    assert env.sim.num_captures == 3  # step, reset, and refresh after set_state
+    td = env.reset()
+    for action in actions(env, 10):
+        _, td = env.step_and_maybe_reset(td.set("action", action))
+    env.reset(env.get_state(), set_state=True)
+    env.set_seed(3)
+    env.reset()
+    assert env.sim.num_captures == 3
+
+
+@pytest.mark.gpu
+def test_cuda_agrees_with_the_cpu_after_one_step(task, protocol, actions):
+    envs = [torchrl_loco.make(task, 64, device, seed=6, protocol=protocol) for device in ("cpu", "cuda")]
+    results = []
+    for env in envs:
+        td = env.reset()
+        after = env.step(td.set("action", actions(env, 1)[0]))["next"]
+        results.append((td["observation"].cpu(), env.get_state()["qpos"].cpu(), after["reward"].cpu()))
+    for cpu, cuda in zip(*results, strict=True):
+        torch.testing.assert_close(cpu, cuda, rtol=0, atol=1e-4)
+
+
+@pytest.mark.gpu
+def test_no_host_synchronisation_in_a_step(task):
+    env = torchrl_loco.make(task, 256, "cuda", seed=0)
+    td = env.reset()
+    td.set("action", torch.zeros_like(env.action_spec.zero()))
+    env._step(td)
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(10):
+            env._step(td)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+@pytest.mark.gpu
+def test_replays_on_the_current_stream(actions):
+    """On a side stream that is kept busy, the step waits for the work queued before it."""
+    env, twin = (torchrl_loco.make("walker_walk", 64, "cuda", seed=0) for _ in range(2))
+    td, expected = env.reset(), twin.reset()
+    moves = actions(env, 5)
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for action in moves:
+            late = torch.zeros_like(action)
+            torch.cuda._sleep(50_000_000)
+            late.copy_(action)
+            td = env.step(td.set("action", late))["next"].exclude("reward")
+    torch.cuda.current_stream().wait_stream(stream)
+    for action in moves:
+        expected = twin.step(expected.set("action", action))["next"].exclude("reward")
+    torch.testing.assert_close(td["observation"], expected["observation"], rtol=1e-2, atol=1e-2)

@@ -1,0 +1,117 @@
+"""Observations, rewards and physics against dm_control's recordings and C MuJoCo."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from oracle import Oracle, recorded
+
+import torchrl_loco
+
+MODELS = Path(torchrl_loco.__file__).parent / "models"
+WALKER_ROW = [-0.8415, -0.5403, -0.7934, 0.6087, -0.9945, 0.1048, -0.9205, -0.3908, -0.8747, -0.4847, 0.911, -0.4125]
+WALKER_ROW += [0.4919, -0.8707, -0.8415] + [0.0] * 9
+HUMANOID_LIMBS = [0.36, 0.17, 0.06, -0.0027, 0.09, -1.258, 0.36, -0.17, 0.06, -0.0027, -0.09, -1.258]
+
+
+def state(record, extra=()):
+    """The recorded states as a TensorDict for set_state."""
+    keys = {"qpos": "qpos", "qvel": "qvel", **dict(extra)}
+    entries = {key: torch.as_tensor(record[name], dtype=torch.float32) for key, name in keys.items()}
+    return torchrl_loco.State(entries, batch_size=[len(record["qpos"])])
+
+
+def test_observation_agrees_with_dm_control(task, device):
+    record = recorded(task)
+    env = torchrl_loco.make(task, 192, device, seed=0, protocol="dm_control")
+    after = {"qpos": record["next_qpos"], "qvel": record["next_qvel"]}
+    td = env.reset(state(after).to(device), set_state=True)
+    np.testing.assert_allclose(td["observation"].cpu(), record["obs"], rtol=0, atol=1e-5)
+
+
+def test_oracle_agrees_with_dm_control(task):
+    """The NumPy formulas that the rewards are held against are dm_control's own."""
+    record, oracle = recorded(task), Oracle(task, MODELS / f"{task.split('_')[0]}.xml")
+    rows = zip(record["next_qpos"], record["next_qvel"], record["action"], strict=True)
+    np.testing.assert_allclose([oracle.reward(*row) for row in rows], record["reward"], rtol=0, atol=1e-6)
+
+
+def test_physics_agrees_with_dm_control(task, device):
+    record = recorded(task)
+    env = torchrl_loco.make(task, 192, device, seed=0, protocol="dm_control")
+    td = env.reset(state(record, {"qacc_warmstart": "warmstart"}.items()).to(device), set_state=True)
+    env.step(td.set("action", torch.as_tensor(record["action"], dtype=torch.float32, device=device)))
+    error = np.abs(env.get_state()["qpos"].cpu().numpy() - record["next_qpos"]).max(axis=1)
+    assert np.median(error) < 1e-5
+    assert np.quantile(error, 0.95) < 1e-4
+
+
+def interpolated_states(task):
+    """Recorded states, and the same raised and sped up, so that rewards reach from nothing to nearly one."""
+    record = recorded(task)
+    body = task.split("_")[0]
+    height, velocity = (0, 1) if body == "walker" else (2, 0)
+    fallen = {key: record[key].copy() for key in ("qpos", "qvel", "action")}
+    fallen["qpos"][:, height] -= 0.7
+    fallen["qvel"][:, velocity] = 0.0
+    return {key: np.concatenate([record[key], fallen[key]]) for key in fallen}
+
+
+def test_reward_agrees_with_numpy(task, protocol, device):
+    record = interpolated_states(task)
+    n = len(record["qpos"])
+    env = torchrl_loco.make(task, n, device, seed=0, protocol=protocol)
+    td = env.reset(state(record).to(device), set_state=True)
+    action = torch.as_tensor(record["action"], dtype=torch.float32, device=device)
+    rewards = env.step(td.set("action", action))["next", "reward"].squeeze(-1).cpu().numpy()
+
+    after = {key: env.get_state()[key].cpu().numpy().astype(np.float64) for key in ("qpos", "qvel")}
+    oracle = Oracle(task, MODELS / f"{env.body}.xml")
+    expected = [oracle.reward(after["qpos"][i], after["qvel"][i], record["action"][i]) for i in range(n)]
+    np.testing.assert_allclose(rewards, expected, rtol=0, atol=1e-4)
+    assert min(expected) < 0.2
+    assert max(expected) > 0.9
+
+
+def test_reward_terms_multiply_to_the_reward(task, actions):
+    env = torchrl_loco.make(task, 16, "cpu", seed=0, reward_terms=True)
+    td = env.reset()
+    for action in actions(env, 5):
+        td = env.step(td.set("action", action))["next"]
+        product = torch.stack(list(td["reward_terms"].values())).prod(0)
+        torch.testing.assert_close(product, td["reward"])
+        assert (td["reward"] > 0).all()
+        td = td.exclude("reward")
+
+
+def test_playground_rows(device):
+    humanoid = torchrl_loco.make("humanoid_walk", 2, device).reset()["observation"].cpu()
+    expected = torch.zeros(67)
+    expected[21], expected[36] = 1.69, 1.0
+    expected[22:34] = torch.tensor(HUMANOID_LIMBS)
+    torch.testing.assert_close(humanoid, expected.expand(2, -1), atol=1e-4, rtol=0)
+
+    env = torchrl_loco.make("walker_walk", 1, device)
+    angles = walker_angles(WALKER_ROW)
+    td = torchrl_loco.State({"qpos": torch.tensor([angles]), "qvel": torch.zeros(1, 9)}, batch_size=[1]).to(device)
+    walker = env.reset(td, set_state=True)["observation"].cpu()
+    torch.testing.assert_close(walker, torch.tensor([WALKER_ROW]), atol=2e-4, rtol=0)
+
+
+def walker_angles(row):
+    """qpos of a walker that shows the orientations of ``row``: pitch downstream is the sum of the hinges, negated."""
+    pitch = [float(np.arctan2(row[i + 1], row[i])) for i in range(0, 14, 2)]
+    torso, right, left = pitch[0], pitch[1:4], pitch[4:7]
+    hinges = []
+    for leg in (right, left):
+        hinges += [-(angle - parent) for angle, parent in zip(leg, [torso, *leg[:2]], strict=True)]
+    return [0.0, 0.0, torso, *hinges]
+
+
+@pytest.mark.parametrize("protocol", ["playground", "dm_control"])
+def test_walker_height_entry(protocol):
+    env = torchrl_loco.make("walker_stand", 8, "cpu", seed=0, protocol=protocol)
+    height = env.reset()["observation"][:, 14]
+    expected = env.sim.xpos[:, 1, 2] if protocol == "dm_control" else env.sim.xmat[:, 1, 2, 2]
+    torch.testing.assert_close(height, expected)

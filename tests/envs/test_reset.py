@@ -1,0 +1,157 @@
+"""Resets: what they draw, from which stream, and whom they leave alone."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from oracle import DATA
+from tensordict import TensorDict
+
+import torchrl_loco
+from torchrl_loco import State
+
+SIGNIFICANCE = 1e-4
+
+
+def kolmogorov_smirnov(x, cdf):
+    """Distance of a sample from a distribution, and the distance that chance exceeds with SIGNIFICANCE."""
+    x = np.sort(x)
+    steps = np.arange(len(x) + 1) / len(x)
+    distance = max(np.abs(cdf(x) - steps[1:]).max(), np.abs(cdf(x) - steps[:-1]).max())
+    return distance, np.sqrt(-0.5 * np.log(SIGNIFICANCE / 2) / len(x))
+
+
+def draws(task, num_envs, episodes, seed, protocol="playground", device="cpu"):
+    """qpos at the start of consecutive episodes, shape (episodes, num_envs, nq)."""
+    env = torchrl_loco.make(task, num_envs, device, seed=seed, protocol=protocol)
+    starts = []
+    for _ in range(episodes):
+        env.reset()
+        starts.append(env.get_state()["qpos"].cpu())
+    return torch.stack(starts)
+
+
+def test_masked_reset_leaves_the_others_bitwise_unchanged(task, protocol, device, actions):
+    env = torchrl_loco.make(task, 6, device, seed=0, protocol=protocol)
+    td = env.reset()
+    for action in actions(env, 8):
+        td = env.step(td.set("action", action))["next"].exclude("reward")
+    before, overflow = env.get_state(), env.sim.overflow.clone()
+    mask = torch.tensor([True, False, False, True, False, False], device=device).unsqueeze(-1)
+    after_td = env.reset(td.clone().set("_reset", mask))
+    after = env.get_state()
+    kept = ~mask.squeeze(-1)
+    for key in State.KEYS:
+        assert torch.equal(before[key][kept], after[key][kept]), key
+    assert torch.equal(overflow, env.sim.overflow)
+    assert torch.equal(after_td["observation"][kept], td["observation"][kept])
+    assert (after["elapsed_steps"][~kept] == 0).all()
+    assert (after["elapsed_steps"][kept] == 8).all()
+    assert (after["episode"][~kept] == 2).all()
+    assert (after["qvel"][~kept] == 0).all()
+
+    if device == "cpu":  # and they go on as if nothing had happened
+        action = actions(env, 1, seed=1)[0]
+        observation = env.step(after_td.set("action", action))["next", "observation"]
+        env.reset(before, set_state=True)
+        undisturbed = env.step(after_td.set("action", action))["next", "observation"]
+        assert torch.equal(observation[kept], undisturbed[kept])
+
+
+def test_walker_starts_uniformly(device):
+    qpos = draws("walker_walk", 4096, 1, seed=12, device=device)[0].numpy().astype(np.float64)
+    model = torchrl_loco.models.load("walker")
+    assert (qpos[:, :2] == 0).all()
+    ranges = [(-np.pi, np.pi), *model.jnt_range[3:]]
+    for angle, (low, high) in zip(qpos[:, 2:].T, ranges, strict=True):
+        assert low <= angle.min()
+        assert angle.max() <= high
+        distance, critical = kolmogorov_smirnov(angle, lambda x, low=low, high=high: (x - low) / (high - low))
+        assert distance < critical
+    correlation = np.corrcoef(qpos[:, 2:].T) - np.eye(7)
+    assert np.abs(correlation).max() < 5 / np.sqrt(len(qpos))
+
+
+def test_humanoid_starts_free_of_contact(device):
+    """dm_control's start, judged by C MuJoCo, with the distribution that dm_control recorded."""
+    qpos = draws("humanoid_walk", 2048, 1, seed=5, protocol="dm_control", device=device)[0].numpy().astype(np.float64)
+    model = torchrl_loco.models.load("humanoid")
+    data = mujoco.MjData(model)
+    for q in qpos:
+        data.qpos[:] = q
+        mujoco.mj_fwdPosition(model, data)
+        assert data.ncon == 0
+    assert (qpos[:, :3] == [0, 0, 1.5]).all()
+    np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1, atol=1e-6)
+    recorded = np.load(DATA / "humanoid_resets_dm_control.npz")["qpos"]
+    for ours, theirs in zip(qpos.T[3:], recorded.T[3:], strict=True):
+        both = np.concatenate([ours, theirs])
+        share = [np.searchsorted(np.sort(x), both, side="right") / len(x) for x in (ours, theirs)]
+        critical = np.sqrt(-0.5 * np.log(SIGNIFICANCE / 2) * (1 / len(ours) + 1 / len(theirs)))
+        assert np.abs(share[0] - share[1]).max() < critical
+
+
+def test_humanoid_playground_start_is_the_default_pose():
+    qpos = draws("humanoid_run", 3, 2, seed=0)
+    expected = torch.as_tensor(torchrl_loco.models.load("humanoid").qpos0, dtype=torch.float32)
+    assert torch.equal(qpos, expected.expand_as(qpos))
+
+
+@pytest.mark.parametrize(("task", "protocol"), [("walker_run", "playground"), ("humanoid_run", "dm_control")])
+def test_a_world_draws_from_seed_world_and_episode_alone(task, protocol, device):
+    few, many = (draws(task, n, 3, seed=9, protocol=protocol, device=device) for n in (3, 64))
+    assert torch.equal(few, many[:, :3])
+    assert torch.equal(few, draws(task, 3, 3, seed=9, protocol=protocol, device=device))
+    assert not torch.equal(few, draws(task, 3, 3, seed=10, protocol=protocol, device=device))
+    starts = many.reshape(-1, many.shape[-1])
+    assert len(starts.unique(dim=0)) == len(starts)  # no world or episode repeats another
+
+    # Episodes count by world: whoever is reset alone draws what it would have drawn with the others.
+    env = torchrl_loco.make(task, 3, device, seed=9, protocol=protocol)
+    env.reset()
+    mask = torch.tensor([[False], [True], [False]], device=device)
+    for episode in (1, 2):
+        env.reset(TensorDict({"_reset": mask, "done": mask}, batch_size=[3], device=device))
+        assert torch.equal(env.get_state()["qpos"][1].cpu(), few[episode, 1])
+        assert torch.equal(env.get_state()["qpos"][0].cpu(), few[0, 0])
+
+
+def test_set_seed_starts_the_streams_anew():
+    env = torchrl_loco.make("walker_walk", 4, "cpu", seed=1)
+    first = env.reset()["observation"]
+    env.reset()
+    env.set_seed(1)
+    assert torch.equal(env.reset()["observation"], first)
+    env.set_seed(2)
+    assert not torch.equal(env.reset()["observation"], first)
+
+
+def test_no_global_generator_is_read_or_seeded():
+    torch.manual_seed(0)
+    np.random.seed(0)  # noqa: NPY002
+    torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    env = torchrl_loco.make("walker_walk", 4, "cpu")
+    env.reset()
+    env.set_seed(5)
+    env.reset()
+    assert torch.equal(torch_state, torch.get_rng_state())
+    assert (numpy_state == np.random.get_state()[1]).all()  # noqa: NPY002
+
+
+def test_without_a_seed_environments_differ():
+    first, second = (torchrl_loco.make("walker_walk", 2, "cpu").reset()["observation"] for _ in range(2))
+    assert not torch.equal(first, second)
+
+
+def test_stagger_spreads_the_time_limits():
+    env = torchrl_loco.make("walker_stand", 2000, "cpu", seed=0, stagger=True, episode_length=100)
+    env.reset()
+    elapsed = env.get_state()["elapsed_steps"].numpy()
+    distance, critical = kolmogorov_smirnov(elapsed + 0.5, lambda x: x / 100)
+    assert distance < critical + 0.01
+    assert elapsed.min() >= 0
+    assert elapsed.max() < 100
+    mask = torch.zeros(2000, 1, dtype=torch.bool)
+    mask[:1000] = True
+    env.reset(TensorDict({"_reset": mask, "done": ~mask}, batch_size=[2000]))
+    assert (env.get_state()["elapsed_steps"][:1000] == 0).all()  # only a full reset staggers

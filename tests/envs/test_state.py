@@ -1,0 +1,114 @@
+"""get_state and reset(set_state=True)."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv
+
+import torchrl_loco
+from torchrl_loco import State
+
+
+def walk(env, td, moves):
+    trace = []
+    for action in moves:
+        current, td = env.step_and_maybe_reset(td.set("action", action))
+        trace.append(current["next"].select("observation", "reward", "done", "truncated"))
+    return torch.stack(trace)
+
+
+@pytest.mark.parametrize("transformed", [False, True])
+def test_restores_the_continuation(task, protocol, device, actions, transformed):
+    """Bitwise on the CPU; across a time limit, so that step count and random counter take part."""
+    env = torchrl_loco.make(task, 4, device, seed=0, protocol=protocol, episode_length=9)
+    if transformed:
+        env = TransformedEnv(env, Compose(InitTracker(), RewardSum(), StepCounter()))
+    moves = actions(env, 10)
+    td = env.reset()
+    _, td = env.step_and_maybe_reset(td.set("action", moves[0]))
+    state = env.get_state()
+    assert isinstance(state, State)
+    first = walk(env, td, moves)
+    assert first["truncated"].sum() == 4
+    for _ in range(2):  # a state can be restored again
+        second = walk(env, env.reset(state, set_state=True), moves)
+        tolerance = {"rtol": 0, "atol": 0} if device == "cpu" else {"rtol": 1e-2, "atol": 1e-2}
+        for key in ("observation", "reward", "done", "truncated"):
+            torch.testing.assert_close(first[key], second[key], **tolerance)
+
+
+def test_restores_a_masked_world_only(task):
+    env = torchrl_loco.make(task, 3, "cpu", seed=0)
+    env.reset()
+    old = env.get_state()
+    env.rollout(5, auto_reset=False, tensordict=env.reset())
+    now = env.get_state()
+    mask = torch.tensor([[False], [True], [False]])
+    env.reset(old.clone().set("_reset", mask).set("done", mask), set_state=True)
+    after = env.get_state()
+    for key in State.KEYS:
+        assert torch.equal(after[key][1], old[key][1]), key
+        assert torch.equal(after[key][::2], now[key][::2]), key
+
+
+def test_qpos_and_qvel_are_enough():
+    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0)
+    env.rollout(3)
+    td = TensorDict({"qpos": torch.zeros(2, 9), "qvel": torch.ones(2, 9)}, batch_size=[2])
+    env.reset(td, set_state=True)
+    state = env.get_state()
+    assert (state["qpos"] == 0).all()
+    assert (state["qvel"] == 1).all()
+    assert (state["qacc_warmstart"] == 0).all()
+    assert (state["elapsed_steps"] == 0).all()
+    assert (state["episode"] == 1).all()  # the random counter goes on
+
+
+def test_branching_copies_one_world_into_all(actions):
+    env = torchrl_loco.make("humanoid_walk", 4, "cpu", seed=0)
+    td = env.reset()
+    for action in actions(env, 3):
+        td = env.step(td.set("action", action))["next"].exclude("reward")
+    state = env.get_state()
+    td = env.reset(state[2].expand(4), set_state=True)
+    assert (td["observation"] == td["observation"][0]).all()
+    same = env.step(td.set("action", actions(env, 1)[0][:1].expand(4, -1)))["next", "observation"]
+    assert (same == same[0]).all()
+
+
+def test_a_state_is_a_copy():
+    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0)
+    env.reset()
+    state = env.get_state()
+    before = state.clone()
+    env.rollout(3)
+    for key in State.KEYS:
+        assert torch.equal(state[key], before[key])
+
+
+@pytest.mark.parametrize(
+    ("td", "message"),
+    [
+        (None, "'qpos' and 'qvel'"),
+        ({"qpos": torch.zeros(2, 9)}, "'qpos' and 'qvel'"),
+        ({"qpos": torch.zeros(2, 9), "qvel": torch.zeros(2, 8)}, r"qvel must have shape \(2, 9\), got \(2, 8\)"),
+        ({"qpos": torch.full((2, 9), torch.nan), "qvel": torch.zeros(2, 9)}, "qpos must be finite"),
+    ],
+)
+def test_a_wrong_state_changes_nothing(td, message):
+    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0)
+    env.reset()
+    before = env.get_state()
+    with pytest.raises(ValueError, match=message):
+        env.reset(None if td is None else TensorDict(td, batch_size=[2]), set_state=True)
+    after = env.get_state()
+    assert all(torch.equal(before[key], after[key]) for key in State.KEYS)
+
+
+def test_transformed_env_never_drops_a_state_silently():
+    env = TransformedEnv(torchrl_loco.make("walker_walk", 2, "cpu", seed=0), InitTracker())
+    entries = {"qpos": torch.zeros(2, 9), "qvel": torch.zeros(2, 9)}
+    with pytest.raises(ValueError, match=r"torchrl_loco\.State"):
+        env.reset(TensorDict(entries, batch_size=[2]), set_state=True)
+    env.reset(State(entries, batch_size=[2]), set_state=True)
+    assert (env.get_state()["qpos"] == 0).all()

@@ -1,0 +1,85 @@
+"""Independent formulas in float64: NumPy on top of C MuJoCo, sharing nothing with the package but its models."""
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+DATA = Path(__file__).parent / "data"
+SPEEDS = {"walker": {"stand": 0, "walk": 1, "run": 8}, "humanoid": {"stand": 0, "walk": 1, "run": 10}}
+
+
+def reference_model(body):
+    return json.loads((DATA / f"{body}_model.json").read_text())
+
+
+def recorded(task):
+    """The rollout of a task that dm_control recorded: arrays of 192 control steps."""
+    return dict(np.load(DATA / f"{task}_dm_control.npz"))
+
+
+def tolerance(x, lower=0.0, upper=0.0, margin=0.0, sigmoid="gaussian", value=0.1):
+    x = np.asarray(x, dtype=np.float64)
+    inside = (lower <= x) & (x <= upper)
+    if margin == 0:
+        return np.where(inside, 1.0, 0.0)
+    d = np.where(x < lower, lower - x, x - upper) / margin
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        if sigmoid == "gaussian":
+            outside = np.exp(-0.5 * (d * np.sqrt(-2 * np.log(value))) ** 2)
+        elif sigmoid == "hyperbolic":
+            outside = 1 / np.cosh(d * np.arccosh(1 / value))
+        elif sigmoid == "long_tail":
+            outside = 1 / ((d * np.sqrt(1 / value - 1)) ** 2 + 1)
+        elif sigmoid == "reciprocal":
+            outside = 1 / (np.abs(d) * (1 / value - 1) + 1)
+        elif sigmoid == "cosine":
+            s = d * np.arccos(2 * value - 1) / np.pi
+            outside = np.where(np.abs(s) < 1, (1 + np.cos(np.pi * s)) / 2, 0.0)
+        elif sigmoid == "linear":
+            s = d * (1 - value)
+            outside = np.where(np.abs(s) < 1, 1 - s, 0.0)
+        elif sigmoid == "quadratic":
+            s = d * np.sqrt(1 - value)
+            outside = np.where(np.abs(s) < 1, 1 - s**2, 0.0)
+        elif sigmoid == "tanh_squared":
+            outside = 1 - np.tanh(d * np.arctanh(np.sqrt(1 - value))) ** 2
+        else:
+            raise ValueError(sigmoid)
+    return np.where(inside, 1.0, outside)
+
+
+class Oracle:
+    """Evaluates one task at given states with C MuJoCo in float64."""
+
+    def __init__(self, task, path):
+        self.body, self.goal = task.split("_")
+        self.speed = SPEEDS[self.body][self.goal]
+        self.model = mujoco.MjModel.from_xml_path(str(path))
+        self.data = mujoco.MjData(self.model)
+
+    def forward(self, qpos, qvel):
+        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(self.model, self.data)
+        return self.data
+
+    def reward(self, qpos, qvel, action):
+        d = self.forward(qpos, qvel)
+        vx, vy, _ = d.sensordata
+        upright = d.body("torso").xmat[8]
+        if self.body == "walker":
+            standing = tolerance(d.body("torso").xpos[2], 1.2, np.inf, 0.6)
+            stand = (3 * standing + (1 + upright) / 2) / 4
+            if self.speed == 0:
+                return float(stand)
+            move = tolerance(vx, self.speed, np.inf, self.speed / 2, "linear", 0.5)
+            return float(stand * (5 * move + 1) / 6)
+        standing = tolerance(d.body("head").xpos[2], 1.4, np.inf, 0.35)
+        upright = tolerance(upright, 0.9, np.inf, 1.9, "linear", 0)
+        control = (4 + tolerance(action, margin=1, sigmoid="quadratic", value=0).mean()) / 5
+        if self.speed == 0:
+            still = (tolerance(vx, margin=2) + tolerance(vy, margin=2)) / 2
+            return float(standing * upright * control * still)
+        move = tolerance(np.hypot(vx, vy), self.speed, np.inf, self.speed, "linear", 0)
+        return float(standing * upright * control * (5 * move + 1) / 6)

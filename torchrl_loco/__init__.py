@@ -1,0 +1,32 @@
+"""TorchRL environments for dm_control's locomotion tasks, stepped by MuJoCo-Warp thousands of worlds at a time."""
+
+from torchrl_loco import _versions
+from torchrl_loco.config import SimConfig
+from torchrl_loco.envs import (
+    HumanoidRun,
+    HumanoidStand,
+    HumanoidWalk,
+    State,
+    WalkerRun,
+    WalkerStand,
+    WalkerWalk,
+)
+from torchrl_loco.registry import list_envs, make
+
+__version__ = _versions.own_version()
+
+__all__ = [
+    "HumanoidRun",
+    "HumanoidStand",
+    "HumanoidWalk",
+    "SimConfig",
+    "State",
+    "WalkerRun",
+    "WalkerStand",
+    "WalkerWalk",
+    "__version__",
+    "list_envs",
+    "make",
+]
+
+_versions.warn_if_untested()

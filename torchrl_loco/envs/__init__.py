@@ -1,0 +1,10 @@
+"""The environments: one base that knows no task, and a file for each body."""
+
+from torchrl_loco.envs.base import LocoEnv as LocoEnv
+from torchrl_loco.envs.humanoid import HumanoidRun as HumanoidRun
+from torchrl_loco.envs.humanoid import HumanoidStand as HumanoidStand
+from torchrl_loco.envs.humanoid import HumanoidWalk as HumanoidWalk
+from torchrl_loco.envs.state import State as State
+from torchrl_loco.envs.walker import WalkerRun as WalkerRun
+from torchrl_loco.envs.walker import WalkerStand as WalkerStand
+from torchrl_loco.envs.walker import WalkerWalk as WalkerWalk

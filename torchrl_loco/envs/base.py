@@ -1,0 +1,300 @@
+"""What all locomotion environments share: specs, step, reset, seeding, time limit, state. Knows no task."""
+
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_loco import models
+from torchrl_loco.config import sim_config
+from torchrl_loco.envs.checks import check_count, check_device, check_seed
+from torchrl_loco.envs.episode import apply_action, begin_episode, count_step, quench
+from torchrl_loco.envs.state import State
+from torchrl_loco.rendering import Renderer
+from torchrl_loco.sim import Simulation
+
+
+class LocoEnv(EnvBase):
+    """Base of the locomotion environments: batched worlds of one body on one device.
+
+    A subclass names its ``body`` and ``reward_terms``, and launches the kernels that fill the observation, the reward
+    and its terms (:meth:`_launch_observe`) and draw initial poses (:meth:`_launch_pose`). Everything else is here.
+
+    Args:
+        num_envs: number of worlds, the batch size.
+        device: where physics and tensors live; ``None`` takes CUDA if there is any, else the CPU.
+        seed: integer in [0, 2**32) that, with world and episode, decides every random draw; ``None`` takes a fresh one.
+        protocol: ``"playground"`` (the solver cut short, fast) or ``"dm_control"`` (the solver converged).
+        reward_terms: whether to return each factor of the reward under ``("next", "reward_terms", name)``.
+        stagger: whether a full ``reset()`` starts each world at a random point of its time limit, so that the worlds
+            are not truncated together.
+        config: fields of :class:`torchrl_loco.SimConfig` to override.
+
+    Raises:
+        ValueError: an argument is out of range or unknown; the message names the valid choices.
+        TypeError: an argument has the wrong type.
+    """
+
+    body: ClassVar[str]
+    observation_size: ClassVar[int]
+    term_names: ClassVar[tuple[str, ...]]
+
+    _has_frame_skip = True  # the substeps are our own
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        device: torch.device | str | None = None,
+        seed: int | None = None,
+        protocol: str = "playground",
+        *,
+        reward_terms: bool = False,
+        stagger: bool = False,
+        **config: Any,
+    ) -> None:
+        num_envs = check_count("num_envs", num_envs)
+        seed = None if seed is None else check_seed(seed)
+        device = check_device(device)
+        self.config = sim_config(self.body, protocol, num_envs, config)
+        self.protocol = protocol
+        super().__init__(device=device, batch_size=[num_envs])
+        self.num_envs = num_envs
+        self.sim = Simulation(models.load(self.body), self.config, num_envs, device)
+        self.reward_terms, self.stagger = bool(reward_terms), bool(stagger)
+        self._make_buffers()
+        self._make_specs()
+        self._prepare()
+        self._step_graph = self.sim.capture(self._launch_step)
+        self._reset_graph = self.sim.capture(self._launch_reset)
+        self._refresh_graph = self.sim.capture(self._launch_refresh)
+        self._set_seed(seed)  # and begin anew: recording has drawn episodes
+        self.sim.overflow.zero_()
+        self._renderers: dict[tuple[str, int, int], Renderer] = {}
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The compiled MuJoCo model, with the options that the simulation uses."""
+        return self.sim.mj_model
+
+    # What a body adds.
+
+    def _prepare(self) -> None:
+        """Makes what the body's kernels need, once, before they are recorded."""
+
+    def _launch_observe(self) -> None:
+        """Launches the kernel that fills ``_observation``, ``_reward`` and ``_terms`` from the state."""
+        raise NotImplementedError
+
+    def _launch_pose(self) -> None:
+        """Launches the kernel that draws ``qpos`` of the worlds in ``_mask``; without one they start at the default."""
+
+    # Setting up.
+
+    def _make_buffers(self) -> None:
+        n, device = self.num_envs, self.sim.device
+        self._action = wp.zeros((n, self.mj_model.nu), dtype=float, device=device)
+        self._observation = wp.zeros((n, self.observation_size), dtype=float, device=device)
+        self._reward = wp.zeros(n, dtype=float, device=device)
+        self._terms = wp.zeros((n, len(self.term_names)), dtype=float, device=device)
+        self._mask = wp.ones(n, dtype=bool, device=device)
+        self._stagger = wp.zeros(1, dtype=bool, device=device)
+        self._seed = wp.zeros(1, dtype=wp.uint32, device=device)
+        self._episode = wp.zeros(n, dtype=int, device=device)
+        self._elapsed_steps = wp.zeros(n, dtype=int, device=device)
+        self._bad = wp.zeros(n, dtype=bool, device=device)
+        self._done = wp.zeros(n, dtype=bool, device=device)
+        self._terminated = wp.zeros(n, dtype=bool, device=device)
+        self._truncated = wp.zeros(n, dtype=bool, device=device)
+        # Torch's views of the same memory, for the transfers at the border.
+        names = ("action", "observation", "reward", "terms", "mask", "stagger", "episode", "elapsed_steps")
+        flags = ("bad", "done", "terminated", "truncated")
+        self._views = {name: wp.to_torch(getattr(self, f"_{name}")) for name in names + flags}
+
+    def _make_specs(self) -> None:
+        n, device = self.num_envs, self.device
+        observation = {"observation": Unbounded((n, self.observation_size), device=device)}
+        if self.reward_terms:
+            terms = {name: Unbounded((n, 1), device=device) for name in self.term_names}
+            observation["reward_terms"] = Composite(terms, shape=(n,), device=device)
+        flag = Binary(n=1, shape=(n, 1), dtype=torch.bool, device=device)
+        self.observation_spec = Composite(observation, shape=(n,), device=device)
+        self.action_spec = Bounded(-1.0, 1.0, (n, self.mj_model.nu), device=device)
+        # In [0, 1], but RewardSum takes the bounds over for the sum.
+        self.reward_spec = Unbounded((n, 1), device=device)
+        self.done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
+        )
+
+    # What the graphs record.
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=self.num_envs, inputs=inputs, outputs=outputs, device=self.sim.device)
+
+    def _launch_step(self) -> None:
+        self._launch(apply_action, [self._action], [self.sim.data.ctrl, self._bad])
+        self.sim.step()
+        self._launch_outputs()
+        self._launch(
+            count_step,
+            [self._bad, self.config.episode_length],
+            [self._elapsed_steps, self._done, self._terminated, self._truncated],
+        )
+
+    def _launch_reset(self) -> None:
+        self.sim.reset(self._mask)
+        self._launch_pose()
+        self._launch(
+            begin_episode,
+            [self._mask, self._stagger, self._seed, self.config.episode_length],
+            [self._episode, self._elapsed_steps, self._bad, self._done, self._terminated, self._truncated],
+        )
+        self._launch_refresh()
+
+    def _launch_refresh(self) -> None:
+        self.sim.forward(self._mask)
+        self._launch_outputs()
+
+    def _launch_outputs(self) -> None:
+        data = self.sim.data
+        self._launch_observe()
+        self._launch(quench, [data.qpos, data.qvel], [self._bad, self._observation, self._reward, self._terms])
+
+    # TorchRL's side.
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action")
+        if action.shape != self._views["action"].shape:
+            raise ValueError(f"action must have shape {tuple(self._views['action'].shape)}, got {tuple(action.shape)}")
+        self._views["action"].copy_(action)
+        self._step_graph.replay()
+        result = self._read_outputs()
+        result.set("reward", self._views["reward"].clone().unsqueeze(-1))
+        return result
+
+    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            self._views["mask"].fill_(True)
+        else:
+            self._views["mask"].copy_(mask.reshape(self.num_envs))
+        if set_state:
+            self._restore(tensordict)
+            self._refresh_graph.replay()
+        else:
+            self._views["stagger"].fill_(self.stagger and mask is None)
+            self._reset_graph.replay()
+        result = self._read_outputs()
+        if self.reward_terms:
+            result.get("reward_terms").zero_()  # nothing was rewarded yet
+        return result
+
+    def _read_outputs(self) -> TensorDict:
+        """Copies what the kernels wrote: the buffers themselves change at the next step."""
+        views = self._views
+        entries: dict[str, Any] = {
+            name: views[name].clone().unsqueeze(-1) for name in ("done", "terminated", "truncated")
+        }
+        entries["observation"] = views["observation"].clone()
+        if self.reward_terms:
+            columns = views["terms"].clone().split(1, dim=-1)
+            entries["reward_terms"] = dict(zip(self.term_names, columns, strict=True))
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Starts the random streams of all worlds anew, at their episode 0."""
+        if seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        seed = check_seed(seed)
+        self.seed = seed
+        self._seed.fill_(seed)
+        self._episode.zero_()
+
+    # State.
+
+    def get_state(self) -> State:
+        """Returns a copy of the state of all worlds, for ``env.reset(state, set_state=True)``."""
+        return State(
+            {
+                "qpos": self.sim.qpos.clone(),
+                "qvel": self.sim.qvel.clone(),
+                "qacc_warmstart": self.sim.qacc_warmstart.clone(),
+                "elapsed_steps": self._views["elapsed_steps"].clone(),
+                "episode": self._views["episode"].clone(),
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _restore(self, state: TensorDictBase | None) -> None:
+        """Writes a state into the worlds in the mask; what it lacks beside qpos and qvel starts at zero."""
+        targets = {
+            "qpos": self.sim.qpos,
+            "qvel": self.sim.qvel,
+            "qacc_warmstart": self.sim.qacc_warmstart,
+            "elapsed_steps": self._views["elapsed_steps"],
+            "episode": self._views["episode"],
+        }
+        new = {key: None if state is None else state.get(key, None) for key in targets}
+        if new["qpos"] is None or new["qvel"] is None:
+            raise ValueError(
+                "set_state=True needs a state with 'qpos' and 'qvel', as env.get_state() returns it. TransformedEnv "
+                "drops them from a plain TensorDict: pass torchrl_loco.State({'qpos': ..., 'qvel': ...}, batch_size)"
+            )
+        for key, value in new.items():
+            if value is None:
+                continue
+            if value.shape != targets[key].shape:
+                raise ValueError(f"{key} must have shape {tuple(targets[key].shape)}, got {tuple(value.shape)}")
+            if not torch.isfinite(value).all():
+                raise ValueError(f"{key} must be finite")
+        mask = self._views["mask"]
+        for key, target in targets.items():
+            value = new[key]
+            if value is None:
+                if key == "episode":
+                    continue  # the world goes on drawing where it was
+                value = torch.zeros_like(target)
+            rows = mask.view(-1, *[1] * (target.ndim - 1))
+            target.copy_(torch.where(rows, value.to(target), target))
+        for flag in ("bad", "done", "terminated", "truncated"):
+            self._views[flag].masked_fill_(mask, False)
+        self.sim.time.copy_(torch.where(mask, self._views["elapsed_steps"] * self.config.ctrl_dt, self.sim.time))
+
+    # Pictures, and the way out.
+
+    def render(self, camera: str = "side", width: int = 320, height: int = 240) -> torch.Tensor:
+        """Ray-traces every world, on the CPU or CUDA, without OpenGL.
+
+        Args:
+            camera: ``"side"``, ``"back"`` or ``"egocentric"``.
+            width: pixels in a row.
+            height: rows.
+
+        Returns:
+            uint8 tensor of shape ``(num_envs, height, width, 3)``.
+
+        Raises:
+            ValueError: the model has no such camera, or a size is not positive.
+        """
+        key = (camera, width, height)
+        if key not in self._renderers:
+            self._renderers[key] = Renderer(self.sim, *key)
+        return self._renderers[key].render()
+
+    def to(self, device: Any) -> "LocoEnv":
+        """Returns the environment itself if it lives on ``device``; physics cannot move, so anything else raises.
+
+        Raises:
+            ValueError: ``device`` is another one.
+        """
+        if check_device(device) != self.device:
+            raise ValueError(
+                f"the physics lives on {self.device} and cannot move: make a new one with device={device!r}"
+            )
+        return self

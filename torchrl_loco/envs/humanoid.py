@@ -1,0 +1,150 @@
+"""Humanoid: 21 hinges on a free root, learning to stand, walk and run."""
+
+import warp as wp
+
+from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.rewards import Sigmoid, tolerance
+from torchrl_loco.sim.sampling import draw_free_poses, make_skeleton
+
+STAND_HEIGHT = wp.constant(1.4)
+"""Height of the head from which the humanoid counts as standing (m)."""
+WALK_SPEED = 1.0
+"""Horizontal speed that counts as walking (m/s)."""
+RUN_SPEED = 10.0
+"""Horizontal speed that counts as running (m/s)."""
+
+TORSO = wp.constant(1)
+"""Id of the torso; the world is body 0."""
+HEAD = wp.constant(2)
+"""Id of the head."""
+EXTREMITIES = ("left_hand", "left_foot", "right_hand", "right_foot")
+"""Bodies whose position is observed, in order."""
+ROOT_QPOS = wp.constant(7)
+"""Numbers of qpos that place the root: position and quaternion; the hinges follow."""
+
+
+@wp.kernel(enable_backward=False)
+def observe_humanoid(
+    # Data in:
+    qpos_in: wp.array2d[float],
+    qvel_in: wp.array2d[float],
+    ctrl_in: wp.array2d[float],
+    xpos_in: wp.array2d[wp.vec3],
+    xmat_in: wp.array2d[wp.mat33],
+    sensordata_in: wp.array2d[float],
+    # In:
+    extremities: wp.array[int],
+    speed: float,
+    # Out:
+    observation_out: wp.array2d[float],
+    reward_out: wp.array[float],
+    terms_out: wp.array2d[float],
+):
+    world = wp.tid()
+    head_height = xpos_in[world, HEAD][2]
+    torso_pos = xpos_in[world, TORSO]
+    torso_mat = xmat_in[world, TORSO]
+    velocity = wp.vec3(sensordata_in[world, 0], sensordata_in[world, 1], sensordata_in[world, 2])
+
+    k = int(0)
+    for i in range(ROOT_QPOS, qpos_in.shape[1]):
+        observation_out[world, k] = qpos_in[world, i]
+        k += 1
+    observation_out[world, k] = head_height
+    k += 1
+    for i in range(extremities.shape[0]):
+        limb = wp.transpose(torso_mat) * (xpos_in[world, extremities[i]] - torso_pos)
+        for j in range(3):
+            observation_out[world, k + j] = limb[j]
+        k += 3
+    for j in range(3):
+        observation_out[world, k + j] = torso_mat[2, j]
+        observation_out[world, k + 3 + j] = velocity[j]
+    k += 6
+    for i in range(qvel_in.shape[1]):
+        observation_out[world, k + i] = qvel_in[world, i]
+
+    standing = tolerance(head_height, STAND_HEIGHT, wp.inf, STAND_HEIGHT / 4.0)
+    upright = tolerance(torso_mat[2, 2], 0.9, wp.inf, 1.9, Sigmoid.LINEAR, 0.0)
+    effort = float(0.0)
+    for i in range(ctrl_in.shape[1]):
+        effort += tolerance(ctrl_in[world, i], 0.0, 0.0, 1.0, Sigmoid.QUADRATIC, 0.0)
+    small_control = (4.0 + effort / float(ctrl_in.shape[1])) / 5.0
+    if speed > 0.0:
+        horizontal = wp.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
+        move = (5.0 * tolerance(horizontal, speed, wp.inf, speed, Sigmoid.LINEAR, 0.0) + 1.0) / 6.0
+    else:
+        move = 0.5 * (tolerance(velocity[0], 0.0, 0.0, 2.0) + tolerance(velocity[1], 0.0, 0.0, 2.0))
+    reward_out[world] = standing * upright * small_control * move
+    terms_out[world, 0] = standing
+    terms_out[world, 1] = upright
+    terms_out[world, 2] = small_control
+    terms_out[world, 3] = move
+
+
+class Humanoid(LocoEnv):
+    """What the humanoid's three tasks share; they differ in ``speed`` (m/s, 0 to stand)."""
+
+    body = "humanoid"
+    observation_size = 67
+    speed = 0.0
+    term_names = ("standing", "upright", "small_control", "move")
+
+    def _prepare(self) -> None:
+        device = self.sim.device
+        ids = [self.mj_model.body(name).id for name in EXTREMITIES]
+        self._extremities = wp.array(ids, dtype=int, device=device)
+        if self.protocol == "dm_control":
+            self._skeleton = make_skeleton(self.mj_model, self.sim.model.nxn_geom_pair_filtered.numpy(), device)
+
+    def _launch_observe(self) -> None:
+        d = self.sim.data
+        self._launch(
+            observe_humanoid,
+            [d.qpos, d.qvel, d.ctrl, d.xpos, d.xmat, d.sensordata, self._extremities, self.speed],
+            [self._observation, self._reward, self._terms],
+        )
+
+    def _launch_pose(self) -> None:
+        if self.protocol == "dm_control":
+            d = self.sim.data
+            self._launch(
+                draw_free_poses,
+                [self._skeleton, self._seed, self._episode, self._mask],
+                [d.qpos, d.xpos, d.xquat],
+            )
+
+
+class HumanoidStand(Humanoid):
+    """Stand still and upright.
+
+    Observation (67): hinge angles, qpos[7:] (21, rad); head height (1, m); left hand, left foot, right hand and right
+        foot relative to the torso, in its frame (12, m); the torso's z row of xmat (3); velocity of the torso
+        subtree's center of mass (3, m/s); qvel (27).
+    Action (21): torques of the hinges as a share of their gear, in [-1, 1]; clipped beyond.
+    Reward: ``standing * upright * small_control * move`` with
+        ``standing = tolerance(head z, [1.4 m, inf), margin 0.35 m)``,
+        ``upright = tolerance(torso zz, [0.9, inf), margin 1.9, linear, value_at_margin 0)``,
+        ``small_control = (4 + mean(tolerance(action, margin 1, quadratic, value_at_margin 0))) / 5`` and
+        ``move = mean(tolerance(vx, margin 2 m/s), tolerance(vy, margin 2 m/s))``. The four are the terms.
+    Start: at rest; the default pose under ``playground``, a random one free of contact under ``dm_control``.
+    Termination: none by falling; truncation after 1000 steps; a world that is no longer finite is terminated with
+        reward 0 and a zero observation.
+    Source: dm_control ``suite/humanoid.py``; arguments as in :class:`LocoEnv`.
+    """
+
+
+class HumanoidWalk(Humanoid):
+    """Walk at 1 m/s or faster, in any direction. As :class:`HumanoidStand`, but for
+
+    Reward: its last factor is ``move = (5 tolerance(|v_xy|, [1 m/s, inf), margin 1 m/s, linear, value_at_margin 0)
+        + 1) / 6``.
+    """
+
+    speed = WALK_SPEED
+
+
+class HumanoidRun(Humanoid):
+    """Run at 10 m/s or faster, in any direction. As :class:`HumanoidWalk` with target and margin of 10 m/s."""
+
+    speed = RUN_SPEED

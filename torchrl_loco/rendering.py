@@ -1,0 +1,50 @@
+"""Pixels from Warp's ray tracer: all worlds at once, on the CPU or CUDA, without OpenGL."""
+
+import mujoco_warp as mjw
+import torch
+import warp as wp
+
+from torchrl_loco.sim import Simulation
+
+
+class Renderer:
+    """Renders the worlds of a simulation through one camera.
+
+    Args:
+        sim: the simulation whose current state is shown.
+        camera: name of a camera of the model.
+        width: pixels in a row.
+        height: rows.
+
+    Raises:
+        ValueError: the model has no such camera, or a size is not positive.
+    """
+
+    def __init__(self, sim: Simulation, camera: str, width: int, height: int) -> None:
+        names = [sim.mj_model.camera(i).name for i in range(sim.mj_model.ncam)]
+        if camera not in names:
+            raise ValueError(f"no camera {camera!r}: choose one of {', '.join(names)}")
+        if width < 1 or height < 1:
+            raise ValueError(f"width and height must be at least 1 pixel, got {width} and {height}")
+        self._sim = sim
+        with wp.ScopedDevice(sim.device):
+            self._context = mjw.create_render_context(
+                sim.mj_model,
+                nworld=sim.num_envs,
+                cam_res=(width, height),
+                render_rgb=True,
+                use_shadows=True,
+                render_skybox=True,
+                cam_active=[camera],
+            )
+            self._rgb = wp.zeros((sim.num_envs, height, width), dtype=wp.vec3)
+
+    def render(self) -> torch.Tensor:
+        """Returns the current state of all worlds as uint8 pixels, shape ``(num_envs, height, width, 3)``."""
+        sim = self._sim
+        stream = wp.stream_from_torch(torch.cuda.current_stream()) if sim.device.is_cuda else None
+        with wp.ScopedStream(stream), wp.ScopedDevice(sim.device):
+            mjw.refit_bvh(sim.model, sim.data, self._context)
+            mjw.render(sim.model, sim.data, self._context)
+            mjw.get_rgb(self._context, 0, self._rgb)
+        return wp.to_torch(self._rgb).clamp(0.0, 1.0).mul(255.0).round().to(torch.uint8)

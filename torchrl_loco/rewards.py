@@ -1,0 +1,117 @@
+"""dm_control's ``tolerance`` and its eight sigmoids as Warp functions, for use inside kernels."""
+
+import enum
+
+import warp as wp
+
+
+class Sigmoid(enum.IntEnum):
+    """How :func:`tolerance` falls off outside its bounds; the names are dm_control's."""
+
+    GAUSSIAN = 0
+    LINEAR = 1
+    HYPERBOLIC = 2
+    LONG_TAIL = 3
+    RECIPROCAL = 4
+    COSINE = 5
+    QUADRATIC = 6
+    TANH_SQUARED = 7
+
+
+@wp.func
+def gaussian(x: float, value_at_1: float) -> float:
+    return wp.exp(wp.log(value_at_1) * x * x)
+
+
+@wp.func
+def linear(x: float, value_at_1: float) -> float:
+    return wp.max(1.0 - wp.abs(x) * (1.0 - value_at_1), 0.0)
+
+
+@wp.func
+def hyperbolic(x: float, value_at_1: float) -> float:
+    inverse = 1.0 / value_at_1
+    scale = wp.log(inverse + wp.sqrt(inverse * inverse - 1.0))  # arccosh
+    return 1.0 / wp.cosh(x * scale)
+
+
+@wp.func
+def long_tail(x: float, value_at_1: float) -> float:
+    return 1.0 / (1.0 + x * x * (1.0 / value_at_1 - 1.0))
+
+
+@wp.func
+def reciprocal(x: float, value_at_1: float) -> float:
+    return 1.0 / (1.0 + wp.abs(x) * (1.0 / value_at_1 - 1.0))
+
+
+@wp.func
+def cosine(x: float, value_at_1: float) -> float:
+    angle = wp.min(wp.abs(x) * wp.acos(2.0 * value_at_1 - 1.0), wp.pi)
+    return 0.5 * (1.0 + wp.cos(angle))
+
+
+@wp.func
+def quadratic(x: float, value_at_1: float) -> float:
+    return wp.max(1.0 - x * x * (1.0 - value_at_1), 0.0)
+
+
+@wp.func
+def tanh_squared(x: float, value_at_1: float) -> float:
+    root = wp.sqrt(1.0 - value_at_1)
+    scale = 0.5 * wp.log((1.0 + root) / (1.0 - root))  # arctanh
+    tanh = wp.tanh(x * scale)
+    return 1.0 - tanh * tanh
+
+
+@wp.func
+def sigmoid(x: float, value_at_1: float, kind: int) -> float:
+    """Value at ``x`` of a sigmoid that is 1 at 0 and ``value_at_1`` at 1."""
+    if kind == Sigmoid.LINEAR:
+        return linear(x, value_at_1)
+    if kind == Sigmoid.HYPERBOLIC:
+        return hyperbolic(x, value_at_1)
+    if kind == Sigmoid.LONG_TAIL:
+        return long_tail(x, value_at_1)
+    if kind == Sigmoid.RECIPROCAL:
+        return reciprocal(x, value_at_1)
+    if kind == Sigmoid.COSINE:
+        return cosine(x, value_at_1)
+    if kind == Sigmoid.QUADRATIC:
+        return quadratic(x, value_at_1)
+    if kind == Sigmoid.TANH_SQUARED:
+        return tanh_squared(x, value_at_1)
+    return gaussian(x, value_at_1)
+
+
+@wp.func
+def tolerance(
+    x: float,
+    lower: float,
+    upper: float,
+    margin: float = 0.0,
+    kind: int = 0,
+    value_at_margin: float = 0.1,
+) -> float:
+    """Returns 1 where ``lower <= x <= upper`` and falls off outside, in [0, 1].
+
+    Args:
+        x: the value to judge, in any unit.
+        lower: lower bound, in the unit of ``x``; may be ``-wp.inf``.
+        upper: upper bound, in the unit of ``x``; may be ``wp.inf``.
+        margin: distance from the nearer bound at which the result is ``value_at_margin``, in the unit of ``x``;
+            0 makes it 0 everywhere outside.
+        kind: the :class:`Sigmoid` of the fall-off.
+        value_at_margin: result at the margin, within [0, 1) for LINEAR, COSINE and QUADRATIC and within (0, 1) for
+            the others, which never reach 0.
+
+    Source: dm_control ``utils/rewards.py``.
+    """
+    if x >= lower and x <= upper:
+        return 1.0
+    if margin <= 0.0:
+        return 0.0
+    distance = lower - x
+    if x > upper:
+        distance = x - upper
+    return sigmoid(distance / margin, value_at_margin, kind)

@@ -1,0 +1,212 @@
+"""What a world draws at its reset: a random stream of its own, joint angles, and a pose free of contact."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+MAX_TRIES = 64
+"""Poses drawn before one in contact is kept; three of four humanoid poses are free, so it never comes to that."""
+
+
+@wp.func
+def world_stream(seed: wp.array[wp.uint32], world: int, episode: int) -> wp.uint32:
+    """Start of the random stream of one episode: a function of (seed, world, episode) alone."""
+    return wp.rand_init(int(wp.rand_init(int(seed[0]), world)), episode)
+
+
+@wp.func
+def positive_quaternion(stream: wp.uint32):
+    """Draws four numbers from U(0, 1) and normalises them; returns (w, x, y, z) and the advanced stream.
+
+    dm_control orients free joints so. It favours some orientations, and is kept for comparable returns.
+    """
+    w = wp.randf(stream)
+    x = wp.randf(stream)
+    y = wp.randf(stream)
+    z = wp.randf(stream)
+    return wp.normalize(wp.vec4(w, x, y, z)), stream
+
+
+@wp.func
+def segment_distance(p: wp.vec3, u: wp.vec3, q: wp.vec3, v: wp.vec3) -> float:
+    """Distance of the segments ``p + s u`` and ``q + t v``, s and t in [-1, 1]; points have ``u`` or ``v`` zero."""
+    d = p - q
+    uu = wp.dot(u, u)
+    vv = wp.dot(v, v)
+    uv = wp.dot(u, v)
+    ud = wp.dot(u, d)
+    vd = wp.dot(v, d)
+    s = float(0.0)
+    t = float(0.0)
+    determinant = uu * vv - uv * uv
+    if determinant > 1.0e-12:
+        s = wp.clamp((uv * vd - vv * ud) / determinant, -1.0, 1.0)
+    if vv > 0.0:
+        t = wp.clamp((uv * s + vd) / vv, -1.0, 1.0)
+    if uu > 0.0:
+        s = wp.clamp((uv * t - ud) / uu, -1.0, 1.0)
+    return wp.length(d + s * u - t * v)
+
+
+@wp.struct
+class Skeleton:
+    """What forward kinematics and the contact test of one world need of a model. Geom 0 is the floor, z = 0.
+
+    body_parent      (nbody,)     id of the parent body
+    body_joint       (nbody, 2)   first joint and number of joints
+    body_pos         (nbody,)     offset from the parent (m)
+    body_quat        (nbody,)     rotation against the parent
+    joint_qpos       (njnt,)      start of the joint in qpos
+    joint_free       (njnt,)      whether it is a free joint, else a hinge
+    joint_pos        (njnt,)      anchor in the body's frame (m)
+    joint_axis       (njnt,)      axis in the body's frame
+    joint_range      (njnt,)      lower and upper limit (rad)
+    geom_body        (ngeom,)     id of the geom's body
+    geom_pos         (ngeom,)     center in the body's frame (m)
+    geom_axis        (ngeom,)     from the center to the end of the capsule's segment (m), zero for a sphere
+    geom_radius      (ngeom,)     radius (m)
+    pair             (npair,)     geoms that may touch
+    """
+
+    body_parent: wp.array[int]
+    body_joint: wp.array[wp.vec2i]
+    body_pos: wp.array[wp.vec3]
+    body_quat: wp.array[wp.quat]
+    joint_qpos: wp.array[int]
+    joint_free: wp.array[bool]
+    joint_pos: wp.array[wp.vec3]
+    joint_axis: wp.array[wp.vec3]
+    joint_range: wp.array[wp.vec2]
+    geom_body: wp.array[int]
+    geom_pos: wp.array[wp.vec3]
+    geom_axis: wp.array[wp.vec3]
+    geom_radius: wp.array[float]
+    pair: wp.array[wp.vec2i]
+
+
+@wp.func
+def draw_joints(skeleton: Skeleton, stream: wp.uint32, qpos: wp.array[float]) -> wp.uint32:
+    """Draws the orientation of free joints and every hinge uniformly in its range; root positions stay."""
+    for joint in range(skeleton.joint_qpos.shape[0]):
+        address = skeleton.joint_qpos[joint]
+        if skeleton.joint_free[joint]:
+            quat, stream = positive_quaternion(stream)
+            for i in range(4):
+                qpos[address + 3 + i] = quat[i]
+        else:
+            limits = skeleton.joint_range[joint]
+            qpos[address] = wp.randf(stream, limits[0], limits[1])
+    return stream
+
+
+@wp.func
+def pose_bodies(skeleton: Skeleton, qpos: wp.array[float], xpos: wp.array[wp.vec3], xquat: wp.array[wp.quat]):
+    """Forward kinematics of one world; ``xquat`` is (x, y, z, w), Warp's order."""
+    xpos[0] = wp.vec3(0.0)
+    xquat[0] = wp.quat_identity()
+    for body in range(1, skeleton.body_parent.shape[0]):
+        parent = skeleton.body_parent[body]
+        pos = xpos[parent] + wp.quat_rotate(xquat[parent], skeleton.body_pos[body])
+        quat = xquat[parent] * skeleton.body_quat[body]
+        first = skeleton.body_joint[body][0]
+        for joint in range(first, first + skeleton.body_joint[body][1]):
+            q = skeleton.joint_qpos[joint]
+            if skeleton.joint_free[joint]:
+                pos = wp.vec3(qpos[q], qpos[q + 1], qpos[q + 2])
+                quat = wp.quat(qpos[q + 4], qpos[q + 5], qpos[q + 6], qpos[q + 3])
+            else:
+                anchor = pos + wp.quat_rotate(quat, skeleton.joint_pos[joint])
+                quat = quat * wp.quat_from_axis_angle(skeleton.joint_axis[joint], qpos[q])
+                pos = anchor - wp.quat_rotate(quat, skeleton.joint_pos[joint])
+        xpos[body] = pos
+        xquat[body] = quat
+
+
+@wp.func
+def in_contact(skeleton: Skeleton, xpos: wp.array[wp.vec3], xquat: wp.array[wp.quat]) -> bool:
+    """Whether any pair of geoms of one world overlaps."""
+    for i in range(skeleton.pair.shape[0]):
+        a = skeleton.pair[i][0]
+        b = skeleton.pair[i][1]
+        body = skeleton.geom_body[b]
+        q = xpos[body] + wp.quat_rotate(xquat[body], skeleton.geom_pos[b])
+        v = wp.quat_rotate(xquat[body], skeleton.geom_axis[b])
+        if a == 0:  # the floor
+            if q[2] - wp.abs(v[2]) < skeleton.geom_radius[b]:
+                return True
+        else:
+            body = skeleton.geom_body[a]
+            p = xpos[body] + wp.quat_rotate(xquat[body], skeleton.geom_pos[a])
+            u = wp.quat_rotate(xquat[body], skeleton.geom_axis[a])
+            if segment_distance(p, u, q, v) < skeleton.geom_radius[a] + skeleton.geom_radius[b]:
+                return True
+    return False
+
+
+@wp.kernel(enable_backward=False)
+def draw_free_poses(
+    # In:
+    skeleton: Skeleton,
+    seed_in: wp.array[wp.uint32],
+    episode_in: wp.array[int],
+    mask_in: wp.array[bool],
+    # Data out:
+    qpos_out: wp.array2d[float],
+    xpos_out: wp.array2d[wp.vec3],
+    xquat_out: wp.array2d[wp.quat],
+):
+    world = wp.tid()
+    if not mask_in[world]:
+        return
+    stream = world_stream(seed_in, world, episode_in[world])
+    for _ in range(MAX_TRIES):
+        stream = draw_joints(skeleton, stream, qpos_out[world])
+        pose_bodies(skeleton, qpos_out[world], xpos_out[world], xquat_out[world])
+        if not in_contact(skeleton, xpos_out[world], xquat_out[world]):
+            return
+
+
+def make_skeleton(mj_model: mujoco.MjModel, pairs: np.ndarray, device: wp.Device) -> Skeleton:
+    """Gathers the :class:`Skeleton` of a model.
+
+    Args:
+        mj_model: a model of free joints, hinges, capsules and spheres on a floor at z = 0, which is geom 0.
+        pairs: geoms that may touch, lower id first, shape ``(npair, 2)``.
+        device: where the arrays live.
+
+    Raises:
+        ValueError: the model has another kind of joint or geom.
+    """
+    m, joint, geom = mj_model, mujoco.mjtJoint, mujoco.mjtGeom
+    capsule, sphere = m.geom_type[1:] == geom.mjGEOM_CAPSULE, m.geom_type[1:] == geom.mjGEOM_SPHERE
+    if m.geom_type[0] != geom.mjGEOM_PLANE or not np.all(capsule | sphere):
+        raise ValueError("contact-free poses need a floor as geom 0 and only capsules and spheres after it")
+    if not np.isin(m.jnt_type, (joint.mjJNT_FREE, joint.mjJNT_HINGE)).all():
+        raise ValueError("contact-free poses need a model of free joints and hinges only")
+
+    half_length = np.where(m.geom_type == geom.mjGEOM_CAPSULE, m.geom_size[:, 1], 0.0)
+    geom_axis = np.zeros((m.ngeom, 3))
+    for i in range(m.ngeom):
+        mujoco.mju_rotVecQuat(geom_axis[i], np.array([0.0, 0.0, half_length[i]]), m.geom_quat[i])
+
+    def array(values: Any, dtype: Any) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+    skeleton = Skeleton()
+    skeleton.body_parent = array(m.body_parentid, int)
+    skeleton.body_joint = array(np.stack([m.body_jntadr, m.body_jntnum], axis=1), wp.vec2i)
+    skeleton.body_pos = array(m.body_pos, wp.vec3)
+    skeleton.body_quat = array(m.body_quat[:, [1, 2, 3, 0]], wp.quat)
+    skeleton.joint_qpos = array(m.jnt_qposadr, int)
+    skeleton.joint_free = array(m.jnt_type == joint.mjJNT_FREE, bool)
+    skeleton.joint_pos = array(m.jnt_pos, wp.vec3)
+    skeleton.joint_axis = array(m.jnt_axis, wp.vec3)
+    skeleton.joint_range = array(m.jnt_range, wp.vec2)
+    skeleton.geom_body = array(m.geom_bodyid, int)
+    skeleton.geom_pos = array(m.geom_pos, wp.vec3)
+    skeleton.geom_axis = array(geom_axis, wp.vec3)
+    skeleton.geom_radius = array(m.geom_size[:, 0], float)
+    skeleton.pair = array(pairs, wp.vec2i)
+    return skeleton

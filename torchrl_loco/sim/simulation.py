@@ -1,0 +1,162 @@
+"""Many worlds of one model, stepped together by MuJoCo-Warp."""
+
+from collections.abc import Callable
+
+import mujoco
+import mujoco_warp as mjw
+import torch
+import warp as wp
+
+from torchrl_loco.config import SimConfig
+from torchrl_loco.sim.graph import Graph
+
+
+@wp.kernel(enable_backward=False)
+def clear_worlds(
+    # Model:
+    qpos0: wp.array2d[float],
+    # In:
+    mask_in: wp.array[bool],
+    # Data out:
+    qpos_out: wp.array2d[float],
+    qvel_out: wp.array2d[float],
+    qacc_warmstart_out: wp.array2d[float],
+    ctrl_out: wp.array2d[float],
+    time_out: wp.array[float],
+):
+    world = wp.tid()
+    if not mask_in[world]:
+        return
+    for i in range(qpos_out.shape[1]):
+        qpos_out[world, i] = qpos0[0, i]
+    for i in range(qvel_out.shape[1]):
+        qvel_out[world, i] = 0.0
+        qacc_warmstart_out[world, i] = 0.0
+    for i in range(ctrl_out.shape[1]):
+        ctrl_out[world, i] = 0.0
+    time_out[world] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def clear_constraints(
+    # In:
+    mask_in: wp.array[bool],
+    # Data out:
+    efc_J_out: wp.array3d[float],  # noqa: N803
+    efc_D_out: wp.array2d[float],  # noqa: N803
+):
+    """Zeroes the constraint rows: the solver multiplies unused ones by zero, which leaves a NaN a NaN for ever."""
+    world, row = wp.tid()
+    if not mask_in[world]:
+        return
+    for i in range(efc_J_out.shape[2]):
+        efc_J_out[world, row, i] = 0.0
+    if row < efc_D_out.shape[1]:
+        efc_D_out[world, row] = 0.0
+
+
+class Simulation:
+    """Owns the models, the state of all worlds, and the graphs that advance it.
+
+    ``step``, ``reset`` and ``forward`` launch kernels on Warp's current stream and return at once; :meth:`capture`
+    records any sequence of them, with kernels of the caller's in between, to be replayed.
+
+    The torch views share memory with the Warp arrays and keep their address for life. They always hold the current
+    state: clone what you want to keep.
+
+    ===================  =======================  ==============================================
+    ``qpos``             ``(nworld, nq)``         positions (m, rad, unit quaternions)
+    ``qvel``             ``(nworld, nv)``         velocities (m/s, rad/s)
+    ``ctrl``             ``(nworld, nu)``         actions, clipped by the physics to the ctrlrange
+    ``qacc_warmstart``   ``(nworld, nv)``         where the constraint solver starts
+    ``xpos``             ``(nworld, nbody, 3)``   positions of the bodies (m)
+    ``xmat``             ``(nworld, nbody, 3, 3)``  orientations of the bodies
+    ``time``             ``(nworld,)``            time since the world's reset (s)
+    ``overflow``         ``(nworld,)``            bitmask of :class:`mujoco_warp.OverflowType`, kept until you zero it
+    ===================  =======================  ==============================================
+
+    Args:
+        mj_model: the compiled model; its options are set from ``config``.
+        config: settings of the simulation.
+        num_envs: number of worlds.
+        device: where they live.
+    """
+
+    def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: torch.device) -> None:
+        self.mj_model = mj_model
+        self.num_envs = num_envs
+        self.substeps = config.substeps
+        self.device = wp.get_device(str(device))
+        self.graphs: list[Graph] = []
+
+        _set_options(mj_model, config)
+        with wp.ScopedDevice(self.device):
+            self.model = mjw.put_model(mj_model)
+            self.data = mjw.make_data(mj_model, nworld=num_envs, naconmax=config.naconmax, njmax=config.njmax)
+        # Printing from kernels costs more than the physics; the same facts stay readable in ``overflow``.
+        self.model.opt.warn_overflow = 0
+
+        self.qpos = wp.to_torch(self.data.qpos)
+        self.qvel = wp.to_torch(self.data.qvel)
+        self.ctrl = wp.to_torch(self.data.ctrl)
+        self.qacc_warmstart = wp.to_torch(self.data.qacc_warmstart)
+        self.xpos = wp.to_torch(self.data.xpos)
+        self.xmat = wp.to_torch(self.data.xmat)
+        self.time = wp.to_torch(self.data.time)
+        self.overflow = wp.to_torch(self.data.overflow)
+
+    def step(self) -> None:
+        """Advances every world by one control step under ``ctrl``.
+
+        In dm_control's order: each step's second half comes before the next one's first, so that afterwards all
+        derived quantities and sensors belong to the new state. Needs :meth:`forward` after any change of the state.
+        """
+        mjw.step2(self.model, self.data)
+        for _ in range(self.substeps - 1):
+            mjw.step(self.model, self.data)
+        mjw.step1(self.model, self.data)
+
+    def forward(self, mask: wp.array) -> None:
+        """Brings derived quantities and sensors up to ``qpos`` and ``qvel``, changed where ``mask`` is set."""
+        efc = self.data.efc
+        wp.launch(
+            clear_constraints,
+            dim=(self.num_envs, efc.J.shape[1]),
+            inputs=[mask],
+            outputs=[efc.J, efc.D],
+            device=self.device,
+        )
+        mjw.step1(self.model, self.data)
+
+    def reset(self, mask: wp.array) -> None:
+        """Puts the worlds where ``mask`` (bool, ``(nworld,)``) is set at rest in the default pose; others stay."""
+        d = self.data
+        wp.launch(
+            clear_worlds,
+            dim=self.num_envs,
+            inputs=[self.model.qpos0, mask],
+            outputs=[d.qpos, d.qvel, d.qacc_warmstart, d.ctrl, d.time],
+            device=self.device,
+        )
+
+    def capture(self, launch: Callable[[], None]) -> Graph:
+        """Records the launches that ``launch`` makes. The state afterwards is arbitrary: reset before use."""
+        graph = Graph(launch, self.device)
+        self.graphs.append(graph)
+        return graph
+
+    @property
+    def num_captures(self) -> int:
+        """How many graphs were ever recorded."""
+        return len(self.graphs)
+
+
+def _set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
+    option = mj_model.opt
+    option.timestep = config.sim_dt
+    option.iterations = config.iterations
+    option.ls_iterations = config.ls_iterations
+    euler_damping = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    option.disableflags = (
+        option.disableflags & ~euler_damping if config.euler_damping else option.disableflags | euler_damping
+    )
