@@ -1,15 +1,10 @@
 import pytest
 import torch
-import warp as wp
 
 import torchrl_loco
 
 TASKS = torchrl_loco.list_envs()
 PROTOCOLS = ("playground", "dm_control")
-
-
-def pytest_configure():
-    wp.config.log_level = wp.LOG_WARNING
 
 
 def pytest_collection_modifyitems(items):

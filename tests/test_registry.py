@@ -100,6 +100,7 @@ def test_naconmax_grows_with_the_worlds():
         ({"ls_iterations": -1}, ValueError, "ls_iterations must be positive"),
         ({"euler_damping": 1}, TypeError, "euler_damping must be True or False"),
         ({"episode_length": 0}, ValueError, "episode_length must be positive"),
+        ({"episode_length": 2**31}, ValueError, r"episode_length must be less than 2\*\*31"),
     ],
 )
 def test_wrong_arguments(arguments, error, message):

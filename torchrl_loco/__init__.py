@@ -13,7 +13,7 @@ from torchrl_loco.envs import (
 )
 from torchrl_loco.registry import list_envs, make
 
-__version__ = _versions.own_version()
+__version__ = "0.1.0"
 
 __all__ = [
     "HumanoidRun",

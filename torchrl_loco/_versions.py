@@ -7,11 +7,6 @@ TESTED = {"mujoco-warp": "4.0", "torchrl": "0.14"}
 """Series (leading part of the version) of each library that the tests ran with."""
 
 
-def own_version() -> str:
-    """Returns the version of the installed torchrl_loco."""
-    return metadata.version("torchrl-loco")
-
-
 def warn_if_untested() -> None:
     """Warns of every library in :data:`TESTED` whose installed version is of another series."""
     for name, series in TESTED.items():

@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import math
+import numbers
 from typing import Any
 
 PROTOCOLS = ("playground", "dm_control")
@@ -58,11 +59,12 @@ def _check_field(name: str, kind: Any, value: Any) -> None:
         if not isinstance(value, bool):
             raise TypeError(f"{name} must be True or False, got {value!r}")
         return
-    number = (int, float) if kind is float else (int,)
-    if isinstance(value, bool) or not isinstance(value, number):
+    if isinstance(value, bool) or not isinstance(value, numbers.Real if kind is float else numbers.Integral):
         raise TypeError(f"{name} must be of type {kind.__name__}, got {value!r}")
-    if not (math.isfinite(value) and value > 0):
+    if not (math.isfinite(value) and float(value) > 0):
         raise ValueError(f"{name} must be positive and finite, got {value!r}")
+    if kind is int and float(value) >= 2**31:  # kernels count in 32 bits
+        raise ValueError(f"{name} must be less than 2**31, got {value!r}")
 
 
 _WALKER = SimConfig(

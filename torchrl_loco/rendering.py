@@ -4,7 +4,7 @@ import mujoco_warp as mjw
 import torch
 import warp as wp
 
-from torchrl_loco.sim import Simulation
+from torchrl_loco.sim import Simulation, current_stream
 
 
 class Renderer:
@@ -38,12 +38,12 @@ class Renderer:
                 cam_active=[camera],
             )
             self._rgb = wp.zeros((sim.num_envs, height, width), dtype=wp.vec3)
+        wp.synchronize_device(sim.device)  # made on Warp's stream, used on torch's
 
     def render(self) -> torch.Tensor:
         """Returns the current state of all worlds as uint8 pixels, shape ``(num_envs, height, width, 3)``."""
         sim = self._sim
-        stream = wp.stream_from_torch(torch.cuda.current_stream()) if sim.device.is_cuda else None
-        with wp.ScopedStream(stream), wp.ScopedDevice(sim.device):
+        with wp.ScopedDevice(sim.device), wp.ScopedStream(current_stream(sim.device)):
             mjw.refit_bvh(sim.model, sim.data, self._context)
             mjw.render(sim.model, sim.data, self._context)
             mjw.get_rgb(self._context, 0, self._rgb)

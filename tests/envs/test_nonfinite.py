@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+import warp as wp
 from tensordict import TensorDict
 
 import torchrl_loco
+from torchrl_loco.envs.episode import quench
 
 BAD = [float("nan"), float("inf"), -float("inf"), 1e11]
 
@@ -95,3 +97,25 @@ def test_rollout_goes_on_past_a_bad_action():
     assert td["next", "terminated"].squeeze(-1).nonzero().tolist() == [[2, 5]]
     assert td["next", "observation"].isfinite().all()
     assert not td["done"][2, 6]
+
+
+@pytest.mark.parametrize("spoilt", ["qpos", "qvel", "observation", "reward", None])
+def test_quench_looks_at_everything_it_should(spoilt):
+    arrays = {
+        "qpos": torch.ones(2, 3),
+        "qvel": torch.ones(2, 3),
+        "observation": torch.ones(2, 4),
+        "reward": torch.ones(2),
+    }
+    if spoilt is not None:
+        arrays[spoilt].view(2, -1)[1, -1] = 2e10
+    bad, terms = torch.zeros(2, dtype=torch.bool), torch.ones(2, 1)
+    with wp.ScopedDevice("cpu"):
+        outputs = [bad, arrays["observation"], arrays["reward"], terms]
+        views = [wp.from_torch(array) for array in [arrays["qpos"], arrays["qvel"], *outputs]]
+        wp.launch(quench, dim=2, inputs=views[:2], outputs=views[2:])
+    ill = spoilt is not None
+    assert bad.tolist() == [False, ill]
+    for array in outputs[1:]:
+        assert (array[0] == 1).all()
+        assert (array[1] == (0 if ill else 1)).all()

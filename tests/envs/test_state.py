@@ -112,3 +112,52 @@ def test_transformed_env_never_drops_a_state_silently():
         env.reset(TensorDict(entries, batch_size=[2]), set_state=True)
     env.reset(State(entries, batch_size=[2]), set_state=True)
     assert (env.get_state()["qpos"] == 0).all()
+
+
+@pytest.mark.parametrize("transformed", [False, True])
+def test_a_restored_state_does_not_travel_on(transformed):
+    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0)
+    if transformed:
+        env = TransformedEnv(env, InitTracker())
+    env.reset()
+    state = env.get_state()
+    td = env.reset(state, set_state=True)
+    assert set(td.select("observation").keys()) == {"observation"}
+    if transformed:  # TorchRL's own: it returns what it was given
+        assert td is state
+    else:
+        assert not set(State.KEYS) & set(td.keys())
+        assert set(state.keys()) == set(State.KEYS)
+
+
+def test_restoring_makes_an_ended_world_well_again(actions):
+    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0)
+    td = env.reset()
+    good = env.get_state()
+    bad = actions(env, 1)[0]
+    bad[1] = torch.nan
+    env.step(td.set("action", bad))
+    td = env.reset(good, set_state=True)
+    assert not td["done"].any()
+    assert not td["terminated"].any()
+    assert (td["observation"][1] != 0).any()
+
+
+def test_a_masked_restore_ignores_the_rows_it_leaves():
+    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0)
+    env.reset()
+    state = env.get_state()
+    state["qvel"][0] = torch.nan
+    mask = torch.tensor([[False], [True]])
+    env.reset(state.set("_reset", mask).set("done", ~mask & False), set_state=True)
+    assert env.get_state()["qvel"].isfinite().all()
+
+
+def test_time_follows_the_elapsed_steps():
+    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0)
+    env.rollout(4)
+    state = env.get_state()
+    env.reset()
+    assert (env.sim.time == 0).all()
+    env.reset(state, set_state=True)
+    torch.testing.assert_close(env.sim.time, torch.full((2,), 4 * 0.025))

@@ -1,9 +1,9 @@
 """What all locomotion environments share: specs, step, reset, seeding, time limit, state. Knows no task."""
 
+import secrets
 from typing import Any, ClassVar
 
 import mujoco
-import numpy as np
 import torch
 import warp as wp
 from tensordict import TensorDict, TensorDictBase
@@ -22,8 +22,9 @@ from torchrl_loco.sim import Simulation
 class LocoEnv(EnvBase):
     """Base of the locomotion environments: batched worlds of one body on one device.
 
-    A subclass names its ``body`` and ``reward_terms``, and launches the kernels that fill the observation, the reward
-    and its terms (:meth:`_launch_observe`) and draw initial poses (:meth:`_launch_pose`). Everything else is here.
+    A subclass names its ``body``, ``observation_size`` and ``term_names``, and launches the kernels that fill the
+    observation, the reward and its terms (:meth:`_launch_observe`) and draw initial poses (:meth:`_launch_pose`).
+    Everything else is here.
 
     Args:
         num_envs: number of worlds, the batch size.
@@ -47,6 +48,7 @@ class LocoEnv(EnvBase):
     _has_frame_skip = True  # the substeps are our own
     _supports_set_state = True
 
+    @torch.inference_mode(False)  # the buffers must stay writable wherever the environment is made
     def __init__(
         self,
         num_envs: int = 1,
@@ -73,6 +75,7 @@ class LocoEnv(EnvBase):
         self._step_graph = self.sim.capture(self._launch_step)
         self._reset_graph = self.sim.capture(self._launch_reset)
         self._refresh_graph = self.sim.capture(self._launch_refresh)
+        wp.synchronize_device(self.sim.device)  # made on Warp's stream, used on torch's
         self._set_seed(seed)  # and begin anew: recording has drawn episodes
         self.sim.overflow.zero_()
         self._renderers: dict[tuple[str, int, int], Renderer] = {}
@@ -112,21 +115,22 @@ class LocoEnv(EnvBase):
         self._terminated = wp.zeros(n, dtype=bool, device=device)
         self._truncated = wp.zeros(n, dtype=bool, device=device)
         # Torch's views of the same memory, for the transfers at the border.
-        names = ("action", "observation", "reward", "terms", "mask", "stagger", "episode", "elapsed_steps")
+        names = ("action", "observation", "reward", "terms", "mask", "stagger", "seed", "episode", "elapsed_steps")
         flags = ("bad", "done", "terminated", "truncated")
         self._views = {name: wp.to_torch(getattr(self, f"_{name}")) for name in names + flags}
 
     def _make_specs(self) -> None:
         n, device = self.num_envs, self.device
-        observation = {"observation": Unbounded((n, self.observation_size), device=device)}
+        as_float: dict[str, Any] = {"device": device, "dtype": torch.float32}
+        observation = {"observation": Unbounded((n, self.observation_size), **as_float)}
         if self.reward_terms:
-            terms = {name: Unbounded((n, 1), device=device) for name in self.term_names}
+            terms = {name: Unbounded((n, 1), **as_float) for name in self.term_names}
             observation["reward_terms"] = Composite(terms, shape=(n,), device=device)
         flag = Binary(n=1, shape=(n, 1), dtype=torch.bool, device=device)
         self.observation_spec = Composite(observation, shape=(n,), device=device)
-        self.action_spec = Bounded(-1.0, 1.0, (n, self.mj_model.nu), device=device)
+        self.action_spec = Bounded(-1.0, 1.0, (n, self.mj_model.nu), **as_float)
         # In [0, 1], but RewardSum takes the bounds over for the sum.
-        self.reward_spec = Unbounded((n, 1), device=device)
+        self.reward_spec = Unbounded((n, 1), **as_float)
         self.done_spec = Composite(
             done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
         )
@@ -171,7 +175,7 @@ class LocoEnv(EnvBase):
         action = tensordict.get("action")
         if action.shape != self._views["action"].shape:
             raise ValueError(f"action must have shape {tuple(self._views['action'].shape)}, got {tuple(action.shape)}")
-        self._views["action"].copy_(action)
+        self._views["action"].copy_(action.detach())  # else the buffer would hold on to every past policy's graph
         self._step_graph.replay()
         result = self._read_outputs()
         result.set("reward", self._views["reward"].clone().unsqueeze(-1))
@@ -194,6 +198,16 @@ class LocoEnv(EnvBase):
             result.get("reward_terms").zero_()  # nothing was rewarded yet
         return result
 
+    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        """Keeps a state that was passed to ``reset`` out of what it returns, where it would grow stale."""
+        if tensordict is not None and any(key in tensordict for key in State.KEYS):
+            tensordict = TensorDict(
+                {key: value for key, value in tensordict.items() if key not in State.KEYS},
+                batch_size=tensordict.batch_size,
+                device=tensordict.device,
+            )
+        return super()._reset_proc_data(tensordict, tensordict_reset)
+
     def _read_outputs(self) -> TensorDict:
         """Copies what the kernels wrote: the buffers themselves change at the next step."""
         views = self._views
@@ -209,11 +223,11 @@ class LocoEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         """Starts the random streams of all worlds anew, at their episode 0."""
         if seed is None:
-            seed = int(np.random.SeedSequence().generate_state(1)[0])
+            seed = secrets.randbits(32)
         seed = check_seed(seed)
         self.seed = seed
-        self._seed.fill_(seed)
-        self._episode.zero_()
+        self._views["seed"].fill_(seed)
+        self._views["episode"].zero_()
 
     # State.
 
@@ -246,14 +260,14 @@ class LocoEnv(EnvBase):
                 "set_state=True needs a state with 'qpos' and 'qvel', as env.get_state() returns it. TransformedEnv "
                 "drops them from a plain TensorDict: pass torchrl_loco.State({'qpos': ..., 'qvel': ...}, batch_size)"
             )
+        mask = self._views["mask"]
         for key, value in new.items():
             if value is None:
                 continue
             if value.shape != targets[key].shape:
                 raise ValueError(f"{key} must have shape {tuple(targets[key].shape)}, got {tuple(value.shape)}")
-            if not torch.isfinite(value).all():
+            if not value[mask].isfinite().all():
                 raise ValueError(f"{key} must be finite")
-        mask = self._views["mask"]
         for key, target in targets.items():
             value = new[key]
             if value is None:
@@ -261,7 +275,7 @@ class LocoEnv(EnvBase):
                     continue  # the world goes on drawing where it was
                 value = torch.zeros_like(target)
             rows = mask.view(-1, *[1] * (target.ndim - 1))
-            target.copy_(torch.where(rows, value.to(target), target))
+            target.copy_(torch.where(rows, value.detach().to(target), target))
         for flag in ("bad", "done", "terminated", "truncated"):
             self._views[flag].masked_fill_(mask, False)
         self.sim.time.copy_(torch.where(mask, self._views["elapsed_steps"] * self.config.ctrl_dt, self.sim.time))

@@ -135,7 +135,9 @@ class HumanoidStand(Humanoid):
 
 
 class HumanoidWalk(Humanoid):
-    """Walk at 1 m/s or faster, in any direction. As :class:`HumanoidStand`, but for
+    """Walk at 1 m/s or faster, in any direction.
+
+    As :class:`HumanoidStand`, but for the
 
     Reward: its last factor is ``move = (5 tolerance(|v_xy|, [1 m/s, inf), margin 1 m/s, linear, value_at_margin 0)
         + 1) / 6``.
@@ -145,6 +147,9 @@ class HumanoidWalk(Humanoid):
 
 
 class HumanoidRun(Humanoid):
-    """Run at 10 m/s or faster, in any direction. As :class:`HumanoidWalk` with target and margin of 10 m/s."""
+    """Run at 10 m/s or faster, in any direction.
+
+    As :class:`HumanoidWalk`, with target and margin of 10 m/s.
+    """
 
     speed = RUN_SPEED

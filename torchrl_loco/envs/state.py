@@ -10,21 +10,24 @@ class State(TensorDict):
 
     A TensorDict of batch size ``(num_envs,)`` with
 
-    ==================  ================  =======================================================
-    ``qpos``            ``(N, nq)``       positions (m, rad, unit quaternions)
-    ``qvel``            ``(N, nv)``       velocities (m/s, rad/s)
-    ``qacc_warmstart``  ``(N, nv)``       where the constraint solver starts
-    ``elapsed_steps``      ``(N,)``          control steps since the world's reset
-    ``episode``         ``(N,)``          episodes drawn so far: the world's random counter
-    ==================  ================  =======================================================
+    ==================  ===========  =====================================================
+    ``qpos``            ``(N, nq)``  positions (m, rad, unit quaternions)
+    ``qvel``            ``(N, nv)``  velocities (m/s, rad/s)
+    ``qacc_warmstart``  ``(N, nv)``  where the constraint solver starts
+    ``elapsed_steps``   ``(N,)``     control steps since the world's reset
+    ``episode``         ``(N,)``     episodes drawn so far: the world's random counter
+    ==================  ===========  =====================================================
 
-    The only difference to a TensorDict: :meth:`select` never drops these entries. ``TransformedEnv`` hands down nothing
-    but selected keys, and would otherwise lose the state on its way to the environment. To make one by hand:
-    ``State({"qpos": ..., "qvel": ...}, batch_size=[num_envs])``.
+    The only difference to a TensorDict: a :meth:`select` of ``"_reset"`` keeps these entries too. ``TransformedEnv``
+    hands down nothing else, and would lose the state on its way to the environment. It also returns the very TensorDict
+    that it was given, state and all: exclude ``State.KEYS`` before you pass that on as a state again.
+
+    To make a state by hand: ``State({"qpos": ..., "qvel": ...}, batch_size=[num_envs])``.
     """
 
     KEYS = ("qpos", "qvel", "qacc_warmstart", "elapsed_steps", "episode")
 
     def select(self, *keys: Any, inplace: bool = False, strict: bool = True) -> TensorDictBase:
-        """Selects ``keys`` and the state."""
-        return super().select(*keys, *(key for key in self.KEYS if key in self), inplace=inplace, strict=strict)
+        """Selects ``keys``, and the state if ``"_reset"`` is among them."""
+        state = [key for key in self.KEYS if key in self] if "_reset" in keys else []
+        return super().select(*keys, *state, inplace=inplace, strict=strict)

@@ -124,7 +124,9 @@ class WalkerStand(Walker):
 
 
 class WalkerWalk(Walker):
-    """Walk at 1 m/s or faster. As :class:`WalkerStand`, but for
+    """Walk at 1 m/s or faster.
+
+    As :class:`WalkerStand`, but for the
 
     Reward: ``stand * (5 move + 1) / 6`` with
         ``move = tolerance(speed, [1 m/s, inf), margin 0.5 m/s, linear, value_at_margin 0.5)``, the speed being the
@@ -136,7 +138,10 @@ class WalkerWalk(Walker):
 
 
 class WalkerRun(Walker):
-    """Run at 8 m/s or faster. As :class:`WalkerWalk` with a target of 8 m/s and a margin of 4 m/s."""
+    """Run at 8 m/s or faster.
+
+    As :class:`WalkerWalk`, with a target of 8 m/s and a margin of 4 m/s.
+    """
 
     speed = RUN_SPEED
     term_names = ("stand", "move")

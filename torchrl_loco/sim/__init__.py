@@ -1,4 +1,11 @@
 """The physics: worlds on a device and the graphs that advance them. Knows no task."""
 
+import warp as wp
+
 from torchrl_loco.sim.graph import Graph as Graph
+from torchrl_loco.sim.graph import current_stream as current_stream
 from torchrl_loco.sim.simulation import Simulation as Simulation
+
+# At its default level Warp prints a line for each of a hundred kernels that it loads. Set another level to see them.
+if wp.config.log_level == wp.LOG_INFO:
+    wp.config.log_level = wp.LOG_WARNING

@@ -6,21 +6,28 @@ import torch
 import warp as wp
 
 
+def current_stream(device: wp.Device) -> wp.Stream | None:
+    """Returns torch's current stream of a CUDA device as a Warp stream, and ``None`` for the CPU."""
+    if not device.is_cuda:
+        return None
+    return wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(device)))
+
+
 class Graph:
     """The Warp launches that ``launch`` makes, recorded at construction and run by :meth:`replay`.
 
-    Recording runs nothing on CUDA. Every array that the launches touch must live, at the same address, as long as the
-    graph does; scratch memory that is allocated while recording is kept by the graph itself.
+    Every array that the launches touch must live, at the same address, as long as the graph does; scratch memory that
+    is allocated while recording is kept by the graph itself.
 
     Args:
-        launch: makes the launches; called once to load the kernels and once to record. It must not read the device.
+        launch: makes the launches. It is called twice: once for real, which compiles the kernels and lets mujoco_warp
+            make what it makes lazily, and once to record. It must not read the device.
         device: the Warp device.
     """
 
     def __init__(self, launch: Callable[[], None], device: wp.Device) -> None:
         self._device = device
         with wp.ScopedDevice(device):
-            # Recording loads kernels too, but lazily created buffers of mujoco_warp must exist before it.
             launch()
             with wp.ScopedCapture(device=device) as capture:
                 launch()
@@ -28,11 +35,4 @@ class Graph:
 
     def replay(self) -> None:
         """Runs the recorded work on torch's current stream of the device, without waiting for it."""
-        if self._device.is_cuda:
-            wp.capture_launch(self._graph, stream=wp.stream_from_torch(torch.cuda.current_stream(self._torch_device)))
-        else:
-            wp.capture_launch(self._graph)
-
-    @property
-    def _torch_device(self) -> torch.device:
-        return torch.device(wp.device_to_torch(self._device))
+        wp.capture_launch(self._graph, stream=current_stream(self._device))

@@ -64,16 +64,16 @@ class Simulation:
     The torch views share memory with the Warp arrays and keep their address for life. They always hold the current
     state: clone what you want to keep.
 
-    ===================  =======================  ==============================================
-    ``qpos``             ``(nworld, nq)``         positions (m, rad, unit quaternions)
-    ``qvel``             ``(nworld, nv)``         velocities (m/s, rad/s)
-    ``ctrl``             ``(nworld, nu)``         actions, clipped by the physics to the ctrlrange
-    ``qacc_warmstart``   ``(nworld, nv)``         where the constraint solver starts
-    ``xpos``             ``(nworld, nbody, 3)``   positions of the bodies (m)
-    ``xmat``             ``(nworld, nbody, 3, 3)``  orientations of the bodies
-    ``time``             ``(nworld,)``            time since the world's reset (s)
-    ``overflow``         ``(nworld,)``            bitmask of :class:`mujoco_warp.OverflowType`, kept until you zero it
-    ===================  =======================  ==============================================
+    ==================  =========================  ========================================================
+    ``qpos``            ``(nworld, nq)``           positions (m, rad, unit quaternions)
+    ``qvel``            ``(nworld, nv)``           velocities (m/s, rad/s)
+    ``ctrl``            ``(nworld, nu)``           actions, clipped by the physics to the ctrlrange
+    ``qacc_warmstart``  ``(nworld, nv)``           where the constraint solver starts
+    ``xpos``            ``(nworld, nbody, 3)``     positions of the bodies (m)
+    ``xmat``            ``(nworld, nbody, 3, 3)``  orientations of the bodies
+    ``time``            ``(nworld,)``              time since the world's reset (s)
+    ``overflow``        ``(nworld,)``              :class:`mujoco_warp.OverflowType` bits, kept until you zero them
+    ==================  =========================  ========================================================
 
     Args:
         mj_model: the compiled model; its options are set from ``config``.

@@ -1,0 +1,94 @@
+"""The environments inside TorchRL's own machinery."""
+
+import functools
+
+import pytest
+import torch
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.envs import (
+    Compose,
+    EnvCreator,
+    InitTracker,
+    ParallelEnv,
+    RewardSum,
+    StepCounter,
+    TransformedEnv,
+    VecNormV2,
+)
+from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
+
+import torchrl_loco
+
+make_walker = functools.partial(torchrl_loco.make, "walker_walk", device="cpu", seed=0, episode_length=6)
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # TorchRL says so of any batch
+def test_transforms_count_and_sum_by_world():
+    env = TransformedEnv(make_walker(3), Compose(InitTracker(), RewardSum(), StepCounter(), VecNormV2(["observation"])))
+    td = env.rollout(14, break_when_any_done=False)
+    assert td["is_init"].squeeze(-1)[0].nonzero().squeeze(-1).tolist() == [0, 6, 12]
+    assert td["next", "step_count"].squeeze(-1)[0].tolist() == [1, 2, 3, 4, 5, 6, 1, 2, 3, 4, 5, 6, 1, 2]
+    sums = td["next", "reward"][:, :6].sum(dim=1)
+    torch.testing.assert_close(td["next", "episode_reward"][:, 5], sums)
+    assert td["next", "observation"].isfinite().all()
+
+
+@pytest.mark.filterwarnings("ignore:The default value of `auto_register_policy_transforms`")
+@pytest.mark.parametrize("track", [True, False])
+def test_collector_collects_what_rollout_does(track):
+    env = make_walker(4)
+    collector = Collector(
+        env, None, frames_per_batch=32, total_frames=64, track_traj_ids=track, auto_register_policy_transforms=False
+    )
+    batches = [batch.clone() for batch in collector]
+    collector.shutdown()
+    assert [batch.shape for batch in batches] == [(4, 8), (4, 8)]
+    data = torch.cat(batches, dim=1)
+    twin, td = make_walker(4), None
+    td = twin.reset()
+    for step in range(16):
+        current, td = twin.step_and_maybe_reset(td.set("action", data["action"][:, step]))
+        assert torch.equal(current["observation"], data["observation"][:, step])
+        for key in ("observation", "reward", "truncated"):
+            assert torch.equal(current["next", key], data["next", key][:, step]), key
+
+
+@pytest.mark.slow
+def test_multi_sync_collector():
+    collector = MultiSyncCollector(
+        [functools.partial(make_walker, 2)] * 2,
+        None,
+        frames_per_batch=16,
+        total_frames=16,
+        cat_results="stack",
+        auto_register_policy_transforms=False,
+    )
+    try:
+        (batch,) = list(collector)
+    finally:
+        collector.shutdown()
+    assert batch.numel() == 16
+    assert batch["next", "reward"].isfinite().all()
+
+
+@pytest.mark.slow
+def test_parallel_env():
+    env = ParallelEnv(2, EnvCreator(functools.partial(make_walker, 3)), mp_start_method="spawn")
+    try:
+        td = env.rollout(4)
+    finally:
+        env.close()
+    assert td.shape == (2, 3, 4)
+    assert torch.equal(td["observation"][0, :, 0], make_walker(3).reset()["observation"])
+
+
+def test_video_recorder(tmp_path):
+    logger = CSVLogger("run", log_dir=str(tmp_path), video_format="pt")
+    recorder = VideoRecorder(logger, tag="walk", skip=1)
+    env = TransformedEnv(make_walker(2), Compose(PixelRenderTransform(width=64, height=48), recorder))
+    td = env.rollout(4)
+    assert td["pixels"].shape == (2, 4, 48, 64, 3)
+    assert td["pixels"].dtype == torch.uint8
+    recorder.dump()
+    (video,) = tmp_path.rglob("*.pt")
+    assert torch.load(video).shape[-3:] == (3, 48, 128)  # the worlds side by side
