@@ -1,0 +1,110 @@
+"""Advantages and normalisation against values computed by hand, and what an update does."""
+
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import ValueOperator
+
+import torchrl_loco
+from torchrl_loco.training import preset
+from torchrl_loco.training.networks import ObservationNorm, make_actor_critic
+from torchrl_loco.training.update import PPOUpdate
+
+
+def parts(**overrides):
+    settings = {"num_envs": 1, "decisions": 4, "minibatch_size": 4, "total_frames": 10_000, "epochs": 1, **overrides}
+    config = preset("walker_stand", "cpu", **settings)
+    env = torchrl_loco.make("walker_stand", 1, "cpu")
+    torch.manual_seed(0)
+    return config, *make_actor_critic(config, 24, env.action_spec)
+
+
+def test_truncation_bootstraps_and_termination_does_not():
+    """Four steps of one world: an ordinary one, a truncated one, a terminated one, an ordinary one."""
+    gamma, lmbda = 0.9, 0.8
+    config, actor, _, _ = parts(gamma=gamma, lmbda=lmbda, reward_scale=1.0)
+    first = nn.Linear(24, 1, bias=False)
+    first.weight.data.zero_()[0, 0] = 1.0  # the value is the first entry of the observation
+    update = PPOUpdate(config, actor, ValueOperator(first, in_keys=["observation"]))
+
+    value, next_value = torch.tensor([1.0, 2.0, 3.0, 4.0]), torch.tensor([2.0, 5.0, 7.0, 6.0])
+    reward = torch.tensor([0.5, 0.25, 1.0, 0.75])
+    truncated = torch.tensor([False, True, False, False])
+    terminated = torch.tensor([False, False, True, False])
+    observation, after = torch.zeros(1, 4, 24), torch.zeros(1, 4, 24)
+    observation[0, :, 0], after[0, :, 0] = value, next_value
+    td = TensorDict(
+        {
+            "observation": observation,
+            "next": {
+                "observation": after,
+                "reward": reward.view(1, 4, 1),
+                "done": (truncated | terminated).view(1, 4, 1),
+                "terminated": terminated.view(1, 4, 1),
+                "truncated": truncated.view(1, 4, 1),
+            },
+        },
+        batch_size=[1, 4],
+    )
+    with torch.no_grad():
+        update._gae(td)
+    d3 = 0.75 + gamma * 6.0 - 4.0
+    d2 = 1.0 - 3.0  # nothing follows a termination
+    d1 = 0.25 + gamma * 5.0 - 2.0  # at the time limit, the value of the terminal observation follows
+    d0 = 0.5 + gamma * 2.0 - 1.0
+    expected = torch.tensor([d0 + gamma * lmbda * d1, d1, d2, d3])
+    torch.testing.assert_close(td["advantage"].flatten(), expected)
+    torch.testing.assert_close(td["value_target"].flatten(), expected + value)
+
+
+def test_observation_norm_is_the_mean_and_variance_of_all_it_saw():
+    norm = ObservationNorm(3)
+    chunks = [torch.randn(5, 7, 3) * 4 + 2, torch.randn(1, 3), torch.randn(50, 3) - 6]
+    for chunk in chunks:
+        norm.update(chunk)
+    seen = torch.cat([chunk.reshape(-1, 3) for chunk in chunks])
+    torch.testing.assert_close(norm.mean, seen.mean(0))
+    torch.testing.assert_close(norm.var, seen.var(0, correction=0))
+    assert norm.count == len(seen)
+    normalised = norm(seen)
+    torch.testing.assert_close(normalised.mean(0), torch.zeros(3), atol=1e-4, rtol=0)
+    torch.testing.assert_close(normalised.std(0, correction=0), torch.ones(3), atol=1e-4, rtol=0)
+    assert norm(torch.full((1, 3), 1e9)).max() == norm.limit
+
+
+def collected(config, actor, num_envs):
+    env = torchrl_loco.make("walker_stand", num_envs, "cpu", seed=0)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        return env.rollout(config.decisions, actor)
+
+
+def test_updates_raise_what_is_rewarded():
+    """Rewarded for the first joint alone, the actor moves that joint and leaves the others."""
+    config, actor, critic, _ = parts(num_envs=64, decisions=8, minibatch_size=128, epochs=4, lr=1e-3)
+    update, means = PPOUpdate(config, actor, critic), []
+    for _ in range(6):
+        batch = collected(config, actor, 64)
+        batch["next", "reward"] = batch["action"][..., :1].clone()
+        update(batch, progress=0.0)
+        means.append(torch.tanh(actor.get_dist(batch).loc).mean(dim=(0, 1)))
+    assert means[-1][0] > 0.2
+    assert means[-1][1:].abs().max() < means[-1][0] / 2
+
+
+def test_learning_rate_falls_to_nothing():
+    config, actor, critic, _ = parts(num_envs=2, decisions=8, minibatch_size=16)
+    before = [p.clone() for p in actor.parameters()]
+    PPOUpdate(config, actor, critic)(collected(config, actor, 2), progress=1.0)
+    assert all(torch.equal(p, q) for p, q in zip(before, actor.parameters(), strict=True))
+
+
+def test_same_seed_same_parameters():
+    results = []
+    for _ in range(2):
+        config, actor, critic, _ = parts(num_envs=8, decisions=8, minibatch_size=16, epochs=2)
+        torch.manual_seed(1)
+        batch = collected(config, actor, 8)
+        PPOUpdate(config, actor, critic)(batch, progress=0.0)
+        results.append(torch.cat([p.detach().flatten() for p in [*actor.parameters(), *critic.parameters()]]))
+    assert torch.equal(*results)

@@ -1,0 +1,5 @@
+"""``python -m torchrl_loco``: the command line."""
+
+from torchrl_loco.cli import main
+
+raise SystemExit(main())
