@@ -1,0 +1,36 @@
+# Everything happens in a virtual environment of the project's own: nothing else needs to be installed than Python and make.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+TASK ?= walker_stand
+ARGS ?=
+
+.PHONY: train test test-fast lint format clean
+
+train: $(VENV)/installed  ## train a policy; TASK=walker_walk ARGS="--seed 1" to change what
+	$(BIN)/torchrl-loco train $(TASK) $(ARGS)
+
+test: lint  ## style, types and all tests, on real physics
+	$(BIN)/python -m pytest
+
+test-fast: $(VENV)/installed  ## the everyday part of the tests
+	$(BIN)/python -m pytest -m "not slow"
+
+lint: $(VENV)/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/installed
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# PIP_ARGS can constrain versions, for example to a CPU build of torch: make test PIP_ARGS="torch==2.13.0"
+$(VENV)/installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --editable ".[all]"
+	touch $@
+
+clean:
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache
