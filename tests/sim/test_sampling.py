@@ -1,12 +1,13 @@
 """The pieces of the contact-free start, each against an independent reckoning."""
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
 
 from torchrl_loco import models
-from torchrl_loco.sim.sampling import make_skeleton, segment_distance
+from torchrl_loco.sim.sampling import draw_free_poses, make_skeleton, segment_distance
 
 
 @wp.kernel
@@ -45,6 +46,31 @@ def test_segment_distance_agrees_with_mujoco():
         arrays[1][:], arrays[3][:] = 0, 0
         wp.launch(distances, n, [*(wp.array(a, dtype=wp.vec3) for a in arrays), out])
         np.testing.assert_allclose(out.numpy(), np.linalg.norm(centers[0] - centers[1], axis=1), atol=1e-6)
+
+
+def test_poses_near_the_floor_do_not_touch_it():
+    """From a root 0.9 m high most poses reach the floor; C MuJoCo finds no contact in those that are kept."""
+    model = models.load("humanoid")
+    device, n = wp.get_device("cpu"), 500
+    with wp.ScopedDevice(device):
+        pairs = mjw.put_model(model).nxn_geom_pair_filtered.numpy()
+        start = np.tile(model.qpos0, (n, 1))
+        start[:, 2] = 0.9
+        qpos = wp.array(start, dtype=float)
+        inputs = [
+            make_skeleton(model, pairs, device),
+            wp.array([3], dtype=wp.uint32),
+            wp.zeros(n, dtype=int),
+            wp.ones(n, dtype=bool),
+        ]
+        bodies = [wp.zeros((n, model.nbody), dtype=dtype) for dtype in (wp.vec3, wp.quat)]
+        wp.launch(draw_free_poses, n, inputs, [qpos, *bodies])
+        drawn = qpos.numpy().astype(np.float64)
+    data = mujoco.MjData(model)
+    for q in drawn:
+        data.qpos[:] = q
+        mujoco.mj_fwdPosition(model, data)
+        assert data.ncon == 0
 
 
 def test_other_models_are_refused():
