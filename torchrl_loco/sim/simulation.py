@@ -11,6 +11,10 @@ from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.graph import Graph
 
 
+UNROLLED_ITERATIONS = 10
+"""Solver iterations up to which a recorded step holds them all, without a condition between them."""
+
+
 @wp.kernel(enable_backward=False)
 def clear_worlds(
     # Model:
@@ -93,8 +97,13 @@ class Simulation:
         with wp.ScopedDevice(self.device):
             self.model = mjw.put_model(mj_model)
             self.data = mjw.make_data(mj_model, nworld=num_envs, naconmax=config.naconmax, njmax=config.njmax)
+        option = self.model.opt
         # Printing from kernels costs more than the physics; the same facts stay readable in ``overflow``.
-        self.model.opt.warn_overflow = 0
+        option.warn_overflow = 0
+        # A few iterations are cheaper in a row than in a loop that may stop early.
+        option.graph_conditional = config.iterations > UNROLLED_ITERATIONS
+        # The solver starts from the warm start; a second start that it would compare with costs a factorization.
+        option.run_qacc_smooth = False
 
         self.qpos = wp.to_torch(self.data.qpos)
         self.qvel = wp.to_torch(self.data.qvel)
