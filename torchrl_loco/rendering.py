@@ -44,6 +44,7 @@ class Renderer:
         """Returns the current state of all worlds as uint8 pixels, shape ``(num_envs, height, width, 3)``."""
         sim = self._sim
         with wp.ScopedDevice(sim.device), wp.ScopedStream(current_stream(sim.device)):
+            mjw.camlight(sim.model, sim.data)
             mjw.refit_bvh(sim.model, sim.data, self._context)
             mjw.render(sim.model, sim.data, self._context)
             mjw.get_rgb(self._context, 0, self._rgb)

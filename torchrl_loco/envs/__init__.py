@@ -1,5 +1,6 @@
 """The environments: one base that knows no task, and a file for each body."""
 
+from torchrl_loco.envs.autoreset import TransformedEnv as TransformedEnv
 from torchrl_loco.envs.base import LocoEnv as LocoEnv
 from torchrl_loco.envs.humanoid import HumanoidRun as HumanoidRun
 from torchrl_loco.envs.humanoid import HumanoidStand as HumanoidStand

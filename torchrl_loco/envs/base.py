@@ -8,18 +8,18 @@ import torch
 import warp as wp
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from torchrl_loco import models
 from torchrl_loco.config import sim_config
+from torchrl_loco.envs.autoreset import AsyncReset
 from torchrl_loco.envs.checks import check_count, check_device, check_seed
-from torchrl_loco.envs.episode import apply_action, begin_episode, count_step, quench
+from torchrl_loco.envs.episode import any_world, apply_action, begin_episode, count_step, quench
 from torchrl_loco.envs.state import State
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import Simulation
 
 
-class LocoEnv(EnvBase):
+class LocoEnv(AsyncReset):
     """Base of the locomotion environments: batched worlds of one body on one device.
 
     A subclass names its ``body``, ``observation_size`` and ``term_names``, and launches the kernels that fill the
@@ -106,6 +106,7 @@ class LocoEnv(EnvBase):
         self._reward = wp.zeros(n, dtype=float, device=device)
         self._terms = wp.zeros((n, len(self.term_names)), dtype=float, device=device)
         self._mask = wp.ones(n, dtype=bool, device=device)
+        self._any = wp.zeros(1, dtype=int, device=device)
         self._stagger = wp.zeros(1, dtype=bool, device=device)
         self._seed = wp.zeros(1, dtype=wp.uint32, device=device)
         self._episode = wp.zeros(n, dtype=int, device=device)
@@ -151,6 +152,11 @@ class LocoEnv(EnvBase):
         )
 
     def _launch_reset(self) -> None:
+        self._any.zero_()
+        self._launch(any_world, [self._mask], [self._any])
+        wp.capture_if(self._any, self._launch_masked_reset)  # costs next to nothing where no world is done
+
+    def _launch_masked_reset(self) -> None:
         self.sim.reset(self._mask)
         self._launch_pose()
         self._launch(

@@ -83,6 +83,17 @@ def count_step(
 
 
 @wp.kernel(enable_backward=False)
+def any_world(
+    # In:
+    mask_in: wp.array[bool],
+    # Out:
+    any_out: wp.array[int],
+):
+    if mask_in[wp.tid()]:
+        any_out[0] = 1
+
+
+@wp.kernel(enable_backward=False)
 def begin_episode(
     # In:
     mask_in: wp.array[bool],

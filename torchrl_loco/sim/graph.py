@@ -1,9 +1,12 @@
 """Work recorded once and replayed at every step: CUDA graphs on the GPU, Warp's recorder on the CPU."""
 
+import contextlib
 from collections.abc import Callable
 
 import torch
 import warp as wp
+
+from torchrl_loco.sim.scratch import ScratchPool
 
 
 def current_stream(device: wp.Device) -> wp.Stream | None:
@@ -16,18 +19,21 @@ def current_stream(device: wp.Device) -> wp.Stream | None:
 class Graph:
     """The Warp launches that ``launch`` makes, recorded at construction and run by :meth:`replay`.
 
-    Every array that the launches touch must live, at the same address, as long as the graph does; scratch memory that
-    is allocated while recording is kept by the graph itself.
+    Every array that the launches touch must live, at the same address, as long as the graph does. Scratch memory that
+    is allocated while recording comes from ``scratch`` on CUDA and is kept by the recording itself on the CPU.
 
     Args:
         launch: makes the launches. It is called twice: once for real, which compiles the kernels and lets mujoco_warp
             make what it makes lazily, and once to record. It must not read the device.
         device: the Warp device.
+        scratch: where scratch memory comes from; needed on CUDA.
     """
 
-    def __init__(self, launch: Callable[[], None], device: wp.Device) -> None:
+    def __init__(self, launch: Callable[[], None], device: wp.Device, scratch: ScratchPool | None = None) -> None:
         self._device = device
-        with wp.ScopedDevice(device):
+        self._scratch = scratch
+        allocator = wp.ScopedAllocator(device, scratch) if device.is_cuda else contextlib.nullcontext()
+        with wp.ScopedDevice(device), allocator:
             launch()
             with wp.ScopedCapture(device=device) as capture:
                 launch()

@@ -1,6 +1,7 @@
 """Many worlds of one model, stepped together by MuJoCo-Warp."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 
 import mujoco
 import mujoco_warp as mjw
@@ -9,7 +10,7 @@ import warp as wp
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.graph import Graph
-
+from torchrl_loco.sim.scratch import ScratchPool
 
 UNROLLED_ITERATIONS = 10
 """Solver iterations up to which a recorded step holds them all, without a condition between them."""
@@ -92,6 +93,7 @@ class Simulation:
         self.substeps = config.substeps
         self.device = wp.get_device(str(device))
         self.graphs: list[Graph] = []
+        self._scratch = ScratchPool(self.device) if self.device.is_cuda else None
 
         _set_options(mj_model, config)
         with wp.ScopedDevice(self.device):
@@ -120,10 +122,12 @@ class Simulation:
         In dm_control's order: each step's second half comes before the next one's first, so that afterwards all
         derived quantities and sensors belong to the new state. Needs :meth:`forward` after any change of the state.
         """
-        mjw.step2(self.model, self.data)
-        for _ in range(self.substeps - 1):
-            mjw.step(self.model, self.data)
-        mjw.step1(self.model, self.data)
+        with self._lean(sensors=False):
+            mjw.step2(self.model, self.data)
+            for _ in range(self.substeps - 1):
+                mjw.step(self.model, self.data)
+        with self._lean(sensors=True):
+            mjw.step1(self.model, self.data)
 
     def forward(self, mask: wp.array) -> None:
         """Brings derived quantities and sensors up to ``qpos`` and ``qvel``, changed where ``mask`` is set."""
@@ -135,7 +139,21 @@ class Simulation:
             outputs=[efc.J, efc.D],
             device=self.device,
         )
-        mjw.step1(self.model, self.data)
+        with self._lean(sensors=True):
+            mjw.step1(self.model, self.data)
+
+    @contextlib.contextmanager
+    def _lean(self, sensors: bool) -> Iterator[None]:
+        """Launches nothing for cameras and lights, which are posed when a picture is taken, and maybe for sensors."""
+        model = self.model
+        kept = model.opt.disableflags, model.ncam, model.nlight
+        model.ncam = model.nlight = 0
+        if not sensors:
+            model.opt.disableflags |= mjw.DisableBit.SENSOR
+        try:
+            yield
+        finally:
+            model.opt.disableflags, model.ncam, model.nlight = kept
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds where ``mask`` (bool, ``(nworld,)``) is set at rest in the default pose; others stay."""
@@ -150,7 +168,7 @@ class Simulation:
 
     def capture(self, launch: Callable[[], None]) -> Graph:
         """Records the launches that ``launch`` makes. The state afterwards is arbitrary: reset before use."""
-        graph = Graph(launch, self.device)
+        graph = Graph(launch, self.device, self._scratch)
         self.graphs.append(graph)
         return graph
 

@@ -1,0 +1,5 @@
+"""``python -m benchmarks``: runs the benchmarks."""
+
+from benchmarks.throughput import main
+
+raise SystemExit(main())

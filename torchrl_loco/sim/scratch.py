@@ -1,0 +1,35 @@
+"""Scratch memory for recorded work on CUDA."""
+
+from collections import defaultdict
+
+import torch
+import warp as wp
+
+
+class ScratchPool:
+    """A Warp allocator that gives freed blocks out again and none back, for launches that will be recorded.
+
+    Without it the arrays that mujoco_warp allocates within a step become allocation nodes of the CUDA graph, which cost
+    time at every replay and are forbidden inside a condition. Blocks are reused within one graph and between graphs,
+    which is sound because they are replayed one after another.
+
+    Args:
+        device: a CUDA device.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self._device = wp.device_to_torch(device)
+        self._blocks: list[torch.Tensor] = []
+        self._free: dict[int, list[int]] = defaultdict(list)
+
+    def allocate(self, size_in_bytes: int) -> int:
+        """Returns the address of a block of that size."""
+        if not self._free[size_in_bytes]:
+            block = torch.empty(size_in_bytes, dtype=torch.uint8, device=self._device)
+            self._blocks.append(block)
+            return block.data_ptr()
+        return self._free[size_in_bytes].pop()
+
+    def deallocate(self, ptr: int, size_in_bytes: int) -> None:
+        """Takes a block back, to be given out again."""
+        self._free[size_in_bytes].append(ptr)
