@@ -18,6 +18,7 @@ LAYERS = [  # a module imports from its own layer or from those before it
     {"sim"},
     {"rendering"},
     {"envs"},
+    {"collector"},
     {"registry"},
     {"training"},
     {"cli", "__main__"},

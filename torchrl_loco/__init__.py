@@ -1,6 +1,7 @@
 """TorchRL environments for dm_control's locomotion tasks, stepped by MuJoCo-Warp thousands of worlds at a time."""
 
 from torchrl_loco import _versions
+from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs import (
     HumanoidRun,
@@ -20,6 +21,7 @@ __all__ = [
     "HumanoidRun",
     "HumanoidStand",
     "HumanoidWalk",
+    "RolloutCollector",
     "SimConfig",
     "State",
     "TransformedEnv",

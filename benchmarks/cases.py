@@ -1,0 +1,126 @@
+"""What is measured: each case makes a function that advances all worlds by one control step."""
+
+import itertools
+from collections.abc import Callable, Iterable
+
+import mujoco_warp as mjw
+import torch
+import warp as wp
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+
+import torchrl_loco
+from torchrl_loco import RolloutCollector, models
+from torchrl_loco.config import sim_config
+from torchrl_loco.sim import Simulation, current_stream
+
+TASKS = {"walker": "walker_walk", "humanoid": "humanoid_walk"}
+BATCH_STEPS = 20
+"""Control steps in a batch of the collectors."""
+
+
+def bare_default(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """A plain loop of ``mujoco_warp.step`` in a graph, with mujoco_warp's own settings but for the printing."""
+    sim = Simulation(models.load(body), sim_config(body, "playground", n, {}), n, device)
+    sim.model.opt.graph_conditional, sim.model.opt.run_qacc_smooth = True, True
+    mask = wp.ones(n, dtype=bool, device=sim.device)
+    with wp.ScopedDevice(sim.device):
+        sim.reset(mask)
+        mjw.step(sim.model, sim.data)
+        with wp.ScopedCapture(device=sim.device) as capture:
+            for _ in range(sim.substeps):
+                mjw.step(sim.model, sim.data)
+    wp.synchronize_device(sim.device)
+
+    def step() -> None:
+        sim.ctrl.uniform_(-1.0, 1.0)
+        wp.capture_launch(capture.graph, stream=current_stream(sim.device))
+
+    return step
+
+
+def bare_tuned(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """Our simulation's recorded control step, without observation or reward."""
+    sim = Simulation(models.load(body), sim_config(body, "playground", n, {}), n, device)
+    mask = wp.ones(n, dtype=bool, device=sim.device)
+    graph = sim.capture(sim.step)
+    sim.capture(lambda: (sim.reset(mask), sim.forward(mask))).replay()
+
+    def step() -> None:
+        sim.ctrl.uniform_(-1.0, 1.0)
+        graph.replay()
+
+    return step
+
+
+def env_step(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """``env._step`` on random actions."""
+    env = torchrl_loco.make(TASKS[body], n, device, seed=0)
+    td = env.reset()
+
+    def step() -> None:
+        env._step(td.set("action", torch.empty(env.action_spec.shape, device=device).uniform_(-1.0, 1.0)))
+
+    return step
+
+
+def env_step_and_maybe_reset(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """``env.step_and_maybe_reset`` on random actions, worlds at different points of their episodes."""
+    env = torchrl_loco.make(TASKS[body], n, device, seed=0, stagger=True)
+    carried = [env.reset()]
+
+    def step() -> None:
+        action = torch.empty(env.action_spec.shape, device=device).uniform_(-1.0, 1.0)
+        _, carried[0] = env.step_and_maybe_reset(carried[0].set("action", action))
+
+    return step
+
+
+def rollout_collector(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """Our collection loop with a 2x256 MLP."""
+    env, policy = env_and_policy(body, n, device)
+    return every_batch(RolloutCollector(env, policy, frames_per_batch=n * BATCH_STEPS))
+
+
+def torchrl_collector(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """TorchRL's Collector with the same policy and batches."""
+    env, policy = env_and_policy(body, n, device)
+    collector = Collector(
+        env,
+        policy,
+        frames_per_batch=n * BATCH_STEPS,
+        total_frames=-1,
+        device=device,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+        trust_policy=True,
+    )
+    return every_batch(collector)
+
+
+def env_and_policy(body: str, n: int, device: torch.device) -> tuple[EnvBase, TensorDictModule]:
+    """An environment with staggered episodes, and a policy of two hidden layers of 256."""
+    env = torchrl_loco.make(TASKS[body], n, device, seed=0, stagger=True)
+    inputs, outputs = env.observation_size, env.action_spec.shape[-1]
+    layers = [nn.Linear(inputs, 256), nn.SiLU(), nn.Linear(256, 256), nn.SiLU(), nn.Linear(256, outputs), nn.Tanh()]
+    return env, TensorDictModule(nn.Sequential(*layers).to(device), in_keys=["observation"], out_keys=["action"])
+
+
+def every_batch(collector: Iterable[TensorDictBase]) -> Callable[[], None]:
+    """Takes a batch at every 20th call, so that a call costs a step on average."""
+    batches, calls = iter(collector), itertools.count()
+
+    def step() -> None:
+        if next(calls) % BATCH_STEPS == 0:
+            next(batches)
+
+    return step
+
+
+CASES = {
+    case.__name__: case
+    for case in (bare_default, bare_tuned, env_step, env_step_and_maybe_reset, rollout_collector, torchrl_collector)
+}

@@ -1,0 +1,71 @@
+"""Our collection loop against TorchRL's Collector."""
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, InitTracker, RewardSum
+
+import torchrl_loco
+from torchrl_loco import RolloutCollector
+
+
+def env(task, wrap, device="cpu", num_envs=4, **settings):
+    made = torchrl_loco.make(task, num_envs, device, seed=0, stagger=True, **{"episode_length": 7, **settings})
+    return torchrl_loco.TransformedEnv(made, Compose(InitTracker(), RewardSum())) if wrap else made
+
+
+def policy(env):
+    torch.manual_seed(0)
+    layer = torch.nn.Linear(env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1])
+    module = torch.nn.Sequential(layer.to(env.device), torch.nn.Tanh())
+    return TensorDictModule(module, in_keys=["observation"], out_keys=["action"])
+
+
+@pytest.mark.parametrize("wrap", [False, True])
+def test_exchangeable_with_torchrls_collector(task, wrap):
+    ours, theirs = env(task, wrap), env(task, wrap)
+    settings = {"frames_per_batch": 20, "total_frames": 60}
+    reference = Collector(
+        theirs, policy(theirs), track_traj_ids=False, auto_register_policy_transforms=False, **settings
+    )
+    got = list(RolloutCollector(ours, policy(ours), **settings))
+    expected = [batch.clone() for batch in reference]
+    reference.shutdown()
+    assert [batch.shape for batch in got] == [batch.shape for batch in expected] == [(4, 5)] * 3
+    for ours_batch, theirs_batch in zip(got, expected, strict=True):
+        assert set(ours_batch.keys(True, True)) == set(theirs_batch.keys(True, True))
+        assert ours_batch.names == theirs_batch.names
+        for key in theirs_batch.keys(True, True):
+            assert torch.equal(ours_batch[key], theirs_batch[key]), key
+    assert not got[0].requires_grad
+
+
+def test_endless_and_wrong_sizes():
+    made = env("walker_walk", False)
+    batches = iter(RolloutCollector(made, policy(made), frames_per_batch=8))
+    first, second = next(batches), next(batches)
+    assert first["observation"].data_ptr() != second["observation"].data_ptr()
+    assert torch.equal(
+        first["next", "observation"][:, -1][~first["next", "done"][:, -1].squeeze(-1)],
+        second["observation"][:, 0][~first["next", "done"][:, -1].squeeze(-1)],
+    )
+    for frames in (0, 6, -4):
+        with pytest.raises(ValueError, match="positive multiple of the 4 worlds"):
+            RolloutCollector(made, policy(made), frames_per_batch=frames)
+
+
+@pytest.mark.gpu
+@pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")
+@pytest.mark.parametrize("wrap", [False, True])
+def test_no_synchronisation(task, wrap):
+    made = env(task, wrap, "cuda", 256, episode_length=50)
+    batches = iter(RolloutCollector(made, policy(made), frames_per_batch=256 * 10))
+    next(batches)
+    torch.cuda.synchronize()
+    try:
+        torch.cuda.set_sync_debug_mode("error")
+        done = [next(batches)["next", "done"] for _ in range(10)]
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert (torch.cat(done, dim=1).sum(dim=1) >= 2).all()
