@@ -80,7 +80,7 @@ def env_step_and_maybe_reset(body: str, n: int, device: torch.device) -> Callabl
 
 
 def rollout_collector(body: str, n: int, device: torch.device) -> Callable[[], None]:
-    """Our collection loop with a 2x256 MLP."""
+    """Our collection loop with a policy of two hidden layers of 256."""
     env, policy = env_and_policy(body, n, device)
     return every_batch(RolloutCollector(env, policy, frames_per_batch=n * BATCH_STEPS))
 
@@ -102,11 +102,23 @@ def torchrl_collector(body: str, n: int, device: torch.device) -> Callable[[], N
 
 
 def env_and_policy(body: str, n: int, device: torch.device) -> tuple[EnvBase, TensorDictModule]:
-    """An environment with staggered episodes, and a policy of two hidden layers of 256."""
+    """An environment with staggered episodes, and a policy for it."""
     env = torchrl_loco.make(TASKS[body], n, device, seed=0, stagger=True)
-    inputs, outputs = env.observation_size, env.action_spec.shape[-1]
-    layers = [nn.Linear(inputs, 256), nn.SiLU(), nn.Linear(256, 256), nn.SiLU(), nn.Linear(256, outputs), nn.Tanh()]
-    return env, TensorDictModule(nn.Sequential(*layers).to(device), in_keys=["observation"], out_keys=["action"])
+    policy = NoisyMLP(env.observation_size, env.action_spec.shape[-1]).to(device)
+    return env, TensorDictModule(policy, in_keys=["observation"], out_keys=["action"])
+
+
+class NoisyMLP(nn.Module):
+    """The work of two hidden layers of 256, under noise that makes the worlds move as under random actions."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        layers = [nn.Linear(inputs, 256), nn.SiLU(), nn.Linear(256, 256), nn.SiLU(), nn.Linear(256, outputs)]
+        self.net = nn.Sequential(*layers, nn.Tanh())
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        action = self.net(observation)
+        return torch.empty_like(action).uniform_(-1.0, 1.0).add_(action, alpha=1e-3).clamp_(-1.0, 1.0)
 
 
 def every_batch(collector: Iterable[TensorDictBase]) -> Callable[[], None]:

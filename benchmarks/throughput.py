@@ -5,7 +5,6 @@ idle device. Ratios are to the bare loop with mujoco_warp's defaults.
 """
 
 import datetime
-import gc
 import json
 import platform
 import statistics
@@ -29,13 +28,7 @@ def throughput(bodies: Sequence[str], worlds: Sequence[int], cases: Sequence[str
     rows = []
     runs = [(body, n, case) for body in bodies for n in worlds for case in cases]
     for body, n, case in tqdm(runs, desc="throughput"):
-        free = free_memory(device)
-        step = CASES[case](body, n, device)
-        row = {"body": body, "worlds": n, "case": case, "ms": milliseconds(step, device)}
-        if device.type == "cuda":
-            row["bytes_per_world"] = round((free - free_memory(device)) / n)
-        rows.append(row)
-        del step
+        rows.append({"body": body, "worlds": n, "case": case, "ms": milliseconds(CASES[case](body, n, device), device)})
     for row in rows:
         base = [r["ms"] for r in rows if r["case"] == "bare_default" and (r["body"], r["worlds"]) == key(row)]
         row["ratio"] = row["ms"] / base[0] if base else None
@@ -67,24 +60,14 @@ def idle(device: torch.device) -> float:
     return time.perf_counter()
 
 
-def free_memory(device: torch.device) -> int:
-    """Returns the free memory of a CUDA device in bytes, after giving back what is unused."""
-    if device.type != "cuda":
-        return 0
-    gc.collect()
-    torch.cuda.empty_cache()
-    return torch.cuda.mem_get_info(device)[0]
-
-
 def show(rows: Sequence[dict]) -> None:
     """Prints the rows as a table."""
-    print(f"{'body':<10}{'worlds':>8}  {'case':<26}{'ms':>9}{'ratio':>8}{'million steps/s':>17}{'kB/world':>10}")
+    print(f"{'body':<10}{'worlds':>8}  {'case':<26}{'ms':>9}{'ratio':>8}{'million steps/s':>17}")
     for row in rows:
         ratio = "" if row["ratio"] is None else f"{row['ratio']:.3f}"
-        memory = f"{row['bytes_per_world'] / 1e3:.1f}" if "bytes_per_world" in row else ""
         speed = row["worlds"] / row["ms"] / 1e3
         name = f"{row['body']:<10}{row['worlds']:>8}  {row['case']:<26}"
-        print(f"{name}{row['ms']:>9.3f}{ratio:>8}{speed:>17.3f}{memory:>10}")
+        print(f"{name}{row['ms']:>9.3f}{ratio:>8}{speed:>17.3f}")
 
 
 def save(rows: Sequence[dict], path: Path, device: torch.device) -> None:

@@ -119,18 +119,18 @@ class Simulation:
     def step(self) -> None:
         """Advances every world by one control step under ``ctrl``.
 
-        In dm_control's order: each step's second half comes before the next one's first, so that afterwards all
-        derived quantities and sensors belong to the new state. Needs :meth:`forward` after any change of the state.
+        Afterwards poses, velocities of bodies and sensors belong to the new state, as in dm_control. dm_control gets
+        there by a whole first half of the next step; here it is only what an observation can ask for, which leaves
+        nothing else to bring up to date when a world is reset. Forces, contacts and constraints are those of the last
+        substep.
         """
-        with self._lean(sensors=False):
-            mjw.step2(self.model, self.data)
-            for _ in range(self.substeps - 1):
+        with self._lean():
+            for _ in range(self.substeps):
                 mjw.step(self.model, self.data)
-        with self._lean(sensors=True):
-            mjw.step1(self.model, self.data)
+        self._pose()
 
     def forward(self, mask: wp.array) -> None:
-        """Brings derived quantities and sensors up to ``qpos`` and ``qvel``, changed where ``mask`` is set."""
+        """Brings poses and sensors up to ``qpos`` and ``qvel``, which were changed where ``mask`` is set."""
         efc = self.data.efc
         wp.launch(
             clear_constraints,
@@ -139,17 +139,22 @@ class Simulation:
             outputs=[efc.J, efc.D],
             device=self.device,
         )
-        with self._lean(sensors=True):
-            mjw.step1(self.model, self.data)
+        self._pose()
+
+    def _pose(self) -> None:
+        """Evaluates what an observation can ask for: poses and velocities of bodies, and sensors of them."""
+        mjw.kinematics(self.model, self.data)
+        mjw.com_pos(self.model, self.data)
+        mjw.com_vel(self.model, self.data)
+        mjw.sensor_vel(self.model, self.data)
 
     @contextlib.contextmanager
-    def _lean(self, sensors: bool) -> Iterator[None]:
-        """Launches nothing for cameras and lights, which are posed when a picture is taken, and maybe for sensors."""
+    def _lean(self) -> Iterator[None]:
+        """Launches nothing for sensors, cameras and lights: they are evaluated once they are asked for."""
         model = self.model
         kept = model.opt.disableflags, model.ncam, model.nlight
         model.ncam = model.nlight = 0
-        if not sensors:
-            model.opt.disableflags |= mjw.DisableBit.SENSOR
+        model.opt.disableflags |= mjw.DisableBit.SENSOR
         try:
             yield
         finally:
