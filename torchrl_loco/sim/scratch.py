@@ -9,9 +9,9 @@ import warp as wp
 class ScratchPool:
     """A Warp allocator that gives freed blocks out again and none back, for launches that will be recorded.
 
-    Without it the arrays that mujoco_warp allocates within a step become allocation nodes of the CUDA graph, which cost
-    time at every replay and are forbidden inside a condition. Blocks are reused within one graph and between graphs,
-    which is sound because they are replayed one after another.
+    Without it the arrays that mujoco_warp allocates within a step become allocation nodes of the CUDA graph, which are
+    not allowed inside a condition. Blocks are reused within one graph and between graphs, which is sound because they
+    are replayed one after another.
 
     Args:
         device: a CUDA device.
