@@ -1,4 +1,4 @@
-"""``python -m benchmarks``: measure throughput, or draw what was measured."""
+"""``python -m benchmarks``: measure, print a table, write JSON, draw."""
 
 import argparse
 from pathlib import Path
@@ -6,27 +6,61 @@ from pathlib import Path
 import torch
 
 from benchmarks.cases import CASES, TASKS
-from benchmarks.plot import plot
-from benchmarks.throughput import save, show, throughput
+from benchmarks.results import save, show
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
 commands = parser.add_subparsers(dest="command", required=True)
-measure = commands.add_parser("throughput", help="measure, print a table, write JSON")
-measure.add_argument("--worlds", type=int, nargs="+", default=[512, 2048, 8192, 32768])
-measure.add_argument("--bodies", nargs="+", choices=list(TASKS), default=list(TASKS))
-measure.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
-measure.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-measure.add_argument("--out", type=Path, help="file for the results as JSON")
+
+
+def add(name: str, description: str, worlds: list[int]) -> argparse.ArgumentParser:
+    """Adds a command that measures."""
+    command = commands.add_parser(name, help=description, description=description)
+    command.add_argument("--worlds", type=int, nargs="+", default=worlds)
+    command.add_argument("--bodies", nargs="+", choices=list(TASKS), default=list(TASKS))
+    command.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
+    command.add_argument("--out", type=Path, help="file for the results as JSON")
+    return command
+
+
+small = [256] if DEVICE == "cpu" else [8192]
+add("throughput", "from the bare simulator to a collector", small if DEVICE == "cpu" else [512, 2048, 8192, 32768])
+add("startup", "time from process start to the first step, and memory per world", small)
+add("peers", "other simulators beside ours, in processes of their own", small)
+add("profile", "time of each kernel (CUDA)", small)
+for name, default in (("throughput", list(CASES)), ("profile", ["env_step_and_maybe_reset"])):
+    commands.choices[name].add_argument("--cases", nargs="+", choices=list(CASES), default=default)
+commands.choices["peers"].add_argument("--path", type=Path, help="folder that the peers' packages were installed in")
 draw = commands.add_parser("plot", help="draw throughput against worlds from the JSON")
 draw.add_argument("results", type=Path)
 draw.add_argument("picture", type=Path)
 
 args = parser.parse_args()
 if args.command == "plot":
+    from benchmarks.plot import plot
+
     plot(args.results, args.picture)
+    raise SystemExit
+if args.command == "throughput":
+    from benchmarks.throughput import COLUMNS, PHASES, phases, throughput
+
+    rows = throughput(args.bodies, args.worlds, args.cases, args.device)
+    show(phases(rows), {"body": "", "worlds": "d", **dict.fromkeys(PHASES, ".3f")})
+elif args.command == "startup":
+    from benchmarks.startup import COLUMNS, startup
+
+    rows = startup(args.bodies, args.worlds, str(args.device))
+elif args.command == "peers":
+    from benchmarks.peers import COLUMNS, peers
+
+    rows = peers(args.bodies, args.worlds, args.device, args.path)
 else:
-    device = torch.device(args.device)
-    rows = throughput(args.bodies, args.worlds, args.cases, device)
-    show(rows)
-    if args.out:
-        save(rows, args.out, device)
+    from benchmarks.profile import COLUMNS, profile
+
+    if args.device.type != "cuda":
+        parser.error("profile needs a CUDA device")
+    rows = profile(args.bodies, args.worlds[0], args.cases, args.device)
+show(rows, COLUMNS)
+if args.out:
+    save(rows, args.out, args.device)

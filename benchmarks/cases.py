@@ -22,6 +22,11 @@ BATCH_STEPS = 20
 """Control steps in a batch of the collectors."""
 
 
+def waiter(device: torch.device) -> Callable[[], None]:
+    """Returns what waits for all work on a device."""
+    return (lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else (lambda: None)
+
+
 def bare_default(body: str, n: int, device: torch.device) -> Callable[[], None]:
     """A plain loop of ``mujoco_warp.step`` in a graph, with mujoco_warp's own settings but for the printing."""
     sim = Simulation(models.load(body), sim_config(body, "playground", n, {}), n, device)

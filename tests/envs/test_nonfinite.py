@@ -109,11 +109,11 @@ def test_quench_looks_at_everything_it_should(spoilt):
     }
     if spoilt is not None:
         arrays[spoilt].view(2, -1)[1, -1] = 2e10
-    bad, terms = torch.zeros(2, dtype=torch.bool), torch.ones(2, 1)
+    mask, bad, terms = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool), torch.ones(2, 1)
     with wp.ScopedDevice("cpu"):
         outputs = [bad, arrays["observation"], arrays["reward"], terms]
-        views = [wp.from_torch(array) for array in [arrays["qpos"], arrays["qvel"], *outputs]]
-        wp.launch(quench, dim=2, inputs=views[:2], outputs=views[2:])
+        views = [wp.from_torch(array) for array in [mask, arrays["qpos"], arrays["qvel"], *outputs]]
+        wp.launch(quench, dim=2, inputs=views[:3], outputs=views[3:])
     ill = spoilt is not None
     assert bad.tolist() == [False, ill]
     for array in outputs[1:]:

@@ -70,6 +70,27 @@ def test_derived_quantities_belong_to_the_new_state(body, device):
         np.testing.assert_allclose(sim.data.sensordata.numpy()[world], data.sensordata, atol=1e-4)
 
 
+def test_place_is_forward_for_worlds_at_rest(body, device):
+    """What a reset leaves out is zero, and the worlds beside it keep what they have."""
+    states = []
+    for bring_up in (Simulation.forward, Simulation.place):
+        sim, mask = simulation(body, device)
+        generator = torch.Generator(device).manual_seed(0)
+        sim.reset(mask)
+        sim.forward(mask)
+        sim.ctrl.uniform_(-1, 1, generator=generator)
+        sim.step()
+        wp.to_torch(mask)[1:] = False
+        sim.reset(mask)
+        sim.qpos[0, -5:].uniform_(-1, 1, generator=generator)
+        bring_up(sim, mask)
+        d = sim.data
+        states.append([wp.to_torch(x).clone() for x in (d.xpos, d.xmat, d.geom_xpos, d.cvel, d.sensordata, d.efc.J)])
+    for full, less in zip(*states, strict=True):
+        torch.testing.assert_close(less, full, rtol=0, atol=0)
+    assert all(array[1:].any() for array in states[0])
+
+
 def test_time_and_substeps(body):
     sim, mask = simulation(body, "cpu", ctrl_dt=0.05)
     sim.reset(mask)

@@ -72,6 +72,7 @@ class LocoEnv(AsyncReset):
         self._make_buffers()
         self._make_specs()
         self._prepare()
+        self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
         self._step_graph = self.sim.capture(self._launch_step)
         self._reset_graph = self.sim.capture(self._launch_reset)
         self._refresh_graph = self.sim.capture(self._launch_refresh)
@@ -90,8 +91,8 @@ class LocoEnv(AsyncReset):
     def _prepare(self) -> None:
         """Makes what the body's kernels need, once, before they are recorded."""
 
-    def _launch_observe(self) -> None:
-        """Launches the kernel that fills ``_observation``, ``_reward`` and ``_terms`` from the state."""
+    def _launch_observe(self, mask: wp.array) -> None:
+        """Launches the kernel that fills ``_observation``, ``_reward`` and ``_terms`` of the worlds in ``mask``."""
         raise NotImplementedError
 
     def _launch_pose(self) -> None:
@@ -106,6 +107,7 @@ class LocoEnv(AsyncReset):
         self._reward = wp.zeros(n, dtype=float, device=device)
         self._terms = wp.zeros((n, len(self.term_names)), dtype=float, device=device)
         self._mask = wp.ones(n, dtype=bool, device=device)
+        self._everyone = wp.ones(n, dtype=bool, device=device)
         self._any = wp.zeros(1, dtype=int, device=device)
         self._stagger = wp.zeros(1, dtype=bool, device=device)
         self._seed = wp.zeros(1, dtype=wp.uint32, device=device)
@@ -144,7 +146,7 @@ class LocoEnv(AsyncReset):
     def _launch_step(self) -> None:
         self._launch(apply_action, [self._action], [self.sim.data.ctrl, self._bad])
         self.sim.step()
-        self._launch_outputs()
+        self._launch_outputs(self._everyone)
         self._launch(
             count_step,
             [self._bad, self.config.episode_length],
@@ -164,16 +166,17 @@ class LocoEnv(AsyncReset):
             [self._mask, self._stagger, self._seed, self.config.episode_length],
             [self._episode, self._elapsed_steps, self._bad, self._done, self._terminated, self._truncated],
         )
-        self._launch_refresh()
+        self.sim.place(self._mask)
+        self._launch_outputs(self._mask)
 
     def _launch_refresh(self) -> None:
         self.sim.forward(self._mask)
-        self._launch_outputs()
+        self._launch_outputs(self._mask)
 
-    def _launch_outputs(self) -> None:
+    def _launch_outputs(self, mask: wp.array) -> None:
         data = self.sim.data
-        self._launch_observe()
-        self._launch(quench, [data.qpos, data.qvel], [self._bad, self._observation, self._reward, self._terms])
+        self._launch_observe(mask)
+        self._launch(quench, [mask, data.qpos, data.qvel], [self._bad, self._observation, self._reward, self._terms])
 
     # TorchRL's side.
 

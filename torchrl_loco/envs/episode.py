@@ -34,6 +34,8 @@ def apply_action(
 
 @wp.kernel(enable_backward=False)
 def quench(
+    # In:
+    mask_in: wp.array[bool],
     # Data in:
     qpos_in: wp.array2d[float],
     qvel_in: wp.array2d[float],
@@ -45,6 +47,8 @@ def quench(
 ):
     """Marks worlds that are no longer finite as bad, and zeroes what bad worlds report."""
     world = wp.tid()
+    if not mask_in[world]:
+        return
     bad = bad_out[world]
     for i in range(qpos_in.shape[1]):
         bad = bad or not is_finite(qpos_in[world, i])

@@ -33,6 +33,7 @@ def observe_humanoid(
     xmat_in: wp.array2d[wp.mat33],
     sensordata_in: wp.array2d[float],
     # In:
+    mask_in: wp.array[bool],
     extremities: wp.array[int],
     speed: float,
     # Out:
@@ -41,6 +42,8 @@ def observe_humanoid(
     terms_out: wp.array2d[float],
 ):
     world = wp.tid()
+    if not mask_in[world]:
+        return
     head_height = xpos_in[world, HEAD][2]
     torso_pos = xpos_in[world, TORSO]
     torso_mat = xmat_in[world, TORSO]
@@ -97,11 +100,11 @@ class Humanoid(LocoEnv):
         if self.protocol == "dm_control":
             self._skeleton = make_skeleton(self.mj_model, self.sim.model.nxn_geom_pair_filtered.numpy(), device)
 
-    def _launch_observe(self) -> None:
+    def _launch_observe(self, mask: wp.array) -> None:
         d = self.sim.data
         self._launch(
             observe_humanoid,
-            [d.qpos, d.qvel, d.ctrl, d.xpos, d.xmat, d.sensordata, self._extremities, self.speed],
+            [d.qpos, d.qvel, d.ctrl, d.xpos, d.xmat, d.sensordata, mask, self._extremities, self.speed],
             [self._observation, self._reward, self._terms],
         )
 

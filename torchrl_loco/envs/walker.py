@@ -27,6 +27,7 @@ def observe_walker(
     xmat_in: wp.array2d[wp.mat33],
     sensordata_in: wp.array2d[float],
     # In:
+    mask_in: wp.array[bool],
     speed: float,
     true_height: bool,
     # Out:
@@ -35,6 +36,8 @@ def observe_walker(
     terms_out: wp.array2d[float],
 ):
     world = wp.tid()
+    if not mask_in[world]:
+        return
 
     k = int(0)
     for body in range(TORSO, xmat_in.shape[1]):
@@ -90,11 +93,11 @@ class Walker(LocoEnv):
     observation_size = 24
     speed = 0.0
 
-    def _launch_observe(self) -> None:
+    def _launch_observe(self, mask: wp.array) -> None:
         d = self.sim.data
         self._launch(
             observe_walker,
-            [d.qvel, d.xpos, d.xmat, d.sensordata, self.speed, self.protocol == "dm_control"],
+            [d.qvel, d.xpos, d.xmat, d.sensordata, mask, self.speed, self.protocol == "dm_control"],
             [self._observation, self._reward, self._terms],
         )
 

@@ -10,10 +10,14 @@ import warp as wp
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.graph import Graph
+from torchrl_loco.sim.kernels import compile_kernels
 from torchrl_loco.sim.scratch import ScratchPool
 
 UNROLLED_ITERATIONS = 10
 """Solver iterations up to which a recorded step holds them all, without a condition between them."""
+
+LANES = wp.constant(32)
+"""Threads that share the constraint rows of a world."""
 
 
 @wp.kernel(enable_backward=False)
@@ -28,6 +32,8 @@ def clear_worlds(
     qacc_warmstart_out: wp.array2d[float],
     ctrl_out: wp.array2d[float],
     time_out: wp.array[float],
+    cvel_out: wp.array2d[wp.spatial_vector],
+    sensordata_out: wp.array2d[float],
 ):
     world = wp.tid()
     if not mask_in[world]:
@@ -40,6 +46,10 @@ def clear_worlds(
     for i in range(ctrl_out.shape[1]):
         ctrl_out[world, i] = 0.0
     time_out[world] = 0.0
+    for i in range(cvel_out.shape[1]):
+        cvel_out[world, i] = wp.spatial_vector()
+    for i in range(sensordata_out.shape[1]):
+        sensordata_out[world, i] = 0.0
 
 
 @wp.kernel(enable_backward=False)
@@ -51,20 +61,21 @@ def clear_constraints(
     efc_D_out: wp.array2d[float],  # noqa: N803
 ):
     """Zeroes the constraint rows: the solver multiplies unused ones by zero, which leaves a NaN a NaN for ever."""
-    world, row = wp.tid()
+    world, lane = wp.tid()
     if not mask_in[world]:
         return
-    for i in range(efc_J_out.shape[2]):
-        efc_J_out[world, row, i] = 0.0
-    if row < efc_D_out.shape[1]:
-        efc_D_out[world, row] = 0.0
+    for row in range(lane, efc_J_out.shape[1], LANES):
+        for i in range(efc_J_out.shape[2]):
+            efc_J_out[world, row, i] = 0.0
+        if row < efc_D_out.shape[1]:
+            efc_D_out[world, row] = 0.0
 
 
 class Simulation:
     """Owns the models, the state of all worlds, and the graphs that advance it.
 
-    ``step``, ``reset`` and ``forward`` launch kernels on Warp's current stream and return at once; :meth:`capture`
-    records any sequence of them, with kernels of the caller's in between, to be replayed.
+    ``step``, ``reset``, ``place`` and ``forward`` launch kernels on Warp's current stream and return at once;
+    :meth:`capture` records any sequence of them, with kernels of the caller's in between, to be replayed.
 
     The torch views share memory with the Warp arrays and keep their address for life. They always hold the current
     state: clone what you want to keep.
@@ -95,7 +106,7 @@ class Simulation:
         self.graphs: list[Graph] = []
         self._scratch = ScratchPool(self.device) if self.device.is_cuda else None
 
-        _set_options(mj_model, config)
+        set_options(mj_model, config)
         with wp.ScopedDevice(self.device):
             self.model = mjw.put_model(mj_model)
             self.data = mjw.make_data(mj_model, nworld=num_envs, naconmax=config.naconmax, njmax=config.njmax)
@@ -106,6 +117,9 @@ class Simulation:
         option.graph_conditional = config.iterations > UNROLLED_ITERATIONS
         # The solver starts from the warm start; a second start that it would compare with costs a factorization.
         option.run_qacc_smooth = False
+        # Threads to a world's matrices, which are small: measured in benchmarks/README.md.
+        self.model.block_dim.update_gradient_cholesky = 32
+        self.model.block_dim.update_gradient_JTDAJ_dense = 64
 
         self.qpos = wp.to_torch(self.data.qpos)
         self.qvel = wp.to_torch(self.data.qvel)
@@ -131,15 +145,23 @@ class Simulation:
 
     def forward(self, mask: wp.array) -> None:
         """Brings poses and sensors up to ``qpos`` and ``qvel``, which were changed where ``mask`` is set."""
+        self._clear_constraints(mask)
+        self._pose()
+
+    def place(self, mask: wp.array) -> None:
+        """As :meth:`forward`, for less: after a :meth:`reset`, and ``qpos`` alone was changed where ``mask`` is set."""
+        self._clear_constraints(mask)
+        mjw.kinematics(self.model, self.data)
+
+    def _clear_constraints(self, mask: wp.array) -> None:
         efc = self.data.efc
         wp.launch(
             clear_constraints,
-            dim=(self.num_envs, efc.J.shape[1]),
+            dim=(self.num_envs, LANES),
             inputs=[mask],
             outputs=[efc.J, efc.D],
             device=self.device,
         )
-        self._pose()
 
     def _pose(self) -> None:
         """Evaluates what an observation can ask for: poses and velocities of bodies, and sensors of them."""
@@ -167,9 +189,13 @@ class Simulation:
             clear_worlds,
             dim=self.num_envs,
             inputs=[self.model.qpos0, mask],
-            outputs=[d.qpos, d.qvel, d.qacc_warmstart, d.ctrl, d.time],
+            outputs=[d.qpos, d.qvel, d.qacc_warmstart, d.ctrl, d.time, d.cvel, d.sensordata],
             device=self.device,
         )
+
+    def compile(self, *launches: Callable[[], None]) -> None:
+        """Compiles the kernels that ``launches`` would launch, in parallel and under a progress bar."""
+        compile_kernels(launches, self.device)
 
     def capture(self, launch: Callable[[], None]) -> Graph:
         """Records the launches that ``launch`` makes. The state afterwards is arbitrary: reset before use."""
@@ -183,7 +209,8 @@ class Simulation:
         return len(self.graphs)
 
 
-def _set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
+def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
+    """Sets the options of a model as the settings say."""
     option = mj_model.opt
     option.timestep = config.sim_dt
     option.iterations = config.iterations

@@ -1,0 +1,52 @@
+"""The same step in other simulators, each in a process of its own, beside ours.
+
+A peer is a module that is run with a body and a number of worlds and prints ``{"ms": ...}``: the time of one control
+step of all worlds. Those that bring another MuJoCo import nothing of torchrl_loco.
+"""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from benchmarks.processes import MeasurementError, run_json
+from benchmarks.results import Row
+from benchmarks.throughput import throughput, time_of
+
+OURS = ("bare_tuned", "env_step", "env_step_and_maybe_reset")
+ON_CUDA = ("playground", "playground_torchrl")
+ON_CPU = ("c_mujoco", "c_mujoco_one_thread", "dm_control_suite")
+COLUMNS = {"body": "", "worlds": "d", "case": "", "ms": ".3f", "thousand steps/s": ".1f", "ours is": "", "error": ""}
+
+
+def peers(bodies: Sequence[str], worlds: Sequence[int], device: torch.device, path: Path | None) -> list[Row]:
+    """Measures the peers of a device and ours; a peer that cannot run gets a row with the error.
+
+    Args:
+        bodies: "walker", "humanoid" or both.
+        worlds: numbers of worlds.
+        device: where ours runs; the peers are those of its kind.
+        path: folder with the peers' packages, which take precedence there.
+    """
+    found = [str(p) for p in (path, os.environ.get("PYTHONPATH")) if p]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(found)}
+    names = ON_CUDA if device.type == "cuda" else ON_CPU
+    rows: list[Row] = []
+    for body, n, name in tqdm([(b, n, name) for b in bodies for n in worlds for name in names], desc="peers"):
+        row = {"body": body, "worlds": n, "case": name}
+        try:
+            row |= run_json([f"benchmarks.peers.{name}", body, n], environment)
+        except MeasurementError as error:
+            row["error"] = str(error)
+        rows.append(row)
+    rows += throughput(bodies, worlds, OURS, device)
+    for row in rows:
+        if "ms" in row:
+            row["thousand steps/s"] = row["worlds"] / row["ms"]
+            like = {"body": row["body"], "worlds": row.get("beside", row["worlds"])}
+            ours = time_of(rows, like, "env_step_and_maybe_reset")
+            if ours:
+                row["ours is"] = f"{like['worlds'] / ours / row['thousand steps/s']:.2f} x"
+    return rows

@@ -1,0 +1,33 @@
+"""MuJoCo Playground: its jitted step in JAX, physics by MuJoCo-Warp, random actions."""
+
+import json
+import sys
+
+import jax
+from mujoco_playground import dm_control_suite
+
+from benchmarks.peers.playground_settings import TASKS, overrides
+from benchmarks.timing import milliseconds
+
+
+def main(body: str, worlds: int) -> None:
+    """Prints the time of a step."""
+    env = dm_control_suite.load(TASKS[body], config_overrides=overrides(body, worlds))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), worlds))
+    key = jax.random.PRNGKey(1)
+
+    @jax.jit
+    def advance(state, key):
+        key, now = jax.random.split(key)
+        action = jax.random.uniform(now, (worlds, env.action_size), minval=-1.0, maxval=1.0)
+        return jax.vmap(env.step)(state, action), key
+
+    def step() -> None:
+        nonlocal state, key
+        state, key = advance(state, key)
+
+    print(json.dumps({"ms": milliseconds(step, lambda: jax.block_until_ready(state.reward))}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]))

@@ -1,0 +1,30 @@
+"""TorchRL's MujocoPlaygroundEnv: ``step_and_maybe_reset`` on CUDA with random actions."""
+
+import json
+import sys
+
+import torch
+from torchrl.envs import MujocoPlaygroundEnv
+
+from benchmarks.peers.playground_settings import TASKS, overrides
+from benchmarks.timing import milliseconds
+
+
+@torch.no_grad()
+def main(body: str, worlds: int) -> None:
+    """Prints the time of a step."""
+    env = MujocoPlaygroundEnv(
+        TASKS[body], config_overrides=overrides(body, worlds), device="cuda", batch_size=torch.Size([worlds])
+    )
+    carried = env.reset()
+
+    def step() -> None:
+        nonlocal carried
+        action = torch.empty(env.action_spec.shape, device="cuda").uniform_(-1.0, 1.0)
+        _, carried = env.step_and_maybe_reset(carried.set("action", action))
+
+    print(json.dumps({"ms": milliseconds(step, torch.cuda.synchronize)}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]))

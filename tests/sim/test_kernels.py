@@ -1,0 +1,78 @@
+"""Kernels are compiled before they are needed, all of them, and compiling does nothing else."""
+
+import threading
+
+import pytest
+import torch
+import warp as wp
+
+from torchrl_loco import models
+from torchrl_loco.config import sim_config
+from torchrl_loco.sim import Simulation
+from torchrl_loco.sim.kernels import compile_kernels
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def count(total: wp.array[int]):
+    wp.atomic_add(total, 0, 1)
+
+
+@pytest.mark.parametrize("protocol", ["playground", "dm_control"])  # without and with a condition in the solver
+@pytest.mark.parametrize("body", ["walker", "humanoid"])
+def test_a_step_finds_every_kernel_compiled(body, protocol, device, monkeypatch):
+    config = sim_config(body, protocol, 2, {})
+    sim = Simulation(models.load(body), config, 2, torch.device(device))
+    sim.compile(sim.step)
+    load, asked = wp.Module.load, []
+
+    def spy(module, device, block_dim=None, *args, **kwargs):
+        size = module.options["block_dim"] if block_dim is None else block_dim
+        asked.append((device.context, size) in module.execs)
+        return load(module, device, block_dim, *args, **kwargs)
+
+    monkeypatch.setattr(wp.Module, "load", spy)
+    sim.step()
+    assert len(asked) > 100
+    assert all(asked)
+
+
+def test_compiling_launches_nothing(device):
+    total = wp.zeros(1, dtype=int, device=device)
+    condition = wp.zeros(1, dtype=int, device=device)
+
+    def launch():
+        wp.launch(count, dim=5, outputs=[total], device=device)
+
+    def conditional():
+        wp.capture_if(condition, on_true=launch, on_false=launch)
+        wp.capture_while(condition, while_body=launch)
+
+    compile_kernels([launch, conditional], wp.get_device(device))
+    assert total.numpy()[0] == 0
+    launch()
+    assert total.numpy()[0] == 5
+
+
+def test_another_thread_goes_on_launching():
+    total = wp.zeros(1, dtype=int, device="cpu")
+    outside = wp.zeros(1, dtype=int, device="cpu")
+
+    def launch():
+        thread = threading.Thread(target=lambda: wp.launch(count, dim=3, outputs=[outside], device="cpu"))
+        thread.start()
+        thread.join()
+        wp.launch(count, dim=3, outputs=[total], device="cpu")
+
+    compile_kernels([launch], wp.get_device("cpu"))
+    assert (total.numpy()[0], outside.numpy()[0]) == (0, 3)
+
+
+def test_an_error_leaves_warp_as_it_was():
+    before = wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size
+
+    def launch():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        compile_kernels([launch], wp.get_device("cpu"))
+    assert before == (wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size)

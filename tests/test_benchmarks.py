@@ -1,0 +1,60 @@
+"""The parts of the benchmarks that could lie: differences, ratios, and processes that fail."""
+
+import json
+import os
+
+import pytest
+import torch
+
+from benchmarks import timing
+from benchmarks.processes import MeasurementError, run_json
+from benchmarks.results import save, show
+from benchmarks.throughput import phases
+
+
+def rows(**ms):
+    return [{"body": "walker", "worlds": 8, "case": case, "ms": value} for case, value in ms.items()]
+
+
+def test_phases_add_up_to_the_collected_step():
+    measured = rows(
+        bare_default=6.0, bare_tuned=5.0, env_step=5.5, env_step_and_maybe_reset=5.75, rollout_collector=6.5
+    )
+    (parts,) = phases(measured)
+    assert list(parts.values())[2:] == [5.0, 0.5, 0.25, 0.75]
+
+
+def test_phases_leave_open_what_was_not_measured():
+    (parts,) = phases(rows(bare_tuned=5.0, rollout_collector=6.5))
+    assert list(parts.values())[2:] == [5.0, None, None, None]
+
+
+def test_time_is_the_median_of_blocks_after_the_first(monkeypatch):
+    clock, cost = [0.0], iter([100.0] * 2 + [1.0] * 2 + [2.0] * 2 + [30.0] * 2)
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
+
+    def step():
+        clock[0] += next(cost)
+
+    assert timing.milliseconds(step, lambda: None, blocks=3, steps=2) == 2000.0
+
+
+def test_a_failed_process_is_told(tmp_path):
+    (tmp_path / "good.py").write_text("print('chatter'); print('{\"ms\": 2.5}')")
+    (tmp_path / "bad.py").write_text("import there_is_no_such_module")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    assert run_json(["good"], environment) == {"ms": 2.5}
+    with pytest.raises(MeasurementError, match="there_is_no_such_module"):
+        run_json(["bad"], environment)
+
+
+def test_results_keep_how_they_were_made(tmp_path, capsys):
+    measured = rows(env_step=5.5)
+    save(measured, tmp_path / "new" / "results.json", torch.device("cpu"))
+    results = json.loads((tmp_path / "new" / "results.json").read_text())
+    assert results["rows"] == measured
+    assert results["versions"]["torch"] == torch.__version__
+    assert results["command"].startswith("python -m benchmarks")
+    assert results["device"]
+    show(measured, {"case": "", "ms": ".2f", "error": ""})
+    assert capsys.readouterr().out.splitlines()[1].split() == ["env_step", "5.50"]

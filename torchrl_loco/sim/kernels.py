@@ -1,0 +1,81 @@
+"""Compiles the kernels of recorded work before it first runs: side by side, and under a progress bar."""
+
+import contextlib
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from typing import Any
+
+import warp as wp
+from tqdm.auto import tqdm
+
+SHOW_AFTER = 2.0
+"""Seconds after which the progress bar appears; kernels from the cache are there before."""
+
+_COLLECTING = threading.Lock()
+
+
+def compile_kernels(launches: Iterable[Callable[[], None]], device: wp.Device) -> None:
+    """Compiles and loads the kernels that ``launches`` would launch, without launching any.
+
+    Warp compiles a module when a kernel of it is first launched, one module after another. Known beforehand, they are
+    compiled on all cores, and how many are left can be shown.
+
+    Args:
+        launches: make the launches. Whatever else they do is done.
+        device: the Warp device.
+    """
+    with wp.ScopedDevice(device), _collecting() as variants:
+        for launch in launches:
+            launch()
+    with (
+        ThreadPoolExecutor(max_workers=os.cpu_count()) as pool,
+        tqdm(total=len(variants), desc=f"compiling for {device}", unit="module", delay=SHOW_AFTER, leave=False) as bar,
+    ):
+        for loaded in as_completed([pool.submit(module.load, device, block_dim) for module, block_dim in variants]):
+            loaded.result()
+            bar.update()
+
+
+@contextlib.contextmanager
+def _collecting() -> Iterator[dict[tuple[wp.Module, int], None]]:
+    """Yields the modules and block sizes, in order, that this thread's launches ask for; the launches come to nothing.
+
+    A launch asks its module for an executable and returns if there is none. What is conditional is gone through once.
+    """
+    variants: dict[tuple[wp.Module, int], None] = {}
+    thread = threading.get_ident()
+    originals = wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size
+    load, capture_if, capture_while, suggested_block_size = originals
+
+    def collect(module: wp.Module, device: Any, block_dim: Any = None, *args: Any, **kwargs: Any) -> Any:
+        if threading.get_ident() != thread:
+            return load(module, device, block_dim, *args, **kwargs)
+        variants[module, block_dim] = None
+        return None
+
+    def both(condition: wp.array, on_true: Any = None, on_false: Any = None, stream: Any = None, **kwargs: Any) -> None:
+        if threading.get_ident() != thread:
+            return capture_if(condition, on_true, on_false, stream, **kwargs)
+        for body in filter(callable, (on_true, on_false)):
+            body(**kwargs)
+
+    def once(condition: wp.array, while_body: Any, stream: Any = None, **kwargs: Any) -> None:
+        if threading.get_ident() != thread:
+            return capture_while(condition, while_body, stream, **kwargs)
+        if callable(while_body):
+            while_body(**kwargs)
+
+    def block_size(kernel: wp.Kernel, device: Any) -> tuple[int, int]:
+        if threading.get_ident() != thread:
+            return suggested_block_size(kernel, device)
+        variants[kernel.module, kernel.module.options["block_dim"]] = None
+        return 1, 1
+
+    with _COLLECTING:  # else two threads could put back each other's
+        wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size = collect, both, once, block_size
+        try:
+            yield variants
+        finally:
+            wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size = originals
