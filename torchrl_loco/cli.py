@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import torchrl_loco
-from torchrl_loco import registry
+from torchrl_loco import doctor, registry
 
 try:
     import tyro
@@ -21,6 +21,16 @@ def list_tasks() -> None:
     """List the environments."""
     for name, env in registry.ENVS.items():
         print(f"{name:<16} {(env.__doc__ or '').splitlines()[0]}")
+
+
+def diagnose() -> None:
+    """Print versions, devices and the kernel cache, and test the physics of each device against C MuJoCo."""
+    well = True
+    for subject, finding, is_well in doctor.diagnose():
+        print(f"{subject:<20} {finding}{'' if is_well else '  <- NOT RIGHT'}", flush=True)
+        well &= is_well
+    if not well:
+        raise SystemExit(1)
 
 
 def evaluate(
@@ -63,7 +73,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {"train": train, "eval": evaluate, "list": list_tasks},
+            {"train": train, "eval": evaluate, "list": list_tasks, "doctor": diagnose},
             prog="torchrl-loco",
             description=torchrl_loco.__doc__,
             args=args,

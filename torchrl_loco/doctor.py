@@ -1,0 +1,83 @@
+"""What there is on this machine, and whether the physics on it is right."""
+
+import os
+import platform
+import time
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+
+import torchrl_loco
+from torchrl_loco.registry import make
+
+PACKAGES = ("torch", "torchrl", "tensordict", "warp-lang", "mujoco-warp", "mujoco")
+SELF_TEST = {"walker": "walker_run", "humanoid": "humanoid_run"}
+TOLERANCE = 1e-4
+"""Largest median error of qpos (m, rad) after a control step that counts as right."""
+
+
+def diagnose() -> Iterator[tuple[str, str, bool]]:
+    """Yields what was found, line by line: subject, finding, and whether all is well with it.
+
+    The self-test of a body plays 20 random control steps in 4 worlds on each device, each step also in C MuJoCo, which
+    computes in double precision, from the same state.
+    """
+    yield "python", f"{platform.python_version()} on {platform.platform()}", True
+    yield "torchrl-loco", torchrl_loco.__version__, True
+    for name in PACKAGES:
+        yield name, metadata.version(name), True
+    devices = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    yield "cpu", f"{platform.machine()}, {os.cpu_count()} cores", True
+    for device in devices[1:]:
+        properties = torch.cuda.get_device_properties(device)
+        yield device, f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}", True
+    if len(devices) == 1:
+        why = "this torch is built without CUDA" if torch.version.cuda is None else "torch finds no driver or no device"
+        yield "cuda", f"none: {why}", True
+    yield "kernel cache", _describe_cache(), True
+    for device in devices:
+        for body, task in SELF_TEST.items():
+            seconds, error = self_test(task, device)
+            finding = f"made in {seconds:.1f} s, error against C MuJoCo {error:.1e}"
+            yield f"{body} on {device}", finding, error < TOLERANCE
+
+
+def _describe_cache() -> str:
+    wp.init()  # else there is no folder yet
+    folder = Path(wp.config.kernel_cache_dir)
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    modules = len({path.parent for path in files if path.suffix in (".o", ".cubin", ".ptx")})
+    return f"{folder}, {modules} modules, {sum(path.stat().st_size for path in files) / 1e6:.0f} MB"
+
+
+def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float]:
+    """Plays ``steps`` random control steps and returns the seconds that making the environment took, and the error.
+
+    The error is the median over worlds and steps of the largest deviation of qpos from C MuJoCo (m, rad); NaN if
+    anything was not finite.
+    """
+    start = time.perf_counter()
+    env = make(task, 4, device, seed=0, protocol="dm_control")
+    seconds = time.perf_counter() - start
+    generator = torch.Generator().manual_seed(0)
+    errors, data = [], mujoco.MjData(env.mj_model)
+    td = env.reset()
+    for _ in range(steps):
+        action = torch.rand(env.action_spec.shape, generator=generator) * 2 - 1
+        before = env.get_state().cpu().numpy()
+        td = env.step(td.set("action", action.to(env.device)))["next"]
+        after = env.get_state()["qpos"].cpu().numpy()
+        if td["terminated"].any():  # a world was not finite
+            return seconds, float("nan")
+        for world in range(env.num_envs):
+            for name in ("qpos", "qvel", "qacc_warmstart"):
+                getattr(data, name)[:] = before[name][world]
+            data.ctrl[:] = action[world]
+            mujoco.mj_step(env.mj_model, data, env.config.substeps)
+            errors.append(np.abs(data.qpos - after[world]).max())
+    return seconds, float(np.median(errors))
