@@ -32,7 +32,9 @@ def show(rows: Sequence[Row], columns: dict[str, str]) -> None:
 
 def save(rows: Sequence[Row], path: Path, device: torch.device) -> None:
     """Writes the rows and what a reader needs to judge them by as JSON."""
-    git = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    git = subprocess.run(
+        ["git", "describe", "--always", "--abbrev=40", "--dirty"], capture_output=True, text=True, check=False
+    )
     results = {
         "command": " ".join(["python -m benchmarks", *sys.argv[1:]]),
         "date": datetime.date.today().isoformat(),

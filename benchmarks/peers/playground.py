@@ -6,13 +6,12 @@ import sys
 import jax
 from mujoco_playground import dm_control_suite
 
-from benchmarks.peers.playground_settings import TASKS, overrides
 from benchmarks.timing import milliseconds
 
 
 def main(body: str, worlds: int) -> None:
     """Prints the time of a step."""
-    env = dm_control_suite.load(TASKS[body], config_overrides=overrides(body, worlds))
+    env = dm_control_suite.load(f"{body.capitalize()}Walk")
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), worlds))
     key = jax.random.PRNGKey(1)
 
