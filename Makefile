@@ -4,6 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 TASK ?= walker_stand
 ARGS ?=
+PYTEST_ARGS ?= --numprocesses auto
 
 .PHONY: train test test-fast lint format clean
 
@@ -11,10 +12,10 @@ train: $(VENV)/installed  ## train a policy; TASK=walker_walk ARGS="--seed 1" to
 	$(BIN)/torchrl-loco train $(TASK) $(ARGS)
 
 test: lint  ## style, types and all tests, on real physics
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 test-fast: $(VENV)/installed  ## the everyday part of the tests
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest $(PYTEST_ARGS) -m "not slow"
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .

@@ -7,6 +7,7 @@ import torch
 
 from benchmarks.cases import CASES, TASKS
 from benchmarks.results import save, show
+from torchrl_loco import list_envs
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
@@ -32,6 +33,13 @@ add("profile", "time of each kernel (CUDA)", small)
 for name, default in (("throughput", list(CASES)), ("profile", ["env_step_and_maybe_reset"])):
     commands.choices[name].add_argument("--cases", nargs="+", choices=list(CASES), default=default)
 commands.choices["peers"].add_argument("--path", type=Path, help="folder that the peers' packages were installed in")
+train = commands.add_parser("training", help="time to a return, beside Brax's PPO on Playground")
+train.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_walk"])
+train.add_argument("--frames", type=int, default=10_000_000)
+train.add_argument("--peer", action="store_true", help="train Brax's PPO too")
+train.add_argument("--path", type=Path, help="folder that the peer's packages were installed in")
+train.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
+train.add_argument("--out", type=Path, help="file for the results as JSON")
 draw = commands.add_parser("plot", help="draw throughput against worlds from the JSON")
 draw.add_argument("results", type=Path)
 draw.add_argument("picture", type=Path)
@@ -55,6 +63,10 @@ elif args.command == "peers":
     from benchmarks.peers import COLUMNS, peers
 
     rows = peers(args.bodies, args.worlds, args.device, args.path)
+elif args.command == "training":
+    from benchmarks.training import COLUMNS, training
+
+    rows = training(args.tasks, args.device, args.frames, args.peer, args.path)
 else:
     from benchmarks.profile import COLUMNS, profile
 

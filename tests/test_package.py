@@ -20,7 +20,7 @@ LAYERS = [  # a module imports from its own layer or from those before it
     {"envs"},
     {"collector"},
     {"registry"},
-    {"doctor"},
+    {"doctor", "policy"},
     {"training"},
     {"cli", "__main__"},
 ]

@@ -13,6 +13,7 @@ from torchrl_loco.envs import (
     WalkerStand,
     WalkerWalk,
 )
+from torchrl_loco.policy import Policy, load_policy
 from torchrl_loco.registry import list_envs, make
 
 __version__ = "0.1.0"
@@ -21,6 +22,7 @@ __all__ = [
     "HumanoidRun",
     "HumanoidStand",
     "HumanoidWalk",
+    "Policy",
     "RolloutCollector",
     "SimConfig",
     "State",
@@ -30,6 +32,7 @@ __all__ = [
     "WalkerWalk",
     "__version__",
     "list_envs",
+    "load_policy",
     "make",
 ]
 

@@ -1,10 +1,11 @@
 """The command ``torchrl-loco``: parse, call, exit."""
 
 import contextlib
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torchrl_loco
 from torchrl_loco import doctor, registry
@@ -50,15 +51,102 @@ def evaluate(
     """
     with _user_errors():
         summary = training.evaluate_run(training.RunFolder(run), episodes, seed, device)
-    training.report(summary)
+    print(training.describe(summary))
+
+
+def resume(run: tyro.conf.Positional[Path], /) -> None:
+    """Go on with a run that was stopped, from its last checkpoint, as if it had not been.
+
+    Args:
+        run: folder of the run.
+    """
+    with _user_errors():
+        trainer = training.Trainer(training.RunFolder(run), resume=True)
+    trainer.train()
+
+
+def record(
+    run: tyro.conf.Positional[Path],
+    /,
+    seconds: float = 10.0,
+    camera: Literal["side", "back", "egocentric"] = "side",
+    seed: int = 0,
+    device: str | None = None,
+    out: Path | None = None,
+) -> None:
+    """Record a video of the trained policy of a run.
+
+    Args:
+        run: folder of the run.
+        seconds: length of the video.
+        camera: which of the model's cameras.
+        seed: seed that the episode is drawn from.
+        device: where to play; default: CUDA if there is any.
+        out: the video; default: video.mp4 in the run's folder.
+    """
+    with _user_errors():
+        folder = training.RunFolder(run)
+        policy = torchrl_loco.Policy.load(folder.policy, device)
+        _record(policy, folder.video if out is None else out, seconds, camera, seed, device)
+
+
+def play(
+    task: tyro.conf.Positional[str],
+    /,
+    seconds: float = 10.0,
+    camera: Literal["side", "back", "egocentric"] = "side",
+    seed: int = 0,
+    device: str | None = None,
+    out: Path | None = None,
+) -> None:
+    """Show the trained policy that comes with the package: in a window if there is a display, else as a video.
+
+    Args:
+        task: id of the environment.
+        seconds: length of the video.
+        camera: which of the model's cameras.
+        seed: seed that the episode is drawn from.
+        device: where to play; default: CUDA if there is any.
+        out: a video instead of a window; default without a display: TASK.mp4.
+    """
+    with _user_errors():
+        policy = torchrl_loco.load_policy(task, device)
+        shown = ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on", "mean", "std")
+        print(task, *(f"{key} {policy.info[key]}" for key in shown if key in policy.info), sep=", ")
+        has_display = sys.platform in ("darwin", "win32") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+        if out is None and has_display:
+            env = torchrl_loco.make(task, 1, device, seed, policy.info["protocol"])
+            training.view(policy, env, policy.info["action_repeat"])
+        else:
+            _record(policy, Path(f"{policy.info['task']}.mp4") if out is None else out, seconds, camera, seed, device)
+
+
+def _record(policy: torchrl_loco.Policy, out: Path, seconds: float, camera: str, seed: int, device: str | None) -> None:
+    env = torchrl_loco.make(policy.info["task"], 1, device, seed, policy.info["protocol"])
+    training.record(policy, env, out, seconds, policy.info["action_repeat"], camera)
+    print(out)
+
+
+def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("learning_curves.png")) -> None:
+    """Draw the learning curves of runs; runs that differ in nothing but their seed become a mean and a band.
+
+    Args:
+        runs: folders of the runs.
+        out: the picture.
+    """
+    with _user_errors():
+        training.plot_runs([training.RunFolder(run) for run in runs], out)
+    print(out)
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Runs the command line; returns 0, exits with 2 for what the user can mend, returns 130 when interrupted."""
     args = sys.argv[1:] if args is None else list(args)
     with _user_errors():
-        device = _value_of("--device", args)
-        presets = {task: training.preset(task, device) for task in registry.list_envs()}
+        device, algorithm = _take("--device", args), _take("--algorithm", args)
+        presets = {task: training.preset(task, device, algorithm) for task in registry.list_envs()}
+    if device is not None and "train" not in args[:1]:
+        args += ["--device", device]
     task_config = tyro.extras.subcommand_type_from_defaults(
         presets,
         {task: f"Train {task}." for task in presets},
@@ -66,21 +154,35 @@ def main(args: Sequence[str] | None = None) -> int:
     )
 
     def train(config: Annotated[task_config, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]
-        """Train a policy with PPO: evaluation, learning curve and video included."""
+        """Train a policy: evaluation, learning curve and video included.
+
+        --algorithm ppo or reppo, and --device, choose among the presets before all other options.
+        """
         with _user_errors():
             run = training.RunFolder.create(config)
-        training.train(run)
+            print(f"run folder: {run.path}")
+            trainer = training.Trainer(run)
+        trainer.train()
 
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {"train": train, "eval": evaluate, "list": list_tasks, "doctor": diagnose},
+            {
+                "train": train,
+                "resume": resume,
+                "eval": evaluate,
+                "record": record,
+                "play": play,
+                "plot": plot,
+                "list": list_tasks,
+                "doctor": diagnose,
+            },
             prog="torchrl-loco",
             description=torchrl_loco.__doc__,
             args=args,
             use_underscores=True,
         )
     except KeyboardInterrupt:
-        print("torchrl-loco: interrupted; the run folder holds what there was", file=sys.stderr)
+        print("torchrl-loco: interrupted; torchrl-loco resume goes on from the run folder", file=sys.stderr)
         return 130
     return 0
 
@@ -95,11 +197,14 @@ def _user_errors() -> Iterator[None]:
         raise SystemExit(2) from None
 
 
-def _value_of(flag: str, args: Sequence[str]) -> str | None:
-    """Returns what follows ``flag``: the presets depend on the device, so it is read before the rest."""
+def _take(flag: str, args: list[str]) -> str | None:
+    """Removes ``flag`` and its value from ``args`` and returns the value: it decides what the other options are."""
     for i, arg in enumerate(args):
         if arg == flag and i + 1 < len(args):
-            return args[i + 1]
+            value = args[i + 1]
+            del args[i : i + 2]
+            return value
         if arg.startswith(f"{flag}="):
+            del args[i]
             return arg.removeprefix(f"{flag}=")
     return None

@@ -1,11 +1,15 @@
 """A collection loop that never waits for the device."""
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
+from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_loco.envs.state import State
 
 
 class RolloutCollector:
@@ -66,6 +70,22 @@ class RolloutCollector:
                 steps.append(current)
         self._carried = td
         return TensorDict.stack(steps, dim=-1).refine_names(..., "time")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns where the collection stands: the worlds' state, and what the next batch begins with."""
+        if self._carried is None:
+            return {}
+        env = self._env.base_env if isinstance(self._env, TorchRLTransformedEnv) else self._env
+        return {"carried": self._carried.to_dict(), "env": env.get_state().to_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from a :meth:`state_dict`, in an environment of the same settings."""
+        if not state:
+            self._carried = None
+            return
+        size, device = self._env.batch_size, self._env.device
+        self._env.reset(State(state["env"], batch_size=size, device=device), set_state=True)
+        self._carried = TensorDict(state["carried"], batch_size=size, device=device)
 
     def shutdown(self) -> None:
         """Does nothing; here so that a ``Collector`` can be exchanged for this."""

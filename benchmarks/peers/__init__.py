@@ -30,8 +30,7 @@ def peers(bodies: Sequence[str], worlds: Sequence[int], device: torch.device, pa
         device: where ours runs; the peers are those of its kind.
         path: folder with the peers' packages, which take precedence there.
     """
-    found = [str(p) for p in (path, os.environ.get("PYTHONPATH")) if p]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(found)}
+    environment = environment_with(path)
     names = ON_CUDA if device.type == "cuda" else ON_CPU
     rows: list[Row] = []
     for body, n, name in tqdm([(b, n, name) for b in bodies for n in worlds for name in names], desc="peers"):
@@ -50,3 +49,9 @@ def peers(bodies: Sequence[str], worlds: Sequence[int], device: torch.device, pa
             if ours:
                 row["ours is"] = f"{like['worlds'] / ours / row['thousand steps/s']:.2f} x"
     return rows
+
+
+def environment_with(path: Path | None) -> dict[str, str]:
+    """Returns the environment variables of a process in which the packages in a folder take precedence."""
+    found = [str(p) for p in (path, os.environ.get("PYTHONPATH")) if p]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(found)}

@@ -1,48 +1,103 @@
 """How good a policy is, and what it looks like."""
 
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import imageio.v3 as imageio
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase, step_mdp
+from torchrl.envs import step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import trange
 
+from torchrl_loco.envs import LocoEnv
 from torchrl_loco.registry import make
-from torchrl_loco.training.presets import PPOConfig
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
-def evaluate(policy: Policy, config: PPOConfig, episodes: int, seed: int) -> torch.Tensor:
-    """Plays full episodes of the task in fresh worlds, without exploration.
+class Evaluator:
+    """Plays full episodes of a task in fresh worlds, without exploration; the same episodes every time.
 
-    Returns:
-        The return of each episode, shape ``(episodes,)``.
+    Args:
+        task: id of the environment.
+        episodes: how many, all side by side.
+        device: where to play.
+        seed: decides how they start.
+        protocol: settings of the solver and of the reset.
+        action_repeat: frames for which an action is held.
     """
-    env = make(config.task, episodes, config.device, seed, config.protocol)
-    returns = torch.zeros(episodes, 1, device=env.device)
-    alive = torch.ones_like(returns, dtype=torch.bool)
-    for after in _play(policy, env, config.action_repeat, env.config.episode_length, "evaluation"):
-        returns += after["reward"] * alive
-        alive &= ~after["done"]
-    return returns.squeeze(-1)
+
+    def __init__(
+        self, task: str, episodes: int, device: str, seed: int, protocol: str = "playground", action_repeat: int = 1
+    ) -> None:
+        self._env = make(task, episodes, device, seed, protocol)
+        self._seed = seed
+        self._action_repeat = action_repeat
+
+    def __call__(self, policy: Policy) -> torch.Tensor:
+        """Returns the return of each episode, shape ``(episodes,)``."""
+        env = self._env
+        env.set_seed(self._seed)
+        returns = torch.zeros(env.num_envs, 1, device=env.device)
+        alive = torch.ones_like(returns, dtype=torch.bool)
+        for after in _play(policy, env, self._action_repeat, env.config.episode_length, "evaluation"):
+            returns += after["reward"] * alive
+            alive &= ~after["done"]
+        return returns.squeeze(-1)
 
 
-def record(policy: Policy, config: PPOConfig, path: Path, seconds: float, seed: int, camera: str = "side") -> None:
-    """Writes a video of one world from its reset on, in real time."""
-    env = make(config.task, 1, config.device, seed, config.protocol)
+def summarize(returns: torch.Tensor) -> dict[str, float]:
+    """Returns number, mean, standard deviation and extremes of episode returns of shape ``(episodes,)``."""
+    return {
+        "episodes": len(returns),
+        "mean": returns.mean().item(),
+        "std": returns.std(correction=0).item(),
+        "min": returns.min().item(),
+        "max": returns.max().item(),
+    }
+
+
+def describe(summary: dict[str, float]) -> str:
+    """Returns the summary of an evaluation as a line."""
+    return (
+        f"return {summary['mean']:.1f} +- {summary['std']:.1f} over {summary['episodes']:.0f} episodes "
+        f"(min {summary['min']:.1f}, max {summary['max']:.1f})"
+    )
+
+
+def record(
+    policy: Policy, env: LocoEnv, path: Path, seconds: float, action_repeat: int = 1, camera: str = "side"
+) -> None:
+    """Writes a video of the first world of an environment from its reset on, in real time."""
     frame_rate = round(1 / env.config.ctrl_dt)
     with imageio.imopen(path, "w", plugin="pyav") as video:
         video.init_video_stream("h264", fps=frame_rate)
-        for _ in _play(policy, env, config.action_repeat, round(seconds * frame_rate), "video"):
+        for _ in _play(policy, env, action_repeat, round(seconds * frame_rate), "video"):
             video.write_frame(env.render(camera, 480, 360)[0].cpu().numpy())
 
 
+def view(policy: Policy, env: LocoEnv, action_repeat: int = 1) -> None:
+    """Shows the first world of an environment in MuJoCo's viewer, in real time, until its window is closed."""
+    import mujoco.viewer  # needs a display
+
+    data = mujoco.MjData(env.mj_model)
+    with mujoco.viewer.launch_passive(env.mj_model, data) as window:
+        while window.is_running():
+            due = time.perf_counter()
+            for _ in _play(policy, env, action_repeat, env.config.episode_length, "episode"):
+                data.qpos[:] = env.sim.qpos[0].cpu()
+                mujoco.mj_kinematics(env.mj_model, data)
+                window.sync()
+                due += env.config.ctrl_dt
+                time.sleep(max(0.0, due - time.perf_counter()))
+                if not window.is_running():
+                    break
+
+
 @torch.no_grad()
-def _play(policy: Policy, env: EnvBase, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
+def _play(policy: Policy, env: LocoEnv, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
     """Yields what each of so many frames from a reset brings, with every action held for ``action_repeat`` of them."""
     td = env.reset()
     for frame in trange(frames, desc=label, leave=False):

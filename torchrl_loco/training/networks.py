@@ -1,50 +1,18 @@
-"""The actor and the critic, both on raw observations: normalisation is part of the networks."""
+"""Actors and critics, all on raw observations: normalisation is part of the networks."""
 
+import copy
+import dataclasses
 import math
+from typing import Any
 
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
-from torchrl.data import TensorSpec
+from torchrl.data import Bounded
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
-from torchrl_loco.training.presets import PPOConfig
-
-
-class ObservationNorm(nn.Module):
-    """Shifts and scales observations by the mean and variance of all that :meth:`update` saw.
-
-    Args:
-        size: length of an observation.
-        limit: bound of the result; what lies beyond is clipped.
-    """
-
-    mean: torch.Tensor
-    var: torch.Tensor
-    count: torch.Tensor
-
-    def __init__(self, size: int, limit: float = 10.0) -> None:
-        super().__init__()
-        self.limit = limit
-        self.register_buffer("mean", torch.zeros(size))
-        self.register_buffer("var", torch.ones(size))
-        self.register_buffer("count", torch.zeros(()))
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Normalises observations of shape ``(..., size)``."""
-        return ((observation - self.mean) * torch.rsqrt(self.var + 1e-6)).clamp(-self.limit, self.limit)
-
-    @torch.no_grad()
-    def update(self, observation: torch.Tensor) -> None:
-        """Takes observations of shape ``(..., size)`` into mean and variance (Chan's parallel formula)."""
-        batch = observation.flatten(0, -2)
-        var, mean = torch.var_mean(batch, dim=0, correction=0)
-        total = self.count + len(batch)
-        share = len(batch) / total
-        delta = mean - self.mean
-        self.var.lerp_(var, share).add_(delta.square() * share * (1 - share))
-        self.mean.add_(delta * share)
-        self.count.copy_(total)
+from torchrl_loco.policy import ObservationNorm, Policy
+from torchrl_loco.training.config import PPOConfig, REPPOConfig, TrainingConfig
 
 
 class StateIndependentScale(nn.Module):
@@ -59,32 +27,129 @@ class StateIndependentScale(nn.Module):
         return torch.cat([loc, self.log_std.expand_as(loc)], dim=-1)
 
 
-def make_actor_critic(
-    config: PPOConfig, observation_size: int, action_spec: TensorSpec
-) -> tuple[ProbabilisticActor, ValueOperator, ObservationNorm]:
-    """Makes a tanh-normal actor and a critic that share their observation norm.
+class ValueBins(nn.Module):
+    """Returns as distributions over evenly spaced bins (HL-Gauss: Imani and White, 2018; Farebrother et al., 2024).
 
-    The actor reads ``observation`` and writes ``loc``, ``scale``, ``action`` and ``action_log_prob``; the critic writes
-    ``state_value``.
+    Args:
+        low: return that the center of the first bin stands for.
+        high: return that the center of the last bin stands for.
+        count: number of bins.
     """
-    device = action_spec.device
-    action_size = action_spec.shape[-1]
-    layers = {"num_cells": list(config.hidden), "activation_class": nn.SiLU, "device": device}
-    norm = ObservationNorm(observation_size).to(device)
-    scale = StateIndependentScale(action_size, config.init_std).to(device)
-    mean = MLP(in_features=observation_size, out_features=action_size, **layers)
-    nn.init.orthogonal_(mean[-1].weight, gain=0.01)
-    actor = ProbabilisticActor(
-        TensorDictModule(
-            nn.Sequential(norm, mean, scale, NormalParamExtractor("exp")),
-            in_keys=["observation"],
-            out_keys=["loc", "scale"],
-        ),
+
+    SPREAD = 0.75
+    """Standard deviation of a target, in widths of a bin."""
+
+    centers: torch.Tensor
+    edges: torch.Tensor
+
+    def __init__(self, low: float, high: float, count: int) -> None:
+        super().__init__()
+        half = (high - low) / (count - 1) / 2
+        self.register_buffer("centers", torch.linspace(low, high, count), persistent=False)
+        self.register_buffer("edges", torch.linspace(low - half, high + half, count + 1), persistent=False)
+        self.low, self.high, self.sigma = low, high, 2 * half * self.SPREAD
+
+    def encode(self, returns: torch.Tensor) -> torch.Tensor:
+        """Returns the probabilities, shape ``(..., count)``, of a Gaussian about each return of shape ``(...)``."""
+        returns = returns.clamp(self.low, self.high).unsqueeze(-1)
+        below = torch.erf((self.edges - returns) / (math.sqrt(2.0) * self.sigma))
+        return below.diff(dim=-1) / (below[..., -1:] - below[..., :1])
+
+    def decode(self, logits: torch.Tensor) -> torch.Tensor:
+        """Returns the mean, shape ``(...)``, of distributions given as logits of shape ``(..., count)``."""
+        return logits.softmax(-1) @ self.centers
+
+
+class DistributionalQ(nn.Module):
+    """Critic of actions whose output is a distribution over returns, with a second head that foresees features.
+
+    Args:
+        norm: normalises observations.
+        sizes: length of an observation and of an action.
+        hidden: widths of the encoder's layers; the heads have one hidden layer of the last width.
+        bins: what the logits stand for.
+    """
+
+    def __init__(self, norm: ObservationNorm, sizes: tuple[int, int], hidden: tuple[int, ...], bins: ValueBins) -> None:
+        super().__init__()
+        self.norm, self.bins = norm, bins
+        width = hidden[-1]
+        self.encoder = nn.Sequential(*normed_layers(sum(sizes), hidden), nn.Linear(width, width))
+        last = nn.Linear(width, len(bins.centers))
+        with torch.no_grad():  # begin at a return of zero
+            last.bias.add_(40.0 * bins.encode(torch.zeros(())))
+        self.value_head = nn.Sequential(nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), last)
+        self.foresight = nn.Sequential(
+            nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), nn.Linear(width, width)
+        )
+
+    def forward(self, observation: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns logits of shape ``(..., count)`` and the foreseen features of shape ``(..., hidden[-1])``."""
+        features = self.encoder(torch.cat([self.norm(observation), action], dim=-1))
+        return self.value_head(features), self.foresight(features)
+
+    def value_and_features(self, observation: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the mean return, shape ``(...)``, and the features, shape ``(..., hidden[-1])``."""
+        features = self.encoder(torch.cat([self.norm(observation), action], dim=-1))
+        return self.bins.decode(self.value_head(features)), features
+
+
+def normed_layers(inputs: int, hidden: tuple[int, ...]) -> list[nn.Module]:
+    """Returns layers of the given widths, each with layer norm and SiLU."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), nn.LayerNorm(width), nn.SiLU()]
+        inputs = width
+    return layers
+
+
+def make_actor(config: TrainingConfig, network: nn.Module, log_prob: bool) -> ProbabilisticActor:
+    """Wraps a network that gives means and log deviations into a tanh-normal actor.
+
+    It reads ``observation`` and writes ``loc``, ``scale``, ``action`` and, if asked to, ``action_log_prob``.
+    """
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
-        spec=action_spec,
+        spec=Bounded(-1.0, 1.0, (config.action_size,), device=config.device, dtype=torch.float32),
         distribution_class=TanhNormal,
-        return_log_prob=True,
-    )
-    value = MLP(in_features=observation_size, out_features=1, **layers)
+        return_log_prob=log_prob,
+    ).to(config.device)
+
+
+def make_actor_critic(config: PPOConfig) -> tuple[ProbabilisticActor, ValueOperator, ObservationNorm]:
+    """Makes the actor and the critic of PPO, which share their observation norm; the critic writes ``state_value``."""
+    layers = {"num_cells": list(config.hidden), "activation_class": nn.SiLU}
+    norm = ObservationNorm(config.observation_size)
+    mean = MLP(in_features=config.observation_size, out_features=config.action_size, **layers)
+    nn.init.orthogonal_(mean[-1].weight, gain=0.01)
+    scale = StateIndependentScale(config.action_size, config.init_std)
+    actor = make_actor(config, nn.Sequential(norm, mean, scale, NormalParamExtractor("exp")), log_prob=True)
+    value = MLP(in_features=config.observation_size, out_features=1, **layers)
     critic = ValueOperator(nn.Sequential(norm, value), in_keys=["observation"])
-    return actor, critic, norm
+    return actor, critic.to(config.device), norm
+
+
+def make_actor_q(config: REPPOConfig) -> tuple[ProbabilisticActor, DistributionalQ, ObservationNorm]:
+    """Makes the actor and the critic of REPPO, which share their observation norm."""
+    norm = ObservationNorm(config.observation_size)
+    head = nn.Linear(config.hidden[-1], 2 * config.action_size)
+    body = normed_layers(config.observation_size, config.hidden)
+    actor = make_actor(config, nn.Sequential(norm, *body, head, NormalParamExtractor("exp")), log_prob=False)
+    bins = ValueBins(0.0, config.max_value, config.num_bins)
+    critic = DistributionalQ(norm, (config.observation_size, config.action_size), config.hidden, bins)
+    return actor, critic.to(config.device), norm
+
+
+def deterministic(actor: ProbabilisticActor, config: TrainingConfig, info: dict[str, Any]) -> Policy:
+    """Returns the policy that takes the mode of an actor's actions, without what only training needs.
+
+    Its info holds the settings of the training, and ``info`` on top.
+    """
+    kinds = (ObservationNorm, nn.Linear, nn.LayerNorm, nn.SiLU)
+    *layers, last = (copy.deepcopy(module) for module in actor.modules() if isinstance(module, kinds))
+    head = nn.Linear(config.hidden[-1], config.action_size)  # the mean's rows of the last layer
+    head.load_state_dict({name: value[: config.action_size] for name, value in last.state_dict().items()})
+    settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "device")}
+    network = nn.Sequential(*layers, head.to(config.device), nn.Tanh())
+    return Policy(network, {"algorithm": config.algorithm, **settings, **info})

@@ -5,21 +5,24 @@ import dataclasses
 import itertools
 import json
 import pickle
+import shutil
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import torch
 
-from torchrl_loco.training.presets import PPOConfig
+from torchrl_loco.envs.checks import check_device
+from torchrl_loco.training.config import CONFIGS, TrainingConfig
 
-CHECKPOINT_VERSION = 1
+CHECKPOINT_VERSION = 2
+ROOM_NEEDED = 200 * 2**20
+"""Bytes that a run may need: checkpoints, video, metrics."""
 
 
 class RunFolder:
-    """A run on disk: ``config.json``, ``metrics.csv``, ``checkpoint.pt``, ``evaluation.json``, ``learning_curve.png``
-    and ``video.mp4``.
+    """A run on disk: ``config.json``, ``metrics.csv``, ``tensorboard/``, ``evaluations.csv``, ``checkpoint.pt``,
+    ``policy.safetensors``, ``learning_curve.png`` and ``video.mp4``.
 
     Args:
         path: an existing folder of a run.
@@ -34,11 +37,20 @@ class RunFolder:
             raise FileNotFoundError(f"{self.path} is no run folder: it has no config.json")
 
     @classmethod
-    def create(cls, config: PPOConfig) -> "RunFolder":
-        """Makes a new folder for a run in ``config.out``, named after task, time and seed."""
+    def create(cls, config: TrainingConfig) -> "RunFolder":
+        """Makes a new folder for a run in ``config.out``, named after task, time and seed.
+
+        Raises:
+            ValueError: the device is not here.
+            OSError: the folder cannot be made, or the disk has no room for a run.
+        """
+        check_device(config.device)
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         name = f"{config.task}-{stamp}-seed{config.seed}"
         Path(config.out).mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(config.out).free
+        if free < ROOM_NEEDED:
+            raise OSError(f"{config.out} has {free / 2**20:.0f} MiB left, a run may need {ROOM_NEEDED / 2**20:.0f} MiB")
         for suffix in itertools.count(1):  # runs may start within the same second
             path = Path(config.out) / (name if suffix == 1 else f"{name}-{suffix}")
             try:
@@ -46,23 +58,59 @@ class RunFolder:
                 break
             except FileExistsError:
                 continue
-        (path / "config.json").write_text(json.dumps(dataclasses.asdict(config), default=str, indent=2) + "\n")
+        values = {"algorithm": config.algorithm, **dataclasses.asdict(config)}
+        (path / "config.json").write_text(json.dumps(values, default=str, indent=2) + "\n")
         return cls(path)
 
-    def load_config(self, **overrides: Any) -> PPOConfig:
+    def load_config(self, **overrides: Any) -> TrainingConfig:
         """Returns the settings of the run, with ``overrides`` on top, such as ``device="cpu"`` for a run from CUDA."""
         values = json.loads((self.path / "config.json").read_text())
         values.update(out=Path(values["out"]), hidden=tuple(values["hidden"]))
-        return PPOConfig(**{**values, **overrides})
+        return CONFIGS[values.pop("algorithm")](**{**values, **overrides})
 
     @property
     def video(self) -> Path:
         """Where the video lies."""
         return self.path / "video.mp4"
 
+    @property
+    def policy(self) -> Path:
+        """Where the trained policy lies, without what only training needs."""
+        return self.path / "policy.safetensors"
+
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Adds a line to ``metrics.csv``."""
-        path = self.path / "metrics.csv"
+        self._append("metrics.csv", row)
+
+    def append_evaluation(self, row: dict[str, Any]) -> None:
+        """Adds a line to ``evaluations.csv``."""
+        self._append("evaluations.csv", row)
+
+    def read_metrics(self) -> dict[str, list[float]]:
+        """Returns the columns of ``metrics.csv``.
+
+        Raises:
+            ValueError: there is no line yet.
+        """
+        rows = self._read("metrics.csv")
+        if not rows:
+            raise ValueError(f"{self.path} has no metrics yet")
+        return {key: [row[key] for row in rows] for key in rows[0]}
+
+    def read_evaluations(self) -> list[dict[str, float]]:
+        """Returns the lines of ``evaluations.csv``, none if there was no evaluation yet."""
+        return self._read("evaluations.csv")
+
+    def forget_after(self, frames: int) -> None:
+        """Removes the lines of metrics and evaluations after so many frames: a resumed run writes them again."""
+        for name in ("metrics.csv", "evaluations.csv"):
+            rows = [row for row in self._read(name) if row["frames"] <= frames]
+            (self.path / name).unlink(missing_ok=True)
+            for row in rows:
+                self._append(name, row)
+
+    def _append(self, name: str, row: dict[str, Any]) -> None:
+        path = self.path / name
         new = not path.exists()
         with path.open("a", newline="") as file:
             writer = csv.DictWriter(file, row)
@@ -70,11 +118,12 @@ class RunFolder:
                 writer.writeheader()
             writer.writerow(row)
 
-    def read_metrics(self) -> dict[str, list[float]]:
-        """Returns the columns of ``metrics.csv``."""
-        with (self.path / "metrics.csv").open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        return {key: [float(row[key]) for row in rows] for key in rows[0]}
+    def _read(self, name: str) -> list[dict[str, float]]:
+        path = self.path / name
+        if not path.exists():
+            return []
+        with path.open(newline="") as file:
+            return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
 
     def save_checkpoint(self, entries: dict[str, Any]) -> None:
         """Writes the checkpoint; a crash while writing leaves the previous one."""
@@ -100,37 +149,3 @@ class RunFolder:
         if version != CHECKPOINT_VERSION:
             raise ValueError(f"{path} has version {version}, this release reads {CHECKPOINT_VERSION}")
         return entries
-
-    def save_evaluation(self, summary: dict[str, float]) -> None:
-        """Writes the summary of the evaluation."""
-        (self.path / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
-
-    def plot_learning_curve(self, evaluation: dict[str, float] | None = None) -> None:
-        """Draws return against frames, with the evaluation at the end if there is one."""
-        matplotlib.use("agg")
-        from matplotlib import pyplot as plt
-
-        metrics, config = self.read_metrics(), self.load_config()
-        figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
-        millions = [frames / 1e6 for frames in metrics["frames"]]
-        label = f"training (sampled actions, episodes of {config.episode_length} steps)"
-        axes.plot(millions, metrics["return"], label=label)
-        if evaluation is not None:
-            axes.errorbar(
-                millions[-1],
-                evaluation["mean"],
-                evaluation["std"],
-                fmt="o",
-                capsize=4,
-                label=f"evaluation: {evaluation['mean']:.0f} over {evaluation['episodes']} episodes",
-            )
-        axes.set(
-            xlabel="frames (million)",
-            ylabel="return of 1000 steps",
-            title=f"{config.task}, {config.protocol}, {metrics['seconds'][-1]:.0f} s on {config.device}",
-            ylim=(0, 1000),
-        )
-        axes.grid(alpha=0.3)
-        axes.legend(loc="lower right")
-        figure.savefig(self.path / "learning_curve.png", dpi=150)
-        plt.close(figure)

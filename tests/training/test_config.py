@@ -1,22 +1,25 @@
 """Presets are valid, and wrong settings are named."""
 
-import dataclasses
 import inspect
 
 import pytest
 
-from torchrl_loco.training import PPOConfig, preset
+from torchrl_loco.training import PPOConfig, REPPOConfig, TrainingConfig, preset
 
 
-def test_a_preset_for_every_task(task):
-    config = preset(task, "cpu")
+@pytest.mark.parametrize("algorithm", [None, "ppo", "reppo"])
+def test_a_preset_for_every_task(task, algorithm):
+    config = preset(task, "cpu", algorithm)
     assert config.task == task
+    assert config.algorithm == (algorithm or "ppo")
     assert config.total_frames >= config.frames_per_batch == config.num_envs * config.decisions * config.action_repeat
 
 
 @pytest.mark.parametrize(
     ("overrides", "error", "message"),
     [
+        ({"eval_interval": -1}, ValueError, "eval_interval .* must be an integer of at least 1"),
+        ({"final_lr": 1.5}, ValueError, r"final_lr must lie in \[0, 1\]"),
         ({"num_envs": 0}, ValueError, "num_envs must be an integer of at least 1"),
         ({"epochs": 1.5}, TypeError, "epochs must be an integer"),
         ({"gamma": 1.2}, ValueError, r"gamma must lie in \(0, 1\]"),
@@ -40,8 +43,29 @@ def test_wrong_settings(overrides, error, message):
         PPOConfig(**{"task": "walker_stand", **overrides})
 
 
-def test_every_setting_is_documented():
-    lines = inspect.getsource(PPOConfig).splitlines()
-    for field in dataclasses.fields(PPOConfig):
-        at = next(i for i, line in enumerate(lines) if line.startswith(f"    {field.name}:"))
-        assert lines[at + 1].strip().startswith('"""'), field.name
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"kl_bound": 0.0}, r"kl_bound must lie in \(0, inf\]"),
+        ({"num_bins": 0}, "num_bins must be an integer of at least 1"),
+        ({"target_entropy": float("nan")}, r"target_entropy must lie in"),
+    ],
+)
+def test_wrong_settings_of_reppo(overrides, message):
+    with pytest.raises(ValueError, match=message):
+        REPPOConfig("walker_stand", **overrides)
+
+
+def test_unknown_algorithm():
+    with pytest.raises(ValueError, match="did you mean 'reppo'"):
+        preset("walker_stand", "cpu", "repo")
+
+
+@pytest.mark.parametrize("config", [TrainingConfig, PPOConfig, REPPOConfig])
+def test_every_setting_is_documented(config):
+    lines = inspect.getsource(config).splitlines()
+    for name in config.__annotations__:
+        if name == "algorithm":
+            continue
+        at = next(i for i, line in enumerate(lines) if line.startswith(f"    {name}:"))
+        assert lines[at + 1].strip().startswith('"""'), name

@@ -1,0 +1,62 @@
+"""Time to a return, from the start of the process, beside Brax's PPO on Playground on the same device."""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from benchmarks.peers import environment_with
+from benchmarks.processes import MeasurementError, run_json
+from benchmarks.results import Row
+from torchrl_loco.training import RunFolder
+
+COLUMNS = {"task": "", "trainer": "", "frames": "d", "seconds": ".1f", "mean": ".1f", "error": ""}
+EVALUATIONS = 20
+"""How often ours is evaluated; each takes a few seconds, which count."""
+
+
+def training(tasks: Sequence[str], device: torch.device, frames: int, peer: bool, path: Path | None) -> list[Row]:
+    """Trains each task in processes of their own; returns a row for each evaluation.
+
+    Args:
+        tasks: ids of environments.
+        device: where to train.
+        frames: frames of our runs; the peer's are set by its own settings.
+        peer: whether to train the peer too.
+        path: folder with the peer's packages.
+    """
+    rows: list[Row] = []
+    for task in tasks:
+        rows += [{"task": task, "trainer": "ours", **row} for row in ours(task, device, frames)]
+        if peer:
+            try:
+                arguments = ["benchmarks.peers.playground_ppo", task, time.time()]
+                evaluations = run_json(arguments, environment_with(path))["evaluations"]
+            except MeasurementError as error:
+                evaluations = [{"error": str(error)}]
+            rows += [{"task": task, "trainer": "brax ppo on playground", **row} for row in evaluations]
+    return rows
+
+
+def ours(task: str, device: torch.device, frames: int) -> list[Row]:
+    """Runs our command and notes when each evaluation is written."""
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as out:
+        options = {"total_frames": frames, "eval_interval": frames // EVALUATIONS, "video_seconds": 0, "out": out}
+        command = [sys.executable, "-m", "torchrl_loco", "train", task, f"--device={device}"]
+        started = time.time()
+        process = subprocess.Popen([*command, *(f"--{key}={value}" for key, value in options.items())], env=os.environ)
+        while process.poll() is None:
+            time.sleep(0.05)
+            for folder in Path(out).glob("*/evaluations.csv"):
+                for row in RunFolder(folder.parent).read_evaluations()[len(rows) :]:
+                    seconds = time.time() - started
+                    rows.append({"frames": int(row["frames"]), "seconds": seconds, "mean": row["mean"]})
+        if process.returncode:
+            raise MeasurementError(f"training {task} ended with status {process.returncode}")
+    return rows

@@ -1,0 +1,68 @@
+"""Policies on disk: small, exact enough, and safe to load."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+import torchrl_loco
+from torchrl_loco.policy import SHIPPED, ObservationNorm, Policy
+
+INFO = {"task": "walker_stand", "protocol": "playground", "action_repeat": 2, "mean": 12.5}
+
+
+@pytest.fixture
+def policy():
+    torch.manual_seed(0)
+    norm = ObservationNorm(24)
+    norm.update(torch.randn(1000, 24) * 100 + 7)
+    network = nn.Sequential(norm, nn.Linear(24, 32), nn.LayerNorm(32), nn.SiLU(), nn.Linear(32, 6), nn.Tanh())
+    return Policy(network, INFO)
+
+
+def test_round_trip(policy, tmp_path):
+    policy.save(tmp_path / "policy.safetensors")
+    again = Policy.load(tmp_path / "policy.safetensors", "cpu")
+    assert again.info == INFO
+    env = torchrl_loco.make("walker_stand", 16, "cpu", seed=0)
+    td = env.reset()
+    torch.testing.assert_close(again(td.clone())["action"], policy(td.clone())["action"], atol=1e-3, rtol=0)
+    assert env.rollout(3, again)["action"].abs().max() <= 1
+
+
+def test_what_cannot_be_read_is_told(policy, tmp_path):
+    with pytest.raises(FileNotFoundError, match="there is no policy"):
+        Policy.load(tmp_path / "none.safetensors", "cpu")
+    path = tmp_path / "policy.safetensors"
+    path.write_bytes(b"no tensors at all")
+    with pytest.raises(ValueError, match="cannot be read as a policy"):
+        Policy.load(path, "cpu")
+    policy.save(path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match="cannot be read as a policy"):
+        Policy.load(path, "cpu")
+    save_file({"0.mean": torch.zeros(3)}, path)
+    with pytest.raises(ValueError, match="its format is None"):
+        Policy.load(path, "cpu")
+    metadata = {"format": "torchrl_loco policy 1", "layers": json.dumps(["os.system"]), "info": "{}"}
+    save_file({"0.weight": torch.zeros(3)}, path, metadata)
+    with pytest.raises(ValueError, match=r"unknown layer 'os.system'"):
+        Policy.load(path, "cpu")
+
+
+def test_unknown_task():
+    with pytest.raises(ValueError, match="did you mean 'walker_walk'"):
+        torchrl_loco.load_policy("walker_wlak")
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.safetensors")), ids=lambda path: path.stem)
+def test_shipped_policies(path):
+    """Each is small, belongs to its task, and earns on the CPU what it is said to earn on the GPU."""
+    assert path.stat().st_size < 1e6
+    policy = torchrl_loco.load_policy(path.stem, "cpu")
+    assert policy.info["task"] == path.stem
+    env = torchrl_loco.make(path.stem, 4, "cpu", seed=1, protocol=policy.info["protocol"])
+    returns = env.rollout(1000, policy)["next", "reward"].sum(dim=1)
+    assert returns.mean() > policy.info["mean"] - 3 * policy.info["std"] - 20

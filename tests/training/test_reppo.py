@@ -1,0 +1,147 @@
+"""REPPO's parts against values computed by hand or by torch's distributions."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.distributions import Independent, Normal, TransformedDistribution, kl_divergence
+from torch.distributions.transforms import TanhTransform
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import torchrl_loco
+from torchrl_loco.training import preset
+from torchrl_loco.training.networks import ValueBins
+from torchrl_loco.training.reppo import REPPO, kl, sample
+
+
+def made(**overrides):
+    settings = {"num_envs": 1, "decisions": 4, "minibatch_size": 4, "total_frames": 10_000, "epochs": 1, **overrides}
+    torch.manual_seed(0)
+    return REPPO(preset("walker_stand", "cpu", "reppo", hidden=(32,), **settings))
+
+
+def test_bins_keep_a_return():
+    bins = ValueBins(0.0, 150.0, 151)
+    returns = torch.tensor([5.0, 17.3, 99.99, 140.0])
+    encoded = bins.encode(returns)
+    torch.testing.assert_close(encoded.sum(-1), torch.ones(4))
+    torch.testing.assert_close(bins.decode(encoded.log()), returns, atol=1e-3, rtol=0)
+    spread = (encoded * (bins.centers - returns.unsqueeze(-1)).square()).sum(-1).sqrt()
+    torch.testing.assert_close(spread, torch.full((4,), math.sqrt(0.75**2 + 1 / 12)), atol=1e-2, rtol=0)
+
+
+def test_bins_clip_what_lies_beyond():
+    bins = ValueBins(0.0, 10.0, 11)
+    torch.testing.assert_close(bins.encode(torch.tensor([-5.0, 99.0])), bins.encode(torch.tensor([0.0, 10.0])))
+
+
+def test_critic_begins_at_zero():
+    reppo = made()
+    value, _ = reppo.critic.value_and_features(torch.randn(50, 24), torch.rand(50, 6))
+    assert value.max() < 1.0
+
+
+def test_log_probability_is_that_of_the_squashed_normal():
+    loc, scale = torch.randn(100, 6), torch.rand(100, 6) + 0.1
+    action, log_prob = sample(loc.double(), scale.double())
+    reference = TransformedDistribution(Independent(Normal(loc.double(), scale.double()), 1), TanhTransform())
+    inside = (action.abs() < 0.999).all(-1)  # beyond, atanh of the action loses what the reference needs
+    assert inside.sum() > 50
+    torch.testing.assert_close(log_prob[inside], reference.log_prob(action)[inside], atol=1e-5, rtol=1e-5)
+    assert sample(torch.full((1, 6), 30.0), torch.ones(1, 6))[1].isfinite().all()
+
+
+def test_divergence_is_that_of_the_normals():
+    old, new = ((torch.randn(50, 6), torch.rand(50, 6) + 0.2) for _ in range(2))
+    expected = kl_divergence(Independent(Normal(*old), 1), Independent(Normal(*new), 1))
+    torch.testing.assert_close(kl(*old, *new), expected, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(kl(*old, *old), torch.zeros(50))
+
+
+def test_soft_returns_by_hand(monkeypatch):
+    """Four steps of one world: an ordinary one, a truncated one, a terminated one, an ordinary one."""
+    gamma, lmbda, temperature = 0.9, 0.8, 0.5
+    reppo = made(gamma=gamma, lmbda=lmbda, reward_scale=2.0, init_temperature=temperature)
+    log_prob = torch.tensor([[-1.0, -2.0, -3.0, -4.0]])
+    monkeypatch.setattr("torchrl_loco.training.reppo.sample", lambda loc, scale: (torch.zeros(1, 4, 6), log_prob))
+    reppo.critic.value_and_features = lambda observation, action: (observation[..., 0], torch.zeros(1, 4, 32))
+    reward, next_value = torch.tensor([0.5, 0.25, 1.0, 0.75]), torch.tensor([2.0, 5.0, 7.0, 6.0])
+    truncated = torch.tensor([False, True, False, False])
+    terminated = torch.tensor([False, False, True, False])
+    after = torch.zeros(1, 4, 24)
+    after[0, :, 0] = next_value
+    zeros = {name: torch.zeros(1, 4, 6) for name in ("action", "loc", "scale")}
+    td = TensorDict(
+        {
+            "observation": torch.zeros(1, 4, 24),
+            **zeros,
+            "next": {
+                "observation": after,
+                "reward": reward.view(1, 4, 1),
+                "done": (truncated | terminated).view(1, 4, 1),
+                "terminated": terminated.view(1, 4, 1),
+            },
+        },
+        batch_size=[1, 4],
+    )
+    with torch.no_grad():
+        data = reppo.prepare(td)
+    g3 = 2 * 0.75 + gamma * (6.0 + temperature * 4.0)
+    g2 = 2 * 1.0  # nothing follows a termination, no entropy either
+    g1 = 2 * 0.25 + gamma * (5.0 + temperature * 2.0)  # at the time limit, the terminal observation's value follows
+    g0 = 2 * 0.5 + gamma * (temperature * 1.0 + (1 - lmbda) * 2.0 + lmbda * g1)
+    torch.testing.assert_close(data["returns"], torch.tensor([[g0, g1, g2, g3]]))
+    assert data["alive"].tolist() == [[1.0, 1.0, 0.0, 1.0]]
+
+
+def collected(reppo, num_envs):
+    env = torchrl_loco.make("walker_stand", num_envs, "cpu", seed=0)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        return env.rollout(reppo.config.decisions, reppo.actor)
+
+
+def test_updates_raise_what_is_rewarded():
+    """Rewarded for the first joint alone, the actor moves that joint."""
+    reppo = made(num_envs=64, decisions=8, minibatch_size=128, epochs=8, lr=1e-3, gamma=0.5, reward_scale=10.0)
+    for _ in range(24):
+        batch = collected(reppo, 64)
+        batch["next", "reward"] = batch["action"][..., :1] + 1.0
+        reppo.update(batch, progress=0.0)
+    mean = torch.tanh(batch["loc"]).mean(dim=(0, 1))
+    assert mean[0] > 0.5
+    assert mean[1:].mean().abs() < mean[0] / 2
+
+
+def test_the_actor_is_drawn_back_where_it_went_too_far():
+    """With a bound that is always exceeded, the critic's gradient counts for nothing."""
+    reppo = made(num_envs=16, decisions=8, minibatch_size=128, kl_bound=1e-12, init_kl_weight=1.0, lr=1e-3)
+    batch = collected(reppo, 16)
+    batch["loc"] += 0.3  # as if the policy that collected had been another
+    before = kl(batch["loc"], batch["scale"], *reppo.distribution(batch["observation"])).mean()
+    data = reppo.prepare(batch).detach().reshape(-1)
+    reppo.critic.value_and_features = lambda observation, action: (1e6 * action.sum(-1), None)
+    for _ in range(20):
+        reppo._actor_step(data)
+    after = kl(batch["loc"], batch["scale"], *reppo.distribution(batch["observation"])).mean()
+    assert after < before / 2
+
+
+@pytest.mark.parametrize(("aim", "rises"), [(5.0, True), (-50.0, False)])
+def test_temperature_rises_while_entropy_is_too_low(aim, rises):
+    reppo = made(num_envs=16, decisions=8, minibatch_size=128, target_entropy=aim)
+    batch = collected(reppo, 16)
+    reppo.update(batch, progress=0.0)
+    temperature = reppo.weights.temperature.item()
+    assert (temperature > reppo.config.init_temperature) == rises
+
+
+def test_the_actors_step_leaves_the_critic_alone():
+    reppo = made(num_envs=16, decisions=8, minibatch_size=128)
+    batch = collected(reppo, 16)
+    with torch.no_grad():
+        data = reppo.prepare(batch).reshape(-1)
+    before = {name: value.clone() for name, value in reppo.critic.state_dict().items()}
+    reppo._actor_step(data)
+    assert all(torch.equal(value, before[name]) for name, value in reppo.critic.state_dict().items())
+    assert all(parameter.grad is None for parameter in reppo.critic.parameters())

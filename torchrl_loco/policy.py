@@ -1,0 +1,157 @@
+"""Trained policies, in files that hold tensors and settings and nothing to execute."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from tensordict.nn import TensorDictModule
+from torch import nn
+
+from torchrl_loco.envs.checks import check_device
+from torchrl_loco.registry import env_class, list_envs
+
+SHIPPED = Path(__file__).parent / "policies"
+FORMAT = "torchrl_loco policy 1"
+
+
+class ObservationNorm(nn.Module):
+    """Shifts and scales observations by the mean and variance of all that :meth:`update` saw.
+
+    Args:
+        size: length of an observation.
+        limit: bound of the result; what lies beyond is clipped.
+    """
+
+    mean: torch.Tensor
+    var: torch.Tensor
+    count: torch.Tensor
+
+    def __init__(self, size: int, limit: float = 10.0) -> None:
+        super().__init__()
+        self.limit = limit
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("var", torch.ones(size))
+        self.register_buffer("count", torch.zeros(()))
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Normalises observations of shape ``(..., size)``."""
+        return ((observation - self.mean) * torch.rsqrt(self.var + 1e-6)).clamp(-self.limit, self.limit)
+
+    @torch.no_grad()
+    def update(self, observation: torch.Tensor) -> None:
+        """Takes observations of shape ``(..., size)`` into mean and variance (Chan's parallel formula)."""
+        batch = observation.flatten(0, -2)
+        var, mean = torch.var_mean(batch, dim=0, correction=0)
+        total = self.count + len(batch)
+        share = len(batch) / total
+        delta = mean - self.mean
+        self.var.lerp_(var, share).add_(delta.square() * share * (1 - share))
+        self.mean.add_(delta * share)
+        self.count.copy_(total)
+
+
+class Policy(TensorDictModule):
+    """A deterministic policy: reads ``observation``, shape ``(..., n)``, and writes ``action`` in [-1, 1].
+
+    Args:
+        network: an :class:`ObservationNorm`, then linear layers, layer norms and SiLUs, at the end a tanh.
+        info: ``task``, ``protocol``, ``action_repeat`` and whatever else is known of it, such as its return.
+    """
+
+    def __init__(self, network: nn.Sequential, info: dict[str, Any]) -> None:
+        super().__init__(network, in_keys=["observation"], out_keys=["action"])
+        self.info = info
+
+    def save(self, path: Path) -> None:
+        """Writes the policy in half precision, which moves an action by less than a thousandth."""
+        layers = [_LAYER_NAMES[type(layer)] for layer in self.module]
+        metadata = {"format": FORMAT, "layers": json.dumps(layers), "info": json.dumps(self.info)}
+        tensors = {  # the observation's statistics span more than half precision does
+            name: tensor.detach().cpu().contiguous().to(torch.float32 if name.startswith("0.") else torch.float16)
+            for name, tensor in self.module.state_dict().items()
+        }
+        save_file(tensors, path, metadata)
+
+    @classmethod
+    def load(cls, path: Path, device: torch.device | str | None = None) -> "Policy":
+        """Reads a policy without executing code.
+
+        Args:
+            path: a file that :meth:`save` wrote.
+            device: where it computes; ``None`` takes CUDA if there is any.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it is no policy, or of another version.
+        """
+        device = check_device(device)
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"there is no policy {path}")
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
+            if metadata.get("format") != FORMAT:
+                raise ValueError(f"its format is {metadata.get('format')!r}, this release reads {FORMAT!r}")
+            network = nn.Sequential(*map(_make_layer, *_with_tensors(json.loads(metadata["layers"]), tensors)))
+            network.load_state_dict(tensors)
+            info = json.loads(metadata["info"])
+        except (SafetensorError, ValueError, KeyError, RuntimeError, OSError) as error:
+            raise ValueError(f"{path} cannot be read as a policy: {error}") from error
+        return cls(network.to(device).requires_grad_(False), info)
+
+
+_LAYER_NAMES: dict[type[nn.Module], str] = {
+    ObservationNorm: "observation_norm",
+    nn.Linear: "linear",
+    nn.LayerNorm: "layer_norm",
+    nn.SiLU: "silu",
+    nn.Tanh: "tanh",
+}
+
+
+def _with_tensors(layers: list[str], tensors: dict[str, torch.Tensor]) -> tuple[list[str], list[torch.Tensor | None]]:
+    """Returns for each layer its name and the tensor that tells its size."""
+    sized = [tensors.get(f"{i}.weight", tensors.get(f"{i}.mean")) for i in range(len(layers))]
+    return layers, sized
+
+
+def _make_layer(name: str, sized: torch.Tensor | None) -> nn.Module:
+    if name == "silu":
+        return nn.SiLU()
+    if name == "tanh":
+        return nn.Tanh()
+    if sized is None:
+        raise ValueError(f"a layer {name!r} without tensors")
+    if name == "observation_norm":
+        return ObservationNorm(len(sized))
+    if name == "layer_norm":
+        return nn.LayerNorm(len(sized))
+    if name == "linear":
+        return nn.Linear(sized.shape[1], sized.shape[0])
+    raise ValueError(f"unknown layer {name!r}")
+
+
+def load_policy(task: str, device: torch.device | str | None = None) -> Policy:
+    """Loads the trained policy that comes with the package.
+
+    Args:
+        task: id of the environment.
+        device: where it computes; ``None`` takes CUDA if there is any.
+
+    Returns:
+        The policy. ``policy.info`` has the return that it reached, its protocol, frames, wall time, seed and settings;
+        hold its actions for ``policy.info["action_repeat"]`` frames.
+
+    Raises:
+        ValueError: there is no such task, or no policy for it.
+    """
+    name = next(name for name in list_envs() if env_class(name) is env_class(task))
+    path = SHIPPED / f"{name}.safetensors"
+    if not path.is_file():
+        shipped = sorted(p.stem for p in SHIPPED.glob("*.safetensors"))
+        raise ValueError(f"no policy for {name!r} comes with this release: choose one of {', '.join(shipped)}")
+    return Policy.load(path, device)

@@ -1,0 +1,158 @@
+"""What all algorithms share: gradient steps over the minibatches of a batch, recorded and replayed on CUDA."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import nn
+from torchrl.modules import ProbabilisticActor
+
+from torchrl_loco.training.config import TrainingConfig
+from torchrl_loco.training.networks import ObservationNorm
+
+
+class Algorithm(ABC):
+    """Improves an actor on one batch after another.
+
+    A subclass sets ``actor``, ``norm`` and ``networks``, turns a batch into what gradient steps need (:meth:`prepare`)
+    and makes one gradient step (:meth:`gradient_step`).
+
+    Args:
+        config: the run's settings.
+    """
+
+    metric_names: ClassVar[tuple[str, ...]]
+    recordable: ClassVar[bool] = True
+    """Whether a gradient step can be recorded: that it copies nothing from the host."""
+
+    actor: ProbabilisticActor
+    norm: ObservationNorm
+    networks: nn.Module
+
+    def __init__(self, config: TrainingConfig) -> None:
+        self.config = config
+        self.device = torch.device(config.device)
+        self.optimizers: dict[str, torch.optim.Adam] = {}
+        self.generator = torch.Generator(config.device).manual_seed(config.seed)
+        self._indices = torch.zeros(config.minibatch_size, dtype=torch.long, device=config.device)
+        self._totals = torch.zeros(len(self.metric_names), device=config.device)
+        self._data: TensorDictBase | None = None
+        on_cuda = self.device.type == "cuda"
+        self._step = Replay(self._minibatch_step, self.device) if on_cuda and self.recordable else self._minibatch_step
+
+    @abstractmethod
+    def prepare(self, batch: TensorDictBase) -> TensorDictBase:
+        """Returns what gradient steps need of a batch of shape ``(num_envs, decisions)``, in the same shape."""
+
+    @abstractmethod
+    def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
+        """Makes one gradient step without reading the device; returns the metrics in the order of ``metric_names``."""
+
+    def make_optimizer(self, name: str, parameters: Iterable[nn.Parameter]) -> torch.optim.Adam:
+        """Makes an optimizer whose learning rate lives on the device, where recorded steps find it."""
+        on_cuda = self.device.type == "cuda"
+        lr = torch.tensor(self.config.lr, device=self.device)
+        optimizer = torch.optim.Adam(parameters, lr=lr, eps=1e-5, capturable=on_cuda, fused=on_cuda or None)
+        self.optimizers[name] = optimizer
+        return optimizer
+
+    def update(self, batch: TensorDictBase, progress: float) -> torch.Tensor:
+        """Updates on one batch, without synchronising with the device.
+
+        Args:
+            batch: experience of shape ``(num_envs, decisions)``.
+            progress: share of the run that is done, in [0, 1], which sets the learning rate.
+
+        Returns:
+            The mean of the metrics over all gradient steps, shape ``(len(metric_names),)``.
+        """
+        config = self.config
+        lr = config.lr * (1.0 - (1.0 - config.final_lr) * progress)
+        for optimizer in self.optimizers.values():
+            for group in optimizer.param_groups:
+                group["lr"].fill_(lr)
+        with torch.no_grad():
+            data = self.prepare(batch).reshape(-1)
+            if self._data is None:
+                self._data = data.clone()
+            else:
+                self._data.update_(data)
+        self._totals.zero_()
+        # A rest smaller than a minibatch is left out: it would weigh as much as a full one.
+        minibatches = len(data) // config.minibatch_size
+        for _ in range(config.epochs):
+            order = torch.randperm(len(data), generator=self.generator, device=self.device)
+            for indices in order[: minibatches * config.minibatch_size].split(config.minibatch_size):
+                self._indices.copy_(indices)
+                self._step()
+        self.norm.update(batch["observation"])  # after the update: the policy that collected stays what it was
+        return self._totals / (config.epochs * minibatches)
+
+    def _minibatch_step(self) -> None:
+        assert self._data is not None
+        self._totals += torch.stack([metric.detach() for metric in self.gradient_step(self._data[self._indices])])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that an exact continuation needs."""
+        return {
+            "networks": self.networks.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from a :meth:`state_dict`."""
+        self.networks.load_state_dict(state["networks"])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        self.generator.set_state(state["generator"].cpu())
+
+
+class Replay:
+    """Work without arguments on CUDA that is recorded as a graph and replayed.
+
+    ``tensordict.nn.CudaGraphModule`` waits for the device at every call; this does not.
+
+    Args:
+        work: reads and writes tensors that stay where they are.
+        device: a CUDA device.
+    """
+
+    WARMUP = 3  # calls that run as they are: optimizers and cuBLAS allocate at their first
+
+    def __init__(self, work: Callable[[], None], device: torch.device) -> None:
+        self._work = work
+        self._device = device
+        self._calls = 0
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self) -> None:
+        if self._calls < self.WARMUP:
+            self._calls += 1
+            side = torch.cuda.Stream(self._device)
+            side.wait_stream(torch.cuda.current_stream(self._device))
+            with torch.cuda.stream(side):
+                self._work()
+            torch.cuda.current_stream(self._device).wait_stream(side)
+            return
+        if self._graph is None:
+            torch.cuda.synchronize(self._device)
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph):
+                self._work()
+        self._graph.replay()
+
+
+def clip_and_step(optimizer: torch.optim.Optimizer, max_norm: float) -> torch.Tensor:
+    """Clips the gradients of an optimizer's parameters to a norm, makes its step, and returns the norm before."""
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    norm = nn.utils.clip_grad_norm_(parameters, max_norm)
+    optimizer.step()
+    return norm
+
+
+def flat(td: TensorDictBase, **entries: torch.Tensor) -> TensorDict:
+    """Returns a TensorDict of entries with the batch size of another."""
+    return TensorDict(entries, batch_size=td.batch_size)

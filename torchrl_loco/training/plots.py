@@ -1,0 +1,59 @@
+"""Learning curves as pictures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+
+from torchrl_loco.training.run_folder import RunFolder
+
+
+def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
+    """Draws return against frames; runs that differ in nothing but their seed share a line, their mean, and a band.
+
+    Evaluations are dots: the mean over episodes, with the standard deviation over episodes as a bar.
+
+    Raises:
+        ValueError: a run has no metrics yet.
+    """
+    matplotlib.use("agg")
+    from matplotlib import pyplot as plt
+
+    groups: dict[str, list[RunFolder]] = {}
+    for run in runs:
+        config = run.load_config()
+        label = f"{config.task}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds on {config.device}"
+        groups.setdefault(label, []).append(run)
+    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    for label, group in groups.items():
+        metrics = [run.read_metrics() for run in group]
+        length = min(len(m["frames"]) for m in metrics)
+        returns = np.array([m["return"][:length] for m in metrics])
+        millions = np.array(metrics[0]["frames"][:length]) / 1e6
+        seconds = np.mean([m["seconds"][-1] for m in metrics])
+        seeds = "" if len(group) == 1 else f", {len(group)} seeds"
+        (line,) = axes.plot(millions, returns.mean(0), label=f"{label}{seeds}, {seconds:.0f} s")
+        axes.fill_between(millions, returns.min(0), returns.max(0), color=line.get_color(), alpha=0.2, linewidth=0)
+        for run in group:
+            rows = run.read_evaluations()
+            axes.errorbar(
+                [row["frames"] / 1e6 for row in rows],
+                [row["mean"] for row in rows],
+                [row["std"] for row in rows],
+                fmt="o",
+                markersize=4,
+                capsize=3,
+                color=line.get_color(),
+            )
+    axes.set(
+        xlabel="frames (million)",
+        ylabel="return of 1000 steps",
+        title="line: sampled actions in training; dots: evaluations without exploration",
+        ylim=(0, 1000),
+    )
+    axes.title.set_fontsize("small")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", fontsize="small")
+    figure.savefig(picture, dpi=150)
+    plt.close(figure)

@@ -1,0 +1,257 @@
+"""The training loop: collect, update, write down; now and then evaluate and save; at the end draw and record."""
+
+import contextlib
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from torch.utils.tensorboard import SummaryWriter
+from torchrl.envs import EnvBase, FrameSkipTransform
+from tqdm.auto import tqdm
+
+from torchrl_loco.collector import RolloutCollector
+from torchrl_loco.envs.autoreset import TransformedEnv
+from torchrl_loco.envs.checks import check_count, check_seed
+from torchrl_loco.policy import Policy
+from torchrl_loco.registry import make
+from torchrl_loco.training.algorithm import Algorithm
+from torchrl_loco.training.config import TrainingConfig
+from torchrl_loco.training.evaluation import Evaluator, describe, record, summarize
+from torchrl_loco.training.networks import deterministic
+from torchrl_loco.training.plots import plot_runs
+from torchrl_loco.training.ppo import PPO
+from torchrl_loco.training.reppo import REPPO
+from torchrl_loco.training.run_folder import RunFolder
+
+ALGORITHMS: dict[str, Callable[[Any], Algorithm]] = {"ppo": PPO, "reppo": REPPO}
+
+EPISODE_LENGTH = 1000
+"""Control steps of an episode of all tasks, to which the mean reward in training is scaled up."""
+
+
+class Trainer:
+    """A run in progress: environment, algorithm, collector and counters.
+
+    Args:
+        run: where the settings are read from and everything is written to.
+        resume: whether to go on from the run's checkpoint, exactly: on the CPU, a run that was stopped and resumed
+            equals one that was not, bit for bit.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint to resume from.
+        ValueError: the checkpoint cannot be read, or the run is complete.
+    """
+
+    def __init__(self, run: RunFolder, resume: bool = False) -> None:
+        self.run = run
+        self.config = config = run.load_config()
+        checkpoint = run.load_checkpoint(config.device) if resume else None
+        torch.manual_seed(config.seed)
+        self.env = make_env(config)
+        self.algorithm = ALGORITHMS[config.algorithm](config)
+        self.collector = RolloutCollector(self.env, self.algorithm.actor, frames_per_batch=config.batch_size)
+        self.frames, self.iteration, self.seconds = 0, 0, 0.0
+        if checkpoint is not None:
+            self._load(checkpoint)
+        self._evaluator: Evaluator | None = None
+
+    def train(self) -> None:
+        """Trains to the last frame, then draws the learning curve and records a video.
+
+        A progress bar shows the return (mean reward of the last batch times the length of an episode) and the frames
+        per second. At Ctrl-C the iteration is finished and a checkpoint written before KeyboardInterrupt is raised; a
+        second one interrupts at once.
+        """
+        config = self.config
+        saved = time.perf_counter()
+        board = SummaryWriter(str(self.run.path / "tensorboard"), purge_step=self.frames)
+        bar = tqdm(total=config.total_frames, initial=self.frames, unit="frame", unit_scale=True, desc=config.task)
+        with tf32(), board, bar, interruptible() as interrupted:
+            while self.frames < self.last_frame:
+                row = self._iterate()
+                self.run.append_metrics(row)
+                for key, value in row.items():
+                    board.add_scalar(key, value, self.frames)
+                bar.set_postfix({"return": f"{row['return']:.0f}"}, refresh=False)
+                bar.update(config.frames_per_batch)
+                if self.frames >= self.last_frame or self._evaluation_is_due():
+                    board.add_scalar("evaluation", self._evaluate()["mean"], self.frames)
+                if interrupted() or time.perf_counter() - saved > config.checkpoint_seconds:
+                    self.save()
+                    saved = time.perf_counter()
+                if interrupted():
+                    plot_runs([self.run], self.run.path / "learning_curve.png")
+                    raise KeyboardInterrupt
+        self.save()
+        self._finish()
+
+    @property
+    def device_name(self) -> str:
+        """What the device calls itself."""
+        device = self.algorithm.device
+        return torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+
+    @property
+    def last_frame(self) -> int:
+        """Frames of a complete run: whole batches."""
+        return self.config.total_frames // self.config.frames_per_batch * self.config.frames_per_batch
+
+    def _iterate(self) -> dict[str, float]:
+        """Collects a batch and updates on it; reads from the device once."""
+        config, algorithm, start = self.config, self.algorithm, time.perf_counter()
+        batch = self.collector.rollout()
+        reward = batch["next", "reward"].mean() / config.action_repeat
+        metrics = algorithm.update(batch, progress=self.frames / config.total_frames)
+        mean_reward, *means = torch.cat([reward.view(1), metrics]).tolist()
+        self.frames += config.frames_per_batch
+        self.iteration += 1
+        seconds = time.perf_counter() - start
+        self.seconds += seconds
+        return {
+            "iteration": self.iteration,
+            "frames": self.frames,
+            "seconds": round(self.seconds, 3),
+            "frames_per_second": round(config.frames_per_batch / seconds, 1),
+            "return": round(mean_reward * EPISODE_LENGTH, 3),
+            **{name: round(value, 6) for name, value in zip(algorithm.metric_names, means, strict=True)},
+        }
+
+    def _evaluation_is_due(self) -> bool:
+        interval = self.config.eval_interval
+        return interval > 0 and self.frames % interval < self.config.frames_per_batch
+
+    def _evaluate(self) -> dict[str, float]:
+        """Evaluates the policy of the moment, and keeps it if none before it was better."""
+        if self._evaluator is None:
+            self._evaluator = make_evaluator(self.config, seed=evaluation_seed(self.config, 0))
+        when = {"frames": self.frames, "seconds": round(self.seconds, 3)}
+        policy = deterministic(self.algorithm.actor, self.config, {**when, "trained_on": self.device_name})
+        summary = summarize(self._evaluator(policy))
+        best = max((row["mean"] for row in self.run.read_evaluations()), default=-math.inf)
+        self.run.append_evaluation({**when, **summary})
+        if summary["mean"] >= best:
+            policy.save(self.run.policy)
+        return summary
+
+    def _finish(self) -> None:
+        """Evaluates the best policy anew, in episodes that did not choose it, draws the curve and records a video."""
+        config = self.config
+        policy = Policy.load(self.run.policy, config.device)
+        summary = evaluate_run(self.run)
+        policy.info |= summary
+        policy.save(self.run.policy)
+        plot_runs([self.run], self.run.path / "learning_curve.png")
+        if config.video_seconds > 0:
+            env = make(config.task, 1, config.device, evaluation_seed(config, 1), config.protocol)
+            record(policy, env, self.run.video, config.video_seconds, config.action_repeat)
+        print(describe(summary))
+
+    def save(self) -> None:
+        """Writes the checkpoint: all that an exact continuation needs."""
+        on_cuda = self.algorithm.device.type == "cuda"
+        self.run.save_checkpoint(
+            {
+                "frames": self.frames,
+                "iteration": self.iteration,
+                "seconds": self.seconds,
+                "algorithm": self.algorithm.state_dict(),
+                "collector": self.collector.state_dict(),
+                "rng": torch.get_rng_state(),
+                "cuda_rng": torch.cuda.get_rng_state(self.algorithm.device) if on_cuda else None,
+            }
+        )
+
+    def _load(self, checkpoint: dict[str, Any]) -> None:
+        self.frames, self.iteration, self.seconds = (checkpoint[key] for key in ("frames", "iteration", "seconds"))
+        if self.frames >= self.last_frame:
+            raise ValueError(f"{self.run.path} is complete: it has all of its {self.frames} frames")
+        self.algorithm.load_state_dict(checkpoint["algorithm"])
+        self.collector.load_state_dict(checkpoint["collector"])
+        self.run.forget_after(self.frames)
+        torch.set_rng_state(checkpoint["rng"].cpu())
+        if checkpoint["cuda_rng"] is not None and self.algorithm.device.type == "cuda":
+            torch.cuda.set_rng_state(checkpoint["cuda_rng"].cpu(), self.algorithm.device)
+
+
+def make_env(config: TrainingConfig) -> EnvBase:
+    """Makes the environment of a run, which holds an action for ``config.action_repeat`` frames and sums the reward."""
+    env = make(
+        config.task,
+        config.num_envs,
+        config.device,
+        config.seed,
+        config.protocol,
+        stagger=True,
+        episode_length=config.episode_length,
+    )
+    return env if config.action_repeat == 1 else TransformedEnv(env, FrameSkipTransform(config.action_repeat))
+
+
+def make_evaluator(config: TrainingConfig, episodes: int | None = None, seed: int | None = None) -> Evaluator:
+    """Makes the evaluation of a run; ``None`` takes the run's own number, and the seed of its last evaluation."""
+    episodes = check_count("episodes", config.eval_episodes if episodes is None else episodes)
+    seed = evaluation_seed(config, 1) if seed is None else check_seed(seed)
+    return Evaluator(config.task, episodes, config.device, seed, config.protocol, config.action_repeat)
+
+
+def evaluation_seed(config: TrainingConfig, which: int) -> int:
+    """Returns the seed of the episodes that choose the best policy (0) or evaluate it at the end (1).
+
+    They are apart from those of training and from each other.
+    """
+    return (config.seed + (1 + which) * 1_000_003) % 2**32
+
+
+def evaluate_run(
+    run: RunFolder, episodes: int | None = None, seed: int | None = None, device: str | None = None
+) -> dict[str, float]:
+    """Evaluates the policy of a run and returns the summary of the returns.
+
+    Args:
+        run: the run.
+        episodes: number of episodes; ``None`` takes the run's own setting.
+        seed: seed that the episodes are drawn from; ``None`` plays those of the run's last evaluation again.
+        device: where to play them; ``None`` takes where the run was trained.
+
+    Raises:
+        FileNotFoundError: the run has no policy yet.
+        ValueError: an argument is out of range, or the policy cannot be read.
+    """
+    config = run.load_config() if device is None else run.load_config(device=device)
+    policy = Policy.load(run.policy, config.device)
+    return summarize(make_evaluator(config, episodes, seed)(policy))
+
+
+@contextlib.contextmanager
+def tf32() -> Iterator[None]:
+    """Lets matrix products on CUDA round to TF32, three times as fast, and puts the setting back."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[Callable[[], bool]]:
+    """Yields whether Ctrl-C was pressed, instead of raising at the first one. In a thread it is left as it is."""
+    pressed = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield pressed.is_set
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def press(*_: object) -> None:
+        pressed.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, press)
+    try:
+        yield pressed.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
