@@ -13,6 +13,7 @@ from torchrl_loco.envs import (
     WalkerStand,
     WalkerWalk,
 )
+from torchrl_loco.envs.health import PhysicsOverflowError, PhysicsOverflowWarning
 from torchrl_loco.policy import Policy, load_policy
 from torchrl_loco.registry import list_envs, make
 
@@ -22,6 +23,8 @@ __all__ = [
     "HumanoidRun",
     "HumanoidStand",
     "HumanoidWalk",
+    "PhysicsOverflowError",
+    "PhysicsOverflowWarning",
     "Policy",
     "RolloutCollector",
     "SimConfig",

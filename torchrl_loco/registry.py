@@ -46,6 +46,7 @@ def make(
     *,
     reward_terms: bool = False,
     stagger: bool = False,
+    on_overflow: str = "warn",
     **config: Any,
 ) -> envs.LocoEnv:
     """Makes one of the six environments.
@@ -58,6 +59,7 @@ def make(
         protocol: ``"playground"`` or ``"dm_control"``.
         reward_terms: whether to return each factor of the reward under ``("next", "reward_terms", name)``.
         stagger: whether a full ``reset()`` starts each world at a random point of its time limit.
+        on_overflow: ``"warn"``, ``"raise"`` or ``"ignore"`` when contacts or constraints find no room.
         config: fields of :class:`torchrl_loco.SimConfig` to override, such as ``episode_length=500``.
 
     Raises:
@@ -69,4 +71,5 @@ def make(
         >>> env.rollout(100)["next", "reward"].shape
         torch.Size([16, 100, 1])
     """
-    return env_class(id)(num_envs, device, seed, protocol, reward_terms=reward_terms, stagger=stagger, **config)
+    options: dict[str, Any] = {"reward_terms": reward_terms, "stagger": stagger, "on_overflow": on_overflow}
+    return env_class(id)(num_envs, device, seed, protocol, **options, **config)

@@ -18,7 +18,7 @@ from torchrl_loco.policy import Policy
 from torchrl_loco.training import RunFolder, Trainer, evaluate_run, plot_runs, preset, trainer
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.evaluation import Evaluator
-from torchrl_loco.training.trainer import ALGORITHMS, evaluation_seed
+from torchrl_loco.training.trainer import ALGORITHMS, evaluation_seed, interruptible
 
 SMALL = {
     "num_envs": 4,
@@ -35,6 +35,14 @@ FILES = {
     *("config.json", "metrics.csv", "evaluations.csv", "checkpoint.pt", "policy.safetensors"),
     *("learning_curve.png", "video.mp4", "tensorboard"),
 }
+
+
+@pytest.fixture(autouse=True)
+def ctrl_c():
+    """Ctrl-C as in a terminal: a shell starts processes in the background with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="module", params=["ppo", "reppo"])
@@ -195,6 +203,14 @@ def test_a_second_interrupt_does_not_wait(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         trained(tmp_path)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_where_it_is_ignored_it_stays_ignored(tmp_path):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with interruptible() as interrupted:
+        signal.raise_signal(signal.SIGINT)
+        assert not interrupted()
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 def test_evaluations_during_training(tmp_path):

@@ -14,6 +14,7 @@ from torchrl_loco.config import sim_config
 from torchrl_loco.envs.autoreset import AsyncReset
 from torchrl_loco.envs.checks import check_count, check_device, check_seed
 from torchrl_loco.envs.episode import any_world, apply_action, begin_episode, count_step, quench
+from torchrl_loco.envs.health import Health
 from torchrl_loco.envs.state import State
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import Simulation
@@ -34,6 +35,8 @@ class LocoEnv(AsyncReset):
         reward_terms: whether to return each factor of the reward under ``("next", "reward_terms", name)``.
         stagger: whether a full ``reset()`` starts each world at a random point of its time limit, so that the worlds
             are not truncated together.
+        on_overflow: what to do when contacts or constraints find no room and are left out: ``"warn"``, ``"raise"`` or
+            ``"ignore"``. It is noticed within some 100 steps, without waiting for the device; see :meth:`health`.
         config: fields of :class:`torchrl_loco.SimConfig` to override.
 
     Raises:
@@ -58,6 +61,7 @@ class LocoEnv(AsyncReset):
         *,
         reward_terms: bool = False,
         stagger: bool = False,
+        on_overflow: str = "warn",
         **config: Any,
     ) -> None:
         num_envs = check_count("num_envs", num_envs)
@@ -70,6 +74,7 @@ class LocoEnv(AsyncReset):
         self.sim = Simulation(models.load(self.body), self.config, num_envs, device)
         self.reward_terms, self.stagger = bool(reward_terms), bool(stagger)
         self._make_buffers()
+        self._health = Health(self.sim, self._bad, on_overflow)
         self._make_specs()
         self._prepare()
         self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
@@ -78,7 +83,7 @@ class LocoEnv(AsyncReset):
         self._refresh_graph = self.sim.capture(self._launch_refresh)
         wp.synchronize_device(self.sim.device)  # made on Warp's stream, used on torch's
         self._set_seed(seed)  # and begin anew: recording has drawn episodes
-        self.sim.overflow.zero_()
+        self._health.zero_()
         self._renderers: dict[tuple[str, int, int], Renderer] = {}
 
     @property
@@ -147,6 +152,7 @@ class LocoEnv(AsyncReset):
         self._launch(apply_action, [self._action], [self.sim.data.ctrl, self._bad])
         self.sim.step()
         self._launch_outputs(self._everyone)
+        self._health.launch()
         self._launch(
             count_step,
             [self._bad, self.config.episode_length],
@@ -186,6 +192,7 @@ class LocoEnv(AsyncReset):
             raise ValueError(f"action must have shape {tuple(self._views['action'].shape)}, got {tuple(action.shape)}")
         self._views["action"].copy_(action.detach())  # else the buffer would hold on to every past policy's graph
         self._step_graph.replay()
+        self._health.after_step()
         result = self._read_outputs()
         result.set("reward", self._views["reward"].clone().unsqueeze(-1))
         return result
@@ -237,6 +244,22 @@ class LocoEnv(AsyncReset):
         self.seed = seed
         self._views["seed"].fill_(seed)
         self._views["episode"].zero_()
+
+    def health(self) -> TensorDict:
+        """Returns what went wrong in the physics since the environment was made.
+
+        ``"worlds"`` (batch ``(num_envs,)``) and ``"total"`` count control steps in which
+
+        - ``constraint_overflow``, ``contact_overflow``: constraints or contacts found no room and were left out.
+          Contacts are pooled: if some find no room, that counts in every world.
+        - ``iteration_limit``, ``line_search_limit``: the solver or its line search used up its iterations, which is the
+          rule under ``protocol="playground"``.
+        - ``non_finite``: the world was no longer finite, and terminated.
+
+        ``"peak"`` holds the most ``constraints`` of a world and ``contacts`` of all worlds together that any physics
+        step asked for, to choose ``njmax`` and ``naconmax`` by. Nothing waits for the device until you read a number.
+        """
+        return self._health.report()
 
     # State.
 

@@ -71,6 +71,23 @@ def clear_constraints(
             efc_D_out[world, row] = 0.0
 
 
+@wp.kernel(enable_backward=False)
+def note_demand(
+    # Data in:
+    nefc_in: wp.array[int],
+    nacon_in: wp.array[int],
+    ncollision_in: wp.array[int],
+    # Out:
+    rows_out: wp.array[int],
+    contacts_out: wp.array[int],
+):
+    """Keeps the largest numbers of constraint rows and contacts that were asked for, also where there was no room."""
+    world = wp.tid()
+    rows_out[world] = wp.max(rows_out[world], nefc_in[world])
+    if world == 0:
+        contacts_out[0] = wp.max(contacts_out[0], wp.max(nacon_in[0], ncollision_in[0]))
+
+
 class Simulation:
     """Owns the models, the state of all worlds, and the graphs that advance it.
 
@@ -89,6 +106,8 @@ class Simulation:
     ``xmat``            ``(nworld, nbody, 3, 3)``  orientations of the bodies
     ``time``            ``(nworld,)``              time since the world's reset (s)
     ``overflow``        ``(nworld,)``              :class:`mujoco_warp.OverflowType` bits, kept until you zero them
+    ``peak_rows``       ``(nworld,)``              most constraint rows that a substep asked for
+    ``peak_contacts``   ``(1,)``                   most contacts that a substep asked for, over all worlds
     ==================  =========================  ========================================================
 
     Args:
@@ -129,6 +148,10 @@ class Simulation:
         self.xmat = wp.to_torch(self.data.xmat)
         self.time = wp.to_torch(self.data.time)
         self.overflow = wp.to_torch(self.data.overflow)
+        self._peak_rows = wp.zeros(num_envs, dtype=int, device=self.device)
+        self._peak_contacts = wp.zeros(1, dtype=int, device=self.device)
+        self.peak_rows = wp.to_torch(self._peak_rows)
+        self.peak_contacts = wp.to_torch(self._peak_contacts)
 
     def step(self) -> None:
         """Advances every world by one control step under ``ctrl``.
@@ -141,7 +164,18 @@ class Simulation:
         with self._lean():
             for _ in range(self.substeps):
                 mjw.step(self.model, self.data)
+                self._note_demand()
         self._pose()
+
+    def _note_demand(self) -> None:
+        d = self.data
+        wp.launch(
+            note_demand,
+            dim=self.num_envs,
+            inputs=[d.nefc, d.nacon, d.ncollision],
+            outputs=[self._peak_rows, self._peak_contacts],
+            device=self.device,
+        )
 
     def forward(self, mask: wp.array) -> None:
         """Brings poses and sensors up to ``qpos`` and ``qvel``, which were changed where ``mask`` is set."""

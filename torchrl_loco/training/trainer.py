@@ -239,12 +239,15 @@ def tf32() -> Iterator[None]:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Yields whether Ctrl-C was pressed, instead of raising at the first one. In a thread it is left as it is."""
+    """Yields whether Ctrl-C was pressed, instead of raising at the first one.
+
+    In a thread, and where Ctrl-C is ignored (``nohup``), all is left as it is.
+    """
     pressed = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
         yield pressed.is_set
         return
-    before = signal.getsignal(signal.SIGINT)
 
     def press(*_: object) -> None:
         pressed.set()
