@@ -1,8 +1,11 @@
 """The doctor: finds what is here, and does not overlook what is wrong."""
 
+import re
+
 import pytest
 import torch
 
+import torchrl_loco
 from torchrl_loco import cli, doctor
 
 
@@ -36,3 +39,22 @@ def test_ill(capsys, monkeypatch, spoil):
     with pytest.raises(SystemExit, match="1"):
         cli.main(["doctor"])
     assert capsys.readouterr().out.count("NOT RIGHT") == 2
+
+
+def test_size(capsys):
+    """What is advised is enough, and a good deal less leads to losses."""
+    assert cli.main(["doctor", "--size", "humanoid_run", "--num_envs", "32", "--device", "cpu"]) == 0
+    out = capsys.readouterr().out
+    advice = {name: int(re.search(rf"{name} .* (\d+) advised", out)[1]) for name in ("njmax", "naconmax")}
+    env = torchrl_loco.make("humanoid_run", 32, "cpu", seed=1, on_overflow="ignore", **advice)
+    env.rollout(200)
+    assert env.health()["total", "constraint_overflow"] == env.health()["total", "contact_overflow"] == 0
+    env = torchrl_loco.make("humanoid_run", 32, "cpu", seed=1, on_overflow="ignore", njmax=advice["njmax"] // 3)
+    env.rollout(200)
+    assert env.health()["total", "constraint_overflow"] > 0
+
+
+def test_size_of_what_is_not_there(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["doctor", "--size", "humanoid_rum"])
+    assert "did you mean 'humanoid_run'" in capsys.readouterr().err

@@ -8,7 +8,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 import torchrl_loco
-from torchrl_loco.policy import SHIPPED, ObservationNorm, Policy
+from torchrl_loco.policy import FORMAT, SHIPPED, ObservationNorm, Policy, _digest
 
 INFO = {"task": "walker_stand", "protocol": "playground", "action_repeat": 2, "mean": 12.5}
 
@@ -46,8 +46,9 @@ def test_what_cannot_be_read_is_told(policy, tmp_path):
     save_file({"0.mean": torch.zeros(3)}, path)
     with pytest.raises(ValueError, match="its format is None"):
         Policy.load(path, "cpu")
-    metadata = {"format": "torchrl_loco policy 1", "layers": json.dumps(["os.system"]), "info": "{}"}
-    save_file({"0.weight": torch.zeros(3)}, path, metadata)
+    metadata = {"format": FORMAT, "layers": json.dumps(["os.system"]), "info": "{}"}
+    tensors = {"0.weight": torch.zeros(3)}
+    save_file(tensors, path, {**metadata, "sha256": _digest(tensors, metadata)})
     with pytest.raises(ValueError, match=r"unknown layer 'os.system'"):
         Policy.load(path, "cpu")
 

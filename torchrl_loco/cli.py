@@ -24,8 +24,19 @@ def list_tasks() -> None:
         print(f"{name:<16} {(env.__doc__ or '').splitlines()[0]}")
 
 
-def diagnose() -> None:
-    """Print versions, devices and the kernel cache, and test the physics of each device against C MuJoCo."""
+def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None = None) -> None:
+    """Print versions, devices and the kernel cache, and test the physics of each device against C MuJoCo.
+
+    Args:
+        size: instead, measure what njmax and naconmax this task needs.
+        num_envs: number of worlds to measure with.
+        device: where to measure; default: CUDA if there is any.
+    """
+    if size is not None:
+        with _user_errors():
+            for name, (needed, advised) in doctor.size(size, num_envs, device).items():
+                print(f"{name:<9} at most {needed} needed under random actions, {advised} advised")
+        return
     well = True
     for subject, finding, is_well in doctor.diagnose():
         print(f"{subject:<20} {finding}{'' if is_well else '  <- NOT RIGHT'}", flush=True)

@@ -11,8 +11,10 @@ import mujoco
 import numpy as np
 import torch
 import warp as wp
+from tqdm.auto import trange
 
 import torchrl_loco
+from torchrl_loco.envs.health import advise
 from torchrl_loco.registry import make
 
 PACKAGES = ("torch", "torchrl", "tensordict", "warp-lang", "mujoco-warp", "mujoco")
@@ -53,6 +55,29 @@ def _describe_cache() -> str:
     files = [path for path in folder.rglob("*") if path.is_file()]
     modules = len({path.parent for path in files if path.suffix in (".o", ".cubin", ".ptx")})
     return f"{folder}, {modules} modules, {sum(path.stat().st_size for path in files) / 1e6:.0f} MB"
+
+
+def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) -> dict[str, tuple[int, int]]:
+    """Measures what ``njmax`` and ``naconmax`` a task needs, by steps under random actions with room to spare.
+
+    Args:
+        task: id of the environment.
+        num_envs: number of worlds.
+        device: where to measure; ``None`` takes CUDA if there is any.
+        steps: control steps; a trained policy may need more room than random actions do.
+
+    Returns:
+        For each setting the most that was needed and the value that is advised.
+    """
+    env = make(task, num_envs, device, seed=0, on_overflow="raise", njmax=1000, naconmax=200 * num_envs)
+    with torch.no_grad():
+        td = env.reset()
+        for _ in trange(steps, desc=f"{task}, {num_envs} worlds", leave=False):
+            _, td = env.step_and_maybe_reset(td.set("action", env.action_spec.rand()))
+    env._health.check()
+    peak = env.health()["peak"]
+    needed = {"njmax": int(peak["constraints"]), "naconmax": int(peak["contacts"])}
+    return {name: (value, advise(value)) for name, value in needed.items()}
 
 
 def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float]:

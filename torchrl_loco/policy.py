@@ -1,5 +1,6 @@
 """Trained policies, in files that hold tensors and settings and nothing to execute."""
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,7 @@ class Policy(TensorDictModule):
             name: tensor.detach().cpu().contiguous().to(torch.float32 if name.startswith("0.") else torch.float16)
             for name, tensor in self.module.state_dict().items()
         }
-        save_file(tensors, path, metadata)
+        save_file(tensors, path, {**metadata, "sha256": _digest(tensors, metadata)})
 
     @classmethod
     def load(cls, path: Path, device: torch.device | str | None = None) -> "Policy":
@@ -93,15 +94,28 @@ class Policy(TensorDictModule):
         try:
             with safe_open(path, framework="pt") as file:
                 metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             if metadata.get("format") != FORMAT:
                 raise ValueError(f"its format is {metadata.get('format')!r}, this release reads {FORMAT!r}")
+            if metadata.pop("sha256", None) != _digest(tensors, metadata):
+                raise ValueError("its checksum is wrong: the file was damaged or changed")
+            tensors = {name: tensor.float() for name, tensor in tensors.items()}
             network = nn.Sequential(*map(_make_layer, *_with_tensors(json.loads(metadata["layers"]), tensors)))
             network.load_state_dict(tensors)
             info = json.loads(metadata["info"])
         except (SafetensorError, ValueError, KeyError, RuntimeError, OSError) as error:
             raise ValueError(f"{path} cannot be read as a policy: {error}") from error
         return cls(network.to(device).requires_grad_(False), info)
+
+
+def _digest(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> str:
+    """Returns a checksum of all that a file holds: a changed bit in a weight would make a policy worse in silence."""
+    sha256 = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        sha256.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        sha256.update(tensor.numpy().tobytes())
+    return sha256.hexdigest()
 
 
 _LAYER_NAMES: dict[type[nn.Module], str] = {

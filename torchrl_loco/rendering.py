@@ -13,19 +13,17 @@ class Renderer:
     Args:
         sim: the simulation whose current state is shown.
         camera: name of a camera of the model.
-        width: pixels in a row.
-        height: rows.
+        width: pixels in a row, at least 1.
+        height: rows, at least 1.
 
     Raises:
-        ValueError: the model has no such camera, or a size is not positive.
+        ValueError: the model has no such camera.
     """
 
     def __init__(self, sim: Simulation, camera: str, width: int, height: int) -> None:
         names = [sim.mj_model.camera(i).name for i in range(sim.mj_model.ncam)]
         if camera not in names:
             raise ValueError(f"no camera {camera!r}: choose one of {', '.join(names)}")
-        if width < 1 or height < 1:
-            raise ValueError(f"width and height must be at least 1 pixel, got {width} and {height}")
         self._sim = sim
         with wp.ScopedDevice(sim.device):
             self._context = mjw.create_render_context(

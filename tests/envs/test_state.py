@@ -161,3 +161,54 @@ def test_time_follows_the_elapsed_steps():
     assert (env.sim.time == 0).all()
     env.reset(state, set_state=True)
     torch.testing.assert_close(env.sim.time, torch.full((2,), 4 * 0.025))
+
+
+def test_branches_are_copies(task, actions):
+    """All worlds go on from one world's moment: the same actions lead to the same steps, different ones do not."""
+    env = torchrl_loco.make(task, 4, "cpu", seed=0)
+    td = env.reset()
+    for action in actions(env, 5):
+        td = env.step(td.set("action", action))["next"]
+    state = env.get_state()
+    branch = state.branch(2)
+    td = env.reset(branch, set_state=True)
+    assert all(torch.equal(env.get_state()[key], state[key][2].expand_as(state[key])) for key in State.KEYS)
+    same = actions(env, 3)[:, :1].expand(3, 4, -1)
+    trace = walk(env, td, same)
+    assert (trace["observation"] == trace["observation"][:, :1]).all()
+    trace = walk(env, env.reset(branch, set_state=True), actions(env, 3, seed=1))
+    assert (trace["observation"][-1, 0] != trace["observation"][-1, 1]).any()
+    other = torchrl_loco.make(task, 7, "cpu", seed=0)
+    other.reset(state.branch(-1, 7), set_state=True)
+    assert torch.equal(other.get_state()["qpos"], state["qpos"][-1:].expand(7, -1))
+    with pytest.raises(IndexError):
+        state.branch(4)
+
+
+def test_state_dict_goes_on_in_another_environment(task, actions):
+    """With the seed: what is drawn at the next resets is the same too."""
+    first = torchrl_loco.make(task, 3, "cpu", seed=5, episode_length=4)
+    second = torchrl_loco.make(task, 3, "cpu", seed=6, episode_length=4)
+    moves = actions(first, 10)
+    td = first.reset()
+    _, td = first.step_and_maybe_reset(td.set("action", moves[0]))
+    second.load_state_dict(first.state_dict())
+    assert second.seed == 5
+    one, other = walk(first, td, moves), walk(second, td.clone(), moves)
+    assert (one == other).all()
+    assert one["truncated"].sum() > 3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_envs": 4}, "num_envs=3, this environment of 4"),
+        ({"protocol": "dm_control"}, "protocol='playground', this environment of 'dm_control'"),
+        ({"id": "humanoid_run"}, "body='walker', this environment of 'humanoid'"),
+    ],
+)
+def test_state_dict_of_another_kind(options, message):
+    state = torchrl_loco.make("walker_run", 3, "cpu", seed=5).state_dict()
+    env = torchrl_loco.make(**{"id": "walker_run", "num_envs": 3, "device": "cpu", **options})
+    with pytest.raises(ValueError, match=message):
+        env.load_state_dict(state)

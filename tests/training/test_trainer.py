@@ -10,6 +10,7 @@ import signal
 import imageio.v3 as imageio
 import pytest
 import torch
+from compare import assert_same
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torchrl_loco
@@ -169,28 +170,13 @@ def test_resumed_equals_uninterrupted(algorithm, action_repeat, tmp_path, monkey
     stopped.append_metrics(stopped.read_metrics() and dict.fromkeys(stopped.read_metrics(), 1e9))  # and was not saved
     Trainer(stopped, resume=True).train()
     first, second = whole.load_checkpoint("cpu"), stopped.load_checkpoint("cpu")
-    same(first["algorithm"], second["algorithm"])
-    same(first["collector"], second["collector"])
+    assert_same(first["algorithm"], second["algorithm"])
+    assert_same(first["collector"], second["collector"])
     for name in ("frames", "return", "grad_norm" if algorithm == "ppo" else "loss_critic"):
         assert whole.read_metrics()[name] == stopped.read_metrics()[name]
     assert whole.read_evaluations()[0]["mean"] == stopped.read_evaluations()[0]["mean"]
     with pytest.raises(ValueError, match="is complete"):
         Trainer(stopped, resume=True)
-
-
-def same(a, b):
-    assert type(a) is type(b)
-    if isinstance(a, dict):
-        assert a.keys() == b.keys()
-        for key in a:
-            same(a[key], b[key])
-    elif isinstance(a, list):
-        for x, y in zip(a, b, strict=True):
-            same(x, y)
-    elif isinstance(a, torch.Tensor):
-        assert torch.equal(a, b)
-    else:
-        assert a == b
 
 
 def test_a_second_interrupt_does_not_wait(tmp_path, monkeypatch):

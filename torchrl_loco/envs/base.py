@@ -277,6 +277,24 @@ class LocoEnv(AsyncReset):
             device=self.device,
         )
 
+    def get_extra_state(self) -> dict[str, Any]:
+        """Returns what ``state_dict`` holds: the state of all worlds and the seed."""
+        made_by = {"body": self.body, "protocol": self.protocol, "num_envs": self.num_envs}
+        return {**made_by, "seed": self.seed, "worlds": self.get_state().to_dict()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Goes on where ``state_dict`` was taken: the worlds, their random streams, and the seed.
+
+        Raises:
+            ValueError: it was taken from an environment of another body, protocol or number of worlds.
+        """
+        for name in ("body", "protocol", "num_envs"):
+            if state[name] != getattr(self, name):
+                raise ValueError(f"the state is of {name}={state[name]!r}, this environment of {getattr(self, name)!r}")
+        self.seed = check_seed(state["seed"])
+        self._views["seed"].fill_(self.seed)
+        self.reset(State(state["worlds"], batch_size=self.batch_size, device=self.device), set_state=True)
+
     def _restore(self, state: TensorDictBase | None) -> None:
         """Writes a state into the worlds in the mask; what it lacks beside qpos and qvel starts at zero."""
         targets = {
@@ -327,8 +345,9 @@ class LocoEnv(AsyncReset):
 
         Raises:
             ValueError: the model has no such camera, or a size is not positive.
+            TypeError: a size is not an integer.
         """
-        key = (camera, width, height)
+        key = (camera, check_count("width", width), check_count("height", height))
         if key not in self._renderers:
             self._renderers[key] = Renderer(self.sim, *key)
         return self._renderers[key].render()

@@ -4,6 +4,8 @@ from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
 
+from torchrl_loco.envs.checks import check_count
+
 
 class State(TensorDict):
     """What ``env.get_state()`` returns and ``env.reset(state, set_state=True)`` restores.
@@ -26,6 +28,20 @@ class State(TensorDict):
     """
 
     KEYS = ("qpos", "qvel", "qacc_warmstart", "elapsed_steps", "episode")
+
+    def branch(self, world: int, num_envs: int | None = None) -> "State":
+        """Returns a state in which every world is a copy of one, to try different futures from the same moment.
+
+        Args:
+            world: index of the world to copy.
+            num_envs: number of copies; ``None`` takes as many worlds as there are.
+
+        Raises:
+            IndexError: there is no such world.
+        """
+        count = self.batch_size[0] if num_envs is None else check_count("num_envs", num_envs)
+        copies = {key: value[world].expand(count, *value.shape[1:]).clone() for key, value in self.items()}
+        return State(copies, batch_size=[count], device=self.device)
 
     def select(self, *keys: Any, inplace: bool = False, strict: bool = True) -> TensorDictBase:
         """Selects ``keys``, and the state if ``"_reset"`` is among them."""

@@ -6,6 +6,8 @@ import itertools
 import json
 import pickle
 import shutil
+import zipfile
+import zlib
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,12 @@ from torchrl_loco.training.config import CONFIGS, TrainingConfig
 CHECKPOINT_VERSION = 2
 ROOM_NEEDED = 200 * 2**20
 """Bytes that a run may need: checkpoints, video, metrics."""
+
+_UNREADABLE = (
+    *(zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, NotImplementedError),
+    *(RuntimeError, OSError, EOFError, LookupError, TypeError, ValueError),
+)
+"""What reading a damaged checkpoint may raise."""
 
 
 class RunFolder:
@@ -142,9 +150,13 @@ class RunFolder:
         if not path.is_file():
             raise FileNotFoundError(f"{self.path} has no checkpoint.pt: the run did not get that far")
         try:
+            with zipfile.ZipFile(path) as archive:  # torch.load looks at no checksum
+                damaged = archive.testzip()
+            if damaged is not None:
+                raise ValueError(f"{damaged} is damaged")
             entries = torch.load(path, map_location=device, weights_only=True)
             version = entries["version"]
-        except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError) as error:
+        except _UNREADABLE as error:
             raise ValueError(f"{path} cannot be read as a checkpoint: {error}") from error
         if version != CHECKPOINT_VERSION:
             raise ValueError(f"{path} has version {version}, this release reads {CHECKPOINT_VERSION}")
