@@ -29,6 +29,8 @@ small = [256] if DEVICE == "cpu" else [8192]
 add("throughput", "from the bare simulator to a collector", small if DEVICE == "cpu" else [512, 2048, 8192, 32768])
 add("startup", "time from process start to the first step, and memory per world", small)
 add("peers", "other simulators beside ours, in processes of their own", small)
+add("fidelity", "deviation from C MuJoCo in double precision", [256])
+commands.choices["fidelity"].add_argument("--picture", type=Path, help="file for a plot")
 add("profile", "time of each kernel (CUDA)", small)
 for name, default in (("throughput", list(CASES)), ("profile", ["env_step_and_maybe_reset"])):
     commands.choices[name].add_argument("--cases", nargs="+", choices=list(CASES), default=default)
@@ -63,6 +65,12 @@ elif args.command == "peers":
     from benchmarks.peers import COLUMNS, peers
 
     rows = peers(args.bodies, args.worlds, args.device, args.path)
+elif args.command == "fidelity":
+    from benchmarks.fidelity import COLUMNS, fidelity, plot_fidelity
+
+    rows = fidelity(args.bodies, args.worlds[0], args.device)
+    if args.picture:
+        plot_fidelity(rows, args.picture)
 elif args.command == "training":
     from benchmarks.training import COLUMNS, training
 

@@ -60,7 +60,7 @@ def test_unknown_task():
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.safetensors")), ids=lambda path: path.stem)
 def test_shipped_policies(path):
-    """Each is small, belongs to its task, and earns on the CPU what it is said to earn on the GPU."""
+    """Each is small, belongs to its task, and earns what it is said to earn."""
     assert path.stat().st_size < 1e6
     policy = torchrl_loco.load_policy(path.stem, "cpu")
     assert policy.info["task"] == path.stem

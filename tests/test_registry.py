@@ -115,7 +115,7 @@ def test_wrong_shapes_and_cameras():
         env.step(td.set("action", torch.zeros(2, 1)))
     with pytest.raises(ValueError, match="choose one of side, back, egocentric"):
         env.render("front")
-    with pytest.raises(ValueError, match="at least 1 pixel"):
+    with pytest.raises(ValueError, match="width must be an integer of at least 1"):
         env.render(width=0)
 
 

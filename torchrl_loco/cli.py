@@ -1,7 +1,7 @@
 """The command ``torchrl-loco``: parse, call, exit."""
 
 import contextlib
-import os
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -72,8 +72,7 @@ def resume(run: tyro.conf.Positional[Path], /) -> None:
         run: folder of the run.
     """
     with _user_errors():
-        trainer = training.Trainer(training.RunFolder(run), resume=True)
-    trainer.train()
+        training.Trainer(training.RunFolder(run), resume=True).train()
 
 
 def record(
@@ -124,8 +123,7 @@ def play(
         policy = torchrl_loco.load_policy(task, device)
         shown = ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on", "mean", "std")
         print(task, *(f"{key} {policy.info[key]}" for key in shown if key in policy.info), sep=", ")
-        has_display = sys.platform in ("darwin", "win32") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
-        if out is None and has_display:
+        if out is None and training.has_display():
             env = torchrl_loco.make(task, 1, device, seed, policy.info["protocol"])
             training.view(policy, env, policy.info["action_repeat"])
         else:
@@ -133,6 +131,8 @@ def play(
 
 
 def _record(policy: torchrl_loco.Policy, out: Path, seconds: float, camera: str, seed: int, device: str | None) -> None:
+    if not 0 < seconds < math.inf:
+        raise ValueError(f"seconds must be positive and finite, got {seconds}")
     env = torchrl_loco.make(policy.info["task"], 1, device, seed, policy.info["protocol"])
     training.record(policy, env, out, seconds, policy.info["action_repeat"], camera)
     print(out)
@@ -154,10 +154,9 @@ def main(args: Sequence[str] | None = None) -> int:
     """Runs the command line; returns 0, exits with 2 for what the user can mend, returns 130 when interrupted."""
     args = sys.argv[1:] if args is None else list(args)
     with _user_errors():
-        device, algorithm = _take("--device", args), _take("--algorithm", args)
+        is_training = args[:1] == ["train"]
+        device, algorithm = (_take(flag, args) if is_training else None for flag in ("--device", "--algorithm"))
         presets = {task: training.preset(task, device, algorithm) for task in registry.list_envs()}
-    if device is not None and "train" not in args[:1]:
-        args += ["--device", device]
     task_config = tyro.extras.subcommand_type_from_defaults(
         presets,
         {task: f"Train {task}." for task in presets},
@@ -172,8 +171,7 @@ def main(args: Sequence[str] | None = None) -> int:
         with _user_errors():
             run = training.RunFolder.create(config)
             print(f"run folder: {run.path}")
-            trainer = training.Trainer(run)
-        trainer.train()
+            training.Trainer(run).train()
 
     try:
         tyro.extras.subcommand_cli_from_dict(
@@ -193,7 +191,9 @@ def main(args: Sequence[str] | None = None) -> int:
             use_underscores=True,
         )
     except KeyboardInterrupt:
-        print("torchrl-loco: interrupted; torchrl-loco resume goes on from the run folder", file=sys.stderr)
+        resumable = args[:1] in (["train"], ["resume"])
+        hint = "; if the run folder has a checkpoint.pt, torchrl-loco resume goes on from it" if resumable else ""
+        print(f"torchrl-loco: interrupted{hint}", file=sys.stderr)
         return 130
     return 0
 

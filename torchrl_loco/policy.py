@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from torchrl_loco.envs.checks import check_device
-from torchrl_loco.registry import env_class, list_envs
+from torchrl_loco.registry import canonical_id
 
 SHIPPED = Path(__file__).parent / "policies"
 FORMAT = "torchrl_loco policy 1"
@@ -67,7 +67,7 @@ class Policy(TensorDictModule):
         self.info = info
 
     def save(self, path: Path) -> None:
-        """Writes the policy in half precision, which moves an action by less than a thousandth."""
+        """Writes the policy in half precision, which moves an action by some thousandths at most."""
         layers = [_LAYER_NAMES[type(layer)] for layer in self.module]
         metadata = {"format": FORMAT, "layers": json.dumps(layers), "info": json.dumps(self.info)}
         tensors = {  # the observation's statistics span more than half precision does
@@ -97,7 +97,9 @@ class Policy(TensorDictModule):
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             if metadata.get("format") != FORMAT:
                 raise ValueError(f"its format is {metadata.get('format')!r}, this release reads {FORMAT!r}")
-            if metadata.pop("sha256", None) != _digest(tensors, metadata):
+            if "sha256" not in metadata:
+                raise ValueError("it has no checksum: a version before 0.1.0 wrote it")
+            if metadata.pop("sha256") != _digest(tensors, metadata):
                 raise ValueError("its checksum is wrong: the file was damaged or changed")
             tensors = {name: tensor.float() for name, tensor in tensors.items()}
             network = nn.Sequential(*map(_make_layer, *_with_tensors(json.loads(metadata["layers"]), tensors)))
@@ -163,7 +165,7 @@ def load_policy(task: str, device: torch.device | str | None = None) -> Policy:
     Raises:
         ValueError: there is no such task, or no policy for it.
     """
-    name = next(name for name in list_envs() if env_class(name) is env_class(task))
+    name = canonical_id(task)
     path = SHIPPED / f"{name}.safetensors"
     if not path.is_file():
         shipped = sorted(p.stem for p in SHIPPED.glob("*.safetensors"))

@@ -24,8 +24,8 @@ def list_envs() -> list[str]:
     return list(ENVS)
 
 
-def env_class(id: str) -> type[envs.LocoEnv]:
-    """Returns the class of ``id`` or an alias.
+def canonical_id(id: str) -> str:
+    """Returns the id that ``id``, or an alias, stands for.
 
     Raises:
         ValueError: there is no such id; the message names the nearest right one and all of them.
@@ -34,7 +34,12 @@ def env_class(id: str) -> type[envs.LocoEnv]:
     if name not in ENVS:
         hint = suggestion(str(id), [*ENVS, *ALIASES])
         raise ValueError(f"unknown environment {id!r}{hint}: choose one of {', '.join(ENVS)}")
-    return ENVS[name]
+    return name
+
+
+def env_class(id: str) -> type[envs.LocoEnv]:
+    """Returns the class of ``id`` or an alias; raises as :func:`canonical_id` does."""
+    return ENVS[canonical_id(id)]
 
 
 def make(

@@ -17,6 +17,8 @@ from benchmarks.throughput import throughput, time_of
 
 OURS = ("bare_tuned", "env_step", "env_step_and_maybe_reset")
 ON_CUDA = ("playground", "playground_torchrl")
+OTHER_MUJOCO = ("playground", "playground_torchrl", "dm_control_suite")
+"""Peers that bring a MuJoCo of their own."""
 ON_CPU = ("c_mujoco", "c_mujoco_one_thread", "dm_control_suite")
 COLUMNS = {"body": "", "worlds": "d", "case": "", "ms": ".3f", "thousand steps/s": ".1f", "ours is": "", "error": ""}
 
@@ -30,12 +32,12 @@ def peers(bodies: Sequence[str], worlds: Sequence[int], device: torch.device, pa
         device: where ours runs; the peers are those of its kind.
         path: folder with the peers' packages, which take precedence there.
     """
-    environment = environment_with(path)
     names = ON_CUDA if device.type == "cuda" else ON_CPU
     rows: list[Row] = []
     for body, n, name in tqdm([(b, n, name) for b in bodies for n in worlds for name in names], desc="peers"):
         row = {"body": body, "worlds": n, "case": name}
         try:
+            environment = environment_with(path if name in OTHER_MUJOCO else None)
             row |= run_json([f"benchmarks.peers.{name}", body, n], environment)
         except MeasurementError as error:
             row["error"] = str(error)

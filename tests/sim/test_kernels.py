@@ -1,6 +1,7 @@
 """Kernels are compiled before they are needed, all of them, and compiling does nothing else."""
 
 import threading
+import time
 
 import pytest
 import torch
@@ -76,3 +77,24 @@ def test_an_error_leaves_warp_as_it_was():
     with pytest.raises(ZeroDivisionError):
         compile_kernels([launch], wp.get_device("cpu"))
     assert before == (wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size)
+
+
+def test_two_threads_may_compile_at_once():
+    """Neither puts back what the other put in place."""
+    before, total = wp.Module.load, wp.zeros(1, dtype=int, device="cpu")
+    entered = threading.Event()
+
+    def slow():
+        entered.set()
+        time.sleep(0.3)
+
+    one = threading.Thread(target=compile_kernels, args=([slow], wp.get_device("cpu")))
+    other = threading.Thread(target=compile_kernels, args=([lambda: time.sleep(0.6)], wp.get_device("cpu")))
+    one.start()
+    entered.wait()
+    other.start()
+    one.join()
+    other.join()
+    assert wp.Module.load is before
+    wp.launch(count, dim=3, outputs=[total], device="cpu")
+    assert total.numpy()[0] == 3

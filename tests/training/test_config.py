@@ -48,12 +48,18 @@ def test_wrong_settings(overrides, error, message):
     [
         ({"kl_bound": 0.0}, r"kl_bound must lie in \(0, inf\]"),
         ({"num_bins": 0}, "num_bins must be an integer of at least 1"),
+        ({"num_bins": 1}, "num_bins must be an integer of at least 2"),
         ({"target_entropy": float("nan")}, r"target_entropy must lie in"),
     ],
 )
 def test_wrong_settings_of_reppo(overrides, message):
     with pytest.raises(ValueError, match=message):
         REPPOConfig("walker_stand", **overrides)
+
+
+def test_an_alias_is_the_task_itself():
+    assert preset("mjx/walker_run-v0", "cpu") == preset("walker_run", "cpu")
+    assert PPOConfig("mjx/walker_run-v0").task == "walker_run"
 
 
 def test_unknown_algorithm():

@@ -145,3 +145,14 @@ def test_the_actors_step_leaves_the_critic_alone():
     reppo._actor_step(data)
     assert all(torch.equal(value, before[name]) for name, value in reppo.critic.state_dict().items())
     assert all(parameter.grad is None for parameter in reppo.critic.parameters())
+
+
+def test_a_temperature_that_has_fallen_rises_again():
+    """From a millionth, with too little entropy, it grows by the learning rate at every step and is not held down."""
+    reppo = made(num_envs=16, decisions=8, minibatch_size=128, target_entropy=50.0, init_temperature=1e-7, lr=1e-2)
+    batch = collected(reppo, 16)
+    with torch.no_grad():
+        data = reppo.prepare(batch).reshape(-1)
+    for _ in range(300):
+        reppo._actor_step(data)
+    assert reppo.weights.temperature > 1e-7 * math.exp(0.8 * 300 * 1e-2)

@@ -11,6 +11,7 @@ import imageio.v3 as imageio
 import pytest
 import torch
 from compare import assert_same
+from matplotlib.axes import Axes
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torchrl_loco
@@ -244,6 +245,52 @@ def test_plot_of_several_runs(run, tmp_path):
         plot_runs([made(tmp_path)], tmp_path / "none.png")
 
 
+def test_runs_that_differ_in_more_than_the_seed_are_apart(tmp_path, monkeypatch):
+    drawn, plot = [], Axes.plot
+    monkeypatch.setattr(Axes, "plot", lambda self, x, y, **k: drawn.append(len(x)) or plot(self, x, y, **k))
+    runs = [trained(tmp_path, video_seconds=0.0, seed=seed, lr=lr) for seed, lr in ((0, 1e-3), (1, 1e-3), (0, 1e-4))]
+    drawn.clear()
+    plot_runs(runs, tmp_path / "curves.png")
+    assert drawn == [2, 2]
+    with pytest.raises(ValueError, match="no runs"):
+        plot_runs([], tmp_path / "none.png")
+
+
+def test_what_was_interrupted_at_the_very_end_can_be_finished(tmp_path, monkeypatch):
+    def press(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer, "record", press)
+        with pytest.raises(KeyboardInterrupt):
+            trained(tmp_path)
+    (path,) = tmp_path.iterdir()
+    run = RunFolder(path)
+    before = run.read_metrics()
+    Trainer(run, resume=True).train()
+    assert run.video.exists()
+    assert run.read_metrics() == before
+    assert "mean" in Policy.load(run.policy, "cpu").info
+    with pytest.raises(ValueError, match="is complete"):
+        Trainer(run, resume=True)
+
+
+def test_a_torn_line_does_not_keep_a_run_from_going_on(tmp_path):
+    run = made(tmp_path)
+    for frames in (128, 256, 384):
+        run.append_metrics({"iteration": frames // 128, "frames": frames, "return": 1.5})
+    path = run.path / "metrics.csv"
+    path.write_text(path.read_text() + "4,5")
+    run.forget_after(256)
+    assert path.read_text() == "iteration,frames,return\n1,128,1.5\n2,256,1.5\n"
+
+
+def test_evaluating_draws_nothing_that_training_draws(tmp_path):
+    often = trained(tmp_path / "often", "reppo", eval_interval=128, video_seconds=0.0)
+    once = trained(tmp_path / "once", "reppo", video_seconds=0.0)
+    assert_same(parameters(often), parameters(once))
+
+
 def test_every_update_begins_with_the_policy_that_collected(tmp_path, monkeypatch):
     """The ratio of new to old probabilities starts at one, and the norm sees all there is."""
     update, batches = Algorithm.update, []
@@ -310,6 +357,9 @@ def test_command_line(run, capsys, tmp_path):
         (["resume", "no/such/run"], "is no run folder"),
         (["resume", "{run}"], "is complete"),
         (["record", "no/such/run"], "is no run folder"),
+        (["record", "{run}", "--seconds", "0"], "seconds must be positive"),
+        (["play", "walker_walk", "--out", "x.mp4", "--seconds", "-1"], "seconds must be positive"),
+        (["plot"], "no runs"),
         (["play", "walker_wlak"], "did you mean 'walker_walk'"),
         (["fly"], "train, resume, eval"),
         (["eval", "{run}", "--episodes", "0"], "episodes must be an integer of at least 1"),

@@ -44,6 +44,11 @@ def _collecting() -> Iterator[dict[tuple[wp.Module, int], None]]:
 
     A launch asks its module for an executable and returns if there is none. What is conditional is gone through once.
     """
+    with _COLLECTING:  # one at a time: two would put back each other's
+        yield from _collect()
+
+
+def _collect() -> Iterator[dict[tuple[wp.Module, int], None]]:
     variants: dict[tuple[wp.Module, int], None] = {}
     thread = threading.get_ident()
     originals = wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size
@@ -73,9 +78,8 @@ def _collecting() -> Iterator[dict[tuple[wp.Module, int], None]]:
         variants[kernel.module, kernel.module.options["block_dim"]] = None
         return 1, 1
 
-    with _COLLECTING:  # else two threads could put back each other's
-        wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size = collect, both, once, block_size
-        try:
-            yield variants
-        finally:
-            wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size = originals
+    wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size = collect, both, once, block_size
+    try:
+        yield variants
+    finally:
+        wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size = originals

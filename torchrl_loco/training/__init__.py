@@ -4,6 +4,7 @@ from torchrl_loco.training.config import PPOConfig as PPOConfig
 from torchrl_loco.training.config import REPPOConfig as REPPOConfig
 from torchrl_loco.training.config import TrainingConfig as TrainingConfig
 from torchrl_loco.training.evaluation import describe as describe
+from torchrl_loco.training.evaluation import has_display as has_display
 from torchrl_loco.training.evaluation import record as record
 from torchrl_loco.training.evaluation import view as view
 from torchrl_loco.training.plots import plot_runs as plot_runs

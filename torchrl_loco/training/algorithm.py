@@ -50,8 +50,8 @@ class Algorithm(ABC):
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
         """Makes one gradient step without reading the device; returns the metrics in the order of ``metric_names``."""
 
-    def make_optimizer(self, name: str, parameters: Iterable[nn.Parameter]) -> torch.optim.Adam:
-        """Makes an optimizer whose learning rate lives on the device, where recorded steps find it."""
+    def make_optimizer(self, name: str, parameters: Iterable[Any]) -> torch.optim.Adam:
+        """Makes an optimizer, of parameters or groups, whose learning rate lives where recorded steps find it."""
         on_cuda = self.device.type == "cuda"
         lr = torch.tensor(self.config.lr, device=self.device)
         optimizer = torch.optim.Adam(parameters, lr=lr, eps=1e-5, capturable=on_cuda, fused=on_cuda or None)
@@ -140,7 +140,8 @@ class Replay:
         if self._graph is None:
             torch.cuda.synchronize(self._device)
             self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph):
+            side = torch.cuda.Stream(self._device)  # else torch takes one of its current device
+            with torch.cuda.device(self._device), torch.cuda.graph(self._graph, stream=side):
                 self._work()
         self._graph.replay()
 

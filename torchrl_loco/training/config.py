@@ -10,7 +10,7 @@ import torch
 from torchrl_loco import models
 from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.envs.checks import check_count, check_seed
-from torchrl_loco.registry import env_class
+from torchrl_loco.registry import canonical_id, env_class
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,7 @@ class TrainingConfig:
     """Time between two checkpoints (s)."""
 
     def __post_init__(self) -> None:
-        env_class(self.task)
+        object.__setattr__(self, "task", canonical_id(self.task))
         if self.protocol not in PROTOCOLS:
             raise ValueError(f"unknown protocol {self.protocol!r}: choose one of {', '.join(PROTOCOLS)}")
         for field in dataclasses.fields(self):
@@ -154,6 +154,11 @@ class REPPOConfig(TrainingConfig):
     """Return that the last bin stands for; the first stands for 0."""
     aux_coeff: float = 1.0
     """Weight of the critic's second task: to foresee its own features of the next step."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.num_bins < 2:
+            raise ValueError(f"num_bins must be an integer of at least 2, got {self.num_bins}")
 
 
 CONFIGS: dict[str, type[TrainingConfig]] = {config.algorithm: config for config in (PPOConfig, REPPOConfig)}

@@ -1,6 +1,9 @@
 """How good a policy is, and what it looks like."""
 
+import os
+import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -76,6 +79,17 @@ def record(
         video.init_video_stream("h264", fps=frame_rate)
         for _ in _play(policy, env, action_repeat, round(seconds * frame_rate), "video"):
             video.write_frame(env.render(camera, 480, 360)[0].cpu().numpy())
+
+
+def has_display() -> bool:
+    """Returns whether MuJoCo's viewer can open a window here."""
+    if sys.platform == "darwin":  # there the viewer needs MuJoCo's own launcher
+        return "mjpython" in Path(sys.argv[0]).name or "MJPYTHON_BIN" in os.environ
+    import glfw
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # glfw warns where it fails
+        return bool(glfw.init())
 
 
 def view(policy: Policy, env: LocoEnv, action_repeat: int = 1) -> None:

@@ -148,7 +148,8 @@ def deterministic(actor: ProbabilisticActor, config: TrainingConfig, info: dict[
     """
     kinds = (ObservationNorm, nn.Linear, nn.LayerNorm, nn.SiLU)
     *layers, last = (copy.deepcopy(module) for module in actor.modules() if isinstance(module, kinds))
-    head = nn.Linear(config.hidden[-1], config.action_size)  # the mean's rows of the last layer
+    # The mean's rows of the last layer; initialising it would draw from the generator that training draws from.
+    head = nn.utils.skip_init(nn.Linear, config.hidden[-1], config.action_size)
     head.load_state_dict({name: value[: config.action_size] for name, value in last.state_dict().items()})
     settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "device")}
     network = nn.Sequential(*layers, head.to(config.device), nn.Tanh())

@@ -1,11 +1,13 @@
 """Learning curves as pictures."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 
+from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
 
 
@@ -15,18 +17,19 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     Evaluations are dots: the mean over episodes, with the standard deviation over episodes as a bar.
 
     Raises:
-        ValueError: a run has no metrics yet.
+        ValueError: there are no runs, or one has no metrics yet.
     """
     matplotlib.use("agg")
     from matplotlib import pyplot as plt
 
-    groups: dict[str, list[RunFolder]] = {}
+    if not runs:
+        raise ValueError("no runs to plot")
+    groups: dict[TrainingConfig, list[RunFolder]] = {}
     for run in runs:
-        config = run.load_config()
-        label = f"{config.task}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds on {config.device}"
-        groups.setdefault(label, []).append(run)
+        groups.setdefault(dataclasses.replace(run.load_config(), seed=0, out=Path()), []).append(run)
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    for label, group in groups.items():
+    for config, group in groups.items():
+        label = f"{config.task}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds on {config.device}"
         metrics = [run.read_metrics() for run in group]
         length = min(len(m["frames"]) for m in metrics)
         returns = np.array([m["return"][:length] for m in metrics])

@@ -6,7 +6,7 @@ import torch
 
 from torchrl_loco.config import suggestion
 from torchrl_loco.envs.checks import check_device
-from torchrl_loco.registry import env_class
+from torchrl_loco.registry import canonical_id
 from torchrl_loco.training.config import CONFIGS, TrainingConfig
 
 Settings = dict[str, Any]
@@ -89,7 +89,7 @@ def preset(
     Raises:
         ValueError: there is no such device or algorithm, or a field is out of range; the message names what is valid.
     """
-    env_class(task)
+    task = canonical_id(task)
     device = check_device(device)
     algorithm = DEFAULT_ALGORITHM[device.type] if algorithm is None else algorithm
     if algorithm not in CONFIGS:

@@ -36,7 +36,9 @@ class REPPO(Algorithm):
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "weights": self.weights})
         self._actor_parameters = [*self.actor.parameters(), *self.weights.parameters()]
         self.critic_optimizer = self.make_optimizer("critic", self.critic.parameters())
-        self.actor_optimizer = self.make_optimizer("actor", self._actor_parameters)
+        # The gradient of a weight's logarithm shrinks with the weight: Adam's usual eps would hold a small one down.
+        groups = [{"params": list(self.actor.parameters())}, {"params": list(self.weights.parameters()), "eps": 1e-8}]
+        self.actor_optimizer = self.make_optimizer("actor", groups)
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Estimates returns in which entropy counts as reward, from one action drawn in every next state.

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from torchrl_loco.envs.checks import check_device
+from torchrl_loco.policy import Policy
 from torchrl_loco.training.config import CONFIGS, TrainingConfig
 
 CHECKPOINT_VERSION = 2
@@ -74,7 +75,10 @@ class RunFolder:
         """Returns the settings of the run, with ``overrides`` on top, such as ``device="cpu"`` for a run from CUDA."""
         values = json.loads((self.path / "config.json").read_text())
         values.update(out=Path(values["out"]), hidden=tuple(values["hidden"]))
-        return CONFIGS[values.pop("algorithm")](**{**values, **overrides})
+        algorithm = values.pop("algorithm", None)
+        if algorithm not in CONFIGS:
+            raise ValueError(f"{self.path} was trained by {algorithm!r}, this release has {', '.join(CONFIGS)}")
+        return CONFIGS[algorithm](**{**values, **overrides})
 
     @property
     def video(self) -> Path:
@@ -85,6 +89,11 @@ class RunFolder:
     def policy(self) -> Path:
         """Where the trained policy lies, without what only training needs."""
         return self.path / "policy.safetensors"
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the trained policy has had its last evaluation."""
+        return self.policy.is_file() and "mean" in Policy.load(self.policy, "cpu").info
 
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Adds a line to ``metrics.csv``."""
@@ -112,16 +121,20 @@ class RunFolder:
     def forget_after(self, frames: int) -> None:
         """Removes the lines of metrics and evaluations after so many frames: a resumed run writes them again."""
         for name in ("metrics.csv", "evaluations.csv"):
-            rows = [row for row in self._read(name) if row["frames"] <= frames]
-            (self.path / name).unlink(missing_ok=True)
-            for row in rows:
-                self._append(name, row)
+            path, part = self.path / name, self.path / f"{name}.part"
+            if not path.exists():
+                continue
+            head, *lines = path.read_text().splitlines()
+            at, count = head.split(",").index("frames"), head.count(",")
+            whole = [line for line in lines if line.count(",") == count]  # a crash may have torn the last one
+            part.write_text("\n".join([head, *(line for line in whole if float(line.split(",")[at]) <= frames)]) + "\n")
+            part.replace(path)
 
     def _append(self, name: str, row: dict[str, Any]) -> None:
         path = self.path / name
         new = not path.exists()
         with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, row)
+            writer = csv.DictWriter(file, row, lineterminator="\n")
             if new:
                 writer.writeheader()
             writer.writerow(row)

@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs.autoreset import TransformedEnv
-from torchrl_loco.envs.checks import check_count, check_seed
+from torchrl_loco.envs.checks import check_count, check_device, check_seed
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make
 from torchrl_loco.training.algorithm import Algorithm
@@ -49,6 +49,7 @@ class Trainer:
     def __init__(self, run: RunFolder, resume: bool = False) -> None:
         self.run = run
         self.config = config = run.load_config()
+        check_device(config.device)
         checkpoint = run.load_checkpoint(config.device) if resume else None
         torch.manual_seed(config.seed)
         self.env = make_env(config)
@@ -68,7 +69,7 @@ class Trainer:
         """
         config = self.config
         saved = time.perf_counter()
-        board = SummaryWriter(str(self.run.path / "tensorboard"), purge_step=self.frames)
+        board = SummaryWriter(str(self.run.path / "tensorboard"), purge_step=self.frames + 1)
         bar = tqdm(total=config.total_frames, initial=self.frames, unit="frame", unit_scale=True, desc=config.task)
         with tf32(), board, bar, interruptible() as interrupted:
             while self.frames < self.last_frame:
@@ -142,12 +143,12 @@ class Trainer:
         config = self.config
         policy = Policy.load(self.run.policy, config.device)
         summary = evaluate_run(self.run)
-        policy.info |= summary
-        policy.save(self.run.policy)
         plot_runs([self.run], self.run.path / "learning_curve.png")
         if config.video_seconds > 0:
             env = make(config.task, 1, config.device, evaluation_seed(config, 1), config.protocol)
             record(policy, env, self.run.video, config.video_seconds, config.action_repeat)
+        policy.info |= summary
+        policy.save(self.run.policy)  # the last thing: it marks the run as finished
         print(describe(summary))
 
     def save(self) -> None:
@@ -167,7 +168,7 @@ class Trainer:
 
     def _load(self, checkpoint: dict[str, Any]) -> None:
         self.frames, self.iteration, self.seconds = (checkpoint[key] for key in ("frames", "iteration", "seconds"))
-        if self.frames >= self.last_frame:
+        if self.frames >= self.last_frame and self.run.is_finished:
             raise ValueError(f"{self.run.path} is complete: it has all of its {self.frames} frames")
         self.algorithm.load_state_dict(checkpoint["algorithm"])
         self.collector.load_state_dict(checkpoint["collector"])
