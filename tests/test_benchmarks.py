@@ -6,7 +6,7 @@ import os
 import pytest
 import torch
 
-from benchmarks import timing
+from benchmarks import fidelity, timing
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
 from benchmarks.throughput import phases
@@ -58,3 +58,14 @@ def test_results_keep_how_they_were_made(tmp_path, capsys):
     assert results["device"]
     show(measured, {"case": "", "ms": ".2f", "error": ""})
     assert capsys.readouterr().out.splitlines()[1].split() == ["env_step", "5.50"]
+
+
+def test_fidelity_is_measured_on_real_worlds(tmp_path, monkeypatch):
+    """One step of converged walkers agrees to rounding, and a solver cut short is told from a converged one."""
+    monkeypatch.setattr(fidelity, "HORIZONS", (1, 4))
+    found = fidelity.fidelity(["walker"], 16, torch.device("cpu"))
+    first = {(row["protocol"], row["against"]): row["median"] for row in found if row["steps"] == 1}
+    assert first["dm_control", "same settings"] < 1e-5
+    assert first["playground", "converged"] > 10 * first["dm_control", "same settings"]
+    fidelity.plot_fidelity(found, tmp_path / "fidelity.png")
+    assert (tmp_path / "fidelity.png").stat().st_size > 10_000
