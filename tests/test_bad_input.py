@@ -62,7 +62,7 @@ def make_cases():
     yield from (("ctrl_dt", value) for value in (0.001, 0.0251, 1e-9))
 
 
-@pytest.mark.parametrize(("field", "value"), list(make_cases()), ids=repr)
+@pytest.mark.parametrize(("field", "value"), list(make_cases()))
 def test_make(field, value):
     arguments = {"id": "walker_walk", "num_envs": 2, "device": "cpu", "seed": 0}
     refused(torchrl_loco.make, **{**arguments, field: value})
@@ -82,7 +82,7 @@ def config_cases():
                 yield from ((config, field.name, value) for value in bad if value != 2**31)
 
 
-@pytest.mark.parametrize(("config", "field", "value"), list(config_cases()), ids=repr)
+@pytest.mark.parametrize(("config", "field", "value"), list(config_cases()))
 def test_training_settings(config, field, value):
     refused(config, **{"task": "walker_walk", field: value})
 

@@ -1,6 +1,7 @@
 """The command ``torchrl-loco``: parse, call, exit."""
 
 import contextlib
+import dataclasses
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -75,67 +76,64 @@ def resume(run: tyro.conf.Positional[Path], /) -> None:
         training.Trainer(training.RunFolder(run), resume=True).train()
 
 
-def record(
-    run: tyro.conf.Positional[Path],
-    /,
-    seconds: float = 10.0,
-    camera: Literal["side", "back", "egocentric"] = "side",
-    seed: int = 0,
-    device: str | None = None,
-    out: Path | None = None,
-) -> None:
+@dataclasses.dataclass(frozen=True)
+class Video:
+    """What of an episode is shown."""
+
+    seconds: float = 10.0
+    """Length of the video."""
+    camera: Literal["side", "back", "egocentric"] = "side"
+    """Which of the model's cameras."""
+    seed: int = 0
+    """Seed that the episode is drawn from."""
+    device: str | None = None
+    """Where to play; default: CUDA if there is any."""
+    out: Path | None = None
+    """The video; default: video.mp4 in the run's folder (record), TASK.mp4 where there is no display (play)."""
+
+    def make(self, policy: torchrl_loco.Policy, default: Path) -> None:
+        """Records the policy into ``out`` or the default, and prints which."""
+        if not 0 < self.seconds < math.inf:
+            raise ValueError(f"seconds must be positive and finite, got {self.seconds}")
+        out = default if self.out is None else self.out
+        training.record(policy, self.env(policy), out, self.seconds, policy.info["action_repeat"], self.camera)
+        print(out)
+
+    def env(self, policy: torchrl_loco.Policy) -> torchrl_loco.envs.LocoEnv:
+        """Returns one world of the policy's task."""
+        return torchrl_loco.make(policy.info["task"], 1, self.device, self.seed, policy.info["protocol"])
+
+
+VideoOptions = Annotated[Video, tyro.conf.arg(name="")]
+
+
+def record(run: tyro.conf.Positional[Path], /, video: VideoOptions = Video()) -> None:
     """Record a video of the trained policy of a run.
 
     Args:
         run: folder of the run.
-        seconds: length of the video.
-        camera: which of the model's cameras.
-        seed: seed that the episode is drawn from.
-        device: where to play; default: CUDA if there is any.
-        out: the video; default: video.mp4 in the run's folder.
+        video: what is shown.
     """
     with _user_errors():
         folder = training.RunFolder(run)
-        policy = torchrl_loco.Policy.load(folder.policy, device)
-        _record(policy, folder.video if out is None else out, seconds, camera, seed, device)
+        video.make(torchrl_loco.Policy.load(folder.policy, video.device), folder.video)
 
 
-def play(
-    task: tyro.conf.Positional[str],
-    /,
-    seconds: float = 10.0,
-    camera: Literal["side", "back", "egocentric"] = "side",
-    seed: int = 0,
-    device: str | None = None,
-    out: Path | None = None,
-) -> None:
+def play(task: tyro.conf.Positional[str], /, video: VideoOptions = Video()) -> None:
     """Show the trained policy that comes with the package: in a window if there is a display, else as a video.
 
     Args:
         task: id of the environment.
-        seconds: length of the video.
-        camera: which of the model's cameras.
-        seed: seed that the episode is drawn from.
-        device: where to play; default: CUDA if there is any.
-        out: a video instead of a window; default without a display: TASK.mp4.
+        video: what is shown; with --out, a video in any case.
     """
     with _user_errors():
-        policy = torchrl_loco.load_policy(task, device)
+        policy = torchrl_loco.load_policy(task, video.device)
         shown = ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on", "mean", "std")
         print(task, *(f"{key} {policy.info[key]}" for key in shown if key in policy.info), sep=", ")
-        if out is None and training.has_display():
-            env = torchrl_loco.make(task, 1, device, seed, policy.info["protocol"])
-            training.view(policy, env, policy.info["action_repeat"])
+        if video.out is None and training.has_display():
+            training.view(policy, video.env(policy), policy.info["action_repeat"])
         else:
-            _record(policy, Path(f"{policy.info['task']}.mp4") if out is None else out, seconds, camera, seed, device)
-
-
-def _record(policy: torchrl_loco.Policy, out: Path, seconds: float, camera: str, seed: int, device: str | None) -> None:
-    if not 0 < seconds < math.inf:
-        raise ValueError(f"seconds must be positive and finite, got {seconds}")
-    env = torchrl_loco.make(policy.info["task"], 1, device, seed, policy.info["protocol"])
-    training.record(policy, env, out, seconds, policy.info["action_repeat"], camera)
-    print(out)
+            video.make(policy, Path(f"{policy.info['task']}.mp4"))
 
 
 def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("learning_curves.png")) -> None:

@@ -275,6 +275,28 @@ def test_what_was_interrupted_at_the_very_end_can_be_finished(tmp_path, monkeypa
         Trainer(run, resume=True)
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+def test_a_run_on_cuda(algorithm, tmp_path):
+    """Recorded gradient steps learn, the run can be stopped and resumed, and its policy plays on the CPU."""
+    config = preset(
+        "walker_stand", "cuda", algorithm, out=tmp_path, video_seconds=0.0, **{**SMALL, "total_frames": 640}
+    )
+    run = RunFolder.create(config)
+    first = Trainer(run)
+    before = {name: value.clone() for name, value in first.algorithm.networks.state_dict().items()}
+    for _ in range(3):
+        first._iterate()
+    first.save()
+    second = Trainer(run, resume=True)
+    assert_same(first.algorithm.networks.state_dict(), second.algorithm.networks.state_dict())
+    second.train()
+    after = second.algorithm.networks.state_dict()
+    assert all(value.isfinite().all() for value in after.values())
+    assert any((value != before[name]).any() for name, value in after.items() if "weight" in name)
+    assert evaluate_run(run, device="cpu")["mean"] > 0
+
+
 def test_a_torn_line_does_not_keep_a_run_from_going_on(tmp_path):
     run = made(tmp_path)
     for frames in (128, 256, 384):
