@@ -36,6 +36,7 @@ class Renderer:
                 cam_active=[camera],
             )
             self._rgb = wp.zeros((sim.num_envs, height, width), dtype=wp.vec3)
+        self._pixels = wp.to_torch(self._rgb)
         wp.synchronize_device(sim.device)  # made on Warp's stream, used on torch's
 
     def render(self) -> torch.Tensor:
@@ -46,4 +47,4 @@ class Renderer:
             mjw.refit_bvh(sim.model, sim.data, self._context)
             mjw.render(sim.model, sim.data, self._context)
             mjw.get_rgb(self._context, 0, self._rgb)
-        return wp.to_torch(self._rgb).clamp(0.0, 1.0).mul(255.0).round().to(torch.uint8)
+        return self._pixels.clamp(0.0, 1.0).mul(255.0).round().to(torch.uint8)

@@ -135,6 +135,23 @@ def test_torch_defaults_of_the_caller_do_not_matter():
         torch.set_default_dtype(torch.float32)
 
 
+@pytest.mark.parametrize("elsewhere", ["meta", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_the_callers_default_device_does_not_matter(elsewhere, protocol):
+    """An environment on the CPU stays whole where tensors are made on another device by default."""
+    action = torch.zeros(3, 21)
+    expected = torchrl_loco.make("humanoid_walk", 3, "cpu", seed=0, protocol=protocol).reset()["observation"]
+    with torch.device(elsewhere):
+        env = torchrl_loco.make("humanoid_walk", 3, "cpu", seed=0, protocol=protocol, stagger=True, reward_terms=True)
+        td = env.reset()
+        torch.testing.assert_close(td["observation"], expected, rtol=0, atol=0)
+        for _ in range(101):
+            _, td = env.step_and_maybe_reset(td.set("action", action))
+        env._health.check()
+        env.reset(env.get_state().branch(1), set_state=True)
+        env.load_state_dict(env.state_dict())
+        assert env.render(width=8, height=8).device == env.health()["total"].device == torch.device("cpu")
+
+
 def test_reward_terms_are_zero_at_a_reset(task):
     env = torchrl_loco.make(task, 2, "cpu", seed=0, reward_terms=True)
     env.rollout(2)

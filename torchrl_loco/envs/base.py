@@ -71,19 +71,20 @@ class LocoEnv(AsyncReset):
         self.protocol = protocol
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
-        self.sim = Simulation(models.load(self.body), self.config, num_envs, device)
-        self.reward_terms, self.stagger = bool(reward_terms), bool(stagger)
-        self._make_buffers()
-        self._health = Health(self.sim, self._bad, on_overflow)
-        self._make_specs()
-        self._prepare()
-        self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
-        self._step_graph = self.sim.capture(self._launch_step)
-        self._reset_graph = self.sim.capture(self._launch_reset)
-        self._refresh_graph = self.sim.capture(self._launch_refresh)
-        wp.synchronize_device(self.sim.device)  # made on Warp's stream, used on torch's
-        self._set_seed(seed)  # and begin anew: recording has drawn episodes
-        self._health.zero_()
+        with device:  # else torch's views of Warp's arrays would follow the caller's default device
+            self.sim = Simulation(models.load(self.body), self.config, num_envs, device)
+            self.reward_terms, self.stagger = bool(reward_terms), bool(stagger)
+            self._make_buffers()
+            self._health = Health(self.sim, self._bad, on_overflow)
+            self._make_specs()
+            self._prepare()
+            self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
+            self._step_graph = self.sim.capture(self._launch_step)
+            self._reset_graph = self.sim.capture(self._launch_reset)
+            self._refresh_graph = self.sim.capture(self._launch_refresh)
+            wp.synchronize_device(self.sim.device)  # made on Warp's stream, used on torch's
+            self._set_seed(seed)  # and begin anew: recording has drawn episodes
+            self._health.zero_()
         self._renderers: dict[tuple[str, int, int], Renderer] = {}
 
     @property
@@ -349,7 +350,8 @@ class LocoEnv(AsyncReset):
         """
         key = (camera, check_count("width", width), check_count("height", height))
         if key not in self._renderers:
-            self._renderers[key] = Renderer(self.sim, *key)
+            with self.device:
+                self._renderers[key] = Renderer(self.sim, *key)
         return self._renderers[key].render()
 
     def to(self, device: Any) -> "LocoEnv":

@@ -77,7 +77,7 @@ class Health:
         self._counts = wp.zeros((sim.num_envs, len(KINDS) + 1), dtype=int, device=sim.device)
         self.counts = wp.to_torch(self._counts)
         on_cuda = sim.device.is_cuda
-        self._seen = torch.zeros(len(LOSSES) + 2, dtype=torch.long, pin_memory=on_cuda)
+        self._seen = torch.zeros(len(LOSSES) + 2, dtype=torch.long, device="cpu", pin_memory=on_cuda)
         self._copied = torch.cuda.Event() if on_cuda else None
         self._looking, self._steps, self._reported = False, 0, 0
 
