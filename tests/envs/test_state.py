@@ -212,3 +212,13 @@ def test_state_dict_of_another_kind(options, message):
     env = torchrl_loco.make(**{"id": "walker_run", "num_envs": 3, "device": "cpu", **options})
     with pytest.raises(ValueError, match=message):
         env.load_state_dict(state)
+
+
+def test_a_lenient_state_dict_leaves_the_worlds_alone():
+    """EnvCreator loads its shadow environment's into every environment that it makes, whatever their size."""
+    env = torchrl_loco.make("walker_walk", 3, "cpu", seed=5)
+    env.reset()
+    before = env.get_state()
+    env.load_state_dict(torchrl_loco.make("walker_walk", 4, "cpu", seed=6).state_dict(), strict=False)
+    assert (env.get_state() == before).all()
+    assert env.seed == 5

@@ -1,6 +1,7 @@
 """What all locomotion environments share: specs, step, reset, seeding, time limit, state. Knows no task."""
 
 import secrets
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import mujoco
@@ -295,6 +296,16 @@ class LocoEnv(AsyncReset):
         self.seed = check_seed(state["seed"])
         self._views["seed"].fill_(self.seed)
         self.reset(State(state["worlds"], batch_size=self.batch_size, device=self.device), set_state=True)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> Any:
+        """Goes on where ``state_dict`` was taken; see :meth:`set_extra_state`.
+
+        With ``strict=False`` the worlds stay as they are: so TorchRL's ``EnvCreator`` hands what transforms share to
+        every environment that it makes, which should begin anew.
+        """
+        if not strict:
+            state_dict = {name: value for name, value in state_dict.items() if not name.endswith("_extra_state")}
+        return super().load_state_dict(state_dict, strict=strict, **kwargs)
 
     def _restore(self, state: TensorDictBase | None) -> None:
         """Writes a state into the worlds in the mask; what it lacks beside qpos and qvel starts at zero."""
