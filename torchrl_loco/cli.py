@@ -73,7 +73,9 @@ def resume(run: tyro.conf.Positional[Path], /) -> None:
         run: folder of the run.
     """
     with _user_errors():
-        training.Trainer(training.RunFolder(run), resume=True).train()
+        trainer = training.Trainer(training.RunFolder(run), resume=True)
+    with _user_errors(OSError):
+        trainer.train()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,7 +171,9 @@ def main(args: Sequence[str] | None = None) -> int:
         with _user_errors():
             run = training.RunFolder.create(config)
             print(f"run folder: {run.path}")
-            training.Trainer(run).train()
+            trainer = training.Trainer(run)
+        with _user_errors(OSError):  # a full disk; anything else in here is a bug and keeps its traceback
+            trainer.train()
 
     try:
         tyro.extras.subcommand_cli_from_dict(
@@ -197,11 +201,12 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _user_errors() -> Iterator[None]:
-    """Turns errors about what the user passed into one line and exit status 2."""
+def _user_errors(*kinds: type[Exception]) -> Iterator[None]:
+    """Turns errors about what the user passed, or those of some kinds, into one line and exit status 2."""
+    told = kinds or (ValueError, TypeError, OSError)
     try:
         yield
-    except (ValueError, TypeError, OSError) as error:
+    except told as error:
         print(f"torchrl-loco: {error}", file=sys.stderr)
         raise SystemExit(2) from None
 

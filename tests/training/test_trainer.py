@@ -398,6 +398,19 @@ def test_command_line_errors(run, arguments, message, capsys):
     assert message in " ".join((captured.out + captured.err).replace("│", " ").split())
 
 
+@pytest.mark.parametrize(("error", "shown"), [(OSError("no space left"), True), (TypeError("a bug"), False)])
+def test_errors_while_training(error, shown, tmp_path, monkeypatch, capsys):
+    """What the machine lacks is told in a line; a bug keeps its traceback."""
+
+    def fail(self, batch, progress):
+        raise error
+
+    monkeypatch.setattr(Algorithm, "update", fail)
+    with pytest.raises(SystemExit if shown else TypeError):
+        cli.main(["train", "walker_walk", "--device", "cpu", "--out", str(tmp_path)])
+    assert ("torchrl-loco: no space left" in capsys.readouterr().err) == shown
+
+
 def test_a_run_needs_a_checkpoint_of_this_version(run, tmp_path):
     folder = tmp_path / "old"
     folder.mkdir()
