@@ -101,6 +101,7 @@ def collected(reppo, num_envs):
         return env.rollout(reppo.config.decisions, reppo.actor)
 
 
+@pytest.mark.slow
 def test_updates_raise_what_is_rewarded():
     """Rewarded for the first joint alone, the actor moves that joint."""
     reppo = made(num_envs=64, decisions=8, minibatch_size=128, epochs=8, lr=1e-3, gamma=0.5, reward_scale=10.0)

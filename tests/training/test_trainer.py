@@ -200,6 +200,7 @@ def test_where_it_is_ignored_it_stays_ignored(tmp_path):
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
+@pytest.mark.slow
 def test_evaluations_during_training(tmp_path):
     run = trained(tmp_path, total_frames=1024, eval_interval=256, video_seconds=0.0)
     assert [row["frames"] for row in run.read_evaluations()] == [256, 512, 768, 1024]
@@ -236,6 +237,7 @@ def test_policy_of_a_run_is_its_actor(run):
     assert expected.std() > 1e-3
 
 
+@pytest.mark.slow
 def test_plot_of_several_runs(run, tmp_path):
     runs = [run, trained(tmp_path, run.load_config().algorithm, seed=1, video_seconds=0.0)]
     plot_runs(runs, tmp_path / "curves.png")
@@ -245,6 +247,7 @@ def test_plot_of_several_runs(run, tmp_path):
         plot_runs([made(tmp_path)], tmp_path / "none.png")
 
 
+@pytest.mark.slow
 def test_runs_that_differ_in_more_than_the_seed_are_apart(tmp_path, monkeypatch):
     drawn, plot = [], Axes.plot
     monkeypatch.setattr(Axes, "plot", lambda self, x, y, **k: drawn.append(len(x)) or plot(self, x, y, **k))
@@ -307,6 +310,7 @@ def test_a_torn_line_does_not_keep_a_run_from_going_on(tmp_path):
     assert path.read_text() == "iteration,frames,return\n1,128,1.5\n2,256,1.5\n"
 
 
+@pytest.mark.slow
 def test_evaluating_draws_nothing_that_training_draws(tmp_path):
     often = trained(tmp_path / "often", "reppo", eval_interval=128, video_seconds=0.0)
     once = trained(tmp_path / "once", "reppo", video_seconds=0.0)
@@ -335,6 +339,7 @@ def test_every_update_begins_with_the_policy_that_collected(tmp_path, monkeypatc
     torch.testing.assert_close(mean, seen.mean(0), atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_training_worlds_are_staggered(tmp_path, monkeypatch):
     update, dones = Algorithm.update, []
     monkeypatch.setattr(
@@ -398,6 +403,7 @@ def test_command_line_errors(run, arguments, message, capsys):
     assert message in " ".join((captured.out + captured.err).replace("│", " ").split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("error", "shown"), [(OSError("no space left"), True), (TypeError("a bug"), False)])
 def test_errors_while_training(error, shown, tmp_path, monkeypatch, capsys):
     """What the machine lacks is told in a line; a bug keeps its traceback."""
