@@ -102,7 +102,9 @@ class Policy(TensorDictModule):
             if metadata.pop("sha256") != _digest(tensors, metadata):
                 raise ValueError("its checksum is wrong: the file was damaged or changed")
             tensors = {name: tensor.float() for name, tensor in tensors.items()}
-            network = nn.Sequential(*map(_make_layer, *_with_tensors(json.loads(metadata["layers"]), tensors)))
+            names = json.loads(metadata["layers"])
+            sized = [tensors.get(f"{i}.weight", tensors.get(f"{i}.mean")) for i in range(len(names))]
+            network = nn.Sequential(*map(_make_layer, names, sized))
             network.load_state_dict(tensors)
             info = json.loads(metadata["info"])
         except (SafetensorError, ValueError, KeyError, RuntimeError, OSError) as error:
@@ -129,13 +131,8 @@ _LAYER_NAMES: dict[type[nn.Module], str] = {
 }
 
 
-def _with_tensors(layers: list[str], tensors: dict[str, torch.Tensor]) -> tuple[list[str], list[torch.Tensor | None]]:
-    """Returns for each layer its name and the tensor that tells its size."""
-    sized = [tensors.get(f"{i}.weight", tensors.get(f"{i}.mean")) for i in range(len(layers))]
-    return layers, sized
-
-
 def _make_layer(name: str, sized: torch.Tensor | None) -> nn.Module:
+    """Makes the layer of a name, as large as one of its tensors tells."""
     if name == "silu":
         return nn.SiLU()
     if name == "tanh":

@@ -99,15 +99,12 @@ class Health:
         """
         if self.on_overflow == "ignore":
             return
-        if self._looking and (self._copied is None or self._copied.query()):
-            self._looking = False
-            self._act()
         self._steps += 1
         if self._steps % INTERVAL == 0 and not self._looking:
             self._look()
-            if self._copied is None:  # on the CPU it is here already
-                self._looking = False
-                self._act()
+        if self._looking and (self._copied is None or self._copied.query()):  # on the CPU it is here at once
+            self._looking = False
+            self._act()
 
     def check(self) -> None:
         """Looks now, waits for the device, and acts; see :meth:`after_step`."""

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
@@ -152,8 +152,3 @@ def clip_and_step(optimizer: torch.optim.Optimizer, max_norm: float) -> torch.Te
     norm = nn.utils.clip_grad_norm_(parameters, max_norm)
     optimizer.step()
     return norm
-
-
-def flat(td: TensorDictBase, **entries: torch.Tensor) -> TensorDict:
-    """Returns a TensorDict of entries with the batch size of another."""
-    return TensorDict(entries, batch_size=td.batch_size)

@@ -14,7 +14,7 @@ from torch import nn
 from torch.nn.functional import cross_entropy, mse_loss, softplus
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
-from torchrl_loco.training.algorithm import Algorithm, clip_and_step, flat
+from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import REPPOConfig
 from torchrl_loco.training.networks import make_actor_q
 
@@ -36,7 +36,7 @@ class REPPO(Algorithm):
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "weights": self.weights})
         self._actor_parameters = [*self.actor.parameters(), *self.weights.parameters()]
         self.critic_optimizer = self.make_optimizer("critic", self.critic.parameters())
-        # The gradient of a weight's logarithm shrinks with the weight: Adam's usual eps would hold a small one down.
+        # The gradient of a weight's logarithm shrinks with the weight: an eps of 1e-5 would hold it down.
         groups = [{"params": list(self.actor.parameters())}, {"params": list(self.weights.parameters()), "eps": 1e-8}]
         self.actor_optimizer = self.make_optimizer("actor", groups)
 
@@ -55,16 +55,8 @@ class REPPO(Algorithm):
         returns = td_lambda_return_estimate(
             config.gamma, config.lmbda, value.unsqueeze(-1), reward, after["done"], after["terminated"]
         )
-        return flat(
-            batch,
-            observation=batch["observation"],
-            action=batch["action"],
-            loc=batch["loc"],
-            scale=batch["scale"],
-            returns=returns.squeeze(-1),
-            features=features,
-            alive=alive.squeeze(-1).float(),
-        )
+        estimates = {"returns": returns.squeeze(-1), "features": features, "alive": alive.squeeze(-1).float()}
+        return batch.select("observation", "action", "loc", "scale").update(estimates)
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
         """Makes a step of the critic, then one of the actor and the two weights."""
