@@ -30,7 +30,7 @@ format: $(VENV)/installed
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --editable ".[all]"
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --editable ".[dev]"
 	touch $@
 
 clean:
