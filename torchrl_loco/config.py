@@ -28,6 +28,8 @@ class SimConfig:
         ls_iterations: limit of the line search's iterations within one solver iteration.
         euler_damping: whether joint damping is integrated implicitly (MuJoCo's ``eulerdamp`` flag).
         episode_length: control steps after which an episode is truncated.
+        deterministic: whether a rollout on CUDA repeats bit for bit, by mujoco_warp's deterministic mode, which is
+            several times slower. On the CPU it always does.
     """
 
     ctrl_dt: float
@@ -38,6 +40,7 @@ class SimConfig:
     ls_iterations: int
     euler_damping: bool
     episode_length: int = 1000
+    deterministic: bool = False
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
