@@ -4,7 +4,7 @@ import mujoco_warp as mjw
 import torch
 import warp as wp
 
-from torchrl_loco.sim import Simulation, current_stream
+from torchrl_loco.sim import EXCLUSIVE, Simulation, current_stream
 
 
 class Renderer:
@@ -25,7 +25,7 @@ class Renderer:
         if camera not in names:
             raise ValueError(f"no camera {camera!r}: choose one of {', '.join(names)}")
         self._sim = sim
-        with wp.ScopedDevice(sim.device):
+        with EXCLUSIVE, wp.ScopedDevice(sim.device):
             self._context = mjw.create_render_context(
                 sim.mj_model,
                 nworld=sim.num_envs,
@@ -42,7 +42,7 @@ class Renderer:
     def render(self) -> torch.Tensor:
         """Returns the current state of all worlds as uint8 pixels, shape ``(num_envs, height, width, 3)``."""
         sim = self._sim
-        with wp.ScopedDevice(sim.device), wp.ScopedStream(current_stream(sim.device)):
+        with EXCLUSIVE, wp.ScopedDevice(sim.device), wp.ScopedStream(current_stream(sim.device)):
             mjw.camlight(sim.model, sim.data)
             mjw.refit_bvh(sim.model, sim.data, self._context)
             mjw.render(sim.model, sim.data, self._context)

@@ -1,5 +1,6 @@
 """What all locomotion environments share: specs, step, reset, seeding, time limit, state. Knows no task."""
 
+import os
 import secrets
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -16,9 +17,9 @@ from torchrl_loco.envs.autoreset import AsyncReset
 from torchrl_loco.envs.checks import check_count, check_device, check_seed
 from torchrl_loco.envs.episode import any_world, apply_action, begin_episode, count_step, quench
 from torchrl_loco.envs.health import Health
-from torchrl_loco.envs.state import State
+from torchrl_loco.envs.state import State, write_state
 from torchrl_loco.rendering import Renderer
-from torchrl_loco.sim import Simulation
+from torchrl_loco.sim import EXCLUSIVE, Simulation
 
 
 class LocoEnv(AsyncReset):
@@ -66,15 +67,18 @@ class LocoEnv(AsyncReset):
         **config: Any,
     ) -> None:
         num_envs = check_count("num_envs", num_envs)
-        seed = None if seed is None else check_seed(seed)
+        seed = secrets.randbits(32) if seed is None else check_seed(seed)
         device = check_device(device)
         self.config = sim_config(self.body, protocol, num_envs, config)
         self.protocol = protocol
         super().__init__(device=device, batch_size=[num_envs])
-        self.num_envs = num_envs
-        with device:  # else torch's views of Warp's arrays would follow the caller's default device
+        self.num_envs, self.seed = num_envs, seed
+        self.reward_terms, self.stagger = bool(reward_terms), bool(stagger)
+        self._pid = os.getpid()
+        no_memory = set(self.__dict__)
+        # The device: else torch's views of Warp's arrays would follow the caller's default device.
+        with EXCLUSIVE, device:
             self.sim = Simulation(models.load(self.body), self.config, num_envs, device)
-            self.reward_terms, self.stagger = bool(reward_terms), bool(stagger)
             self._make_buffers()
             self._health = Health(self.sim, self._bad, on_overflow)
             self._make_specs()
@@ -87,6 +91,8 @@ class LocoEnv(AsyncReset):
             self._set_seed(seed)  # and begin anew: recording has drawn episodes
             self._health.zero_()
         self._renderers: dict[tuple[str, int, int], Renderer] = {}
+        self._memory = set(self.__dict__) - no_memory
+        self.is_closed = False
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -189,6 +195,7 @@ class LocoEnv(AsyncReset):
     # TorchRL's side.
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._refuse_after_fork()
         action = tensordict.get("action")
         if action.shape != self._views["action"].shape:
             raise ValueError(f"action must have shape {tuple(self._views['action'].shape)}, got {tuple(action.shape)}")
@@ -200,6 +207,7 @@ class LocoEnv(AsyncReset):
         return result
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False) -> TensorDictBase:
+        self._refuse_after_fork()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             self._views["mask"].fill_(True)
@@ -308,39 +316,13 @@ class LocoEnv(AsyncReset):
         return super().load_state_dict(state_dict, strict=strict, **kwargs)
 
     def _restore(self, state: TensorDictBase | None) -> None:
-        """Writes a state into the worlds in the mask; what it lacks beside qpos and qvel starts at zero."""
-        targets = {
-            "qpos": self.sim.qpos,
-            "qvel": self.sim.qvel,
-            "qacc_warmstart": self.sim.qacc_warmstart,
-            "elapsed_steps": self._views["elapsed_steps"],
-            "episode": self._views["episode"],
-        }
-        new = {key: None if state is None else state.get(key, None) for key in targets}
-        if new["qpos"] is None or new["qvel"] is None:
-            raise ValueError(
-                "set_state=True needs a state with 'qpos' and 'qvel', as env.get_state() returns it. TransformedEnv "
-                "drops them from a plain TensorDict: pass torchrl_loco.State({'qpos': ..., 'qvel': ...}, batch_size)"
-            )
-        mask = self._views["mask"]
-        for key, value in new.items():
-            if value is None:
-                continue
-            if value.shape != targets[key].shape:
-                raise ValueError(f"{key} must have shape {tuple(targets[key].shape)}, got {tuple(value.shape)}")
-            if not value[mask].isfinite().all():
-                raise ValueError(f"{key} must be finite")
-        for key, target in targets.items():
-            value = new[key]
-            if value is None:
-                if key == "episode":
-                    continue  # the world goes on drawing where it was
-                value = torch.zeros_like(target)
-            rows = mask.view(-1, *[1] * (target.ndim - 1))
-            target.copy_(torch.where(rows, value.detach().to(target), target))
+        """Writes a state into the worlds in the mask."""
+        mask, elapsed_steps = self._views["mask"], self._views["elapsed_steps"]
+        targets = {name: getattr(self.sim, name) for name in ("qpos", "qvel", "qacc_warmstart")}
+        write_state(state, {**targets, "elapsed_steps": elapsed_steps, "episode": self._views["episode"]}, mask)
         for flag in ("bad", "done", "terminated", "truncated"):
             self._views[flag].masked_fill_(mask, False)
-        self.sim.time.copy_(torch.where(mask, self._views["elapsed_steps"] * self.config.ctrl_dt, self.sim.time))
+        self.sim.time.copy_(torch.where(mask, elapsed_steps * self.config.ctrl_dt, self.sim.time))
 
     # Pictures, and the way out.
 
@@ -364,6 +346,28 @@ class LocoEnv(AsyncReset):
             with self.device:
                 self._renderers[key] = Renderer(self.sim, *key)
         return self._renderers[key].render()
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Frees the memory of the worlds. Whatever needs them afterwards raises an error that says so."""
+        if not self.is_closed:
+            for name in self._memory:
+                del self.__dict__[name]
+        super().close()
+
+    def __getattr__(self, name: str) -> Any:
+        if name in self.__dict__.get("_memory", ()):
+            raise RuntimeError(f"this {type(self).__name__} is closed: make a new one")
+        return super().__getattr__(name)
+
+    def _refuse_after_fork(self) -> None:
+        if self.device.type == "cuda" and os.getpid() != self._pid:
+            raise RuntimeError("CUDA does not survive a fork: make the environment in the process that steps it")
+
+    def __reduce__(self) -> Any:
+        raise TypeError(
+            "an environment cannot be copied or pickled: pass on what makes it, functools.partial(torchrl_loco.make, "
+            "...), or what it holds, env.get_state()"
+        )
 
     def to(self, device: Any) -> "LocoEnv":
         """Returns the environment itself if it lives on ``device``; physics cannot move, so anything else raises.

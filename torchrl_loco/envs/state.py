@@ -1,7 +1,9 @@
 """A snapshot of an environment's worlds."""
 
+from collections.abc import Mapping
 from typing import Any
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_loco.envs.checks import check_count
@@ -47,3 +49,37 @@ class State(TensorDict):
         """Selects ``keys``, and the state if ``"_reset"`` is among them."""
         state = [key for key in self.KEYS if key in self] if "_reset" in keys else []
         return super().select(*keys, *state, inplace=inplace, strict=strict)
+
+
+def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor], mask: torch.Tensor) -> None:
+    """Writes a state into what holds it; what it lacks beside qpos and qvel starts at zero, but for the episode.
+
+    Args:
+        state: the state, or whatever was passed for one.
+        targets: the tensors of all worlds by key of :class:`State`, written in place.
+        mask: worlds that are written, ``(num_envs,)``.
+
+    Raises:
+        ValueError: it lacks qpos or qvel, has another shape, or is not finite; then nothing is written.
+    """
+    new = {key: None if state is None else state.get(key, None) for key in targets}
+    if new["qpos"] is None or new["qvel"] is None:
+        raise ValueError(
+            "set_state=True needs a state with 'qpos' and 'qvel', as env.get_state() returns it. TransformedEnv "
+            "drops them from a plain TensorDict: pass torchrl_loco.State({'qpos': ..., 'qvel': ...}, batch_size)"
+        )
+    for key, value in new.items():
+        if value is None:
+            continue
+        if value.shape != targets[key].shape:
+            raise ValueError(f"{key} must have shape {tuple(targets[key].shape)}, got {tuple(value.shape)}")
+        if not value[mask].isfinite().all():
+            raise ValueError(f"{key} must be finite")
+    for key, target in targets.items():
+        value = new[key]
+        if value is None:
+            if key == "episode":
+                continue  # the world goes on drawing where it was
+            value = torch.zeros_like(target)
+        rows = mask.view(-1, *[1] * (target.ndim - 1))
+        target.copy_(torch.where(rows, value.detach().to(target), target))

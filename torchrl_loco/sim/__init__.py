@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from torchrl_loco.sim.graph import EXCLUSIVE as EXCLUSIVE
 from torchrl_loco.sim.graph import Graph as Graph
 from torchrl_loco.sim.graph import current_stream as current_stream
 from torchrl_loco.sim.simulation import Simulation as Simulation

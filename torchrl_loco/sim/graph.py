@@ -1,12 +1,16 @@
 """Work recorded once and replayed at every step: CUDA graphs on the GPU, Warp's recorder on the CPU."""
 
 import contextlib
+import threading
 from collections.abc import Callable
 
 import torch
 import warp as wp
 
 from torchrl_loco.sim.scratch import ScratchPool
+
+EXCLUSIVE = threading.RLock()
+"""Held while anything is launched by hand: a recording on the CPU takes in what other threads launch meanwhile."""
 
 
 def current_stream(device: wp.Device) -> wp.Stream | None:
