@@ -10,7 +10,7 @@ from compare import assert_same
 from tensordict import TensorDict
 
 import torchrl_loco
-from torchrl_loco import RolloutCollector, SimConfig
+from torchrl_loco import RolloutCollector, SimConfig, replay
 from torchrl_loco.policy import SHIPPED, Policy
 from torchrl_loco.training import PPOConfig, REPPOConfig, RunFolder, Trainer, preset
 
@@ -53,6 +53,7 @@ def make_cases():
         "seed": NO_SEED,
         "protocol": NO_NAME,
         "on_overflow": NO_NAME,
+        "bad_world_file": [3, 1.5, True, [], {}, object(), "/", "no/such/folder/file"],
     }.items():
         yield from ((field, value) for value in bad)
     for field in dataclasses.fields(SimConfig):
@@ -181,6 +182,21 @@ def test_damaged_policies(tmp_path):
             refused(Policy.load, path, "cpu")
     path.write_bytes(whole)
     Policy.load(path, "cpu")
+
+
+def test_damaged_bad_worlds(tmp_path):
+    path, chance = tmp_path / "bad.safetensors", random.Random(0)
+    env = torchrl_loco.make("walker_walk", 2, "cpu", 0, bad_world_file=path)
+    env.step(TensorDict({"action": torch.full((2, 6), math.nan)}, batch_size=[2]))
+    with pytest.warns(torchrl_loco.NonFiniteWarning):
+        env.close()
+    whole = path.read_bytes()
+    for _ in range(100):
+        path.write_bytes(data := damaged(whole, chance))
+        if data != whole:
+            refused(replay.load, path)
+    path.write_bytes(whole)
+    replay.load(path)
 
 
 def test_damaged_checkpoints(tmp_path):

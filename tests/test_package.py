@@ -14,13 +14,13 @@ from torchrl_loco import _versions
 
 ROOT = Path(torchrl_loco.__file__).parent
 LAYERS = [  # a module imports from its own layer or from those before it
-    {"config", "rewards", "models", "_versions"},
+    {"config", "rewards", "models", "storage", "_versions"},
     {"sim"},
     {"rendering"},
     {"envs"},
     {"collector"},
     {"registry"},
-    {"doctor", "policy"},
+    {"doctor", "policy", "replay"},
     {"training"},
     {"cli", "__main__"},
 ]

@@ -1,14 +1,13 @@
 """Policies on disk: small, exact enough, and safe to load."""
 
-import json
-
 import pytest
 import torch
 from safetensors.torch import save_file
 from torch import nn
 
 import torchrl_loco
-from torchrl_loco.policy import FORMAT, SHIPPED, ObservationNorm, Policy, _digest
+from torchrl_loco import storage
+from torchrl_loco.policy import SHIPPED, ObservationNorm, Policy
 
 INFO = {"task": "walker_stand", "protocol": "playground", "action_repeat": 2, "mean": 12.5}
 
@@ -46,9 +45,7 @@ def test_what_cannot_be_read_is_told(policy, tmp_path):
     save_file({"0.mean": torch.zeros(3)}, path)
     with pytest.raises(ValueError, match="its format is None"):
         Policy.load(path, "cpu")
-    metadata = {"format": FORMAT, "layers": json.dumps(["os.system"]), "info": "{}"}
-    tensors = {"0.weight": torch.zeros(3)}
-    save_file(tensors, path, {**metadata, "sha256": _digest(tensors, metadata)})
+    storage.save(path, "policy", {"0.weight": torch.zeros(3)}, {"layers": ["os.system"], "info": {}})
     with pytest.raises(ValueError, match=r"unknown layer 'os.system'"):
         Policy.load(path, "cpu")
 

@@ -13,6 +13,7 @@ from torchrl_loco.envs import (
     WalkerStand,
     WalkerWalk,
 )
+from torchrl_loco.envs.bad_world import NonFiniteWarning
 from torchrl_loco.envs.health import PhysicsOverflowError, PhysicsOverflowWarning
 from torchrl_loco.policy import Policy, load_policy
 from torchrl_loco.registry import list_envs, make
@@ -23,6 +24,7 @@ __all__ = [
     "HumanoidRun",
     "HumanoidStand",
     "HumanoidWalk",
+    "NonFiniteWarning",
     "PhysicsOverflowError",
     "PhysicsOverflowWarning",
     "Policy",

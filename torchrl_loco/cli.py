@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import torchrl_loco
 from torchrl_loco import doctor, registry
+from torchrl_loco import replay as replays
 
 try:
     import tyro
@@ -138,6 +139,18 @@ def play(task: tyro.conf.Positional[str], /, video: VideoOptions = Video()) -> N
             video.make(policy, Path(f"{policy.info['task']}.mp4"))
 
 
+def replay(file: tyro.conf.Positional[Path], /, device: str | None = None) -> None:
+    """Step a world that was no longer finite again, substep by substep, in Warp and in C MuJoCo.
+
+    Args:
+        file: what make(..., bad_world_file=FILE) wrote.
+        device: where Warp computes; default: CUDA if there is any.
+    """
+    with _user_errors():
+        for line in replays.describe(replays.load(file), device):
+            print(line)
+
+
 def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("learning_curves.png")) -> None:
     """Draw the learning curves of runs; runs that differ in nothing but their seed become a mean and a band.
 
@@ -184,6 +197,7 @@ def main(args: Sequence[str] | None = None) -> int:
                 "record": record,
                 "play": play,
                 "plot": plot,
+                "replay": replay,
                 "list": list_tasks,
                 "doctor": diagnose,
             },

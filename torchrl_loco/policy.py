@@ -1,21 +1,17 @@
 """Trained policies, in files that hold tensors and settings and nothing to execute."""
 
-import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from tensordict.nn import TensorDictModule
 from torch import nn
 
+from torchrl_loco import storage
 from torchrl_loco.envs.checks import check_device
 from torchrl_loco.registry import canonical_id
 
 SHIPPED = Path(__file__).parent / "policies"
-FORMAT = "torchrl_loco policy 1"
 
 
 class ObservationNorm(nn.Module):
@@ -69,12 +65,11 @@ class Policy(TensorDictModule):
     def save(self, path: Path) -> None:
         """Writes the policy in half precision, which moves an action by some thousandths at most."""
         layers = [_LAYER_NAMES[type(layer)] for layer in self.module]
-        metadata = {"format": FORMAT, "layers": json.dumps(layers), "info": json.dumps(self.info)}
         tensors = {  # the observation's statistics span more than half precision does
-            name: tensor.detach().cpu().contiguous().to(torch.float32 if name.startswith("0.") else torch.float16)
+            name: tensor.to(torch.float32 if name.startswith("0.") else torch.float16)
             for name, tensor in self.module.state_dict().items()
         }
-        save_file(tensors, path, {**metadata, "sha256": _digest(tensors, metadata)})
+        storage.save(path, "policy", tensors, {"layers": layers, "info": self.info})
 
     @classmethod
     def load(cls, path: Path, device: torch.device | str | None = None) -> "Policy":
@@ -86,40 +81,20 @@ class Policy(TensorDictModule):
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: it is no policy, or of another version.
+            ValueError: it is no policy, damaged, or of another version.
         """
         device = check_device(device)
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"there is no policy {path}")
+        tensors, settings = storage.load(path, "policy")
+        tensors = {name: tensor.float() for name, tensor in tensors.items()}
         try:
-            with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            if metadata.get("format") != FORMAT:
-                raise ValueError(f"its format is {metadata.get('format')!r}, this release reads {FORMAT!r}")
-            if "sha256" not in metadata:
-                raise ValueError("it has no checksum: a version before 0.1.0 wrote it")
-            if metadata.pop("sha256") != _digest(tensors, metadata):
-                raise ValueError("its checksum is wrong: the file was damaged or changed")
-            tensors = {name: tensor.float() for name, tensor in tensors.items()}
-            names = json.loads(metadata["layers"])
+            names = settings["layers"]
             sized = [tensors.get(f"{i}.weight", tensors.get(f"{i}.mean")) for i in range(len(names))]
             network = nn.Sequential(*map(_make_layer, names, sized))
             network.load_state_dict(tensors)
-            info = json.loads(metadata["info"])
-        except (SafetensorError, ValueError, KeyError, RuntimeError, OSError) as error:
+            info = settings["info"]
+        except (ValueError, KeyError, RuntimeError) as error:
             raise ValueError(f"{path} cannot be read as a policy: {error}") from error
         return cls(network.to(device).requires_grad_(False), info)
-
-
-def _digest(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> str:
-    """Returns a checksum of all that a file holds: a changed bit in a weight would make a policy worse in silence."""
-    sha256 = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
-    for name in sorted(tensors):
-        tensor = tensors[name]
-        sha256.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        sha256.update(tensor.numpy().tobytes())
-    return sha256.hexdigest()
 
 
 _LAYER_NAMES: dict[type[nn.Module], str] = {

@@ -1,5 +1,6 @@
 """From an id to an environment."""
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -52,6 +53,7 @@ def make(
     reward_terms: bool = False,
     stagger: bool = False,
     on_overflow: str = "warn",
+    bad_world_file: Path | str | None = None,
     **config: Any,
 ) -> envs.LocoEnv:
     """Makes one of the six environments.
@@ -65,6 +67,7 @@ def make(
         reward_terms: whether to return each factor of the reward under ``("next", "reward_terms", name)``.
         stagger: whether a full ``reset()`` starts each world at a random point of its time limit.
         on_overflow: ``"warn"``, ``"raise"`` or ``"ignore"`` when contacts or constraints find no room.
+        bad_world_file: a file, not there yet, that is to hold what the first world that is not finite came from.
         config: fields of :class:`torchrl_loco.SimConfig` to override, such as ``episode_length=500``.
 
     Raises:
@@ -77,4 +80,4 @@ def make(
         torch.Size([16, 100, 1])
     """
     options: dict[str, Any] = {"reward_terms": reward_terms, "stagger": stagger, "on_overflow": on_overflow}
-    return env_class(id)(num_envs, device, seed, protocol, **options, **config)
+    return env_class(id)(num_envs, device, seed, protocol, bad_world_file=bad_world_file, **options, **config)

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 import torchrl_loco
 from torchrl_loco import PhysicsOverflowError, PhysicsOverflowWarning
-from torchrl_loco.envs import health
+from torchrl_loco.envs.watcher import INTERVAL
 
 WORLDS = 4
 
@@ -60,11 +60,11 @@ def test_the_advice_is_enough(device, field):
 
 def test_overflow_is_noticed_while_stepping(device):
     env = made(device, njmax=5, on_overflow="raise")
-    fall(env, health.INTERVAL - 1)
+    fall(env, INTERVAL - 1)
     if env.device.type == "cuda":
         torch.cuda.synchronize()
     with pytest.raises(PhysicsOverflowError, match="njmax="):
-        env.rollout(health.INTERVAL + 1)
+        env.rollout(INTERVAL + 1)
 
 
 def test_a_loss_is_told_once(device):
@@ -75,14 +75,14 @@ def test_a_loss_is_told_once(device):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env._health.check()
-    fall(env, health.INTERVAL - 61)
+    fall(env, INTERVAL - 61)
     with pytest.warns(PhysicsOverflowWarning):
         env._health.check()
 
 
 def test_no_loss_no_word(device, protocol):
     env = made(device, protocol=protocol, on_overflow="raise")
-    env.rollout(2 * health.INTERVAL + 1)
+    env.rollout(2 * INTERVAL + 1)
     env._health.check()
     found = env.health()
     assert found["total", "constraint_overflow"] == found["total", "contact_overflow"] == 0

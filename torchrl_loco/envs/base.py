@@ -1,8 +1,9 @@
 """What all locomotion environments share: specs, step, reset, seeding, time limit, state. Knows no task."""
 
+import dataclasses
 import os
 import secrets
-from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 import mujoco
@@ -14,15 +15,17 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl_loco import models
 from torchrl_loco.config import sim_config
 from torchrl_loco.envs.autoreset import AsyncReset
+from torchrl_loco.envs.bad_world import BadWorldTrap
 from torchrl_loco.envs.checks import check_count, check_device, check_seed
 from torchrl_loco.envs.episode import any_world, apply_action, begin_episode, count_step, quench
 from torchrl_loco.envs.health import Health
-from torchrl_loco.envs.state import State, write_state
+from torchrl_loco.envs.state import Resumable, State, write_state
+from torchrl_loco.envs.watcher import Watcher
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import EXCLUSIVE, Simulation
 
 
-class LocoEnv(AsyncReset):
+class LocoEnv(AsyncReset, Resumable):
     """Base of the locomotion environments: batched worlds of one body on one device.
 
     A subclass names its ``body``, ``observation_size`` and ``term_names``, and launches the kernels that fill the
@@ -39,6 +42,8 @@ class LocoEnv(AsyncReset):
             are not truncated together.
         on_overflow: what to do when contacts or constraints find no room and are left out: ``"warn"``, ``"raise"`` or
             ``"ignore"``. It is noticed within some 100 steps, without waiting for the device; see :meth:`health`.
+        bad_world_file: a file, not there yet, that is to hold the state and action from which a world first became not
+            finite, for ``torchrl-loco replay``. It is written within some 100 steps, or by :meth:`close`.
         config: fields of :class:`torchrl_loco.SimConfig` to override.
 
     Raises:
@@ -64,6 +69,7 @@ class LocoEnv(AsyncReset):
         reward_terms: bool = False,
         stagger: bool = False,
         on_overflow: str = "warn",
+        bad_world_file: Path | str | None = None,
         **config: Any,
     ) -> None:
         num_envs = check_count("num_envs", num_envs)
@@ -81,6 +87,10 @@ class LocoEnv(AsyncReset):
             self.sim = Simulation(models.load(self.body), self.config, num_envs, device)
             self._make_buffers()
             self._health = Health(self.sim, self._bad, on_overflow)
+            self._watchers: list[Watcher] = [self._health]
+            if bad_world_file is not None:
+                inputs = self._action, self._episode, self._elapsed_steps
+                self._watchers.append(BadWorldTrap(bad_world_file, self.sim, inputs, self._bad, self._describe))
             self._make_specs()
             self._prepare()
             self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
@@ -89,7 +99,8 @@ class LocoEnv(AsyncReset):
             self._refresh_graph = self.sim.capture(self._launch_refresh)
             wp.synchronize_device(self.sim.device)  # made on Warp's stream, used on torch's
             self._set_seed(seed)  # and begin anew: recording has drawn episodes
-            self._health.zero_()
+            for watcher in self._watchers:
+                watcher.restart()
         self._renderers: dict[tuple[str, int, int], Renderer] = {}
         self._memory = set(self.__dict__) - no_memory
         self.is_closed = False
@@ -157,15 +168,18 @@ class LocoEnv(AsyncReset):
         wp.launch(kernel, dim=self.num_envs, inputs=inputs, outputs=outputs, device=self.sim.device)
 
     def _launch_step(self) -> None:
+        for watcher in self._watchers:
+            watcher.launch_before_step()
         self._launch(apply_action, [self._action], [self.sim.data.ctrl, self._bad])
         self.sim.step()
         self._launch_outputs(self._everyone)
-        self._health.launch()
         self._launch(
             count_step,
             [self._bad, self.config.episode_length],
             [self._elapsed_steps, self._done, self._terminated, self._truncated],
         )
+        for watcher in self._watchers:
+            watcher.launch_after_step()
 
     def _launch_reset(self) -> None:
         self._any.zero_()
@@ -201,7 +215,8 @@ class LocoEnv(AsyncReset):
             raise ValueError(f"action must have shape {tuple(self._views['action'].shape)}, got {tuple(action.shape)}")
         self._views["action"].copy_(action.detach())  # else the buffer would hold on to every past policy's graph
         self._step_graph.replay()
-        self._health.after_step()
+        for watcher in self._watchers:
+            watcher.after_step()
         result = self._read_outputs()
         result.set("reward", self._views["reward"].clone().unsqueeze(-1))
         return result
@@ -223,16 +238,6 @@ class LocoEnv(AsyncReset):
         if self.reward_terms:
             result.get("reward_terms").zero_()  # nothing was rewarded yet
         return result
-
-    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        """Keeps a state that was passed to ``reset`` out of what it returns, where it would grow stale."""
-        if tensordict is not None and any(key in tensordict for key in State.KEYS):
-            tensordict = TensorDict(
-                {key: value for key, value in tensordict.items() if key not in State.KEYS},
-                batch_size=tensordict.batch_size,
-                device=tensordict.device,
-            )
-        return super()._reset_proc_data(tensordict, tensordict_reset)
 
     def _read_outputs(self) -> TensorDict:
         """Copies what the kernels wrote: the buffers themselves change at the next step."""
@@ -287,33 +292,10 @@ class LocoEnv(AsyncReset):
             device=self.device,
         )
 
-    def get_extra_state(self) -> dict[str, Any]:
-        """Returns what ``state_dict`` holds: the state of all worlds and the seed."""
-        made_by = {"body": self.body, "protocol": self.protocol, "num_envs": self.num_envs}
-        return {**made_by, "seed": self.seed, "worlds": self.get_state().to_dict()}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Goes on where ``state_dict`` was taken: the worlds, their random streams, and the seed.
-
-        Raises:
-            ValueError: it was taken from an environment of another body, protocol or number of worlds.
-        """
-        for name in ("body", "protocol", "num_envs"):
-            if state[name] != getattr(self, name):
-                raise ValueError(f"the state is of {name}={state[name]!r}, this environment of {getattr(self, name)!r}")
-        self.seed = check_seed(state["seed"])
-        self._views["seed"].fill_(self.seed)
-        self.reset(State(state["worlds"], batch_size=self.batch_size, device=self.device), set_state=True)
-
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> Any:
-        """Goes on where ``state_dict`` was taken; see :meth:`set_extra_state`.
-
-        With ``strict=False`` the worlds stay as they are: so TorchRL's ``EnvCreator`` hands what transforms share to
-        every environment that it makes, which should begin anew.
-        """
-        if not strict:
-            state_dict = {name: value for name, value in state_dict.items() if not name.endswith("_extra_state")}
-        return super().load_state_dict(state_dict, strict=strict, **kwargs)
+    def _describe(self) -> dict[str, Any]:
+        """Returns what it takes to make an environment like this one."""
+        made_by = {"env": type(self).__name__, "protocol": self.protocol, "config": dataclasses.asdict(self.config)}
+        return {**made_by, "seed": self.seed, "device": str(self.device), "num_envs": self.num_envs}
 
     def _restore(self, state: TensorDictBase | None) -> None:
         """Writes a state into the worlds in the mask."""
@@ -350,9 +332,13 @@ class LocoEnv(AsyncReset):
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Frees the memory of the worlds. Whatever needs them afterwards raises an error that says so."""
         if not self.is_closed:
-            for name in self._memory:
-                del self.__dict__[name]
-        super().close()
+            super().close()
+            try:
+                for watcher in self._watchers:
+                    watcher.check()
+            finally:
+                for name in self._memory:
+                    del self.__dict__[name]
 
     def __getattr__(self, name: str) -> Any:
         if name in self.__dict__.get("_memory", ()):

@@ -9,6 +9,7 @@ import warp as wp
 from mujoco_warp import OverflowType
 from tensordict import TensorDict
 
+from torchrl_loco.envs.watcher import Watcher
 from torchrl_loco.sim import Simulation
 
 KINDS = {
@@ -21,8 +22,6 @@ KINDS = {
 LOSSES = {"constraint_overflow": "njmax", "contact_overflow": "naconmax"}
 """Counters of what was lost for want of room, and the setting that gives room."""
 ON_OVERFLOW = ("warn", "raise", "ignore")
-INTERVAL = 100
-"""Control steps between two looks at the counters; a look does not wait for the device."""
 MARGIN = 1.25
 """Factor on what was needed at most, in the value that is advised."""
 
@@ -57,7 +56,7 @@ class PhysicsOverflowError(RuntimeError):
     """Contacts or constraints found no room and were left out of the physics."""
 
 
-class Health:
+class Health(Watcher):
     """Counters of the worlds of a simulation, and what to do when something is lost.
 
     Args:
@@ -76,12 +75,10 @@ class Health:
         self._bits = wp.array([int(bits) for bits in KINDS.values()], dtype=int, device=sim.device)
         self._counts = wp.zeros((sim.num_envs, len(KINDS) + 1), dtype=int, device=sim.device)
         self.counts = wp.to_torch(self._counts)
-        on_cuda = sim.device.is_cuda
-        self._seen = torch.zeros(len(LOSSES) + 2, dtype=torch.long, device="cpu", pin_memory=on_cuda)
-        self._copied = torch.cuda.Event() if on_cuda else None
-        self._looking, self._steps, self._reported = False, 0, 0
+        super().__init__(len(LOSSES) + 2, self.counts.device)
+        self._reported = 0
 
-    def launch(self) -> None:
+    def launch_after_step(self) -> None:
         """Launches the kernel that counts a control step."""
         wp.launch(
             count_health,
@@ -91,41 +88,20 @@ class Health:
             device=self._sim.device,
         )
 
-    def after_step(self) -> None:
-        """Looks at the counters every :data:`INTERVAL` steps and acts on what the look before has brought.
-
-        Raises:
-            PhysicsOverflowError: something was lost since the last time, and ``on_overflow`` is "raise".
-        """
-        if self.on_overflow == "ignore":
-            return
-        self._steps += 1
-        if self._steps % INTERVAL == 0 and not self._looking:
-            self._look()
-        if self._looking and (self._copied is None or self._copied.query()):  # on the CPU it is here at once
-            self._looking = False
-            self._act()
-
-    def check(self) -> None:
-        """Looks now, waits for the device, and acts; see :meth:`after_step`."""
-        self._look()
-        if self._copied is not None:
-            self._copied.synchronize()
-        self._looking = False
-        if self.on_overflow != "ignore":
-            self._act()
-
-    def _look(self) -> None:
+    def look(self) -> torch.Tensor:
+        """Returns the steps in which something was lost, by kind, and the most rows and contacts asked for."""
         losses = self.counts[:, : len(LOSSES)].sum(dim=0)
         peaks = torch.stack([self._sim.peak_rows.max(), self._sim.peak_contacts.max()])
-        self._seen.copy_(torch.cat([losses, peaks]), non_blocking=True)
-        if self._copied is not None:
-            self._copied.record(torch.cuda.current_stream(self.counts.device))
-        self._looking = True
+        return torch.cat([losses, peaks])
 
-    def _act(self) -> None:
-        *losses, rows, contacts = self._seen.tolist()
-        if sum(losses) <= self._reported:
+    def act(self, numbers: list[int]) -> None:
+        """Warns, or raises, if something was lost since the last time.
+
+        Raises:
+            PhysicsOverflowError: something was, and ``on_overflow`` is "raise".
+        """
+        *losses, rows, contacts = numbers
+        if self.on_overflow == "ignore" or sum(losses) <= self._reported:
             return
         self._reported = sum(losses)
         needed = {"njmax": rows, "naconmax": contacts}
@@ -139,6 +115,13 @@ class Health:
         if self.on_overflow == "raise":
             raise PhysicsOverflowError(message)
         warnings.warn(message, PhysicsOverflowWarning, stacklevel=2)
+
+    def restart(self) -> None:
+        """Starts all counters anew."""
+        super().restart()
+        for counter in (self.counts, self._sim.overflow, self._sim.peak_rows, self._sim.peak_contacts):
+            counter.zero_()
+        self._reported = 0
 
     def report(self) -> TensorDict:
         """Returns the counters, without waiting for the device; see :meth:`LocoEnv.health`."""
@@ -157,14 +140,6 @@ class Health:
             batch_size=[],
             device=device,
         )
-
-    def zero_(self) -> None:
-        """Starts all counters anew."""
-        self.counts.zero_()
-        self._sim.overflow.zero_()
-        self._sim.peak_rows.zero_()
-        self._sim.peak_contacts.zero_()
-        self._looking, self._steps, self._reported = False, 0, 0
 
 
 def advise(needed: int) -> int:

@@ -1,10 +1,11 @@
 """A snapshot of an environment's worlds."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
 
 from torchrl_loco.envs.checks import check_count
 
@@ -49,6 +50,56 @@ class State(TensorDict):
         """Selects ``keys``, and the state if ``"_reset"`` is among them."""
         state = [key for key in self.KEYS if key in self] if "_reset" in keys else []
         return super().select(*keys, *state, inplace=inplace, strict=strict)
+
+
+class Resumable(EnvBase):
+    """Mixin: ``state_dict`` and ``load_state_dict`` of an environment that has :meth:`get_state`."""
+
+    body: ClassVar[str]
+    protocol: str
+    num_envs: int
+    seed: int
+
+    def get_state(self) -> State:
+        """Returns a copy of the state of all worlds."""
+        raise NotImplementedError
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Returns what ``state_dict`` holds: the state of all worlds and the seed."""
+        made_by = {"body": self.body, "protocol": self.protocol, "num_envs": self.num_envs}
+        return {**made_by, "seed": self.seed, "worlds": self.get_state().to_dict()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Goes on where ``state_dict`` was taken: the worlds, their random streams, and the seed.
+
+        Raises:
+            ValueError: it was taken from an environment of another body, protocol or number of worlds.
+        """
+        for name in ("body", "protocol", "num_envs"):
+            if state[name] != getattr(self, name):
+                raise ValueError(f"the state is of {name}={state[name]!r}, this environment of {getattr(self, name)!r}")
+        self._set_seed(state["seed"])
+        self.reset(State(state["worlds"], batch_size=self.batch_size, device=self.device), set_state=True)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> Any:
+        """Goes on where ``state_dict`` was taken; see :meth:`set_extra_state`.
+
+        With ``strict=False`` the worlds stay as they are: so TorchRL's ``EnvCreator`` hands what transforms share to
+        every environment that it makes, which should begin anew.
+        """
+        if not strict:
+            state_dict = {name: value for name, value in state_dict.items() if not name.endswith("_extra_state")}
+        return super().load_state_dict(state_dict, strict=strict, **kwargs)
+
+    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        """Keeps a state that was passed to ``reset`` out of what it returns, where it would grow stale."""
+        if tensordict is not None and any(key in tensordict for key in State.KEYS):
+            tensordict = TensorDict(
+                {key: value for key, value in tensordict.items() if key not in State.KEYS},
+                batch_size=tensordict.batch_size,
+                device=tensordict.device,
+            )
+        return super()._reset_proc_data(tensordict, tensordict_reset)
 
 
 def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor], mask: torch.Tensor) -> None:

@@ -31,7 +31,8 @@ _UNREADABLE = (
 
 class RunFolder:
     """A run on disk: ``config.json``, ``metrics.csv``, ``tensorboard/``, ``evaluations.csv``, ``checkpoint.pt``,
-    ``policy.safetensors``, ``learning_curve.png`` and ``video.mp4``.
+    ``policy.safetensors``, ``learning_curve.png`` and ``video.mp4``; and ``bad_world.safetensors``, should a world not
+    stay finite.
 
     Args:
         path: an existing folder of a run.
@@ -89,6 +90,11 @@ class RunFolder:
     def policy(self) -> Path:
         """Where the trained policy lies, without what only training needs."""
         return self.path / "policy.safetensors"
+
+    @property
+    def bad_world(self) -> Path:
+        """Where the first world lies that did not stay finite, if any."""
+        return self.path / "bad_world.safetensors"
 
     @property
     def is_finished(self) -> bool:

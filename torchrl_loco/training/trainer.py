@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -52,7 +53,7 @@ class Trainer:
         check_device(config.device)
         checkpoint = run.load_checkpoint(config.device) if resume else None
         torch.manual_seed(config.seed)
-        self.env = make_env(config)
+        self.env = make_env(config, run.bad_world)
         self.algorithm = ALGORITHMS[config.algorithm](config)
         self.collector = RolloutCollector(self.env, self.algorithm.actor, frames_per_batch=config.batch_size)
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
@@ -178,8 +179,11 @@ class Trainer:
             torch.cuda.set_rng_state(checkpoint["cuda_rng"].cpu(), self.algorithm.device)
 
 
-def make_env(config: TrainingConfig) -> EnvBase:
-    """Makes the environment of a run, which holds an action for ``config.action_repeat`` frames and sums the reward."""
+def make_env(config: TrainingConfig, bad_world: Path) -> EnvBase:
+    """Makes the environment of a run, which holds an action for ``config.action_repeat`` frames and sums the reward.
+
+    Should a world not stay finite, what led to it is written to ``bad_world``, unless an earlier one lies there.
+    """
     env = make(
         config.task,
         config.num_envs,
@@ -188,6 +192,7 @@ def make_env(config: TrainingConfig) -> EnvBase:
         config.protocol,
         stagger=True,
         episode_length=config.episode_length,
+        bad_world_file=None if bad_world.exists() else bad_world,
     )
     return env if config.action_repeat == 1 else TransformedEnv(env, FrameSkipTransform(config.action_repeat))
 

@@ -1,0 +1,65 @@
+"""Tensors and settings in a file that holds nothing to execute, and that tells if it was damaged."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+VERSION = 1
+
+
+def save(path: Path, kind: str, tensors: dict[str, torch.Tensor], settings: dict[str, Any]) -> None:
+    """Writes a safetensors file with a checksum.
+
+    Args:
+        path: where to.
+        kind: what the file holds, in a word; :func:`load` asks for it.
+        tensors: the tensors, on any device.
+        settings: whatever JSON can hold.
+    """
+    metadata = {"format": _format(kind), **{name: json.dumps(value) for name, value in settings.items()}}
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    save_file(tensors, path, {**metadata, "sha256": digest(tensors, metadata)})
+
+
+def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Reads what :func:`save` wrote, without executing code; the tensors are on the CPU.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it holds something else, is damaged, or of another version.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no {kind} {path}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if metadata.get("format") != _format(kind):
+            raise ValueError(f"its format is {metadata.get('format')!r}, this release reads {_format(kind)!r}")
+        if "sha256" not in metadata:
+            raise ValueError("it has no checksum: a version before 0.1.0 wrote it")
+        if metadata.pop("sha256") != digest(tensors, metadata):
+            raise ValueError("its checksum is wrong: the file was damaged or changed")
+        del metadata["format"]
+        return tensors, {name: json.loads(value) for name, value in metadata.items()}
+    except (SafetensorError, ValueError, RuntimeError, OSError) as error:
+        raise ValueError(f"{path} cannot be read as a {kind}: {error}") from error
+
+
+def digest(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> str:
+    """Returns a checksum of all that a file holds: safetensors itself would not notice a changed bit in a tensor."""
+    sha256 = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        sha256.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        sha256.update(tensor.numpy().tobytes())
+    return sha256.hexdigest()
+
+
+def _format(kind: str) -> str:
+    return f"torchrl_loco {kind} {VERSION}"
