@@ -150,10 +150,18 @@ def test_the_actors_step_leaves_the_critic_alone():
 
 def test_a_temperature_that_has_fallen_rises_again():
     """From a millionth, with too little entropy, it grows by the learning rate at every step and is not held down."""
-    reppo = made(num_envs=16, decisions=8, minibatch_size=128, target_entropy=50.0, init_temperature=1e-7, lr=1e-2)
+    low = {"init_temperature": 1e-7, "min_temperature": 1e-9}
+    reppo = made(num_envs=16, decisions=8, minibatch_size=128, target_entropy=50.0, lr=1e-2, **low)
     batch = collected(reppo, 16)
     with torch.no_grad():
         data = reppo.prepare(batch).reshape(-1)
     for _ in range(300):
         reppo._actor_step(data)
     assert reppo.weights.temperature > 1e-7 * math.exp(0.8 * 300 * 1e-2)
+
+
+def test_temperature_does_not_fall_below_its_least_value():
+    floor = {"init_temperature": 0.02, "min_temperature": 0.02}
+    reppo = made(num_envs=16, decisions=8, minibatch_size=128, target_entropy=-50.0, **floor)
+    reppo.update(collected(reppo, 16), progress=0.0)
+    torch.testing.assert_close(reppo.weights.temperature.detach(), torch.tensor(0.02))

@@ -24,8 +24,6 @@ class Algorithm(ABC):
     """
 
     metric_names: ClassVar[tuple[str, ...]]
-    recordable: ClassVar[bool] = True
-    """Whether a gradient step can be recorded: that it copies nothing from the host."""
 
     actor: ProbabilisticActor
     norm: ObservationNorm
@@ -40,7 +38,7 @@ class Algorithm(ABC):
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
         self._data: TensorDictBase | None = None
         on_cuda = self.device.type == "cuda"
-        self._step = Replay(self._minibatch_step, self.device) if on_cuda and self.recordable else self._minibatch_step
+        self._step = Replay(self._minibatch_step, self.device) if on_cuda else self._minibatch_step
 
     @abstractmethod
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
@@ -48,7 +46,11 @@ class Algorithm(ABC):
 
     @abstractmethod
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
-        """Makes one gradient step without reading the device; returns the metrics in the order of ``metric_names``."""
+        """Makes one gradient step, which CUDA records: nothing may be read from the device or copied to it.
+
+        Returns:
+            The metrics in the order of ``metric_names``.
+        """
 
     def make_optimizer(self, name: str, parameters: Iterable[Any]) -> torch.optim.Adam:
         """Makes an optimizer, of parameters or groups, whose learning rate lives where recorded steps find it."""

@@ -148,6 +148,8 @@ class REPPOConfig(TrainingConfig):
     """Entropy of an action that is aimed at, for each of its entries (nats)."""
     init_temperature: float = 0.01
     """Weight of the entropy at the start; it is learned."""
+    min_temperature: float = 3e-4
+    """Least weight of the entropy: from much less it would take too long to rise again when entropy falls."""
     num_bins: int = 151
     """Bins of the critic's distribution over returns."""
     max_value: float = 150.0

@@ -8,8 +8,10 @@ from typing import Any
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
+from torch.distributions import Independent, Normal, TransformedDistribution
 from torchrl.data import Bounded
-from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
+from torchrl.modules.distributions.continuous import SafeTanhTransform
 
 from torchrl_loco.policy import ObservationNorm, Policy
 from torchrl_loco.training.config import PPOConfig, REPPOConfig, TrainingConfig
@@ -103,6 +105,27 @@ def normed_layers(inputs: int, hidden: tuple[int, ...]) -> list[nn.Module]:
     return layers
 
 
+class SquashedNormal(TransformedDistribution):
+    """Independent normal variables under tanh.
+
+    TorchRL's ``TanhNormal`` is the same, but looks at its bounds whenever it is made: on CUDA the host would wait for
+    that at every decision, and no gradient step could be recorded.
+
+    Args:
+        loc: means before tanh, shape ``(..., n)``.
+        scale: standard deviations before tanh, of the same shape.
+    """
+
+    def __init__(self, loc: torch.Tensor, scale: torch.Tensor) -> None:
+        normal = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+        super().__init__(normal, SafeTanhTransform(cache_size=1), validate_args=False)
+
+    @property
+    def deterministic_sample(self) -> torch.Tensor:
+        """The image of the mean, shape ``(..., n)``."""
+        return self.base_dist.mean.tanh()
+
+
 def make_actor(config: TrainingConfig, network: nn.Module, log_prob: bool) -> ProbabilisticActor:
     """Wraps a network that gives means and log deviations into a tanh-normal actor.
 
@@ -112,7 +135,7 @@ def make_actor(config: TrainingConfig, network: nn.Module, log_prob: bool) -> Pr
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         spec=Bounded(-1.0, 1.0, (config.action_size,), device=config.device, dtype=torch.float32),
-        distribution_class=TanhNormal,
+        distribution_class=SquashedNormal,
         return_log_prob=log_prob,
     ).to(config.device)
 

@@ -17,7 +17,6 @@ class PPO(Algorithm):
     """Generalised advantages, then minibatch epochs over the clipped loss."""
 
     metric_names = ("loss_objective", "loss_critic", "entropy", "kl_approx", "clip_fraction", "grad_norm")
-    recordable = False  # TorchRL's TanhNormal copies its bounds from the host
     config: PPOConfig
 
     def __init__(self, config: PPOConfig) -> None:

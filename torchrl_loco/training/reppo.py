@@ -90,6 +90,7 @@ class REPPO(Algorithm):
         self.actor_optimizer.zero_grad()
         (loss + dual).backward(inputs=self._actor_parameters)  # and leave the critic's gradients alone
         grad_norm = clip_and_step(self.actor_optimizer, config.max_grad_norm)
+        weights.clamp_()
         return [
             *(loss, divergence.mean(), exceeded.float().mean(), -log_prob.mean()),
             *(weights.temperature, weights.kl_weight, grad_norm),
@@ -103,6 +104,12 @@ class Weights(nn.Module):
         super().__init__()
         self.log_temperature = nn.Parameter(torch.tensor(math.log(config.init_temperature)))
         self.log_kl_weight = nn.Parameter(torch.tensor(math.log(config.init_kl_weight)))
+        self._min_log_temperature = math.log(config.min_temperature)
+
+    @torch.no_grad()
+    def clamp_(self) -> None:
+        """Keeps the temperature at its least value or above."""
+        self.log_temperature.clamp_(min=self._min_log_temperature)
 
     @property
     def temperature(self) -> torch.Tensor:

@@ -1,0 +1,68 @@
+"""What CUDA graphs and an asynchronous host ask of the algorithms, seen on the CPU."""
+
+import traceback
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from torchrl_loco.training import RunFolder, Trainer, preset
+from torchrl_loco.training.networks import SquashedNormal
+
+HOST = ("_local_scalar_dense", "lift_fresh", "nonzero", "aten.equal")
+"""Operations that read a tensor's value, or make a tensor from a value of Python's."""
+
+
+class HostTraffic(TorchDispatchMode):
+    """Notes which operations go between host and device."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        # On the CPU, Adam keeps its count there; on CUDA it does not.
+        if any(name in str(func) for name in HOST) and not any(
+            "/optim/" in f.filename for f in traceback.extract_stack()
+        ):
+            self.found.append(str(func))
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.fixture(params=["ppo", "reppo"])
+def trainer(request, tmp_path):
+    small = {"num_envs": 4, "decisions": 8, "minibatch_size": 16, "epochs": 1, "hidden": (16,), "total_frames": 1000}
+    trainer = Trainer(RunFolder.create(preset("walker_stand", "cpu", request.param, out=tmp_path, **small)))
+    trainer.algorithm.update(trainer.collector.rollout(), 0.0)
+    return trainer
+
+
+def test_a_gradient_step_can_be_recorded(trainer):
+    with HostTraffic() as traffic:
+        trainer.algorithm._minibatch_step()
+    assert traffic.found == []
+
+
+def test_collecting_waits_for_nothing(trainer):
+    with HostTraffic() as traffic:
+        trainer.collector.rollout()
+    assert traffic.found == []
+
+
+def test_the_traffic_would_be_seen():
+    with HostTraffic() as traffic:
+        torch.tensor(1.0)
+        bool(torch.ones(()) > 0)
+    assert len(traffic.found) >= 2
+
+
+def test_squashed_normal_is_a_normal_under_tanh():
+    loc, scale = torch.randn(1000, 3).double(), torch.rand(1000, 3).double() + 0.1
+    squashed = SquashedNormal(loc, scale)
+    u = torch.randn(1000, 3).double()
+    density = torch.distributions.Normal(loc, scale).log_prob(u) - (1 - u.tanh().square()).log()
+    torch.testing.assert_close(squashed.log_prob(u.tanh()), density.sum(-1))
+    torch.testing.assert_close(squashed.deterministic_sample, loc.tanh())
+    drawn = squashed.rsample((500,)).clamp(-1 + 1e-12, 1 - 1e-12).atanh()
+    torch.testing.assert_close(drawn.mean(), loc.mean(), atol=0.01, rtol=0)
+    torch.testing.assert_close(drawn.std(0).mean(), scale.mean(), atol=0.01, rtol=0)
