@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.cases import CASES, TASKS
+from benchmarks.cases import CASES, TASKS, VARIANTS
 from benchmarks.results import save, show
 from torchrl_loco import list_envs
 
@@ -32,8 +32,10 @@ add("peers", "other simulators beside ours, in processes of their own", small)
 add("fidelity", "deviation from C MuJoCo in double precision", [256])
 commands.choices["fidelity"].add_argument("--picture", type=Path, help="file for a plot")
 add("profile", "time of each kernel (CUDA)", small)
+add("soak", "millions of steps under hostile actions and states", small)
+commands.choices["soak"].add_argument("--frames", type=float, default=1e5 if DEVICE == "cpu" else 5e7)
 for name, default in (("throughput", list(CASES)), ("profile", ["env_step_and_maybe_reset"])):
-    commands.choices[name].add_argument("--cases", nargs="+", choices=list(CASES), default=default)
+    commands.choices[name].add_argument("--cases", nargs="+", choices=[*CASES, *VARIANTS], default=default)
 commands.choices["peers"].add_argument("--path", type=Path, help="folder that the peers' packages were installed in")
 train = commands.add_parser("training", help="time to a return, beside Brax's PPO on Playground")
 train.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_walk"])
@@ -71,6 +73,10 @@ elif args.command == "fidelity":
     rows = fidelity(args.bodies, args.worlds[0], args.device)
     if args.picture:
         plot_fidelity(rows, args.picture)
+elif args.command == "soak":
+    from benchmarks.soak import COLUMNS, soak
+
+    rows = soak(args.bodies, args.worlds[0], int(args.frames), args.device)
 elif args.command == "training":
     from benchmarks.training import COLUMNS, training
 

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import mujoco_warp as mjw
 import torch
@@ -72,9 +73,9 @@ def env_step(body: str, n: int, device: torch.device) -> Callable[[], None]:
     return step
 
 
-def env_step_and_maybe_reset(body: str, n: int, device: torch.device) -> Callable[[], None]:
+def env_step_and_maybe_reset(body: str, n: int, device: torch.device, **options: Any) -> Callable[[], None]:
     """``env.step_and_maybe_reset`` on random actions, worlds at different points of their episodes."""
-    env = torchrl_loco.make(TASKS[body], n, device, seed=0, stagger=True)
+    env = torchrl_loco.make(TASKS[body], n, device, seed=0, stagger=True, **options)
     carried = [env.reset()]
 
     def step() -> None:
@@ -82,6 +83,16 @@ def env_step_and_maybe_reset(body: str, n: int, device: torch.device) -> Callabl
         _, carried[0] = env.step_and_maybe_reset(carried[0].set("action", action))
 
     return step
+
+
+def env_deterministic(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """The same with ``deterministic=True``."""
+    return env_step_and_maybe_reset(body, n, device, deterministic=True)
+
+
+def env_dm_control(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """The same under ``protocol="dm_control"``."""
+    return env_step_and_maybe_reset(body, n, device, protocol="dm_control")
 
 
 def rollout_collector(body: str, n: int, device: torch.device) -> Callable[[], None]:
@@ -141,3 +152,6 @@ CASES = {
     case.__name__: case
     for case in (bare_default, bare_tuned, env_step, env_step_and_maybe_reset, rollout_collector, torchrl_collector)
 }
+"""From the bare simulator to a collector."""
+VARIANTS = {case.__name__: case for case in (env_deterministic, env_dm_control)}
+"""What settings cost."""

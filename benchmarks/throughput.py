@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from tqdm import tqdm
 
-from benchmarks.cases import CASES, waiter
+from benchmarks.cases import CASES, VARIANTS, waiter
 from benchmarks.results import Row
 from benchmarks.timing import milliseconds
 
@@ -28,7 +28,7 @@ def throughput(bodies: Sequence[str], worlds: Sequence[int], cases: Sequence[str
     rows: list[Row] = []
     runs = [(body, n, case) for body in bodies for n in worlds for case in cases]
     for body, n, case in tqdm(runs, desc="throughput"):
-        ms = milliseconds(CASES[case](body, n, device), waiter(device))
+        ms = milliseconds({**CASES, **VARIANTS}[case](body, n, device), waiter(device))
         rows.append({"body": body, "worlds": n, "case": case, "ms": ms, "million steps/s": n / ms / 1e3})
     for row in rows:
         base = time_of(rows, row, "bare_default")

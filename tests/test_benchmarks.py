@@ -6,7 +6,7 @@ import os
 import pytest
 import torch
 
-from benchmarks import fidelity, timing
+from benchmarks import fidelity, soak, timing
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
 from benchmarks.throughput import phases
@@ -69,3 +69,14 @@ def test_fidelity_is_measured_on_real_worlds(tmp_path, monkeypatch):
     assert first["playground", "converged"] > 10 * first["dm_control", "same settings"]
     fidelity.plot_fidelity(found, tmp_path / "fidelity.png")
     assert (tmp_path / "fidelity.png").stat().st_size > 10_000
+
+
+def test_soak_holds_the_counters_against_what_happened(monkeypatch):
+    monkeypatch.setattr(soak, "BLOCK", 40)
+    monkeypatch.setattr(soak, "BAD_SHARE", 0.01)
+    (row,) = soak.soak(["walker"], 32, 2 * 40 * 32, torch.device("cpu"))
+    assert row["terminated"] >= row["bad actions"] > 5
+    assert row["million steps"] == 2 * 40 * 32 / 1e6
+    monkeypatch.setattr(soak.LocoEnv, "health", lambda env: {"total": {"non_finite": torch.tensor(3)}})
+    with pytest.raises(AssertionError):
+        soak.soak(["walker"], 32, 40 * 32, torch.device("cpu"))
