@@ -220,3 +220,23 @@ def test_close_frees_device_memory():
     env.close()
     assert meanwhile - before > 300  # MiB
     assert used() - before < 0.05 * (meanwhile - before)
+
+
+@pytest.mark.parametrize("spoilt", [False, True], ids=["well", "bad"])
+def test_a_program_may_end_without_closing(spoilt, tmp_path):
+    """It ends in peace, and what was caught in its last steps is written."""
+    program = f"""
+        import torch, torchrl_loco
+        from torchrl.envs import StepCounter
+        env = torchrl_loco.make("walker_walk", 2, "cpu", 0, bad_world_file={str(tmp_path / "bad")!r})
+        other = torchrl_loco.TransformedEnv(torchrl_loco.make("walker_walk", 2, "cpu", 0), StepCounter())
+        other.rollout(2)
+        td = env.reset()
+        env.step(td.set("action", torch.full((2, 6), float("nan") if {spoilt} else 0.0)))
+        """
+    found = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, timeout=300
+    )
+    assert found.returncode == 0, found.stderr
+    assert (tmp_path / "bad").exists() == spoilt
+    assert ("no longer finite at step 1" in found.stderr) == spoilt

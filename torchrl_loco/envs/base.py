@@ -1,8 +1,10 @@
 """What all locomotion environments share: specs, step, reset, seeding, time limit, state. Knows no task."""
 
+import atexit
 import dataclasses
 import os
 import secrets
+import weakref
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -104,6 +106,7 @@ class LocoEnv(AsyncReset, Resumable):
         self._renderers: dict[tuple[str, int, int], Renderer] = {}
         self._memory = set(self.__dict__) - no_memory
         self.is_closed = False
+        _OPEN.add(self)
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -366,3 +369,14 @@ class LocoEnv(AsyncReset, Resumable):
                 f"the physics lives on {self.device} and cannot move: make a new one with device={device!r}"
             )
         return self
+
+
+_OPEN: weakref.WeakSet[LocoEnv] = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    """Closes what is open while that still can be done: later, the interpreter takes torch apart."""
+    for env in list(_OPEN):
+        if env._pid == os.getpid():  # a fork's copies are the parent's to close
+            env.close()
