@@ -6,7 +6,7 @@ TASK ?= walker_stand
 ARGS ?=
 PYTEST_ARGS ?= --numprocesses auto
 
-.PHONY: train test test-fast lint format clean
+.PHONY: train test test-fast lint format dist clean
 
 train: $(VENV)/installed  ## train a policy; TASK=walker_walk ARGS="--seed 1" to change what
 	$(BIN)/torchrl-loco train $(TASK) $(ARGS)
@@ -26,6 +26,11 @@ format: $(VENV)/installed
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+dist: $(VENV)/installed  ## wheel and sdist, looked through and tried out, into dist/
+	rm -rf dist
+	$(BIN)/python -m hatchling build
+	$(BIN)/python -m pytest tests/test_packaging.py
+
 # PIP_ARGS can constrain versions, for example to a CPU build of torch: make test PIP_ARGS="torch==2.13.0"
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -34,4 +39,4 @@ $(VENV)/installed: pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) dist .mypy_cache .pytest_cache .ruff_cache

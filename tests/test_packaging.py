@@ -1,0 +1,161 @@
+"""What is released: wheel and sdist, what is in them and what they can do; and the files that speak of the package."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+import yaml
+
+import torchrl_loco
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+NAME = f"torchrl_loco-{torchrl_loco.__version__}"
+UNRELEASED = {".ci/run"}  # of use to our own CI alone
+
+TRY = """
+import sys
+from pathlib import Path
+
+import torchrl_loco
+
+assert Path(torchrl_loco.__file__).is_relative_to(sys.argv[1]), torchrl_loco.__file__
+env = torchrl_loco.make("walker_walk", num_envs=2, device="cpu", seed=0)
+policy = torchrl_loco.load_policy("walker_walk", device="cpu")
+random, trained = (env.rollout(50, by)["next", "reward"].mean() for by in (None, policy))
+assert trained > 2 * random, (trained, random)
+print(torchrl_loco.__version__)
+"""
+
+
+def run(*command, cwd, path=None):
+    """Runs a command in a folder, with one folder on Python's path at most, and returns what it prints."""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    environment |= {} if path is None else {"PYTHONPATH": str(path)}
+    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """A folder with wheel and sdist, made by the build backend."""
+    path = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "hatchling", "build", "--directory", str(path), cwd=ROOT)
+    return path
+
+
+def files_below(path):
+    return {file.relative_to(ROOT).as_posix() for file in path.rglob("*") if file.is_file() and file.suffix != ".pyc"}
+
+
+@pytest.mark.slow
+def test_wheel_holds_the_package_and_nothing_else(built):
+    with zipfile.ZipFile(built / f"{NAME}-py3-none-any.whl") as wheel:
+        names, info = set(wheel.namelist()), f"{NAME}.dist-info"
+        metadata = wheel.read(f"{info}/METADATA").decode()
+        entry_points = wheel.read(f"{info}/entry_points.txt").decode()
+    inside = {name for name in names if not name.startswith(info)}
+    assert inside == files_below(ROOT / "torchrl_loco")
+    assert {f"torchrl_loco/models/{name}.xml" for name in ("walker", "humanoid", "scene")} < inside
+    assert {f"torchrl_loco/policies/walker_{goal}.safetensors" for goal in ("stand", "walk", "run")} < inside
+    assert "torchrl_loco/py.typed" in inside
+    assert {f"{info}/licenses/LICENSE", f"{info}/licenses/NOTICE"} < names
+    assert f"\nVersion: {torchrl_loco.__version__}\n" in metadata
+    assert "# torchrl_loco" in metadata  # the README
+    assert "torchrl-loco = torchrl_loco.cli:main" in entry_points
+
+
+@pytest.mark.slow
+def test_sdist_holds_all_that_is_in_the_repository(built, tmp_path):
+    with tarfile.open(built / f"{NAME}.tar.gz") as sdist:
+        names = {name.removeprefix(f"{NAME}/") for name in sdist.getnames()}
+        sdist.extractall(tmp_path, filter="data")
+    unpacked = tmp_path / NAME
+    assert (unpacked / "PKG-INFO").is_file()
+    for folder in ("torchrl_loco", "tests", "benchmarks", "docs", "examples"):
+        assert (unpacked / folder).is_dir(), folder
+    if (ROOT / ".git").exists():  # the tests may run from an sdist themselves
+        tracked = set(run("git", "ls-files", cwd=ROOT).splitlines())
+        assert {name for name in tracked if (ROOT / name).exists()} - names <= UNRELEASED
+
+    # Its tests find in it what they need: those of the house, of its files, and of the example.
+    chosen = ["tests/test_package.py", "tests/test_packaging.py", "tests/test_benchmarks.py", "tests/test_extending.py"]
+    out = run(sys.executable, "-m", "pytest", "-q", "-m", "not slow", *chosen, cwd=unpacked)
+    assert re.search(r"\d{2,} passed", out), out
+
+
+@pytest.mark.slow
+def test_wheel_works_where_there_is_nothing_else(built, tmp_path):
+    site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    options = ["--quiet", "--no-index", "--no-deps", "--target", str(site)]
+    run(sys.executable, "-m", "pip", "install", *options, str(built / f"{NAME}-py3-none-any.whl"), cwd=elsewhere)
+    assert run(sys.executable, "-c", TRY, str(site), cwd=elsewhere, path=site).strip() == torchrl_loco.__version__
+    for command in (["-m", "torchrl_loco"], [str(site / "bin" / "torchrl-loco")]):
+        listed = run(sys.executable, *command, "list", cwd=elsewhere, path=site).splitlines()
+        assert [line.split()[0] for line in listed[:6]] == torchrl_loco.list_envs()[:6]
+
+
+def test_citation_agrees_with_the_package():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == torchrl_loco.__version__
+    assert citation["license"] == PROJECT["license"]
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["type"] == "software"
+    assert all(citation[key] for key in ("message", "title", "authors"))
+
+
+def test_hooks_run_tools_that_are_pinned():
+    pinned = {entry.split("==")[0] for entry in PROJECT["optional-dependencies"]["dev"] if "==" in entry}
+    (repo,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    assert repo["repo"] == "local"
+    assert {hook["entry"].split()[0] for hook in repo["hooks"]} == pinned
+    for hook in repo["hooks"]:
+        assert hook["language"] == "system"
+        run(sys.executable, "-m", *shlex.split(hook["entry"]), "--help", cwd=ROOT)
+
+
+def steps(workflow):
+    jobs = yaml.safe_load(workflow.read_text())["jobs"].values()
+    return [step for job in jobs for step in job["steps"]]
+
+
+def test_workflows_are_those_of_the_house():
+    assert [path.stem for path in WORKFLOWS] == ["docs", "lint", "release", "test"]
+
+
+@pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
+def test_workflows_call_what_there_is(workflow):
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+    called = {target for step in steps(workflow) for target in re.findall(r"\bmake ([\w-]+)", step.get("run", ""))}
+    assert called
+    assert called <= targets
+
+
+def test_tests_run_on_every_python_that_is_supported():
+    job = yaml.safe_load((ROOT / ".github" / "workflows" / "test.yml").read_text())["jobs"]["test"]
+    versions = job["strategy"]["matrix"]["python-version"]
+    prefix = "Programming Language :: Python :: "
+    classifiers = [text.removeprefix(prefix) for text in PROJECT["classifiers"] if text.startswith(f"{prefix}3.")]
+    assert all(isinstance(version, str) for version in versions)  # 3.10 would be 3.1
+    assert versions == classifiers
+    assert PROJECT["requires-python"] == f">={versions[0]}"
+
+
+@pytest.mark.slow
+def test_a_release_is_published_under_its_own_tag_alone(built):
+    workflow = ROOT / ".github" / "workflows" / "release.yml"
+    (check,) = (step["run"] for step in steps(workflow) if "GITHUB_REF_NAME" in step.get("run", ""))
+    (built / "dist").symlink_to(built)
+    for tag, status in ((f"v{torchrl_loco.__version__}", 0), ("v9.9.9", 1)):
+        environment = {**os.environ, "GITHUB_REF_NAME": tag}
+        assert subprocess.run(["bash", "-c", check], cwd=built, env=environment).returncode == status
