@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 
 import torchrl_loco
 from torchrl_loco import RolloutCollector, models
-from torchrl_loco.config import sim_config
+from torchrl_loco.config import DEFAULTS, sim_config
 from torchrl_loco.sim import Simulation, current_stream
 
 TASKS = {"walker": "walker_walk", "humanoid": "humanoid_walk"}
@@ -30,7 +30,7 @@ def waiter(device: torch.device) -> Callable[[], None]:
 
 def bare_default(body: str, n: int, device: torch.device) -> Callable[[], None]:
     """A plain loop of ``mujoco_warp.step`` in a graph, with mujoco_warp's own settings but for the printing."""
-    sim = Simulation(models.load(body), sim_config(body, "playground", n, {}), n, device)
+    sim = Simulation(models.load(body), sim_config(DEFAULTS[body], "playground", n, {}), n, device)
     sim.model.opt.graph_conditional, sim.model.opt.run_qacc_smooth = True, True
     mask = wp.ones(n, dtype=bool, device=sim.device)
     with wp.ScopedDevice(sim.device):
@@ -50,7 +50,7 @@ def bare_default(body: str, n: int, device: torch.device) -> Callable[[], None]:
 
 def bare_tuned(body: str, n: int, device: torch.device) -> Callable[[], None]:
     """Our simulation's recorded control step, without observation or reward."""
-    sim = Simulation(models.load(body), sim_config(body, "playground", n, {}), n, device)
+    sim = Simulation(models.load(body), sim_config(DEFAULTS[body], "playground", n, {}), n, device)
     mask = wp.ones(n, dtype=bool, device=sim.device)
     graph = sim.capture(sim.step)
     sim.capture(lambda: (sim.reset(mask), sim.forward(mask))).replay()

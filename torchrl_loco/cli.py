@@ -22,8 +22,12 @@ except ImportError as error:  # the environments work without the extra, the com
 
 def list_tasks() -> None:
     """List the environments."""
-    for name, env in registry.ENVS.items():
-        print(f"{name:<16} {(env.__doc__ or '').splitlines()[0]}")
+    for name in registry.list_envs():
+        try:
+            about = (registry.env_class(name).__doc__ or "").strip().split("\n")[0]
+        except ImportError as error:
+            about = f"NOT USABLE: {error}"
+        print(f"{name:<16} {about}")
 
 
 def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None = None) -> None:
@@ -122,21 +126,27 @@ def record(run: tyro.conf.Positional[Path], /, video: VideoOptions = Video()) ->
         video.make(torchrl_loco.Policy.load(folder.policy, video.device), folder.video)
 
 
-def play(task: tyro.conf.Positional[str], /, video: VideoOptions = Video()) -> None:
-    """Show the trained policy that comes with the package: in a window if there is a display, else as a video.
+def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: VideoOptions = Video()) -> None:
+    """Show a trained policy: in a window if there is a display, else as a video.
 
     Args:
         task: id of the environment.
+        policy: file of the policy, such as policy.safetensors of a run; default: the one that comes with the package.
         video: what is shown; with --out, a video in any case.
     """
     with _user_errors():
-        policy = torchrl_loco.load_policy(task, video.device)
-        shown = ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on", "mean", "std")
-        print(task, *(f"{key} {policy.info[key]}" for key in shown if key in policy.info), sep=", ")
-        if video.out is None and training.has_display():
-            training.view(policy, video.env(policy), policy.info["action_repeat"])
+        if policy is None:
+            trained = torchrl_loco.load_policy(task, video.device)
         else:
-            video.make(policy, Path(f"{policy.info['task']}.mp4"))
+            trained = torchrl_loco.Policy.load(policy, video.device)
+            if trained.info["task"] != registry.canonical_id(task):
+                raise ValueError(f"{policy} is a policy for {trained.info['task']}, not for {task}")
+        shown = ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on", "mean", "std")
+        print(task, *(f"{key} {trained.info[key]}" for key in shown if key in trained.info), sep=", ")
+        if video.out is None and training.has_display():
+            training.view(trained, video.env(trained), trained.info["action_repeat"])
+        else:
+            video.make(trained, Path(f"{trained.info['task']}.mp4"))
 
 
 def replay(file: tyro.conf.Positional[Path], /, device: str | None = None) -> None:
@@ -172,7 +182,7 @@ def main(args: Sequence[str] | None = None) -> int:
         presets = {task: training.preset(task, device, algorithm) for task in registry.list_envs()}
     task_config = tyro.extras.subcommand_type_from_defaults(
         presets,
-        {task: f"Train {task}." for task in presets},
+        {task: f"Train {task}{'' if task in registry.ENVS else f'; {training.UNTUNED}'}." for task in presets},
         prefix_names=False,
     )
 
@@ -182,9 +192,7 @@ def main(args: Sequence[str] | None = None) -> int:
         --algorithm ppo or reppo, and --device, choose among the presets before all other options.
         """
         with _user_errors():
-            run = training.RunFolder.create(config)
-            print(f"run folder: {run.path}")
-            trainer = training.Trainer(run)
+            trainer = _begin(config)
         with _user_errors(OSError):  # a full disk; anything else in here is a bug and keeps its traceback
             trainer.train()
 
@@ -214,10 +222,19 @@ def main(args: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _begin(config: training.TrainingConfig) -> training.Trainer:
+    """Makes the folder of a run and what trains into it."""
+    run = training.RunFolder.create(config)
+    if config.task not in registry.ENVS:
+        print(f"{config.task}: {training.UNTUNED}")
+    print(f"run folder: {run.path}")
+    return training.Trainer(run)
+
+
 @contextlib.contextmanager
 def _user_errors(*kinds: type[Exception]) -> Iterator[None]:
     """Turns errors about what the user passed, or those of some kinds, into one line and exit status 2."""
-    told = kinds or (ValueError, TypeError, OSError)
+    told = kinds or (ValueError, TypeError, OSError, ImportError)
     try:
         yield
     except told as error:

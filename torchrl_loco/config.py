@@ -70,24 +70,28 @@ def _check_field(name: str, kind: Any, value: Any) -> None:
         raise ValueError(f"{name} must be less than 2**31, got {value!r}")
 
 
-_WALKER = SimConfig(
-    ctrl_dt=0.025, sim_dt=0.0025, naconmax=50_000, njmax=100, iterations=2, ls_iterations=5, euler_damping=False
-)
-_HUMANOID = SimConfig(
-    ctrl_dt=0.025, sim_dt=0.005, naconmax=200_000, njmax=250, iterations=4, ls_iterations=8, euler_damping=False
-)
-_CONVERGED: dict[str, Any] = {"iterations": 100, "ls_iterations": 50, "euler_damping": True}
-
 DEFAULTS = {
-    ("walker", "playground"): _WALKER,
-    ("walker", "dm_control"): dataclasses.replace(_WALKER, **_CONVERGED),
-    ("humanoid", "playground"): _HUMANOID,
-    ("humanoid", "dm_control"): dataclasses.replace(_HUMANOID, **_CONVERGED),
+    "walker": SimConfig(
+        ctrl_dt=0.025, sim_dt=0.0025, naconmax=50_000, njmax=100, iterations=2, ls_iterations=5, euler_damping=False
+    ),
+    "humanoid": SimConfig(
+        ctrl_dt=0.025, sim_dt=0.005, naconmax=200_000, njmax=250, iterations=4, ls_iterations=8, euler_damping=False
+    ),
 }
+"""By body, under the protocol ``playground``."""
+
+CONVERGED: dict[str, Any] = {"iterations": 100, "ls_iterations": 50, "euler_damping": True}
+"""What the protocol ``dm_control`` sets otherwise, for any body."""
 
 
-def sim_config(body: str, protocol: str, num_envs: int, overrides: dict[str, Any]) -> SimConfig:
-    """Returns the settings of ``body`` under ``protocol`` for ``num_envs`` worlds, with ``overrides`` on top.
+def sim_config(defaults: SimConfig, protocol: str, num_envs: int, overrides: dict[str, Any]) -> SimConfig:
+    """Returns the settings of a body under ``protocol`` for ``num_envs`` worlds, with ``overrides`` on top.
+
+    Args:
+        defaults: the body's settings under ``playground``, with ``naconmax`` for 2048 worlds.
+        protocol: one of :data:`PROTOCOLS`.
+        num_envs: number of worlds, which ``naconmax`` grows with.
+        overrides: fields of :class:`SimConfig`.
 
     Raises:
         ValueError: ``protocol`` or a key of ``overrides`` is unknown, or a value is out of range.
@@ -99,7 +103,8 @@ def sim_config(body: str, protocol: str, num_envs: int, overrides: dict[str, Any
     for key in overrides:
         if key not in names:
             raise ValueError(f"unknown setting {key!r}{suggestion(key, names)}: choose from {', '.join(names)}")
-    config = dataclasses.replace(DEFAULTS[body, protocol], **overrides)
+    changes = CONVERGED if protocol == "dm_control" else {}
+    config = dataclasses.replace(defaults, **{**changes, **overrides})
     if "naconmax" in overrides:
         return config
     scaled = math.ceil(config.naconmax * num_envs / NACONMAX_WORLDS)

@@ -15,10 +15,9 @@ from tqdm.auto import trange
 
 import torchrl_loco
 from torchrl_loco.envs.health import advise
-from torchrl_loco.registry import make
+from torchrl_loco.registry import env_class, list_envs, make
 
 PACKAGES = ("torch", "torchrl", "tensordict", "warp-lang", "mujoco-warp", "mujoco")
-SELF_TEST = {"walker": "walker_run", "humanoid": "humanoid_run"}
 TOLERANCE = 1e-4
 """Largest median error of qpos (m, rad) after a control step that counts as right."""
 
@@ -27,7 +26,7 @@ def diagnose() -> Iterator[tuple[str, str, bool]]:
     """Yields what was found, line by line: subject, finding, and whether all is well with it.
 
     The self-test of a body plays 20 random control steps in 4 worlds on each device, each step also in C MuJoCo, which
-    computes in double precision, from the same state.
+    computes in double precision, from the same state. Bodies that other distributions add are tested with ours.
     """
     yield "python", f"{platform.python_version()} on {platform.platform()}", True
     yield "torchrl-loco", torchrl_loco.__version__, True
@@ -42,8 +41,14 @@ def diagnose() -> Iterator[tuple[str, str, bool]]:
         why = "this torch is built without CUDA" if torch.version.cuda is None else "torch finds no driver or no device"
         yield "cuda", f"none: {why}", True
     yield "kernel cache", _describe_cache(), True
+    tasks: dict[str, str] = {}
+    for task in list_envs():
+        try:
+            tasks.setdefault(env_class(task).body, task)  # one of a body is enough
+        except ImportError as broken:
+            yield task, str(broken), False
     for device in devices:
-        for body, task in SELF_TEST.items():
+        for body, task in tasks.items():
             seconds, error = self_test(task, device)
             finding = f"made in {seconds:.1f} s, error against C MuJoCo {error:.1e}"
             yield f"{body} on {device}", finding, error < TOLERANCE

@@ -141,5 +141,7 @@ def load_policy(task: str, device: torch.device | str | None = None) -> Policy:
     path = SHIPPED / f"{name}.safetensors"
     if not path.is_file():
         shipped = sorted(p.stem for p in SHIPPED.glob("*.safetensors"))
-        raise ValueError(f"no policy for {name!r} comes with this release: choose one of {', '.join(shipped)}")
+        raise ValueError(
+            f"no policy for {name!r} comes with this release: choose one of {', '.join(shipped)}, or train one"
+        )
     return Policy.load(path, device)

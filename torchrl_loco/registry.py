@@ -1,5 +1,9 @@
-"""From an id to an environment."""
+"""From an id to an environment: ours, and those that other distributions register."""
 
+import contextlib
+import functools
+import warnings
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +24,36 @@ ENVS: dict[str, type[envs.LocoEnv]] = {
 ALIASES = {f"mjx/{name}-v0": name for name in ENVS}
 
 
+GROUP = "torchrl_loco.envs"
+"""Group of the entry points by which installed distributions add environments: ``id = "module:Class"``."""
+
+
+@functools.cache
+def plugins() -> dict[str, metadata.EntryPoint]:
+    """Returns the entry points of :data:`GROUP` by id, none of them loaded. They are looked up once.
+
+    Of an id that is taken already, by this package or by a distribution that was found before, a warning tells.
+    """
+    found: dict[str, metadata.EntryPoint] = {}
+    for point in metadata.entry_points(group=GROUP):
+        if point.name in ENVS or point.name in ALIASES:
+            taken = "torchrl_loco itself has it"
+        elif point.name in found:
+            taken = f"{_origin(found[point.name])} has it"
+        else:
+            found[point.name] = point
+            continue
+        warnings.warn(f"environment {point.name!r} of {_origin(point)} is refused: {taken}", stacklevel=3)
+    return dict(sorted(found.items()))
+
+
+def _origin(point: metadata.EntryPoint) -> str:
+    return f"{point.dist.name} {point.dist.version} ({point.value})" if point.dist else point.value
+
+
 def list_envs() -> list[str]:
-    """Returns the ids that :func:`make` takes, without the aliases ``mjx/<id>-v0``."""
-    return list(ENVS)
+    """Returns the ids that :func:`make` takes, without the aliases ``mjx/<id>-v0``: ours, then those of others."""
+    return [*ENVS, *plugins()]
 
 
 def canonical_id(id: str) -> str:
@@ -31,16 +62,42 @@ def canonical_id(id: str) -> str:
     Raises:
         ValueError: there is no such id; the message names the nearest right one and all of them.
     """
+    names = list_envs()
     name = ALIASES.get(id, id)
-    if name not in ENVS:
-        hint = suggestion(str(id), [*ENVS, *ALIASES])
-        raise ValueError(f"unknown environment {id!r}{hint}: choose one of {', '.join(ENVS)}")
+    if name not in names:
+        hint = suggestion(str(id), [*names, *ALIASES])
+        raise ValueError(f"unknown environment {id!r}{hint}: choose one of {', '.join(names)}")
     return name
 
 
 def env_class(id: str) -> type[envs.LocoEnv]:
-    """Returns the class of ``id`` or an alias; raises as :func:`canonical_id` does."""
-    return ENVS[canonical_id(id)]
+    """Returns the class of ``id`` or an alias.
+
+    Raises:
+        ValueError: there is no such id; the message names the nearest right one and all of them.
+        ImportError: the distribution that it comes from is broken; the message names it.
+    """
+    name = canonical_id(id)
+    if name in ENVS:
+        return ENVS[name]
+    point = plugins()[name]
+    try:
+        cls = point.load()
+    except Exception as error:  # whatever another's module may raise
+        reason = f"{type(error).__name__}: {error}"
+        raise ImportError(f"environment {name!r} of {_origin(point)} cannot be loaded: {reason}") from error
+    if not (isinstance(cls, type) and issubclass(cls, envs.LocoEnv)):
+        raise ImportError(f"environment {name!r} of {_origin(point)} is no subclass of torchrl_loco.LocoEnv")
+    return cls
+
+
+def usable_classes() -> list[type[envs.LocoEnv]]:
+    """Returns the classes of all environments, without those of broken distributions."""
+    found = []
+    for name in list_envs():
+        with contextlib.suppress(ImportError):
+            found.append(env_class(name))
+    return found
 
 
 def make(
@@ -56,7 +113,7 @@ def make(
     bad_world_file: Path | str | None = None,
     **config: Any,
 ) -> envs.LocoEnv:
-    """Makes one of the six environments.
+    """Makes an environment.
 
     Args:
         id: one of :func:`list_envs`, or its alias ``mjx/<id>-v0``.
@@ -73,6 +130,7 @@ def make(
     Raises:
         ValueError: an argument is out of range or unknown; the message names the valid choices.
         TypeError: an argument has the wrong type.
+        ImportError: the environment is another distribution's, which is broken.
 
     Example:
         >>> env = make("walker_walk", num_envs=16, device="cpu", seed=0)

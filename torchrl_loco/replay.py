@@ -14,7 +14,7 @@ from torchrl_loco import storage
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs import LocoEnv, State
 from torchrl_loco.envs.bad_world import KIND
-from torchrl_loco.registry import ENVS
+from torchrl_loco.registry import usable_classes
 
 STATE = ("qpos", "qvel", "qacc_warmstart")
 RESETS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -36,7 +36,7 @@ class BadWorld:
 
     def make_env(self, device: torch.device | str | None = None, **config: Any) -> LocoEnv:
         """Returns an environment of one world as the file describes it, with ``config`` on top."""
-        classes = {env.__name__: env for env in ENVS.values()}
+        classes = {env.__name__: env for env in usable_classes()}
         env, settings = classes[self.settings["env"]], {**self.settings["config"], **config}
         return env(1, device, self.settings["seed"], self.settings["protocol"], on_overflow="ignore", **settings)
 
@@ -54,7 +54,7 @@ def load(path: Path) -> BadWorld:
         ValueError: it is something else, damaged, or of an environment that is not here.
     """
     world = BadWorld(*storage.load(path, KIND))
-    names = [env.__name__ for env in ENVS.values()]
+    names = [env.__name__ for env in usable_classes()]
     if world.settings["env"] not in names:
         raise ValueError(f"{path} is of {world.settings['env']!r}, there are {', '.join(names)}")
     return world

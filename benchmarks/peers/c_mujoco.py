@@ -10,7 +10,7 @@ from mujoco import rollout
 
 from benchmarks.timing import milliseconds
 from torchrl_loco import models
-from torchrl_loco.config import sim_config
+from torchrl_loco.config import DEFAULTS, sim_config
 from torchrl_loco.sim.simulation import set_options
 
 CONTROL_STEPS = 20
@@ -18,7 +18,7 @@ CONTROL_STEPS = 20
 
 def main(body: str, worlds: int, threads: int) -> None:
     """Prints the time of a control step."""
-    config, model = sim_config(body, "playground", worlds, {}), models.load(body)
+    config, model = sim_config(DEFAULTS[body], "playground", worlds, {}), models.load(body)
     set_options(model, config)
     data = [mujoco.MjData(model) for _ in range(threads)]
     size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)

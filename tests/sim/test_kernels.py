@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from torchrl_loco import models
-from torchrl_loco.config import sim_config
+from torchrl_loco.config import DEFAULTS, sim_config
 from torchrl_loco.sim import Simulation
 from torchrl_loco.sim.kernels import compile_kernels
 
@@ -21,7 +21,7 @@ def count(total: wp.array[int]):
 @pytest.mark.parametrize("protocol", ["playground", "dm_control"])  # without and with a condition in the solver
 @pytest.mark.parametrize("body", ["walker", "humanoid"])
 def test_a_step_finds_every_kernel_compiled(body, protocol, device, monkeypatch):
-    config = sim_config(body, protocol, 2, {})
+    config = sim_config(DEFAULTS[body], protocol, 2, {})
     sim = Simulation(models.load(body), config, 2, torch.device(device))
     sim.compile(sim.step)
     load, asked = wp.Module.load, []

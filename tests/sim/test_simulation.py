@@ -7,14 +7,14 @@ import torch
 import warp as wp
 
 from torchrl_loco import models
-from torchrl_loco.config import sim_config
+from torchrl_loco.config import DEFAULTS, sim_config
 from torchrl_loco.sim import Simulation
 
 VIEWS = ("qpos", "qvel", "ctrl", "qacc_warmstart", "xpos", "xmat", "time", "overflow")
 
 
 def simulation(body, device, num_envs=4, **overrides):
-    config = sim_config(body, "dm_control", num_envs, overrides)
+    config = sim_config(DEFAULTS[body], "dm_control", num_envs, overrides)
     sim = Simulation(models.load(body), config, num_envs, torch.device(device))
     return sim, wp.ones(num_envs, dtype=bool, device=sim.device)
 
@@ -118,7 +118,7 @@ def test_options_come_from_the_config():
     assert sim.mj_model.opt.timestep == 0.005
     assert (sim.model.opt.iterations, sim.model.opt.ls_iterations) == (7, 9)
     assert sim.substeps == 5
-    playground = sim_config("walker", "playground", 1, {})
+    playground = sim_config(DEFAULTS["walker"], "playground", 1, {})
     cut = Simulation(models.load("walker"), playground, 1, torch.device("cpu"))
     assert cut.mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     assert not sim.mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP

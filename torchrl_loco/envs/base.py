@@ -15,10 +15,10 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from torchrl_loco import models
-from torchrl_loco.config import sim_config
+from torchrl_loco.config import SimConfig, sim_config
 from torchrl_loco.envs.autoreset import AsyncReset
 from torchrl_loco.envs.bad_world import BadWorldTrap
-from torchrl_loco.envs.checks import check_count, check_device, check_seed
+from torchrl_loco.envs.checks import check_count, check_device, check_model, check_seed, check_subclass
 from torchrl_loco.envs.episode import any_world, apply_action, begin_episode, count_step, quench
 from torchrl_loco.envs.health import Health
 from torchrl_loco.envs.state import Resumable, State, write_state
@@ -30,9 +30,10 @@ from torchrl_loco.sim import EXCLUSIVE, Simulation
 class LocoEnv(AsyncReset, Resumable):
     """Base of the locomotion environments: batched worlds of one body on one device.
 
-    A subclass names its ``body``, ``observation_size`` and ``term_names``, and launches the kernels that fill the
-    observation, the reward and its terms (:meth:`_launch_observe`) and draw initial poses (:meth:`_launch_pose`).
-    Everything else is here.
+    A subclass names its ``body``, ``mjcf`` (path of the model), ``defaults`` (settings under ``playground``),
+    ``observation_size`` and ``term_names``, and launches the kernels that fill the observation, the reward and its
+    terms (:meth:`_launch_observe`) and draw initial poses (:meth:`_launch_pose`). Everything else is here;
+    docs/guides/extending.md goes through it with a third body.
 
     Args:
         num_envs: number of worlds, the batch size.
@@ -54,6 +55,8 @@ class LocoEnv(AsyncReset, Resumable):
     """
 
     body: ClassVar[str]
+    mjcf: ClassVar[Path]
+    defaults: ClassVar[SimConfig]
     observation_size: ClassVar[int]
     term_names: ClassVar[tuple[str, ...]]
 
@@ -74,10 +77,11 @@ class LocoEnv(AsyncReset, Resumable):
         bad_world_file: Path | str | None = None,
         **config: Any,
     ) -> None:
+        check_subclass(type(self))
         num_envs = check_count("num_envs", num_envs)
         seed = secrets.randbits(32) if seed is None else check_seed(seed)
         device = check_device(device)
-        self.config = sim_config(self.body, protocol, num_envs, config)
+        self.config = sim_config(self.defaults, protocol, num_envs, config)
         self.protocol = protocol
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs, self.seed = num_envs, seed
@@ -86,7 +90,7 @@ class LocoEnv(AsyncReset, Resumable):
         no_memory = set(self.__dict__)
         # The device: else torch's views of Warp's arrays would follow the caller's default device.
         with EXCLUSIVE, device:
-            self.sim = Simulation(models.load(self.body), self.config, num_envs, device)
+            self.sim = Simulation(check_model(models.from_path(self.mjcf)), self.config, num_envs, device)
             self._make_buffers()
             self._health = Health(self.sim, self._bad, on_overflow)
             self._watchers: list[Watcher] = [self._health]
@@ -119,11 +123,17 @@ class LocoEnv(AsyncReset, Resumable):
         """Makes what the body's kernels need, once, before they are recorded."""
 
     def _launch_observe(self, mask: wp.array) -> None:
-        """Launches the kernel that fills ``_observation``, ``_reward`` and ``_terms`` of the worlds in ``mask``."""
+        """Launches the kernel that fills ``_observation``, ``_reward`` and ``_terms`` of the worlds in ``mask``.
+
+        ``mask`` (bool, ``(num_envs,)``) is all worlds after a step, those that begin anew after a reset.
+        """
         raise NotImplementedError
 
     def _launch_pose(self) -> None:
-        """Launches the kernel that draws ``qpos`` of the worlds in ``_mask``; without one they start at the default."""
+        """Launches the kernel that draws ``qpos`` of the worlds in ``_mask``; without one they start at the default.
+
+        They are at rest in the default pose, and stay at rest: what is drawn is ``qpos`` alone.
+        """
 
     # Setting up.
 

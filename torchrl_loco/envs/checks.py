@@ -1,9 +1,20 @@
-"""Checks of what a user passes to an environment."""
+"""Checks of what a user passes to an environment, and of what a new body brings."""
 
 import operator
 from typing import Any
 
+import mujoco
+import numpy as np
 import torch
+
+VELOCITY_SENSORS = {
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
+    for name in (
+        *("JOINTVEL", "BALLANGVEL", "VELOCIMETER", "GYRO"),
+        *("FRAMELINVEL", "FRAMEANGVEL", "SUBTREELINVEL", "SUBTREEANGMOM"),
+    )
+}
+"""Sensors that follow from what is computed after a step, and that are zero at rest."""
 
 
 def check_count(name: str, value: Any) -> int:
@@ -39,3 +50,36 @@ def check_device(device: torch.device | str | None) -> torch.device:
     if name not in ("cpu", *cuda):
         raise ValueError(f"no device {str(device)!r} here: choose one of {', '.join(['cpu', *cuda])}")
     return torch.device(name)
+
+
+def check_subclass(cls: type) -> None:
+    """Checks that a subclass of ``LocoEnv`` has set all class attributes that it must.
+
+    Raises:
+        TypeError: some are missing; the message names them.
+    """
+    names = ("body", "mjcf", "defaults", "observation_size", "term_names")
+    missing = [name for name in names if not hasattr(cls, name)]
+    if missing:
+        raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.LocoEnv)")
+
+
+def check_model(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """Returns the model.
+
+    Raises:
+        ValueError: something in it would go wrong in silence; the message names it.
+    """
+    wrong = []
+    if not np.array_equal(mj_model.actuator_ctrlrange, np.tile([-1.0, 1.0], (mj_model.nu, 1))):
+        wrong.append("every actuator needs ctrlrange -1 1, which actions lie in: scale by gear or gainprm")
+    if mj_model.na:
+        wrong.append("actuators with activations are not supported: they are not part of the state that is reset")
+    for i in range(mj_model.nsensor):
+        of_camera = mj_model.sensor_objtype[i] == int(mujoco.mjtObj.mjOBJ_CAMERA)
+        if of_camera or mj_model.sensor_type[i] not in VELOCITY_SENSORS:
+            name = mj_model.sensor(i).name
+            wrong.append(f"sensor {name!r} is not evaluated, only velocities are: compute it from sim.data in a kernel")
+    if wrong:
+        raise ValueError("; ".join(wrong))
+    return mj_model

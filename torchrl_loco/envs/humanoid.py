@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from torchrl_loco import models
+from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.rewards import Sigmoid, tolerance
 from torchrl_loco.sim.sampling import draw_free_poses, make_skeleton
@@ -89,6 +91,8 @@ class Humanoid(LocoEnv):
     """What the humanoid's three tasks share; they differ in ``speed`` (m/s, 0 to stand)."""
 
     body = "humanoid"
+    mjcf = models.PATHS["humanoid"]
+    defaults = DEFAULTS["humanoid"]
     observation_size = 67
     speed = 0.0
     term_names = ("standing", "upright", "small_control", "move")

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from torchrl_loco import models
+from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.rewards import Sigmoid, tolerance
 from torchrl_loco.sim.sampling import world_stream
@@ -90,6 +92,8 @@ class Walker(LocoEnv):
     """What the walker's three tasks share; they differ in ``speed`` (m/s, 0 to stand)."""
 
     body = "walker"
+    mjcf = models.PATHS["walker"]
+    defaults = DEFAULTS["walker"]
     observation_size = 24
     speed = 0.0
 

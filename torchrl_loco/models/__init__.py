@@ -5,15 +5,27 @@ from pathlib import Path
 import mujoco
 
 _FOLDER = Path(__file__).parent
-NAMES = ("walker", "humanoid")
+PATHS = {name: _FOLDER / f"{name}.xml" for name in ("walker", "humanoid")}
+SCENE = _FOLDER / "scene.xml"
+"""What all bodies can include by its name: light, materials, the look of the floor."""
 
 
 def load(name: str) -> mujoco.MjModel:
-    """Compiles one of the bodies, with dm_control's solver settings.
+    """Returns one of the bodies, compiled with dm_control's solver settings.
 
     Raises:
-        ValueError: ``name`` is none of :data:`NAMES`.
+        ValueError: ``name`` is none of :data:`PATHS`.
     """
-    if name not in NAMES:
-        raise ValueError(f"unknown model {name!r}: choose one of {', '.join(NAMES)}")
-    return mujoco.MjModel.from_xml_path(str(_FOLDER / f"{name}.xml"))
+    if name not in PATHS:
+        raise ValueError(f"unknown model {name!r}: choose one of {', '.join(PATHS)}")
+    return from_path(PATHS[name])
+
+
+def from_path(path: Path) -> mujoco.MjModel:
+    """Returns the model of an MJCF file. What it includes as ``scene.xml`` is ours, unless one lies beside it.
+
+    Raises:
+        ValueError: there is no such file, or it is no valid MJCF.
+    """
+    own = path.with_name(SCENE.name).exists()
+    return mujoco.MjModel.from_xml_path(str(path), {} if own else {SCENE.name: SCENE.read_bytes()})

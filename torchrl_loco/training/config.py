@@ -15,7 +15,7 @@ from torchrl_loco.registry import canonical_id, env_class
 
 @dataclasses.dataclass(frozen=True)
 class TrainingConfig:
-    """Settings of any training run. Frames are control steps of one world (0.025 s)."""
+    """Settings of any training run. Frames are control steps of one world."""
 
     algorithm: ClassVar[str]
 
@@ -117,7 +117,7 @@ class TrainingConfig:
     @property
     def action_size(self) -> int:
         """Length of an action."""
-        return models.load(env_class(self.task).body).nu
+        return models.from_path(env_class(self.task).mjcf).nu
 
 
 @dataclasses.dataclass(frozen=True)

@@ -72,6 +72,9 @@ TASKS: dict[tuple[str, str], Settings] = {
 }
 """What a task needs beside, by algorithm and task, on CUDA."""
 
+UNTUNED = "no settings were tuned for it, these are the ones that teach the walker and the humanoid"
+"""What to say of a task of another distribution."""
+
 DEFAULT_ALGORITHM = {"cpu": "ppo", "cuda": "reppo"}
 
 
@@ -79,6 +82,9 @@ def preset(
     task: str, device: torch.device | str | None = None, algorithm: str | None = None, **overrides: Any
 ) -> TrainingConfig:
     """Returns the settings for ``task`` on ``device``, with ``overrides`` on top.
+
+    A task of another distribution takes those of the algorithm on the kind of device, without more: they teach the
+    walker and the humanoid, and were not tuned for it.
 
     Args:
         task: id of the environment.

@@ -16,6 +16,7 @@ import torch
 
 from torchrl_loco.envs.checks import check_device
 from torchrl_loco.policy import Policy
+from torchrl_loco.registry import env_class
 from torchrl_loco.training.config import CONFIGS, TrainingConfig
 
 CHECKPOINT_VERSION = 2
@@ -52,9 +53,11 @@ class RunFolder:
 
         Raises:
             ValueError: the device is not here.
+            ImportError: the environment is another distribution's, which is broken.
             OSError: the folder cannot be made, or the disk has no room for a run.
         """
         check_device(config.device)
+        env_class(config.task)
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         name = f"{config.task}-{stamp}-seed{config.seed}"
         Path(config.out).mkdir(parents=True, exist_ok=True)

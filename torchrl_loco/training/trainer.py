@@ -18,7 +18,7 @@ from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs.autoreset import TransformedEnv
 from torchrl_loco.envs.checks import check_count, check_device, check_seed
 from torchrl_loco.policy import Policy
-from torchrl_loco.registry import make
+from torchrl_loco.registry import env_class, make
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.evaluation import Evaluator, describe, record, summarize
@@ -29,9 +29,6 @@ from torchrl_loco.training.reppo import REPPO
 from torchrl_loco.training.run_folder import RunFolder
 
 ALGORITHMS: dict[str, Callable[[Any], Algorithm]] = {"ppo": PPO, "reppo": REPPO}
-
-EPISODE_LENGTH = 1000
-"""Control steps of an episode of all tasks, to which the mean reward in training is scaled up."""
 
 
 class Trainer:
@@ -105,6 +102,7 @@ class Trainer:
     def _iterate(self) -> dict[str, float]:
         """Collects a batch and updates on it; reads from the device once."""
         config, algorithm, start = self.config, self.algorithm, time.perf_counter()
+        full_length = env_class(config.task).defaults.episode_length  # that of training may be shorter
         batch = self.collector.rollout()
         reward = batch["next", "reward"].mean() / config.action_repeat
         metrics = algorithm.update(batch, progress=self.frames / config.total_frames)
@@ -118,7 +116,7 @@ class Trainer:
             "frames": self.frames,
             "seconds": round(self.seconds, 3),
             "frames_per_second": round(config.frames_per_batch / seconds, 1),
-            "return": round(mean_reward * EPISODE_LENGTH, 3),
+            "return": round(mean_reward * full_length, 3),
             **{name: round(value, 6) for name, value in zip(algorithm.metric_names, means, strict=True)},
         }
 
