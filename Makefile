@@ -6,7 +6,7 @@ TASK ?= walker_stand
 ARGS ?=
 PYTEST_ARGS ?= --numprocesses auto
 
-.PHONY: train test test-fast lint format dist clean
+.PHONY: train test test-fast lint format docs dist clean
 
 train: $(VENV)/installed  ## train a policy; TASK=walker_walk ARGS="--seed 1" to change what
 	$(BIN)/torchrl-loco train $(TASK) $(ARGS)
@@ -31,6 +31,9 @@ dist: $(VENV)/installed  ## wheel and sdist, looked through and tried out, into 
 	$(BIN)/python -m hatchling build
 	$(BIN)/python -m pytest tests/test_packaging.py
 
+docs: $(VENV)/installed  ## the site, into docs/_build/html; warnings are errors
+	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
+
 # PIP_ARGS can constrain versions, for example to a CPU build of torch: make test PIP_ARGS="torch==2.13.0"
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -39,4 +42,4 @@ $(VENV)/installed: pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) dist .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) dist .mypy_cache .pytest_cache .ruff_cache docs/_build docs/generated

@@ -61,7 +61,7 @@ class RolloutCollector:
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
-        """Returns the next batch."""
+        """Returns the next batch, of shape ``(num_envs, steps)``."""
         td = self._env.reset() if self._carried is None else self._carried
         steps = []
         with set_exploration_type(self._exploration_type):
@@ -79,7 +79,7 @@ class RolloutCollector:
         return {"carried": self._carried.to_dict(), "env": env.get_state().to_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from a :meth:`state_dict`, in an environment of the same settings."""
+        """Goes on from the ``state`` that :meth:`state_dict` returned, in an environment of the same settings."""
         if not state:
             self._carried = None
             return

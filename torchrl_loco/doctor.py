@@ -86,7 +86,7 @@ def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) 
 
 
 def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float]:
-    """Plays ``steps`` random control steps and returns the seconds that making the environment took, and the error.
+    """Returns the seconds that making the environment took, and the error of ``steps`` random control steps.
 
     The error is the median over worlds and steps of the largest deviation of qpos from C MuJoCo (m, rad); NaN if
     anything was not finite.

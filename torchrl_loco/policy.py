@@ -34,12 +34,12 @@ class ObservationNorm(nn.Module):
         self.register_buffer("count", torch.zeros(()))
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Normalises observations of shape ``(..., size)``."""
+        """Returns the normalised ``observation``, shape ``(..., size)``."""
         return ((observation - self.mean) * torch.rsqrt(self.var + 1e-6)).clamp(-self.limit, self.limit)
 
     @torch.no_grad()
     def update(self, observation: torch.Tensor) -> None:
-        """Takes observations of shape ``(..., size)`` into mean and variance (Chan's parallel formula)."""
+        """Takes each ``observation`` of shape ``(..., size)`` into mean and variance (Chan's parallel formula)."""
         batch = observation.flatten(0, -2)
         var, mean = torch.var_mean(batch, dim=0, correction=0)
         total = self.count + len(batch)
@@ -54,7 +54,8 @@ class Policy(TensorDictModule):
     """A deterministic policy: reads ``observation``, shape ``(..., n)``, and writes ``action`` in [-1, 1].
 
     Args:
-        network: an :class:`ObservationNorm`, then linear layers, layer norms and SiLUs, at the end a tanh.
+        network: a :class:`~torchrl_loco.policy.ObservationNorm`, then linear layers, layer norms and SiLUs, then a
+            tanh.
         info: ``task``, ``protocol``, ``action_repeat`` and whatever else is known of it, such as its return.
     """
 
@@ -63,7 +64,7 @@ class Policy(TensorDictModule):
         self.info = info
 
     def save(self, path: Path) -> None:
-        """Writes the policy in half precision, which moves an action by some thousandths at most."""
+        """Writes the policy to ``path`` in half precision, which moves an action by some thousandths at most."""
         layers = [_LAYER_NAMES[type(layer)] for layer in self.module]
         tensors = {  # the observation's statistics span more than half precision does
             name: tensor.to(torch.float32 if name.startswith("0.") else torch.float16)
@@ -78,6 +79,9 @@ class Policy(TensorDictModule):
         Args:
             path: a file that :meth:`save` wrote.
             device: where it computes; ``None`` takes CUDA if there is any.
+
+        Returns:
+            The policy, without gradients.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -107,7 +111,11 @@ _LAYER_NAMES: dict[type[nn.Module], str] = {
 
 
 def _make_layer(name: str, sized: torch.Tensor | None) -> nn.Module:
-    """Makes the layer of a name, as large as one of its tensors tells."""
+    """Returns the layer of a name, as large as one of its tensors tells.
+
+    Raises:
+        ValueError: there is no such layer, or it needs a tensor.
+    """
     if name == "silu":
         return nn.SiLU()
     if name == "tanh":

@@ -127,13 +127,16 @@ def make(
         bad_world_file: a file, not there yet, that is to hold what the first world that is not finite came from.
         config: fields of :class:`torchrl_loco.SimConfig` to override, such as ``episode_length=500``.
 
+    Returns:
+        The environment, with batch size ``(num_envs,)``, ready for ``reset()``.
+
     Raises:
         ValueError: an argument is out of range or unknown; the message names the valid choices.
         TypeError: an argument has the wrong type.
         ImportError: the environment is another distribution's, which is broken.
 
     Example:
-        >>> env = make("walker_walk", num_envs=16, device="cpu", seed=0)
+        >>> env = torchrl_loco.make("walker_walk", num_envs=16, device="cpu", seed=0)
         >>> env.rollout(100)["next", "reward"].shape
         torch.Size([16, 100, 1])
     """

@@ -47,7 +47,7 @@ class BadWorld:
 
 
 def load(path: Path) -> BadWorld:
-    """Reads a bad world file without executing code.
+    """Returns what a bad world file holds, read without executing code.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -61,7 +61,7 @@ def load(path: Path) -> BadWorld:
 
 
 def warp_trace(world: BadWorld, device: torch.device | str | None = None) -> np.ndarray:
-    """Steps the world in Warp and returns qpos and qvel after each substep, ``(substeps + 1, nq + nv)``."""
+    """Returns qpos and qvel after each substep in Warp, shape ``(substeps + 1, nq + nv)``, the start included."""
     config = SimConfig(**world.settings["config"])
     env = world.make_env(device, ctrl_dt=config.sim_dt)  # an action a substep, to see them all
     env.reset(world.state.to(env.device), set_state=True)
@@ -74,7 +74,7 @@ def warp_trace(world: BadWorld, device: torch.device | str | None = None) -> np.
 
 
 def c_trace(world: BadWorld) -> np.ndarray:
-    """As :func:`warp_trace`, in C MuJoCo and double precision.
+    """Returns the same as :func:`warp_trace`, from C MuJoCo in double precision.
 
     C MuJoCo resets a world that is not finite; from there on the trace is NaN.
     """
@@ -97,7 +97,11 @@ def c_trace(world: BadWorld) -> np.ndarray:
 
 
 def describe(world: BadWorld, device: torch.device | str | None = None) -> Iterator[str]:
-    """Yields, line by line, where the world was, what is wrong with it, and how it goes on in Warp and C MuJoCo."""
+    """Yields lines of text: where the world was, what is wrong with it, and how it goes on in Warp and C MuJoCo.
+
+    Yields:
+        The lines.
+    """
     settings = world.settings
     yield (
         f"{settings['env']}, protocol {settings['protocol']}, seed {settings['seed']}: world {settings['world']} of "

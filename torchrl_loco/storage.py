@@ -27,7 +27,7 @@ def save(path: Path, kind: str, tensors: dict[str, torch.Tensor], settings: dict
 
 
 def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Reads what :func:`save` wrote, without executing code; the tensors are on the CPU.
+    """Returns the tensors, on the CPU, and the settings that :func:`save` wrote, read without executing code.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -36,7 +36,8 @@ class AsyncReset(EnvBase):
 
 
 class TransformedEnv(AsyncReset, TorchRLTransformedEnv):
-    """TorchRL's ``TransformedEnv`` for the environments of this package, with :class:`AsyncReset`.
+    """TorchRL's ``TransformedEnv`` for the environments of this package, without waiting for the device.
 
-    A stock one works too and gives the same data, but synchronises with the device at every step.
+    A stock one works too and gives the same data, but synchronises with the device at every step. Arguments are those
+    of TorchRL's: an environment, and a transform or a ``Compose`` of them.
     """

@@ -32,7 +32,7 @@ class LocoEnv(AsyncReset, Resumable):
 
     A subclass names its ``body``, ``mjcf`` (path of the model), ``defaults`` (settings under ``playground``),
     ``observation_size`` and ``term_names``, and launches the kernels that fill the observation, the reward and its
-    terms (:meth:`_launch_observe`) and draw initial poses (:meth:`_launch_pose`). Everything else is here;
+    terms (``_launch_observe``) and draw initial poses (``_launch_pose``). Everything else is here;
     docs/guides/extending.md goes through it with a third body.
 
     Args:
@@ -253,7 +253,7 @@ class LocoEnv(AsyncReset, Resumable):
         return result
 
     def _read_outputs(self) -> TensorDict:
-        """Copies what the kernels wrote: the buffers themselves change at the next step."""
+        """Returns a copy of what the kernels wrote: the buffers themselves change at the next step."""
         views = self._views
         entries: dict[str, Any] = {
             name: views[name].clone().unsqueeze(-1) for name in ("done", "terminated", "truncated")

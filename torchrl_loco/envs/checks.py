@@ -18,7 +18,12 @@ VELOCITY_SENSORS = {
 
 
 def check_count(name: str, value: Any) -> int:
-    """Returns ``value`` as an int of at least 1, or raises an error that names it."""
+    """Returns ``value`` as an int of at least 1.
+
+    Raises:
+        TypeError: it is no integer; the message calls it ``name``.
+        ValueError: it is less than 1.
+    """
     try:
         count = operator.index(value)
     except TypeError:
@@ -29,7 +34,12 @@ def check_count(name: str, value: Any) -> int:
 
 
 def check_seed(value: Any) -> int:
-    """Returns ``value`` as an int in [0, 2**32), or raises an error that names the range."""
+    """Returns ``value`` as an int in [0, 2**32).
+
+    Raises:
+        TypeError: it is no integer.
+        ValueError: it is out of range.
+    """
     try:
         seed = operator.index(value)
     except TypeError:
@@ -40,7 +50,11 @@ def check_seed(value: Any) -> int:
 
 
 def check_device(device: torch.device | str | None) -> torch.device:
-    """Returns the device with its index, CUDA before CPU for ``None``, or raises an error that names those present."""
+    """Returns the device with its index, CUDA before CPU for ``None``.
+
+    Raises:
+        ValueError: it is not here; the message names those that are.
+    """
     cuda = [f"cuda:{i}" for i in range(torch.cuda.device_count())]
     if device is None:
         device = "cuda" if cuda else "cpu"

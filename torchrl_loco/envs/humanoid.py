@@ -125,29 +125,43 @@ class Humanoid(LocoEnv):
 class HumanoidStand(Humanoid):
     """Stand still and upright.
 
-    Observation (67): hinge angles, qpos[7:] (21, rad); head height (1, m); left hand, left foot, right hand and right
+    Arguments as in :class:`~torchrl_loco.LocoEnv`.
+
+    Observation:
+        67 numbers: hinge angles, qpos[7:] (21, rad); head height (1, m); left hand, left foot, right hand and right
         foot relative to the torso, in its frame (12, m); the torso's z row of xmat (3); velocity of the torso
-        subtree's center of mass (3, m/s); qvel (27).
-    Action (21): torques of the hinges as a share of their gear, in [-1, 1]; clipped beyond.
-    Reward: ``standing * upright * small_control * move`` with
+        subtree's center of mass (3, m/s); qvel (27, m/s and rad/s).
+
+    Action:
+        21 numbers: torques of the hinges as a share of their gear, in [-1, 1]; clipped beyond.
+
+    Reward:
+        ``standing * upright * small_control * move`` with
         ``standing = tolerance(head z, [1.4 m, inf), margin 0.35 m)``,
         ``upright = tolerance(torso zz, [0.9, inf), margin 1.9, linear, value_at_margin 0)``,
         ``small_control = (4 + mean(tolerance(action, margin 1, quadratic, value_at_margin 0))) / 5`` and
         ``move = mean(tolerance(vx, margin 2 m/s), tolerance(vy, margin 2 m/s))``. The four are the terms.
-    Start: at rest; the default pose under ``playground``, a random one free of contact under ``dm_control``.
-    Termination: none by falling; truncation after 1000 steps; a world that is no longer finite is terminated with
-        reward 0 and a zero observation.
-    Source: dm_control ``suite/humanoid.py``; arguments as in :class:`LocoEnv`.
+
+    Start:
+        At rest; the default pose under ``playground``, a random one free of contact under ``dm_control``.
+
+    Termination:
+        None by falling; truncation after 1000 steps; a world that is no longer finite is terminated with reward 0 and a
+        zero observation.
+
+    Source:
+        dm_control ``suite/humanoid.py``.
     """
 
 
 class HumanoidWalk(Humanoid):
     """Walk at 1 m/s or faster, in any direction.
 
-    As :class:`HumanoidStand`, but for the
+    As :class:`HumanoidStand`, but for the reward.
 
-    Reward: its last factor is ``move = (5 tolerance(|v_xy|, [1 m/s, inf), margin 1 m/s, linear, value_at_margin 0)
-        + 1) / 6``.
+    Reward:
+        The last factor is ``move = (5 fast + 1) / 6`` with
+        ``fast = tolerance(|v_xy|, [1 m/s, inf), margin 1 m/s, linear, value_at_margin 0)``.
     """
 
     speed = WALK_SPEED

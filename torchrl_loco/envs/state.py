@@ -41,13 +41,24 @@ class State(TensorDict):
 
         Raises:
             IndexError: there is no such world.
+            TypeError: ``num_envs`` is no integer.
+            ValueError: ``num_envs`` is less than 1.
         """
         count = self.batch_size[0] if num_envs is None else check_count("num_envs", num_envs)
         copies = {key: value[world].expand(count, *value.shape[1:]).clone() for key, value in self.items()}
         return State(copies, batch_size=[count], device=self.device)
 
     def select(self, *keys: Any, inplace: bool = False, strict: bool = True) -> TensorDictBase:
-        """Selects ``keys``, and the state if ``"_reset"`` is among them."""
+        """Selects ``keys``, and the state if ``"_reset"`` is among them.
+
+        Args:
+            keys: names of entries.
+            inplace: whether to remove the others instead of making a new TensorDict.
+            strict: whether a key that is not there raises a KeyError.
+
+        Returns:
+            The selection.
+        """
         state = [key for key in self.KEYS if key in self] if "_reset" in keys else []
         return super().select(*keys, *state, inplace=inplace, strict=strict)
 
@@ -84,15 +95,18 @@ class Resumable(EnvBase):
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> Any:
         """Goes on where ``state_dict`` was taken; see :meth:`set_extra_state`.
 
-        With ``strict=False`` the worlds stay as they are: so TorchRL's ``EnvCreator`` hands what transforms share to
+        With ``strict`` False the worlds stay as they are: so TorchRL's ``EnvCreator`` hands what transforms share to
         every environment that it makes, which should begin anew.
+
+        Returns:
+            The keys that were missing or not expected, as torch's own does.
         """
         if not strict:
             state_dict = {name: value for name, value in state_dict.items() if not name.endswith("_extra_state")}
         return super().load_state_dict(state_dict, strict=strict, **kwargs)
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        """Keeps a state that was passed to ``reset`` out of what it returns, where it would grow stale."""
+        """Returns what ``reset`` returns, without a state that was passed to it, which would grow stale."""
         if tensordict is not None and any(key in tensordict for key in State.KEYS):
             tensordict = TensorDict(
                 {key: value for key, value in tensordict.items() if key not in State.KEYS},

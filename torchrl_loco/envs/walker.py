@@ -116,15 +116,29 @@ class Walker(LocoEnv):
 class WalkerStand(Walker):
     """Stand up and stay upright.
 
-    Observation (24): for torso, right thigh, leg, foot and left thigh, leg, foot the pair (xmat_xx, xmat_xz); one
-        height entry, which is the torso's height (m) under ``dm_control`` and its zz under ``playground``; qvel (9).
-    Action (6): torques of hips, knees and ankles as a share of their gear, in [-1, 1]; clipped beyond.
-    Reward: ``stand = (3 standing + upright) / 4`` with ``standing = tolerance(torso z, [1.2 m, inf), margin 0.6 m)``
-        and ``upright = (1 + torso zz) / 2``. Term: ``stand``.
-    Start: at rest, pitch uniform in (-pi, pi), hinges uniform in their ranges.
-    Termination: none by falling; truncation after 1000 steps; a world that is no longer finite is terminated with
-        reward 0 and a zero observation.
-    Source: dm_control ``suite/walker.py``; arguments as in :class:`LocoEnv`.
+    Arguments as in :class:`~torchrl_loco.LocoEnv`.
+
+    Observation:
+        24 numbers: for torso, right thigh, leg, foot and left thigh, leg, foot the pair (xmat_xx, xmat_xz); one height
+        entry, which is the torso's height (m) under ``dm_control`` and its zz under ``playground``; qvel (9, m/s and
+        rad/s).
+
+    Action:
+        6 numbers: torques of hips, knees and ankles as a share of their gear, in [-1, 1]; clipped beyond.
+
+    Reward:
+        ``stand = (3 standing + upright) / 4`` with ``standing = tolerance(torso z, [1.2 m, inf), margin 0.6 m)`` and
+        ``upright = (1 + torso zz) / 2``. Term: ``stand``.
+
+    Start:
+        At rest, pitch uniform in (-pi, pi), hinges uniform in their ranges.
+
+    Termination:
+        None by falling; truncation after 1000 steps; a world that is no longer finite is terminated with reward 0 and a
+        zero observation.
+
+    Source:
+        dm_control ``suite/walker.py``.
     """
 
     term_names = ("stand",)
@@ -133,9 +147,10 @@ class WalkerStand(Walker):
 class WalkerWalk(Walker):
     """Walk at 1 m/s or faster.
 
-    As :class:`WalkerStand`, but for the
+    As :class:`WalkerStand`, but for the reward.
 
-    Reward: ``stand * (5 move + 1) / 6`` with
+    Reward:
+        ``stand * (5 move + 1) / 6`` with
         ``move = tolerance(speed, [1 m/s, inf), margin 0.5 m/s, linear, value_at_margin 0.5)``, the speed being the
         center of mass's along x. Terms: ``stand`` and ``move``, the second factor.
     """

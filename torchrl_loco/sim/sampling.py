@@ -179,6 +179,9 @@ def make_skeleton(mj_model: mujoco.MjModel, pairs: np.ndarray, device: wp.Device
         pairs: geoms that may touch, lower id first, shape ``(npair, 2)``.
         device: where the arrays live.
 
+    Returns:
+        The skeleton.
+
     Raises:
         ValueError: the model has another kind of joint or geom.
     """

@@ -233,7 +233,7 @@ class Simulation:
         compile_kernels(launches, self.device)
 
     def capture(self, launch: Callable[[], None]) -> Graph:
-        """Records the launches that ``launch`` makes. The state afterwards is arbitrary: reset before use."""
+        """Returns a recording of the launches that ``launch`` makes. The state is arbitrary then: reset before use."""
         graph = Graph(launch, self.device, self._scratch)
         self.graphs.append(graph)
         return graph

@@ -42,18 +42,22 @@ class Algorithm(ABC):
 
     @abstractmethod
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """Returns what gradient steps need of a batch of shape ``(num_envs, decisions)``, in the same shape."""
+        """Returns what gradient steps need of a ``batch`` of shape ``(num_envs, decisions)``, in the same shape."""
 
     @abstractmethod
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
-        """Makes one gradient step, which CUDA records: nothing may be read from the device or copied to it.
+        """Makes a gradient step on a ``minibatch``, without reading from the device or copying to it: CUDA records it.
 
         Returns:
-            The metrics in the order of ``metric_names``.
+            The metrics, in the order of ``metric_names``.
         """
 
     def make_optimizer(self, name: str, parameters: Iterable[Any]) -> torch.optim.Adam:
-        """Makes an optimizer, of parameters or groups, whose learning rate lives where recorded steps find it."""
+        """Makes the optimizer ``name`` of ``parameters`` or groups, whose learning rate recorded steps can follow.
+
+        Returns:
+            The optimizer, which is also in ``optimizers``.
+        """
         on_cuda = self.device.type == "cuda"
         lr = torch.tensor(self.config.lr, device=self.device)
         optimizer = torch.optim.Adam(parameters, lr=lr, eps=1e-5, capturable=on_cuda, fused=on_cuda or None)
@@ -105,7 +109,7 @@ class Algorithm(ABC):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from a :meth:`state_dict`."""
+        """Goes on from a ``state`` that :meth:`state_dict` returned."""
         self.networks.load_state_dict(state["networks"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
@@ -131,6 +135,7 @@ class Replay:
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> None:
+        """Runs the work, or from the fourth call on its recording."""
         if self._calls < self.WARMUP:
             self._calls += 1
             side = torch.cuda.Stream(self._device)
@@ -149,7 +154,11 @@ class Replay:
 
 
 def clip_and_step(optimizer: torch.optim.Optimizer, max_norm: float) -> torch.Tensor:
-    """Clips the gradients of an optimizer's parameters to a norm, makes its step, and returns the norm before."""
+    """Clips the gradients of an optimizer's parameters to a norm and makes its step.
+
+    Returns:
+        The norm before.
+    """
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     norm = nn.utils.clip_grad_norm_(parameters, max_norm)
     optimizer.step()

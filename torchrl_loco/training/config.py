@@ -149,13 +149,13 @@ class REPPOConfig(TrainingConfig):
     init_temperature: float = 0.01
     """Weight of the entropy at the start; it is learned."""
     min_temperature: float = 3e-4
-    """Least weight of the entropy: from much less it would take too long to rise again when entropy falls."""
+    """Least weight of the entropy. From much less it would take too long to rise again when entropy falls."""
     num_bins: int = 151
     """Bins of the critic's distribution over returns."""
     max_value: float = 150.0
     """Return that the last bin stands for; the first stands for 0."""
     aux_coeff: float = 1.0
-    """Weight of the critic's second task: to foresee its own features of the next step."""
+    """Weight of the critic's second task, which is to foresee its own features of the next step."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -63,7 +63,7 @@ def summarize(returns: torch.Tensor) -> dict[str, float]:
 
 
 def describe(summary: dict[str, float]) -> str:
-    """Returns the summary of an evaluation as a line."""
+    """Returns the ``summary`` of an evaluation as a line."""
     return (
         f"return {summary['mean']:.1f} +- {summary['std']:.1f} over {summary['episodes']:.0f} episodes "
         f"(min {summary['min']:.1f}, max {summary['max']:.1f})"
@@ -73,7 +73,16 @@ def describe(summary: dict[str, float]) -> str:
 def record(
     policy: Policy, env: LocoEnv, path: Path, seconds: float, action_repeat: int = 1, camera: str = "side"
 ) -> None:
-    """Writes a video of the first world of an environment from its reset on, in real time."""
+    """Writes a video of the first world of an environment from its reset on, in real time.
+
+    Args:
+        policy: reads ``observation`` and writes ``action``.
+        env: where it plays.
+        path: the video, H.264 in a container that its suffix names.
+        seconds: length of the video (s).
+        action_repeat: frames for which an action is held.
+        camera: ``"side"``, ``"back"`` or ``"egocentric"``.
+    """
     frame_rate = round(1 / env.config.ctrl_dt)
     with imageio.imopen(path, "w", plugin="pyav") as video:
         video.init_video_stream("h264", fps=frame_rate)
@@ -93,7 +102,13 @@ def has_display() -> bool:
 
 
 def view(policy: Policy, env: LocoEnv, action_repeat: int = 1) -> None:
-    """Shows the first world of an environment in MuJoCo's viewer, in real time, until its window is closed."""
+    """Shows the first world of an environment in MuJoCo's viewer, in real time, until its window is closed.
+
+    Args:
+        policy: reads ``observation`` and writes ``action``.
+        env: where it plays.
+        action_repeat: frames for which an action is held.
+    """
     import mujoco.viewer  # needs a display
 
     data = mujoco.MjData(env.mj_model)

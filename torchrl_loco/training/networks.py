@@ -25,7 +25,7 @@ class StateIndependentScale(nn.Module):
         self.log_std = nn.Parameter(torch.full((size,), math.log(init_std)))
 
     def forward(self, loc: torch.Tensor) -> torch.Tensor:
-        """Takes means of shape ``(..., size)`` to ``(..., 2 size)``."""
+        """Returns means of shape ``(..., size)`` with the log deviations behind them, ``(..., 2 size)``."""
         return torch.cat([loc, self.log_std.expand_as(loc)], dim=-1)
 
 
@@ -127,7 +127,7 @@ class SquashedNormal(TransformedDistribution):
 
 
 def make_actor(config: TrainingConfig, network: nn.Module, log_prob: bool) -> ProbabilisticActor:
-    """Wraps a network that gives means and log deviations into a tanh-normal actor.
+    """Returns a tanh-normal actor around a network that gives means and log deviations.
 
     It reads ``observation`` and writes ``loc``, ``scale``, ``action`` and, if asked to, ``action_log_prob``.
     """
@@ -141,7 +141,7 @@ def make_actor(config: TrainingConfig, network: nn.Module, log_prob: bool) -> Pr
 
 
 def make_actor_critic(config: PPOConfig) -> tuple[ProbabilisticActor, ValueOperator, ObservationNorm]:
-    """Makes the actor and the critic of PPO, which share their observation norm; the critic writes ``state_value``."""
+    """Returns actor, critic and the observation norm that they share, for PPO; the critic writes ``state_value``."""
     layers = {"num_cells": list(config.hidden), "activation_class": nn.SiLU}
     norm = ObservationNorm(config.observation_size)
     mean = MLP(in_features=config.observation_size, out_features=config.action_size, **layers)
@@ -154,7 +154,7 @@ def make_actor_critic(config: PPOConfig) -> tuple[ProbabilisticActor, ValueOpera
 
 
 def make_actor_q(config: REPPOConfig) -> tuple[ProbabilisticActor, DistributionalQ, ObservationNorm]:
-    """Makes the actor and the critic of REPPO, which share their observation norm."""
+    """Returns actor, critic and the observation norm that they share, for REPPO."""
     norm = ObservationNorm(config.observation_size)
     head = nn.Linear(config.hidden[-1], 2 * config.action_size)
     body = normed_layers(config.observation_size, config.hidden)

@@ -12,7 +12,9 @@ from torchrl_loco.training.run_folder import RunFolder
 
 
 def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
-    """Draws return against frames; runs that differ in nothing but their seed share a line, their mean, and a band.
+    """Draws return against frames of ``runs`` into ``picture``.
+
+    Runs that differ in nothing but their seed share a line, their mean, and a band.
 
     Evaluations are dots: the mean over episodes, with the standard deviation over episodes as a bar.
 

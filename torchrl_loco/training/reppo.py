@@ -41,7 +41,7 @@ class REPPO(Algorithm):
         self.actor_optimizer = self.make_optimizer("actor", groups)
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """Estimates returns in which entropy counts as reward, from one action drawn in every next state.
+        """Returns estimates in which entropy counts as reward, from one action drawn in every next state.
 
         At a time limit the true terminal observation is bootstrapped from; a termination ends the return.
         """
@@ -59,11 +59,15 @@ class REPPO(Algorithm):
         return batch.select("observation", "action", "loc", "scale").update(estimates)
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
-        """Makes a step of the critic, then one of the actor and the two weights."""
+        """Returns the metrics of a step of the critic, then one of the actor and the two weights."""
         return [*self._critic_step(minibatch), *self._actor_step(minibatch)]
 
     def _critic_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
-        """The critic learns the distribution of returns, and to foresee its own features of the next step."""
+        """The critic learns the distribution of returns, and to foresee its own features of the next step.
+
+        Returns:
+            Its metrics.
+        """
         logits, foreseen = self.critic(minibatch["observation"], minibatch["action"])
         target = self.critic.bins.encode(minibatch["returns"])
         loss = cross_entropy(logits, target)
@@ -74,7 +78,11 @@ class REPPO(Algorithm):
         return [loss, aux, minibatch["returns"].mean(), grad_norm]
 
     def _actor_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
-        """The actor climbs value and entropy where it is near the old policy, and goes back to it where it is not."""
+        """The actor climbs value and entropy where it is near the old policy, and goes back to it where it is not.
+
+        Returns:
+            Its metrics.
+        """
         config, weights = self.config, self.weights
         loc, scale = self.distribution(minibatch["observation"])
         action, log_prob = sample(loc, scale)
@@ -123,7 +131,7 @@ class Weights(nn.Module):
 
 
 def sample(loc: torch.Tensor, scale: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Draws an action ``tanh(u)``, u ~ N(loc, scale), differentiably; returns it and its log-probability.
+    """Returns an action ``tanh(u)``, u ~ N(loc, scale), drawn differentiably, and its log-probability.
 
     Taken from u and not from the action, the log-probability stays exact where tanh saturates.
     """
@@ -135,6 +143,6 @@ def sample(loc: torch.Tensor, scale: torch.Tensor) -> tuple[torch.Tensor, torch.
 
 
 def kl(old_loc: torch.Tensor, old_scale: torch.Tensor, loc: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
-    """Divergence KL(old || new) of diagonal Gaussians, which is that of their images under tanh."""
+    """Returns the divergence KL(old || new) of diagonal Gaussians, which is that of their images under tanh."""
     ratio = old_scale / scale
     return (0.5 * (ratio.square() + ((old_loc - loc) / scale).square() - 1.0) - ratio.log()).sum(-1)

@@ -31,7 +31,9 @@ _UNREADABLE = (
 
 
 class RunFolder:
-    """A run on disk: ``config.json``, ``metrics.csv``, ``tensorboard/``, ``evaluations.csv``, ``checkpoint.pt``,
+    """A run on disk.
+
+    It holds ``config.json``, ``metrics.csv``, ``tensorboard/``, ``evaluations.csv``, ``checkpoint.pt``,
     ``policy.safetensors``, ``learning_curve.png`` and ``video.mp4``; and ``bad_world.safetensors``, should a world not
     stay finite.
 
@@ -50,6 +52,9 @@ class RunFolder:
     @classmethod
     def create(cls, config: TrainingConfig) -> "RunFolder":
         """Makes a new folder for a run in ``config.out``, named after task, time and seed.
+
+        Returns:
+            The folder, with ``config`` in it.
 
         Raises:
             ValueError: the device is not here.
@@ -76,7 +81,11 @@ class RunFolder:
         return cls(path)
 
     def load_config(self, **overrides: Any) -> TrainingConfig:
-        """Returns the settings of the run, with ``overrides`` on top, such as ``device="cpu"`` for a run from CUDA."""
+        """Returns the settings of the run, with ``overrides`` on top, such as ``device="cpu"`` for a run from CUDA.
+
+        Raises:
+            ValueError: it was trained by an algorithm that this release has not, or a field is out of range.
+        """
         values = json.loads((self.path / "config.json").read_text())
         values.update(out=Path(values["out"]), hidden=tuple(values["hidden"]))
         algorithm = values.pop("algorithm", None)
@@ -105,11 +114,11 @@ class RunFolder:
         return self.policy.is_file() and "mean" in Policy.load(self.policy, "cpu").info
 
     def append_metrics(self, row: dict[str, Any]) -> None:
-        """Adds a line to ``metrics.csv``."""
+        """Adds ``row`` to ``metrics.csv``."""
         self._append("metrics.csv", row)
 
     def append_evaluation(self, row: dict[str, Any]) -> None:
-        """Adds a line to ``evaluations.csv``."""
+        """Adds ``row`` to ``evaluations.csv``."""
         self._append("evaluations.csv", row)
 
     def read_metrics(self) -> dict[str, list[float]]:
@@ -128,7 +137,7 @@ class RunFolder:
         return self._read("evaluations.csv")
 
     def forget_after(self, frames: int) -> None:
-        """Removes the lines of metrics and evaluations after so many frames: a resumed run writes them again."""
+        """Removes the lines of metrics and evaluations after so many ``frames``: a resumed run writes them again."""
         for name in ("metrics.csv", "evaluations.csv"):
             path, part = self.path / name, self.path / f"{name}.part"
             if not path.exists():
@@ -156,13 +165,16 @@ class RunFolder:
             return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
 
     def save_checkpoint(self, entries: dict[str, Any]) -> None:
-        """Writes the checkpoint; a crash while writing leaves the previous one."""
+        """Writes ``entries`` as the checkpoint; a crash while writing leaves the previous one."""
         part = self.path / "checkpoint.pt.part"
         torch.save({"version": CHECKPOINT_VERSION, **entries}, part)
         part.replace(self.path / "checkpoint.pt")
 
     def load_checkpoint(self, device: torch.device | str) -> dict[str, Any]:
         """Reads the checkpoint without executing code.
+
+        Returns:
+            Its entries, with tensors on ``device``.
 
         Raises:
             FileNotFoundError: the run has none yet.

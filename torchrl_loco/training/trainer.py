@@ -64,6 +64,9 @@ class Trainer:
         A progress bar shows the return (mean reward of the last batch times the length of an episode) and the frames
         per second. At Ctrl-C the iteration is finished and a checkpoint written before KeyboardInterrupt is raised; a
         second one interrupts at once.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed.
         """
         config = self.config
         saved = time.perf_counter()
@@ -96,11 +99,11 @@ class Trainer:
 
     @property
     def last_frame(self) -> int:
-        """Frames of a complete run: whole batches."""
+        """Frames of a complete run, in whole batches."""
         return self.config.total_frames // self.config.frames_per_batch * self.config.frames_per_batch
 
     def _iterate(self) -> dict[str, float]:
-        """Collects a batch and updates on it; reads from the device once."""
+        """Returns the metrics of collecting a batch and updating on it; reads from the device once."""
         config, algorithm, start = self.config, self.algorithm, time.perf_counter()
         full_length = env_class(config.task).defaults.episode_length  # that of training may be shorter
         batch = self.collector.rollout()
@@ -125,7 +128,7 @@ class Trainer:
         return interval > 0 and self.frames % interval < self.config.frames_per_batch
 
     def _evaluate(self) -> dict[str, float]:
-        """Evaluates the policy of the moment, and keeps it if none before it was better."""
+        """Returns the summary of an evaluation of the policy of the moment, which is kept if none before was better."""
         if self._evaluator is None:
             self._evaluator = make_evaluator(self.config, seed=evaluation_seed(self.config, 0))
         when = {"frames": self.frames, "seconds": round(self.seconds, 3)}
@@ -178,7 +181,7 @@ class Trainer:
 
 
 def make_env(config: TrainingConfig, bad_world: Path) -> EnvBase:
-    """Makes the environment of a run, which holds an action for ``config.action_repeat`` frames and sums the reward.
+    """Returns the environment of a run: it holds an action for ``config.action_repeat`` frames and sums the reward.
 
     Should a world not stay finite, what led to it is written to ``bad_world``, unless an earlier one lies there.
     """
@@ -196,7 +199,7 @@ def make_env(config: TrainingConfig, bad_world: Path) -> EnvBase:
 
 
 def make_evaluator(config: TrainingConfig, episodes: int | None = None, seed: int | None = None) -> Evaluator:
-    """Makes the evaluation of a run; ``None`` takes the run's own number, and the seed of its last evaluation."""
+    """Returns the evaluation of a run; ``None`` takes the run's own number, and the seed of its last evaluation."""
     episodes = check_count("episodes", config.eval_episodes if episodes is None else episodes)
     seed = evaluation_seed(config, 1) if seed is None else check_seed(seed)
     return Evaluator(config.task, episodes, config.device, seed, config.protocol, config.action_repeat)
@@ -213,13 +216,16 @@ def evaluation_seed(config: TrainingConfig, which: int) -> int:
 def evaluate_run(
     run: RunFolder, episodes: int | None = None, seed: int | None = None, device: str | None = None
 ) -> dict[str, float]:
-    """Evaluates the policy of a run and returns the summary of the returns.
+    """Evaluates the policy of a run.
 
     Args:
         run: the run.
         episodes: number of episodes; ``None`` takes the run's own setting.
         seed: seed that the episodes are drawn from; ``None`` plays those of the run's last evaluation again.
         device: where to play them; ``None`` takes where the run was trained.
+
+    Returns:
+        Number, mean, standard deviation and extremes of the returns.
 
     Raises:
         FileNotFoundError: the run has no policy yet.

@@ -1,0 +1,69 @@
+"""The documentation site; `make docs` builds it into docs/_build/html."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import generate
+from sphinx.util import inspect
+from sphinx.util.inspect import stringify_signature
+from torchrl.envs import EnvBase
+
+import torchrl_loco
+
+project = "torchrl_loco"
+author = "the torchrl_loco authors"
+release = version = torchrl_loco.__version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+exclude_patterns = ["_build", "tasks/parts", "generated/fragments"]
+nitpicky = True  # a reference to a name that is gone is an error
+ELSEWHERE = "torch|torchrl|tensordict|mujoco|mujoco_warp|warp|wp|mjw|numpy|collections|pathlib"
+nitpick_ignore_regex = [("py:.*", rf"({ELSEWHERE})\..*")]
+nitpick_ignore = [("py:class", "torchrl_loco.sim.scratch.ScratchPool")]  # of no use to a reader
+
+# Notebooks are shown as they are: the tests run them.
+nb_execution_mode = "off"
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+
+# The sections of an environment's docstring, as they are written in torchrl_loco/envs.
+napoleon_custom_sections = ["Observation", "Action", "Reward", "Start", "Termination", "Source"]
+napoleon_numpy_docstring = False
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+
+html_theme = "pydata_sphinx_theme"
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
+html_title = f"torchrl_loco {release}"
+html_show_sourcelink = False
+html_copy_source = False
+html_theme_options = {
+    "logo": {"text": "torchrl_loco"},
+    "navbar_align": "left",
+    "header_links_before_dropdown": 9,
+    "navbar_end": ["theme-switcher"],
+    "show_toc_level": 2,
+    "navigation_depth": 3,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}
+copyright = "the torchrl_loco authors, Apache 2.0"
+
+generate.everything()
+
+
+def sign_environment(app, what, name, thing, options, signature, returns):
+    """Returns the signature of ``__init__``, where autodoc would take that of TorchRL's metaclass."""
+    if what == "class" and issubclass(thing, EnvBase):
+        own = inspect.signature(thing.__init__, bound_method=True)
+        return stringify_signature(own, show_return_annotation=False), returns
+    return None
+
+
+def setup(app):
+    """Registers what Sphinx calls."""
+    app.connect("autodoc-process-signature", sign_environment)

@@ -1,0 +1,40 @@
+"""What the site takes from the package and from benchmarks/results instead of repeating it."""
+
+import shutil
+from pathlib import Path
+
+import torchrl_loco
+from generate import benchmarks, bodies, rewards, tasks
+from generate.markdown import write
+
+DOCS = Path(__file__).parent.parent
+OUT = DOCS / "generated"
+RESULTS = DOCS.parent / "benchmarks" / "results"
+NOTEBOOKS = DOCS.parent / "notebooks"
+
+
+def everything() -> None:
+    """Writes all that pages include to docs/generated, and leaves alone what has not changed."""
+    fragments = OUT / "fragments"
+    for name in torchrl_loco.list_envs():
+        write(fragments / f"{name}_properties.md", tasks.properties(name))
+        write(fragments / f"{name}_reward.md", rewards.formula(name))
+        write(fragments / f"{name}_policy.md", tasks.shipped_policy(name))
+        tasks.picture(name, OUT / "pictures" / f"{name}.png")
+    for body in ("walker", "humanoid"):
+        write(fragments / f"{body}_observation.md", bodies.observation_table(body))
+        write(fragments / f"{body}_action.md", bodies.action_table(body))
+        write(fragments / f"{body}_protocols.md", tasks.protocols(body))
+    write(fragments / "tasks.md", tasks.overview())
+    write(fragments / "benchmarks.md", benchmarks.all_results(RESULTS))
+    write(fragments / "notebooks.md", notebooks(NOTEBOOKS, OUT / "notebooks"))
+
+
+def notebooks(source: Path, target: Path) -> str:
+    """Returns the table of contents of the notebooks, which are copied to where Sphinx finds them."""
+    shutil.rmtree(target, ignore_errors=True)
+    if not source.is_dir():
+        return "There are none in this copy of the repository.\n"
+    shutil.copytree(source, target, ignore=shutil.ignore_patterns("[!a-zA-Z]*", "runs"))
+    entries = "\n".join(f"generated/notebooks/{path.stem}" for path in sorted(source.glob("*.ipynb")))
+    return f"```{{toctree}}\n{entries}\n```\n"

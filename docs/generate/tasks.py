@@ -1,0 +1,122 @@
+"""What the page of a task says in numbers, and its picture."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import torch
+from torchrl.envs.utils import step_mdp
+
+import torchrl_loco
+from generate.markdown import table
+from torchrl_loco import models
+from torchrl_loco.config import DEFAULTS, NACONMAX_FLOOR, NACONMAX_WORLDS, PROTOCOLS, sim_config
+from torchrl_loco.policy import SHIPPED
+from torchrl_loco.registry import ALIASES, ENVS
+
+MOMENTS = (0, 20, 40, 160)
+"""Control steps after the reset at which the picture of a task is taken."""
+WIDTH, HEIGHT = 220, 200
+"""Size of one of its frames, in pixels."""
+
+
+def _aliases(name: str) -> str:
+    return ", ".join(f"`{alias}`" for alias, target in ALIASES.items() if target == name)
+
+
+def properties(name: str) -> str:
+    """Returns the head of a task's page: its picture and a table."""
+    cls = ENVS[name]
+    config = cls.defaults
+    nu = models.load(cls.body).nu
+    length = config.episode_length
+    rows = [
+        ("id", f"`{name}`"),
+        ("alias", _aliases(name)),
+        ("class", f"{{py:class}}`torchrl_loco.{cls.__name__}`"),
+        ("action", f"`(num_envs, {nu})`, float32, in [-1, 1]"),
+        ("observation", f"`(num_envs, {cls.observation_size})`, float32"),
+        ("reward", "`(num_envs, 1)`, float32, in [0, 1]"),
+        ("target speed", f"{cls.speed:g} m/s" if cls.speed else "none: to stand"),
+        ("control step", f"{config.ctrl_dt:g} s"),
+        ("physics step", f"{config.sim_dt:g} s, {config.substeps} in a control step"),
+        ("episode", f"{length} control steps, {length * config.ctrl_dt:g} s"),
+        ("protocols", ", ".join(f"`{protocol}`" for protocol in PROTOCOLS)),
+    ]
+    return f"![{name}](../generated/pictures/{name}.png)\n\n{_caption(name)}\n\n{table(('property', 'value'), rows)}"
+
+
+def _caption(name: str) -> str:
+    if _info(name) is None:
+        return "*The start.*"
+    dt = ENVS[name].defaults.ctrl_dt
+    *first, last = (f"{moment * dt:g}" for moment in MOMENTS)
+    return f"*The policy that comes with the package, {', '.join(first)} and {last} s after a reset.*"
+
+
+def overview() -> str:
+    """Returns the table of all tasks."""
+    rows = []
+    for name, cls in ENVS.items():
+        speed = f"{cls.speed:g}" if cls.speed else "0"
+        policy = _info(name)
+        best = f"{policy['mean']:.0f} ± {policy['std']:.0f}" if policy else "none yet"
+        link = f"[{name}](/tasks/{name}.md)"
+        rows.append((link, _aliases(name), models.load(cls.body).nu, cls.observation_size, speed, best))
+    return table(("id", "alias", "action", "observation", "target speed (m/s)", "return of the policy"), rows)
+
+
+def protocols(body: str) -> str:
+    """Returns the settings of a body's simulation under each protocol."""
+    settings = {p: dataclasses.asdict(sim_config(DEFAULTS[body], p, NACONMAX_WORLDS, {})) for p in PROTOCOLS}
+    rows = [(f"`{field}`", *(f"`{settings[p][field]}`" for p in PROTOCOLS)) for field in settings[PROTOCOLS[0]]]
+    note = (
+        f"\n`naconmax` is meant for {NACONMAX_WORLDS} worlds and scales with `num_envs`, to no less than "
+        f"{NACONMAX_FLOOR}. {{py:class}}`~torchrl_loco.SimConfig` says what each setting is.\n"
+    )
+    return table(("setting", *(f"`{protocol}`" for protocol in PROTOCOLS)), rows) + note
+
+
+def _info(name: str) -> dict[str, Any] | None:
+    """Returns what is known of the policy that comes with the package, None if none comes."""
+    if not (SHIPPED / f"{name}.safetensors").is_file():
+        return None
+    return torchrl_loco.load_policy(name, device="cpu").info
+
+
+def shipped_policy(name: str) -> str:
+    """Returns how well the policy of a task does, if one comes with the package."""
+    info = _info(name)
+    if info is None:
+        return (
+            "No policy of this task comes with the package: the best one of the recorded run was not kept. How far "
+            "training went is in the [benchmarks](/benchmarks.md).\n"
+        )
+    return (
+        f'`torchrl_loco.load_policy("{name}")` returns **{info["mean"]:.1f} ± {info["std"]:.1f}** (mean and standard '
+        f"deviation over {info['episodes']} episodes of {ENVS[name].defaults.episode_length} "
+        f"steps that had no part in choosing it; worst {info['min']:.1f}, best {info['max']:.1f}; protocol "
+        f"`{info['protocol']}`). It was trained by {info['algorithm'].upper()} for "
+        f"{info['frames'] / 1e6:.0f} million frames, {info['seconds']:.0f} s on one {info['trained_on']}, with "
+        f"{info['num_envs']} worlds and seed {info['seed']}.\n"
+    )
+
+
+@torch.no_grad()
+def picture(name: str, path: Path) -> None:
+    """Renders a few moments of an episode under the task's policy, or the start alone if there is none."""
+    env = torchrl_loco.make(name, num_envs=1, device="cpu", seed=2)
+    info = _info(name)
+    td, frames = env.reset(), []
+    policy = torchrl_loco.load_policy(name, device="cpu") if info else None
+    for step in range(MOMENTS[-1] + 1 if policy else 1):
+        if step in MOMENTS:
+            pixels = env.render("side", 2 * WIDTH, 2 * HEIGHT)[0].float()
+            frames.append(pixels.view(HEIGHT, 2, WIDTH, 2, 3).mean(dim=(1, 3)))  # smooth edges
+        if policy:
+            td = step_mdp(env.step(policy(td)))
+    gap = torch.full((HEIGHT, 4, 3), 255.0)
+    strip = torch.cat([piece for frame in frames for piece in (gap, frame)][1:], dim=1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    imageio.imwrite(path, strip.round().to(torch.uint8).numpy())
