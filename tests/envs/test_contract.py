@@ -165,3 +165,8 @@ def test_making_an_environment_leaves_no_overflow_behind():
     assert all(count == 0 for count in env.health()["total"].values())
     env.rollout(40)
     assert env.health()["total", "iteration_limit"] > 0
+
+
+def test_it_says_what_it_is():
+    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=3)
+    assert repr(env) == "WalkerWalk(num_envs=2, device='cpu', protocol='playground', seed=3)"

@@ -15,6 +15,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.collectors import Collector
 
 import torchrl_loco
 
@@ -163,8 +164,7 @@ def test_on_the_second_device(current, actions):
 @pytest.mark.parametrize(
     "use",
     [
-        lambda env: env.reset(),
-        lambda env: env.rollout(2),
+        lambda env: env.step(env.fake_tensordict()),
         lambda env: env.health(),
         lambda env: env.get_state(),
         lambda env: env.render(),
@@ -172,14 +172,39 @@ def test_on_the_second_device(current, actions):
         lambda env: env.state_dict(),
         lambda env: env.set_seed(1),
     ],
-    ids=["reset", "rollout", "health", "get_state", "render", "mj_model", "state_dict", "set_seed"],
+    ids=["step", "health", "get_state", "render", "mj_model", "state_dict", "set_seed"],
 )
 def test_closed_means_closed(use):
     env = made()
     env.close()
     env.close()
-    with pytest.raises(RuntimeError, match="this WalkerWalk is closed: make a new one"):
+    with pytest.raises(RuntimeError, match=r"this WalkerWalk is closed: reset\(\) opens it again"):
         use(env)
+
+
+def test_reset_opens_it_again(device, tmp_path, actions):
+    """As it was when it was made, but for the random streams, which go on."""
+    options = {"reward_terms": True, "bad_world_file": tmp_path / "bad"}
+    env, never_closed = made(device, **options), made(device)
+    moves = actions(env, 8)
+    for other in (env, never_closed):
+        played(other, moves)
+    env.close()
+    assert_repeats(played(env, moves), played(never_closed, moves))
+    assert env.health()["total", "non_finite"] == 0
+    assert not env.is_closed
+    env.step(env.reset().set("action", torch.full_like(moves[0], float("nan"))))
+    with pytest.warns(torchrl_loco.NonFiniteWarning):
+        env.close()
+    env.reset()  # the file is there now
+
+
+@pytest.mark.filterwarnings("ignore:The default value of `auto_register_policy_transforms`")
+def test_a_collector_closes_and_the_environment_goes_on():
+    env = made()
+    options = {"frames_per_batch": 8, "total_frames": 16, "auto_register_policy_transforms": False}
+    assert len(list(Collector(env, None, **options))) == 2
+    assert env.rollout(3).shape == (WORLDS, 3)
 
 
 @pytest.mark.parametrize("way", ["close", "del", "transformed"])

@@ -222,3 +222,13 @@ def test_a_lenient_state_dict_leaves_the_worlds_alone():
     env.load_state_dict(torchrl_loco.make("walker_walk", 4, "cpu", seed=6).state_dict(), strict=False)
     assert (env.get_state() == before).all()
     assert env.seed == 5
+
+
+@pytest.mark.gpu
+def test_a_state_from_another_device_is_taken():
+    env, other = (torchrl_loco.make("walker_walk", 2, device, seed=0) for device in ("cuda", "cpu"))
+    other.rollout(3)
+    mask = torch.tensor([[True], [False]])
+    other_state = other.get_state()
+    env.reset(other_state.clone().set("_reset", mask), set_state=True)
+    assert torch.equal(env.get_state()["qpos"][0].cpu(), other_state["qpos"][0])

@@ -82,30 +82,22 @@ class BadWorldTrap(Watcher):
     """Keeps what each control step began with until a world comes out of one that is not finite.
 
     Args:
-        path: the file that is written then; it must not be there yet.
+        path: the file that is written then, unless it is there.
         sim: the simulation.
         inputs: actions ``(nworld, nu)``, episodes and elapsed steps ``(nworld,)`` of all worlds.
         bad: flags of worlds that are not finite, ``(nworld,)``.
         describe: returns what else belongs into the file.
-
-    Raises:
-        ValueError: ``path`` cannot be written, or would overwrite a file.
-        TypeError: ``path`` is no path.
     """
 
     def __init__(
         self,
-        path: Path | str,
+        path: Path,
         sim: Simulation,
         inputs: tuple[wp.array, wp.array, wp.array],
         bad: wp.array,
         describe: Callable[[], dict[str, Any]],
     ) -> None:
-        self.path = Path(path)
-        if self.path.exists():
-            raise ValueError(f"bad_world_file {self.path} is already there: move it away, or choose another name")
-        if not self.path.parent.is_dir():
-            raise ValueError(f"bad_world_file {self.path} cannot be written: there is no folder {self.path.parent}")
+        self.path = path
         self._sim, self._bad, self._describe = sim, bad, describe
         data, device = sim.data, sim.device
         self._inputs = [*inputs, data.qpos, data.qvel, data.qacc_warmstart]
@@ -148,7 +140,7 @@ class BadWorldTrap(Watcher):
         kept = {name: wp.to_torch(array)[world].clone() for name, array in zip(names, self._kept, strict=True)}
         counters = {name: int(kept.pop(name)) for name in ("episode", "elapsed_steps")}
         try:
-            self.path.open("x").close()  # another environment may have been faster: nothing is overwritten
+            self.path.open("x").close()  # nothing is overwritten
         except FileExistsError:
             told = f"{self.path} is already there and was left as it is"
         else:

@@ -1,10 +1,7 @@
 """What all locomotion environments share: specs, step, reset, seeding, time limit, state. Knows no task."""
 
-import atexit
 import dataclasses
-import os
 import secrets
-import weakref
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,16 +15,17 @@ from torchrl_loco import models
 from torchrl_loco.config import SimConfig, sim_config
 from torchrl_loco.envs.autoreset import AsyncReset
 from torchrl_loco.envs.bad_world import BadWorldTrap
-from torchrl_loco.envs.checks import check_count, check_device, check_model, check_seed, check_subclass
+from torchrl_loco.envs.checks import check_count, check_device, check_model, check_new_file, check_seed, check_subclass
 from torchrl_loco.envs.episode import any_world, apply_action, begin_episode, count_step, quench
 from torchrl_loco.envs.health import Health
+from torchrl_loco.envs.lifecycle import Closable
 from torchrl_loco.envs.state import Resumable, State, write_state
 from torchrl_loco.envs.watcher import Watcher
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import EXCLUSIVE, Simulation
 
 
-class LocoEnv(AsyncReset, Resumable):
+class LocoEnv(AsyncReset, Resumable, Closable):
     """Base of the locomotion environments: batched worlds of one body on one device.
 
     A subclass names its ``body``, ``mjcf`` (path of the model), ``defaults`` (settings under ``playground``),
@@ -63,7 +61,6 @@ class LocoEnv(AsyncReset, Resumable):
     _has_frame_skip = True  # the substeps are our own
     _supports_set_state = True
 
-    @torch.inference_mode(False)  # the buffers must stay writable wherever the environment is made
     def __init__(
         self,
         num_envs: int = 1,
@@ -86,31 +83,37 @@ class LocoEnv(AsyncReset, Resumable):
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs, self.seed = num_envs, seed
         self.reward_terms, self.stagger = bool(reward_terms), bool(stagger)
-        self._pid = os.getpid()
-        no_memory = set(self.__dict__)
+        self.on_overflow = on_overflow
+        self.bad_world_file = None if bad_world_file is None else check_new_file("bad_world_file", bad_world_file)
+        self._open()
+        self._make_specs()
+
+    def _build(self) -> None:
         # The device: else torch's views of Warp's arrays would follow the caller's default device.
-        with EXCLUSIVE, device:
-            self.sim = Simulation(check_model(models.from_path(self.mjcf)), self.config, num_envs, device)
+        with EXCLUSIVE, self.device:
+            self.sim = Simulation(check_model(models.from_path(self.mjcf)), self.config, self.num_envs, self.device)
             self._make_buffers()
-            self._health = Health(self.sim, self._bad, on_overflow)
+            self._health = Health(self.sim, self._bad, self.on_overflow)
             self._watchers: list[Watcher] = [self._health]
-            if bad_world_file is not None:
+            if self.bad_world_file is not None:
                 inputs = self._action, self._episode, self._elapsed_steps
-                self._watchers.append(BadWorldTrap(bad_world_file, self.sim, inputs, self._bad, self._describe))
-            self._make_specs()
+                self._watchers.append(BadWorldTrap(self.bad_world_file, self.sim, inputs, self._bad, self._describe))
             self._prepare()
             self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
             self._step_graph = self.sim.capture(self._launch_step)
             self._reset_graph = self.sim.capture(self._launch_reset)
             self._refresh_graph = self.sim.capture(self._launch_refresh)
             wp.synchronize_device(self.sim.device)  # made on Warp's stream, used on torch's
-            self._set_seed(seed)  # and begin anew: recording has drawn episodes
+            self._set_seed(self.seed)  # and begin anew: recording has drawn episodes
             for watcher in self._watchers:
                 watcher.restart()
         self._renderers: dict[tuple[str, int, int], Renderer] = {}
-        self._memory = set(self.__dict__) - no_memory
-        self.is_closed = False
-        _OPEN.add(self)
+
+    def __repr__(self) -> str:
+        settings = (
+            f"num_envs={self.num_envs}, device={str(self.device)!r}, protocol={self.protocol!r}, seed={self.seed}"
+        )
+        return f"{type(self).__name__}({settings})"
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -236,6 +239,8 @@ class LocoEnv(AsyncReset, Resumable):
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False) -> TensorDictBase:
         self._refuse_after_fork()
+        if self.is_closed:
+            self._open()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             self._views["mask"].fill_(True)
@@ -342,32 +347,6 @@ class LocoEnv(AsyncReset, Resumable):
                 self._renderers[key] = Renderer(self.sim, *key)
         return self._renderers[key].render()
 
-    def close(self, *, raise_if_closed: bool = True) -> None:
-        """Frees the memory of the worlds. Whatever needs them afterwards raises an error that says so."""
-        if not self.is_closed:
-            super().close()
-            try:
-                for watcher in self._watchers:
-                    watcher.check()
-            finally:
-                for name in self._memory:
-                    del self.__dict__[name]
-
-    def __getattr__(self, name: str) -> Any:
-        if name in self.__dict__.get("_memory", ()):
-            raise RuntimeError(f"this {type(self).__name__} is closed: make a new one")
-        return super().__getattr__(name)
-
-    def _refuse_after_fork(self) -> None:
-        if self.device.type == "cuda" and os.getpid() != self._pid:
-            raise RuntimeError("CUDA does not survive a fork: make the environment in the process that steps it")
-
-    def __reduce__(self) -> Any:
-        raise TypeError(
-            "an environment cannot be copied or pickled: pass on what makes it, functools.partial(torchrl_loco.make, "
-            "...), or what it holds, env.get_state()"
-        )
-
     def to(self, device: Any) -> "LocoEnv":
         """Returns the environment itself if it lives on ``device``; physics cannot move, so anything else raises.
 
@@ -379,14 +358,3 @@ class LocoEnv(AsyncReset, Resumable):
                 f"the physics lives on {self.device} and cannot move: make a new one with device={device!r}"
             )
         return self
-
-
-_OPEN: weakref.WeakSet[LocoEnv] = weakref.WeakSet()
-
-
-@atexit.register
-def _close_all() -> None:
-    """Closes what is open while that still can be done: later, the interpreter takes torch apart."""
-    for env in list(_OPEN):
-        if env._pid == os.getpid():  # a fork's copies are the parent's to close
-            env.close()

@@ -1,6 +1,7 @@
 """Checks of what a user passes to an environment, and of what a new body brings."""
 
 import operator
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -64,6 +65,21 @@ def check_device(device: torch.device | str | None) -> torch.device:
     if name not in ("cpu", *cuda):
         raise ValueError(f"no device {str(device)!r} here: choose one of {', '.join(['cpu', *cuda])}")
     return torch.device(name)
+
+
+def check_new_file(name: str, value: Any) -> Path:
+    """Returns ``value`` as the path of a file that is not there yet, but whose folder is.
+
+    Raises:
+        TypeError: it is no path.
+        ValueError: it cannot be written, or would be overwritten.
+    """
+    path = Path(value)
+    if path.exists():
+        raise ValueError(f"{name} {path} is already there: move it away, or choose another name")
+    if not path.parent.is_dir():
+        raise ValueError(f"{name} {path} cannot be written: there is no folder {path.parent}")
+    return path
 
 
 def check_subclass(cls: type) -> None:

@@ -128,6 +128,7 @@ def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor
         ValueError: it lacks qpos or qvel, has another shape, or is not finite; then nothing is written.
     """
     new = {key: None if state is None else state.get(key, None) for key in targets}
+    new = {key: None if value is None else value.detach().to(mask.device) for key, value in new.items()}
     if new["qpos"] is None or new["qvel"] is None:
         raise ValueError(
             "set_state=True needs a state with 'qpos' and 'qvel', as env.get_state() returns it. TransformedEnv "
@@ -147,4 +148,4 @@ def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor
                 continue  # the world goes on drawing where it was
             value = torch.zeros_like(target)
         rows = mask.view(-1, *[1] * (target.ndim - 1))
-        target.copy_(torch.where(rows, value.detach().to(target), target))
+        target.copy_(torch.where(rows, value.to(target.dtype), target))

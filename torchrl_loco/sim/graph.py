@@ -10,7 +10,8 @@ import warp as wp
 from torchrl_loco.sim.scratch import ScratchPool
 
 EXCLUSIVE = threading.RLock()
-"""Held while anything is launched by hand: a recording on the CPU takes in what other threads launch meanwhile."""
+"""Held while Warp works in the calling thread: a recording takes in what other threads launch meanwhile, and on the CPU
+two threads would share the scratch memory of tiles."""
 
 
 def current_stream(device: wp.Device) -> wp.Stream | None:
@@ -45,4 +46,5 @@ class Graph:
 
     def replay(self) -> None:
         """Runs the recorded work on torch's current stream of the device, without waiting for it."""
-        wp.capture_launch(self._graph, stream=current_stream(self._device))
+        with contextlib.nullcontext() if self._device.is_cuda else EXCLUSIVE:
+            wp.capture_launch(self._graph, stream=current_stream(self._device))
