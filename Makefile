@@ -5,8 +5,9 @@ BIN := $(VENV)/bin
 TASK ?= walker_stand
 ARGS ?=
 PYTEST_ARGS ?= --numprocesses auto
+NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
 
-.PHONY: train test test-fast lint format docs dist clean
+.PHONY: train test test-fast lint format docs notebooks dist clean
 
 train: $(VENV)/installed  ## train a policy; TASK=walker_walk ARGS="--seed 1" to change what
 	$(BIN)/torchrl-loco train $(TASK) $(ARGS)
@@ -33,6 +34,9 @@ dist: $(VENV)/installed  ## wheel and sdist, looked through and tried out, into 
 
 docs: $(VENV)/installed  ## the site, into docs/_build/html; warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
+
+notebooks: $(VENV)/installed  ## run the notebooks anew and store what they print; NOTEBOOKS=notebooks/rewards.ipynb for one
+	$(BIN)/python notebooks/execute.py $(NOTEBOOKS)
 
 # PIP_ARGS can constrain versions, for example to a CPU build of torch: make test PIP_ARGS="torch==2.13.0"
 $(VENV)/installed: pyproject.toml

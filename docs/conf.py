@@ -17,7 +17,7 @@ author = "the torchrl_loco authors"
 release = version = torchrl_loco.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
-exclude_patterns = ["_build", "tasks/parts", "generated/fragments"]
+exclude_patterns = ["_build", "tasks/parts", "generated/fragments", "generated/notebooks/README.md"]
 nitpicky = True  # a reference to a name that is gone is an error
 ELSEWHERE = "torch|torchrl|tensordict|mujoco|mujoco_warp|warp|wp|mjw|numpy|collections|pathlib"
 nitpick_ignore_regex = [("py:.*", rf"({ELSEWHERE})\..*")]

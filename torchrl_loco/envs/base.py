@@ -110,10 +110,8 @@ class LocoEnv(AsyncReset, Resumable, Closable):
         self._renderers: dict[tuple[str, int, int], Renderer] = {}
 
     def __repr__(self) -> str:
-        settings = (
-            f"num_envs={self.num_envs}, device={str(self.device)!r}, protocol={self.protocol!r}, seed={self.seed}"
-        )
-        return f"{type(self).__name__}({settings})"
+        name, device = type(self).__name__, str(self.device)
+        return f"{name}(num_envs={self.num_envs}, {device=}, protocol={self.protocol!r}, seed={self.seed})"
 
     @property
     def mj_model(self) -> mujoco.MjModel:

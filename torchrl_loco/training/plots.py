@@ -4,8 +4,8 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
@@ -21,15 +21,13 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     Raises:
         ValueError: there are no runs, or one has no metrics yet.
     """
-    matplotlib.use("agg")
-    from matplotlib import pyplot as plt
-
     if not runs:
         raise ValueError("no runs to plot")
     groups: dict[TrainingConfig, list[RunFolder]] = {}
     for run in runs:
         groups.setdefault(dataclasses.replace(run.load_config(), seed=0, out=Path()), []).append(run)
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    figure = Figure(figsize=(7, 4.2), layout="constrained")  # without pyplot: a caller's backend stays as it is
+    axes = figure.subplots()
     for config, group in groups.items():
         label = f"{config.task}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds on {config.device}"
         metrics = [run.read_metrics() for run in group]
@@ -61,4 +59,3 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize="small")
     figure.savefig(picture, dpi=150)
-    plt.close(figure)

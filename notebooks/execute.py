@@ -1,0 +1,65 @@
+"""Runs notebooks from a clean kernel: ``python notebooks/execute.py notebooks/*.ipynb`` stores what they print."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+
+KERNEL = "python3"
+TIMEOUT = 600
+"""Seconds that a cell may take: with cold kernels, the first waits for the compiler."""
+NO_DRIVER = "Warp CUDA warning: Could not find or load the NVIDIA CUDA driver."
+"""What Warp writes to stderr where there is no GPU: about the machine, not about the notebook."""
+WIDGET = "application/vnd.jupyter.widget-view+json"
+"""Type of an output that shows nothing without its kernel, such as a progress bar."""
+
+
+def execute(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookNode:
+    """Returns a notebook with the outputs of all its cells, run in order in a new kernel.
+
+    Args:
+        notebook: is changed in place.
+        folder: where the cells run.
+
+    Raises:
+        nbclient.exceptions.CellExecutionError: a cell raised an error; the message shows the cell and the error.
+    """
+    environment = {**os.environ, "TQDM_DISABLE": "1"}  # a progress bar at its end is no result
+    environment.pop("PYTHONWARNINGS", None)  # the warnings that users see
+    client = NotebookClient(
+        notebook,
+        timeout=TIMEOUT,
+        kernel_name=KERNEL,
+        resources={"metadata": {"path": str(folder)}},
+        record_timing=False,
+        store_widget_state=False,
+    )
+    client.execute(env=environment)
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            cell.outputs = [output for output in cell.outputs if is_worth_keeping(output)]
+    notebook.metadata["language_info"] = {"name": "python"}  # without the machine's version
+    return notebook
+
+
+def is_worth_keeping(output: nbformat.NotebookNode) -> bool:
+    """Returns whether an output is the notebook's own, and shows something when it is read."""
+    if output.output_type == "stream":
+        return not output.text.startswith(NO_DRIVER)
+    return WIDGET not in output.get("data", {})
+
+
+def main(paths: list[str]) -> None:
+    """Runs notebooks in place."""
+    for path in map(Path, paths):
+        start = time.perf_counter()
+        notebook = execute(nbformat.read(path, as_version=4), path.parent)
+        path.write_text(nbformat.writes(notebook) + "\n")
+        print(f"{path}: {time.perf_counter() - start:.0f} s, {path.stat().st_size / 1e3:.0f} kB", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
