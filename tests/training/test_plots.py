@@ -20,6 +20,7 @@ def test_the_callers_figures_stay_as_they_are(tmp_path, backend):
     run = RunFolder.create(preset("walker_stand", "cpu", out=tmp_path))
     for frames in (1, 2):
         run.append_metrics({"frames": frames, "seconds": 1.0, "return": 100.0 * frames})
+    figures = plt.get_fignums()
     plot_runs([run], tmp_path / "curve.png")
     assert (tmp_path / "curve.png").stat().st_size > 10_000
-    assert (matplotlib.get_backend(), plt.get_fignums()) == (backend, [])
+    assert (matplotlib.get_backend(), plt.get_fignums()) == (backend, figures)

@@ -68,7 +68,7 @@ TASKS: dict[tuple[str, str], Settings] = {
     ("reppo", "walker_run"): {"total_frames": 52_000_000},
     ("reppo", "humanoid_stand"): {"total_frames": 62_000_000},
     ("reppo", "humanoid_walk"): {"total_frames": 62_000_000},
-    ("reppo", "humanoid_run"): {"total_frames": 105_000_000},
+    ("reppo", "humanoid_run"): {"total_frames": 105_000_000, "final_lr": 0.1},
 }
 """What a task needs beside, by algorithm and task, on CUDA."""
 
