@@ -85,11 +85,6 @@ def env_step_and_maybe_reset(body: str, n: int, device: torch.device, **options:
     return step
 
 
-def env_deterministic(body: str, n: int, device: torch.device) -> Callable[[], None]:
-    """The same with ``deterministic=True``."""
-    return env_step_and_maybe_reset(body, n, device, deterministic=True)
-
-
 def env_dm_control(body: str, n: int, device: torch.device) -> Callable[[], None]:
     """The same under ``protocol="dm_control"``."""
     return env_step_and_maybe_reset(body, n, device, protocol="dm_control")
@@ -153,5 +148,5 @@ CASES = {
     for case in (bare_default, bare_tuned, env_step, env_step_and_maybe_reset, rollout_collector, torchrl_collector)
 }
 """From the bare simulator to a collector."""
-VARIANTS = {case.__name__: case for case in (env_deterministic, env_dm_control)}
+VARIANTS = {case.__name__: case for case in (env_dm_control,)}
 """What settings cost."""

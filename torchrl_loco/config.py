@@ -28,8 +28,8 @@ class SimConfig:
         ls_iterations: limit of the line search's iterations within one solver iteration.
         euler_damping: whether joint damping is integrated implicitly (MuJoCo's ``eulerdamp`` flag).
         episode_length: control steps after which an episode is truncated.
-        deterministic: whether a rollout on CUDA repeats bit for bit, by mujoco_warp's deterministic mode, which is
-            several times slower. On the CPU it always does.
+        deterministic: whether rollouts must repeat bit for bit. On the CPU they always do; on CUDA this is refused,
+            because the physics adds up constraints in the order of their arrival.
     """
 
     ctrl_dt: float

@@ -82,7 +82,7 @@ def test_an_environment_itself_is_not_pickled():
         pickle.dumps(made())
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of Inductor's
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:TensorFloat32")  # of Inductor's
 @pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.gpu)])
 def test_a_compiled_policy(backend, actions):
     device = "cuda" if backend == "inductor" else "cpu"
@@ -240,11 +240,15 @@ def test_close_frees_device_memory():
 
     live(4096).close()  # loads what stays loaded
     before = used()
-    env = live(4096)
-    meanwhile = used()
-    env.close()
-    assert meanwhile - before > 300  # MiB
-    assert used() - before < 0.05 * (meanwhile - before)
+    left = []
+    for _ in range(3):
+        env = live(4096)
+        taken = used() - before
+        env.close()
+        left.append(used() - before)
+    assert taken > 300  # MiB
+    assert left[0] < 0.15 * taken  # Warp's pool holds on to some
+    assert left[2] <= left[0]
 
 
 @pytest.mark.parametrize("spoilt", [False, True], ids=["well", "bad"])

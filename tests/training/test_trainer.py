@@ -282,9 +282,7 @@ def test_what_was_interrupted_at_the_very_end_can_be_finished(tmp_path, monkeypa
 @pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
 def test_a_run_on_cuda(algorithm, tmp_path):
     """Recorded gradient steps learn, the run can be stopped and resumed, and its policy plays on the CPU."""
-    config = preset(
-        "walker_stand", "cuda", algorithm, out=tmp_path, video_seconds=0.0, **{**SMALL, "total_frames": 640}
-    )
+    config = preset("walker_stand", "cuda", algorithm, out=tmp_path, **{**SMALL, "total_frames": 640})
     run = RunFolder.create(config)
     first = Trainer(run)
     before = {name: value.clone() for name, value in first.algorithm.networks.state_dict().items()}

@@ -111,7 +111,7 @@ class Resumable(EnvBase):
             tensordict = TensorDict(
                 {key: value for key, value in tensordict.items() if key not in State.KEYS},
                 batch_size=tensordict.batch_size,
-                device=tensordict.device,
+                device=self.device,
             )
         return super()._reset_proc_data(tensordict, tensordict_reset)
 

@@ -136,7 +136,6 @@ class Simulation:
         option.graph_conditional = config.iterations > UNROLLED_ITERATIONS
         # The solver starts from the warm start; a second start that it would compare with costs a factorization.
         option.run_qacc_smooth = False
-        option.deterministic = config.deterministic  # on CUDA contacts and sums are otherwise in the order of arrival
         # Threads to a world's matrices, which are small: measured in benchmarks/README.md.
         self.model.block_dim.update_gradient_cholesky = 32
         self.model.block_dim.update_gradient_JTDAJ_dense = 64
