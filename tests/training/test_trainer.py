@@ -455,3 +455,16 @@ def test_learns_to_stand(tmp_path):
     Trainer(run).train()
     assert evaluate_run(untrained)["mean"] < 200
     assert evaluate_run(run)["mean"] > 300
+
+
+def test_torchs_settings_are_put_back(tmp_path, monkeypatch):
+    threads, seen = torch.get_num_threads(), []
+    torch.set_num_threads(2)
+    try:
+        trainer = Trainer(RunFolder.create(preset("walker_stand", "cpu", "ppo", out=tmp_path, **SMALL)))
+        monkeypatch.setattr(trainer, "_iterate", lambda: seen.append(torch.get_num_threads()) or 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            trainer.train()
+        assert (seen, torch.get_num_threads(), torch.get_float32_matmul_precision()) == ([1], 2, "highest")
+    finally:
+        torch.set_num_threads(threads)

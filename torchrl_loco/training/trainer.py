@@ -68,11 +68,17 @@ class Trainer:
         Raises:
             KeyboardInterrupt: Ctrl-C was pressed.
         """
+        with settings_for_small_networks():
+            self._train()
+            self.save()
+            self._finish()
+
+    def _train(self) -> None:
         config = self.config
         saved = time.perf_counter()
         board = SummaryWriter(str(self.run.path / "tensorboard"), purge_step=self.frames + 1)
         bar = tqdm(total=config.total_frames, initial=self.frames, unit="frame", unit_scale=True, desc=config.task)
-        with tf32(), board, bar, interruptible() as interrupted:
+        with board, bar, interruptible() as interrupted:
             while self.frames < self.last_frame:
                 row = self._iterate()
                 self.run.append_metrics(row)
@@ -88,8 +94,6 @@ class Trainer:
                 if interrupted():
                     plot_runs([self.run], self.run.path / "learning_curve.png")
                     raise KeyboardInterrupt
-        self.save()
-        self._finish()
 
     @property
     def device_name(self) -> str:
@@ -237,14 +241,20 @@ def evaluate_run(
 
 
 @contextlib.contextmanager
-def tf32() -> Iterator[None]:
-    """Lets matrix products on CUDA round to TF32, three times as fast, and puts the setting back."""
-    before = torch.get_float32_matmul_precision()
+def settings_for_small_networks() -> Iterator[None]:
+    """Has torch compute in one thread on the CPU and round matrix products to TF32 on CUDA; puts the settings back.
+
+    Threads would wait for each other most of the time, all the more where other work takes turns on the cores. TF32 is
+    three times as fast.
+    """
+    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    torch.set_num_threads(1)
     torch.set_float32_matmul_precision("high")
     try:
         yield
     finally:
-        torch.set_float32_matmul_precision(before)
+        torch.set_num_threads(threads)
+        torch.set_float32_matmul_precision(precision)
 
 
 @contextlib.contextmanager
