@@ -7,7 +7,10 @@ ARGS ?=
 PYTEST_ARGS ?= --numprocesses auto
 NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
 
-.PHONY: train test test-fast lint format docs notebooks dist clean
+.PHONY: help train test test-fast lint format docs notebooks dist clean
+
+help:  ## this list
+	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*##/\t/' | expand -t 12
 
 train: $(VENV)/installed  ## train a policy; TASK=walker_walk ARGS="--seed 1" to change what
 	$(BIN)/torchrl-loco train $(TASK) $(ARGS)

@@ -53,6 +53,8 @@ def make_cases():
         "seed": NO_SEED,
         "protocol": NO_NAME,
         "on_overflow": NO_NAME,
+        "reward_terms": [*NO_FLAG, "True"],
+        "stagger": [*NO_FLAG, "True"],
         "bad_world_file": [3, 1.5, True, [], {}, object(), "/", "no/such/folder/file"],
     }.items():
         yield from ((field, value) for value in bad)
@@ -216,3 +218,20 @@ def test_damaged_checkpoints(tmp_path):
     assert refusals > 100
     path.write_bytes(whole)
     run.load_checkpoint("cpu")
+
+
+def test_a_step_without_an_action():
+    env = torchrl_loco.make("walker_walk", 2, "cpu", 0)
+    with pytest.raises(KeyError, match="step needs an 'action'"):
+        env.step(env.reset())
+
+
+@pytest.mark.parametrize("near", ["num_env", "on_overflw", "njmx"])
+def test_a_misspelt_argument_is_suggested(near):
+    with pytest.raises(ValueError, match=r"did you mean '(num_envs|on_overflow|njmax)'"):
+        torchrl_loco.make("walker_walk", device="cpu", **{near: 3})
+
+
+def test_a_file_is_no_task():
+    with pytest.raises(ValueError, match=r"Policy\.load\('runs/policy\.safetensors'\)"):
+        torchrl_loco.load_policy("runs/policy.safetensors")

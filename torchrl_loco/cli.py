@@ -178,6 +178,8 @@ def main(args: Sequence[str] | None = None) -> int:
     args = sys.argv[1:] if args is None else list(args)
     with _user_errors():
         is_training = args[:1] == ["train"]
+        if is_training and len(args) > 1 and not args[1].startswith("-"):
+            args[1] = registry.canonical_id(args[1])
         device, algorithm = (_take(flag, args) if is_training else None for flag in ("--device", "--algorithm"))
         presets = {task: training.preset(task, device, algorithm) for task in registry.list_envs()}
     task_config = tyro.extras.subcommand_type_from_defaults(

@@ -80,6 +80,9 @@ DEFAULTS = {
 }
 """By body, under the protocol ``playground``."""
 
+ARGUMENTS = ("num_envs", "device", "seed", "protocol", "reward_terms", "stagger", "on_overflow", "bad_world_file")
+"""What an environment takes beside the fields of :class:`SimConfig`."""
+
 CONVERGED: dict[str, Any] = {"iterations": 100, "ls_iterations": 50, "euler_damping": True}
 """What the protocol ``dm_control`` sets otherwise, for any body."""
 
@@ -102,7 +105,8 @@ def sim_config(defaults: SimConfig, protocol: str, num_envs: int, overrides: dic
     names = [field.name for field in dataclasses.fields(SimConfig)]
     for key in overrides:
         if key not in names:
-            raise ValueError(f"unknown setting {key!r}{suggestion(key, names)}: choose from {', '.join(names)}")
+            choices = [*ARGUMENTS, *names]
+            raise ValueError(f"unknown setting {key!r}{suggestion(key, choices)}: choose from {', '.join(choices)}")
     changes = CONVERGED if protocol == "dm_control" else {}
     config = dataclasses.replace(defaults, **{**changes, **overrides})
     if "naconmax" in overrides:

@@ -145,6 +145,8 @@ def load_policy(task: str, device: torch.device | str | None = None) -> Policy:
     Raises:
         ValueError: there is no such task, or no policy for it.
     """
+    if str(task).endswith(".safetensors"):
+        raise ValueError(f"load_policy takes the id of a task; for a file there is torchrl_loco.Policy.load({task!r})")
     name = canonical_id(task)
     path = SHIPPED / f"{name}.safetensors"
     if not path.is_file():

@@ -113,6 +113,8 @@ def describe(world: BadWorld, device: torch.device | str | None = None) -> Itera
         values = world.tensors[name]
         entries = ", ".join(f"{i} is {values[i]}" for i in torch.nonzero(~values.isfinite()).flatten().tolist())
         yield f"{name} is not finite before the step: entry {entries}"
+    if "action" in wrong:
+        yield "such an action ends its world, which is stepped with zeros instead"
     if any(name in STATE for name in wrong):
         yield "it was written into the simulation from outside: there is nothing to step"
         return

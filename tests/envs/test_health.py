@@ -103,3 +103,11 @@ def test_worlds_that_are_not_finite_are_counted(device):
 def test_unknown_policy():
     with pytest.raises(ValueError, match="choose one of warn, raise, ignore"):
         made("cpu", on_overflow="shout")
+
+
+def test_an_error_that_nobody_can_catch_is_a_warning():
+    """Left to the garbage collector, the strictest setting is not the most silent one."""
+    env = made("cpu", njmax=5, on_overflow="raise")
+    fall(env, 60)
+    with pytest.warns(RuntimeWarning, match="njmax="):
+        del env

@@ -373,7 +373,9 @@ def test_command_line(run, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["train", "walker_wlak"], "walker_walk"),
+        (["train", "walker_wlak"], "did you mean 'walker_walk'"),
+        (["train", "walker-walk"], "did you mean 'walker_walk'"),
+        (["train", "mjx/walker_walk-v0", "--gamma", "2"], "gamma must lie in (0, 1]"),
         (["train", "walker_walk", "--gamma", "2"], "gamma must lie in (0, 1]"),
         (["train", "walker_walk", "--gama", "0.9"], "--gamma"),
         (["train", "walker_walk", "--device", "cuda:9"], "choose one of cpu"),
@@ -402,6 +404,13 @@ def test_command_line_errors(run, arguments, message, capsys):
 
 
 @pytest.mark.slow
+def test_a_run_without_a_policy_names_the_way_to_one(tmp_path, capsys):
+    run = RunFolder.create(preset("walker_stand", "cpu", out=tmp_path, **SMALL))
+    with pytest.raises(SystemExit):
+        cli.main(["eval", str(run.path)])
+    assert "has no policy yet: torchrl-loco resume" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("error", "shown"), [(OSError("no space left"), True), (TypeError("a bug"), False)])
 def test_errors_while_training(error, shown, tmp_path, monkeypatch, capsys):
     """What the machine lacks is told in a line; a bug keeps its traceback."""
@@ -419,7 +428,7 @@ def test_a_run_needs_a_checkpoint_of_this_version(run, tmp_path):
     folder = tmp_path / "old"
     folder.mkdir()
     (folder / "config.json").write_text((run.path / "config.json").read_text())
-    with pytest.raises(FileNotFoundError, match="there is no policy"):
+    with pytest.raises(FileNotFoundError, match="has no policy yet"):
         evaluate_run(RunFolder(folder))
     with pytest.raises(FileNotFoundError, match="has no checkpoint"):
         Trainer(RunFolder(folder), resume=True)

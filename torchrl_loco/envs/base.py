@@ -15,7 +15,15 @@ from torchrl_loco import models
 from torchrl_loco.config import SimConfig, sim_config
 from torchrl_loco.envs.autoreset import AsyncReset
 from torchrl_loco.envs.bad_world import BadWorldTrap
-from torchrl_loco.envs.checks import check_count, check_device, check_model, check_new_file, check_seed, check_subclass
+from torchrl_loco.envs.checks import (
+    check_count,
+    check_device,
+    check_flag,
+    check_model,
+    check_new_file,
+    check_seed,
+    check_subclass,
+)
 from torchrl_loco.envs.episode import any_world, apply_action, begin_episode, count_step, quench
 from torchrl_loco.envs.health import Health
 from torchrl_loco.envs.lifecycle import Closable
@@ -84,7 +92,7 @@ class LocoEnv(AsyncReset, Resumable, Closable):
         self.protocol = protocol
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs, self.seed = num_envs, seed
-        self.reward_terms, self.stagger = bool(reward_terms), bool(stagger)
+        self.reward_terms, self.stagger = check_flag("reward_terms", reward_terms), check_flag("stagger", stagger)
         self.on_overflow = on_overflow
         self.bad_world_file = None if bad_world_file is None else check_new_file("bad_world_file", bad_world_file)
         self._open()
@@ -226,7 +234,9 @@ class LocoEnv(AsyncReset, Resumable, Closable):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._refuse_after_fork()
-        action = tensordict.get("action")
+        action = tensordict.get("action", None)
+        if action is None:
+            raise KeyError(f"step needs an 'action' of shape {tuple(self._views['action'].shape)} in its TensorDict")
         if action.shape != self._views["action"].shape:
             raise ValueError(f"action must have shape {tuple(self._views['action'].shape)}, got {tuple(action.shape)}")
         self._views["action"].copy_(action.detach())  # else the buffer would hold on to every past policy's graph

@@ -34,6 +34,17 @@ def check_count(name: str, value: Any) -> int:
     return count
 
 
+def check_flag(name: str, value: Any) -> bool:
+    """Returns ``value``, or raises an error that names it if it is neither True nor False.
+
+    Raises:
+        TypeError: it is something else.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
 def check_seed(value: Any) -> int:
     """Returns ``value`` as an int in [0, 2**32).
 

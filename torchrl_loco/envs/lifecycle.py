@@ -1,7 +1,9 @@
 """Opening and closing an environment, and the ends of a process."""
 
 import atexit
+import contextlib
 import os
+import warnings
 import weakref
 from typing import Any
 
@@ -53,6 +55,18 @@ class Closable(EnvBase):
             for name in self._memory:
                 del self.__dict__[name]
 
+    def _close_at_last(self) -> None:
+        """Closes where nothing can be raised any more: it becomes a warning."""
+        if "_views" in self.__dict__:
+            with contextlib.suppress(Warning):  # which may be errors
+                try:
+                    self.close()
+                except Exception as error:
+                    warnings.warn(str(error), RuntimeWarning, stacklevel=2)
+
+    def __del__(self) -> None:
+        self._close_at_last()
+
     def __getattr__(self, name: str) -> Any:
         if name in self.__dict__.get("_memory", ()):
             raise RuntimeError(f"this {type(self).__name__} is closed: reset() opens it again")
@@ -77,4 +91,4 @@ def _close_all() -> None:
     """Closes what is open while that still can be done: later, the interpreter takes torch apart."""
     for env in list(_OPEN):
         if env._pid == os.getpid():  # a fork's copies are the parent's to close
-            env.close()
+            env._close_at_last()

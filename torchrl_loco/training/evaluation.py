@@ -16,6 +16,7 @@ from tqdm.auto import trange
 
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.registry import make
+from torchrl_loco.training.networks import settings_for_small_networks
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -84,7 +85,7 @@ def record(
         camera: ``"side"``, ``"back"`` or ``"egocentric"``.
     """
     frame_rate = round(1 / env.config.ctrl_dt)
-    with imageio.imopen(path, "w", plugin="pyav") as video:
+    with settings_for_small_networks(), imageio.imopen(path, "w", plugin="pyav") as video:
         video.init_video_stream("h264", fps=frame_rate)
         for _ in _play(policy, env, action_repeat, round(seconds * frame_rate), "video"):
             video.write_frame(env.render(camera, 480, 360)[0].cpu().numpy())

@@ -22,7 +22,7 @@ from torchrl_loco.registry import env_class, make
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.evaluation import Evaluator, describe, record, summarize
-from torchrl_loco.training.networks import deterministic
+from torchrl_loco.training.networks import deterministic, settings_for_small_networks
 from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.ppo import PPO
 from torchrl_loco.training.reppo import REPPO
@@ -236,25 +236,11 @@ def evaluate_run(
         ValueError: an argument is out of range, or the policy cannot be read.
     """
     config = run.load_config() if device is None else run.load_config(device=device)
+    if not run.policy.is_file():
+        raise FileNotFoundError(f"{run.path} has no policy yet: torchrl-loco resume goes on with the run")
     policy = Policy.load(run.policy, config.device)
-    return summarize(make_evaluator(config, episodes, seed)(policy))
-
-
-@contextlib.contextmanager
-def settings_for_small_networks() -> Iterator[None]:
-    """Has torch compute in one thread on the CPU and round matrix products to TF32 on CUDA; puts the settings back.
-
-    Threads would wait for each other most of the time, all the more where other work takes turns on the cores. TF32 is
-    three times as fast.
-    """
-    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
-    torch.set_num_threads(1)
-    torch.set_float32_matmul_precision("high")
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-        torch.set_float32_matmul_precision(precision)
+    with settings_for_small_networks():
+        return summarize(make_evaluator(config, episodes, seed)(policy))
 
 
 @contextlib.contextmanager
