@@ -69,3 +69,12 @@ def test_no_synchronisation(task, wrap):
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert (torch.cat(done, dim=1).sum(dim=1) >= 2).all()
+
+
+def test_a_closed_environment_begins_anew():
+    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0)
+    collector = RolloutCollector(env, lambda td: td.set("action", torch.zeros(2, 6)), frames_per_batch=8)
+    collector.rollout()
+    env.close()
+    batch = collector.rollout()
+    assert (batch["observation"][:, 0, 15:] == 0).all()  # at rest

@@ -321,7 +321,7 @@ def test_an_incomplete_class_is_told_what_it_lacks():
 
 ANT = """
 <mujoco>
-  <worldbody><body name="ant"><joint name="leg"/><geom name="leg" size="0.1"/></body></worldbody>
+  <worldbody><body name="ant"><joint name="leg"/><geom name="leg" size="0.1"/><camera name="eye"/></body></worldbody>
   <actuator>{actuator}</actuator>
   <sensor>{sensor}</sensor>
 </mujoco>
@@ -336,6 +336,13 @@ VELOCITY = '<subtreelinvel name="speed" body="ant"/>'
         ('<motor joint="leg" ctrlrange="-2 2"/>', VELOCITY, "every actuator needs ctrlrange -1 1"),
         ('<motor joint="leg"/>', VELOCITY, "every actuator needs ctrlrange -1 1"),
         ('<intvelocity joint="leg" ctrlrange="-1 1" actrange="-1 1"/>', VELOCITY, "activations are not supported"),
+        ('<motor joint="leg" ctrlrange="-1 1" ctrllimited="false"/>', VELOCITY, "must be clipped"),
+        ('<motor joint="leg" ctrlrange="-1 1" delay="0.1" nsample="4"/>', VELOCITY, "delays of actuators"),
+        (
+            MOTOR,
+            '<framelinvel name="seen" objtype="body" objname="ant" reftype="camera" refname="eye"/>',
+            "sensor 'seen' is not evaluated",
+        ),
         (MOTOR, '<framepos name="place" objtype="body" objname="ant"/>', "sensor 'place' is not evaluated"),
         (MOTOR, '<actuatorfrc name="force" actuator="a"/>', "sensor 'force' is not evaluated"),
     ],

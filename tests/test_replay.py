@@ -57,7 +57,11 @@ def test_the_file_holds_what_the_step_began_with(device, file, actions, spoil):
     torch.testing.assert_close(world.tensors["action"], action[BAD].cpu(), rtol=0, atol=0, equal_nan=True)
     settings = world.settings
     assert (settings["world"], settings["episode"], settings["elapsed_steps"], settings["seed"]) == (BAD, 1, 3, 7)
-    assert (settings["env"], settings["protocol"], settings["config"]["njmax"]) == ("WalkerWalk", "playground", 90)
+    assert (settings["env"], settings["protocol"], settings["config"]["njmax"]) == (
+        "torchrl_loco.envs.walker.WalkerWalk",
+        "playground",
+        90,
+    )
 
 
 def test_only_the_first_is_kept(file, actions):
@@ -165,7 +169,52 @@ def test_files_that_are_something_else(file, tmp_path, capsys):
         cli.main(["replay", str(file)])
     assert "its format is 'torchrl_loco policy 1'" in capsys.readouterr().err
     storage.save(file, "bad world", {}, {"env": "Cheetah"})
-    with pytest.raises(ValueError, match="is of 'Cheetah', there are WalkerStand"):
+    with pytest.raises(ValueError, match=r"is of 'Cheetah', there are torchrl_loco\.envs\.walker\.WalkerStand"):
         replay.load(file)
     with pytest.raises(FileNotFoundError, match="there is no bad world"):
         replay.load(tmp_path / "none")
+
+
+def test_a_huge_action_is_named(file):
+    env = made(file)
+    action = env.action_spec.zero()
+    action[BAD, 1] = 1e30
+    stepped(env, env.reset(), action)
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    lines = list(replay.describe(replay.load(file), "cpu"))
+    assert any("action is not finite before the step: entry 1 is" in line for line in lines), lines
+
+
+def test_an_overflow_that_raises_does_not_keep_the_file_from_being_written(file):
+    env = torchrl_loco.make("humanoid_stand", 2, "cpu", 0, njmax=5, on_overflow="raise", bad_world_file=file)
+    td = env.reset()
+    for _ in range(60):
+        td = stepped(env, td, env.action_spec.zero())
+    stepped(env, td, torch.full_like(env.action_spec.zero(), float("nan")))
+    with pytest.warns(NonFiniteWarning), pytest.raises(torchrl_loco.PhysicsOverflowError):
+        env.close()
+    assert replay.load(file).settings["elapsed_steps"] == 60
+    assert env.is_closed
+    with pytest.raises(RuntimeError, match="is closed"):
+        env.get_state()
+
+
+def test_the_path_is_that_of_the_moment(tmp_path, monkeypatch, actions):
+    monkeypatch.chdir(tmp_path)
+    env = made("bad.safetensors")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    drive(env, actions, bad_action)
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    assert (tmp_path / "bad.safetensors").exists()
+
+
+def test_a_failed_write_leaves_no_empty_file(file, actions, monkeypatch):
+    env = made(file)
+    drive(env, actions, bad_action)
+    monkeypatch.setattr(storage, "save", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        env.close()
+    assert not file.exists()

@@ -62,7 +62,7 @@ class RolloutCollector:
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
         """Returns the next batch, of shape ``(num_envs, steps)``."""
-        td = self._env.reset() if self._carried is None else self._carried
+        td = self._env.reset() if self._carried is None or self._env.is_closed else self._carried
         steps = []
         with set_exploration_type(self._exploration_type):
             for _ in range(self._steps):

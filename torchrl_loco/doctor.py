@@ -49,7 +49,11 @@ def diagnose() -> Iterator[tuple[str, str, bool]]:
             yield task, str(broken), False
     for device in devices:
         for body, task in tasks.items():
-            seconds, error = self_test(task, device)
+            try:
+                seconds, error = self_test(task, device)
+            except Exception as reason:  # the others are still worth a look
+                yield f"{body} on {device}", f"{type(reason).__name__}: {reason}", False
+                continue
             finding = f"made in {seconds:.1f} s, error against C MuJoCo {error:.1e}"
             yield f"{body} on {device}", finding, error < TOLERANCE
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import re
 import warnings
 from importlib import metadata
 from pathlib import Path
@@ -11,6 +12,7 @@ import torch
 
 from torchrl_loco import envs
 from torchrl_loco.config import suggestion
+from torchrl_loco.envs.checks import check_subclass
 
 ENVS: dict[str, type[envs.LocoEnv]] = {
     "walker_stand": envs.WalkerStand,
@@ -40,6 +42,8 @@ def plugins() -> dict[str, metadata.EntryPoint]:
             taken = "torchrl_loco itself has it"
         elif point.name in found:
             taken = f"{_origin(found[point.name])} has it"
+        elif not re.fullmatch(r"[\w.-]+", point.name):
+            taken = "an id is letters, digits, and _ . -, because runs are named after it"
         else:
             found[point.name] = point
             continue
@@ -88,6 +92,10 @@ def env_class(id: str) -> type[envs.LocoEnv]:
         raise ImportError(f"environment {name!r} of {_origin(point)} cannot be loaded: {reason}") from error
     if not (isinstance(cls, type) and issubclass(cls, envs.LocoEnv)):
         raise ImportError(f"environment {name!r} of {_origin(point)} is no subclass of torchrl_loco.LocoEnv")
+    try:
+        check_subclass(cls)
+    except TypeError as error:
+        raise ImportError(f"environment {name!r} of {_origin(point)}: {error}") from error
     return cls
 
 

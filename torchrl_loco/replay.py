@@ -14,6 +14,7 @@ from torchrl_loco import storage
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs import LocoEnv, State
 from torchrl_loco.envs.bad_world import KIND
+from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.registry import usable_classes
 
 STATE = ("qpos", "qvel", "qacc_warmstart")
@@ -36,8 +37,7 @@ class BadWorld:
 
     def make_env(self, device: torch.device | str | None = None, **config: Any) -> LocoEnv:
         """Returns an environment of one world as the file describes it, with ``config`` on top."""
-        classes = {env.__name__: env for env in usable_classes()}
-        env, settings = classes[self.settings["env"]], {**self.settings["config"], **config}
+        env, settings = _classes()[self.settings["env"]], {**self.settings["config"], **config}
         return env(1, device, self.settings["seed"], self.settings["protocol"], on_overflow="ignore", **settings)
 
     @property
@@ -54,10 +54,15 @@ def load(path: Path) -> BadWorld:
         ValueError: it is something else, damaged, or of an environment that is not here.
     """
     world = BadWorld(*storage.load(path, KIND))
-    names = [env.__name__ for env in usable_classes()]
+    names = _classes()
     if world.settings["env"] not in names:
         raise ValueError(f"{path} is of {world.settings['env']!r}, there are {', '.join(names)}")
     return world
+
+
+def _classes() -> dict[str, type[LocoEnv]]:
+    """Returns the classes of all environments by module and name, as a bad world file names them."""
+    return {f"{env.__module__}.{env.__qualname__}": env for env in usable_classes()}
 
 
 def warp_trace(world: BadWorld, device: torch.device | str | None = None) -> np.ndarray:
@@ -103,15 +108,16 @@ def describe(world: BadWorld, device: torch.device | str | None = None) -> Itera
         The lines.
     """
     settings = world.settings
+    env = settings["env"].split(".")[-1]
     yield (
-        f"{settings['env']}, protocol {settings['protocol']}, seed {settings['seed']}: world {settings['world']} of "
+        f"{env}, protocol {settings['protocol']}, seed {settings['seed']}: world {settings['world']} of "
         f"{settings['num_envs']} on {settings['device']}, episode {settings['episode']}, "
         f"after {settings['elapsed_steps']} steps"
     )
-    wrong = [name for name in (*STATE, "action") if not world.tensors[name].isfinite().all()]
+    bad = {name: ~(world.tensors[name].abs() < MAX_VALUE) for name in (*STATE, "action")}
+    wrong = [name for name in bad if bad[name].any()]
     for name in wrong:
-        values = world.tensors[name]
-        entries = ", ".join(f"{i} is {values[i]}" for i in torch.nonzero(~values.isfinite()).flatten().tolist())
+        entries = ", ".join(f"{i} is {world.tensors[name][i]}" for i in torch.nonzero(bad[name]).flatten().tolist())
         yield f"{name} is not finite before the step: entry {entries}"
     if "action" in wrong:
         yield "such an action ends its world, which is stepped with zeros instead"
@@ -125,5 +131,5 @@ def describe(world: BadWorld, device: torch.device | str | None = None) -> Itera
         speeds = (np.abs(values[nq:]).max() for values in (ours, theirs))
         yield "{:>7}  {:>22.6g}  {:>12.6g}  {:>18.3g}".format(i, *speeds, np.abs(ours - theirs).max())
     for name, trace in (("Warp", warp), ("C MuJoCo", c)):
-        lost = np.flatnonzero(~np.isfinite(trace).all(axis=1))
+        lost = np.flatnonzero(~(np.abs(trace) < MAX_VALUE).all(axis=1))
         yield f"{name}: " + (f"not finite after substep {lost[0]}" if len(lost) else "finite to the end")

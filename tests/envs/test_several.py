@@ -269,3 +269,67 @@ def test_a_program_may_end_without_closing(spoilt, tmp_path):
     assert found.returncode == 0, found.stderr
     assert (tmp_path / "bad").exists() == spoilt
     assert ("no longer finite at step 1" in found.stderr) == spoilt
+
+
+def test_a_failed_opening_leaves_nothing_behind(actions, monkeypatch):
+    env, never_closed = made(), made()
+    moves = actions(env, 8)
+    for other in (env, never_closed):
+        played(other, moves)
+    env.close()
+    with monkeypatch.context() as broken:
+        broken.setattr(type(env), "_prepare", lambda self: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            env.reset()
+    env.close()
+    assert env.is_closed
+    assert_repeats(played(env, moves), played(never_closed, moves))
+    held = weakref.ref(env.sim)
+    env.close()
+    gc.collect()
+    assert held() is None
+
+
+def test_a_closed_environment_is_reset_as_a_whole():
+    env = made()
+    td = env.reset()
+    env.close()
+    mask = torch.tensor([[True], [False], [False], [False]])
+    with pytest.raises(ValueError, match="reset all of them"):
+        env.reset(td.set("_reset", mask))
+
+
+def test_a_fork_while_another_thread_works():
+    """The child does not wait for a lock that a thread held which it does not have."""
+    program = """
+        import os, threading, time, warnings
+        warnings.simplefilter("ignore")
+        import torch, torchrl_loco
+        busy, env = (torchrl_loco.make("walker_walk", n, "cpu", 0) for n in (256, 2))
+        going = True
+        def work():
+            td = busy.reset()
+            while going:
+                busy._step(td.set("action", torch.zeros(256, 6)))
+        thread = threading.Thread(target=work)
+        thread.start()
+        time.sleep(1)
+        pid = os.fork()
+        if pid == 0:
+            env.reset()
+            os._exit(7)
+        deadline = time.time() + 60
+        done, status = 0, 0
+        while not done and time.time() < deadline:
+            done, status = os.waitpid(pid, os.WNOHANG)
+            time.sleep(0.1)
+        if not done:
+            os.kill(pid, 9)
+        going = False
+        thread.join()
+        print(os.waitstatus_to_exitcode(status) if done else "hangs")
+        """
+    found = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, timeout=300
+    )
+    assert found.stdout.split() == ["7"], found.stdout + found.stderr

@@ -232,3 +232,20 @@ def test_a_state_from_another_device_is_taken():
     other_state = other.get_state()
     env.reset(other_state.clone().set("_reset", mask), set_state=True)
     assert torch.equal(env.get_state()["qpos"][0].cpu(), other_state["qpos"][0])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("qvel", torch.full((2, 9), 1e39, dtype=torch.double)),
+        ("elapsed_steps", torch.tensor([2**32, 0])),
+        ("episode", torch.tensor([-5, 0])),
+    ],
+    ids=["qvel", "elapsed_steps", "episode"],
+)
+def test_numbers_that_do_not_fit_are_refused(key, value):
+    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0)
+    state, before = env.get_state(), env.get_state()
+    with pytest.raises(ValueError, match=rf"{key} must (be finite|lie in)"):
+        env.reset(State({**state, key: value}, batch_size=[2]), set_state=True)
+    assert all(torch.equal(env.get_state()[name], before[name]) for name in State.KEYS)

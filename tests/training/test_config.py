@@ -50,6 +50,7 @@ def test_wrong_settings(overrides, error, message):
         ({"num_bins": 0}, "num_bins must be an integer of at least 1"),
         ({"num_bins": 1}, "num_bins must be an integer of at least 2"),
         ({"target_entropy": float("nan")}, r"target_entropy must lie in"),
+        ({"init_temperature": 1e-5}, "must not be below min_temperature"),
     ],
 )
 def test_wrong_settings_of_reppo(overrides, message):

@@ -144,7 +144,11 @@ class BadWorldTrap(Watcher):
         except FileExistsError:
             told = f"{self.path} is already there and was left as it is"
         else:
-            storage.save(self.path, KIND, kept, {**self._describe(), "world": world, **counters})
+            try:
+                storage.save(self.path, KIND, kept, {**self._describe(), "world": world, **counters})
+            except BaseException:
+                self.path.unlink()  # an empty file would keep a later one from being written
+                raise
             told = f"what led to it is in {self.path}: see torchrl-loco replay"
         step = counters["elapsed_steps"] + 1
         warnings.warn(

@@ -249,9 +249,11 @@ class LocoEnv(AsyncReset, Resumable, Closable):
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False) -> TensorDictBase:
         self._refuse_after_fork()
-        if self.is_closed:
-            self._open()
         mask = None if tensordict is None else tensordict.get("_reset", None)
+        if self.is_closed:
+            if mask is not None and not mask.all():
+                raise ValueError("a closed environment has no worlds to keep: reset all of them")
+            self._open()
         if mask is None:
             self._views["mask"].fill_(True)
         else:
@@ -322,8 +324,11 @@ class LocoEnv(AsyncReset, Resumable, Closable):
 
     def _describe(self) -> dict[str, Any]:
         """Returns what it takes to make an environment like this one."""
-        made_by = {"env": type(self).__name__, "protocol": self.protocol, "config": dataclasses.asdict(self.config)}
-        return {**made_by, "seed": self.seed, "device": str(self.device), "num_envs": self.num_envs}
+        cls = type(self)
+        return {
+            **{"env": f"{cls.__module__}.{cls.__qualname__}", "protocol": self.protocol, "seed": self.seed},
+            **{"config": dataclasses.asdict(self.config), "device": str(self.device), "num_envs": self.num_envs},
+        }
 
     def _restore(self, state: TensorDictBase | None) -> None:
         """Writes a state into the worlds in the mask."""

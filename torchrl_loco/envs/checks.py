@@ -85,7 +85,7 @@ def check_new_file(name: str, value: Any) -> Path:
         TypeError: it is no path.
         ValueError: it cannot be written, or would be overwritten.
     """
-    path = Path(value)
+    path = Path(value).absolute()  # where it is now, should the working directory change
     if path.exists():
         raise ValueError(f"{name} {path} is already there: move it away, or choose another name")
     if not path.parent.is_dir():
@@ -114,10 +114,16 @@ def check_model(mj_model: mujoco.MjModel) -> mujoco.MjModel:
     wrong = []
     if not np.array_equal(mj_model.actuator_ctrlrange, np.tile([-1.0, 1.0], (mj_model.nu, 1))):
         wrong.append("every actuator needs ctrlrange -1 1, which actions lie in: scale by gear or gainprm")
+    unclipped = mj_model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    if unclipped or not mj_model.actuator_ctrllimited.all():
+        wrong.append("actions beyond -1 1 must be clipped: leave ctrllimited and the flag clampctrl on")
+    if mj_model.actuator_delay.any():
+        wrong.append("delays of actuators are not supported: they are not part of the state that is reset")
     if mj_model.na:
         wrong.append("actuators with activations are not supported: they are not part of the state that is reset")
     for i in range(mj_model.nsensor):
-        of_camera = mj_model.sensor_objtype[i] == int(mujoco.mjtObj.mjOBJ_CAMERA)
+        camera = int(mujoco.mjtObj.mjOBJ_CAMERA)
+        of_camera = camera in (mj_model.sensor_objtype[i], mj_model.sensor_reftype[i])
         if of_camera or mj_model.sensor_type[i] not in VELOCITY_SENSORS:
             name = mj_model.sensor(i).name
             wrong.append(f"sensor {name!r} is not evaluated, only velocities are: compute it from sim.data in a kernel")

@@ -26,10 +26,14 @@ class Closable(EnvBase):
     def _open(self) -> None:
         """Makes an environment ready to be reset."""
         kept = set(self.__dict__)
-        with torch.inference_mode(False):  # the buffers must stay writable wherever they are made
-            self._build()
-            if "_episodes" in kept:  # it was open before: its worlds go on drawing where they were
-                self._views["episode"].copy_(self._episodes)
+        try:
+            with torch.inference_mode(False):  # the buffers must stay writable wherever they are made
+                self._build()
+                if "_episodes" in kept:  # it was open before: its worlds go on drawing where they were
+                    self._views["episode"].copy_(self._episodes)
+        except BaseException:
+            self._forget(set(self.__dict__) - kept)
+            raise
         self._memory = set(self.__dict__) - kept
         self._pid = os.getpid()
         self.is_closed = False
@@ -48,12 +52,14 @@ class Closable(EnvBase):
         if "_views" not in self.__dict__:
             return
         self._episodes = self._views["episode"].cpu()
-        try:
+        with contextlib.ExitStack() as stack:  # whatever a watcher raises, the others act and the memory goes
+            stack.callback(self._forget, self._memory)
             for watcher in self._watchers:
-                watcher.check()
-        finally:
-            for name in self._memory:
-                del self.__dict__[name]
+                stack.callback(watcher.check)
+
+    def _forget(self, names: set[str]) -> None:
+        for name in names:
+            del self.__dict__[name]
 
     def _close_at_last(self) -> None:
         """Closes where nothing can be raised any more: it becomes a warning."""

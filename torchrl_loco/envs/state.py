@@ -139,8 +139,11 @@ def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor
             continue
         if value.shape != targets[key].shape:
             raise ValueError(f"{key} must have shape {tuple(targets[key].shape)}, got {tuple(value.shape)}")
-        if not value[mask].isfinite().all():
-            raise ValueError(f"{key} must be finite")
+        if targets[key].dtype.is_floating_point:
+            if not value[mask].to(targets[key].dtype).isfinite().all():
+                raise ValueError(f"{key} must be finite")
+        elif not ((value[mask].long() >= 0) & (value[mask].long() < 2**31)).all():
+            raise ValueError(f"{key} must lie in [0, 2**31)")
     for key, target in targets.items():
         value = new[key]
         if value is None:

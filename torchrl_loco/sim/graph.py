@@ -1,6 +1,7 @@
 """Work recorded once and replayed at every step: CUDA graphs on the GPU, Warp's recorder on the CPU."""
 
 import contextlib
+import os
 import threading
 from collections.abc import Callable
 
@@ -12,6 +13,9 @@ from torchrl_loco.sim.scratch import ScratchPool
 EXCLUSIVE = threading.RLock()
 """Held while Warp works in the calling thread: a recording takes in what other threads launch meanwhile, and on the CPU
 two threads would share the scratch memory of tiles."""
+
+# A child of a fork has only the thread that forked: it must not find the lock held by another.
+os.register_at_fork(before=EXCLUSIVE.acquire, after_in_parent=EXCLUSIVE.release, after_in_child=EXCLUSIVE.release)
 
 
 def current_stream(device: wp.Device) -> wp.Stream | None:

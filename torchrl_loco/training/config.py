@@ -159,6 +159,10 @@ class REPPOConfig(TrainingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.init_temperature < self.min_temperature:
+            raise ValueError(
+                f"init_temperature ({self.init_temperature}) must not be below min_temperature ({self.min_temperature})"
+            )
         if self.num_bins < 2:
             raise ValueError(f"num_bins must be an integer of at least 2, got {self.num_bins}")
 
