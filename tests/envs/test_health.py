@@ -1,5 +1,6 @@
 """What the physics drops is counted, told, and mended by the setting that the message names."""
 
+import gc
 import re
 import warnings
 
@@ -107,7 +108,10 @@ def test_unknown_policy():
 
 def test_an_error_that_nobody_can_catch_is_a_warning():
     """Left to the garbage collector, the strictest setting is not the most silent one."""
-    env = made("cpu", njmax=5, on_overflow="raise")
-    fall(env, 60)
+
+    def leave():
+        fall(made("cpu", njmax=5, on_overflow="raise"), 60)
+        gc.collect()
+
     with pytest.warns(RuntimeWarning, match="njmax="):
-        del env
+        leave()
