@@ -57,6 +57,7 @@ def compare_output(example: Example):
 PARSER = Sybil([CodeBlockParser("python", run_block), CodeBlockParser("text", compare_output)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", WITH_CODE, ids=lambda path: str(path.relative_to(ROOT)))
 def test_code_runs_and_prints_what_the_page_says(path, tmp_path, monkeypatch):
     """All blocks of a page, in order, in one namespace and an empty folder."""

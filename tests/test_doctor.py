@@ -41,6 +41,7 @@ def test_ill(capsys, monkeypatch, spoil):
     assert capsys.readouterr().out.count("NOT RIGHT") == 2
 
 
+@pytest.mark.slow
 def test_size(capsys):
     """What is advised is enough, and a good deal less leads to losses."""
     assert cli.main(["doctor", "--size", "humanoid_run", "--num_envs", "32", "--device", "cpu"]) == 0

@@ -72,6 +72,7 @@ def test_untested_versions_are_named(monkeypatch):
     _versions.warn_if_untested()  # silent: a warning is an error here
 
 
+@pytest.mark.slow
 def test_importing_needs_no_extra():
     """The environments work without what only training needs."""
     code = (

@@ -120,6 +120,7 @@ def forked(body):
     return textwrap.dedent(program)
 
 
+@pytest.mark.slow
 def test_a_fork_goes_on_by_itself_on_the_cpu():
     program = forked('print("sum", float(env.rollout(3)["next", "observation"].sum()), flush=True)')
     program += 'print("sum", float(env.rollout(3)["next", "observation"].sum()), flush=True)\n'
@@ -251,6 +252,7 @@ def test_close_frees_device_memory():
     assert left[2] <= left[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoilt", [False, True], ids=["well", "bad"])
 def test_a_program_may_end_without_closing(spoilt, tmp_path):
     """It ends in peace, and what was caught in its last steps is written."""
@@ -299,6 +301,7 @@ def test_a_closed_environment_is_reset_as_a_whole():
         env.reset(td.set("_reset", mask))
 
 
+@pytest.mark.slow
 def test_a_fork_while_another_thread_works():
     """The child does not wait for a lock that a thread held which it does not have."""
     program = """

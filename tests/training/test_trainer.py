@@ -259,6 +259,7 @@ def test_runs_that_differ_in_more_than_the_seed_are_apart(tmp_path, monkeypatch)
         plot_runs([], tmp_path / "none.png")
 
 
+@pytest.mark.slow
 def test_what_was_interrupted_at_the_very_end_can_be_finished(tmp_path, monkeypatch):
     def press(*_):
         raise KeyboardInterrupt
@@ -315,6 +316,7 @@ def test_evaluating_draws_nothing_that_training_draws(tmp_path):
     assert_same(parameters(often), parameters(once))
 
 
+@pytest.mark.slow
 def test_every_update_begins_with_the_policy_that_collected(tmp_path, monkeypatch):
     """The ratio of new to old probabilities starts at one, and the norm sees all there is."""
     update, batches = Algorithm.update, []
@@ -349,6 +351,7 @@ def test_training_worlds_are_staggered(tmp_path, monkeypatch):
     assert done_together.max() < 16
 
 
+@pytest.mark.slow
 def test_command_line(run, capsys, tmp_path):
     assert cli.main(["list"]) == 0
     assert capsys.readouterr().out.count("\n") == 6
