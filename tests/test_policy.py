@@ -64,3 +64,9 @@ def test_shipped_policies(path):
     env = torchrl_loco.make(path.stem, 4, "cpu", seed=1, protocol=policy.info["protocol"])
     returns = env.rollout(1000, policy)["next", "reward"].sum(dim=1)
     assert returns.mean() > policy.info["mean"] - 3 * policy.info["std"] - 20
+
+
+def test_another_bodys_observations_are_refused(policy):
+    env = torchrl_loco.make("humanoid_walk", 2, "cpu", seed=0)
+    with pytest.raises(Exception, match="takes observations of 24 numbers, got 67"):
+        env.rollout(1, policy)

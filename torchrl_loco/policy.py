@@ -34,7 +34,13 @@ class ObservationNorm(nn.Module):
         self.register_buffer("count", torch.zeros(()))
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Returns the normalised ``observation``, shape ``(..., size)``."""
+        """Returns observations of shape ``(..., size)``, normalised.
+
+        Raises:
+            ValueError: they have another size: those of another body.
+        """
+        if observation.shape[-1] != len(self.mean):
+            raise ValueError(f"this takes observations of {len(self.mean)} numbers, got {observation.shape[-1]}")
         return ((observation - self.mean) * torch.rsqrt(self.var + 1e-6)).clamp(-self.limit, self.limit)
 
     @torch.no_grad()
