@@ -10,12 +10,13 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torchrl_loco import storage
+from torchrl_loco import models, storage
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs import LocoEnv, State
 from torchrl_loco.envs.bad_world import KIND
 from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.registry import usable_classes
+from torchrl_loco.sim.simulation import set_options
 
 STATE = ("qpos", "qvel", "qacc_warmstart")
 RESETS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -28,8 +29,8 @@ class BadWorld:
 
     Attributes:
         tensors: ``qpos`` (nq), ``qvel`` (nv), ``qacc_warmstart`` (nv) and ``action`` (nu), before the step.
-        settings: ``env`` (name of the class), ``protocol``, ``config``, ``seed``, ``device``, ``num_envs``, and
-            ``world``, ``episode`` and ``elapsed_steps`` at the time.
+        settings: ``env`` (module and name of the class), ``protocol``, ``config``, ``seed``, ``device``, ``num_envs``,
+            and ``world``, ``episode`` and ``elapsed_steps`` at the time.
     """
 
     tensors: dict[str, torch.Tensor]
@@ -84,8 +85,9 @@ def c_trace(world: BadWorld) -> np.ndarray:
     C MuJoCo resets a world that is not finite; from there on the trace is NaN.
     """
     config = SimConfig(**world.settings["config"])
-    env = world.make_env("cpu")
-    data = mujoco.MjData(env.mj_model)
+    model = models.from_path(_classes()[world.settings["env"]].mjcf)
+    set_options(model, config)
+    data = mujoco.MjData(model)
     for name in STATE:
         getattr(data, name)[:] = world.tensors[name].numpy()
     trace = [np.concatenate([data.qpos, data.qvel])]
@@ -93,7 +95,7 @@ def c_trace(world: BadWorld) -> np.ndarray:
     mujoco.set_mju_user_warning(lambda message: None)  # else it prints, and writes a log into the working directory
     try:
         for _ in range(config.substeps):
-            mujoco.mj_step(env.mj_model, data)
+            mujoco.mj_step(model, data)
             lost = any(data.warning[kind].number for kind in RESETS)
             trace.append(np.full_like(trace[0], np.nan) if lost else np.concatenate([data.qpos, data.qvel]))
     finally:
