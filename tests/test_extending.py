@@ -70,9 +70,14 @@ def state(qpos, qvel, **more):
 # The example.
 
 
-def test_a_body_takes_one_file_under_150_lines():
-    (file,) = EXAMPLE.rglob("*.py")
-    assert len(file.read_text().splitlines()) < 150
+def lines_of_the_example():
+    files = [file for file in EXAMPLE.rglob("*") if file.suffix in {".py", ".xml", ".toml"}]
+    assert {file.name for file in files} == {"__init__.py", "cheetah.xml", "pyproject.toml"}
+    return sum(len(file.read_text().splitlines()) for file in files)
+
+
+def test_a_body_takes_under_150_lines_in_all():
+    assert lines_of_the_example() < 150
 
 
 @pytest.mark.parametrize("field", FIGURES)
@@ -145,7 +150,7 @@ def expanded():
 
 
 def test_starts_are_distributed_as_dm_control_s(cheetah):
-    ours, theirs = cheetah(1, "cpu", protocol="dm_control")._starts.numpy(), recorded("resets")["qpos"]
+    ours, theirs = cheetah(1, "cpu", protocol="dm_control")._initial_poses(), recorded("resets")["qpos"]
     critical = np.sqrt(-0.5 * np.log(1e-6 / 2) * (1 / len(ours) + 1 / len(theirs)))  # Kolmogorov and Smirnov's
     for a, b in zip(ours.T, theirs.T, strict=True):
         both = np.concatenate([a, b])
@@ -175,7 +180,7 @@ def test_a_masked_reset_draws_anew_and_leaves_the_others(cheetah):
     td = env.reset(td.set("_reset", mask.unsqueeze(-1)))
     after = env.get_state()
     assert torch.equal(after["qpos"][~mask], before["qpos"][~mask])
-    starts = torch.as_tensor(env._starts.numpy())
+    starts = torch.as_tensor(env._initial_poses(), dtype=torch.float32)
     assert (after["qpos"][mask].unsqueeze(1) == starts).all(dim=-1).any(dim=-1).all()
     assert torch.equal(td["observation"][mask, :8], after["qpos"][mask, 1:])
     assert (after["qvel"][mask] == 0).all()
@@ -191,6 +196,50 @@ def test_a_bad_world_is_caught_and_replayed(cheetah, tmp_path, capsys):
         env.close()
     assert cli.main(["replay", str(file), "--device", "cpu"]) == 0
     assert "world 1 of 3" in capsys.readouterr().out
+
+
+# A table of initial poses.
+
+
+@pytest.fixture
+def posed(cheetah):
+    """Makes an environment of the example's body that has another table."""
+
+    def make(table, num_envs=1):
+        cls = type("Posed", (registry.env_class("cheetah_run"),), {"_initial_poses": lambda self: table})
+        return cls(num_envs, "cpu", seed=0)
+
+    return make
+
+
+def test_each_reset_draws_a_row_uniformly(posed):
+    table = np.random.default_rng(0).uniform(0.5, 1.0, (3, 9)).astype(np.float32)
+    env, drawn = posed(table, num_envs=300), []
+    for _ in range(2):
+        td = env.reset()
+        qpos = env.get_state()["qpos"].numpy()
+        np.testing.assert_array_equal(td["observation"][:, :8], qpos[:, 1:])
+        rows, counts = np.unique(qpos, axis=0, return_counts=True)
+        np.testing.assert_array_equal(rows, np.unique(table, axis=0))
+        assert counts.min() > 60  # of 100; the deviation is 8
+        drawn.append(qpos)
+    assert 150 < (drawn[0] != drawn[1]).any(axis=1).sum() < 250  # 200 of 300, if the draws are independent
+    env.set_seed(0)
+    env.reset()
+    np.testing.assert_array_equal(env.get_state()["qpos"], drawn[0])
+
+
+def test_without_a_table_a_world_starts_in_the_default_pose(posed):
+    env = posed(None, num_envs=2)
+    env.reset()
+    np.testing.assert_array_equal(env.get_state()["qpos"], np.tile(env.mj_model.qpos0, (2, 1)))
+
+
+@pytest.mark.parametrize("shape", [(9,), (4, 8), (0, 9), (2, 2, 9)])
+def test_a_table_of_another_shape_is_refused(posed, shape):
+    told = f"_initial_poses must return an array of shape (count, 9), count > 0; got {shape}"
+    with pytest.raises(ValueError, match=re.escape(told)):
+        posed(np.zeros(shape))
 
 
 # The command.
@@ -364,12 +413,11 @@ def test_a_scene_of_its_own_comes_first(tmp_path):
 def test_the_guide_names_what_there_is(cheetah):
     guide, env = (ROOT / "docs" / "guides" / "extending.md").read_text(), cheetah(1, "cpu")
     named = re.findall(r"^\| `(?:self\.)?([\w.]+)` \|", guide, flags=re.MULTILINE)
-    assert len(named) == 13
+    assert len(named) == 17
     for name in named:
         assert operator.attrgetter(name)(env) is not None
     for field in re.findall(r"`(\w+)`", next(line for line in guide.splitlines() if "`self.sim.data`" in line)):
         assert hasattr(env.sim.data, field), field
     for file in re.findall(r"{literalinclude} (\S+)", guide):
         assert (ROOT / "docs" / "guides" / file).is_file()
-    lines = len((EXAMPLE / "loco_cheetah" / "__init__.py").read_text().splitlines())
-    assert f"one Python file of {lines} lines" in guide
+    assert f"{lines_of_the_example()} lines in all" in " ".join(guide.split())

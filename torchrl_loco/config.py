@@ -38,7 +38,7 @@ class SimConfig:
     njmax: int
     iterations: int
     ls_iterations: int
-    euler_damping: bool
+    euler_damping: bool = False
     episode_length: int = 1000
     deterministic: bool = False
 
@@ -71,12 +71,8 @@ def _check_field(name: str, kind: Any, value: Any) -> None:
 
 
 DEFAULTS = {
-    "walker": SimConfig(
-        ctrl_dt=0.025, sim_dt=0.0025, naconmax=50_000, njmax=100, iterations=2, ls_iterations=5, euler_damping=False
-    ),
-    "humanoid": SimConfig(
-        ctrl_dt=0.025, sim_dt=0.005, naconmax=200_000, njmax=250, iterations=4, ls_iterations=8, euler_damping=False
-    ),
+    "walker": SimConfig(ctrl_dt=0.025, sim_dt=0.0025, naconmax=50_000, njmax=100, iterations=2, ls_iterations=5),
+    "humanoid": SimConfig(ctrl_dt=0.025, sim_dt=0.005, naconmax=200_000, njmax=250, iterations=4, ls_iterations=8),
 }
 """By body, under the protocol ``playground``."""
 

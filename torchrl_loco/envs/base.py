@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import mujoco
+import numpy as np
 import torch
 import warp as wp
 from tensordict import TensorDict, TensorDictBase
@@ -21,6 +22,7 @@ from torchrl_loco.envs.checks import (
     check_flag,
     check_model,
     check_new_file,
+    check_poses,
     check_seed,
     check_subclass,
 )
@@ -31,15 +33,17 @@ from torchrl_loco.envs.state import Resumable, State, write_state
 from torchrl_loco.envs.watcher import Watcher
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import EXCLUSIVE, Simulation
+from torchrl_loco.sim.sampling import draw_from_table
 
 
 class LocoEnv(AsyncReset, Resumable, Closable):
     """Base of the locomotion environments: batched worlds of one body on one device.
 
     A subclass names its ``body``, ``mjcf`` (path of the model), ``defaults`` (settings under ``playground``),
-    ``observation_size`` and ``term_names``, and launches the kernels that fill the observation, the reward and its
-    terms (``_launch_observe``) and draw initial poses (``_launch_pose``). Everything else is here;
-    docs/guides/extending.md goes through it with a third body.
+    ``observation_size`` and ``term_names``, and the kernel that fills the observation, the reward and its terms
+    (``_observation_kernel``). Initial poses are drawn from a table (``_initial_poses``) or by a kernel of the
+    subclass's own (``_launch_pose``). Everything else is here; docs/guides/extending.md goes through it with a third
+    body.
 
     Args:
         num_envs: number of worlds, the batch size.
@@ -109,6 +113,7 @@ class LocoEnv(AsyncReset, Resumable, Closable):
                 inputs = self._action, self._episode, self._elapsed_steps
                 self._watchers.append(BadWorldTrap(self.bad_world_file, self.sim, inputs, self._bad, self._describe))
             self._prepare()
+            self._make_poses()
             self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
             self._step_graph = self.sim.capture(self._launch_step)
             self._reset_graph = self.sim.capture(self._launch_reset)
@@ -133,18 +138,30 @@ class LocoEnv(AsyncReset, Resumable, Closable):
     def _prepare(self) -> None:
         """Makes what the body's kernels need, once, before they are recorded."""
 
-    def _launch_observe(self, mask: wp.array) -> None:
-        """Launches the kernel that fills ``_observation``, ``_reward`` and ``_terms`` of the worlds in ``mask``.
+    def _observation_kernel(self) -> tuple[wp.Kernel, list]:
+        """Returns the kernel that observes, and what it reads.
 
-        ``mask`` (bool, ``(num_envs,)``) is all worlds after a step, those that begin anew after a reset.
+        Its parameters are these, then the mask of the worlds to observe (bool, ``(num_envs,)``; all after a step, those
+        that begin anew after a reset), then what it fills there: ``_observation``, ``_reward`` and ``_terms``.
         """
         raise NotImplementedError
 
+    def _initial_poses(self) -> np.ndarray | None:
+        """Returns a table of poses, ``(count, nq)``, for each reset to draw one of; ``None`` for the default pose.
+
+        It is asked for when the environment is made, and again when it opens after :meth:`close`: draw from a fixed
+        seed.
+        """
+        return None
+
     def _launch_pose(self) -> None:
-        """Launches the kernel that draws ``qpos`` of the worlds in ``_mask``; without one they start at the default.
+        """Launches the kernel that draws ``qpos`` of the worlds in ``_mask``: by default from the table, if any.
 
         They are at rest in the default pose, and stay at rest: what is drawn is ``qpos`` alone.
         """
+        if self._poses is not None:
+            inputs = [self._poses, self._seed, self._episode, self._mask]
+            self._launch(draw_from_table, inputs, [self.sim.data.qpos])
 
     # Setting up.
 
@@ -169,6 +186,12 @@ class LocoEnv(AsyncReset, Resumable, Closable):
         names = ("action", "observation", "reward", "terms", "mask", "stagger", "seed", "episode", "elapsed_steps")
         flags = ("bad", "done", "terminated", "truncated")
         self._views = {name: wp.to_torch(getattr(self, f"_{name}")) for name in names + flags}
+
+    def _make_poses(self) -> None:
+        poses = self._initial_poses()
+        if poses is not None:
+            poses = wp.array(check_poses(poses, self.mj_model.nq), dtype=float, device=self.sim.device)
+        self._poses = poses
 
     def _make_specs(self) -> None:
         n, device = self.num_envs, self.device
@@ -227,8 +250,10 @@ class LocoEnv(AsyncReset, Resumable, Closable):
 
     def _launch_outputs(self, mask: wp.array) -> None:
         data = self.sim.data
-        self._launch_observe(mask)
-        self._launch(quench, [mask, data.qpos, data.qvel], [self._bad, self._observation, self._reward, self._terms])
+        kernel, inputs = self._observation_kernel()
+        outputs = [self._observation, self._reward, self._terms]
+        self._launch(kernel, [*inputs, mask], outputs)
+        self._launch(quench, [mask, data.qpos, data.qvel], [self._bad, *outputs])
 
     # TorchRL's side.
 

@@ -105,6 +105,18 @@ def check_subclass(cls: type) -> None:
         raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.LocoEnv)")
 
 
+def check_poses(poses: Any, nq: int) -> np.ndarray:
+    """Returns a table of initial poses as an array of float32.
+
+    Raises:
+        ValueError: it is not of shape ``(count, nq)``, or has no rows.
+    """
+    table = np.asarray(poses, dtype=np.float32)
+    if table.ndim != 2 or table.shape[1] != nq or len(table) == 0:
+        raise ValueError(f"_initial_poses must return an array of shape (count, {nq}), count > 0; got {table.shape}")
+    return table
+
+
 def check_model(mj_model: mujoco.MjModel) -> mujoco.MjModel:
     """Returns the model.
 

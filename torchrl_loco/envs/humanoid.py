@@ -35,9 +35,9 @@ def observe_humanoid(
     xmat_in: wp.array2d[wp.mat33],
     sensordata_in: wp.array2d[float],
     # In:
-    mask_in: wp.array[bool],
     extremities: wp.array[int],
     speed: float,
+    mask_in: wp.array[bool],
     # Out:
     observation_out: wp.array2d[float],
     reward_out: wp.array[float],
@@ -104,13 +104,9 @@ class Humanoid(LocoEnv):
         if self.protocol == "dm_control":
             self._skeleton = make_skeleton(self.mj_model, self.sim.model.nxn_geom_pair_filtered.numpy(), device)
 
-    def _launch_observe(self, mask: wp.array) -> None:
+    def _observation_kernel(self) -> tuple[wp.Kernel, list]:
         d = self.sim.data
-        self._launch(
-            observe_humanoid,
-            [d.qpos, d.qvel, d.ctrl, d.xpos, d.xmat, d.sensordata, mask, self._extremities, self.speed],
-            [self._observation, self._reward, self._terms],
-        )
+        return observe_humanoid, [d.qpos, d.qvel, d.ctrl, d.xpos, d.xmat, d.sensordata, self._extremities, self.speed]
 
     def _launch_pose(self) -> None:
         if self.protocol == "dm_control":

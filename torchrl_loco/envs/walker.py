@@ -29,9 +29,9 @@ def observe_walker(
     xmat_in: wp.array2d[wp.mat33],
     sensordata_in: wp.array2d[float],
     # In:
-    mask_in: wp.array[bool],
     speed: float,
     true_height: bool,
+    mask_in: wp.array[bool],
     # Out:
     observation_out: wp.array2d[float],
     reward_out: wp.array[float],
@@ -97,13 +97,9 @@ class Walker(LocoEnv):
     observation_size = 24
     speed = 0.0
 
-    def _launch_observe(self, mask: wp.array) -> None:
+    def _observation_kernel(self) -> tuple[wp.Kernel, list]:
         d = self.sim.data
-        self._launch(
-            observe_walker,
-            [d.qvel, d.xpos, d.xmat, d.sensordata, mask, self.speed, self.protocol == "dm_control"],
-            [self._observation, self._reward, self._terms],
-        )
+        return observe_walker, [d.qvel, d.xpos, d.xmat, d.sensordata, self.speed, self.protocol == "dm_control"]
 
     def _launch_pose(self) -> None:
         self._launch(

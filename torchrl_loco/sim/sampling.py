@@ -1,4 +1,4 @@
-"""What a world draws at its reset: a random stream of its own, joint angles, and a pose free of contact."""
+"""What a world draws at its reset: a random stream of its own, a pose of a table, or one free of contact."""
 
 from typing import Any
 
@@ -17,6 +17,25 @@ def world_stream(seed: wp.array[wp.uint32], world: int, episode: int) -> wp.uint
     It has 32 bits: of n episodes, about n^2 / 2^33 pairs start alike.
     """
     return wp.rand_init(int(wp.rand_init(int(seed[0]), world)), episode)
+
+
+@wp.kernel(enable_backward=False)
+def draw_from_table(
+    # In:
+    poses_in: wp.array2d[float],
+    seed_in: wp.array[wp.uint32],
+    episode_in: wp.array[int],
+    mask_in: wp.array[bool],
+    # Data out:
+    qpos_out: wp.array2d[float],
+):
+    """Draws ``qpos`` uniformly from the rows of a table."""
+    world = wp.tid()
+    if not mask_in[world]:
+        return
+    row = wp.randi(world_stream(seed_in, world, episode_in[world]), 0, poses_in.shape[0])
+    for i in range(qpos_out.shape[1]):
+        qpos_out[world, i] = poses_in[row, i]
 
 
 @wp.func
