@@ -1,7 +1,7 @@
 """Runs notebooks from a clean kernel: ``python notebooks/execute.py notebooks/*.ipynb`` stores what they print."""
 
+import argparse
 import os
-import sys
 import time
 from pathlib import Path
 
@@ -52,9 +52,16 @@ def is_worth_keeping(output: nbformat.NotebookNode) -> bool:
     return WIDGET not in output.get("data", {})
 
 
-def main(paths: list[str]) -> None:
+def main(args: list[str] | None = None) -> None:
     """Runs notebooks in place."""
-    for path in map(Path, paths):
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("notebooks", nargs="+", type=Path, help="files to run; each is overwritten")
+    paths = parser.parse_args(args).notebooks
+    for path in paths:
+        if path.suffix != ".ipynb" or not path.is_file():
+            known = ", ".join(sorted(os.path.relpath(known) for known in Path(__file__).parent.glob("*.ipynb")))
+            parser.error(f"there is no notebook {path}: choose from {known}")
+    for path in paths:
         start = time.perf_counter()
         notebook = execute(nbformat.read(path, as_version=4), path.parent)
         path.write_text(nbformat.writes(notebook) + "\n")
@@ -62,4 +69,4 @@ def main(paths: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

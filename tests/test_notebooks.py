@@ -6,7 +6,7 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from notebooks.execute import execute
+from notebooks.execute import execute, main
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -47,6 +47,16 @@ def test_runs_from_a_clean_kernel(path, tmp_path):
     cells = [cell for cell in executed.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["quickstrat.ipynb", "README.md"])
+def test_an_unknown_notebook_is_refused(name, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main([str(ROOT / "notebooks" / "quickstart.ipynb"), str(ROOT / "notebooks" / name)])
+    said = capsys.readouterr()
+    assert said.out == ""  # not even the first was run
+    assert f"{name}: choose from " in said.err
+    assert all(path.name in said.err for path in NOTEBOOKS)
 
 
 @each

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import torchrl_loco
-from torchrl_loco import _versions
+from torchrl_loco import _api, _versions
 
 ROOT = Path(torchrl_loco.__file__).parent
 LAYERS = [  # a module imports from its own layer or from those before it
@@ -43,7 +43,7 @@ def imports(path):
 @pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_keep_to_their_layer_and_stay_small(path):
     own = path.relative_to(ROOT).parts[0].removesuffix(".py")
-    if own != "__init__":
+    if own not in ("__init__", "_api"):
         assert all(layer(module) <= layer(own) for module in imports(path)), list(imports(path))
     assert len(path.read_text().splitlines()) <= 400
 
@@ -55,6 +55,25 @@ def test_a_body_is_one_file_under_250_lines(body):
 
 def test_typing_marker():
     assert (ROOT / "py.typed").exists()
+
+
+def test_public_names_are_imported_when_they_are_asked_for():
+    """In an interpreter of its own, where nothing was asked for before."""
+    code = (
+        "import sys, torchrl_loco\n"
+        "assert 'torch' not in sys.modules\n"
+        "assert set(torchrl_loco.__all__) <= set(dir(torchrl_loco))\n"
+        "assert not hasattr(torchrl_loco, 'mke')\n"
+        "assert torchrl_loco.envs.LocoEnv is torchrl_loco.LocoEnv\n"
+        "from torchrl_loco import *\n"
+        "assert make('walker_walk', 1, 'cpu').num_envs == 1"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_public_names_are_those_that_are_imported():
+    own = {name for name in vars(_api) if not name.startswith("_")}
+    assert own == {*torchrl_loco.__all__} - {"__version__"}
 
 
 def test_public_names_have_docstrings():

@@ -142,6 +142,9 @@ def test_command(file, actions, capsys, spoil, told, tmp_path, monkeypatch):
     drive(env, actions, spoil)
     with pytest.warns(NonFiniteWarning):
         env.close()
+    with pytest.raises(SystemExit):
+        cli.main(["replay", str(file), "--device", "cuda:9"])
+    assert capsys.readouterr().out == ""  # refused before the first line
     assert cli.main(["replay", str(file), "--device", "cpu"]) == 0
     out = capsys.readouterr().out
     assert f"world {BAD} of {WORLDS} on cpu, episode 1, after 3 steps" in out

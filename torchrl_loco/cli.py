@@ -1,4 +1,7 @@
-"""The command ``torchrl-loco``: parse, call, exit."""
+"""The command ``torchrl-loco``: parse, call, exit.
+
+What takes seconds to import is imported where it is used: help and wrong options appear at once.
+"""
 
 import contextlib
 import dataclasses
@@ -6,22 +9,26 @@ import math
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torchrl_loco
-from torchrl_loco import doctor, registry
-from torchrl_loco import replay as replays
+
+if TYPE_CHECKING:
+    from torchrl_loco import training
 
 try:
     import tyro
-
-    from torchrl_loco import training
 except ImportError as error:  # the environments work without the extra, the command does not
     raise SystemExit(f"torchrl-loco: {error}. Install what it needs: pip install 'torchrl-loco[train]'") from None
+
+CONTAINERS = (".mp4", ".mkv", ".mov")
+"""What the file of a video can be."""
 
 
 def list_tasks() -> None:
     """List the environments."""
+    from torchrl_loco import registry
+
     for name in registry.list_envs():
         try:
             about = (registry.env_class(name).__doc__ or "").strip().split("\n")[0]
@@ -38,6 +45,8 @@ def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None =
         num_envs: number of worlds to measure with.
         device: where to measure; default: CUDA if there is any.
     """
+    from torchrl_loco import doctor
+
     if size is not None:
         with _user_errors():
             for name, (needed, advised) in doctor.size(size, num_envs, device).items():
@@ -67,6 +76,8 @@ def evaluate(
         device: where to play them; default: where the run was trained.
     """
     with _user_errors():
+        from torchrl_loco import training
+
         summary = training.evaluate_run(training.RunFolder(run), episodes, seed, device)
     print(training.describe(summary))
 
@@ -78,6 +89,8 @@ def resume(run: tyro.conf.Positional[Path], /) -> None:
         run: folder of the run.
     """
     with _user_errors():
+        from torchrl_loco import training
+
         trainer = training.Trainer(training.RunFolder(run), resume=True)
     with _user_errors(OSError):
         trainer.train()
@@ -88,7 +101,7 @@ class Video:
     """What of an episode is shown."""
 
     seconds: float = 10.0
-    """Length of the video."""
+    """Length of the video (s)."""
     camera: Literal["side", "back", "egocentric"] = "side"
     """Which of the model's cameras."""
     seed: int = 0
@@ -98,15 +111,28 @@ class Video:
     out: Path | None = None
     """The video; default: video.mp4 in the run's folder (record), TASK.mp4 where there is no display (play)."""
 
-    def make(self, policy: torchrl_loco.Policy, default: Path) -> None:
-        """Records the policy into ``out`` or the default, and prints which."""
+    def check(self) -> None:
+        """Refuses what cannot be shown, before anything is printed or made."""
+        from torchrl_loco.envs.checks import check_device, check_folder, check_seed
+
         if not 0 < self.seconds < math.inf:
             raise ValueError(f"seconds must be positive and finite, got {self.seconds}")
+        check_seed(self.seed)
+        check_device(self.device)
+        if self.out is not None:
+            if self.out.suffix not in CONTAINERS:
+                raise ValueError(f"out must end in one of {', '.join(CONTAINERS)}, got {self.out}")
+            check_folder("out", self.out)
+
+    def make(self, policy: "torchrl_loco.Policy", default: Path) -> None:
+        """Records the policy into ``out`` or the default, and prints which."""
+        from torchrl_loco import training
+
         out = default if self.out is None else self.out
         training.record(policy, self.env(policy), out, self.seconds, policy.info["action_repeat"], self.camera)
         print(out)
 
-    def env(self, policy: torchrl_loco.Policy) -> torchrl_loco.envs.LocoEnv:
+    def env(self, policy: "torchrl_loco.Policy") -> "torchrl_loco.LocoEnv":
         """Returns one world of the policy's task."""
         return torchrl_loco.make(policy.info["task"], 1, self.device, self.seed, policy.info["protocol"])
 
@@ -122,6 +148,9 @@ def record(run: tyro.conf.Positional[Path], /, video: VideoOptions = Video()) ->
         video: what is shown.
     """
     with _user_errors():
+        from torchrl_loco import training
+
+        video.check()
         folder = training.RunFolder(run)
         video.make(torchrl_loco.Policy.load(folder.policy, video.device), folder.video)
 
@@ -135,6 +164,9 @@ def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: 
         video: what is shown; with --out, a video in any case.
     """
     with _user_errors():
+        from torchrl_loco import registry, training
+
+        video.check()
         if policy is None:
             trained = torchrl_loco.load_policy(task, video.device)
         else:
@@ -157,6 +189,10 @@ def replay(file: tyro.conf.Positional[Path], /, device: str | None = None) -> No
         device: where Warp computes; default: CUDA if there is any.
     """
     with _user_errors():
+        from torchrl_loco import replay as replays
+        from torchrl_loco.envs.checks import check_device
+
+        check_device(device)  # before the first line
         for line in replays.describe(replays.load(file), device):
             print(line)
 
@@ -169,6 +205,8 @@ def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("lear
         out: the picture.
     """
     with _user_errors():
+        from torchrl_loco import training
+
         training.plot_runs([training.RunFolder(run) for run in runs], out)
     print(out)
 
@@ -176,17 +214,7 @@ def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("lear
 def main(args: Sequence[str] | None = None) -> int:
     """Runs the command line; returns 0, exits with 2 for what the user can mend, returns 130 when interrupted."""
     args = sys.argv[1:] if args is None else list(args)
-    with _user_errors():
-        is_training = args[:1] == ["train"]
-        if is_training and len(args) > 1 and not args[1].startswith("-"):
-            args[1] = registry.canonical_id(args[1])
-        device, algorithm = (_take(flag, args) if is_training else None for flag in ("--device", "--algorithm"))
-        presets = {task: training.preset(task, device, algorithm) for task in registry.list_envs()}
-    task_config = tyro.extras.subcommand_type_from_defaults(
-        presets,
-        {task: f"Train {task}{'' if task in registry.ENVS else f'; {training.UNTUNED}'}." for task in presets},
-        prefix_names=False,
-    )
+    task_config = _task_config(args) if args[:1] == ["train"] else None
 
     def train(config: Annotated[task_config, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]
         """Train a policy: evaluation, learning curve and video included.
@@ -224,8 +252,26 @@ def main(args: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _begin(config: training.TrainingConfig) -> training.Trainer:
+def _task_config(args: list[str]) -> Any:
+    """Returns the type that stands for a task and its settings; takes from ``args`` what decides on the presets."""
+    with _user_errors():
+        from torchrl_loco import registry, training
+
+        if len(args) > 1 and not args[1].startswith("-"):
+            args[1] = registry.canonical_id(args[1])
+        device, algorithm = (_take(flag, args) for flag in ("--device", "--algorithm"))
+        presets = {task: training.preset(task, device, algorithm) for task in registry.list_envs()}
+    return tyro.extras.subcommand_type_from_defaults(
+        presets,
+        {task: f"Train {task}{'' if task in registry.ENVS else f'; {training.UNTUNED}'}." for task in presets},
+        prefix_names=False,
+    )
+
+
+def _begin(config: "training.TrainingConfig") -> "training.Trainer":
     """Makes the folder of a run and what trains into it."""
+    from torchrl_loco import registry, training
+
     run = training.RunFolder.create(config)
     if config.task not in registry.ENVS:
         print(f"{config.task}: {training.UNTUNED}")

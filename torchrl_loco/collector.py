@@ -21,7 +21,7 @@ class RolloutCollector:
 
     Args:
         env: an environment of this package, or one in :class:`torchrl_loco.TransformedEnv`.
-        policy: takes a TensorDict with the observation and writes the action.
+        policy: takes a TensorDict with the observation ``(num_envs, n)`` and writes the action ``(num_envs, nu)``.
         frames_per_batch: steps in a batch, over all worlds; a multiple of the number of worlds.
         total_frames: steps over all batches, rounded up to whole batches; -1 never ends.
         exploration_type: how actions are taken from a stochastic policy.

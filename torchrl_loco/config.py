@@ -30,6 +30,10 @@ class SimConfig:
         episode_length: control steps after which an episode is truncated.
         deterministic: whether rollouts must repeat bit for bit. On the CPU they always do; on CUDA this is refused,
             because the physics adds up constraints in the order of their arrival.
+
+    Raises:
+        TypeError: a value has the wrong type.
+        ValueError: a value is out of range, or ``ctrl_dt`` no multiple of ``sim_dt``.
     """
 
     ctrl_dt: float

@@ -28,7 +28,8 @@ class BadWorld:
     """A world from which a control step made one that is not finite.
 
     Attributes:
-        tensors: ``qpos`` (nq), ``qvel`` (nv), ``qacc_warmstart`` (nv) and ``action`` (nu), before the step.
+        tensors: ``qpos`` ``(nq,)``, ``qvel`` ``(nv,)``, ``qacc_warmstart`` ``(nv,)`` and ``action`` ``(nu,)``, before
+            the step.
         settings: ``env`` (module and name of the class), ``protocol``, ``config``, ``seed``, ``device``, ``num_envs``,
             and ``world``, ``episode`` and ``elapsed_steps`` at the time.
     """

@@ -18,7 +18,7 @@ def save(path: Path, kind: str, tensors: dict[str, torch.Tensor], settings: dict
     Args:
         path: where to.
         kind: what the file holds, in a word; :func:`load` asks for it.
-        tensors: the tensors, on any device.
+        tensors: the tensors, of any shape ``(...)`` and on any device.
         settings: whatever JSON can hold.
     """
     metadata = {"format": _format(kind), **{name: json.dumps(value) for name, value in settings.items()}}
@@ -52,7 +52,12 @@ def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]
 
 
 def digest(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> str:
-    """Returns a checksum of all that a file holds: safetensors itself would not notice a changed bit in a tensor."""
+    """Returns a checksum of all that a file holds: safetensors itself would not notice a changed bit in a tensor.
+
+    Args:
+        tensors: the tensors, of any shape ``(...)``, on the CPU.
+        metadata: what is written beside them.
+    """
     sha256 = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name]

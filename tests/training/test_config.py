@@ -31,6 +31,7 @@ def test_a_preset_for_every_task(task, algorithm):
         ({"hidden": ()}, ValueError, "hidden must name"),
         ({"hidden": (64, 0)}, ValueError, "each width of hidden"),
         ({"minibatch_size": 10_000_000}, ValueError, "minibatch_size .* must not exceed"),
+        ({"num_envs": 7}, ValueError, r"num_envs \(7\) .* pass minibatch_size=224 or less, or decisions=74 or more"),
         ({"total_frames": 10}, ValueError, "total_frames .* at least one batch"),
         ({"seed": -1}, ValueError, "seed must lie in"),
         ({"device": "tpu"}, ValueError, "choose one of cpu"),
@@ -56,6 +57,16 @@ def test_wrong_settings(overrides, error, message):
 def test_wrong_settings_of_reppo(overrides, message):
     with pytest.raises(ValueError, match=message):
         REPPOConfig("walker_stand", **overrides)
+
+
+@pytest.mark.parametrize("mended", [{"minibatch_size": 224}, {"decisions": 74}])
+def test_few_worlds_need_smaller_minibatches_or_more_decisions(mended):
+    """What the error above says to pass is enough, and no more than enough."""
+    (name, value), *_ = mended.items()
+    assert getattr(preset("walker_stand", "cpu", "ppo", num_envs=7, **mended), name) == value
+    beyond = value + (1 if name == "minibatch_size" else -1)
+    with pytest.raises(ValueError, match="must not exceed"):
+        preset("walker_stand", "cpu", "ppo", num_envs=7, **{name: beyond})
 
 
 def test_an_alias_is_the_task_itself():

@@ -17,10 +17,11 @@ class AsyncReset(EnvBase):
         """Resets the worlds that are done, without synchronising with the device.
 
         Args:
-            tensordict: what ``step_mdp`` makes of a step.
+            tensordict: what ``step_mdp`` makes of a step, batch ``(num_envs,)``.
 
         Returns:
-            The same TensorDict, with the first observation of the next episode in the worlds that were done.
+            The same TensorDict, batch ``(num_envs,)``, with the first observation of the next episode in the worlds
+            that were done.
         """
         mask = tensordict.get("done").clone()
         request = TensorDict({"_reset": mask}, batch_size=tensordict.batch_size, device=tensordict.device)

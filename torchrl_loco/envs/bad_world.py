@@ -121,7 +121,7 @@ class BadWorldTrap(Watcher):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._sim.device)
 
     def look(self) -> torch.Tensor:
-        """Returns the index of the world that was caught, or the number of worlds if none was."""
+        """Returns the index of the world that was caught, or the number of worlds if none was, shape ``(1,)``."""
         return self._first_view.long()
 
     def restart(self) -> None:

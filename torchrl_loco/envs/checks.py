@@ -85,9 +85,20 @@ def check_new_file(name: str, value: Any) -> Path:
         TypeError: it is no path.
         ValueError: it cannot be written, or would be overwritten.
     """
-    path = Path(value).absolute()  # where it is now, should the working directory change
+    path = check_folder(name, value)
     if path.exists():
         raise ValueError(f"{name} {path} is already there: move it away, or choose another name")
+    return path
+
+
+def check_folder(name: str, value: Any) -> Path:
+    """Returns ``value`` as the path of a file whose folder is there.
+
+    Raises:
+        TypeError: it is no path.
+        ValueError: there is no such folder.
+    """
+    path = Path(value).absolute()  # where it is now, should the working directory change
     if not path.parent.is_dir():
         raise ValueError(f"{name} {path} cannot be written: there is no folder {path.parent}")
     return path

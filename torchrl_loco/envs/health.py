@@ -89,7 +89,7 @@ class Health(Watcher):
         )
 
     def look(self) -> torch.Tensor:
-        """Returns the steps in which something was lost, by kind, and the most rows and contacts asked for."""
+        """Returns the steps in which something was lost, by kind, and the most rows and contacts needed, ``(4,)``."""
         losses = self.counts[:, : len(LOSSES)].sum(dim=0)
         peaks = torch.stack([self._sim.peak_rows.max(), self._sim.peak_contacts.max()])
         return torch.cat([losses, peaks])

@@ -57,7 +57,7 @@ class State(TensorDict):
             strict: whether a key that is not there raises a KeyError.
 
         Returns:
-            The selection.
+            The selection, batch ``(num_envs,)``.
         """
         state = [key for key in self.KEYS if key in self] if "_reset" in keys else []
         return super().select(*keys, *state, inplace=inplace, strict=strict)
@@ -120,7 +120,7 @@ def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor
     """Writes a state into what holds it; what it lacks beside qpos and qvel starts at zero, but for the episode.
 
     Args:
-        state: the state, or whatever was passed for one.
+        state: the :class:`State`, or whatever was passed for one.
         targets: the tensors of all worlds by key of :class:`State`, written in place.
         mask: worlds that are written, ``(num_envs,)``.
 

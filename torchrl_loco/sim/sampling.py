@@ -76,20 +76,21 @@ def segment_distance(p: wp.vec3, u: wp.vec3, q: wp.vec3, v: wp.vec3) -> float:
 class Skeleton:
     """What forward kinematics and the contact test of one world need of a model. Geom 0 is the floor, z = 0.
 
-    body_parent      (nbody,)     id of the parent body
-    body_joint       (nbody, 2)   first joint and number of joints
-    body_pos         (nbody,)     offset from the parent (m)
-    body_quat        (nbody,)     rotation against the parent
-    joint_qpos       (njnt,)      start of the joint in qpos
-    joint_free       (njnt,)      whether it is a free joint, else a hinge
-    joint_pos        (njnt,)      anchor in the body's frame (m)
-    joint_axis       (njnt,)      axis in the body's frame
-    joint_range      (njnt,)      lower and upper limit (rad)
-    geom_body        (ngeom,)     id of the geom's body
-    geom_pos         (ngeom,)     center in the body's frame (m)
-    geom_axis        (ngeom,)     from the center to the end of the capsule's segment (m), zero for a sphere
-    geom_radius      (ngeom,)     radius (m)
-    pair             (npair,)     geoms that may touch
+    Attributes:
+        body_parent: id of the parent body, ``(nbody,)``.
+        body_joint: first joint and number of joints, ``(nbody, 2)``.
+        body_pos: offset from the parent (m), ``(nbody,)``.
+        body_quat: rotation against the parent, ``(nbody,)``.
+        joint_qpos: start of the joint in qpos, ``(njnt,)``.
+        joint_free: whether it is a free joint, else a hinge, ``(njnt,)``.
+        joint_pos: anchor in the body's frame (m), ``(njnt,)``.
+        joint_axis: axis in the body's frame, ``(njnt,)``.
+        joint_range: lower and upper limit (rad), ``(njnt,)``.
+        geom_body: id of the geom's body, ``(ngeom,)``.
+        geom_pos: center in the body's frame (m), ``(ngeom,)``.
+        geom_axis: from the center to the end of the capsule's segment (m), zero for a sphere, ``(ngeom,)``.
+        geom_radius: radius (m), ``(ngeom,)``.
+        pair: geoms that may touch, ``(npair,)``.
     """
 
     body_parent: wp.array[int]

@@ -178,7 +178,7 @@ class Simulation:
         )
 
     def forward(self, mask: wp.array) -> None:
-        """Brings poses and sensors up to ``qpos`` and ``qvel``, which were changed where ``mask`` is set."""
+        """Brings poses and sensors up to ``qpos`` and ``qvel``, changed where ``mask`` ``(nworld,)`` is set."""
         self._clear_constraints(mask)
         self._pose()
 

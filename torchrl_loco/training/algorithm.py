@@ -46,10 +46,13 @@ class Algorithm(ABC):
 
     @abstractmethod
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
-        """Makes a gradient step on a ``minibatch``, without reading from the device or copying to it: CUDA records it.
+        """Makes a gradient step, without reading from the device or copying to it: CUDA records it.
+
+        Args:
+            minibatch: decisions that :meth:`prepare` returned, batch ``(minibatch_size,)``.
 
         Returns:
-            The metrics, in the order of ``metric_names``.
+            The metrics, a scalar each, in the order of ``metric_names``.
         """
 
     def make_optimizer(self, name: str, parameters: Iterable[Any]) -> torch.optim.Adam:
@@ -157,7 +160,7 @@ def clip_and_step(optimizer: torch.optim.Optimizer, max_norm: float) -> torch.Te
     """Clips the gradients of an optimizer's parameters to a norm and makes its step.
 
     Returns:
-        The norm before.
+        The norm before, a scalar.
     """
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     norm = nn.utils.clip_grad_norm_(parameters, max_norm)

@@ -15,7 +15,12 @@ from torchrl_loco.registry import canonical_id, env_class
 
 @dataclasses.dataclass(frozen=True)
 class TrainingConfig:
-    """Settings of any training run. Frames are control steps of one world."""
+    """Settings of any training run. Frames are control steps of one world.
+
+    Raises:
+        TypeError: a count is no integer.
+        ValueError: a field is out of range, or does not fit another; the message names what is valid.
+    """
 
     algorithm: ClassVar[str]
 
@@ -90,8 +95,9 @@ class TrainingConfig:
             check_count("each width of hidden", width)
         if self.minibatch_size > self.batch_size:
             raise ValueError(
-                f"minibatch_size ({self.minibatch_size}) must not exceed the batch of num_envs * decisions "
-                f"({self.batch_size})"
+                f"minibatch_size ({self.minibatch_size}) must not exceed the batch of num_envs ({self.num_envs}) * "
+                f"decisions ({self.decisions}) = {self.batch_size}: pass minibatch_size={self.batch_size} or less, or "
+                f"decisions={math.ceil(self.minibatch_size / self.num_envs)} or more"
             )
         if self.total_frames < self.frames_per_batch:
             raise ValueError(
@@ -136,7 +142,11 @@ class PPOConfig(TrainingConfig):
 
 @dataclasses.dataclass(frozen=True)
 class REPPOConfig(TrainingConfig):
-    """Settings of relative entropy pathwise policy optimization."""
+    """Settings of relative entropy pathwise policy optimization.
+
+    Raises:
+        ValueError: a field is out of range, or does not fit another; the message names what is valid.
+    """
 
     algorithm: ClassVar[str] = "reppo"
 

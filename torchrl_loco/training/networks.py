@@ -38,6 +38,10 @@ class ValueBins(nn.Module):
         low: return that the center of the first bin stands for.
         high: return that the center of the last bin stands for.
         count: number of bins.
+
+    Attributes:
+        centers: returns that the bins stand for, shape ``(count,)``.
+        edges: returns between them, shape ``(count + 1,)``, the outer ends included.
     """
 
     SPREAD = 0.75

@@ -37,13 +37,13 @@ class PPO(Algorithm):
         self.optimizer = self.make_optimizer("actor and critic", self.loss.parameters())
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """Returns the batch with advantages and value targets."""
+        """Returns the ``batch``, of shape ``(num_envs, decisions)``, with advantages and value targets."""
         scaled = batch.copy().set(("next", "reward"), batch["next", "reward"] * self.config.reward_scale)
         self.gae(scaled)
         return scaled.select(*self.loss.in_keys, "advantage", "value_target", "state_value", strict=False)
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
-        """Returns the metrics of a step down the clipped loss, the critic's and the entropy's."""
+        """Returns the metrics, a scalar each, of a step down the clipped loss, the critic's and the entropy's."""
         losses = self.loss(minibatch)
         self.optimizer.zero_grad()
         (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()

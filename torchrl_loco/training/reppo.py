@@ -41,7 +41,9 @@ class REPPO(Algorithm):
         self.actor_optimizer = self.make_optimizer("actor", groups)
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """Returns estimates in which entropy counts as reward, from one action drawn in every next state.
+        """Returns estimates, ``(num_envs, decisions)``, in which entropy counts as reward.
+
+        They take one action drawn in every next state.
 
         At a time limit the true terminal observation is bootstrapped from; a termination ends the return.
         """
@@ -59,7 +61,7 @@ class REPPO(Algorithm):
         return batch.select("observation", "action", "loc", "scale").update(estimates)
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
-        """Returns the metrics of a step of the critic, then one of the actor and the two weights."""
+        """Returns the metrics, a scalar each, of a step of the critic, then one of the actor and the two weights."""
         return [*self._critic_step(minibatch), *self._actor_step(minibatch)]
 
     def _critic_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
@@ -121,18 +123,19 @@ class Weights(nn.Module):
 
     @property
     def temperature(self) -> torch.Tensor:
-        """Weight of the entropy."""
+        """Weight of the entropy, a scalar."""
         return self.log_temperature.exp()
 
     @property
     def kl_weight(self) -> torch.Tensor:
-        """Weight of the divergence."""
+        """Weight of the divergence, a scalar."""
         return self.log_kl_weight.exp()
 
 
 def sample(loc: torch.Tensor, scale: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns an action ``tanh(u)``, u ~ N(loc, scale), drawn differentiably, and its log-probability.
 
+    Of means and deviations of shape ``(..., nu)`` come actions of that shape and log-probabilities of shape ``(...)``.
     Taken from u and not from the action, the log-probability stays exact where tanh saturates.
     """
     noise = torch.randn_like(loc)
@@ -143,6 +146,9 @@ def sample(loc: torch.Tensor, scale: torch.Tensor) -> tuple[torch.Tensor, torch.
 
 
 def kl(old_loc: torch.Tensor, old_scale: torch.Tensor, loc: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
-    """Returns the divergence KL(old || new) of diagonal Gaussians, which is that of their images under tanh."""
+    """Returns the divergence KL(old || new) of diagonal Gaussians, which is that of their images under tanh.
+
+    Of means and deviations of shape ``(..., nu)`` come divergences of shape ``(...)``.
+    """
     ratio = old_scale / scale
     return (0.5 * (ratio.square() + ((old_loc - loc) / scale).square() - 1.0) - ratio.log()).sum(-1)
