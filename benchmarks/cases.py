@@ -90,6 +90,11 @@ def env_dm_control(body: str, n: int, device: torch.device) -> Callable[[], None
     return env_step_and_maybe_reset(body, n, device, protocol="dm_control")
 
 
+def env_deterministic(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """The same with ``deterministic=True``."""
+    return env_step_and_maybe_reset(body, n, device, deterministic=True)
+
+
 def rollout_collector(body: str, n: int, device: torch.device) -> Callable[[], None]:
     """Our collection loop with a policy of two hidden layers of 256."""
     env, policy = env_and_policy(body, n, device)
@@ -148,5 +153,5 @@ CASES = {
     for case in (bare_default, bare_tuned, env_step, env_step_and_maybe_reset, rollout_collector, torchrl_collector)
 }
 """From the bare simulator to a collector."""
-VARIANTS = {case.__name__: case for case in (env_dm_control,)}
+VARIANTS = {case.__name__: case for case in (env_dm_control, env_deterministic)}
 """What settings cost."""

@@ -16,8 +16,8 @@ from benchmarks.results import Row
 from torchrl_loco.training import RunFolder
 
 COLUMNS = {"task": "", "trainer": "", "frames": "d", "seconds": ".1f", "mean": ".1f", "error": ""}
-EVALUATIONS = 20
-"""How often ours is evaluated; each takes a few seconds, which count."""
+EVALUATIONS = 10
+"""How often ours is evaluated, as often as the peer; each takes a few seconds, which count."""
 
 
 def training(tasks: Sequence[str], device: torch.device, frames: int, peer: bool, path: Path | None) -> list[Row]:

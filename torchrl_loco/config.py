@@ -28,8 +28,9 @@ class SimConfig:
         ls_iterations: limit of the line search's iterations within one solver iteration.
         euler_damping: whether joint damping is integrated implicitly (MuJoCo's ``eulerdamp`` flag).
         episode_length: control steps after which an episode is truncated.
-        deterministic: whether rollouts must repeat bit for bit. On the CPU they always do; on CUDA this is refused,
-            because the physics adds up constraints in the order of their arrival.
+        deterministic: whether rollouts on CUDA repeat bit for bit on the same kind of device, at three to four times
+            the time of a step. On the CPU they always do. What finds no room is lost in any order, see
+            :meth:`torchrl_loco.LocoEnv.health`.
 
     Raises:
         TypeError: a value has the wrong type.

@@ -91,8 +91,6 @@ class LocoEnv(AsyncReset, Resumable, Closable):
         seed = secrets.randbits(32) if seed is None else check_seed(seed)
         device = check_device(device)
         self.config = sim_config(self.defaults, protocol, num_envs, config)
-        if self.config.deterministic and device.type == "cuda":  # mujoco_warp 4.0 has a mode for it, which falls short
-            raise ValueError("deterministic=True holds on the CPU only: pass device='cpu', or leave it out")
         self.protocol = protocol
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs, self.seed = num_envs, seed

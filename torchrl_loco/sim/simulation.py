@@ -11,6 +11,7 @@ import warp as wp
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.graph import Graph
 from torchrl_loco.sim.kernels import compile_kernels
+from torchrl_loco.sim.order import RowOrder
 from torchrl_loco.sim.scratch import ScratchPool
 
 UNROLLED_ITERATIONS = 10
@@ -140,6 +141,8 @@ class Simulation:
         self.model.block_dim.update_gradient_cholesky = 32
         self.model.block_dim.update_gradient_JTDAJ_dense = 64
 
+        self._order = RowOrder(self.model, self.data) if config.deterministic else None
+
         self.qpos = wp.to_torch(self.data.qpos)
         self.qvel = wp.to_torch(self.data.qvel)
         self.ctrl = wp.to_torch(self.data.ctrl)
@@ -163,9 +166,20 @@ class Simulation:
         """
         with self._lean():
             for _ in range(self.substeps):
-                mjw.step(self.model, self.data)
+                self._substep()
                 self._note_demand()
         self._pose()
+
+    def _substep(self) -> None:
+        if self._order is None:
+            mjw.step(self.model, self.data)
+            return
+        mjw.step1(self.model, self.data)
+        self._order.apply()
+        # In the solver alone, where it costs the least: nothing before it adds up in any order.
+        self.model.opt.deterministic = mjw.DeterminismType.ATOMICS
+        mjw.step2(self.model, self.data)
+        self.model.opt.deterministic = mjw.DeterminismType.NONE
 
     def _note_demand(self) -> None:
         d = self.data

@@ -1,0 +1,137 @@
+"""The order of constraint rows: the same whichever came first, and nothing but an order."""
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import pytest
+import warp as wp
+
+from torchrl_loco import models
+from torchrl_loco.config import DEFAULTS, sim_config
+from torchrl_loco.envs.checks import check_device
+from torchrl_loco.sim import Simulation
+from torchrl_loco.sim.order import FIRST_CONTACT, ROW_FIELDS, RowOrder
+
+WORLDS = 8
+
+
+def fallen(body, **settings):
+    """A simulation of a body that fell under random actions: contacts, and joints at their limits."""
+    config = sim_config(DEFAULTS[body], "dm_control", WORLDS, settings)
+    sim = Simulation(models.load(body), config, WORLDS, check_device("cpu"))
+    rng = np.random.default_rng(0)
+    step = sim.capture(sim.step)
+    sim.reset(wp.ones(WORLDS, dtype=bool))
+    for _ in range(200):
+        sim.ctrl.copy_(sim.ctrl.new_tensor(rng.choice([-1.0, 1.0], sim.ctrl.shape)))
+        step.replay()
+    assert sim.data.nefc.numpy().sum() > 30
+    return sim
+
+
+@pytest.fixture(params=["walker", "humanoid"])
+def lying(request):
+    return fallen(request.param)
+
+
+def read(sim):
+    """Returns the rows of each world and, for those of contacts, the geoms of their contact."""
+    efc, geoms, worlds = sim.data.efc, sim.data.contact.geom.numpy(), []
+    jacobian, fields = efc.J.numpy(), {name: getattr(efc, name).numpy() for name in ROW_FIELDS}
+    for world, rows in enumerate(sim.data.nefc.numpy()):
+        found = {name: values[world, :rows].copy() for name, values in fields.items()}
+        of_contact = found["type"] >= FIRST_CONTACT
+        ids = found.pop("id")
+        found["where"] = np.where(of_contact[:, None], geoms[ids], ids[:, None])
+        worlds.append({"J": jacobian[world, :rows].copy(), **found})
+    return worlds
+
+
+def shuffle(sim, rng):
+    """Lets contacts and constraints arrive in another order, as threads on CUDA may; what one thread makes stays so."""
+    d = sim.data
+    contacts = int(d.nacon.numpy()[0])
+    owner, geom, address = (a.numpy()[:contacts] for a in (d.contact.worldid, d.contact.geom, d.contact.efc_address))
+    place = rng.permutation(contacts)
+    threads = np.unique(np.column_stack([owner, geom]), axis=0, return_inverse=True)[1].reshape(-1)
+    for thread in np.unique(threads):
+        place[threads == thread] = np.sort(place[threads == thread])
+
+    rows = {name: getattr(d.efc, name).numpy() for name in (*ROW_FIELDS, "J")}
+    for world, count in enumerate(d.nefc.numpy()):
+        ids = rows["id"][world, :count]
+        of_contact = rows["type"][world, :count] >= FIRST_CONTACT
+        ids[of_contact] = place[ids[of_contact]]
+        # Limits come first, in any order; then contacts, in any order, the rows of each together.
+        keys = np.where(of_contact, 1.0 + rng.permutation(contacts)[np.where(of_contact, ids, 0)], rng.random(count))
+        order = np.argsort(keys, kind="stable")
+        for values in rows.values():
+            values[world, :count] = values[world, order]
+        mine = owner == world
+        address[mine] = np.where(address[mine] < 0, -1, np.argsort(order)[address[mine]])
+    for name, values in rows.items():
+        getattr(d.efc, name).assign(values)
+    for array, values in ((d.contact.worldid, owner), (d.contact.geom, geom), (d.contact.efc_address, address)):
+        shuffled = array.numpy()
+        shuffled[place] = values
+        array.assign(shuffled)
+
+
+def test_rows_end_up_the_same_whichever_came_first(lying):
+    order = RowOrder(lying.model, lying.data)
+    order.apply()
+    expected = read(lying)
+    for seed in range(3):
+        shuffle(lying, np.random.default_rng(seed))
+        assert any(not np.array_equal(a["J"], b["J"]) for a, b in zip(read(lying), expected, strict=True))
+        order.apply()
+        for found, wanted in zip(read(lying), expected, strict=True):
+            for name, values in wanted.items():
+                np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def test_rows_are_moved_and_not_changed(lying):
+    before = read(lying)
+    RowOrder(lying.model, lying.data).apply()
+    for found, wanted in zip(read(lying), before, strict=True):
+        for name in wanted:
+            rows = [np.column_stack([world["J"], world[name]]) for world in (found, wanted)]
+            assert sorted(row.tobytes() for row in rows[0]) == sorted(row.tobytes() for row in rows[1]), name
+
+
+def test_the_solver_finds_rows_in_order_and_adds_them_up_so(monkeypatch):
+    sim, rng, found = fallen("humanoid", deterministic=True), np.random.default_rng(0), []
+    step1, step2 = mjw.step1, mjw.step2
+
+    def look(model, data):
+        before = data.efc.J.numpy().copy()
+        RowOrder(model, data).apply()
+        found.append((np.array_equal(before, data.efc.J.numpy()), model.opt.deterministic))
+        step2(model, data)
+
+    monkeypatch.setattr(mjw, "step1", lambda model, data: (step1(model, data), shuffle(sim, rng)))
+    monkeypatch.setattr(mjw, "step2", look)
+    sim.step()
+    assert found == [(True, mjw.DeterminismType.ATOMICS)] * sim.substeps
+    assert sim.model.opt.deterministic == mjw.DeterminismType.NONE
+
+
+def test_contacts_still_know_their_rows(lying):
+    shuffle(lying, np.random.default_rng(0))
+    RowOrder(lying.model, lying.data).apply()
+    d = lying.data
+    ids, owner, address = d.efc.id.numpy(), d.contact.worldid.numpy(), d.contact.efc_address.numpy()
+    rows = 0
+    for contact in range(int(d.nacon.numpy()[0])):
+        for row in address[contact][address[contact] >= 0]:
+            assert ids[owner[contact], row] == contact
+            rows += 1
+    assert rows
+
+
+def test_other_models_are_refused():
+    body = '<body gravcomp="1"><joint/><geom size="1"/></body>'
+    xml = f'<mujoco><option cone="elliptic"/><worldbody>{body}</worldbody></mujoco>'
+    mj_model = mujoco.MjModel.from_xml_string(xml)
+    with wp.ScopedDevice("cpu"), pytest.raises(ValueError, match="elliptic friction cones, gravity compensation"):
+        RowOrder(mjw.put_model(mj_model), mjw.make_data(mj_model))

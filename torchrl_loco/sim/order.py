@@ -1,0 +1,178 @@
+"""Constraint rows in an order of their own, whichever came first: what makes a rollout on CUDA repeat bit for bit.
+
+mujoco_warp hands out rows and contacts as its threads arrive, and the solver adds them up in that order, which decides
+how sums are rounded. Its own mode, ``opt.deterministic``, mends the additions; the ordering is empty in 4.0.
+"""
+
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+ROW_FIELDS = ("type", "id", "pos", "margin", "D", "vel", "aref", "frictionloss")
+"""Numbers of a constraint row, which move with its Jacobian."""
+
+FIRST_CONTACT = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS))
+"""Least type of a row whose id is a contact; that of all others is fixed by the model."""
+
+
+@wp.struct
+class RowKey:
+    """What decides where a row stands. The members are compared one after the other."""
+
+    type: int
+    first: int
+    second: int
+    id: int
+
+
+@wp.func
+def row_key(efc_type: int, efc_id: int, contact_geom: wp.array[wp.vec2i]) -> RowKey:
+    key = RowKey()
+    key.type = efc_type
+    if efc_type >= FIRST_CONTACT:
+        geoms = contact_geom[efc_id]
+        key.first = geoms[0]
+        key.second = geoms[1]
+    key.id = efc_id  # contacts of the same two geoms come from one thread, and so in their order
+    return key
+
+
+@wp.func
+def comes_before(a: RowKey, b: RowKey, otherwise: bool) -> bool:
+    if a.type != b.type:
+        return a.type < b.type
+    if a.first != b.first:
+        return a.first < b.first
+    if a.second != b.second:
+        return a.second < b.second
+    if a.id != b.id:
+        return a.id < b.id
+    return otherwise
+
+
+@wp.kernel(enable_backward=False)
+def rank_rows(
+    # Data in:
+    nefc_in: wp.array[int],
+    efc_type_in: wp.array2d[int],
+    efc_id_in: wp.array2d[int],
+    contact_geom_in: wp.array[wp.vec2i],
+    # Out:
+    rank_out: wp.array2d[int],
+):
+    """Counts the rows that come before each row: its place."""
+    world, row = wp.tid()
+    rows = wp.min(nefc_in[world], rank_out.shape[1])
+    if row >= rows:
+        return
+    key = row_key(efc_type_in[world, row], efc_id_in[world, row], contact_geom_in)
+    rank = int(0)
+    for other in range(rows):
+        other_key = row_key(efc_type_in[world, other], efc_id_in[world, other], contact_geom_in)
+        if comes_before(other_key, key, other < row):  # rows of one constraint stay in their order
+            rank += 1
+    rank_out[world, row] = rank
+
+
+@wp.kernel(enable_backward=False)
+def move_rows(
+    # Data in:
+    nefc_in: wp.array[int],
+    # In:
+    rank_in: wp.array2d[int],
+    # Out:
+    rows_out: wp.array3d[Any],
+):
+    """Moves a column of the rows to their places, in place: each cycle of the permutation from its least row."""
+    world, column = wp.tid()
+    for start in range(wp.min(nefc_in[world], rank_in.shape[1])):
+        row = rank_in[world, start]
+        while row > start:
+            row = rank_in[world, row]
+        if row < start:  # not the least of its cycle
+            continue
+        carried = rows_out[world, start, column]
+        row = rank_in[world, start]
+        while row != start:
+            left = rows_out[world, row, column]
+            rows_out[world, row, column] = carried
+            carried = left
+            row = rank_in[world, row]
+        rows_out[world, start, column] = carried
+
+
+@wp.kernel(enable_backward=False)
+def follow_rows(
+    # Data in:
+    nacon_in: wp.array[int],
+    contact_worldid_in: wp.array[int],
+    # In:
+    rank_in: wp.array2d[int],
+    # Data out:
+    contact_efc_address_out: wp.array2d[int],
+):
+    """Tells the contacts where their rows are now."""
+    contact, i = wp.tid()
+    if contact >= nacon_in[0]:
+        return
+    row = contact_efc_address_out[contact, i]
+    if row >= 0:
+        contact_efc_address_out[contact, i] = rank_in[contact_worldid_in[contact], row]
+
+
+class RowOrder:
+    """Puts the constraint rows of every world into the order of the model: by type, then joint, or pair of geoms.
+
+    Args:
+        model: the model.
+        data: the data whose rows :meth:`apply` moves, between ``mujoco_warp.step1`` and ``step2``.
+
+    Raises:
+        ValueError: the model has something else whose order is not fixed.
+    """
+
+    def __init__(self, model: mjw.Model, data: mjw.Data) -> None:
+        check_order(model)
+        self._data = data
+        self._rank = wp.zeros((data.nworld, data.njmax), dtype=int, device=data.qpos.device)
+        fields = [getattr(data.efc, name) for name in ROW_FIELDS]
+        self._rows = [data.efc.J, *(field.reshape((*field.shape, 1)) for field in fields)]
+
+    def apply(self) -> None:
+        """Launches the kernels."""
+        d, device = self._data, self._data.qpos.device
+        inputs = [d.nefc, d.efc.type, d.efc.id, d.contact.geom]
+        wp.launch(rank_rows, dim=self._rank.shape, inputs=inputs, outputs=[self._rank], device=device)
+        for rows in self._rows:
+            dim = rows.shape[0], rows.shape[2]
+            wp.launch(move_rows, dim=dim, inputs=[d.nefc, self._rank], outputs=[rows], device=device)
+        wp.launch(
+            follow_rows,
+            dim=d.contact.efc_address.shape,
+            inputs=[d.nacon, d.contact.worldid, self._rank],
+            outputs=[d.contact.efc_address],
+            device=device,
+        )
+
+
+def check_order(model: mjw.Model) -> None:
+    """Checks that constraint rows are all that arrives in any order before the solver starts.
+
+    Raises:
+        ValueError: they are not.
+    """
+    most = model.block_dim.contact_jac_tiled
+    others = {
+        "a sparse Jacobian": model.is_sparse,
+        "elliptic friction cones": model.opt.cone == mjw.ConeType.ELLIPTIC,
+        "gravity compensation": bool(model.body_gravcomp.numpy().any()),
+        "tendons": model.ntendon > 0,
+        "flexes": model.nflex > 0,
+        # Beyond it several blocks of threads add to one row.
+        f"more than {most} degrees of freedom": model.nv > most,
+    }
+    found = [name for name, here in others.items() if here]
+    if found:
+        raise ValueError(f"deterministic=True does not know models with {', '.join(found)}: leave it out")
