@@ -44,7 +44,7 @@ train.add_argument("--peer", action="store_true", help="train Brax's PPO too")
 train.add_argument("--path", type=Path, help="folder that the peer's packages were installed in")
 train.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 train.add_argument("--out", type=Path, help="file for the results as JSON")
-draw = commands.add_parser("plot", help="draw throughput against worlds from the JSON")
+draw = commands.add_parser("plot", help="draw throughput against worlds, or return against time, from the JSON")
 draw.add_argument("results", type=Path)
 draw.add_argument("picture", type=Path)
 

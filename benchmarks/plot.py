@@ -1,28 +1,52 @@
-"""A picture of throughput against the number of worlds."""
+"""Pictures of results: throughput against the number of worlds, or return against the time that training took."""
 
 import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import matplotlib
 
 matplotlib.use("agg")
 from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+
+from benchmarks.results import Row
 
 
 def plot(results: Path, picture: Path) -> None:
-    """Draws the rows of a results file, a panel for each body and a line for each case."""
+    """Draws the rows of a results file, a panel for each body or task and a line for each case or trainer."""
     data = json.loads(results.read_text())
-    rows = data["rows"]
-    bodies = list(dict.fromkeys(row["body"] for row in rows))
-    figure, panels = plt.subplots(1, len(bodies), figsize=(5.5 * len(bodies), 4.2), squeeze=False, layout="constrained")
-    for axes, body in zip(panels[0], bodies, strict=True):
-        axes.set(title=f"{body}, {data['device']}, {data['date']}", xlabel="worlds", ylabel="million steps per second")
-        axes.set_xscale("log", base=2)
+    panel, draw = ("task", draw_returns) if "trainer" in data["rows"][0] else ("body", draw_throughput)
+    names = distinct(data["rows"], panel)
+    figure, panels = plt.subplots(1, len(names), figsize=(5.5 * len(names), 4.2), squeeze=False, layout="constrained")
+    for axes, name in zip(panels[0], names, strict=True):
+        axes.set(title=f"{name}, {data['device']}, {data['date']}")
+        draw(axes, [row for row in data["rows"] if row[panel] == name])
         axes.grid(alpha=0.3)
-        for case in dict.fromkeys(row["case"] for row in rows):
-            of_case = [row for row in rows if row["body"] == body and row["case"] == case]
-            worlds = [row["worlds"] for row in of_case]
-            axes.plot(worlds, [row["worlds"] / row["ms"] / 1e3 for row in of_case], "o-", markersize=3, label=case)
         axes.set_ylim(bottom=0)
         axes.legend()
     figure.savefig(picture, dpi=150)
+
+
+def draw_throughput(axes: Axes, rows: Sequence[Row]) -> None:
+    """Draws steps per second against worlds."""
+    axes.set(xlabel="worlds", ylabel="million steps per second")
+    axes.set_xscale("log", base=2)
+    for case in distinct(rows, "case"):
+        of_case = [row for row in rows if row["case"] == case]
+        worlds = [row["worlds"] for row in of_case]
+        axes.plot(worlds, [row["worlds"] / row["ms"] / 1e3 for row in of_case], "o-", markersize=3, label=case)
+
+
+def draw_returns(axes: Axes, rows: Sequence[Row]) -> None:
+    """Draws the return of evaluations against the time since the process was started."""
+    axes.set(xlabel="seconds from the start of the process", ylabel="return of 1000 steps")
+    for trainer in distinct(rows, "trainer"):
+        found = [row for row in rows if row["trainer"] == trainer and "mean" in row]
+        seconds, means = [row["seconds"] for row in found], [row["mean"] for row in found]
+        axes.plot(seconds, means, "o-", markersize=3, label=trainer)
+
+
+def distinct(rows: Iterable[Row], key: str) -> list[str]:
+    """Returns the values under a key, each once, in order."""
+    return list(dict.fromkeys(row[key] for row in rows))

@@ -2,14 +2,17 @@
 
 import json
 import os
+from pathlib import Path
 
 import pytest
 import torch
 
-from benchmarks import fidelity, soak, timing
+from benchmarks import fidelity, plot, soak, timing
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
 from benchmarks.throughput import phases
+
+RESULTS = Path(__file__).parents[1] / "benchmarks/results/2026-11-21-h200"
 
 
 def rows(**ms):
@@ -69,6 +72,12 @@ def test_fidelity_is_measured_on_real_worlds(tmp_path, monkeypatch):
     assert first["playground", "converged"] > 10 * first["dm_control", "same settings"]
     fidelity.plot_fidelity(found, tmp_path / "fidelity.png")
     assert (tmp_path / "fidelity.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("results", ["throughput", "training/time-to-return"])
+def test_pictures_are_drawn_of_recorded_results(results, tmp_path):
+    plot.plot(RESULTS / f"{results}.json", tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
 def test_soak_holds_the_counters_against_what_happened(monkeypatch):

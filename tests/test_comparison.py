@@ -32,9 +32,17 @@ def test_what_it_says_of_ours_exists(path):
 @pytest.mark.parametrize(
     ("label", "folder", "file", "case", "worlds", "column", "digits"),
     [
-        ("torchrl_loco, `step_and_maybe_reset`", H200, "throughput", "env_step_and_maybe_reset", 8192, "ms", 2),
-        ("torchrl_loco in TorchRL's `Collector`", H200, "throughput", "torchrl_collector", 8192, "ms", 2),
-        ("plain loop of `mujoco_warp.step`", H200, "throughput", "bare_default", 8192, "ms", 2),
+        (
+            "torchrl_loco, `step_and_maybe_reset`",
+            H200,
+            "throughput-beside-peers",
+            "env_step_and_maybe_reset",
+            8192,
+            "ms",
+            2,
+        ),
+        ("torchrl_loco in TorchRL's `Collector`", H200, "throughput-beside-peers", "torchrl_collector", 8192, "ms", 2),
+        ("plain loop of `mujoco_warp.step`", H200, "throughput-beside-peers", "bare_default", 8192, "ms", 2),
         ("Playground 0.2.0, jitted step", H200, "peers", "playground", 8192, "ms", 1),
         ("TorchRL's `MujocoPlaygroundEnv`", H200, "peers", "playground_torchrl", 8192, "ms", 1),
         ("torchrl_loco, 256 worlds", CPU, "peers", "env_step_and_maybe_reset", 256, "thousand steps/s", 1),

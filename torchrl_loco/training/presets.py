@@ -62,12 +62,14 @@ SETTINGS: dict[tuple[str, str], Settings] = {
 }
 """By algorithm and kind of device."""
 
+NO_FLOOR: Settings = {"min_temperature": 1e-9}
+"""The weight of entropy may fall to nothing, where it was never seen to do harm."""
 TASKS: dict[tuple[str, str], Settings] = {
-    ("reppo", "walker_stand"): {"total_frames": 10_000_000},
-    ("reppo", "walker_walk"): {"total_frames": 10_000_000},
-    ("reppo", "walker_run"): {"total_frames": 52_000_000},
-    ("reppo", "humanoid_stand"): {"total_frames": 62_000_000},
-    ("reppo", "humanoid_walk"): {"total_frames": 62_000_000},
+    ("reppo", "walker_stand"): {"total_frames": 10_000_000, **NO_FLOOR},
+    ("reppo", "walker_walk"): {"total_frames": 10_000_000, **NO_FLOOR},
+    ("reppo", "walker_run"): {"total_frames": 52_000_000, **NO_FLOOR},
+    ("reppo", "humanoid_stand"): {"total_frames": 62_000_000, **NO_FLOOR},
+    ("reppo", "humanoid_walk"): {"total_frames": 62_000_000, **NO_FLOOR},
     ("reppo", "humanoid_run"): {"total_frames": 105_000_000, "final_lr": 0.1},
 }
 """What a task needs beside, by algorithm and task, on CUDA."""
