@@ -120,8 +120,11 @@ def test_wrong_shapes_and_cameras():
         env.render(width=0)
 
 
-def test_moving_to_another_device_is_refused():
+def test_moving_to_another_device_is_refused(monkeypatch):
     env = make("walker_walk", 2, "cpu")
     assert env.to("cpu") is env
     with pytest.raises(ValueError, match=r"choose one of cpu|cannot move"):
         env.to("cuda:5")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)  # also where there is one
+    with pytest.raises(ValueError, match="lives on cpu and cannot move"):
+        env.to("cuda:0")

@@ -76,6 +76,15 @@ def test_only_the_first_is_kept(file, actions):
     assert torch.equal(replay.load(file).tensors["qvel"], state["qvel"][BAD])
 
 
+def test_of_two_in_one_step_the_lower_is_kept(file):
+    env = made(file)
+    action = env.action_spec.zero()
+    action[1:4:2] = float("nan")
+    stepped(env, env.reset(), action)
+    with pytest.warns(NonFiniteWarning, match="world 1 "):
+        env.close()
+
+
 def test_it_is_written_while_stepping(device, file, actions):
     env = made(file, device)
     *_, td = drive(env, actions, bad_action)
@@ -121,18 +130,40 @@ def test_catching_changes_no_rollout(file, actions):
     assert torch.equal(td["observation"], expected["observation"])
 
 
-def test_warp_replays_what_happened_and_c_goes_its_own_way(file, actions):
+@pytest.mark.parametrize("substeps", [10, 5])
+def test_warp_replays_what_happened_and_c_goes_its_own_way(file, actions, substeps):
     """A state that is bad after the last substep was good before it; slow ones agree in both."""
-    env = made(file, protocol="dm_control")
+    env = made(file, protocol="dm_control", sim_dt=0.025 / substeps)
     drive(env, actions, bad_action)
     with pytest.warns(NonFiniteWarning):
         env.close()
     world = replay.load(file)
     world.tensors["action"][2] = 0.0  # mended, the step is an ordinary one
     warp, c = replay.warp_trace(world, "cpu"), replay.c_trace(world)
-    assert warp.shape == c.shape == (11, 18)
+    assert warp.shape == c.shape == (substeps + 1, 18)
     np.testing.assert_allclose(warp, c, atol=1e-3)
     assert np.abs(warp[-1] - warp[0]).max() > 1e-3
+
+
+def test_the_replay_goes_on_from_the_solvers_warm_start(file, actions):
+    """From a wrong one, the few iterations of ``playground`` do not lead all the way back."""
+
+    def astray(state, action):
+        state["qacc_warmstart"][BAD] = 1e4
+        bad_action(state, action)
+
+    env = made(file)
+    state, action, _ = drive(env, actions, astray)
+    action[BAD, 2] = 0.0
+    stepped(env, env.reset(state, set_state=True), action)
+    expected = env.get_state()["qvel"][BAD].numpy()
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    world = replay.load(file)
+    world.tensors["action"][2] = 0.0
+    np.testing.assert_array_equal(replay.warp_trace(world, "cpu")[-1, 9:], expected)
+    world.tensors["qacc_warmstart"].zero_()
+    assert (replay.warp_trace(world, "cpu")[-1, 9:] != expected).any()
 
 
 @pytest.mark.parametrize(("spoil", "told"), [(bad_action, "entry 2 is nan"), (too_fast, "C MuJoCo: not finite after")])

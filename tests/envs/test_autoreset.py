@@ -18,8 +18,9 @@ def play(env, moves, maybe_reset):
     for i, action in enumerate(moves):
         td = td.set("action", action).set("loc", torch.full_like(action, i + 1.0))
         td = env.step(td)
-        trace.append(td.clone())
-        td = maybe_reset(env._step_mdp(td))
+        after = maybe_reset(env._step_mdp(td))
+        trace.append(td.clone().set("carried", after.clone()))
+        td = after
     return torch.stack(trace)
 
 

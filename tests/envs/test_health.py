@@ -6,6 +6,7 @@ import warnings
 
 import pytest
 import torch
+from mujoco_warp import OverflowType
 from tensordict import TensorDict
 
 import torchrl_loco
@@ -45,6 +46,56 @@ def test_contacts_without_room_are_counted(device):
     found = fall(made(device, naconmax=2, on_overflow="ignore"))
     assert found["total", "contact_overflow"] > 20
     assert found["peak", "contacts"] > 2
+
+
+@pytest.mark.parametrize(
+    ("bits", "counter"),
+    [
+        (OverflowType.NEFC, "constraint_overflow"),
+        (OverflowType.NJMAX_NNZ, "constraint_overflow"),
+        (OverflowType.BROADPHASE, "contact_overflow"),
+        (OverflowType.NARROWPHASE, "contact_overflow"),
+        (OverflowType.CCD, "contact_overflow"),
+        (OverflowType.ITERATIONS, "iteration_limit"),
+        (OverflowType.LS_ITERATIONS, "line_search_limit"),
+    ],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_each_bit_counts_once_and_in_its_world(bits, counter):
+    """In the air, where nothing else is lost: a bit that a physics step sets counts in this control step alone."""
+    env = made("cpu", protocol="dm_control", on_overflow="ignore")
+    env.reset()
+    state = env.get_state()
+    state["qpos"][:, 2] = 50.0
+    td = env.reset(state, set_state=True)
+    env.sim.overflow[2] = int(bits)
+    for _ in range(3):
+        td = env.step(td.set("action", env.action_spec.zero()))["next"]
+    counts = env.health()["worlds"]
+    assert {name: count.tolist() for name, count in counts.items() if count.any()} == {counter: [0, 0, 1, 0]}
+
+
+def test_peaks_hold_for_all_steps():
+    """A lying capsule has two contacts in one pair, limbs that pass each other have none: both need room."""
+    env = made("cpu")
+    td, contacts, pairs, rows = env.reset(), [0], [0], [0]
+    for _ in range(80):
+        td = env.step(td.set("action", env.action_spec.zero()))["next"]
+        contacts.append(int(env.sim.data.nacon.numpy()[0]))
+        pairs.append(int(env.sim.data.ncollision.numpy()[0]))
+        rows.append(int(env.sim.data.nefc.numpy().max()))
+        peak = env.health()["peak"]
+        assert peak["contacts"] >= max(contacts + pairs)
+        assert peak["constraints"] >= max(rows)
+    assert any(some > max(pairs[: i + 1]) for i, some in enumerate(contacts))
+    assert max(rows) > rows[-1]
+
+
+def test_ignored_is_ignored_where_it_is_looked_for():
+    env = made("cpu", njmax=5, on_overflow="ignore")
+    assert fall(env, INTERVAL + 1)["total", "constraint_overflow"] > 0
+    env._health.check()
+    env.close()
 
 
 @pytest.mark.parametrize("field", ["njmax", "naconmax"])

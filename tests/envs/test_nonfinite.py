@@ -39,12 +39,24 @@ def test_bad_action_ends_only_its_world(task, protocol, device, actions, bad):
     mask = {"_reset": ended, "done": ended}
     td = env.reset(after.exclude("reward").update(mask))
     twin_td = twin.reset(expected.exclude("reward").update(mask))
+    torch.testing.assert_close(td["observation"], twin_td["observation"], **exact)
     for action in more:
         td, twin_td = step_all(env, td, action), step_all(twin, twin_td, action)
         torch.testing.assert_close(td["observation"], twin_td["observation"], **exact)
         torch.testing.assert_close(td["reward"], twin_td["reward"], **exact)
         assert not td["terminated"].any()
         td, twin_td = td.exclude("reward"), twin_td.exclude("reward")
+
+
+def test_a_bad_action_is_stepped_with_zeros(task, actions):
+    """All of it, so that the state stays one that can be looked at."""
+    env, twin = (torchrl_loco.make(task, 3, "cpu", seed=2) for _ in range(2))
+    good, expected = actions(env, 1)[0], actions(env, 1)[0]
+    good[1, 2], expected[1] = torch.nan, 0.0
+    step_all(env, env.reset(), good)
+    step_all(twin, twin.reset(), expected)
+    for field in ("qpos", "qvel"):
+        assert torch.equal(getattr(env.sim, field), getattr(twin.sim, field))
 
 
 @pytest.mark.parametrize("field", ["qpos", "qvel"])
@@ -67,6 +79,17 @@ def test_exploding_state_ends_only_its_world(task, protocol, actions, field):
         td, twin_td = step_all(env, td, action), step_all(twin, twin_td, action)
         assert torch.equal(td["observation"], twin_td["observation"])
         td, twin_td = td.exclude("reward"), twin_td.exclude("reward")
+
+
+@pytest.mark.parametrize("field", ["J", "D"])
+def test_a_reset_leaves_nothing_of_constraints_that_were_not_finite(protocol, field):
+    """The solver multiplies rows that are not in use by zero: a NaN would stay one."""
+    env, twin = (torchrl_loco.make("walker_walk", 4, "cpu", seed=0, protocol=protocol) for _ in range(2))
+    wp.to_torch(getattr(env.sim.data.efc, field)).fill_(torch.nan)
+    td, twin_td = env.reset(), twin.reset()
+    for _ in range(3):
+        td, twin_td = (step_all(e, t, e.action_spec.one() / 2) for e, t in ((env, td), (twin, twin_td)))
+        assert torch.equal(td["observation"], twin_td["observation"])
 
 
 def test_a_world_left_ill_stays_ended_and_harms_nobody(actions):

@@ -103,8 +103,9 @@ def test_a_world_draws_from_seed_world_and_episode_alone(task, protocol, device)
     assert torch.equal(few, many[:, :3])
     assert torch.equal(few, draws(task, 3, 3, seed=9, protocol=protocol, device=device))
     assert not torch.equal(few, draws(task, 3, 3, seed=10, protocol=protocol, device=device))
-    starts = many.reshape(-1, many.shape[-1])
-    assert len(starts.unique(dim=0)) == len(starts)  # no world or episode repeats another
+    neighbour = draws(task, 64, 3, seed=10, protocol=protocol, device=device)
+    starts = torch.cat([many, neighbour]).reshape(-1, many.shape[-1])
+    assert len(starts.unique(dim=0)) == len(starts)  # no seed, world or episode repeats another
 
     # Episodes count by world: whoever is reset alone draws what it would have drawn with the others.
     env = torchrl_loco.make(task, 3, device, seed=9, protocol=protocol)

@@ -18,6 +18,7 @@ from torch import nn
 from torchrl.collectors import Collector
 
 import torchrl_loco
+from torchrl_loco.sim import EXCLUSIVE
 
 WORLDS = 4
 
@@ -69,6 +70,20 @@ def test_threads_make_step_and_render_at_once(device, actions):
         for (result, lit), single in zip(pool.map(work, range(4)), expected, strict=True):
             assert_repeats(result, single)
             assert lit
+
+
+@pytest.mark.parametrize("work", ["reset", "render"])
+def test_one_at_a_time_on_the_cpu(work):
+    """While another thread works, a step or a picture waits for its turn."""
+    env = made()
+    env.reset()
+    env.render()
+    with ThreadPoolExecutor(1) as pool:
+        with EXCLUSIVE:
+            waiting = pool.submit(getattr(env, work))
+            with pytest.raises(TimeoutError):
+                waiting.result(timeout=0.5)
+        waiting.result(timeout=60)
 
 
 def test_a_pickled_creator_makes_the_same():

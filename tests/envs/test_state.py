@@ -181,6 +181,8 @@ def test_branches_are_copies(task, actions):
     other = torchrl_loco.make(task, 7, "cpu", seed=0)
     other.reset(state.branch(-1, 7), set_state=True)
     assert torch.equal(other.get_state()["qpos"], state["qpos"][-1:].expand(7, -1))
+    branch["qpos"][0] += 1.0  # a future of its own
+    assert (branch["qpos"][0] != branch["qpos"][1]).all()
     with pytest.raises(IndexError):
         state.branch(4)
 

@@ -7,6 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import torchrl_loco
 from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training import preset
+from torchrl_loco.training.algorithm import clip_and_step
 from torchrl_loco.training.ppo import PPO
 
 
@@ -85,6 +86,57 @@ def test_updates_raise_what_is_rewarded():
         means.append(ppo.actor.get_dist(batch).deterministic_sample.mean(dim=(0, 1)))
     assert means[-1][0] > 0.2
     assert means[-1][1:].abs().max() < means[-1][0] / 2
+
+
+def test_advantages_count_relative_to_each_other():
+    """What is added to all of a minibatch, or multiplies all, changes nothing: they are normalised."""
+    ppo = made(num_envs=8, decisions=8, minibatch_size=64)
+    with torch.no_grad():
+        data = ppo.prepare(collected(ppo, 8)).reshape(-1)
+    data["action_log_prob"] += torch.linspace(-0.1, 0.1, 64)  # as if the policy had moved on
+    loss = ppo.loss(data)["loss_objective"]
+    data["advantage"] = 1e3 * data["advantage"] + 5e2
+    assert loss.abs() > 1e-3
+    torch.testing.assert_close(ppo.loss(data)["loss_objective"], loss, rtol=1e-3, atol=0)
+
+
+def test_entropy_is_rewarded():
+    """With nothing else to gain, actions spread."""
+    ppo = made(num_envs=8, decisions=8, minibatch_size=64, entropy_coeff=1.0, init_std=0.3, lr=1e-2)
+    batch = collected(ppo, 8)
+    batch["next", "reward"].zero_()
+    before = batch["scale"].mean()
+    for _ in range(5):
+        ppo.update(batch, progress=0.0)
+    assert ppo.actor.get_dist(batch).base_dist.stddev.mean() > 1.02 * before
+
+
+def test_a_rest_smaller_than_a_minibatch_is_left_out():
+    """Of nine decisions, minibatches of four take eight, other ones in each epoch, and none twice in one."""
+    ppo, seen = made(num_envs=3, decisions=3, epochs=2, minibatch_size=4), []
+    ppo.gradient_step = lambda minibatch: seen.append(minibatch["observation"]) or [torch.zeros(())] * 6
+    ppo.update(collected(ppo, 3), progress=0.0)
+    assert [len(minibatch) for minibatch in seen] == [4] * 4
+    for epoch in (seen[:2], seen[2:]):
+        assert len(torch.cat(epoch).unique(dim=0)) == 8
+
+
+def test_the_norm_waits_for_the_gradient_steps():
+    """Else probabilities would be compared with those that were seen through another norm."""
+    ppo, seen = made(num_envs=2, decisions=4), []
+    ppo.gradient_step = lambda minibatch: seen.append(ppo.norm.count.item()) or [torch.zeros(())] * 6
+    ppo.update(collected(ppo, 2), progress=0.0)
+    assert (seen, ppo.norm.count) == ([0.0, 0.0], 8.0)
+
+
+def test_gradients_are_clipped_to_a_norm():
+    parameter = torch.nn.Parameter(torch.zeros(4))
+    optimizer = torch.optim.SGD([parameter], lr=1.0)
+    for length, step in ((6.0, 1.5), (1.0, 1.0)):
+        parameter.data.zero_()
+        parameter.grad = torch.full((4,), length / 2)
+        torch.testing.assert_close(clip_and_step(optimizer, 1.5), torch.tensor(length))
+        torch.testing.assert_close(parameter.norm(), torch.tensor(step), rtol=1e-4, atol=0)
 
 
 def test_learning_rate_falls_to_nothing():

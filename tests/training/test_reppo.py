@@ -114,6 +114,16 @@ def test_updates_raise_what_is_rewarded():
     assert mean[1:].mean().abs() < mean[0] / 2
 
 
+def test_nothing_is_foreseen_beyond_a_termination():
+    reppo = made(num_envs=16, decisions=8, minibatch_size=128)
+    with torch.no_grad():
+        data = reppo.prepare(collected(reppo, 16)).reshape(-1)
+    data["features"][::2] = 1e3
+    assert reppo._critic_step(data)[1] > 1e5
+    data["alive"][::2] = 0.0
+    assert reppo._critic_step(data)[1] < 10.0
+
+
 def test_the_actor_is_drawn_back_where_it_went_too_far():
     """With a bound that is always exceeded, the critic's gradient counts for nothing."""
     reppo = made(num_envs=16, decisions=8, minibatch_size=128, kl_bound=1e-12, init_kl_weight=1.0, lr=1e-3)
@@ -164,4 +174,4 @@ def test_temperature_does_not_fall_below_its_least_value():
     floor = {"init_temperature": 0.02, "min_temperature": 0.02}
     reppo = made(num_envs=16, decisions=8, minibatch_size=128, target_entropy=-50.0, **floor)
     reppo.update(collected(reppo, 16), progress=0.0)
-    torch.testing.assert_close(reppo.weights.temperature.detach(), torch.tensor(0.02))
+    torch.testing.assert_close(reppo.weights.temperature.detach(), torch.tensor(0.02), rtol=1e-6, atol=0)

@@ -1,9 +1,11 @@
 """A whole run, small: what it leaves behind, and what can be done with it."""
 
+import contextlib
 import csv
 import itertools
 import json
 import math
+import os
 import shutil
 import signal
 
@@ -15,7 +17,7 @@ from matplotlib.axes import Axes
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torchrl_loco
-from torchrl_loco import cli
+from torchrl_loco import NonFiniteWarning, cli, replay
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import RunFolder, Trainer, evaluate_run, plot_runs, preset, trainer
 from torchrl_loco.training.algorithm import Algorithm
@@ -441,6 +443,30 @@ def test_a_run_needs_a_checkpoint_of_this_version(run, tmp_path):
     torch.save({"version": 0}, folder / "checkpoint.pt")
     with pytest.raises(ValueError, match="has version 0, this release reads 2"):
         Trainer(RunFolder(folder), resume=True)
+
+
+def test_a_checkpoint_executes_nothing(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "executed"),)
+
+    run = made(tmp_path)
+    run.save_checkpoint({"frames": 0, "rng": Trap()})
+    with pytest.raises(ValueError, match="cannot be read as a checkpoint"):
+        Trainer(run, resume=True)
+    assert not (tmp_path / "executed").exists()
+
+
+def test_a_run_keeps_its_first_bad_world(tmp_path):
+    run, found = made(tmp_path, action_repeat=1), []
+    for told in (pytest.warns(NonFiniteWarning), contextlib.nullcontext()):  # the second time as when resumed
+        env = Trainer(run).env
+        env.step(env.reset().set("action", torch.full((4, 6), torch.nan)))
+        with told:
+            env.close()
+        found.append(run.bad_world.read_bytes())
+    assert found[0] == found[1]
+    assert replay.load(run.bad_world).settings["num_envs"] == 4
 
 
 def test_unwritable_folder_is_reported_before_training(tmp_path):
