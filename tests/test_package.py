@@ -71,6 +71,12 @@ def test_public_names_are_imported_when_they_are_asked_for():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
+def test_a_module_may_be_imported_before_the_rest():
+    """As unpickling does in a worker: what makes an environment is looked for in its module."""
+    code = "import pickle, torchrl_loco.registry as r; assert pickle.loads(pickle.dumps(r.make)) is r.make"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
 def test_public_names_are_those_that_are_imported():
     own = {name for name in vars(_api) if not name.startswith("_")}
     assert own == {*torchrl_loco.__all__} - {"__version__"}

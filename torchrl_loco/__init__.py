@@ -1,6 +1,6 @@
 """TorchRL environments for dm_control's locomotion tasks, stepped by MuJoCo-Warp thousands of worlds at a time."""
 
-import importlib
+import importlib.util
 from typing import TYPE_CHECKING, Any
 
 from torchrl_loco import _versions
@@ -35,18 +35,18 @@ __all__ = [
 if not TYPE_CHECKING:  # to a type checker it would mean that there is every name
 
     def __getattr__(name: str) -> Any:
-        """Imports everything once anything is asked for: torch and Warp take seconds, and not all commands need them.
+        """Imports what is public once any is asked for: torch and Warp take seconds, and not all commands need them.
 
         Returns:
-            What goes by the name: something public, or a module that is imported with it.
+            What goes by the name: something public, or a module of the package, which is imported alone.
 
         Raises:
             AttributeError: there is no such name.
         """
-        api = importlib.import_module("torchrl_loco._api")
-        for names in (vars(api), globals()):
-            if name in names:
-                return names[name]
+        if name in __all__:
+            return getattr(importlib.import_module(f"{__name__}._api"), name)
+        if importlib.util.find_spec(f"{__name__}.{name}") is not None:
+            return importlib.import_module(f"{__name__}.{name}")
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
     def __dir__() -> list[str]:
