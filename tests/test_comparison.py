@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/comparison.md").read_text()
 BODY, EVIDENCE = PAGE.split("\n## Evidence\n")
 H200, CPU = "2026-11-21-h200", "2026-11-21-cpu"
+BESIDE = "throughput-beside-peers"
 
 
 def test_every_mark_has_its_evidence():
@@ -32,17 +33,9 @@ def test_what_it_says_of_ours_exists(path):
 @pytest.mark.parametrize(
     ("label", "folder", "file", "case", "worlds", "column", "digits"),
     [
-        (
-            "torchrl_loco, `step_and_maybe_reset`",
-            H200,
-            "throughput-beside-peers",
-            "env_step_and_maybe_reset",
-            8192,
-            "ms",
-            2,
-        ),
-        ("torchrl_loco in TorchRL's `Collector`", H200, "throughput-beside-peers", "torchrl_collector", 8192, "ms", 2),
-        ("plain loop of `mujoco_warp.step`", H200, "throughput-beside-peers", "bare_default", 8192, "ms", 2),
+        ("torchrl_loco, `step_and_maybe_reset`", H200, BESIDE, "env_step_and_maybe_reset", 8192, "ms", 2),
+        ("torchrl_loco in TorchRL's `Collector`", H200, BESIDE, "torchrl_collector", 8192, "ms", 2),
+        ("plain loop of `mujoco_warp.step`", H200, BESIDE, "bare_default", 8192, "ms", 2),
         ("Playground 0.2.0, jitted step", H200, "peers", "playground", 8192, "ms", 1),
         ("TorchRL's `MujocoPlaygroundEnv`", H200, "peers", "playground_torchrl", 8192, "ms", 1),
         ("torchrl_loco, 256 worlds", CPU, "peers", "env_step_and_maybe_reset", 256, "thousand steps/s", 1),
