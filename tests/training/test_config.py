@@ -59,7 +59,7 @@ def test_wrong_settings_of_reppo(overrides, message):
         REPPOConfig("walker_stand", **overrides)
 
 
-@pytest.mark.parametrize("mended", [{"minibatch_size": 224}, {"decisions": 74}])
+@pytest.mark.parametrize("mended", [{"minibatch_size": 224}, {"decisions": 37}])
 def test_few_worlds_need_smaller_minibatches_or_more_decisions(mended):
     """What the error above says to pass is enough, and no more than enough."""
     (name, value), *_ = mended.items()

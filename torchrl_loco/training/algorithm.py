@@ -63,7 +63,7 @@ class Algorithm(ABC):
         """
         on_cuda = self.device.type == "cuda"
         lr = torch.tensor(self.config.lr, device=self.device)
-        optimizer = torch.optim.Adam(parameters, lr=lr, eps=1e-5, capturable=on_cuda, fused=on_cuda or None)
+        optimizer = torch.optim.Adam(parameters, lr=lr, eps=1e-5, capturable=on_cuda, fused=True)
         self.optimizers[name] = optimizer
         return optimizer
 

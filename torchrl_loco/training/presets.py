@@ -11,7 +11,13 @@ from torchrl_loco.training.config import CONFIGS, TrainingConfig
 
 Settings = dict[str, Any]
 
-PPO_ON_CPU: Settings = {}
+PPO_ON_CPU: Settings = {
+    "num_envs": 32,
+    "total_frames": 330_000,
+    "action_repeat": 2,
+    "lr": 2e-3,
+    "minibatch_size": 256,
+}
 PPO_ON_CUDA: Settings = {
     "num_envs": 4096,
     "decisions": 16,
