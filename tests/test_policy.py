@@ -31,6 +31,12 @@ def test_round_trip(policy, tmp_path):
     assert env.rollout(3, again)["action"].abs().max() <= 1
 
 
+def test_others_may_read_what_they_may_read_of_any_file(policy, tmp_path):
+    (tmp_path / "any").touch()
+    policy.save(tmp_path / "policy.safetensors")  # safetensors' own writer would keep it private
+    assert (tmp_path / "policy.safetensors").stat().st_mode == (tmp_path / "any").stat().st_mode
+
+
 def test_what_cannot_be_read_is_told(policy, tmp_path):
     with pytest.raises(FileNotFoundError, match="there is no policy"):
         Policy.load(tmp_path / "none.safetensors", "cpu")

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 try:
     import tyro
 except ImportError as error:  # the environments work without the extra, the command does not
-    raise SystemExit(f"torchrl-loco: {error}. Install what it needs: pip install 'torchrl-loco[train]'") from None
+    hint = "pip install 'torchrl-loco[train]', or in a checkout pip install '.[train]'"
+    raise SystemExit(f"torchrl-loco: {error}. Install what it needs: {hint}") from None
 
 CONTAINERS = (".mp4", ".mkv", ".mov")
 """What the file of a video can be."""
@@ -219,7 +220,8 @@ def main(args: Sequence[str] | None = None) -> int:
     def train(config: Annotated[task_config, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]
         """Train a policy: evaluation, learning curve and video included.
 
-        --algorithm ppo or reppo, and --device, choose among the presets before all other options.
+        One more option may stand anywhere on the line: --algorithm, ppo or reppo. Together with the task and --device
+        it chooses the preset, which is what the other options change.
         """
         with _user_errors():
             trainer = _begin(config)

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as serialize
 
 VERSION = 1
 
@@ -23,7 +23,7 @@ def save(path: Path, kind: str, tensors: dict[str, torch.Tensor], settings: dict
     """
     metadata = {"format": _format(kind), **{name: json.dumps(value) for name, value in settings.items()}}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    save_file(tensors, path, {**metadata, "sha256": digest(tensors, metadata)})
+    Path(path).write_bytes(serialize(tensors, {**metadata, "sha256": digest(tensors, metadata)}))
 
 
 def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

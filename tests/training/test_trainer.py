@@ -208,7 +208,7 @@ def test_evaluations_during_training(tmp_path):
     assert [row["frames"] for row in run.read_evaluations()] == [256, 512, 768, 1024]
 
 
-def test_the_best_policy_is_kept(tmp_path, monkeypatch):
+def test_the_best_policy_is_kept(tmp_path, monkeypatch, capsys):
     """Of three evaluations the second is the best: its policy is what the run leaves, evaluated in new episodes."""
     means, seeds = iter([10.0, 30.0, 20.0, 25.0]), []
     make_evaluator = trainer.make_evaluator
@@ -223,6 +223,9 @@ def test_the_best_policy_is_kept(tmp_path, monkeypatch):
     info = Policy.load(run.policy, "cpu").info
     assert (info["frames"], info["mean"]) == (512, 25.0)
     assert seeds[0] != seeds[1]
+    told = capsys.readouterr().out
+    assert "best policy, evaluated anew: return 25.0" in told
+    assert str(run.path) in told
 
 
 def test_policy_of_a_run_is_its_actor(run):

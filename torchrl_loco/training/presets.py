@@ -17,6 +17,7 @@ PPO_ON_CPU: Settings = {
     "action_repeat": 2,
     "lr": 2e-3,
     "minibatch_size": 256,
+    "video_seconds": 5.0,
 }
 PPO_ON_CUDA: Settings = {
     "num_envs": 4096,

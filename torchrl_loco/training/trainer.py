@@ -155,7 +155,7 @@ class Trainer:
             record(policy, env, self.run.video, config.video_seconds, config.action_repeat)
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
-        print(describe(summary))
+        print(f"best policy, evaluated anew: {describe(summary)}\nrun folder: {self.run.path}")
 
     def save(self) -> None:
         """Writes the checkpoint: all that an exact continuation needs."""
