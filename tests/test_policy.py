@@ -1,5 +1,7 @@
 """Policies on disk: small, exact enough, and safe to load."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -35,6 +37,21 @@ def test_others_may_read_what_they_may_read_of_any_file(policy, tmp_path):
     (tmp_path / "any").touch()
     policy.save(tmp_path / "policy.safetensors")  # safetensors' own writer would keep it private
     assert (tmp_path / "policy.safetensors").stat().st_mode == (tmp_path / "any").stat().st_mode
+
+
+def test_a_write_that_breaks_off_leaves_what_was_there(policy, tmp_path, monkeypatch):
+    def disk_full(path, data):
+        with path.open("wb") as file:
+            file.write(data[:100])
+        raise OSError("no space left")
+
+    path = tmp_path / "policy.safetensors"
+    policy.save(path)
+    before = path.read_bytes()
+    monkeypatch.setattr(Path, "write_bytes", disk_full)
+    with pytest.raises(OSError, match="no space left"):
+        policy.save(path)
+    assert path.read_bytes() == before
 
 
 def test_what_cannot_be_read_is_told(policy, tmp_path):

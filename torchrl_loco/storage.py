@@ -23,7 +23,9 @@ def save(path: Path, kind: str, tensors: dict[str, torch.Tensor], settings: dict
     """
     metadata = {"format": _format(kind), **{name: json.dumps(value) for name, value in settings.items()}}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    Path(path).write_bytes(serialize(tensors, {**metadata, "sha256": digest(tensors, metadata)}))
+    part = Path(f"{path}.part")  # a write that breaks off leaves the file as it was
+    part.write_bytes(serialize(tensors, {**metadata, "sha256": digest(tensors, metadata)}))
+    part.replace(path)
 
 
 def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
