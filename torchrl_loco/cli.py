@@ -93,8 +93,7 @@ def resume(run: tyro.conf.Positional[Path], /) -> None:
         from torchrl_loco import training
 
         trainer = training.Trainer(training.RunFolder(run), resume=True)
-    with _user_errors(OSError):
-        trainer.train()
+    _train(trainer)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -225,8 +224,7 @@ def main(args: Sequence[str] | None = None) -> int:
         """
         with _user_errors():
             trainer = _begin(config)
-        with _user_errors(OSError):  # a full disk; anything else in here is a bug and keeps its traceback
-            trainer.train()
+        _train(trainer)
 
     try:
         tyro.extras.subcommand_cli_from_dict(
@@ -279,6 +277,13 @@ def _begin(config: "training.TrainingConfig") -> "training.Trainer":
         print(f"{config.task}: {training.UNTUNED}")
     print(f"run folder: {run.path}")
     return training.Trainer(run)
+
+
+def _train(trainer: "training.Trainer") -> None:
+    """Trains to the last frame and prints where everything lies."""
+    with _user_errors(OSError):  # a full disk; anything else in here is a bug and keeps its traceback
+        trainer.train()
+    print(f"policy, curve and all else: {trainer.run.path}")
 
 
 @contextlib.contextmanager

@@ -155,7 +155,7 @@ class Trainer:
             record(policy, env, self.run.video, config.video_seconds, config.action_repeat)
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
-        print(f"best policy, evaluated anew: {describe(summary)}\nrun folder: {self.run.path}")
+        print(f"best policy, evaluated anew: {describe(summary)}")
 
     def save(self) -> None:
         """Writes the checkpoint: all that an exact continuation needs."""
