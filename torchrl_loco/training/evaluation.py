@@ -130,7 +130,7 @@ def view(policy: Policy, env: LocoEnv, action_repeat: int = 1) -> None:
 def _play(policy: Policy, env: LocoEnv, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
     """Yields what each of so many frames from a reset brings, with every action held for ``action_repeat`` of them."""
     td = env.reset()
-    for frame in trange(frames, desc=label, leave=False):
+    for frame in trange(frames, desc=label, leave=False, disable=None):  # in a log, a line a run is enough
         if frame % action_repeat == 0:
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 td = policy(td)
