@@ -488,15 +488,15 @@ def test_a_full_disk_is_reported_before_training(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_learns_to_stand(tmp_path):
-    """A third of the default run lifts the walker well above what an untrained policy gets.
+    """Half of the default run lifts the walker well above what an untrained policy gets.
 
-    Seen: 120 to 142 untrained (six seeds), 299 and 320 trained (seed 0, twice 32 episodes; others learn faster).
+    Seen: 120 to 142 untrained (six seeds), 611 trained; 340 and 882 of 150,000 frames (two seeds).
     """
     untrained = trained(tmp_path, total_frames=128, hidden=(128, 128), lr=1e-9, eval_episodes=32, video_seconds=0.0)
-    run = RunFolder.create(preset("walker_stand", "cpu", out=tmp_path, total_frames=100_000, video_seconds=0.0))
+    run = RunFolder.create(preset("walker_stand", "cpu", out=tmp_path, total_frames=180_000, video_seconds=0.0))
     Trainer(run).train()
     assert evaluate_run(untrained)["mean"] < 180
-    assert evaluate_run(run)["mean"] > 230
+    assert evaluate_run(run)["mean"] > 300
 
 
 def test_torchs_settings_are_put_back(tmp_path, monkeypatch):
