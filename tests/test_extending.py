@@ -15,7 +15,7 @@ from oracle import DATA, reference_model, tolerance
 from torchrl.envs import check_env_specs
 
 import torchrl_loco
-from torchrl_loco import State, cli, doctor, models, registry
+from torchrl_loco import State, cli, doctor, ids, models, registry
 from torchrl_loco.envs.checks import check_model
 
 ROOT = Path(__file__).parents[1]
@@ -43,11 +43,11 @@ def discover(monkeypatch):
 
     def add(path):
         monkeypatch.syspath_prepend(str(path))
-        registry.plugins.cache_clear()
+        ids.plugins.cache_clear()
 
     yield add
     monkeypatch.undo()
-    registry.plugins.cache_clear()
+    ids.plugins.cache_clear()
 
 
 @pytest.fixture
@@ -300,7 +300,7 @@ def distribution(path, name, entry_points, module=""):
     info = path / f"{name}-1.2.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.2\n")
-    (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\n{entry_points}\n")
+    (info / "entry_points.txt").write_text(f"[{ids.GROUP}]\n{entry_points}\n")
 
 
 @pytest.mark.parametrize(

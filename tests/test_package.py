@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 import torchrl_loco
-from torchrl_loco import _api, _versions
+from torchrl_loco import _versions
 
 ROOT = Path(torchrl_loco.__file__).parent
 LAYERS = [  # a module imports from its own layer or from those before it
-    {"config", "rewards", "models", "storage", "_versions"},
+    {"config", "checks", "ids", "rewards", "models", "storage", "_lazy", "_versions"},
     {"sim"},
     {"rendering"},
     {"envs"},
@@ -77,9 +77,10 @@ def test_a_module_may_be_imported_before_the_rest():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
-def test_public_names_are_those_that_are_imported():
-    own = {name for name in vars(_api) if not name.startswith("_")}
-    assert own == {*torchrl_loco.__all__} - {"__version__"}
+@pytest.mark.parametrize("package", [torchrl_loco, torchrl_loco.training], ids=lambda package: package.__name__)
+def test_public_names_are_those_that_are_imported(package):
+    own = {name for name in vars(package._api) if not name.startswith("_")}
+    assert own == {*package.__all__} - {"__version__"} <= set(dir(package))
 
 
 def test_public_names_have_docstrings():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchrl_loco
-from torchrl_loco import SimConfig, list_envs, make
+from torchrl_loco import SimConfig, ids, list_envs, make, registry
 from torchrl_loco.config import DEFAULTS, sim_config
 
 EXPECTED = {
@@ -17,6 +17,11 @@ EXPECTED = {
 
 def test_six_environments():
     assert list_envs()[:6] == [f"{body}_{goal}" for body in ("walker", "humanoid") for goal in ("stand", "walk", "run")]
+
+
+def test_ids_are_those_of_the_classes_and_say_what_they_ask_for():
+    """Two tables, because an id and what it asks for are told without the seconds that its class takes to import."""
+    assert {name: cls.__doc__.split("\n")[0] for name, cls in registry.ENVS.items()} == ids.OURS
 
 
 def test_classes_aliases_and_sizes(task):

@@ -1,9 +1,9 @@
 """TorchRL environments for dm_control's locomotion tasks, stepped by MuJoCo-Warp thousands of worlds at a time."""
 
-import importlib.util
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from torchrl_loco import _versions
+from torchrl_loco._lazy import lazy
 
 if TYPE_CHECKING:
     from torchrl_loco._api import *
@@ -33,24 +33,6 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:  # to a type checker it would mean that there is every name
-
-    def __getattr__(name: str) -> Any:
-        """Imports what is public once any is asked for: torch and Warp take seconds, and not all commands need them.
-
-        Returns:
-            What goes by the name: something public, or a module of the package, which is imported alone.
-
-        Raises:
-            AttributeError: there is no such name.
-        """
-        if name in __all__:
-            return getattr(importlib.import_module(f"{__name__}._api"), name)
-        if importlib.util.find_spec(f"{__name__}.{name}") is not None:
-            return importlib.import_module(f"{__name__}.{name}")
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-    def __dir__() -> list[str]:
-        return sorted({*globals(), *__all__})
-
+    __getattr__, __dir__ = lazy(__name__, __all__)
 
 _versions.warn_if_untested()

@@ -14,7 +14,7 @@ from torchrl_loco.envs import WalkerWalk as WalkerWalk
 from torchrl_loco.envs.bad_world import NonFiniteWarning as NonFiniteWarning
 from torchrl_loco.envs.health import PhysicsOverflowError as PhysicsOverflowError
 from torchrl_loco.envs.health import PhysicsOverflowWarning as PhysicsOverflowWarning
+from torchrl_loco.ids import list_envs as list_envs
 from torchrl_loco.policy import Policy as Policy
 from torchrl_loco.policy import load_policy as load_policy
-from torchrl_loco.registry import list_envs as list_envs
 from torchrl_loco.registry import make as make

@@ -113,7 +113,7 @@ class Video:
 
     def check(self) -> None:
         """Refuses what cannot be shown, before anything is printed or made."""
-        from torchrl_loco.envs.checks import check_device, check_folder, check_seed
+        from torchrl_loco.checks import check_device, check_folder, check_seed
 
         if not 0 < self.seconds < math.inf:
             raise ValueError(f"seconds must be positive and finite, got {self.seconds}")
@@ -190,7 +190,7 @@ def replay(file: tyro.conf.Positional[Path], /, device: str | None = None) -> No
     """
     with _user_errors():
         from torchrl_loco import replay as replays
-        from torchrl_loco.envs.checks import check_device
+        from torchrl_loco.checks import check_device
 
         check_device(device)  # before the first line
         for line in replays.describe(replays.load(file), device):

@@ -15,7 +15,8 @@ from tqdm.auto import trange
 
 import torchrl_loco
 from torchrl_loco.envs.health import advise
-from torchrl_loco.registry import env_class, list_envs, make
+from torchrl_loco.ids import list_envs
+from torchrl_loco.registry import env_class, make
 
 PACKAGES = ("torch", "torchrl", "tensordict", "warp-lang", "mujoco-warp", "mujoco")
 TOLERANCE = 1e-4

@@ -8,8 +8,8 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from torchrl_loco import storage
-from torchrl_loco.envs.checks import check_device
-from torchrl_loco.registry import canonical_id
+from torchrl_loco.checks import check_device
+from torchrl_loco.ids import canonical_id
 
 SHIPPED = Path(__file__).parent / "policies"
 

@@ -1,18 +1,14 @@
-"""From an id to an environment: ours, and those that other distributions register."""
+"""From an id to an environment."""
 
 import contextlib
-import functools
-import re
-import warnings
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from torchrl_loco import envs
-from torchrl_loco.config import suggestion
 from torchrl_loco.envs.checks import check_subclass
+from torchrl_loco.ids import canonical_id, list_envs, origin, plugins
 
 ENVS: dict[str, type[envs.LocoEnv]] = {
     "walker_stand": envs.WalkerStand,
@@ -22,56 +18,6 @@ ENVS: dict[str, type[envs.LocoEnv]] = {
     "humanoid_walk": envs.HumanoidWalk,
     "humanoid_run": envs.HumanoidRun,
 }
-
-ALIASES = {f"mjx/{name}-v0": name for name in ENVS}
-
-
-GROUP = "torchrl_loco.envs"
-"""Group of the entry points by which installed distributions add environments: ``id = "module:Class"``."""
-
-
-@functools.cache
-def plugins() -> dict[str, metadata.EntryPoint]:
-    """Returns the entry points of :data:`GROUP` by id, none of them loaded. They are looked up once.
-
-    Of an id that is taken already, by this package or by a distribution that was found before, a warning tells.
-    """
-    found: dict[str, metadata.EntryPoint] = {}
-    for point in metadata.entry_points(group=GROUP):
-        if point.name in ENVS or point.name in ALIASES:
-            taken = "torchrl_loco itself has it"
-        elif point.name in found:
-            taken = f"{_origin(found[point.name])} has it"
-        elif not re.fullmatch(r"[\w.-]+", point.name):
-            taken = "an id is letters, digits, and _ . -, because runs are named after it"
-        else:
-            found[point.name] = point
-            continue
-        warnings.warn(f"environment {point.name!r} of {_origin(point)} is refused: {taken}", stacklevel=3)
-    return dict(sorted(found.items()))
-
-
-def _origin(point: metadata.EntryPoint) -> str:
-    return f"{point.dist.name} {point.dist.version} ({point.value})" if point.dist else point.value
-
-
-def list_envs() -> list[str]:
-    """Returns the ids that :func:`make` takes, without the aliases ``mjx/<id>-v0``: ours, then those of others."""
-    return [*ENVS, *plugins()]
-
-
-def canonical_id(id: str) -> str:
-    """Returns the id that ``id``, or an alias, stands for.
-
-    Raises:
-        ValueError: there is no such id; the message names the nearest right one and all of them.
-    """
-    names = list_envs()
-    name = ALIASES.get(id, id)
-    if name not in names:
-        hint = suggestion(str(id), [*names, *ALIASES])
-        raise ValueError(f"unknown environment {id!r}{hint}: choose one of {', '.join(names)}")
-    return name
 
 
 def env_class(id: str) -> type[envs.LocoEnv]:
@@ -89,13 +35,13 @@ def env_class(id: str) -> type[envs.LocoEnv]:
         cls = point.load()
     except Exception as error:  # whatever another's module may raise
         reason = f"{type(error).__name__}: {error}"
-        raise ImportError(f"environment {name!r} of {_origin(point)} cannot be loaded: {reason}") from error
+        raise ImportError(f"environment {name!r} of {origin(point)} cannot be loaded: {reason}") from error
     if not (isinstance(cls, type) and issubclass(cls, envs.LocoEnv)):
-        raise ImportError(f"environment {name!r} of {_origin(point)} is no subclass of torchrl_loco.LocoEnv")
+        raise ImportError(f"environment {name!r} of {origin(point)} is no subclass of torchrl_loco.LocoEnv")
     try:
         check_subclass(cls)
     except TypeError as error:
-        raise ImportError(f"environment {name!r} of {_origin(point)}: {error}") from error
+        raise ImportError(f"environment {name!r} of {origin(point)}: {error}") from error
     return cls
 
 
@@ -124,7 +70,7 @@ def make(
     """Makes an environment.
 
     Args:
-        id: one of :func:`list_envs`, or its alias ``mjx/<id>-v0``.
+        id: one of :func:`torchrl_loco.list_envs`, or its alias ``mjx/<id>-v0``.
         num_envs: number of worlds, the batch size.
         device: where physics and tensors live; ``None`` takes CUDA if there is any, else the CPU.
         seed: integer in [0, 2**32) that, with world and episode, decides every random draw; ``None`` takes a fresh one.

@@ -12,8 +12,9 @@ import torchrl_loco
 from generate.markdown import table
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS, NACONMAX_FLOOR, NACONMAX_WORLDS, PROTOCOLS, sim_config
+from torchrl_loco.ids import ALIASES
 from torchrl_loco.policy import SHIPPED
-from torchrl_loco.registry import ALIASES, ENVS
+from torchrl_loco.registry import ENVS
 
 MOMENTS = (0, 20, 40, 160)
 """Control steps after the reset at which the picture of a task is taken."""

@@ -7,8 +7,8 @@ import pytest
 import warp as wp
 
 from torchrl_loco import models
+from torchrl_loco.checks import check_device
 from torchrl_loco.config import DEFAULTS, sim_config
-from torchrl_loco.envs.checks import check_device
 from torchrl_loco.sim import Simulation
 from torchrl_loco.sim.order import FIRST_CONTACT, ROW_FIELDS, RowOrder
 

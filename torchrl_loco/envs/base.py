@@ -13,19 +13,11 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from torchrl_loco import models
+from torchrl_loco.checks import check_count, check_device, check_flag, check_new_file, check_seed
 from torchrl_loco.config import SimConfig, sim_config
 from torchrl_loco.envs.autoreset import AsyncReset
 from torchrl_loco.envs.bad_world import BadWorldTrap
-from torchrl_loco.envs.checks import (
-    check_count,
-    check_device,
-    check_flag,
-    check_model,
-    check_new_file,
-    check_poses,
-    check_seed,
-    check_subclass,
-)
+from torchrl_loco.envs.checks import check_model, check_poses, check_subclass
 from torchrl_loco.envs.episode import any_world, apply_action, begin_episode, count_step, quench
 from torchrl_loco.envs.health import Health
 from torchrl_loco.envs.lifecycle import Closable

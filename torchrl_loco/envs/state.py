@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from torchrl_loco.envs.checks import check_count
+from torchrl_loco.checks import check_count
 
 
 class State(TensorDict):

@@ -1,15 +1,27 @@
 """Training as parts that read on their own: settings, networks, algorithms, evaluation, run folder, and the loop."""
 
-from torchrl_loco.training.config import PPOConfig as PPOConfig
-from torchrl_loco.training.config import REPPOConfig as REPPOConfig
-from torchrl_loco.training.config import TrainingConfig as TrainingConfig
-from torchrl_loco.training.evaluation import describe as describe
-from torchrl_loco.training.evaluation import has_display as has_display
-from torchrl_loco.training.evaluation import record as record
-from torchrl_loco.training.evaluation import view as view
-from torchrl_loco.training.plots import plot_runs as plot_runs
-from torchrl_loco.training.presets import UNTUNED as UNTUNED
-from torchrl_loco.training.presets import preset as preset
-from torchrl_loco.training.run_folder import RunFolder as RunFolder
-from torchrl_loco.training.trainer import Trainer as Trainer
-from torchrl_loco.training.trainer import evaluate_run as evaluate_run
+from typing import TYPE_CHECKING
+
+from torchrl_loco._lazy import lazy
+
+if TYPE_CHECKING:
+    from torchrl_loco.training._api import *
+
+__all__ = [
+    "UNTUNED",
+    "PPOConfig",
+    "REPPOConfig",
+    "RunFolder",
+    "Trainer",
+    "TrainingConfig",
+    "describe",
+    "evaluate_run",
+    "has_display",
+    "plot_runs",
+    "preset",
+    "record",
+    "view",
+]
+
+if not TYPE_CHECKING:  # to a type checker it would mean that there is every name
+    __getattr__, __dir__ = lazy(__name__, __all__)

@@ -2,15 +2,13 @@
 
 import dataclasses
 import math
+import re
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import torch
-
-from torchrl_loco import models
+from torchrl_loco.checks import check_count, check_seed
 from torchrl_loco.config import PROTOCOLS
-from torchrl_loco.envs.checks import check_count, check_seed
-from torchrl_loco.registry import canonical_id, env_class
+from torchrl_loco.ids import canonical_id
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,12 +116,20 @@ class TrainingConfig:
     @property
     def observation_size(self) -> int:
         """Length of an observation."""
-        return env_class(self.task).observation_size
+        return self._env_class.observation_size
 
     @property
     def action_size(self) -> int:
         """Length of an action."""
-        return models.from_path(env_class(self.task).mjcf).nu
+        from torchrl_loco import models
+
+        return models.from_path(self._env_class.mjcf).nu
+
+    @property
+    def _env_class(self) -> Any:
+        from torchrl_loco.registry import env_class  # takes seconds, which whoever looks at settings need not wait for
+
+        return env_class(self.task)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,11 +198,7 @@ _MAY_BE_ZERO = ("lmbda", "entropy_coeff", "video_seconds", "final_lr", "aux_coef
 
 
 def _check_kind_of_device(name: str) -> None:
-    try:
-        kind = torch.device(name).type
-    except RuntimeError:
-        kind = name
-    if kind not in ("cpu", "cuda"):
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
         raise ValueError(f"no device {name!r}: choose one of cpu, cuda, cuda:0, ...")
 
 

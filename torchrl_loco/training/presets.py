@@ -1,13 +1,14 @@
 """Which settings teach which task on which device, as data."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-
+from torchrl_loco.checks import check_device
 from torchrl_loco.config import suggestion
-from torchrl_loco.envs.checks import check_device
-from torchrl_loco.registry import canonical_id
+from torchrl_loco.ids import canonical_id
 from torchrl_loco.training.config import CONFIGS, TrainingConfig
+
+if TYPE_CHECKING:
+    import torch
 
 Settings = dict[str, Any]
 
@@ -88,7 +89,7 @@ DEFAULT_ALGORITHM = {"cpu": "ppo", "cuda": "reppo"}
 
 
 def preset(
-    task: str, device: torch.device | str | None = None, algorithm: str | None = None, **overrides: Any
+    task: str, device: "torch.device | str | None" = None, algorithm: str | None = None, **overrides: Any
 ) -> TrainingConfig:
     """Returns the settings for ``task`` on ``device``, with ``overrides`` on top.
 

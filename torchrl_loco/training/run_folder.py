@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from torchrl_loco.envs.checks import check_device
+from torchrl_loco.checks import check_device
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import env_class
 from torchrl_loco.training.config import CONFIGS, TrainingConfig

@@ -14,9 +14,9 @@ from torch.utils.tensorboard import SummaryWriter
 from torchrl.envs import EnvBase, FrameSkipTransform
 from tqdm.auto import tqdm
 
+from torchrl_loco.checks import check_count, check_device, check_seed
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs.autoreset import TransformedEnv
-from torchrl_loco.envs.checks import check_count, check_device, check_seed
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import env_class, make
 from torchrl_loco.training.algorithm import Algorithm
