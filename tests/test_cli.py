@@ -4,27 +4,65 @@ import subprocess
 import sys
 
 import pytest
+import tyro
 
 from torchrl_loco import cli
 
 HELP = """
 import sys
 from torchrl_loco.cli import main
-for args in (["--help"], ["fly"], ["play"], ["play", "--help"], ["eval", "run", "--episode", "many"]):
+for line in sys.argv[1:]:
     try:
-        main(args)
+        print("exit", main(line.split()))
     except SystemExit as end:
         print("exit", end.code)
-print("imported", {"torch", "mujoco", "warp"} & set(sys.modules))
+print("imported", sorted({"torch", "torchrl", "mujoco", "warp"} & set(sys.modules)))
 """
+
+
+def told(*lines):
+    """Returns what a fresh interpreter prints for command lines, how it exits, and what it imports for them."""
+    done = subprocess.run([sys.executable, "-c", HELP, *lines], capture_output=True, text=True, timeout=60)
+    said = done.stdout.splitlines()
+    *exits, imported = (line for line in said if line.startswith(("exit", "imported")))
+    return " ".join((done.stdout + done.stderr).replace("│", " ").split()), exits, imported
 
 
 def test_help_and_wrong_options_wait_for_nothing():
     """Importing torch, TorchRL and MuJoCo-Warp takes seconds."""
-    done = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True, timeout=60)
-    told = [line for line in done.stdout.splitlines() if line.startswith(("exit", "imported"))]
-    assert told == ["exit 0", "exit 2", "exit 2", "exit 0", "exit 2", "imported set()"], done.stderr
-    assert "Train a policy" in done.stdout
+    helpful = ["--help", "list", "train --help", "play --help"]
+    wrong = ["fly", "train", "train walker_wlak", "train --seed 1", "play", "play walker_wlak", "eval x --episode many"]
+    said, exits, imported = told(*helpful, *wrong)
+    assert exits == ["exit 0"] * len(helpful) + ["exit 2"] * len(wrong), said
+    assert imported == "imported []"
+    assert "Train a policy" in said
+    assert said.count("Walk at 1 m/s or faster, in any direction.") == 2  # in the list and among what can be trained
+
+
+def test_settings_of_a_task_wait_for_torch_alone():
+    """It knows whether there is CUDA, which decides on the preset."""
+    said, exits, imported = told("train walker_walk --help", "train walker_walk --num_env 8")
+    assert exits == ["exit 0", "exit 2"], said
+    assert imported == "imported ['torch']"
+    assert "--algorithm {ppo,reppo}" in said
+    assert "Perhaps you meant: --num_envs" in said
+    assert not {"walker_run", "doctor"} & set(said.split())  # other tasks and commands have such an option too
+
+
+@pytest.mark.parametrize(("word", "number"), [("100_000", 100_000), ("1e5", 100_000), ("12", 12)])
+def test_ways_to_write_a_whole_number(word, number):
+    assert tyro.cli(tuple[int, ...], args=[word, "8"], registry=cli.NUMBERS) == (number, 8)
+    assert type(tyro.cli(int | None, args=[word], registry=cli.NUMBERS)) is int
+
+
+@pytest.mark.parametrize("word", ["100k", "1.5", "inf", "nan", ""])
+def test_what_is_no_whole_number(word, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["doctor", f"--num_envs={word}"])
+    said = capsys.readouterr()
+    assert "is no whole number: write it as 100000, 100_000 or 1e5" in " ".join(
+        (said.out + said.err).replace("│", " ").split()
+    )
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -25,17 +25,39 @@ except ImportError as error:  # the environments work without the extra, the com
 CONTAINERS = (".mp4", ".mkv", ".mov")
 """What the file of a video can be."""
 
+NUMBERS = tyro.constructors.ConstructorRegistry()
+"""How whole numbers may be written."""
+
+
+@NUMBERS.primitive_rule
+def _whole_number(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[int] | None:
+    def parse(words: list[str]) -> int:
+        with contextlib.suppress(ValueError):
+            return int(words[0])
+        with contextlib.suppress(ValueError):
+            if (value := float(words[0])).is_integer():
+                return int(value)
+        raise ValueError(f"{words[0]!r} is no whole number: write it as 100000, 100_000 or 1e5")
+
+    if info.type is not int:
+        return None
+    return tyro.constructors.PrimitiveConstructorSpec(1, "INT", parse, lambda x: isinstance(x, int), lambda x: [str(x)])
+
 
 def list_tasks() -> None:
     """List the environments."""
-    from torchrl_loco import registry
+    from torchrl_loco.ids import OURS, plugins
 
-    for name in registry.list_envs():
+    about = dict(OURS)
+    for name in plugins():
+        from torchrl_loco.registry import env_class
+
         try:
-            about = (registry.env_class(name).__doc__ or "").strip().split("\n")[0]
+            about[name] = (env_class(name).__doc__ or "").strip().split("\n")[0]
         except ImportError as error:
-            about = f"NOT USABLE: {error}"
-        print(f"{name:<16} {about}")
+            about[name] = f"NOT USABLE: {error}"
+    for name, words in about.items():
+        print(f"{name:<16} {words}")
 
 
 def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None = None) -> None:
@@ -164,14 +186,16 @@ def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: 
         video: what is shown; with --out, a video in any case.
     """
     with _user_errors():
-        from torchrl_loco import registry, training
+        from torchrl_loco import training
+        from torchrl_loco.ids import canonical_id
 
+        name = canonical_id(task)
         video.check()
         if policy is None:
             trained = torchrl_loco.load_policy(task, video.device)
         else:
             trained = torchrl_loco.Policy.load(policy, video.device)
-            if trained.info["task"] != registry.canonical_id(task):
+            if trained.info["task"] != name:
                 raise ValueError(f"{policy} is a policy for {trained.info['task']}, not for {task}")
         shown = ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on", "mean", "std")
         print(task, *(f"{key} {trained.info[key]}" for key in shown if key in trained.info), sep=", ")
@@ -217,32 +241,32 @@ def main(args: Sequence[str] | None = None) -> int:
     task_config = _task_config(args) if args[:1] == ["train"] else None
 
     def train(config: Annotated[task_config, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]
-        """Train a policy: evaluation, learning curve and video included.
-
-        One more option may stand anywhere on the line: --algorithm, ppo or reppo. Together with the task and --device
-        it chooses the preset, which is what the other options change.
-        """
+        """Train a policy: evaluation, learning curve and video included. All settings: train TASK --help."""
         with _user_errors():
             trainer = _begin(config)
         _train(trainer)
 
+    commands: dict[str, Callable[..., None]] = {
+        "train": train,
+        "resume": resume,
+        "eval": evaluate,
+        "record": record,
+        "play": play,
+        "plot": plot,
+        "replay": replay,
+        "list": list_tasks,
+        "doctor": diagnose,
+    }
+    if args and args[0] in commands:  # so that of an unknown option only what is like it in this command is named
+        commands = {args[0]: commands[args[0]]}
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {
-                "train": train,
-                "resume": resume,
-                "eval": evaluate,
-                "record": record,
-                "play": play,
-                "plot": plot,
-                "replay": replay,
-                "list": list_tasks,
-                "doctor": diagnose,
-            },
+            commands,
             prog="torchrl-loco",
             description=torchrl_loco.__doc__,
             args=args,
             use_underscores=True,
+            registry=NUMBERS,
         )
     except KeyboardInterrupt:
         resumable = args[:1] in (["train"], ["resume"])
@@ -253,27 +277,32 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _task_config(args: list[str]) -> Any:
-    """Returns the type that stands for a task and its settings; takes from ``args`` what decides on the presets."""
-    with _user_errors():
-        from torchrl_loco import registry, training
+    """Returns the type that stands for a task and its settings; takes from ``args`` what decides on the preset."""
+    from torchrl_loco.ids import OURS, canonical_id, list_envs
+    from torchrl_loco.training.config import CONFIGS, TrainingConfig
+    from torchrl_loco.training.presets import UNTUNED, preset
 
-        if len(args) > 1 and not args[1].startswith("-"):
-            args[1] = registry.canonical_id(args[1])
-        device, algorithm = (_take(flag, args) for flag in ("--device", "--algorithm"))
-        presets = {task: training.preset(task, device, algorithm) for task in registry.list_envs()}
-    return tyro.extras.subcommand_type_from_defaults(
-        presets,
-        {task: f"Train {task}{'' if task in registry.ENVS else f'; {training.UNTUNED}'}." for task in presets},
-        prefix_names=False,
-    )
+    about = {task: OURS.get(task, f"Another distribution's: {UNTUNED}.") for task in list_envs()}
+    device, algorithm = (_take(flag, args) for flag in ("--device", "--algorithm"))
+    if len(args) > 1 and not args[1].startswith("-"):
+        with _user_errors():
+            task = args[1] = canonical_id(args[1])
+            config = preset(task, device, algorithm)
+        about[task] += f"\n\n--algorithm {{{','.join(CONFIGS)}}}, {config.algorithm} on this device unless it is given,"
+        about[task] += " decides with TASK and --device which settings there are and how they are preset."
+        configs = {task: config}
+    else:  # this is going to show what tasks there are, which need not wait for what presets take to import
+        configs = {task: TrainingConfig(task) for task in about}
+    return tyro.extras.subcommand_type_from_defaults(configs, about, prefix_names=False)
 
 
 def _begin(config: "training.TrainingConfig") -> "training.Trainer":
     """Makes the folder of a run and what trains into it."""
-    from torchrl_loco import registry, training
+    from torchrl_loco import training
+    from torchrl_loco.ids import OURS
 
     run = training.RunFolder.create(config)
-    if config.task not in registry.ENVS:
+    if config.task not in OURS:
         print(f"{config.task}: {training.UNTUNED}")
     print(f"run folder: {run.path}")
     return training.Trainer(run)
