@@ -50,7 +50,7 @@ def list_tasks() -> None:
 
     about = dict(OURS)
     for name in plugins():
-        from torchrl_loco.registry import env_class
+        from torchrl_loco.registry import env_class  # takes seconds, which most users' list need not
 
         try:
             about[name] = (env_class(name).__doc__ or "").strip().split("\n")[0]
