@@ -39,12 +39,27 @@ def test_help_and_wrong_options_wait_for_nothing():
     assert said.count("Walk at 1 m/s or faster, in any direction.") == 2  # in the list and among what can be trained
 
 
+def test_an_unknown_command_names_the_one_that_is_meant(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["tain"])
+    assert "did you mean 'train'?" in capsys.readouterr().err
+
+
+def test_ctrl_c_while_a_command_starts_is_told_in_a_line(monkeypatch, capsys):
+    def interrupted(task, *rest):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchrl_loco.training.presets.preset", interrupted)  # importing torch takes the longest in it
+    assert cli.main(["train", "walker_walk"]) == 130
+    assert capsys.readouterr().err == "torchrl-loco: interrupted\n"
+
+
 def test_settings_of_a_task_wait_for_torch_alone():
     """It knows whether there is CUDA, which decides on the preset."""
     said, exits, imported = told("train walker_walk --help", "train walker_walk --num_env 8")
     assert exits == ["exit 0", "exit 2"], said
     assert imported == "imported ['torch']"
-    assert "--algorithm {ppo,reppo}" in said
+    assert "--algorithm, ppo or reppo (here ppo)" in said
     assert "Perhaps you meant: --num_envs" in said
     assert not {"walker_run", "doctor"} & set(said.split())  # other tasks and commands have such an option too
 

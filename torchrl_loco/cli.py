@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torchrl_loco
+from torchrl_loco.config import suggestion
 
 if TYPE_CHECKING:
     from torchrl_loco import training
@@ -182,7 +183,7 @@ def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: 
 
     Args:
         task: id of the environment.
-        policy: file of the policy, such as policy.safetensors of a run; default: the one that comes with the package.
+        policy: a run, or the file of a policy; default: the one that comes with the package.
         video: what is shown; with --out, a video in any case.
     """
     with _user_errors():
@@ -194,11 +195,14 @@ def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: 
         if policy is None:
             trained = torchrl_loco.load_policy(task, video.device)
         else:
-            trained = torchrl_loco.Policy.load(policy, video.device)
+            file = training.RunFolder(policy).policy if policy.is_dir() else policy
+            trained = torchrl_loco.Policy.load(file, video.device)
             if trained.info["task"] != name:
                 raise ValueError(f"{policy} is a policy for {trained.info['task']}, not for {task}")
-        shown = ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on", "mean", "std")
+        shown = ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
         print(task, *(f"{key} {trained.info[key]}" for key in shown if key in trained.info), sep=", ")
+        if "mean" in trained.info:
+            print(training.describe(trained.info))
         if video.out is None and training.has_display():
             training.view(trained, video.env(trained), trained.info["action_repeat"])
         else:
@@ -237,7 +241,16 @@ def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("lear
 
 def main(args: Sequence[str] | None = None) -> int:
     """Runs the command line; returns 0, exits with 2 for what the user can mend, returns 130 when interrupted."""
-    args = sys.argv[1:] if args is None else list(args)
+    try:
+        _run(sys.argv[1:] if args is None else list(args))
+    except KeyboardInterrupt:
+        print("torchrl-loco: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _run(args: list[str]) -> None:
+    """Runs one command."""
     task_config = _task_config(args) if args[:1] == ["train"] else None
 
     def train(config: Annotated[task_config, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]
@@ -257,39 +270,38 @@ def main(args: Sequence[str] | None = None) -> int:
         "list": list_tasks,
         "doctor": diagnose,
     }
-    if args and args[0] in commands:  # so that of an unknown option only what is like it in this command is named
+    if args and args[0] in commands:  # alone, so that hints speak of it and not of the others
         commands = {args[0]: commands[args[0]]}
-    try:
-        tyro.extras.subcommand_cli_from_dict(
-            commands,
-            prog="torchrl-loco",
-            description=torchrl_loco.__doc__,
-            args=args,
-            use_underscores=True,
-            registry=NUMBERS,
-        )
-    except KeyboardInterrupt:
-        resumable = args[:1] in (["train"], ["resume"])
-        hint = "; if the run folder has a checkpoint.pt, torchrl-loco resume goes on from it" if resumable else ""
-        print(f"torchrl-loco: interrupted{hint}", file=sys.stderr)
-        return 130
-    return 0
+    elif args and not args[0].startswith("-"):
+        with _user_errors():
+            hint = suggestion(args[0], list(commands))
+            raise ValueError(f"unknown command {args[0]!r}{hint}: choose one of {', '.join(commands)}")
+    tyro.extras.subcommand_cli_from_dict(
+        commands,
+        prog="torchrl-loco",
+        description=torchrl_loco.__doc__,
+        args=args,
+        use_underscores=True,
+        registry=NUMBERS,
+    )
 
 
 def _task_config(args: list[str]) -> Any:
     """Returns the type that stands for a task and its settings; takes from ``args`` what decides on the preset."""
     from torchrl_loco.ids import OURS, canonical_id, list_envs
     from torchrl_loco.training.config import CONFIGS, TrainingConfig
-    from torchrl_loco.training.presets import UNTUNED, preset
+    from torchrl_loco.training.presets import preset, untuned
 
-    about = {task: OURS.get(task, f"Another distribution's: {UNTUNED}.") for task in list_envs()}
+    about = {task: OURS.get(task, "Of another distribution.") for task in list_envs()}
     device, algorithm = (_take(flag, args) for flag in ("--device", "--algorithm"))
     if len(args) > 1 and not args[1].startswith("-"):
         with _user_errors():
             task = args[1] = canonical_id(args[1])
+            if _take("--task", args) is not None:  # a field as the others, but the preset is for one task
+                raise ValueError("the task stands right after train, and --task is no option")
             config = preset(task, device, algorithm)
-        about[task] += f"\n\n--algorithm {{{','.join(CONFIGS)}}}, {config.algorithm} on this device unless it is given,"
-        about[task] += " decides with TASK and --device which settings there are and how they are preset."
+        about[task] += f" {untuned(config)}\n\n--algorithm, {' or '.join(CONFIGS)} (here {config.algorithm}), and"
+        about[task] += " --device decide which\nsettings there are, and how they are preset."
         configs = {task: config}
     else:  # this is going to show what tasks there are, which need not wait for what presets take to import
         configs = {task: TrainingConfig(task) for task in about}
@@ -299,19 +311,23 @@ def _task_config(args: list[str]) -> Any:
 def _begin(config: "training.TrainingConfig") -> "training.Trainer":
     """Makes the folder of a run and what trains into it."""
     from torchrl_loco import training
-    from torchrl_loco.ids import OURS
 
     run = training.RunFolder.create(config)
-    if config.task not in OURS:
-        print(f"{config.task}: {training.UNTUNED}")
+    if note := training.untuned(config):
+        print(note)
     print(f"run folder: {run.path}")
     return training.Trainer(run)
 
 
 def _train(trainer: "training.Trainer") -> None:
     """Trains to the last frame and prints where everything lies."""
-    with _user_errors(OSError):  # a full disk; anything else in here is a bug and keeps its traceback
-        trainer.train()
+    try:
+        with _user_errors(OSError):  # a full disk; anything else in here is a bug and keeps its traceback
+            trainer.train()
+    except KeyboardInterrupt:
+        if trainer.run.has_checkpoint:
+            print(f"to go on: torchrl-loco resume {trainer.run.path}", file=sys.stderr)
+        raise
     print(f"policy, curve and all else: {trainer.run.path}")
 
 

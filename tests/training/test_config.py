@@ -1,10 +1,11 @@
 """Presets are valid, and wrong settings are named."""
 
+import dataclasses
 import inspect
 
 import pytest
 
-from torchrl_loco.training import PPOConfig, REPPOConfig, TrainingConfig, preset
+from torchrl_loco.training import PPOConfig, REPPOConfig, TrainingConfig, preset, untuned
 
 
 @pytest.mark.parametrize("algorithm", [None, "ppo", "reppo"])
@@ -87,3 +88,19 @@ def test_every_setting_is_documented(config):
             continue
         at = next(i for i, line in enumerate(lines) if line.startswith(f"    {name}:"))
         assert lines[at + 1].strip().startswith('"""'), name
+
+
+@pytest.mark.parametrize(
+    ("task", "device", "algorithm", "said"),
+    [
+        ("walker_stand", "cpu", "ppo", False),
+        ("walker_stand", "cpu", "reppo", True),
+        ("walker_walk", "cpu", "ppo", True),
+        ("walker_walk", "cuda", "reppo", False),
+        ("humanoid_run", "cuda:1", "reppo", False),
+    ],
+)
+def test_what_the_settings_are_not_tuned_for_is_said(task, device, algorithm, said):
+    config = dataclasses.replace(preset(task, "cpu", algorithm), device=device)
+    assert ("walker_stand by ppo" in untuned(config)) == said
+    assert bool(untuned(config)) == said

@@ -202,6 +202,21 @@ def test_where_it_is_ignored_it_stays_ignored(tmp_path):
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
+def test_the_command_says_how_to_go_on(kind, tmp_path, monkeypatch, capsys):
+    """SIGTERM is how a cluster, or kill, asks a process to end."""
+    run = made(tmp_path)
+    update = Algorithm.update
+    monkeypatch.setattr(Algorithm, "update", lambda *args, **more: signal.raise_signal(kind) or update(*args, **more))
+    before = signal.getsignal(kind)
+    trainer = Trainer(run)
+    with pytest.raises(KeyboardInterrupt):
+        cli._train(trainer)
+    assert run.load_checkpoint("cpu")["iteration"] == 1
+    assert capsys.readouterr().err.splitlines()[-1] == f"to go on: torchrl-loco resume {run.path}"
+    assert signal.getsignal(kind) is before
+
+
 @pytest.mark.slow
 def test_evaluations_during_training(tmp_path):
     run = trained(tmp_path, total_frames=1024, eval_interval=256, video_seconds=0.0)
@@ -377,6 +392,11 @@ def test_command_line(run, capsys, tmp_path):
         cli.main(["record", str(path), "--seconds", "0.1", "--camera", "back", "--out", str(tmp_path / "x.mp4")]) == 0
     )
     assert imageio.imread(tmp_path / "x.mp4", plugin="pyav").shape[0] == 4
+    capsys.readouterr()
+    shown = ["--policy", str(path), "--seconds", "0.1", "--out", str(tmp_path / "y.mp4")]  # a run, or a file
+    assert cli.main(["play", "walker_walk", *shown]) == 0
+    head, returns, video = capsys.readouterr().out.splitlines()
+    assert (head.split(",")[0], returns.split()[0], video) == ("walker_walk", "return", shown[-1])
 
 
 @pytest.mark.parametrize(
@@ -388,6 +408,7 @@ def test_command_line(run, capsys, tmp_path):
         (["train", "walker_walk", "--gamma", "2"], "gamma must lie in (0, 1]"),
         (["train", "walker_walk", "--gama", "0.9"], "--gamma"),
         (["train", "walker_walk", "--device", "cuda:9"], "choose one of cpu"),
+        (["train", "walker_walk", "--task", "walker_run"], "the task stands right after train"),
         (["train", "walker_walk", "--algorithm", "pppo"], "did you mean 'ppo'"),
         (["eval", "no/such/run"], "is no run folder"),
         (["resume", "no/such/run"], "is no run folder"),
@@ -415,9 +436,11 @@ def test_command_line_errors(run, arguments, message, capsys):
 @pytest.mark.slow
 def test_a_run_without_a_policy_names_the_way_to_one(tmp_path, capsys):
     run = RunFolder.create(preset("walker_stand", "cpu", out=tmp_path, **SMALL))
-    with pytest.raises(SystemExit):
-        cli.main(["eval", str(run.path)])
-    assert "has no policy yet: torchrl-loco resume" in capsys.readouterr().err
+    for way in ("nor a checkpoint, train anew", "torchrl-loco resume goes on with the run"):
+        with pytest.raises(SystemExit):
+            cli.main(["eval", str(run.path)])
+        assert f"has no policy yet: {way}" in capsys.readouterr().err
+        run.save_checkpoint({})
 
 
 @pytest.mark.parametrize(("error", "shown"), [(OSError("no space left"), True), (TypeError("a bug"), False)])

@@ -60,8 +60,8 @@ def observe_walker(
     reward = stand
     terms_out[world, 0] = stand
     if speed > 0.0:
-        move = tolerance(sensordata_in[world, 0], speed, wp.inf, speed / 2.0, Sigmoid.LINEAR, 0.5)
-        move = (5.0 * move + 1.0) / 6.0
+        fast = tolerance(sensordata_in[world, 0], speed, wp.inf, speed / 2.0, Sigmoid.LINEAR, 0.5)
+        move = (5.0 * fast + 1.0) / 6.0
         reward *= move
         terms_out[world, 1] = move
     reward_out[world] = reward
@@ -146,9 +146,10 @@ class WalkerWalk(Walker):
     As :class:`WalkerStand`, but for the reward.
 
     Reward:
-        ``stand * (5 move + 1) / 6`` with
-        ``move = tolerance(speed, [1 m/s, inf), margin 0.5 m/s, linear, value_at_margin 0.5)``, the speed being the
-        center of mass's along x. Terms: ``stand`` and ``move``, the second factor.
+        ``stand * move``, its two terms: ``stand`` is all that :class:`WalkerStand` pays,
+        ``(3 standing + upright) / 4``, and ``move = (5 fast + 1) / 6`` with
+        ``fast = tolerance(speed, [1 m/s, inf), margin 0.5 m/s, linear, value_at_margin 0.5)``, the speed being the
+        center of mass's along x.
     """
 
     speed = WALK_SPEED

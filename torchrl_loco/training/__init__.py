@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from torchrl_loco.training._api import *
 
 __all__ = [
-    "UNTUNED",
     "PPOConfig",
     "REPPOConfig",
     "RunFolder",
@@ -20,6 +19,7 @@ __all__ = [
     "plot_runs",
     "preset",
     "record",
+    "untuned",
     "view",
 ]
 

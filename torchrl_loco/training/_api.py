@@ -8,8 +8,8 @@ from torchrl_loco.training.evaluation import has_display as has_display
 from torchrl_loco.training.evaluation import record as record
 from torchrl_loco.training.evaluation import view as view
 from torchrl_loco.training.plots import plot_runs as plot_runs
-from torchrl_loco.training.presets import UNTUNED as UNTUNED
 from torchrl_loco.training.presets import preset as preset
+from torchrl_loco.training.presets import untuned as untuned
 from torchrl_loco.training.run_folder import RunFolder as RunFolder
 from torchrl_loco.training.trainer import Trainer as Trainer
 from torchrl_loco.training.trainer import evaluate_run as evaluate_run

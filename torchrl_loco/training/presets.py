@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_loco.checks import check_device
 from torchrl_loco.config import suggestion
-from torchrl_loco.ids import canonical_id
+from torchrl_loco.ids import OURS, canonical_id
 from torchrl_loco.training.config import CONFIGS, TrainingConfig
 
 if TYPE_CHECKING:
@@ -84,8 +84,8 @@ TASKS: dict[tuple[str, str], Settings] = {
 }
 """What a task needs beside, by algorithm and task, on CUDA."""
 
-UNTUNED = "no settings were tuned for it, these are the ones that teach the walker and the humanoid"
-"""What to say of a task of another distribution."""
+TUNED_ON_CPU = ("ppo", "walker_stand")
+"""What a CPU learns in minutes."""
 
 DEFAULT_ALGORITHM = {"cpu": "ppo", "cuda": "reppo"}
 
@@ -117,3 +117,13 @@ def preset(
     if device.type == "cuda":
         values |= TASKS.get((algorithm, task), {})
     return CONFIGS[algorithm](task, **{**values, **overrides})
+
+
+def untuned(config: TrainingConfig) -> str:
+    """Returns what else than its task the preset behind ``config`` was made for, in a sentence, or an empty string."""
+    if config.task not in OURS:
+        return f"No settings were tuned for {config.task}, these are the ones that teach the walker and the humanoid."
+    if config.device == "cpu" and (config.algorithm, config.task) != TUNED_ON_CPU:
+        algorithm, task = TUNED_ON_CPU
+        return f"The settings for a CPU are tuned for {task} by {algorithm}: all else wants a GPU, or many more frames."
+    return ""

@@ -104,6 +104,11 @@ class RunFolder:
         return self.path / "policy.safetensors"
 
     @property
+    def has_checkpoint(self) -> bool:
+        """Whether there is something to resume from."""
+        return (self.path / "checkpoint.pt").is_file()
+
+    @property
     def bad_world(self) -> Path:
         """Where the first world lies that did not stay finite, if any."""
         return self.path / "bad_world.safetensors"
@@ -181,8 +186,8 @@ class RunFolder:
             ValueError: it is of another version, or no checkpoint at all.
         """
         path = self.path / "checkpoint.pt"
-        if not path.is_file():
-            raise FileNotFoundError(f"{self.path} has no checkpoint.pt: the run did not get that far")
+        if not self.has_checkpoint:
+            raise FileNotFoundError(f"{self.path} has no checkpoint.pt: the run did not get that far, train anew")
         try:
             with zipfile.ZipFile(path) as archive:  # torch.load looks at no checksum
                 damaged = archive.testzip()

@@ -62,11 +62,11 @@ class Trainer:
         """Trains to the last frame, then draws the learning curve and records a video.
 
         A progress bar shows the return (mean reward of the last batch times the length of an episode) and the frames
-        per second. At Ctrl-C the iteration is finished and a checkpoint written before KeyboardInterrupt is raised; a
-        second one interrupts at once.
+        per second. At Ctrl-C, or SIGTERM, the iteration is finished and a checkpoint written before KeyboardInterrupt
+        is raised; a second one ends at once.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C was pressed.
+            KeyboardInterrupt: Ctrl-C was pressed, or the process asked to end.
         """
         with settings_for_small_networks():
             self._train()
@@ -77,7 +77,7 @@ class Trainer:
         config = self.config
         saved = time.perf_counter()
         board = SummaryWriter(str(self.run.path / "tensorboard"), purge_step=self.frames + 1)
-        bar = tqdm(total=config.total_frames, initial=self.frames, unit="frame", unit_scale=True, desc=config.task)
+        bar = tqdm(total=self.last_frame, initial=self.frames, unit="frame", unit_scale=True, desc=config.task)
         with board, bar, interruptible() as interrupted:
             while self.frames < self.last_frame:
                 row = self._iterate()
@@ -237,7 +237,8 @@ def evaluate_run(
     """
     config = run.load_config() if device is None else run.load_config(device=device)
     if not run.policy.is_file():
-        raise FileNotFoundError(f"{run.path} has no policy yet: torchrl-loco resume goes on with the run")
+        way = "torchrl-loco resume goes on with the run" if run.has_checkpoint else "nor a checkpoint, train anew"
+        raise FileNotFoundError(f"{run.path} has no policy yet: {way}")
     policy = Policy.load(run.policy, config.device)
     with settings_for_small_networks():
         return summarize(make_evaluator(config, episodes, seed)(policy))
@@ -245,22 +246,26 @@ def evaluate_run(
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Yields whether Ctrl-C was pressed, instead of raising at the first one.
+    """Yields whether Ctrl-C was pressed or the process asked to end (SIGTERM), instead of ending at the first time.
 
-    In a thread, and where Ctrl-C is ignored (``nohup``), all is left as it is.
+    In a thread, and where a signal is ignored (Ctrl-C by ``nohup``), all is left as it is.
     """
     pressed = threading.Event()
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
-        yield pressed.is_set
-        return
+    in_main = threading.current_thread() is threading.main_thread()
+    handlers = {kind: signal.getsignal(kind) for kind in (signal.SIGINT, signal.SIGTERM) if in_main}
+    handlers = {kind: handler for kind, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
+
+    def restore() -> None:
+        for kind, handler in handlers.items():
+            signal.signal(kind, handler)
 
     def press(*_: object) -> None:
         pressed.set()
-        signal.signal(signal.SIGINT, before)
+        restore()
 
-    signal.signal(signal.SIGINT, press)
+    for kind in handlers:
+        signal.signal(kind, press)
     try:
         yield pressed.is_set
     finally:
-        signal.signal(signal.SIGINT, before)
+        restore()
