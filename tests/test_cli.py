@@ -32,6 +32,7 @@ def test_help_and_wrong_options_wait_for_nothing():
     """Importing torch, TorchRL and MuJoCo-Warp takes seconds."""
     helpful = ["--help", "list", "train --help", "play --help"]
     wrong = ["fly", "train", "train walker_wlak", "train --seed 1", "play", "play walker_wlak", "eval x --episode many"]
+    wrong += [f"{command} no/such/run" for command in ("eval", "resume", "record", "plot")]
     said, exits, imported = told(*helpful, *wrong)
     assert exits == ["exit 0"] * len(helpful) + ["exit 2"] * len(wrong), said
     assert imported == "imported []"
@@ -66,18 +67,20 @@ def test_settings_of_a_task_wait_for_torch_alone():
 
 @pytest.mark.parametrize(("word", "number"), [("100_000", 100_000), ("1e5", 100_000), ("12", 12)])
 def test_ways_to_write_a_whole_number(word, number):
-    assert tyro.cli(tuple[int, ...], args=[word, "8"], registry=cli.NUMBERS) == (number, 8)
-    assert type(tyro.cli(int | None, args=[word], registry=cli.NUMBERS)) is int
+    assert tyro.cli(tuple[int, ...], args=[word, "8"], registry=cli.VALUES) == (number, 8)
+    assert type(tyro.cli(int | None, args=[word], registry=cli.VALUES)) is int
 
 
 @pytest.mark.parametrize("word", ["100k", "1.5", "inf", "nan", ""])
-def test_what_is_no_whole_number(word, capsys):
+@pytest.mark.parametrize("command", [["doctor", "--num_envs"], ["eval", "x", "--episodes"]], ids=lambda words: words[0])
+def test_what_is_no_whole_number(command, word, capsys):
+    *words, option = command
     with pytest.raises(SystemExit, match="2"):
-        cli.main(["doctor", f"--num_envs={word}"])
+        cli.main([*words, f"{option}={word}"])
     said = capsys.readouterr()
-    assert "is no whole number: write it as 100000, 100_000 or 1e5" in " ".join(
-        (said.out + said.err).replace("│", " ").split()
-    )
+    plain = " ".join((said.out + said.err).replace("│", " ").split())
+    assert "is no whole number: write it as 100000, 100_000 or 1e5" in plain
+    assert "NoneType" not in plain
 
 
 @pytest.mark.parametrize(

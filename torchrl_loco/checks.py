@@ -96,3 +96,14 @@ def check_folder(name: str, value: Any) -> Path:
     if not path.parent.is_dir():
         raise ValueError(f"{name} {path} cannot be written: there is no folder {path.parent}")
     return path
+
+
+def check_run(path: Path) -> Path:
+    """Returns ``path`` as that of a run.
+
+    Raises:
+        FileNotFoundError: it is no folder with a ``config.json``.
+    """
+    if not (Path(path) / "config.json").is_file():
+        raise FileNotFoundError(f"{path} is no run folder: it has no config.json")
+    return Path(path)

@@ -9,9 +9,11 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 
 import torchrl_loco
+from torchrl_loco.checks import check_device, check_folder, check_run, check_seed
 from torchrl_loco.config import suggestion
 
 if TYPE_CHECKING:
@@ -26,23 +28,34 @@ except ImportError as error:  # the environments work without the extra, the com
 CONTAINERS = (".mp4", ".mkv", ".mov")
 """What the file of a video can be."""
 
-NUMBERS = tyro.constructors.ConstructorRegistry()
-"""How whole numbers may be written."""
+VALUES = tyro.constructors.ConstructorRegistry()
+"""How values are written, where the parser's own way is hard on the user."""
 
 
-@NUMBERS.primitive_rule
-def _whole_number(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[int] | None:
-    def parse(words: list[str]) -> int:
-        with contextlib.suppress(ValueError):
-            return int(words[0])
-        with contextlib.suppress(ValueError):
-            if (value := float(words[0])).is_integer():
-                return int(value)
-        raise ValueError(f"{words[0]!r} is no whole number: write it as 100000, 100_000 or 1e5")
-
-    if info.type is not int:
+@VALUES.primitive_rule
+def _whole_numbers_and_what_may_be_none(info: tyro.constructors.PrimitiveTypeInfo) -> Any:
+    """Takes whole numbers as people write them, and what may be None as what it is else: nobody types None."""
+    kinds = get_args(info.type) if info.type_origin in (Union, UnionType) else (info.type,)
+    named = [kind for kind in kinds if kind is not NoneType]
+    if named != [int] and (len(named) != 1 or len(kinds) == 1):
         return None
-    return tyro.constructors.PrimitiveConstructorSpec(1, "INT", parse, lambda x: isinstance(x, int), lambda x: [str(x)])
+    parse: Callable[[str], Any] = _whole_number if named == [int] else named[0]
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=named[0].__name__.upper(),
+        instance_from_str=lambda words: parse(words[0]),
+        is_instance=lambda value: isinstance(value, tuple(kinds)),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _whole_number(word: str) -> int:
+    with contextlib.suppress(ValueError):
+        return int(word)
+    with contextlib.suppress(ValueError):
+        if (value := float(word)).is_integer():
+            return int(value)
+    raise ValueError(f"{word!r} is no whole number: write it as 100000, 100_000 or 1e5")
 
 
 def list_tasks() -> None:
@@ -102,6 +115,7 @@ def evaluate(
     with _user_errors():
         from torchrl_loco import training
 
+        check_run(run)
         summary = training.evaluate_run(training.RunFolder(run), episodes, seed, device)
     print(training.describe(summary))
 
@@ -115,6 +129,7 @@ def resume(run: tyro.conf.Positional[Path], /) -> None:
     with _user_errors():
         from torchrl_loco import training
 
+        check_run(run)
         trainer = training.Trainer(training.RunFolder(run), resume=True)
     _train(trainer)
 
@@ -136,12 +151,11 @@ class Video:
 
     def check(self) -> None:
         """Refuses what cannot be shown, before anything is printed or made."""
-        from torchrl_loco.checks import check_device, check_folder, check_seed
-
         if not 0 < self.seconds < math.inf:
             raise ValueError(f"seconds must be positive and finite, got {self.seconds}")
         check_seed(self.seed)
-        check_device(self.device)
+        if self.device is not None:  # to look for devices imports torch
+            check_device(self.device)
         if self.out is not None:
             if self.out.suffix not in CONTAINERS:
                 raise ValueError(f"out must end in one of {', '.join(CONTAINERS)}, got {self.out}")
@@ -174,6 +188,7 @@ def record(run: tyro.conf.Positional[Path], /, video: VideoOptions = Video()) ->
         from torchrl_loco import training
 
         video.check()
+        check_run(run)
         folder = training.RunFolder(run)
         video.make(torchrl_loco.Policy.load(folder.policy, video.device), folder.video)
 
@@ -191,12 +206,13 @@ def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: 
         from torchrl_loco.ids import canonical_id
 
         name = canonical_id(task)
+        if policy is not None and policy.is_dir():
+            policy = training.RunFolder(check_run(policy)).policy
         video.check()
         if policy is None:
             trained = torchrl_loco.load_policy(task, video.device)
         else:
-            file = training.RunFolder(policy).policy if policy.is_dir() else policy
-            trained = torchrl_loco.Policy.load(file, video.device)
+            trained = torchrl_loco.Policy.load(policy, video.device)
             if trained.info["task"] != name:
                 raise ValueError(f"{policy} is a policy for {trained.info['task']}, not for {task}")
         shown = ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
@@ -218,7 +234,6 @@ def replay(file: tyro.conf.Positional[Path], /, device: str | None = None) -> No
     """
     with _user_errors():
         from torchrl_loco import replay as replays
-        from torchrl_loco.checks import check_device
 
         check_device(device)  # before the first line
         for line in replays.describe(replays.load(file), device):
@@ -235,6 +250,8 @@ def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("lear
     with _user_errors():
         from torchrl_loco import training
 
+        for run in runs:
+            check_run(run)
         training.plot_runs([training.RunFolder(run) for run in runs], out)
     print(out)
 
@@ -282,7 +299,7 @@ def _run(args: list[str]) -> None:
         description=torchrl_loco.__doc__,
         args=args,
         use_underscores=True,
-        registry=NUMBERS,
+        registry=VALUES,
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from torchrl_loco.checks import check_device
+from torchrl_loco.checks import check_device, check_run
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import env_class
 from torchrl_loco.training.config import CONFIGS, TrainingConfig
@@ -45,9 +45,7 @@ class RunFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = Path(path)
-        if not (self.path / "config.json").is_file():
-            raise FileNotFoundError(f"{self.path} is no run folder: it has no config.json")
+        self.path = check_run(path)
 
     @classmethod
     def create(cls, config: TrainingConfig) -> "RunFolder":
