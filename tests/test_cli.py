@@ -61,6 +61,7 @@ def test_settings_of_a_task_wait_for_torch_alone():
     assert exits == ["exit 0", "exit 2"], said
     assert imported == "imported ['torch']"
     assert "--algorithm, ppo or reppo (here ppo)" in said
+    assert "--task" not in said  # the preset is for no other
     assert "Perhaps you meant: --num_envs" in said
     assert not {"walker_run", "doctor"} & set(said.split())  # other tasks and commands have such an option too
 

@@ -314,15 +314,21 @@ def _task_config(args: list[str]) -> Any:
     if len(args) > 1 and not args[1].startswith("-"):
         with _user_errors():
             task = args[1] = canonical_id(args[1])
-            if _take("--task", args) is not None:  # a field as the others, but the preset is for one task
-                raise ValueError("the task stands right after train, and --task is no option")
-            config = preset(task, device, algorithm)
+            config = _fixed_task(preset(task, device, algorithm))
         about[task] += f" {untuned(config)}\n\n--algorithm, {' or '.join(CONFIGS)} (here {config.algorithm}), and"
         about[task] += " --device decide which\nsettings there are, and how they are preset."
         configs = {task: config}
     else:  # this is going to show what tasks there are, which need not wait for what presets take to import
         configs = {task: TrainingConfig(task) for task in about}
     return tyro.extras.subcommand_type_from_defaults(configs, about, prefix_names=False)
+
+
+def _fixed_task(config: "training.TrainingConfig") -> "training.TrainingConfig":
+    """Returns the settings with all but their task open to options: the preset is for no other."""
+    hidden = Annotated[str, tyro.conf.Suppress, tyro.conf.Fixed]
+    members = {"__annotations__": {"task": hidden}, "task": config.task, "__doc__": config.__doc__}
+    cls: Any = dataclasses.dataclass(frozen=True)(type(type(config).__name__, (type(config),), members))
+    return cls(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
 
 
 def _begin(config: "training.TrainingConfig") -> "training.Trainer":
