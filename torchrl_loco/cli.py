@@ -166,6 +166,7 @@ class Video:
         from torchrl_loco import training
 
         out = default if self.out is None else self.out
+        print(f"recording {self.seconds:g} s; on a CPU this takes a while", file=sys.stderr)  # in a log there is no bar
         training.record(policy, self.env(policy), out, self.seconds, policy.info["action_repeat"], self.camera)
         print(out)
 
