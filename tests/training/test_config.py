@@ -1,9 +1,11 @@
 """Presets are valid, and wrong settings are named."""
 
+import contextlib
 import dataclasses
 import inspect
 
 import pytest
+import torch
 
 from torchrl_loco.training import PPOConfig, REPPOConfig, TrainingConfig, preset, untuned
 
@@ -104,3 +106,10 @@ def test_what_the_settings_are_not_tuned_for_is_said(task, device, algorithm, sa
     config = dataclasses.replace(preset(task, "cpu", algorithm), device=device)
     assert ("walker_stand by ppo" in untuned(config)) == said
     assert bool(untuned(config)) == said
+
+
+@pytest.mark.parametrize(("device", "is_valid"), [(torch.device("cuda", 1), True), ("cpu:1", False), (3, False)])
+def test_a_device_may_be_torchs_own(device, is_valid):
+    config = preset("walker_stand", "cpu", "ppo")
+    with contextlib.nullcontext() if is_valid else pytest.raises(ValueError, match="choose one of cpu, cuda, cuda:0"):
+        assert dataclasses.replace(config, device=device).device == device

@@ -198,7 +198,7 @@ _MAY_BE_ZERO = ("lmbda", "entropy_coeff", "video_seconds", "final_lr", "aux_coef
 
 
 def _check_kind_of_device(name: str) -> None:
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", str(name)):
         raise ValueError(f"no device {name!r}: choose one of cpu, cuda, cuda:0, ...")
 
 
