@@ -327,8 +327,8 @@ def _task_config(args: list[str]) -> Any:
 def _fixed_task(config: "training.TrainingConfig") -> "training.TrainingConfig":
     """Returns the settings with all but their task open to options: the preset is for no other."""
     hidden = Annotated[str, tyro.conf.Suppress, tyro.conf.Fixed]
-    members = {"__annotations__": {"task": hidden}, "task": config.task, "__doc__": config.__doc__}
-    cls: Any = dataclasses.dataclass(frozen=True)(type(type(config).__name__, (type(config),), members))
+    kind = type(config)
+    cls = dataclasses.make_dataclass(kind.__name__, [("task", hidden, config.task)], bases=(kind,), frozen=True)
     return cls(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
 
 
