@@ -28,7 +28,7 @@ def add(name: str, description: str, worlds: list[int]) -> argparse.ArgumentPars
 small = [256] if DEVICE == "cpu" else [8192]
 add("throughput", "from the bare simulator to a collector", small if DEVICE == "cpu" else [512, 2048, 8192, 32768])
 add("startup", "time from process start to the first step, and memory per world", small)
-add("peers", "other simulators beside ours, in processes of their own", small)
+add("peers", "other simulators compared with ours, in processes of their own", small)
 add("fidelity", "deviation from C MuJoCo in double precision", [256])
 commands.choices["fidelity"].add_argument("--picture", type=Path, help="file for a plot")
 add("profile", "time of each kernel (CUDA)", small)
@@ -37,7 +37,7 @@ commands.choices["soak"].add_argument("--frames", type=float, default=1e5 if DEV
 for name, default in (("throughput", list(CASES)), ("profile", ["env_step_and_maybe_reset"])):
     commands.choices[name].add_argument("--cases", nargs="+", choices=[*CASES, *VARIANTS], default=default)
 commands.choices["peers"].add_argument("--path", type=Path, help="folder that the peers' packages were installed in")
-train = commands.add_parser("training", help="time to a return, beside Brax's PPO on Playground")
+train = commands.add_parser("training", help="time to a return, compared with Brax's PPO on Playground")
 train.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_walk"])
 train.add_argument("--frames", type=int, default=10_000_000)
 train.add_argument("--peer", action="store_true", help="train Brax's PPO too")

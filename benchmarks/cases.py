@@ -30,14 +30,15 @@ def waiter(device: torch.device) -> Callable[[], None]:
 
 def bare_default(body: str, n: int, device: torch.device) -> Callable[[], None]:
     """A plain loop of ``mujoco_warp.step`` in a graph, with mujoco_warp's own settings but for the printing."""
-    sim = Simulation(models.load(body), sim_config(DEFAULTS[body], "playground", n, {}), n, device)
+    config = sim_config(DEFAULTS[body], "playground", n, {})
+    sim = Simulation(models.load(models.PATHS[body]), config, n, device)
     sim.model.opt.graph_conditional, sim.model.opt.run_qacc_smooth = True, True
     mask = wp.ones(n, dtype=bool, device=sim.device)
     with wp.ScopedDevice(sim.device):
         sim.reset(mask)
         mjw.step(sim.model, sim.data)
         with wp.ScopedCapture(device=sim.device) as capture:
-            for _ in range(sim.substeps):
+            for _ in range(config.substeps):
                 mjw.step(sim.model, sim.data)
     wp.synchronize_device(sim.device)
 
@@ -50,7 +51,7 @@ def bare_default(body: str, n: int, device: torch.device) -> Callable[[], None]:
 
 def bare_tuned(body: str, n: int, device: torch.device) -> Callable[[], None]:
     """Our simulation's recorded control step, without observation or reward."""
-    sim = Simulation(models.load(body), sim_config(DEFAULTS[body], "playground", n, {}), n, device)
+    sim = Simulation(models.load(models.PATHS[body]), sim_config(DEFAULTS[body], "playground", n, {}), n, device)
     mask = wp.ones(n, dtype=bool, device=sim.device)
     graph = sim.capture(sim.step)
     sim.capture(lambda: (sim.reset(mask), sim.forward(mask))).replay()

@@ -33,8 +33,8 @@ APART = 0.1
 def fidelity(bodies: Sequence[str], worlds: int, device: torch.device) -> list[Row]:
     """Compares trajectories from the same states under the same random actions.
 
-    Each protocol is held against C MuJoCo with the same solver settings, and the one that cuts the solver short also
-    against a converged solver.
+    Each protocol is compared with C MuJoCo under the same solver settings, and the one that stops the solver early also
+    with a converged solver.
     """
     rows = []
     cases = [(b, "playground", against) for b in bodies for against in ("same settings", "converged")]

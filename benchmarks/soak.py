@@ -1,8 +1,8 @@
 """Millions of steps under actions and states that no trained policy would choose: nothing may break, leak or be lost.
 
-Three things are done to the worlds: bang-bang actions beside uniform ones, a NaN or infinity in the actions of some,
-and now and then states far outside what a body can be in. After every block, what the rollout showed is held against
-the counters of ``env.health()``.
+Three things are done to the worlds: bang-bang actions beside uniform ones, a NaN, infinity or huge number in the action
+of some, and now and then states far outside what a body can be in. After every block, what the rollout showed is
+compared with the counters of ``env.health()``.
 """
 
 import time
@@ -26,7 +26,7 @@ COLUMNS = {
 BLOCK = 500
 """Control steps between two comparisons."""
 BAD_SHARE = 1e-4
-"""Share of worlds whose action is spoilt at a step."""
+"""Share of worlds that get one of these values in their action at a step."""
 BAD_VALUES = (float("nan"), float("inf"), -float("inf"), 1e30)
 EXTREME = 64
 """Worlds that are put into an extreme state before each block."""
@@ -84,7 +84,7 @@ def upset(env: LocoEnv, td: TensorDictBase, generator: torch.Generator) -> Tenso
 
 
 def play(env: LocoEnv, td: TensorDictBase, generator: torch.Generator) -> tuple[TensorDictBase, dict[str, int]]:
-    """Plays a block; returns where it ends and how much of what happened in it."""
+    """Plays a block; returns where it ends, and counts of bad actions and of ends of episodes."""
     shape, device = env.action_spec.shape, env.device
     values = torch.tensor(BAD_VALUES, device=device)
     sums = torch.zeros(3, dtype=torch.long, device=device)
@@ -93,15 +93,15 @@ def play(env: LocoEnv, td: TensorDictBase, generator: torch.Generator) -> tuple[
         action = torch.empty(shape, device=device).uniform_(-1.5, 1.5, generator=generator)
         draw = torch.rand(shape[0], 2, device=device, generator=generator)
         action = torch.where(draw[:, :1] < 0.5, action.sign(), action)
-        spoilt = draw[:, 1] < BAD_SHARE
         which = (draw[:, 0] * len(values)).long()
-        action[:, 0] = torch.where(spoilt, values[which], action[:, 0])
+        action[:, 0] = torch.where(draw[:, 1] < BAD_SHARE, values[which], action[:, 0])
+        bad = ~action.isfinite().all(dim=1)  # a huge number is clipped
         current, td = env.step_and_maybe_reset(td.set("action", action))
         after = current["next"]
         reward = after["reward"]
         well &= after["observation"].isfinite().all() & td["observation"].isfinite().all()
         well &= (reward >= 0).all() & (reward <= 1 + 1e-5).all() & (reward * after["terminated"] == 0).all()
-        sums += torch.stack([spoilt.sum(), after["terminated"].sum(), after["truncated"].sum()])
+        sums += torch.stack([bad.sum(), after["terminated"].sum(), after["truncated"].sum()])
     assert well, "an observation or reward was not finite, or not in [0, 1]"
     return td, dict(zip(("bad actions", "terminated", "truncated"), sums.tolist(), strict=True))
 

@@ -16,12 +16,15 @@ project = "torchrl_loco"
 author = "the torchrl_loco authors"
 release = version = torchrl_loco.__version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = [
+    *("myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"),
+    *("sphinx.ext.mathjax", "sphinx-mathjax-offline"),  # formulas without a network
+]
 exclude_patterns = ["_build", "tasks/parts", "generated/fragments", "generated/notebooks/README.md"]
 nitpicky = True  # a reference to a name that is gone is an error
 ELSEWHERE = "torch|torchrl|tensordict|mujoco|mujoco_warp|warp|wp|mjw|numpy|collections|pathlib"
 nitpick_ignore_regex = [("py:.*", rf"({ELSEWHERE})\..*")]
-nitpick_ignore = [("py:class", "torchrl_loco.sim.scratch.ScratchPool")]  # of no use to a reader
+nitpick_ignore = [("py:class", "torchrl_loco.sim.graph.ScratchPool")]  # internal
 
 # Notebooks are shown as they are: the tests run them.
 nb_execution_mode = "off"
@@ -35,6 +38,7 @@ autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 
 html_theme = "pydata_sphinx_theme"
+html_sidebars = {page: [] for page in ("benchmarks", "changelog", "comparison", "fidelity")}  # without subpages
 html_static_path = ["_static"]
 html_css_files = ["wide.css"]
 html_title = f"torchrl_loco {release}"

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from conftest import COARSE
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, RewardSum
@@ -10,9 +11,13 @@ import torchrl_loco
 from torchrl_loco import RolloutCollector
 
 
-def env(task, wrap, device="cpu", num_envs=4, **settings):
-    made = torchrl_loco.make(task, num_envs, device, seed=0, stagger=True, **{"episode_length": 7, **settings})
-    return torchrl_loco.TransformedEnv(made, Compose(InitTracker(), RewardSum())) if wrap else made
+@pytest.fixture
+def make(shared):
+    def make(task, wrap, device="cpu", num_envs=4, copy=0, **settings):
+        env = shared(task, num_envs, device, stagger=True, copy=copy, **{"episode_length": 7, **COARSE, **settings})
+        return torchrl_loco.TransformedEnv(env, Compose(InitTracker(), RewardSum())) if wrap else env
+
+    return make
 
 
 def policy(env):
@@ -23,8 +28,8 @@ def policy(env):
 
 
 @pytest.mark.parametrize("wrap", [False, True])
-def test_exchangeable_with_torchrls_collector(task, wrap):
-    ours, theirs = env(task, wrap), env(task, wrap)
+def test_exchangeable_with_torchrls_collector(make, body_task, wrap):
+    ours, theirs = (make(body_task, wrap, copy=copy) for copy in (0, 1))
     settings = {"frames_per_batch": 20, "total_frames": 60}
     reference = Collector(
         theirs, policy(theirs), track_traj_ids=False, auto_register_policy_transforms=False, **settings
@@ -41,25 +46,33 @@ def test_exchangeable_with_torchrls_collector(task, wrap):
     assert not got[0].requires_grad
 
 
-def test_endless_and_wrong_sizes():
-    made = env("walker_walk", False)
+def test_endless_and_wrong_sizes(make):
+    made = make("walker_run", False)
     batches = iter(RolloutCollector(made, policy(made), frames_per_batch=8))
     first, second = next(batches), next(batches)
     assert first["observation"].data_ptr() != second["observation"].data_ptr()
-    assert torch.equal(
-        first["next", "observation"][:, -1][~first["next", "done"][:, -1].squeeze(-1)],
-        second["observation"][:, 0][~first["next", "done"][:, -1].squeeze(-1)],
-    )
+    going_on = ~first["next", "done"][:, -1].squeeze(-1)
+    assert torch.equal(first["next", "observation"][:, -1][going_on], second["observation"][:, 0][going_on])
     for frames in (0, 6, -4):
         with pytest.raises(ValueError, match="positive multiple of the 4 worlds"):
             RolloutCollector(made, policy(made), frames_per_batch=frames)
 
 
+def test_its_state_goes_on_in_another_collector(make):
+    """To the bit; and before the first batch there is nothing to go on from."""
+    envs = [make("walker_run", True, copy=copy) for copy in (0, 1)]
+    first, second = (RolloutCollector(env, policy(env), frames_per_batch=12) for env in envs)
+    second.load_state_dict(first.state_dict())
+    first.rollout()
+    second.load_state_dict(first.state_dict())
+    assert (first.rollout() == second.rollout()).all()
+
+
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")
 @pytest.mark.parametrize("wrap", [False, True])
-def test_no_synchronisation(task, wrap):
-    made = env(task, wrap, "cuda", 256, episode_length=50)
+def test_no_synchronisation(make, task, wrap):
+    made = make(task, wrap, "cuda", 256, episode_length=50)
     batches = iter(RolloutCollector(made, policy(made), frames_per_batch=256 * 10))
     next(batches)
     torch.cuda.synchronize()
@@ -71,7 +84,7 @@ def test_no_synchronisation(task, wrap):
     assert (torch.cat(done, dim=1).sum(dim=1) >= 2).all()
 
 
-def test_a_closed_environment_begins_anew():
+def test_a_closed_environment_begins_new_episodes():
     env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0)
     collector = RolloutCollector(env, lambda td: td.set("action", torch.zeros(2, 6)), frames_per_batch=8)
     collector.rollout()

@@ -1,4 +1,4 @@
-"""Our MJCF files against the figures of dm_control's compiled models."""
+"""Our MJCF files against the figures of dm_control's compiled models, and what a model must keep to."""
 
 import mujoco
 import numpy as np
@@ -7,50 +7,77 @@ from oracle import reference_model
 
 from torchrl_loco import models
 
-BODIES = ("walker", "humanoid")
 SECTIONS = ("names", "sizes", "option", "source")
 
 
-def compiled_fields():
-    return [(body, field) for body in BODIES for field in reference_model(body) if field not in SECTIONS]
-
-
-@pytest.mark.parametrize(("body", "field"), compiled_fields())
-def test_field_agrees_with_dm_control(body, field):
-    ours = np.asarray(getattr(models.load(body), field), dtype=float)
-    theirs = np.asarray(reference_model(body)[field], dtype=float)
-    assert ours.shape == theirs.shape or ours.size == theirs.size == 0
-    np.testing.assert_allclose(ours.ravel(), theirs.ravel(), rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("body", BODIES)
-def test_names_sizes_and_options_agree(body):
-    model, reference = models.load(body), reference_model(body)
-    for kind, names in reference["names"].items():
-        assert [getattr(model, kind)(i).name for i in range(len(names))] == names
-    for size, value in reference["sizes"].items():
-        assert getattr(model, size) == value, size
+def assert_figures_are_dm_controls(model, body):
+    reference = reference_model(body)
+    for field in reference:
+        if field not in SECTIONS:
+            ours, theirs = np.asarray(getattr(model, field), dtype=float), np.ravel(reference[field])
+            np.testing.assert_allclose(ours.ravel(), theirs, rtol=0, atol=1e-6, err_msg=field)
+    assert {size: getattr(model, size) for size in reference["sizes"]} == reference["sizes"]
     for option, value in reference["option"].items():
         np.testing.assert_allclose(getattr(model.opt, option), value, err_msg=option)
 
 
-@pytest.mark.parametrize("body", BODIES)
-def test_scene_is_shared(body):
-    model = models.load(body)
+@pytest.mark.parametrize("body", ["walker", "humanoid"])
+def test_figures_names_and_scene(body):
+    model = models.load(models.PATHS[body])
+    assert_figures_are_dm_controls(model, body)
+    for kind, names in reference_model(body)["names"].items():
+        assert [getattr(model, kind)(i).name for i in range(len(names))] == names
     assert {model.camera(i).name for i in range(model.ncam)} == {"side", "back", "egocentric"}
     assert model.geom("floor").type == mujoco.mjtGeom.mjGEOM_PLANE
     assert model.nlight == 1
     assert {model.material(i).name for i in range(model.nmat)} == {"floor", "skin", "skin_left"}
-
-
-@pytest.mark.parametrize("body", BODIES)
-def test_only_the_sensor_that_is_read(body):
-    model = models.load(body)
-    assert model.nsensor == 1
+    assert model.nsensor == 1  # a sensor that nobody reads costs time
     assert model.sensor_type[0] == mujoco.mjtSensor.mjSENS_SUBTREELINVEL
     assert model.sensor_objid[0] == model.body("torso").id
+    assert models.check(model) is model
 
 
-def test_unknown_model():
-    with pytest.raises(ValueError, match="walker, humanoid"):
-        models.load("ant")
+ANT = """
+<mujoco>
+  <worldbody><body name="ant"><joint name="leg"/><geom name="leg" size="0.1"/><camera name="eye"/></body></worldbody>
+  <actuator>{actuator}</actuator>
+  <sensor>{sensor}</sensor>
+</mujoco>
+"""
+MOTOR = '<motor name="a" joint="leg" ctrlrange="-1 1"/>'
+VELOCITY = '<subtreelinvel name="speed" body="ant"/>'
+
+
+def ant(actuator=MOTOR, sensor=VELOCITY, option=""):
+    xml = ANT.format(actuator=actuator, sensor=sensor).replace("<mujoco>", f"<mujoco>{option}")
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def test_a_model_that_would_go_wrong_in_silence_is_refused():
+    from_camera = '<framelinvel name="seen" objtype="body" objname="ant" reftype="camera" refname="eye"/>'
+    clampctrl = '<option><flag clampctrl="disable"/></option>'
+    for options, message in [
+        ({"actuator": MOTOR.replace("-1 1", "-2 2")}, "every actuator needs ctrlrange -1 1"),
+        ({"actuator": '<motor name="a" joint="leg"/>'}, "every actuator needs ctrlrange -1 1"),
+        ({"actuator": MOTOR.replace("/>", ' ctrllimited="false"/>')}, "must be clipped"),
+        ({"option": clampctrl}, "must be clipped"),
+        ({"actuator": MOTOR.replace("/>", ' delay="0.1" nsample="4"/>')}, "delays"),
+        ({"actuator": '<intvelocity joint="leg" ctrlrange="-1 1" actrange="-1 1"/>'}, "activations"),
+        ({"sensor": from_camera}, "sensor 'seen' is not evaluated"),
+        ({"sensor": '<framepos name="place" objtype="body" objname="ant"/>'}, "sensor 'place' is not evaluated"),
+        ({"sensor": '<actuatorfrc name="force" actuator="a"/>'}, "sensor 'force' is not evaluated"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            models.check(ant(**options))
+    models.check(ant())
+
+
+def test_load(tmp_path):
+    """A scene of its own comes before ours; a missing or broken file is named."""
+    path = tmp_path / "ant.xml"
+    with pytest.raises(ValueError, match=r"ant\.xml"):
+        models.load(path)
+    path.write_text('<mujoco><include file="scene.xml"/></mujoco>')
+    assert models.load(path).nmat == 3
+    (tmp_path / "scene.xml").write_text('<mujoco><asset><material name="sand"/></asset></mujoco>')
+    assert models.load(path).nmat == 1

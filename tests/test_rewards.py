@@ -1,4 +1,4 @@
-"""tolerance against a NumPy version over a grid that holds the edges."""
+"""tolerance against a NumPy version, over a grid that contains the edges."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,14 @@
-"""Checks of what a user passes: numbers, devices, paths."""
+"""Checks of user input, one function per kind of argument. Each returns the value in its canonical type.
 
+A message says what is wrong and what is valid. Intervals are written as in mathematics: ``"(0, 1]"``.
+"""
+
+import dataclasses
+import difflib
+import math
+import numbers
 import operator
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,55 +17,130 @@ import numpy as np
 if TYPE_CHECKING:
     import torch
 
+POSITIVE_INT = "[1, 2**31)"
+"""Counts: kernels index with 32 bits."""
+POSITIVE = "(0, inf)"
+SEED = "[0, 2**32)"
 
-def check_count(name: str, value: Any) -> int:
-    """Returns ``value`` as an int of at least 1.
+
+def check_int(name: str, value: Any, interval: str = POSITIVE_INT) -> int:
+    """Returns ``value`` as an int.
 
     Raises:
-        TypeError: it is no integer; the message calls it ``name``.
-        ValueError: it is less than 1.
+        TypeError: it is no integer.
+        ValueError: it lies outside the interval.
     """
     try:
-        count = operator.index(value)
+        number = operator.index(value)
     except TypeError:
         raise TypeError(f"{name} must be an integer, got {value!r}") from None
-    if isinstance(value, bool) or count < 1:
-        raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
-    return count
+    if isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be an integer, got {value!r}")
+    _check_interval(name, number, interval)
+    return number
 
 
-def check_flag(name: str, value: Any) -> bool:
-    """Returns ``value``, or raises an error that names it if it is neither True nor False.
+def check_float(name: str, value: Any, interval: str = POSITIVE) -> float:
+    """Returns ``value`` as a float.
 
     Raises:
-        TypeError: it is something else.
+        TypeError: it is no real number.
+        ValueError: it lies outside the interval, or is NaN.
+    """
+    if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real):
+        raise TypeError(f"{name} must be a number, got {value!r}")
+    _check_interval(name, float(value), interval)
+    return float(value)
+
+
+def _check_interval(name: str, value: float, interval: str) -> None:
+    low, high = (_bound(text) for text in interval[1:-1].split(", "))
+    above = value >= low if interval[0] == "[" else value > low
+    below = value <= high if interval[-1] == "]" else value < high
+    if not (above and below):  # false for NaN too
+        raise ValueError(f"{name} must lie in {interval}, got {value!r}")
+
+
+def _bound(text: str) -> float:
+    base, _, power = text.partition("**")
+    return float(base) ** float(power) if power else float(base)
+
+
+def check_bool(name: str, value: Any) -> bool:
+    """Returns ``value`` as a bool.
+
+    Raises:
+        TypeError: it is neither True nor False.
     """
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"{name} must be True or False, got {value!r}")
     return bool(value)
 
 
-def check_seed(value: Any) -> int:
-    """Returns ``value`` as an int in [0, 2**32).
+def check_choice(name: str, value: Any, choices: Collection[str], also: Collection[str] = ()) -> str:
+    """Returns ``value``.
+
+    Args:
+        name: what the value is called.
+        value: the value.
+        choices: what it may be.
+        also: further names that the message may suggest, such as aliases.
 
     Raises:
-        TypeError: it is no integer.
-        ValueError: it is out of range.
+        ValueError: it is none of the choices.
     """
-    try:
-        seed = operator.index(value)
-    except TypeError:
-        raise TypeError(f"seed must be an integer or None, got {value!r}") from None
-    if isinstance(value, bool) or not 0 <= seed < 2**32:
-        raise ValueError(f"seed must lie in [0, 2**32), got {value!r}")
-    return seed
+    if not isinstance(value, str) or value not in choices:
+        hint = suggestion(str(value), [*choices, *also])
+        raise ValueError(f"unknown {name} {value!r}{hint}: choose one of {', '.join(choices)}")
+    return value
+
+
+def suggestion(word: str, choices: Collection[str]) -> str:
+    """Returns ``", did you mean 'x'?"`` for the choice nearest to ``word``, or an empty string."""
+    near = difflib.get_close_matches(word, choices, n=1)
+    return f", did you mean {near[0]!r}?" if near else ""
+
+
+def check_fields(config: Any, intervals: Mapping[str, str]) -> None:
+    """Checks the fields of a dataclass that are numbers or flags.
+
+    Args:
+        config: an instance.
+        intervals: the interval of a field whose default is not :data:`POSITIVE_INT` or :data:`POSITIVE`.
+
+    Raises:
+        TypeError: a field has the wrong type.
+        ValueError: a field lies outside its interval.
+    """
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.type is bool:
+            check_bool(field.name, value)
+        elif field.type is int:
+            check_int(field.name, value, intervals.get(field.name, POSITIVE_INT))
+        elif field.type is float:
+            check_float(field.name, value, intervals.get(field.name, POSITIVE))
+
+
+def check_multiple(name: str, value: float, base_name: str, base: float) -> int:
+    """Returns how many times ``base`` goes into ``value``.
+
+    Raises:
+        ValueError: it is no whole number of at least 1.
+    """
+    ratio = round(value / base)
+    if ratio < 1 or not math.isclose(value, ratio * base, rel_tol=1e-6):
+        raise ValueError(
+            f"{name} ({value}) must be a whole multiple of {base_name} ({base}), for example {max(ratio, 1) * base:g}"
+        )
+    return ratio
 
 
 def check_device(device: "torch.device | str | None") -> "torch.device":
-    """Returns the device with its index, CUDA before CPU for ``None``.
+    """Returns the device with its index; ``None`` stands for CUDA if there is any, else the CPU.
 
     Raises:
-        ValueError: it is not here; the message names those that are.
+        ValueError: this machine does not have it; the message names the devices that it has.
     """
     import torch  # takes seconds, which the other checks need not wait for
 
@@ -68,42 +151,38 @@ def check_device(device: "torch.device | str | None") -> "torch.device":
     if name == "cuda" and cuda:
         name = f"cuda:{torch.cuda.current_device()}"
     if name not in ("cpu", *cuda):
-        raise ValueError(f"no device {str(device)!r} here: choose one of {', '.join(['cpu', *cuda])}")
+        raise ValueError(f"no device {str(device)!r} on this machine: choose one of {', '.join(['cpu', *cuda])}")
     return torch.device(name)
 
 
-def check_new_file(name: str, value: Any) -> Path:
-    """Returns ``value`` as the path of a file that is not there yet, but whose folder is.
+def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> Path:
+    """Returns ``value`` as the absolute path of a file that can be created.
+
+    Args:
+        name: what the value is called.
+        value: the path.
+        suffixes: what the file may end in; anything if empty.
 
     Raises:
         TypeError: it is no path.
-        ValueError: it cannot be written, or would be overwritten.
+        ValueError: its folder does not exist, a file is already there, or the suffix is none of the valid ones.
     """
-    path = check_folder(name, value)
-    if path.exists():
-        raise ValueError(f"{name} {path} is already there: move it away, or choose another name")
-    return path
-
-
-def check_folder(name: str, value: Any) -> Path:
-    """Returns ``value`` as the path of a file whose folder is there.
-
-    Raises:
-        TypeError: it is no path.
-        ValueError: there is no such folder.
-    """
-    path = Path(value).absolute()  # where it is now, should the working directory change
+    path = Path(value).absolute()  # the working directory may change
+    if suffixes and path.suffix not in suffixes:
+        raise ValueError(f"{name} must end in one of {', '.join(suffixes)}, got {path}")
     if not path.parent.is_dir():
-        raise ValueError(f"{name} {path} cannot be written: there is no folder {path.parent}")
+        raise ValueError(f"{name} {path} cannot be written: the folder {path.parent} does not exist")
+    if path.exists():
+        raise ValueError(f"{name} {path} already exists: move it away, or choose another name")
     return path
 
 
 def check_run(path: Path) -> Path:
-    """Returns ``path`` as that of a run.
+    """Returns ``path`` as that of a run folder.
 
     Raises:
         FileNotFoundError: it is no folder with a ``config.json``.
     """
     if not (Path(path) / "config.json").is_file():
-        raise FileNotFoundError(f"{path} is no run folder: it has no config.json")
+        raise FileNotFoundError(f"{path} is not a run folder: it has no config.json")
     return Path(path)

@@ -1,45 +1,42 @@
 """The command ``torchrl-loco``: parse, call, exit.
 
-What takes seconds to import is imported where it is used: help and wrong options appear at once.
+Modules that take seconds to import are imported where they are used, so that help and errors appear at once.
 """
 
 import contextlib
 import dataclasses
-import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 
+import tyro
+
 import torchrl_loco
-from torchrl_loco.checks import check_device, check_folder, check_run, check_seed
-from torchrl_loco.config import suggestion
+from torchrl_loco.checks import SEED, check_choice, check_device, check_float, check_int, check_output_file, check_run
 
 if TYPE_CHECKING:
     from torchrl_loco import training
 
-try:
-    import tyro
-except ImportError as error:  # the environments work without the extra, the command does not
-    hint = "pip install 'torchrl-loco[train]', or in a checkout pip install '.[train]'"
-    raise SystemExit(f"torchrl-loco: {error}. Install what it needs: {hint}") from None
-
 CONTAINERS = (".mp4", ".mkv", ".mov")
-"""What the file of a video can be."""
+"""Suffixes of a video."""
+
+EXTRA = ("matplotlib", "tensorboard", "imageio", "av")
+"""Modules of the extra "train"."""
 
 VALUES = tyro.constructors.ConstructorRegistry()
-"""How values are written, where the parser's own way is hard on the user."""
+"""How values are parsed, where the parser's own rules are inconvenient."""
 
 
 @VALUES.primitive_rule
-def _whole_numbers_and_what_may_be_none(info: tyro.constructors.PrimitiveTypeInfo) -> Any:
-    """Takes whole numbers as people write them, and what may be None as what it is else: nobody types None."""
+def _integers_and_optionals(info: tyro.constructors.PrimitiveTypeInfo) -> Any:
+    """Parses integers as people write them, and optional values without the word None."""
     kinds = get_args(info.type) if info.type_origin in (Union, UnionType) else (info.type,)
     named = [kind for kind in kinds if kind is not NoneType]
     if named != [int] and (len(named) != 1 or len(kinds) == 1):
         return None
-    parse: Callable[[str], Any] = _whole_number if named == [int] else named[0]
+    parse: Callable[[str], Any] = _integer if named == [int] else named[0]
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
         metavar=named[0].__name__.upper(),
@@ -49,36 +46,39 @@ def _whole_numbers_and_what_may_be_none(info: tyro.constructors.PrimitiveTypeInf
     )
 
 
-def _whole_number(word: str) -> int:
+def _integer(word: str) -> int:
     with contextlib.suppress(ValueError):
         return int(word)
     with contextlib.suppress(ValueError):
         if (value := float(word)).is_integer():
             return int(value)
-    raise ValueError(f"{word!r} is no whole number: write it as 100000, 100_000 or 1e5")
+    raise ValueError(f"{word!r} is not an integer: write it as 100000, 100_000 or 1e5")
 
 
 def list_tasks() -> None:
     """List the environments."""
-    from torchrl_loco.ids import OURS, plugins
-
-    about = dict(OURS)
-    for name in plugins():
-        from torchrl_loco.registry import env_class  # takes seconds, which most users' list need not
-
-        try:
-            about[name] = (env_class(name).__doc__ or "").strip().split("\n")[0]
-        except ImportError as error:
-            about[name] = f"NOT USABLE: {error}"
-    for name, words in about.items():
+    for name, words in _summaries().items():
         print(f"{name:<16} {words}")
+
+
+def _summaries() -> dict[str, str]:
+    """Returns what each environment asks for, by id."""
+    from torchrl_loco.registry import list_envs, summary
+
+    summaries = {}
+    for name in list_envs():
+        try:
+            summaries[name] = summary(name)
+        except ImportError as error:
+            summaries[name] = f"NOT USABLE: {error}"
+    return summaries
 
 
 def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None = None) -> None:
     """Print versions, devices and the kernel cache, and test the physics of each device against C MuJoCo.
 
     Args:
-        size: instead, measure what njmax and naconmax this task needs.
+        size: instead, measure the njmax and naconmax that this task needs.
         num_envs: number of worlds to measure with.
         device: where to measure; default: CUDA if there is any.
     """
@@ -89,12 +89,15 @@ def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None =
             for name, (needed, advised) in doctor.size(size, num_envs, device).items():
                 print(f"{name:<9} at most {needed} needed under random actions, {advised} advised")
         return
-    well = True
-    for subject, finding, is_well in doctor.diagnose():
-        print(f"{subject:<20} {finding}{'' if is_well else '  <- NOT RIGHT'}", flush=True)
-        well &= is_well
-    if not well:
+    problems = []
+    for finding in doctor.diagnose():
+        print(f"{finding.subject:<20} {finding.text}", flush=True)
+        if finding.problem:
+            problems.append(finding.subject)
+    if problems:
+        print(f"verdict: NOT RIGHT, see {', '.join(problems)}")
         raise SystemExit(1)
+    print("verdict: everything works")
 
 
 def evaluate(
@@ -109,8 +112,8 @@ def evaluate(
     Args:
         run: folder of the run.
         episodes: number of episodes; default: as the run was evaluated.
-        seed: seed that the episodes are drawn from; default: the episodes of the run's own evaluation.
-        device: where to play them; default: where the run was trained.
+        seed: seed of the episodes; default: the episodes of the run's own evaluation.
+        device: where to play them; default: the device on which the run was trained.
     """
     with _user_errors():
         from torchrl_loco import training
@@ -121,7 +124,7 @@ def evaluate(
 
 
 def resume(run: tyro.conf.Positional[Path], /) -> None:
-    """Go on with a run that was stopped, from its last checkpoint, as if it had not been.
+    """Continue a run that was stopped, from its last checkpoint, as if it had not been stopped.
 
     Args:
         run: folder of the run.
@@ -136,37 +139,34 @@ def resume(run: tyro.conf.Positional[Path], /) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Video:
-    """What of an episode is shown."""
+    """Which part of an episode is shown, and how."""
 
     seconds: float = 10.0
     """Length of the video (s)."""
     camera: Literal["side", "back", "egocentric"] = "side"
     """Which of the model's cameras."""
     seed: int = 0
-    """Seed that the episode is drawn from."""
+    """Seed of the episode."""
     device: str | None = None
     """Where to play; default: CUDA if there is any."""
     out: Path | None = None
-    """The video; default: video.mp4 in the run's folder (record), TASK.mp4 where there is no display (play)."""
+    """The video, a new file; default: a new file in the run folder (record), or TASK.mp4 without a display (play)."""
 
     def check(self) -> None:
-        """Refuses what cannot be shown, before anything is printed or made."""
-        if not 0 < self.seconds < math.inf:
-            raise ValueError(f"seconds must be positive and finite, got {self.seconds}")
-        check_seed(self.seed)
-        if self.device is not None:  # to look for devices imports torch
+        """Checks all options before anything is printed or made."""
+        check_float("seconds", self.seconds)
+        check_int("seed", self.seed, SEED)
+        if self.device is not None:  # looking for devices imports torch
             check_device(self.device)
         if self.out is not None:
-            if self.out.suffix not in CONTAINERS:
-                raise ValueError(f"out must end in one of {', '.join(CONTAINERS)}, got {self.out}")
-            check_folder("out", self.out)
+            check_output_file("out", self.out, CONTAINERS)
 
     def make(self, policy: "torchrl_loco.Policy", default: Path) -> None:
-        """Records the policy into ``out`` or the default, and prints which."""
+        """Records the policy into ``out``, or into ``default`` or a numbered sibling of it, and prints the path."""
         from torchrl_loco import training
 
-        out = default if self.out is None else self.out
-        print(f"recording {self.seconds:g} s; on a CPU this takes a while", file=sys.stderr)  # in a log there is no bar
+        out = training.unused_path(default) if self.out is None else self.out
+        print(f"recording {self.seconds:g} s; on a CPU this takes a while", file=sys.stderr)  # logs have no bar
         training.record(policy, self.env(policy), out, self.seconds, policy.info["action_repeat"], self.camera)
         print(out)
 
@@ -183,7 +183,7 @@ def record(run: tyro.conf.Positional[Path], /, video: VideoOptions = Video()) ->
 
     Args:
         run: folder of the run.
-        video: what is shown.
+        video: which part of an episode is shown, and how.
     """
     with _user_errors():
         from torchrl_loco import training
@@ -199,12 +199,12 @@ def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: 
 
     Args:
         task: id of the environment.
-        policy: a run, or the file of a policy; default: the one that comes with the package.
-        video: what is shown; with --out, a video in any case.
+        policy: a run folder or a policy file; default: the policy shipped with the package.
+        video: which part of an episode is shown, and how; --out always records a video.
     """
     with _user_errors():
         from torchrl_loco import training
-        from torchrl_loco.ids import canonical_id
+        from torchrl_loco.registry import canonical_id
 
         name = canonical_id(task)
         if policy is not None and policy.is_dir():
@@ -226,27 +226,27 @@ def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: 
             video.make(trained, Path(f"{trained.info['task']}.mp4"))
 
 
-def replay(file: tyro.conf.Positional[Path], /, device: str | None = None) -> None:
-    """Step a world that was no longer finite again, substep by substep, in Warp and in C MuJoCo.
+def inspect(file: tyro.conf.Positional[Path], /, device: str | None = None) -> None:
+    """Inspect a NaN dump: step its world again, substep by substep, in Warp and in C MuJoCo.
 
     Args:
-        file: what make(..., bad_world_file=FILE) wrote.
+        file: the file that make(..., nan_dump=FILE) or a training run wrote.
         device: where Warp computes; default: CUDA if there is any.
     """
     with _user_errors():
-        from torchrl_loco import replay as replays
+        from torchrl_loco import nan_dump
 
-        check_device(device)  # before the first line
-        for line in replays.describe(replays.load(file), device):
+        check_device(device)  # before the first line is printed
+        for line in nan_dump.describe(nan_dump.load(file), device):
             print(line)
 
 
 def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("learning_curves.png")) -> None:
-    """Draw the learning curves of runs; runs that differ in nothing but their seed become a mean and a band.
+    """Plot the learning curves of runs; runs that differ only in their seed become a mean and a band.
 
     Args:
         runs: folders of the runs.
-        out: the picture.
+        out: the picture; an existing one is replaced.
     """
     with _user_errors():
         from torchrl_loco import training
@@ -258,7 +258,7 @@ def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("lear
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns 0, exits with 2 for what the user can mend, returns 130 when interrupted."""
+    """Runs the command line. Returns 0, or 130 when interrupted; exits with 2 for errors of the user."""
     try:
         _run(sys.argv[1:] if args is None else list(args))
     except KeyboardInterrupt:
@@ -284,16 +284,14 @@ def _run(args: list[str]) -> None:
         "record": record,
         "play": play,
         "plot": plot,
-        "replay": replay,
+        "inspect": inspect,
         "list": list_tasks,
         "doctor": diagnose,
     }
-    if args and args[0] in commands:  # alone, so that hints speak of it and not of the others
-        commands = {args[0]: commands[args[0]]}
-    elif args and not args[0].startswith("-"):
+    if args and not args[0].startswith("-"):
         with _user_errors():
-            hint = suggestion(args[0], list(commands))
-            raise ValueError(f"unknown command {args[0]!r}{hint}: choose one of {', '.join(commands)}")
+            check_choice("command", args[0], commands)
+        commands = {args[0]: commands[args[0]]}  # alone, so that the parser's hints are about this command
     tyro.extras.subcommand_cli_from_dict(
         commands,
         prog="torchrl-loco",
@@ -305,27 +303,27 @@ def _run(args: list[str]) -> None:
 
 
 def _task_config(args: list[str]) -> Any:
-    """Returns the type that stands for a task and its settings; takes from ``args`` what decides on the preset."""
-    from torchrl_loco.ids import OURS, canonical_id, list_envs
+    """Returns the type of a task's settings; removes from ``args`` the options that choose the preset."""
+    from torchrl_loco.registry import canonical_id
     from torchrl_loco.training.config import CONFIGS, TrainingConfig
-    from torchrl_loco.training.presets import preset, untuned
+    from torchrl_loco.training.presets import preset, tuning_note
 
-    about = {task: OURS.get(task, "Of another distribution.") for task in list_envs()}
+    about = _summaries()
     device, algorithm = (_take(flag, args) for flag in ("--device", "--algorithm"))
     if len(args) > 1 and not args[1].startswith("-"):
         with _user_errors():
             task = args[1] = canonical_id(args[1])
             config = _fixed_task(preset(task, device, algorithm))
-        about[task] += f" {untuned(config)}\n\n--algorithm, {' or '.join(CONFIGS)} (here {config.algorithm}), and"
-        about[task] += " --device decide which\nsettings there are, and how they are preset."
+        about[task] += f" {tuning_note(config)}\n\n--algorithm, {' or '.join(CONFIGS)} (here {config.algorithm}), and"
+        about[task] += " --device choose the\nsettings and their defaults."
         configs = {task: config}
-    else:  # this is going to show what tasks there are, which need not wait for what presets take to import
+    else:  # the list of tasks need not wait for the imports of presets
         configs = {task: TrainingConfig(task) for task in about}
     return tyro.extras.subcommand_type_from_defaults(configs, about, prefix_names=False)
 
 
 def _fixed_task(config: "training.TrainingConfig") -> "training.TrainingConfig":
-    """Returns the settings with all but their task open to options: the preset is for no other."""
+    """Returns the settings with their task fixed: the preset is for no other."""
     hidden = Annotated[str, tyro.conf.Suppress, tyro.conf.Fixed]
     kind = type(config)
     cls = dataclasses.make_dataclass(kind.__name__, [("task", hidden, config.task)], bases=(kind,), frozen=True)
@@ -333,41 +331,44 @@ def _fixed_task(config: "training.TrainingConfig") -> "training.TrainingConfig":
 
 
 def _begin(config: "training.TrainingConfig") -> "training.Trainer":
-    """Makes the folder of a run and what trains into it."""
+    """Makes the run folder and the trainer of a run."""
     from torchrl_loco import training
 
+    trainer = training.Trainer  # imports the extra: if it is missing, no folder is made
     run = training.RunFolder.create(config)
-    if note := training.untuned(config):
+    if note := training.tuning_note(config):
         print(note)
     print(f"run folder: {run.path}")
-    return training.Trainer(run)
+    return trainer(run)
 
 
 def _train(trainer: "training.Trainer") -> None:
-    """Trains to the last frame and prints where everything lies."""
+    """Trains to the last frame and prints where the results are."""
     try:
-        with _user_errors(OSError):  # a full disk; anything else in here is a bug and keeps its traceback
+        with _user_errors(OSError):  # such as a full disk; other errors are bugs and keep their traceback
             trainer.train()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit):
         if trainer.run.has_checkpoint:
-            print(f"to go on: torchrl-loco resume {trainer.run.path}", file=sys.stderr)
+            print(f"to continue: torchrl-loco resume {trainer.run.path}", file=sys.stderr)
         raise
-    print(f"policy, curve and all else: {trainer.run.path}")
+    print(f"policy, curve, video and logs: {trainer.run.path}")
 
 
 @contextlib.contextmanager
 def _user_errors(*kinds: type[Exception]) -> Iterator[None]:
-    """Turns errors about what the user passed, or those of some kinds, into one line and exit status 2."""
-    told = kinds or (ValueError, TypeError, OSError, ImportError)
+    """Prints errors of the user, or errors of the given kinds, in one line and exits with status 2."""
+    kinds = kinds or (ValueError, TypeError, OSError, ImportError, MemoryError)
     try:
         yield
-    except told as error:
+    except kinds as error:
         print(f"torchrl-loco: {error}", file=sys.stderr)
+        if isinstance(error, ModuleNotFoundError) and error.name in EXTRA:
+            print("install it with: pip install 'torchrl-loco[train]', or pip install '.[train]'", file=sys.stderr)
         raise SystemExit(2) from None
 
 
 def _take(flag: str, args: list[str]) -> str | None:
-    """Removes ``flag`` and its value from ``args`` and returns the value: it decides what the other options are."""
+    """Removes ``flag`` and its value from ``args`` and returns the value, by which the other options are chosen."""
     for i, arg in enumerate(args):
         if arg == flag and i + 1 < len(args):
             value = args[i + 1]

@@ -1,4 +1,4 @@
-"""A collection loop that never waits for the device."""
+"""A collector that never waits for the device."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -15,16 +15,16 @@ from torchrl_loco.envs.state import State
 class RolloutCollector:
     """Collects batches of consecutive steps, across episodes; iterable like TorchRL's ``Collector``.
 
-    A batch has the layout of TorchRL's: shape ``(num_envs, steps)``, with what the policy saw and did at the root and
-    what came of it under ``"next"``. The next batch goes on where the last one ended. Environment and policy run
-    without gradients and, if neither does by itself, without any synchronisation with the device.
+    A batch has the layout of TorchRL's: shape ``(num_envs, steps)``, with observation and action at the root and the
+    result of the step under ``"next"``. Each batch continues where the last one ended. Environment and policy run
+    without gradients, and without synchronisation with the device unless the policy itself synchronises.
 
     Args:
         env: an environment of this package, or one in :class:`torchrl_loco.TransformedEnv`.
-        policy: takes a TensorDict with the observation ``(num_envs, n)`` and writes the action ``(num_envs, nu)``.
+        policy: reads the observation ``(num_envs, n)`` from a TensorDict and writes the action ``(num_envs, nu)``.
         frames_per_batch: steps in a batch, over all worlds; a multiple of the number of worlds.
         total_frames: steps over all batches, rounded up to whole batches; -1 never ends.
-        exploration_type: how actions are taken from a stochastic policy.
+        exploration_type: how a stochastic policy chooses actions.
 
     Raises:
         ValueError: ``frames_per_batch`` is not a positive multiple of the number of worlds.
@@ -72,14 +72,14 @@ class RolloutCollector:
         return TensorDict.stack(steps, dim=-1).refine_names(..., "time")
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns where the collection stands: the worlds' state, and what the next batch begins with."""
+        """Returns the state of the worlds and the data that the next batch begins with."""
         if self._carried is None:
             return {}
         env = self._env.base_env if isinstance(self._env, TorchRLTransformedEnv) else self._env
         return {"carried": self._carried.to_dict(), "env": env.get_state().to_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from the ``state`` that :meth:`state_dict` returned, in an environment of the same settings."""
+        """Continues from a ``state`` that :meth:`state_dict` returned, in an environment of the same settings."""
         if not state:
             self._carried = None
             return
@@ -88,4 +88,4 @@ class RolloutCollector:
         self._carried = TensorDict(state["carried"], batch_size=size, device=device)
 
     def shutdown(self) -> None:
-        """Does nothing; here so that a ``Collector`` can be exchanged for this."""
+        """Does nothing: TorchRL's ``Collector`` has this method."""

@@ -1,10 +1,11 @@
 """The settings of a simulation and the one place of their defaults."""
 
 import dataclasses
-import difflib
 import math
-import numbers
+from collections.abc import Collection
 from typing import Any
+
+from torchrl_loco.checks import check_choice, check_fields, check_multiple
 
 PROTOCOLS = ("playground", "dm_control")
 
@@ -21,20 +22,20 @@ class SimConfig:
     Attributes:
         ctrl_dt: time between two actions (s), a whole multiple of ``sim_dt``.
         sim_dt: time step of the physics (s).
-        naconmax: contacts stored for all worlds together. The default is meant for 2048 worlds and scales with
-            ``num_envs``; a value that you set is taken as it is.
+        naconmax: contacts stored for all worlds together. The default is for 2048 worlds and scales with
+            ``num_envs``; a value that you set is used as it is.
         njmax: constraint rows stored for each world.
         iterations: limit of the constraint solver's iterations.
         ls_iterations: limit of the line search's iterations within one solver iteration.
         euler_damping: whether joint damping is integrated implicitly (MuJoCo's ``eulerdamp`` flag).
         episode_length: control steps after which an episode is truncated.
         deterministic: whether rollouts on CUDA repeat bit for bit on the same kind of device, at three to four times
-            the time of a step. On the CPU they always do. What finds no room is lost in any order, see
-            :meth:`torchrl_loco.LocoEnv.health`.
+            the time of a step. On the CPU they always do. Which constraints are dropped when ``njmax`` or ``naconmax``
+            is too small is not deterministic, see :meth:`torchrl_loco.LocoEnv.health`.
 
     Raises:
         TypeError: a value has the wrong type.
-        ValueError: a value is out of range, or ``ctrl_dt`` no multiple of ``sim_dt``.
+        ValueError: a value is out of range, or ``ctrl_dt`` is no multiple of ``sim_dt``.
     """
 
     ctrl_dt: float
@@ -48,31 +49,13 @@ class SimConfig:
     deterministic: bool = False
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            _check_field(field.name, field.type, getattr(self, field.name))
-        if not math.isclose(self.ctrl_dt, self.substeps * self.sim_dt, rel_tol=1e-6) or self.substeps < 1:
-            raise ValueError(
-                f"ctrl_dt ({self.ctrl_dt} s) must be a whole multiple of sim_dt ({self.sim_dt} s), "
-                f"for example ctrl_dt={max(self.substeps, 1) * self.sim_dt:g}"
-            )
+        check_fields(self, {})
+        check_multiple("ctrl_dt", self.ctrl_dt, "sim_dt", self.sim_dt)
 
     @property
     def substeps(self) -> int:
         """Physics steps in one control step."""
         return round(self.ctrl_dt / self.sim_dt)
-
-
-def _check_field(name: str, kind: Any, value: Any) -> None:
-    if kind is bool:
-        if not isinstance(value, bool):
-            raise TypeError(f"{name} must be True or False, got {value!r}")
-        return
-    if isinstance(value, bool) or not isinstance(value, numbers.Real if kind is float else numbers.Integral):
-        raise TypeError(f"{name} must be of type {kind.__name__}, got {value!r}")
-    if not (math.isfinite(value) and float(value) > 0):
-        raise ValueError(f"{name} must be positive and finite, got {value!r}")
-    if kind is int and float(value) >= 2**31:  # kernels count in 32 bits
-        raise ValueError(f"{name} must be less than 2**31, got {value!r}")
 
 
 DEFAULTS = {
@@ -81,42 +64,36 @@ DEFAULTS = {
 }
 """By body, under the protocol ``playground``."""
 
-ARGUMENTS = ("num_envs", "device", "seed", "protocol", "reward_terms", "stagger", "on_overflow", "bad_world_file")
-"""What an environment takes beside the fields of :class:`SimConfig`."""
-
 CONVERGED: dict[str, Any] = {"iterations": 100, "ls_iterations": 50, "euler_damping": True}
-"""What the protocol ``dm_control`` sets otherwise, for any body."""
+"""Settings of the protocol ``dm_control`` that differ from ``playground``, for any body."""
 
 
-def sim_config(defaults: SimConfig, protocol: str, num_envs: int, overrides: dict[str, Any]) -> SimConfig:
+def sim_config(
+    defaults: SimConfig,
+    protocol: str,
+    num_envs: int,
+    overrides: dict[str, Any],
+    arguments: Collection[str] = (),
+) -> SimConfig:
     """Returns the settings of a body under ``protocol`` for ``num_envs`` worlds, with ``overrides`` on top.
 
     Args:
         defaults: the body's settings under ``playground``, with ``naconmax`` for 2048 worlds.
         protocol: one of :data:`PROTOCOLS`.
-        num_envs: number of worlds, which ``naconmax`` grows with.
+        num_envs: number of worlds, by which ``naconmax`` is scaled.
         overrides: fields of :class:`SimConfig`.
+        arguments: other argument names of the caller, for suggestions when a key is misspelt.
 
     Raises:
         ValueError: ``protocol`` or a key of ``overrides`` is unknown, or a value is out of range.
         TypeError: a value has the wrong type.
     """
-    if protocol not in PROTOCOLS:
-        raise ValueError(f"unknown protocol {protocol!r}: choose one of {', '.join(PROTOCOLS)}")
-    names = [field.name for field in dataclasses.fields(SimConfig)]
+    check_choice("protocol", protocol, PROTOCOLS)
     for key in overrides:
-        if key not in names:
-            choices = [*ARGUMENTS, *names]
-            raise ValueError(f"unknown setting {key!r}{suggestion(key, choices)}: choose from {', '.join(choices)}")
+        check_choice("argument", key, [*arguments, *(field.name for field in dataclasses.fields(SimConfig))])
     changes = CONVERGED if protocol == "dm_control" else {}
     config = dataclasses.replace(defaults, **{**changes, **overrides})
     if "naconmax" in overrides:
         return config
     scaled = math.ceil(config.naconmax * num_envs / NACONMAX_WORLDS)
     return dataclasses.replace(config, naconmax=max(scaled, NACONMAX_FLOOR))
-
-
-def suggestion(word: str, choices: list[str]) -> str:
-    """Returns ``", did you mean 'x'?"`` for the choice nearest to ``word``, or an empty string."""
-    near = difflib.get_close_matches(word, choices, n=1)
-    return f", did you mean {near[0]!r}?" if near else ""

@@ -1,5 +1,6 @@
-"""What there is on this machine, and whether the physics on it is right."""
+"""What is on this machine, and whether the physics computes correctly on it."""
 
+import dataclasses
 import os
 import platform
 import time
@@ -14,49 +15,67 @@ import warp as wp
 from tqdm.auto import trange
 
 import torchrl_loco
-from torchrl_loco.envs.health import advise
-from torchrl_loco.ids import list_envs
-from torchrl_loco.registry import env_class, make
+from torchrl_loco.envs.monitors import with_margin
+from torchrl_loco.registry import env_class, list_envs, make
+from torchrl_loco.sim.simulation import free_memory
 
 PACKAGES = ("torch", "torchrl", "tensordict", "warp-lang", "mujoco-warp", "mujoco")
 TOLERANCE = 1e-4
-"""Largest median error of qpos (m, rad) after a control step that counts as right."""
+"""Largest median error of qpos (m, rad) after a control step that counts as correct."""
 
 
-def diagnose() -> Iterator[tuple[str, str, bool]]:
-    """Yields what was found, line by line: subject, finding, and whether all is well with it.
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """A line of the report."""
 
-    The self-test of a body plays 20 random control steps in 4 worlds on each device, each step also in C MuJoCo, which
-    computes in double precision, from the same state. Bodies that other distributions add are tested with ours.
+    subject: str
+    text: str
+    problem: bool = False
+
+
+def diagnose() -> Iterator[Finding]:
+    """Looks at versions, devices and the kernel cache, and tests the physics of each body on each device.
+
+    The self-test of a body plays 20 random control steps in 4 worlds, each step also in C MuJoCo, which computes in
+    double precision, from the same state. Bodies of plug-ins are tested too.
+
+    Yields:
+        What was found, line by line.
     """
-    yield "python", f"{platform.python_version()} on {platform.platform()}", True
-    yield "torchrl-loco", torchrl_loco.__version__, True
+    yield Finding("python", f"{platform.python_version()} on {platform.platform()}")
+    yield Finding("torchrl-loco", torchrl_loco.__version__)
     for name in PACKAGES:
-        yield name, metadata.version(name), True
+        yield Finding(name, metadata.version(name))
     devices = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
-    yield "cpu", f"{platform.machine()}, {os.cpu_count()} cores", True
+    yield Finding("cpu", f"{platform.machine()}, {os.cpu_count()} cores, {_gib(free_memory(torch.device('cpu')))} free")
     for device in devices[1:]:
-        properties = torch.cuda.get_device_properties(device)
-        yield device, f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}", True
+        name = torch.cuda.get_device_properties(device).name
+        free = _gib(free_memory(torch.device(device)))
+        yield Finding(device, f"{name}, {free} free, CUDA {torch.version.cuda}")
     if len(devices) == 1:
         why = "this torch is built without CUDA" if torch.version.cuda is None else "torch finds no driver or no device"
-        yield "cuda", f"none: {why}", True
-    yield "kernel cache", _describe_cache(), True
+        yield Finding("cuda", f"none: {why}")
+    yield Finding("kernel cache", _describe_cache())
     tasks: dict[str, str] = {}
     for task in list_envs():
         try:
             tasks.setdefault(env_class(task).body, task)  # one of a body is enough
-        except ImportError as broken:
-            yield task, str(broken), False
+        except ImportError as error:
+            yield Finding(task, str(error), problem=True)
     for device in devices:
         for body, task in tasks.items():
             try:
-                seconds, error = self_test(task, device)
-            except Exception as reason:  # the others are still worth a look
-                yield f"{body} on {device}", f"{type(reason).__name__}: {reason}", False
+                seconds, deviation = self_test(task, device)
+            except Exception as reason:  # the other bodies are still worth testing
+                yield Finding(f"{body} on {device}", f"FAILED: {type(reason).__name__}: {reason}", problem=True)
                 continue
-            finding = f"made in {seconds:.1f} s, error against C MuJoCo {error:.1e}"
-            yield f"{body} on {device}", finding, error < TOLERANCE
+            right = deviation < TOLERANCE  # false for NaN
+            verdict = f"{'ok' if right else 'WRONG'}: differs from C MuJoCo by {deviation:.1e} (limit {TOLERANCE:.0e})"
+            yield Finding(f"{body} on {device}", f"{verdict}, made in {seconds:.1f} s", problem=not right)
+
+
+def _gib(size: int) -> str:
+    return f"{size / 2**30:.0f} GiB"
 
 
 def _describe_cache() -> str:
@@ -68,26 +87,26 @@ def _describe_cache() -> str:
 
 
 def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) -> dict[str, tuple[int, int]]:
-    """Measures what ``njmax`` and ``naconmax`` a task needs, by steps under random actions with room to spare.
+    """Measures the ``njmax`` and ``naconmax`` that a task needs, in steps under random actions with room to spare.
 
     Args:
         task: id of the environment.
         num_envs: number of worlds.
         device: where to measure; ``None`` takes CUDA if there is any.
-        steps: control steps; a trained policy may need more room than random actions do.
+        steps: control steps; a trained policy may need more than random actions do.
 
     Returns:
-        For each setting the most that was needed and the value that is advised.
+        For each setting the most that was needed and the advised value.
     """
     env = make(task, num_envs, device, seed=0, on_overflow="raise", njmax=1000, naconmax=200 * num_envs)
     with torch.no_grad():
         td = env.reset()
         for _ in trange(steps, desc=f"{task}, {num_envs} worlds", leave=False):
             _, td = env.step_and_maybe_reset(td.set("action", env.action_spec.rand()))
-    env._health.check()
+    env.world.health.check()
     peak = env.health()["peak"]
     needed = {"njmax": int(peak["constraints"]), "naconmax": int(peak["contacts"])}
-    return {name: (value, advise(value)) for name, value in needed.items()}
+    return {name: (value, with_margin(value)) for name, value in needed.items()}
 
 
 def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Trained policies, in files that hold tensors and settings and nothing to execute."""
+"""Trained policies, in files that hold tensors and settings but no code."""
 
 from pathlib import Path
 from typing import Any
@@ -9,17 +9,17 @@ from torch import nn
 
 from torchrl_loco import storage
 from torchrl_loco.checks import check_device
-from torchrl_loco.ids import canonical_id
+from torchrl_loco.registry import canonical_id
 
 SHIPPED = Path(__file__).parent / "policies"
 
 
 class ObservationNorm(nn.Module):
-    """Shifts and scales observations by the mean and variance of all that :meth:`update` saw.
+    """Normalises observations by the running mean and variance of all that :meth:`update` was given.
 
     Args:
         size: length of an observation.
-        limit: bound of the result; what lies beyond is clipped.
+        limit: bound of the result; values beyond are clipped.
     """
 
     mean: torch.Tensor
@@ -37,15 +37,18 @@ class ObservationNorm(nn.Module):
         """Returns observations of shape ``(..., size)``, normalised.
 
         Raises:
-            ValueError: they have another size: those of another body.
+            ValueError: they have another size.
         """
         if observation.shape[-1] != len(self.mean):
-            raise ValueError(f"this takes observations of {len(self.mean)} numbers, got {observation.shape[-1]}")
+            raise ValueError(
+                f"this policy takes observations of size {len(self.mean)}, got size {observation.shape[-1]}: was it "
+                "trained for another body?"
+            )
         return ((observation - self.mean) * torch.rsqrt(self.var + 1e-6)).clamp(-self.limit, self.limit)
 
     @torch.no_grad()
     def update(self, observation: torch.Tensor) -> None:
-        """Takes each ``observation`` of shape ``(..., size)`` into mean and variance (Chan's parallel formula)."""
+        """Updates mean and variance with observations of shape ``(..., size)`` (Chan's parallel formula)."""
         batch = observation.flatten(0, -2)
         var, mean = torch.var_mean(batch, dim=0, correction=0)
         total = self.count + len(batch)
@@ -62,7 +65,7 @@ class Policy(TensorDictModule):
     Args:
         network: a :class:`~torchrl_loco.policy.ObservationNorm`, then linear layers, layer norms and SiLUs, then a
             tanh.
-        info: ``task``, ``protocol``, ``action_repeat`` and whatever else is known of it, such as its return.
+        info: ``task``, ``protocol``, ``action_repeat``, and further information such as the return.
     """
 
     def __init__(self, network: nn.Sequential, info: dict[str, Any]) -> None:
@@ -70,9 +73,9 @@ class Policy(TensorDictModule):
         self.info = info
 
     def save(self, path: Path) -> None:
-        """Writes the policy to ``path`` in half precision, which moves an action by some thousandths at most."""
+        """Writes the policy to ``path`` in half precision, which changes an action by some thousandths at most."""
         layers = [_LAYER_NAMES[type(layer)] for layer in self.module]
-        tensors = {  # the observation's statistics span more than half precision does
+        tensors = {  # half precision has not the range for the observation's statistics
             name: tensor.to(torch.float32 if name.startswith("0.") else torch.float16)
             for name, tensor in self.module.state_dict().items()
         }
@@ -117,7 +120,7 @@ _LAYER_NAMES: dict[type[nn.Module], str] = {
 
 
 def _make_layer(name: str, sized: torch.Tensor | None) -> nn.Module:
-    """Returns the layer of a name, as large as one of its tensors tells.
+    """Returns the layer of a name, with the size of its tensor.
 
     Raises:
         ValueError: there is no such layer, or it needs a tensor.
@@ -127,7 +130,7 @@ def _make_layer(name: str, sized: torch.Tensor | None) -> nn.Module:
     if name == "tanh":
         return nn.Tanh()
     if sized is None:
-        raise ValueError(f"a layer {name!r} without tensors")
+        raise ValueError(f"layer {name!r} has no tensors")
     if name == "observation_norm":
         return ObservationNorm(len(sized))
     if name == "layer_norm":
@@ -138,26 +141,26 @@ def _make_layer(name: str, sized: torch.Tensor | None) -> nn.Module:
 
 
 def load_policy(task: str, device: torch.device | str | None = None) -> Policy:
-    """Loads the trained policy that comes with the package.
+    """Loads the trained policy of a task that is shipped with the package.
 
     Args:
         task: id of the environment.
         device: where it computes; ``None`` takes CUDA if there is any.
 
     Returns:
-        The policy. ``policy.info`` has the return that it reached, its protocol, frames, wall time, seed and settings;
-        hold its actions for ``policy.info["action_repeat"]`` frames.
+        The policy. ``policy.info`` holds its return, protocol, frames, wall time, seed and settings. Hold each of
+        its actions for ``policy.info["action_repeat"]`` control steps.
 
     Raises:
         ValueError: there is no such task, or no policy for it.
     """
     if str(task).endswith(".safetensors"):
-        raise ValueError(f"load_policy takes the id of a task; for a file there is torchrl_loco.Policy.load({task!r})")
+        raise ValueError(f"load_policy takes the id of a task; load a file with torchrl_loco.Policy.load({task!r})")
     name = canonical_id(task)
     path = SHIPPED / f"{name}.safetensors"
     if not path.is_file():
         shipped = sorted(p.stem for p in SHIPPED.glob("*.safetensors"))
         raise ValueError(
-            f"no policy for {name!r} comes with this release: choose one of {', '.join(shipped)}, or train one"
+            f"no policy for {name!r} is shipped with this release: choose one of {', '.join(shipped)}, or train one"
         )
     return Policy.load(path, device)

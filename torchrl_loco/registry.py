@@ -1,85 +1,131 @@
-"""From an id to an environment."""
+"""From an id to an environment. Importing this module imports no environment, so names are known at once."""
 
-import contextlib
-from pathlib import Path
-from typing import Any
+import dataclasses
+import functools
+import importlib
+import re
+import warnings
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
 
-import torch
+from torchrl_loco.checks import check_choice
 
-from torchrl_loco import envs
-from torchrl_loco.envs.checks import check_subclass
-from torchrl_loco.ids import canonical_id, list_envs, origin, plugins
+if TYPE_CHECKING:
+    from torchrl_loco.envs import LocoEnv
 
-ENVS: dict[str, type[envs.LocoEnv]] = {
-    "walker_stand": envs.WalkerStand,
-    "walker_walk": envs.WalkerWalk,
-    "walker_run": envs.WalkerRun,
-    "humanoid_stand": envs.HumanoidStand,
-    "humanoid_walk": envs.HumanoidWalk,
-    "humanoid_run": envs.HumanoidRun,
+GROUP = "torchrl_loco.envs"
+"""Group of the entry points by which installed distributions add environments: ``id = "module:Class"``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """An environment that :func:`make` knows.
+
+    Attributes:
+        target: where its class is, as ``"module:Class"``.
+        summary: what the task asks for, in a sentence; empty for a plug-in, whose class says it.
+        distribution: name and version of the distribution that a plug-in comes from; empty for ours.
+    """
+
+    target: str
+    summary: str = ""
+    distribution: str = ""
+
+
+OURS = {
+    "walker_stand": Entry("torchrl_loco.envs.walker:WalkerStand", "Stand up and stay upright."),
+    "walker_walk": Entry("torchrl_loco.envs.walker:WalkerWalk", "Walk at 1 m/s or faster."),
+    "walker_run": Entry("torchrl_loco.envs.walker:WalkerRun", "Run at 8 m/s or faster."),
+    "humanoid_stand": Entry("torchrl_loco.envs.humanoid:HumanoidStand", "Stand still and upright."),
+    "humanoid_walk": Entry("torchrl_loco.envs.humanoid:HumanoidWalk", "Walk at 1 m/s or faster, in any direction."),
+    "humanoid_run": Entry("torchrl_loco.envs.humanoid:HumanoidRun", "Run at 10 m/s or faster, in any direction."),
 }
+"""The environments of this package by id."""
+
+ALIASES = {f"mjx/{id}-v0": id for id in OURS}
 
 
-def env_class(id: str) -> type[envs.LocoEnv]:
+@functools.cache
+def registered() -> dict[str, Entry]:
+    """Returns all environments by id: ours, then the plug-ins of installed distributions, which are looked up once.
+
+    A plug-in whose id is taken or malformed is left out with a warning.
+    """
+    entries = dict(OURS)
+    for point in sorted(metadata.entry_points(group=GROUP), key=lambda point: point.name):
+        origin = f"{point.dist.name} {point.dist.version}" if point.dist else "an unknown distribution"
+        taken = entries.get(ALIASES.get(point.name, point.name))
+        if taken is not None:
+            reason = f"{taken.distribution or 'torchrl_loco'} already has this id"
+        elif not re.fullmatch(r"[\w.-]+", point.name):
+            reason = "an id consists of letters, digits and _ . -, because run folders are named after it"
+        else:
+            entries[point.name] = Entry(point.value, distribution=origin)
+            continue
+        warnings.warn(f"environment {point.name!r} of {origin} ({point.value}) is ignored: {reason}", stacklevel=3)
+    return entries
+
+
+def list_envs() -> list[str]:
+    """Returns the ids that :func:`torchrl_loco.make` takes: ours, then those of plug-ins, without aliases."""
+    return list(registered())
+
+
+def canonical_id(id: str) -> str:
+    """Returns the id that ``id``, or an alias, stands for.
+
+    Raises:
+        ValueError: there is no such id; the message names the nearest one and all of them.
+    """
+    return check_choice("environment", ALIASES.get(id, id) if isinstance(id, str) else id, list_envs(), also=ALIASES)
+
+
+def env_class(id: str) -> "type[LocoEnv]":
     """Returns the class of ``id`` or an alias.
 
     Raises:
-        ValueError: there is no such id; the message names the nearest right one and all of them.
-        ImportError: the distribution that it comes from is broken; the message names it.
+        ValueError: there is no such id; the message names the nearest one and all of them.
+        ImportError: the plug-in that it comes from is broken; the message names its distribution.
     """
     name = canonical_id(id)
-    if name in ENVS:
-        return ENVS[name]
-    point = plugins()[name]
+    entry = registered()[name]
+    module, _, attribute = entry.target.partition(":")
+    if not entry.distribution:
+        return getattr(importlib.import_module(module), attribute)
+
+    from torchrl_loco.envs import LocoEnv
+
+    origin = f"environment {name!r} of {entry.distribution} ({entry.target})"
     try:
-        cls = point.load()
-    except Exception as error:  # whatever another's module may raise
-        reason = f"{type(error).__name__}: {error}"
-        raise ImportError(f"environment {name!r} of {origin(point)} cannot be loaded: {reason}") from error
-    if not (isinstance(cls, type) and issubclass(cls, envs.LocoEnv)):
-        raise ImportError(f"environment {name!r} of {origin(point)} is no subclass of torchrl_loco.LocoEnv")
+        cls = functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
+    except Exception as error:  # a plug-in's module may raise anything
+        raise ImportError(f"{origin} cannot be loaded: {type(error).__name__}: {error}") from error
+    if not (isinstance(cls, type) and issubclass(cls, LocoEnv)):
+        raise ImportError(f"{origin} is no subclass of torchrl_loco.LocoEnv")
     try:
-        check_subclass(cls)
+        cls.check_class()
     except TypeError as error:
-        raise ImportError(f"environment {name!r} of {origin(point)}: {error}") from error
+        raise ImportError(f"{origin}: {error}") from error
     return cls
 
 
-def usable_classes() -> list[type[envs.LocoEnv]]:
-    """Returns the classes of all environments, without those of broken distributions."""
-    found = []
-    for name in list_envs():
-        with contextlib.suppress(ImportError):
-            found.append(env_class(name))
-    return found
+def summary(id: str) -> str:
+    """Returns what a task asks for, in a sentence.
+
+    Raises:
+        ImportError: the plug-in that it comes from is broken.
+    """
+    return registered()[id].summary or (env_class(id).__doc__ or "").strip().split("\n")[0]
 
 
-def make(
-    id: str,
-    num_envs: int = 1,
-    device: torch.device | str | None = None,
-    seed: int | None = None,
-    protocol: str = "playground",
-    *,
-    reward_terms: bool = False,
-    stagger: bool = False,
-    on_overflow: str = "warn",
-    bad_world_file: Path | str | None = None,
-    **config: Any,
-) -> envs.LocoEnv:
+def make(id: str, *args: Any, **kwargs: Any) -> "LocoEnv":
     """Makes an environment.
 
     Args:
         id: one of :func:`torchrl_loco.list_envs`, or its alias ``mjx/<id>-v0``.
-        num_envs: number of worlds, the batch size.
-        device: where physics and tensors live; ``None`` takes CUDA if there is any, else the CPU.
-        seed: integer in [0, 2**32) that, with world and episode, decides every random draw; ``None`` takes a fresh one.
-        protocol: ``"playground"`` or ``"dm_control"``.
-        reward_terms: whether to return each factor of the reward under ``("next", "reward_terms", name)``.
-        stagger: whether a full ``reset()`` starts each world at a random point of its time limit.
-        on_overflow: ``"warn"``, ``"raise"`` or ``"ignore"`` when contacts or constraints find no room.
-        bad_world_file: a file, not there yet, that is to hold what the first world that is not finite came from.
-        config: fields of :class:`torchrl_loco.SimConfig` to override, such as ``episode_length=500``.
+        args: positional arguments of :class:`torchrl_loco.LocoEnv`: ``num_envs``, ``device``, ``seed``, ``protocol``.
+        kwargs: keyword arguments of :class:`torchrl_loco.LocoEnv`, fields of :class:`torchrl_loco.SimConfig` among
+            them, such as ``episode_length=500``.
 
     Returns:
         The environment, with batch size ``(num_envs,)``, ready for ``reset()``.
@@ -87,12 +133,12 @@ def make(
     Raises:
         ValueError: an argument is out of range or unknown; the message names the valid choices.
         TypeError: an argument has the wrong type.
-        ImportError: the environment is another distribution's, which is broken.
+        ImportError: the plug-in that the environment comes from is broken.
+        MemoryError: the device has no room for so many worlds.
 
     Example:
         >>> env = torchrl_loco.make("walker_walk", num_envs=16, device="cpu", seed=0)
         >>> env.rollout(100)["next", "reward"].shape
         torch.Size([16, 100, 1])
     """
-    options: dict[str, Any] = {"reward_terms": reward_terms, "stagger": stagger, "on_overflow": on_overflow}
-    return env_class(id)(num_envs, device, seed, protocol, bad_world_file=bad_world_file, **options, **config)
+    return env_class(id)(*args, **kwargs)

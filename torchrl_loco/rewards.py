@@ -6,7 +6,7 @@ import warp as wp
 
 
 class Sigmoid(enum.IntEnum):
-    """How :func:`tolerance` falls off outside its bounds; the names are dm_control's."""
+    """Shape of :func:`tolerance` outside its bounds; the names are dm_control's."""
 
     GAUSSIAN = 0
     LINEAR = 1

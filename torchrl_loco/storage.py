@@ -1,4 +1,4 @@
-"""Tensors and settings in a file that holds nothing to execute, and that tells if it was damaged."""
+"""Tensors and settings in a file without code, with a checksum."""
 
 import hashlib
 import json
@@ -17,13 +17,13 @@ def save(path: Path, kind: str, tensors: dict[str, torch.Tensor], settings: dict
 
     Args:
         path: where to.
-        kind: what the file holds, in a word; :func:`load` asks for it.
+        kind: what the file holds, such as "policy"; :func:`load` checks it.
         tensors: the tensors, of any shape ``(...)`` and on any device.
-        settings: whatever JSON can hold.
+        settings: values that JSON can hold.
     """
     metadata = {"format": _format(kind), **{name: json.dumps(value) for name, value in settings.items()}}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    part = Path(f"{path}.part")  # a write that breaks off leaves the file as it was
+    part = Path(f"{path}.part")  # an interrupted write leaves the file as it was
     part.write_bytes(serialize(tensors, {**metadata, "sha256": digest(tensors, metadata)}))
     part.replace(path)
 
@@ -36,7 +36,7 @@ def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]
         ValueError: it holds something else, is damaged, or of another version.
     """
     if not Path(path).is_file():
-        raise FileNotFoundError(f"there is no {kind} {path}")
+        raise FileNotFoundError(f"there is no {kind} at {path}")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
@@ -54,11 +54,11 @@ def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]
 
 
 def digest(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> str:
-    """Returns a checksum of all that a file holds: safetensors itself would not notice a changed bit in a tensor.
+    """Returns a checksum of all that a file holds: safetensors itself does not notice a changed bit in a tensor.
 
     Args:
         tensors: the tensors, of any shape ``(...)``, on the CPU.
-        metadata: what is written beside them.
+        metadata: what is written with them.
     """
     sha256 = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
     for name in sorted(tensors):

@@ -18,7 +18,7 @@ CONTROL_STEPS = 20
 
 def main(body: str, worlds: int, threads: int) -> None:
     """Prints the time of a control step."""
-    config, model = sim_config(DEFAULTS[body], "playground", worlds, {}), models.load(body)
+    config, model = sim_config(DEFAULTS[body], "playground", worlds, {}), models.load(models.PATHS[body])
     set_options(model, config)
     data = [mujoco.MjData(model) for _ in range(threads)]
     size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)

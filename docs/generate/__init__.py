@@ -5,7 +5,7 @@ from pathlib import Path
 
 from generate import benchmarks, bodies, rewards, tasks
 from generate.markdown import write
-from torchrl_loco.registry import ENVS
+from torchrl_loco.registry import OURS
 
 DOCS = Path(__file__).parent.parent
 OUT = DOCS / "generated"
@@ -16,7 +16,7 @@ NOTEBOOKS = DOCS.parent / "notebooks"
 def everything() -> None:
     """Writes all that pages include to docs/generated, and leaves alone what has not changed."""
     fragments = OUT / "fragments"
-    for name in ENVS:  # what other distributions add has pages of its own
+    for name in OURS:  # not for the plug-ins that happen to be installed
         write(fragments / f"{name}_properties.md", tasks.properties(name))
         write(fragments / f"{name}_reward.md", rewards.formula(name))
         write(fragments / f"{name}_policy.md", tasks.shipped_policy(name))

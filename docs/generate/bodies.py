@@ -31,7 +31,7 @@ class Entry:
 
 def observation(body: str, protocol: str) -> list[Entry]:
     """Returns the entries of a body's observation in order."""
-    model = models.load(body)
+    model = models.load(models.PATHS[body])
     return list(_walker(model, protocol) if body == "walker" else _humanoid(model))
 
 
@@ -51,7 +51,7 @@ def observation_table(body: str) -> str:
 
 def action_table(body: str) -> str:
     """Returns the table of a body's actuators."""
-    model = models.load(body)
+    model = models.load(models.PATHS[body])
     rows = []
     for index in range(model.nu):
         actuator = model.actuator(index)

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from torchrl_loco.envs import humanoid, walker
-from torchrl_loco.registry import ENVS
+from torchrl_loco.registry import env_class
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Tolerance:
 
 def tolerances(task: str) -> dict[str, Tolerance]:
     """Returns the tolerances that a task's reward is made of, by name."""
-    cls = ENVS[task]
-    speed = cls.speed
+    cls = env_class(task)
+    speed = cls.target_speed
     if cls.body == "walker":
         height = float(walker.STAND_HEIGHT)
         parts = {"standing": Tolerance("z", height, math.inf, height / 2)}
@@ -49,9 +49,9 @@ def tolerances(task: str) -> dict[str, Tolerance]:
 def formula(task: str) -> str:
     """Returns a task's reward as an aligned display of LaTeX, and what its symbols mean, as Markdown."""
     parts = {name: part.latex() for name, part in tolerances(task).items()}
-    body = ENVS[task].body
+    cls = env_class(task)
     lines = [("standing", parts["standing"])]
-    if body == "walker":
+    if cls.body == "walker":
         lines.append(("upright", r"\tfrac{1}{2} (1 + u)"))
         lines.append(("stand", r"\tfrac{1}{4} (3\,\text{standing} + \text{upright})"))
     else:
@@ -61,19 +61,19 @@ def formula(task: str) -> str:
         ]
     if "fast" in parts:
         lines.append(("move", rf"\tfrac{{1}}{{6}} \left(1 + 5\,{parts['fast']}\right)"))
-    elif body == "humanoid":
+    elif cls.body == "humanoid":
         lines.append(("move", rf"\tfrac{{1}}{{2}} \left({parts['still_x']} + {parts['still_y']}\right)"))
-    product = r" \cdot ".join(rf"\text{{{term}}}" for term in ENVS[task].term_names)
+    product = r" \cdot ".join(rf"\text{{{term}}}" for term in cls.term_names)
     lines.append(("reward", product))
     aligned = " \\\\\n".join(rf"\text{{{name}}} &= {latex}" for name, latex in lines)
-    part, mover = ("torso", "") if body == "walker" else ("head", ", $a$ the action")
+    part, mover = ("torso", "") if cls.body == "walker" else ("head", ", $a$ the action")
     velocity = "" if task == "walker_stand" else ", $v$ the velocity of the center of mass (m/s)"
-    terms = ", ".join(f"`{term}`" for term in ENVS[task].term_names)
+    terms = ", ".join(f"`{term}`" for term in cls.term_names)
     return (
         f"$$\n\\begin{{aligned}}\n{aligned}\n\\end{{aligned}}\n$$\n\n"
         f"with $z$ the height of the {part} (m), $u$ the z component of the torso's z axis (1 upright, -1 upside down)"
         f"{velocity}{mover}. $\\operatorname{{tol}}$ is dm_control's "
-        "[tolerance](../api/rewards.md): 1 within the bounds, and outside a fall-off that has come down to 0.1 at the "
-        "distance of the margin, by a Gaussian where no other sigmoid and value are named.\n\n"
+        "[tolerance](../api/rewards.md): 1 within the bounds; outside it decreases to 0.1 at the margin, as a Gaussian "
+        "unless another sigmoid and value are given.\n\n"
         f"Terms under `reward_terms=True`, which multiply to the reward: {terms}.\n"
     )

@@ -12,9 +12,8 @@ import torchrl_loco
 from generate.markdown import table
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS, NACONMAX_FLOOR, NACONMAX_WORLDS, PROTOCOLS, sim_config
-from torchrl_loco.ids import ALIASES
 from torchrl_loco.policy import SHIPPED
-from torchrl_loco.registry import ENVS
+from torchrl_loco.registry import ALIASES, OURS, env_class
 
 MOMENTS = (0, 20, 40, 160)
 """Control steps after the reset at which the picture of a task is taken."""
@@ -28,9 +27,9 @@ def _aliases(name: str) -> str:
 
 def properties(name: str) -> str:
     """Returns the head of a task's page: its picture and a table."""
-    cls = ENVS[name]
+    cls = env_class(name)
     config = cls.defaults
-    nu = models.load(cls.body).nu
+    nu = models.load(cls.mjcf).nu
     length = config.episode_length
     rows = [
         ("id", f"`{name}`"),
@@ -39,7 +38,7 @@ def properties(name: str) -> str:
         ("action", f"`(num_envs, {nu})`, float32, in [-1, 1]"),
         ("observation", f"`(num_envs, {cls.observation_size})`, float32"),
         ("reward", "`(num_envs, 1)`, float32, in [0, 1]"),
-        ("target speed", f"{cls.speed:g} m/s" if cls.speed else "none: to stand"),
+        ("target speed", f"{cls.target_speed:g} m/s" if cls.target_speed else "0 m/s"),
         ("control step", f"{config.ctrl_dt:g} s"),
         ("physics step", f"{config.sim_dt:g} s, {config.substeps} in a control step"),
         ("episode", f"{length} control steps, {length * config.ctrl_dt:g} s"),
@@ -51,20 +50,21 @@ def properties(name: str) -> str:
 def _caption(name: str) -> str:
     if _info(name) is None:
         return "*The start.*"
-    dt = ENVS[name].defaults.ctrl_dt
+    dt = env_class(name).defaults.ctrl_dt
     *first, last = (f"{moment * dt:g}" for moment in MOMENTS)
-    return f"*The policy that comes with the package, {', '.join(first)} and {last} s after a reset.*"
+    return f"*The shipped policy, {', '.join(first)} and {last} s after a reset.*"
 
 
 def overview() -> str:
     """Returns the table of all tasks."""
     rows = []
-    for name, cls in ENVS.items():
-        speed = f"{cls.speed:g}" if cls.speed else "0"
+    for name in OURS:
+        cls = env_class(name)
+        speed = f"{cls.target_speed:g}" if cls.target_speed else "0"
         policy = _info(name)
         best = f"{policy['mean']:.0f} ± {policy['std']:.0f}" if policy else "none yet"
         link = f"[{name}](/tasks/{name}.md)"
-        rows.append((link, _aliases(name), models.load(cls.body).nu, cls.observation_size, speed, best))
+        rows.append((link, _aliases(name), models.load(cls.mjcf).nu, cls.observation_size, speed, best))
     return table(("id", "alias", "action", "observation", "target speed (m/s)", "return of the policy"), rows)
 
 
@@ -73,31 +73,28 @@ def protocols(body: str) -> str:
     settings = {p: dataclasses.asdict(sim_config(DEFAULTS[body], p, NACONMAX_WORLDS, {})) for p in PROTOCOLS}
     rows = [(f"`{field}`", *(f"`{settings[p][field]}`" for p in PROTOCOLS)) for field in settings[PROTOCOLS[0]]]
     note = (
-        f"\n`naconmax` is meant for {NACONMAX_WORLDS} worlds and scales with `num_envs`, to no less than "
+        f"\n`naconmax` is for {NACONMAX_WORLDS} worlds and is scaled with `num_envs`, with a minimum of "
         f"{NACONMAX_FLOOR}. {{py:class}}`~torchrl_loco.SimConfig` says what each setting is.\n"
     )
     return table(("setting", *(f"`{protocol}`" for protocol in PROTOCOLS)), rows) + note
 
 
 def _info(name: str) -> dict[str, Any] | None:
-    """Returns what is known of the policy that comes with the package, None if none comes."""
+    """Returns the info of the shipped policy, None if there is none."""
     if not (SHIPPED / f"{name}.safetensors").is_file():
         return None
     return torchrl_loco.load_policy(name, device="cpu").info
 
 
 def shipped_policy(name: str) -> str:
-    """Returns how well the policy of a task does, if one comes with the package."""
+    """Returns how well the shipped policy of a task does, if there is one."""
     info = _info(name)
     if info is None:
-        return (
-            "No policy of this task comes with the package: the best one of the recorded run was not kept. How far "
-            "training went is in the [benchmarks](/benchmarks.md).\n"
-        )
+        return "No policy is shipped for this task. The [benchmarks](/benchmarks.md) list its training runs.\n"
     return (
         f'`torchrl_loco.load_policy("{name}")` returns **{info["mean"]:.1f} ± {info["std"]:.1f}** (mean and standard '
-        f"deviation over {info['episodes']} episodes of {ENVS[name].defaults.episode_length} "
-        f"steps that had no part in choosing it; worst {info['min']:.1f}, best {info['max']:.1f}; protocol "
+        f"deviation over {info['episodes']} episodes of {env_class(name).defaults.episode_length} "
+        f"steps that were not used to select it; worst {info['min']:.1f}, best {info['max']:.1f}; protocol "
         f"`{info['protocol']}`). It was trained by {info['algorithm'].upper()} for "
         f"{info['frames'] / 1e6:.0f} million frames, {info['seconds']:.0f} s on one {info['trained_on']}, with "
         f"{info['num_envs']} worlds and seed {info['seed']}.\n"

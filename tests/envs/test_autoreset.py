@@ -1,9 +1,10 @@
-"""Resets without the host: the same data as TorchRL's own way, and no synchronisation."""
+"""Resets by mask: the same data as TorchRL's way, without synchronisation with the host."""
 
 import pytest
 import torch
+from conftest import COARSE
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter
-from torchrl.envs import TransformedEnv as StockTransformedEnv
+from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
 import torchrl_loco
 
@@ -13,7 +14,7 @@ def transforms():
 
 
 def play(env, moves, maybe_reset):
-    """Steps and resets, with a policy's other outputs travelling along."""
+    """Steps and resets, and carries another output of the policy along."""
     td, trace = env.reset(), []
     for i, action in enumerate(moves):
         td = td.set("action", action).set("loc", torch.full_like(action, i + 1.0))
@@ -24,17 +25,17 @@ def play(env, moves, maybe_reset):
     return torch.stack(trace)
 
 
-@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: StockTransformedEnv(env, transforms())])
-def test_same_data_as_torchrl(task, protocol, actions, wrap):
-    """Worlds end at different times, at the environment's limit, a transform's and by a bad action."""
-    settings = {"seed": 0, "protocol": protocol, "episode_length": 12, "stagger": True, "reward_terms": True}
-    stock = wrap(torchrl_loco.make(task, 6, "cpu", **settings))
-    ours = torchrl_loco.make(task, 6, "cpu", **settings)
-    if isinstance(stock, StockTransformedEnv):
+@pytest.mark.parametrize("wrap", [False, True])
+def test_same_data_as_torchrl(shared, body_task, actions, wrap):
+    """Worlds end at different times: at the environment's limit, at a transform's, and by a NaN action."""
+    options = {"protocol": "dm_control", "episode_length": 12, "stagger": True, "reward_terms": True, **COARSE}
+    theirs, ours = (shared(body_task, 6, copy=copy, **options) for copy in (0, 1))
+    if wrap:
+        theirs = TorchRLTransformedEnv(theirs, transforms())
         ours = torchrl_loco.TransformedEnv(ours, transforms())
     moves = actions(ours, 30)
     moves[7, 3] = torch.nan
-    expected = play(stock, moves, lambda td: EnvBase.maybe_reset(stock, td))
+    expected = play(theirs, moves, lambda td: EnvBase.maybe_reset(theirs, td))
     got = play(ours, moves, ours.maybe_reset)
     assert set(expected.keys(True, True)) == set(got.keys(True, True))
     for key in expected.keys(True, True):
@@ -44,22 +45,20 @@ def test_same_data_as_torchrl(task, protocol, actions, wrap):
     assert not ended.all(dim=1).any()
 
 
-def test_collectors_and_rollouts_take_it(task):
-    env = torchrl_loco.TransformedEnv(torchrl_loco.make(task, 3, "cpu", seed=0, episode_length=5), transforms())
+def test_rollouts_reset_by_it(shared):
+    env = torchrl_loco.TransformedEnv(shared("walker_run", 3, episode_length=5), transforms())
     td = env.rollout(12, break_when_any_done=False)
     assert td["next", "done"].squeeze(-1)[0].nonzero().squeeze(-1).tolist() == [4, 9]
     assert td["is_init"].squeeze(-1)[0].nonzero().squeeze(-1).tolist() == [0, 5, 10]
 
 
-def test_a_reset_of_nobody_changes_nothing(task):
-    env = torchrl_loco.make(task, 3, "cpu", seed=0)
+def test_an_empty_mask_changes_nothing(shared, body_task):
+    env = shared(body_task)
     td = env.rollout(3)[:, -1]["next"]
     before = env.get_state()
-    mask = torch.zeros(3, 1, dtype=torch.bool)
-    after = env.reset(td.clone().set("_reset", mask))
+    after = env.reset(td.clone().set("_reset", torch.zeros(4, 1, dtype=torch.bool)))
     assert torch.equal(after["observation"], td["observation"])
-    state = env.get_state()
-    assert all(torch.equal(before[key], state[key]) for key in torchrl_loco.State.KEYS)
+    assert (env.get_state() == before).all()
 
 
 @pytest.mark.gpu

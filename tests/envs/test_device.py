@@ -1,4 +1,4 @@
-"""The loop stays on its device: captures, synchronisation, streams, and agreement of CUDA with the CPU."""
+"""The loop stays on its device: graphs, synchronisation, streams, memory, and agreement of CUDA with the CPU."""
 
 import pytest
 import torch
@@ -7,23 +7,23 @@ import warp as wp
 import torchrl_loco
 
 
-def test_each_graph_is_recorded_once(task, device, actions, monkeypatch):
+def test_each_graph_is_recorded_once(body_task, device, actions, monkeypatch):
     captures, capture = [], wp.ScopedCapture
     monkeypatch.setattr(wp, "ScopedCapture", lambda **options: captures.append(options) or capture(**options))
-    env = torchrl_loco.make(task, 3, device, seed=0, episode_length=4)
-    assert env.sim.num_captures == len(captures) == 3  # step, reset, and refresh after set_state
+    env = torchrl_loco.make(body_task, 3, device, seed=0, episode_length=4)
+    assert len(env.sim.graphs) == len(captures) == 3  # step, reset, and refresh after set_state
     td = env.reset()
     for action in actions(env, 10):
         _, td = env.step_and_maybe_reset(td.set("action", action))
     env.reset(env.get_state(), set_state=True)
     env.set_seed(3)
     env.reset()
-    assert env.sim.num_captures == len(captures) == 3
+    assert len(env.sim.graphs) == len(captures) == 3
 
 
 @pytest.mark.gpu
-def test_cuda_agrees_with_the_cpu_after_one_step(task, protocol, actions):
-    envs = [torchrl_loco.make(task, 64, device, seed=6, protocol=protocol) for device in ("cpu", "cuda")]
+def test_cuda_agrees_with_the_cpu_after_one_step(body_task, protocol, actions):
+    envs = [torchrl_loco.make(body_task, 64, device, seed=6, protocol=protocol) for device in ("cpu", "cuda")]
     results = []
     for env in envs:
         td = env.reset()
@@ -36,8 +36,8 @@ def test_cuda_agrees_with_the_cpu_after_one_step(task, protocol, actions):
 
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")
-def test_no_host_synchronisation_in_a_step(task):
-    env = torchrl_loco.make(task, 256, "cuda", seed=0)
+def test_no_host_synchronisation_in_a_step(body_task):
+    env = torchrl_loco.make(body_task, 256, "cuda", seed=0)
     td = env.reset()
     td.set("action", torch.zeros_like(env.action_spec.zero()))
     env._step(td)
@@ -68,3 +68,21 @@ def test_replays_on_the_current_stream(actions):
     for action in moves:
         expected = twin.step(expected.set("action", action))["next"].exclude("reward")
     torch.testing.assert_close(td["observation"], expected["observation"], rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.gpu
+def test_device_memory_is_flat_over_10000_steps():
+    env = torchrl_loco.make("walker_walk", 64, "cuda", seed=0, episode_length=100, stagger=True)
+    td = env.reset()
+    action = torch.rand(64, 6, device="cuda") * 2 - 1
+
+    def used(steps):
+        nonlocal td
+        for _ in range(steps):
+            _, td = env.step_and_maybe_reset(td.set("action", action))
+        torch.cuda.synchronize()
+        free, total = torch.cuda.mem_get_info()
+        return total - free
+
+    used(100)
+    assert used(100) == used(9_900)

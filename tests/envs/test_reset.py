@@ -1,4 +1,4 @@
-"""Resets: what they draw, from which stream, and whom they leave alone."""
+"""Resets: what they draw, from which stream, and which worlds they leave alone."""
 
 import mujoco
 import numpy as np
@@ -8,9 +8,11 @@ from oracle import DATA
 from tensordict import TensorDict
 
 import torchrl_loco
-from torchrl_loco import State
+from torchrl_loco import State, models
 
 SIGNIFICANCE = 1e-4
+# Under playground the humanoid draws nothing.
+DRAWING = [("walker_run", "playground"), ("humanoid_run", "dm_control")]
 
 
 def kolmogorov_smirnov(x, cdf):
@@ -21,18 +23,23 @@ def kolmogorov_smirnov(x, cdf):
     return distance, np.sqrt(-0.5 * np.log(SIGNIFICANCE / 2) / len(x))
 
 
-def draws(task, num_envs, episodes, seed, protocol="playground", device="cpu"):
-    """qpos at the start of consecutive episodes, shape (episodes, num_envs, nq)."""
-    env = torchrl_loco.make(task, num_envs, device, seed=seed, protocol=protocol)
-    starts = []
-    for _ in range(episodes):
-        env.reset()
-        starts.append(env.get_state()["qpos"].cpu())
-    return torch.stack(starts)
+@pytest.fixture
+def draws(shared):
+    """Returns qpos at the start of consecutive episodes, shape (episodes, num_envs, nq)."""
+
+    def draw(task, num_envs, episodes, seed, protocol="playground", device="cpu"):
+        env, starts = shared(task, num_envs, device, seed, protocol=protocol), []
+        for _ in range(episodes):
+            env.reset()
+            starts.append(env.get_state()["qpos"].cpu())
+        return torch.stack(starts)
+
+    return draw
 
 
-def test_masked_reset_leaves_the_others_bitwise_unchanged(task, protocol, device, actions):
-    env = torchrl_loco.make(task, 6, device, seed=0, protocol=protocol)
+@pytest.mark.parametrize(("task", "protocol"), [*DRAWING, ("humanoid_run", "playground")])
+def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol, device, actions):
+    env = shared(task, 6, device, protocol=protocol)
     td = env.reset()
     for action in actions(env, 8):
         td = env.step(td.set("action", action))["next"].exclude("reward")
@@ -48,7 +55,10 @@ def test_masked_reset_leaves_the_others_bitwise_unchanged(task, protocol, device
     assert (after["elapsed_steps"][~kept] == 0).all()
     assert (after["elapsed_steps"][kept] == 8).all()
     assert (after["episode"][~kept] == 2).all()
-    assert (after["qvel"][~kept] == 0).all()
+    for name in ("qvel", "qacc_warmstart", "ctrl", "time"):
+        values = getattr(env.sim, name)
+        assert (values[~kept] == 0).all(), name
+        assert (values[kept] != 0).any(), name
 
     if device == "cpu":  # and they go on as if nothing had happened
         action = actions(env, 1, seed=1)[0]
@@ -58,9 +68,9 @@ def test_masked_reset_leaves_the_others_bitwise_unchanged(task, protocol, device
         assert torch.equal(observation[kept], undisturbed[kept])
 
 
-def test_walker_starts_uniformly(device):
+def test_walker_starts_uniformly(draws, device):
     qpos = draws("walker_walk", 4096, 1, seed=12, device=device)[0].numpy().astype(np.float64)
-    model = torchrl_loco.models.load("walker")
+    model = models.load(models.PATHS["walker"])
     assert (qpos[:, :2] == 0).all()
     ranges = [(-np.pi, np.pi), *model.jnt_range[3:]]
     for angle, (low, high) in zip(qpos[:, 2:].T, ranges, strict=True):
@@ -72,10 +82,10 @@ def test_walker_starts_uniformly(device):
     assert np.abs(correlation).max() < 5 / np.sqrt(len(qpos))
 
 
-def test_humanoid_starts_free_of_contact(device):
+def test_humanoid_starts_free_of_contact(draws, device):
     """dm_control's start, judged by C MuJoCo, with the distribution that dm_control recorded."""
     qpos = draws("humanoid_walk", 2048, 1, seed=5, protocol="dm_control", device=device)[0].numpy().astype(np.float64)
-    model = torchrl_loco.models.load("humanoid")
+    model = models.load(models.PATHS["humanoid"])
     data = mujoco.MjData(model)
     for q in qpos:
         data.qpos[:] = q
@@ -91,24 +101,23 @@ def test_humanoid_starts_free_of_contact(device):
         assert np.abs(share[0] - share[1]).max() < critical
 
 
-def test_humanoid_playground_start_is_the_default_pose():
+def test_humanoid_playground_start_is_the_default_pose(draws):
     qpos = draws("humanoid_run", 3, 2, seed=0)
-    expected = torch.as_tensor(torchrl_loco.models.load("humanoid").qpos0, dtype=torch.float32)
+    expected = torch.as_tensor(models.load(models.PATHS["humanoid"]).qpos0, dtype=torch.float32)
     assert torch.equal(qpos, expected.expand_as(qpos))
 
 
-@pytest.mark.parametrize(("task", "protocol"), [("walker_run", "playground"), ("humanoid_run", "dm_control")])
-def test_a_world_draws_from_seed_world_and_episode_alone(task, protocol, device):
+@pytest.mark.parametrize(("task", "protocol"), DRAWING)
+def test_a_world_draws_from_seed_world_and_episode_alone(shared, draws, task, protocol, device):
     few, many = (draws(task, n, 3, seed=9, protocol=protocol, device=device) for n in (3, 64))
     assert torch.equal(few, many[:, :3])
-    assert torch.equal(few, draws(task, 3, 3, seed=9, protocol=protocol, device=device))
     assert not torch.equal(few, draws(task, 3, 3, seed=10, protocol=protocol, device=device))
-    neighbour = draws(task, 64, 3, seed=10, protocol=protocol, device=device)
-    starts = torch.cat([many, neighbour]).reshape(-1, many.shape[-1])
+    other_seed = draws(task, 64, 3, seed=10, protocol=protocol, device=device)
+    starts = torch.cat([many, other_seed]).reshape(-1, many.shape[-1])
     assert len(starts.unique(dim=0)) == len(starts)  # no seed, world or episode repeats another
 
-    # Episodes count by world: whoever is reset alone draws what it would have drawn with the others.
-    env = torchrl_loco.make(task, 3, device, seed=9, protocol=protocol)
+    # Episodes count by world: a world that is reset alone draws what it would have drawn with the others.
+    env = shared(task, 3, device, 9, protocol=protocol)
     env.reset()
     mask = torch.tensor([[False], [True], [False]], device=device)
     for episode in (1, 2):
@@ -117,8 +126,8 @@ def test_a_world_draws_from_seed_world_and_episode_alone(task, protocol, device)
         assert torch.equal(env.get_state()["qpos"][0].cpu(), few[0, 0])
 
 
-def test_set_seed_starts_the_streams_anew():
-    env = torchrl_loco.make("walker_walk", 4, "cpu", seed=1)
+def test_set_seed_starts_the_streams_again(shared):
+    env = shared(seed=1)
     first = env.reset()["observation"]
     env.reset()
     env.set_seed(1)
@@ -140,8 +149,11 @@ def test_no_global_generator_is_read_or_seeded():
 
 
 def test_without_a_seed_environments_differ():
-    first, second = (torchrl_loco.make("walker_walk", 2, "cpu").reset()["observation"] for _ in range(2))
-    assert not torch.equal(first, second)
+    env, other = (torchrl_loco.make("walker_walk", 2, "cpu") for _ in range(2))
+    first = env.reset()["observation"]
+    assert not torch.equal(first, other.reset()["observation"])
+    env.set_seed(None)
+    assert not torch.equal(first, env.reset()["observation"])
 
 
 def test_stagger_spreads_the_time_limits():

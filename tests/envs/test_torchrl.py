@@ -1,30 +1,21 @@
-"""The environments inside TorchRL's own machinery."""
+"""The environments inside TorchRL's own machinery; ParallelEnv is in test_offset.py."""
 
 import functools
 
 import pytest
 import torch
+from conftest import COARSE
 from torchrl.collectors import Collector, MultiSyncCollector
-from torchrl.envs import (
-    Compose,
-    EnvCreator,
-    InitTracker,
-    ParallelEnv,
-    RewardSum,
-    StepCounter,
-    TransformedEnv,
-    VecNormV2,
-)
+from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv, VecNormV2
 from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 
 import torchrl_loco
 
-make_walker = functools.partial(torchrl_loco.make, "walker_walk", device="cpu", seed=0, episode_length=6)
 
-
-@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # TorchRL says so of any batch
-def test_transforms_count_and_sum_by_world():
-    env = TransformedEnv(make_walker(3), Compose(InitTracker(), RewardSum(), StepCounter(), VecNormV2(["observation"])))
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # for any batch
+def test_transforms_count_and_sum_by_world(shared):
+    transforms = Compose(InitTracker(), RewardSum(), StepCounter(), VecNormV2(["observation"]))
+    env = TransformedEnv(shared("walker_run", 3, episode_length=6, **COARSE), transforms)
     td = env.rollout(14, break_when_any_done=False)
     assert td["is_init"].squeeze(-1)[0].nonzero().squeeze(-1).tolist() == [0, 6, 12]
     assert td["next", "step_count"].squeeze(-1)[0].tolist() == [1, 2, 3, 4, 5, 6, 1, 2, 3, 4, 5, 6, 1, 2]
@@ -35,28 +26,30 @@ def test_transforms_count_and_sum_by_world():
 
 @pytest.mark.filterwarnings("ignore:The default value of `auto_register_policy_transforms`")
 @pytest.mark.parametrize("track", [True, False])
-def test_collector_collects_what_rollout_does(track):
-    env = make_walker(4)
-    collector = Collector(
-        env, None, frames_per_batch=32, total_frames=64, track_traj_ids=track, auto_register_policy_transforms=False
-    )
+def test_collector_collects_what_rollout_does_and_closes(shared, track):
+    """The environment that it closes at its end opens again at the next reset."""
+    env, twin = (shared("walker_run", copy=copy, episode_length=6, **COARSE) for copy in (0, 1))
+    options = {"track_traj_ids": track, "auto_register_policy_transforms": False}
+    collector = Collector(env, None, frames_per_batch=32, total_frames=64, **options)
     batches = [batch.clone() for batch in collector]
     collector.shutdown()
     assert [batch.shape for batch in batches] == [(4, 8), (4, 8)]
     data = torch.cat(batches, dim=1)
-    twin, td = make_walker(4), None
     td = twin.reset()
     for step in range(16):
         current, td = twin.step_and_maybe_reset(td.set("action", data["action"][:, step]))
         assert torch.equal(current["observation"], data["observation"][:, step])
         for key in ("observation", "reward", "truncated"):
             assert torch.equal(current["next", key], data["next", key][:, step]), key
+    assert env.is_closed
+    assert env.rollout(3).shape == (4, 3)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_multi_sync_collector():
+    make = functools.partial(torchrl_loco.make, "walker_walk", 2, "cpu", 0)
     collector = MultiSyncCollector(
-        [functools.partial(make_walker, 2)] * 2,
+        [functools.partial(make, world_offset=2 * k) for k in range(2)],
         None,
         frames_per_batch=16,
         total_frames=16,
@@ -69,23 +62,16 @@ def test_multi_sync_collector():
         collector.shutdown()
     assert batch.numel() == 16
     assert batch["next", "reward"].isfinite().all()
+    first = batch["observation"].reshape(4, 4, 24)[:, 0]
+    assert len(first.unique(dim=0)) == 4
 
 
-@pytest.mark.slow
-def test_parallel_env():
-    env = ParallelEnv(2, EnvCreator(functools.partial(make_walker, 3)), mp_start_method="spawn")
-    try:
-        td = env.rollout(4)
-    finally:
-        env.close()
-    assert td.shape == (2, 3, 4)
-    assert torch.equal(td["observation"][0, :, 0], make_walker(3).reset()["observation"])
-
-
-def test_video_recorder(tmp_path):
+def test_video_recorder(shared, tmp_path):
     logger = CSVLogger("run", log_dir=str(tmp_path), video_format="pt")
     recorder = VideoRecorder(logger, tag="walk", skip=1)
-    env = TransformedEnv(make_walker(2), Compose(PixelRenderTransform(width=64, height=48), recorder))
+    env = TransformedEnv(
+        shared("walker_run", 2, **COARSE), Compose(PixelRenderTransform(width=64, height=48), recorder)
+    )
     td = env.rollout(4)
     assert td["pixels"].shape == (2, 4, 48, 64, 3)
     assert td["pixels"].dtype == torch.uint8

@@ -1,4 +1,4 @@
-"""The pieces of the contact-free start, each against an independent reckoning."""
+"""The parts of the contact-free start, each against C MuJoCo."""
 
 import mujoco
 import mujoco_warp as mjw
@@ -50,7 +50,7 @@ def test_segment_distance_agrees_with_mujoco():
 
 def test_poses_near_the_floor_do_not_touch_it():
     """From a root 0.9 m high most poses reach the floor; C MuJoCo finds no contact in those that are kept."""
-    model = models.load("humanoid")
+    model = models.load(models.PATHS["humanoid"])
     device, n = wp.get_device("cpu"), 500
     with wp.ScopedDevice(device):
         pairs = mjw.put_model(model).nxn_geom_pair_filtered.numpy()
@@ -59,9 +59,8 @@ def test_poses_near_the_floor_do_not_touch_it():
         qpos = wp.array(start, dtype=float)
         inputs = [
             make_skeleton(model, pairs, device),
-            wp.array([3], dtype=wp.uint32),
-            wp.zeros(n, dtype=int),
             wp.ones(n, dtype=bool),
+            wp.array(np.arange(n), dtype=wp.uint32),  # where the streams start
         ]
         bodies = [wp.zeros((n, model.nbody), dtype=dtype) for dtype in (wp.vec3, wp.quat)]
         wp.launch(draw_free_poses, n, inputs, [qpos, *bodies])
@@ -76,7 +75,7 @@ def test_poses_near_the_floor_do_not_touch_it():
 def test_other_models_are_refused():
     pairs = np.zeros((0, 2), dtype=np.int32)
     with pytest.raises(ValueError, match="free joints and hinges"):
-        make_skeleton(models.load("walker"), pairs, wp.get_device("cpu"))
+        make_skeleton(models.load(models.PATHS["walker"]), pairs, wp.get_device("cpu"))
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 1])
     with pytest.raises(ValueError, match="capsules and spheres"):

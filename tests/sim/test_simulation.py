@@ -15,7 +15,7 @@ VIEWS = ("qpos", "qvel", "ctrl", "qacc_warmstart", "xpos", "xmat", "time", "over
 
 def simulation(body, device, num_envs=4, **overrides):
     config = sim_config(DEFAULTS[body], "dm_control", num_envs, overrides)
-    sim = Simulation(models.load(body), config, num_envs, torch.device(device))
+    sim = Simulation(models.load(models.PATHS[body]), config, num_envs, torch.device(device))
     return sim, wp.ones(num_envs, dtype=bool, device=sim.device)
 
 
@@ -70,10 +70,10 @@ def test_derived_quantities_belong_to_the_new_state(body, device):
         np.testing.assert_allclose(sim.data.sensordata.numpy()[world], data.sensordata, atol=1e-4)
 
 
-def test_place_is_forward_for_worlds_at_rest(body, device):
-    """What a reset leaves out is zero, and the worlds beside it keep what they have."""
+def test_forward_at_rest_is_forward_for_worlds_at_rest(body, device):
+    """What it leaves out is zero after a reset, and the worlds beside keep what they have."""
     states = []
-    for bring_up in (Simulation.forward, Simulation.place):
+    for forward in (Simulation.forward, Simulation.forward_at_rest):
         sim, mask = simulation(body, device)
         generator = torch.Generator(device).manual_seed(0)
         sim.reset(mask)
@@ -83,7 +83,7 @@ def test_place_is_forward_for_worlds_at_rest(body, device):
         wp.to_torch(mask)[1:] = False
         sim.reset(mask)
         sim.qpos[0, -5:].uniform_(-1, 1, generator=generator)
-        bring_up(sim, mask)
+        forward(sim, mask)
         d = sim.data
         states.append([wp.to_torch(x).clone() for x in (d.xpos, d.xmat, d.geom_xpos, d.cvel, d.sensordata, d.efc.J)])
     for full, less in zip(*states, strict=True):
@@ -117,8 +117,7 @@ def test_options_come_from_the_config():
     sim, _ = simulation("walker", "cpu", sim_dt=0.005, iterations=7, ls_iterations=9)
     assert sim.mj_model.opt.timestep == 0.005
     assert (sim.model.opt.iterations, sim.model.opt.ls_iterations) == (7, 9)
-    assert sim.substeps == 5
     playground = sim_config(DEFAULTS["walker"], "playground", 1, {})
-    cut = Simulation(models.load("walker"), playground, 1, torch.device("cpu"))
+    cut = Simulation(models.load(models.PATHS["walker"]), playground, 1, torch.device("cpu"))
     assert cut.mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     assert not sim.mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP

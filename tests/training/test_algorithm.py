@@ -1,13 +1,14 @@
-"""What CUDA graphs and an asynchronous host ask of the algorithms, seen on the CPU."""
+"""What CUDA graphs and an asynchronous host need of the algorithms, checked on the CPU."""
 
 import traceback
 
 import pytest
 import torch
+from small_runs import made
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from torchrl_loco.training import RunFolder, Trainer, preset
-from torchrl_loco.training.networks import SquashedNormal
+from torchrl_loco.training import Trainer
+from torchrl_loco.training.actor import SquashedNormal
 
 HOST = ("_local_scalar_dense", "lift_fresh", "nonzero", "aten.equal")
 """Operations that read a tensor's value, or make a tensor from a value of Python's."""
@@ -31,26 +32,18 @@ class HostTraffic(TorchDispatchMode):
 
 @pytest.fixture(params=["ppo", "reppo"])
 def trainer(request, tmp_path):
-    small = {"num_envs": 4, "decisions": 8, "minibatch_size": 16, "epochs": 1, "hidden": (16,), "total_frames": 1000}
-    trainer = Trainer(RunFolder.create(preset("walker_stand", "cpu", request.param, out=tmp_path, **small)))
+    trainer = Trainer(made(tmp_path, request.param))
     trainer.algorithm.update(trainer.collector.rollout(), 0.0)
     return trainer
 
 
-def test_a_gradient_step_can_be_recorded(trainer):
-    with HostTraffic() as traffic:
-        trainer.algorithm._minibatch_step()
-    assert traffic.found == []
-
-
-def test_collecting_waits_for_nothing(trainer):
+def test_training_waits_for_nothing(trainer):
+    """Neither collecting nor a gradient step, so that a CUDA graph can record the latter."""
     with HostTraffic() as traffic:
         trainer.collector.rollout()
+        trainer.algorithm._minibatch_step()
     assert traffic.found == []
-
-
-def test_the_traffic_would_be_seen():
-    with HostTraffic() as traffic:
+    with HostTraffic() as traffic:  # it would have been noticed
         torch.tensor(1.0)
         bool(torch.ones(()) > 0)
     assert len(traffic.found) >= 2

@@ -1,10 +1,14 @@
-"""What drawing must not do to the program that asks for it."""
+"""Which runs share a curve, and what plotting leaves as it was."""
+
+import json
 
 import matplotlib
 import pytest
 from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from small_runs import made
 
-from torchrl_loco.training import RunFolder, plot_runs, preset
+from torchrl_loco.training import plot_runs
 
 
 @pytest.fixture
@@ -15,12 +19,46 @@ def backend():
     plt.switch_backend(before)
 
 
+def measured(out, batches=2, device="cpu", **settings):
+    """Returns a run with metrics, as if it had been trained."""
+    run = made(out, **settings)
+    path = run.path / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "device": device}))
+    for i in range(1, batches + 1):
+        run.append_metrics({"frames": i, "seconds": 1.0, "return": 100.0 * (i + settings.get("seed", 0))})
+    return run
+
+
+def test_runs_share_a_curve_unless_they_learn_differently(tmp_path, monkeypatch):
+    drawn, plot = [], Axes.plot
+
+    def note(self, x, y, **options):
+        drawn.append((list(y), options["label"]))
+        return plot(self, x, y, **options)
+
+    monkeypatch.setattr(Axes, "plot", note)
+    same = [{}, {"seed": 1, "batches": 3}, {"device": "cuda:7"}]
+    same += [{"eval_interval": 128}, {"eval_episodes": 9}, {"video_seconds": 3.0}, {"checkpoint_seconds": 5.0}]
+    other = [{"lr": 1e-4}, {"algorithm": "reppo"}]
+    runs = [measured(tmp_path / str(i), **settings) for i, settings in enumerate([*same, *other])]
+    plot_runs(runs, tmp_path / "curves.png")
+    curves = [curve for curve, _ in drawn]
+    assert curves == [[100.0 + 100 / 7, 200.0 + 100 / 7], [100.0, 200.0], [100.0, 200.0]]
+    assert ["7 seeds" in label for _, label in drawn] == [True, False, False]
+
+
+def test_nothing_to_plot(tmp_path):
+    with pytest.raises(ValueError, match="no runs"):
+        plot_runs([], tmp_path / "none.png")
+    with pytest.raises(ValueError, match="has no metrics yet"):
+        plot_runs([made(tmp_path)], tmp_path / "none.png")
+
+
 def test_the_callers_figures_stay_as_they_are(tmp_path, backend):
     """In a notebook, pictures still appear after a training."""
-    run = RunFolder.create(preset("walker_stand", "cpu", out=tmp_path))
-    for frames in (1, 2):
-        run.append_metrics({"frames": frames, "seconds": 1.0, "return": 100.0 * frames})
     figures = plt.get_fignums()
+    run = measured(tmp_path)
+    run.append_evaluation({"frames": 2, "mean": 150.0, "std": 20.0})
     plot_runs([run], tmp_path / "curve.png")
     assert (tmp_path / "curve.png").stat().st_size > 10_000
     assert (matplotlib.get_backend(), plt.get_fignums()) == (backend, figures)

@@ -1,10 +1,10 @@
 """Advantages and normalisation against values computed by hand, and what an update does."""
 
+import pytest
 import torch
+from small_runs import collected
 from tensordict import TensorDict
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-import torchrl_loco
 from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training import preset
 from torchrl_loco.training.algorithm import clip_and_step
@@ -12,7 +12,7 @@ from torchrl_loco.training.ppo import PPO
 
 
 def made(**overrides):
-    settings = {"num_envs": 1, "decisions": 4, "minibatch_size": 4, "total_frames": 10_000, "epochs": 1, **overrides}
+    settings = {"num_envs": 1, "num_steps": 4, "minibatch_size": 4, "total_frames": 10_000, "epochs": 1, **overrides}
     torch.manual_seed(0)
     return PPO(preset("walker_stand", "cpu", "ppo", **settings))
 
@@ -70,15 +70,10 @@ def test_observation_norm_is_the_mean_and_variance_of_all_it_saw():
     assert norm(torch.full((1, 3), 1e9)).max() == norm.limit
 
 
-def collected(ppo, num_envs):
-    env = torchrl_loco.make("walker_stand", num_envs, "cpu", seed=0)
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        return env.rollout(ppo.config.decisions, ppo.actor)
-
-
+@pytest.mark.slow
 def test_updates_raise_what_is_rewarded():
     """Rewarded for the first joint alone, the actor moves that joint and leaves the others."""
-    ppo, means = made(num_envs=64, decisions=8, minibatch_size=128, epochs=4, lr=1e-3), []
+    ppo, means = made(num_envs=64, num_steps=8, minibatch_size=128, epochs=4, lr=1e-3), []
     for _ in range(6):
         batch = collected(ppo, 64)
         batch["next", "reward"] = batch["action"][..., :1].clone()
@@ -88,9 +83,9 @@ def test_updates_raise_what_is_rewarded():
     assert means[-1][1:].abs().max() < means[-1][0] / 2
 
 
-def test_advantages_count_relative_to_each_other():
-    """What is added to all of a minibatch, or multiplies all, changes nothing: they are normalised."""
-    ppo = made(num_envs=8, decisions=8, minibatch_size=64)
+def test_advantages_are_normalised():
+    """What is added to all of a minibatch, or multiplies all, changes nothing."""
+    ppo = made(num_envs=8, num_steps=8, minibatch_size=64)
     with torch.no_grad():
         data = ppo.prepare(collected(ppo, 8)).reshape(-1)
     data["action_log_prob"] += torch.linspace(-0.1, 0.1, 64)  # as if the policy had moved on
@@ -102,7 +97,7 @@ def test_advantages_count_relative_to_each_other():
 
 def test_entropy_is_rewarded():
     """With nothing else to gain, actions spread."""
-    ppo = made(num_envs=8, decisions=8, minibatch_size=64, entropy_coeff=1.0, init_std=0.3, lr=1e-2)
+    ppo = made(num_envs=8, num_steps=8, minibatch_size=64, entropy_coeff=1.0, init_std=0.3, lr=1e-2)
     batch = collected(ppo, 8)
     batch["next", "reward"].zero_()
     before = batch["scale"].mean()
@@ -111,9 +106,9 @@ def test_entropy_is_rewarded():
     assert ppo.actor.get_dist(batch).base_dist.stddev.mean() > 1.02 * before
 
 
-def test_a_rest_smaller_than_a_minibatch_is_left_out():
-    """Of nine decisions, minibatches of four take eight, other ones in each epoch, and none twice in one."""
-    ppo, seen = made(num_envs=3, decisions=3, epochs=2, minibatch_size=4), []
+def test_a_remainder_smaller_than_a_minibatch_is_left_out():
+    """Of nine steps, minibatches of four take eight, other ones in each epoch, and none twice in one."""
+    ppo, seen = made(num_envs=3, num_steps=3, epochs=2, minibatch_size=4), []
     ppo.gradient_step = lambda minibatch: seen.append(minibatch["observation"]) or [torch.zeros(())] * 6
     ppo.update(collected(ppo, 3), progress=0.0)
     assert [len(minibatch) for minibatch in seen] == [4] * 4
@@ -121,9 +116,9 @@ def test_a_rest_smaller_than_a_minibatch_is_left_out():
         assert len(torch.cat(epoch).unique(dim=0)) == 8
 
 
-def test_the_norm_waits_for_the_gradient_steps():
-    """Else probabilities would be compared with those that were seen through another norm."""
-    ppo, seen = made(num_envs=2, decisions=4), []
+def test_the_norm_is_updated_after_the_gradient_steps():
+    """Else probabilities would be compared with those that were computed with another norm."""
+    ppo, seen = made(num_envs=2, num_steps=4), []
     ppo.gradient_step = lambda minibatch: seen.append(ppo.norm.count.item()) or [torch.zeros(())] * 6
     ppo.update(collected(ppo, 2), progress=0.0)
     assert (seen, ppo.norm.count) == ([0.0, 0.0], 8.0)
@@ -139,8 +134,15 @@ def test_gradients_are_clipped_to_a_norm():
         torch.testing.assert_close(parameter.norm(), torch.tensor(step), rtol=1e-4, atol=0)
 
 
-def test_learning_rate_falls_to_nothing():
-    ppo = made(num_envs=2, decisions=8, minibatch_size=16)
+def test_learning_rate_falls_to_a_fraction():
+    ppo = made(num_envs=2, num_steps=8, minibatch_size=16, lr=1e-3, final_lr_fraction=0.2)
+    for progress, lr in ((0.0, 1e-3), (0.5, 6e-4), (1.0, 2e-4)):
+        ppo.update(collected(ppo, 2), progress)
+        torch.testing.assert_close(ppo.optimizer.param_groups[0]["lr"], torch.tensor(lr))
+
+
+def test_nothing_is_learned_at_a_learning_rate_of_zero():
+    ppo = made(num_envs=2, num_steps=8, minibatch_size=16)
     before = [p.clone() for p in ppo.actor.parameters()]
     ppo.update(collected(ppo, 2), progress=1.0)
     assert all(torch.equal(p, q) for p, q in zip(before, ppo.actor.parameters(), strict=True))
@@ -149,7 +151,7 @@ def test_learning_rate_falls_to_nothing():
 def test_same_seed_same_parameters():
     results = []
     for _ in range(2):
-        ppo = made(num_envs=8, decisions=8, minibatch_size=16, epochs=2)
+        ppo = made(num_envs=8, num_steps=8, minibatch_size=16, epochs=2)
         torch.manual_seed(1)
         ppo.update(collected(ppo, 8), progress=0.0)
         results.append(torch.cat([p.detach().flatten() for p in ppo.networks.parameters()]))

@@ -4,19 +4,17 @@ import math
 
 import pytest
 import torch
+from small_runs import collected
 from tensordict import TensorDict
 from torch.distributions import Independent, Normal, TransformedDistribution, kl_divergence
 from torch.distributions.transforms import TanhTransform
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-import torchrl_loco
 from torchrl_loco.training import preset
-from torchrl_loco.training.networks import ValueBins
-from torchrl_loco.training.reppo import REPPO, kl, sample
+from torchrl_loco.training.reppo import REPPO, ValueBins, kl, sample
 
 
 def made(**overrides):
-    settings = {"num_envs": 1, "decisions": 4, "minibatch_size": 4, "total_frames": 10_000, "epochs": 1, **overrides}
+    settings = {"num_envs": 1, "num_steps": 4, "minibatch_size": 4, "total_frames": 10_000, "epochs": 1, **overrides}
     torch.manual_seed(0)
     return REPPO(preset("walker_stand", "cpu", "reppo", hidden=(32,), **settings))
 
@@ -31,7 +29,7 @@ def test_bins_keep_a_return():
     torch.testing.assert_close(spread, torch.full((4,), math.sqrt(0.75**2 + 1 / 12)), atol=1e-2, rtol=0)
 
 
-def test_bins_clip_what_lies_beyond():
+def test_bins_clip_returns_beyond_them():
     bins = ValueBins(0.0, 10.0, 11)
     torch.testing.assert_close(bins.encode(torch.tensor([-5.0, 99.0])), bins.encode(torch.tensor([0.0, 10.0])))
 
@@ -95,16 +93,10 @@ def test_soft_returns_by_hand(monkeypatch):
     assert data["alive"].tolist() == [[1.0, 1.0, 0.0, 1.0]]
 
 
-def collected(reppo, num_envs):
-    env = torchrl_loco.make("walker_stand", num_envs, "cpu", seed=0)
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        return env.rollout(reppo.config.decisions, reppo.actor)
-
-
 @pytest.mark.slow
 def test_updates_raise_what_is_rewarded():
     """Rewarded for the first joint alone, the actor moves that joint."""
-    reppo = made(num_envs=64, decisions=8, minibatch_size=128, epochs=8, lr=1e-3, gamma=0.5, reward_scale=10.0)
+    reppo = made(num_envs=64, num_steps=8, minibatch_size=128, epochs=8, lr=1e-3, gamma=0.5, reward_scale=10.0)
     for _ in range(24):
         batch = collected(reppo, 64)
         batch["next", "reward"] = batch["action"][..., :1] + 1.0
@@ -114,8 +106,8 @@ def test_updates_raise_what_is_rewarded():
     assert mean[1:].mean().abs() < mean[0] / 2
 
 
-def test_nothing_is_foreseen_beyond_a_termination():
-    reppo = made(num_envs=16, decisions=8, minibatch_size=128)
+def test_nothing_is_predicted_beyond_a_termination():
+    reppo = made(num_envs=16, num_steps=8, minibatch_size=128)
     with torch.no_grad():
         data = reppo.prepare(collected(reppo, 16)).reshape(-1)
     data["features"][::2] = 1e3
@@ -124,9 +116,9 @@ def test_nothing_is_foreseen_beyond_a_termination():
     assert reppo._critic_step(data)[1] < 10.0
 
 
-def test_the_actor_is_drawn_back_where_it_went_too_far():
+def test_the_actor_returns_where_the_kl_bound_is_exceeded():
     """With a bound that is always exceeded, the critic's gradient counts for nothing."""
-    reppo = made(num_envs=16, decisions=8, minibatch_size=128, kl_bound=1e-12, init_kl_weight=1.0, lr=1e-3)
+    reppo = made(num_envs=16, num_steps=8, minibatch_size=128, kl_bound=1e-12, init_kl_weight=1.0, lr=1e-3)
     batch = collected(reppo, 16)
     batch["loc"] += 0.3  # as if the policy that collected had been another
     before = kl(batch["loc"], batch["scale"], *reppo.distribution(batch["observation"])).mean()
@@ -138,17 +130,29 @@ def test_the_actor_is_drawn_back_where_it_went_too_far():
     assert after < before / 2
 
 
-@pytest.mark.parametrize(("aim", "rises"), [(5.0, True), (-50.0, False)])
-def test_temperature_rises_while_entropy_is_too_low(aim, rises):
-    reppo = made(num_envs=16, decisions=8, minibatch_size=128, target_entropy=aim)
-    batch = collected(reppo, 16)
+def test_dual_variables_rise_while_their_constraint_is_violated():
+    """Too little entropy raises the temperature, too much divergence the weight of the divergence, and the reverse."""
+    for target_entropy, kl_bound, rises in ((5.0, 1e-12, True), (-50.0, 100.0, False)):
+        reppo = made(num_envs=16, num_steps=8, minibatch_size=128, target_entropy=target_entropy, kl_bound=kl_bound)
+        batch = collected(reppo, 16)
+        batch["loc"] += 0.3  # as if the policy that collected had been another
+        reppo.update(batch, progress=0.0)
+        assert (reppo.dual.temperature > reppo.config.init_temperature) == rises
+        assert (reppo.dual.kl_weight > reppo.config.init_kl_weight) == rises
+
+
+def test_target_entropy_is_that_of_each_entry_of_an_action():
+    """Six entries, so that a third of the entropy for each is twice the entropy, too much or, if negative, enough."""
+    batch = collected(made(num_envs=16, num_steps=8, minibatch_size=128), 16)
+    entropy = -sample(batch["loc"], batch["scale"])[1].mean().item()
+    assert abs(entropy) > 0.3
+    reppo = made(num_envs=16, num_steps=8, minibatch_size=128, target_entropy=entropy / 3)
     reppo.update(batch, progress=0.0)
-    temperature = reppo.weights.temperature.item()
-    assert (temperature > reppo.config.init_temperature) == rises
+    assert (reppo.dual.temperature > reppo.config.init_temperature) == (entropy > 0)
 
 
 def test_the_actors_step_leaves_the_critic_alone():
-    reppo = made(num_envs=16, decisions=8, minibatch_size=128)
+    reppo = made(num_envs=16, num_steps=8, minibatch_size=128)
     batch = collected(reppo, 16)
     with torch.no_grad():
         data = reppo.prepare(batch).reshape(-1)
@@ -159,19 +163,19 @@ def test_the_actors_step_leaves_the_critic_alone():
 
 
 def test_a_temperature_that_has_fallen_rises_again():
-    """From a millionth, with too little entropy, it grows by the learning rate at every step and is not held down."""
-    low = {"init_temperature": 1e-7, "min_temperature": 1e-9}
-    reppo = made(num_envs=16, decisions=8, minibatch_size=128, target_entropy=50.0, lr=1e-2, **low)
+    """With too little entropy its logarithm grows by the learning rate at every step, however small it is."""
+    low = {"init_temperature": 1e-8, "min_temperature": 1e-9}
+    reppo = made(num_envs=16, num_steps=8, minibatch_size=128, target_entropy=50.0, lr=1e-2, **low)
     batch = collected(reppo, 16)
     with torch.no_grad():
         data = reppo.prepare(batch).reshape(-1)
-    for _ in range(300):
+    for _ in range(100):
         reppo._actor_step(data)
-    assert reppo.weights.temperature > 1e-7 * math.exp(0.8 * 300 * 1e-2)
+    assert reppo.dual.temperature > 1e-8 * math.exp(0.8 * 100 * 1e-2)
 
 
-def test_temperature_does_not_fall_below_its_least_value():
+def test_temperature_does_not_fall_below_its_minimum():
     floor = {"init_temperature": 0.02, "min_temperature": 0.02}
-    reppo = made(num_envs=16, decisions=8, minibatch_size=128, target_entropy=-50.0, **floor)
+    reppo = made(num_envs=16, num_steps=8, minibatch_size=128, target_entropy=-50.0, **floor)
     reppo.update(collected(reppo, 16), progress=0.0)
-    torch.testing.assert_close(reppo.weights.temperature.detach(), torch.tensor(0.02), rtol=1e-6, atol=0)
+    torch.testing.assert_close(reppo.dual.temperature.detach(), torch.tensor(0.02), rtol=1e-6, atol=0)

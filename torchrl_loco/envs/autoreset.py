@@ -1,4 +1,4 @@
-"""Episodes that follow one another without the host having to ask whether any has ended."""
+"""Resets by mask, without reading from the device whether a world is done."""
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -6,39 +6,47 @@ from torchrl.envs import EnvBase
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
 
-class AsyncReset(EnvBase):
-    """Mixin: ``step_and_maybe_reset`` resets by mask, always, where TorchRL first reads from the device if it must.
+def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:
+    """Does what TorchRL's ``maybe_reset`` does, without reading from the device.
 
-    The result is the same as TorchRL's. What is left out is the check that no world is done after its reset; the
-    environments of this package cannot be.
+    The result is the same. What is left out is TorchRL's check that no world is done after its reset; the environments
+    of this package cannot be.
+
+    Args:
+        env: an environment of this package, or one around it.
+        tensordict: what ``step_mdp`` makes of a step, batch ``(num_envs,)``.
+
+    Returns:
+        The same TensorDict, batch ``(num_envs,)``, with the first observation of the next episode in the worlds that
+        were done.
+    """
+    mask = tensordict.get("done").clone()
+    request = TensorDict({"_reset": mask}, batch_size=tensordict.batch_size, device=tensordict.device)
+    fresh = env._reset(request, set_state=False)
+
+    def merge(old: torch.Tensor, new: torch.Tensor | None) -> torch.Tensor:
+        rows = mask.view(-1, *[1] * (old.ndim - 1))
+        return old.masked_fill(rows, 0) if new is None else torch.where(rows, new, old)
+
+    # As in TorchRL, entries that a reset does not return (a policy's other outputs) are zero where a world was reset.
+    merged = tensordict._fast_apply(merge, fresh.exclude("_reset"), default=None)
+    return merged.update(fresh.exclude(*merged.keys(True, True)).exclude("_reset"))
+
+
+class TransformedEnv(TorchRLTransformedEnv):
+    """TorchRL's ``TransformedEnv`` for the environments of this package, without waiting for the device.
+
+    TorchRL's own works too and gives the same data, but reads from the device at every step. The arguments are those
+    of TorchRL's: an environment, and a transform or a ``Compose`` of them.
     """
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Resets the worlds that are done, without synchronising with the device.
+        """Resets the worlds that are done; see :func:`reset_done_worlds`.
 
         Args:
             tensordict: what ``step_mdp`` makes of a step, batch ``(num_envs,)``.
 
         Returns:
-            The same TensorDict, batch ``(num_envs,)``, with the first observation of the next episode in the worlds
-            that were done.
+            The same, batch ``(num_envs,)``, with new episodes in the worlds that were done.
         """
-        mask = tensordict.get("done").clone()
-        request = TensorDict({"_reset": mask}, batch_size=tensordict.batch_size, device=tensordict.device)
-        fresh = self._reset(request, set_state=False)
-
-        def merge(old: torch.Tensor, new: torch.Tensor | None) -> torch.Tensor:
-            rows = mask.view(-1, *[1] * (old.ndim - 1))
-            return old.masked_fill(rows, 0) if new is None else torch.where(rows, new, old)
-
-        # As in TorchRL, what a reset does not bring (a policy's other outputs) is zero where a world was reset.
-        merged = tensordict._fast_apply(merge, fresh.exclude("_reset"), default=None)
-        return merged.update(fresh.exclude(*merged.keys(True, True)).exclude("_reset"))
-
-
-class TransformedEnv(AsyncReset, TorchRLTransformedEnv):
-    """TorchRL's ``TransformedEnv`` for the environments of this package, without waiting for the device.
-
-    A stock one works too and gives the same data, but synchronises with the device at every step. Arguments are those
-    of TorchRL's: an environment, and a transform or a ``Compose`` of them.
-    """
+        return reset_done_worlds(self, tensordict)

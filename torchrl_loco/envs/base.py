@@ -1,59 +1,66 @@
-"""What all locomotion environments share: specs, step, reset, seeding, time limit, state. Knows no task."""
+"""What all locomotion environments share, TorchRL's side of it: specs, step, reset, seeding, state. Knows no task."""
 
 import dataclasses
+import inspect
+import multiprocessing
 import secrets
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
-import mujoco
 import numpy as np
 import torch
 import warp as wp
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
 
 from torchrl_loco import models
-from torchrl_loco.checks import check_count, check_device, check_flag, check_new_file, check_seed
+from torchrl_loco.checks import (
+    SEED,
+    check_bool,
+    check_choice,
+    check_device,
+    check_int,
+    check_output_file,
+)
 from torchrl_loco.config import SimConfig, sim_config
-from torchrl_loco.envs.autoreset import AsyncReset
-from torchrl_loco.envs.bad_world import BadWorldTrap
-from torchrl_loco.envs.checks import check_model, check_poses, check_subclass
-from torchrl_loco.envs.episode import any_world, apply_action, begin_episode, count_step, quench
-from torchrl_loco.envs.health import Health
-from torchrl_loco.envs.lifecycle import Closable
-from torchrl_loco.envs.state import Resumable, State, write_state
-from torchrl_loco.envs.watcher import Watcher
-from torchrl_loco.rendering import Renderer
-from torchrl_loco.sim import EXCLUSIVE, Simulation
+from torchrl_loco.envs.autoreset import reset_done_worlds
+from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
+from torchrl_loco.envs.state import State, write_state
+from torchrl_loco.envs.world import World
+from torchrl_loco.sim import Simulation
 from torchrl_loco.sim.sampling import draw_from_table
 
 
-class LocoEnv(AsyncReset, Resumable, Closable):
+class LocoEnv(EnvBase):
     """Base of the locomotion environments: batched worlds of one body on one device.
 
-    A subclass names its ``body``, ``mjcf`` (path of the model), ``defaults`` (settings under ``playground``),
-    ``observation_size`` and ``term_names``, and the kernel that fills the observation, the reward and its terms
-    (``_observation_kernel``). Initial poses are drawn from a table (``_initial_poses``) or by a kernel of the
-    subclass's own (``_launch_pose``). Everything else is here; docs/guides/extending.md goes through it with a third
-    body.
+    A subclass sets ``body``, ``mjcf`` (path of the model), ``defaults`` (settings under ``playground``),
+    ``observation_size`` and ``term_names``, and names the kernel that writes observation and reward
+    (:meth:`observation_kernel`). Initial poses come from a table (:meth:`initial_poses`) or from a kernel of the
+    subclass (:meth:`pose_kernel`). docs/guides/extending.md shows it with a third body.
 
     Args:
-        num_envs: number of worlds, the batch size.
+        num_envs: number of worlds, the batch size. ``None`` makes one world without a batch dimension.
         device: where physics and tensors live; ``None`` takes CUDA if there is any, else the CPU.
-        seed: integer in [0, 2**32) that, with world and episode, decides every random draw; ``None`` takes a fresh one.
-        protocol: ``"playground"`` (the solver cut short, fast) or ``"dm_control"`` (the solver converged).
+        seed: integer in [0, 2**32) that, with world and episode, decides every random draw; ``None`` draws one.
+        protocol: ``"playground"`` (few solver iterations, fast) or ``"dm_control"`` (the solver converges).
+        world_offset: index of the first world in a larger whole. Workers or ranks that share a seed and step different
+            worlds pass different offsets: worker k of n worlds each passes ``k * n``. ``None`` means 0.
         reward_terms: whether to return each factor of the reward under ``("next", "reward_terms", name)``.
         stagger: whether a full ``reset()`` starts each world at a random point of its time limit, so that the worlds
             are not truncated together.
-        on_overflow: what to do when contacts or constraints find no room and are left out: ``"warn"``, ``"raise"`` or
-            ``"ignore"``. It is noticed within some 100 steps, without waiting for the device; see :meth:`health`.
-        bad_world_file: a file, not there yet, that is to hold the state and action from which a world first became not
-            finite, for ``torchrl-loco replay``. It is written within some 100 steps, or by :meth:`close`.
+        on_overflow: what to do when the physics drops contacts or constraints for want of room: ``"warn"``, ``"raise"``
+            or ``"ignore"``. It is noticed within some 100 steps, without waiting for the device; see :meth:`health`.
+        nan_dump: a file that does not exist yet. It receives the state and action from which a world first became not
+            finite, for ``torchrl-loco inspect``, within some 100 steps or at :meth:`close`.
         config: fields of :class:`torchrl_loco.SimConfig` to override.
 
     Raises:
         ValueError: an argument is out of range or unknown; the message names the valid choices.
         TypeError: an argument has the wrong type.
+        MemoryError: the device has no room for so many worlds.
     """
 
     body: ClassVar[str]
@@ -67,294 +74,257 @@ class LocoEnv(AsyncReset, Resumable, Closable):
 
     def __init__(
         self,
-        num_envs: int = 1,
+        num_envs: int | None = 1,
         device: torch.device | str | None = None,
         seed: int | None = None,
         protocol: str = "playground",
         *,
+        world_offset: int | None = None,
         reward_terms: bool = False,
         stagger: bool = False,
         on_overflow: str = "warn",
-        bad_world_file: Path | str | None = None,
+        nan_dump: Path | str | None = None,
         **config: Any,
     ) -> None:
-        check_subclass(type(self))
-        num_envs = check_count("num_envs", num_envs)
-        seed = secrets.randbits(32) if seed is None else check_seed(seed)
+        self.check_class()
+        worlds = 1 if num_envs is None else check_int("num_envs", num_envs)
         device = check_device(device)
-        self.config = sim_config(self.defaults, protocol, num_envs, config)
-        self.protocol = protocol
-        super().__init__(device=device, batch_size=[num_envs])
-        self.num_envs, self.seed = num_envs, seed
-        self.reward_terms, self.stagger = check_flag("reward_terms", reward_terms), check_flag("stagger", stagger)
-        self.on_overflow = on_overflow
-        self.bad_world_file = None if bad_world_file is None else check_new_file("bad_world_file", bad_world_file)
+        if seed is not None:
+            seed = check_int("seed", seed, SEED)
+            if world_offset is None:
+                _warn_if_worlds_repeat()
+        arguments = list(inspect.signature(LocoEnv.__init__).parameters)[1:-1]
+        sim_settings = sim_config(self.defaults, protocol, worlds, config, arguments)
+        world_offset = None if world_offset is None else check_int("world_offset", world_offset, "[0, 2**31)")
+        reward_terms, stagger = check_bool("reward_terms", reward_terms), check_bool("stagger", stagger)
+        check_choice("on_overflow", on_overflow, ON_OVERFLOW)
+        nan_dump = None if nan_dump is None else check_output_file("nan_dump", nan_dump)
+        mj_model = models.check(models.load(self.mjcf))
+
+        super().__init__(device=device, batch_size=[] if num_envs is None else [worlds])
+        self.num_envs, self.world_offset = worlds, world_offset
+        self.seed = secrets.randbits(32) if seed is None else seed
+        self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
+        self.reward_terms, self.stagger = reward_terms, stagger
+        self.on_overflow, self.nan_dump = on_overflow, nan_dump
+        self._episodes: torch.Tensor | None = None  # of a closed environment
         self._open()
         self._make_specs()
 
-    def _build(self) -> None:
-        # The device: else torch's views of Warp's arrays would follow the caller's default device.
-        with EXCLUSIVE, self.device:
-            self.sim = Simulation(check_model(models.from_path(self.mjcf)), self.config, self.num_envs, self.device)
-            self._make_buffers()
-            self._health = Health(self.sim, self._bad, self.on_overflow)
-            self._watchers: list[Watcher] = [self._health]
-            if self.bad_world_file is not None:
-                inputs = self._action, self._episode, self._elapsed_steps
-                self._watchers.append(BadWorldTrap(self.bad_world_file, self.sim, inputs, self._bad, self._describe))
-            self._prepare()
-            self._make_poses()
-            self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
-            self._step_graph = self.sim.capture(self._launch_step)
-            self._reset_graph = self.sim.capture(self._launch_reset)
-            self._refresh_graph = self.sim.capture(self._launch_refresh)
-            wp.synchronize_device(self.sim.device)  # made on Warp's stream, used on torch's
-            self._set_seed(self.seed)  # and begin anew: recording has drawn episodes
-            for watcher in self._watchers:
-                watcher.restart()
-        self._renderers: dict[tuple[str, int, int], Renderer] = {}
+    @classmethod
+    def check_class(cls) -> None:
+        """Checks that a subclass has set all class attributes that it must.
+
+        Raises:
+            TypeError: some are missing; the message names them.
+        """
+        names = ("body", "mjcf", "defaults", "observation_size", "term_names")
+        missing = [name for name in names if not hasattr(cls, name)]
+        if missing:
+            raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.LocoEnv)")
 
     def __repr__(self) -> str:
-        name, device = type(self).__name__, str(self.device)
-        return f"{name}(num_envs={self.num_envs}, {device=}, protocol={self.protocol!r}, seed={self.seed})"
-
-    @property
-    def mj_model(self) -> mujoco.MjModel:
-        """The compiled MuJoCo model, with the options that the simulation uses."""
-        return self.sim.mj_model
+        num_envs = self.num_envs if self.batch_size else None
+        device, protocol, seed = str(self.device), self.protocol, self.seed
+        return f"{type(self).__name__}({num_envs=}, {device=}, {seed=}, {protocol=})"
 
     # What a body adds.
 
-    def _prepare(self) -> None:
-        """Makes what the body's kernels need, once, before they are recorded."""
+    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
+        """Returns the kernel that writes observation and reward, and its inputs.
 
-    def _observation_kernel(self) -> tuple[wp.Kernel, list]:
-        """Returns the kernel that observes, and what it reads.
+        Its parameters are these inputs, then the mask of the worlds to write (bool, ``(num_envs,)``; all after a step,
+        those that begin an episode after a reset), then what it writes: ``observation`` ``(num_envs,
+        observation_size)``, ``reward`` ``(num_envs,)`` and ``terms`` ``(num_envs, len(term_names))``.
 
-        Its parameters are these, then the mask of the worlds to observe (bool, ``(num_envs,)``; all after a step, those
-        that begin anew after a reset), then what it fills there: ``_observation``, ``_reward`` and ``_terms``.
+        Args:
+            world: where the arrays are, in ``world.sim.data`` above all.
         """
         raise NotImplementedError
 
-    def _initial_poses(self) -> np.ndarray | None:
-        """Returns a table of poses, ``(count, nq)``, for each reset to draw one of; ``None`` for the default pose.
+    def initial_poses(self) -> np.ndarray | None:
+        """Returns a table of poses, ``(count, nq)``, of which each reset draws one; ``None`` for the default pose.
 
-        It is asked for when the environment is made, and again when it opens after :meth:`close`: draw from a fixed
-        seed.
+        It is called when the environment is made, and again when it opens after :meth:`close`. Use a fixed seed.
         """
         return None
 
-    def _launch_pose(self) -> None:
-        """Launches the kernel that draws ``qpos`` of the worlds in ``_mask``: by default from the table, if any.
+    def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list] | None:
+        """Returns the kernel that draws initial poses, its inputs and its outputs; by default it draws from the table.
 
-        They are at rest in the default pose, and stay at rest: what is drawn is ``qpos`` alone.
+        Its parameters are the inputs, the mask of the worlds that begin an episode (bool, ``(num_envs,)``), the start
+        of each world's random stream (uint32, ``(num_envs,)``), then the outputs. These worlds are at rest in the
+        default pose before, and stay at rest: it draws ``qpos`` alone.
+
+        Args:
+            world: where the arrays are, in ``world.sim.data`` above all.
+
+        Raises:
+            ValueError: the table has the wrong shape.
         """
-        if self._poses is not None:
-            inputs = [self._poses, self._seed, self._episode, self._mask]
-            self._launch(draw_from_table, inputs, [self.sim.data.qpos])
-
-    # Setting up.
-
-    def _make_buffers(self) -> None:
-        n, device = self.num_envs, self.sim.device
-        self._action = wp.zeros((n, self.mj_model.nu), dtype=float, device=device)
-        self._observation = wp.zeros((n, self.observation_size), dtype=float, device=device)
-        self._reward = wp.zeros(n, dtype=float, device=device)
-        self._terms = wp.zeros((n, len(self.term_names)), dtype=float, device=device)
-        self._mask = wp.ones(n, dtype=bool, device=device)
-        self._everyone = wp.ones(n, dtype=bool, device=device)
-        self._any = wp.zeros(1, dtype=int, device=device)
-        self._stagger = wp.zeros(1, dtype=bool, device=device)
-        self._seed = wp.zeros(1, dtype=wp.uint32, device=device)
-        self._episode = wp.zeros(n, dtype=int, device=device)
-        self._elapsed_steps = wp.zeros(n, dtype=int, device=device)
-        self._bad = wp.zeros(n, dtype=bool, device=device)
-        self._done = wp.zeros(n, dtype=bool, device=device)
-        self._terminated = wp.zeros(n, dtype=bool, device=device)
-        self._truncated = wp.zeros(n, dtype=bool, device=device)
-        # Torch's views of the same memory, for the transfers at the border.
-        names = ("action", "observation", "reward", "terms", "mask", "stagger", "seed", "episode", "elapsed_steps")
-        flags = ("bad", "done", "terminated", "truncated")
-        self._views = {name: wp.to_torch(getattr(self, f"_{name}")) for name in names + flags}
-
-    def _make_poses(self) -> None:
-        poses = self._initial_poses()
-        if poses is not None:
-            poses = wp.array(check_poses(poses, self.mj_model.nq), dtype=float, device=self.sim.device)
-        self._poses = poses
-
-    def _make_specs(self) -> None:
-        n, device = self.num_envs, self.device
-        as_float: dict[str, Any] = {"device": device, "dtype": torch.float32}
-        observation = {"observation": Unbounded((n, self.observation_size), **as_float)}
-        if self.reward_terms:
-            terms = {name: Unbounded((n, 1), **as_float) for name in self.term_names}
-            observation["reward_terms"] = Composite(terms, shape=(n,), device=device)
-        flag = Binary(n=1, shape=(n, 1), dtype=torch.bool, device=device)
-        self.observation_spec = Composite(observation, shape=(n,), device=device)
-        self.action_spec = Bounded(-1.0, 1.0, (n, self.mj_model.nu), **as_float)
-        # In [0, 1], but RewardSum takes the bounds over for the sum.
-        self.reward_spec = Unbounded((n, 1), **as_float)
-        self.done_spec = Composite(
-            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
-        )
-
-    # What the graphs record.
-
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=self.num_envs, inputs=inputs, outputs=outputs, device=self.sim.device)
-
-    def _launch_step(self) -> None:
-        for watcher in self._watchers:
-            watcher.launch_before_step()
-        self._launch(apply_action, [self._action], [self.sim.data.ctrl, self._bad])
-        self.sim.step()
-        self._launch_outputs(self._everyone)
-        self._launch(
-            count_step,
-            [self._bad, self.config.episode_length],
-            [self._elapsed_steps, self._done, self._terminated, self._truncated],
-        )
-        for watcher in self._watchers:
-            watcher.launch_after_step()
-
-    def _launch_reset(self) -> None:
-        self._any.zero_()
-        self._launch(any_world, [self._mask], [self._any])
-        wp.capture_if(self._any, self._launch_masked_reset)  # costs next to nothing where no world is done
-
-    def _launch_masked_reset(self) -> None:
-        self.sim.reset(self._mask)
-        self._launch_pose()
-        self._launch(
-            begin_episode,
-            [self._mask, self._stagger, self._seed, self.config.episode_length],
-            [self._episode, self._elapsed_steps, self._bad, self._done, self._terminated, self._truncated],
-        )
-        self.sim.place(self._mask)
-        self._launch_outputs(self._mask)
-
-    def _launch_refresh(self) -> None:
-        self.sim.forward(self._mask)
-        self._launch_outputs(self._mask)
-
-    def _launch_outputs(self, mask: wp.array) -> None:
-        data = self.sim.data
-        kernel, inputs = self._observation_kernel()
-        outputs = [self._observation, self._reward, self._terms]
-        self._launch(kernel, [*inputs, mask], outputs)
-        self._launch(quench, [mask, data.qpos, data.qvel], [self._bad, *outputs])
+        poses = self.initial_poses()
+        if poses is None:
+            return None
+        table, nq = np.asarray(poses, dtype=np.float32), self.mj_model.nq
+        if table.ndim != 2 or table.shape[1] != nq or len(table) == 0:
+            raise ValueError(f"initial_poses must return an array of shape (count > 0, {nq}), got {table.shape}")
+        return draw_from_table, [wp.array(table, device=world.sim.device)], [world.sim.data.qpos]
 
     # TorchRL's side.
 
+    def _make_specs(self) -> None:
+        batch, device = self.batch_size, self.device
+        as_float: dict[str, Any] = {"device": device, "dtype": torch.float32}
+        observation = {"observation": Unbounded((*batch, self.observation_size), **as_float)}
+        if self.reward_terms:
+            terms = {name: Unbounded((*batch, 1), **as_float) for name in self.term_names}
+            observation["reward_terms"] = Composite(terms, shape=batch, device=device)
+        flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
+        self.observation_spec = Composite(observation, shape=batch, device=device)
+        self.action_spec = Bounded(-1.0, 1.0, (*batch, self.mj_model.nu), **as_float)
+        # In [0, 1], but RewardSum takes the bounds over for the sum.
+        self.reward_spec = Unbounded((*batch, 1), **as_float)
+        self.done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, device=device
+        )
+
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._refuse_after_fork()
+        shape = self.action_spec.shape
         action = tensordict.get("action", None)
         if action is None:
-            raise KeyError(f"step needs an 'action' of shape {tuple(self._views['action'].shape)} in its TensorDict")
-        if action.shape != self._views["action"].shape:
-            raise ValueError(f"action must have shape {tuple(self._views['action'].shape)}, got {tuple(action.shape)}")
-        self._views["action"].copy_(action.detach())  # else the buffer would hold on to every past policy's graph
-        self._step_graph.replay()
-        for watcher in self._watchers:
-            watcher.after_step()
-        result = self._read_outputs()
-        result.set("reward", self._views["reward"].clone().unsqueeze(-1))
+            raise KeyError(f"step needs an 'action' of shape {tuple(shape)} in its TensorDict")
+        if action.shape != shape:
+            raise ValueError(f"action must have shape {tuple(shape)}, got {tuple(action.shape)}")
+        self.world.step(action.reshape(self.num_envs, -1))
+        result = self._outputs()
+        result.set("reward", self._batched(self.world.reward.torch).unsqueeze(-1))
         return result
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False) -> TensorDictBase:
-        self._refuse_after_fork()
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        if self.is_closed:
+        if mask is not None:
+            if mask.dtype != torch.bool:
+                raise TypeError(f"'_reset' must be a mask of dtype bool, got {mask.dtype}")
+            mask = mask.reshape(self.num_envs).to(self.device)
+        if self._world is None:
             if mask is not None and not mask.all():
                 raise ValueError("a closed environment has no worlds to keep: reset all of them")
             self._open()
-        if mask is None:
-            self._views["mask"].fill_(True)
-        else:
-            self._views["mask"].copy_(mask.reshape(self.num_envs))
         if set_state:
-            self._restore(tensordict)
-            self._refresh_graph.replay()
+            self._set_state(tensordict, mask)
         else:
-            self._views["stagger"].fill_(self.stagger and mask is None)
-            self._reset_graph.replay()
-        result = self._read_outputs()
+            self.world.reset(mask, stagger=self.stagger and mask is None)
+        result = self._outputs()
         if self.reward_terms:
             result.get("reward_terms").zero_()  # nothing was rewarded yet
         return result
 
-    def _read_outputs(self) -> TensorDict:
+    def _outputs(self) -> TensorDict:
         """Returns a copy of what the kernels wrote: the buffers themselves change at the next step."""
-        views = self._views
-        entries: dict[str, Any] = {
-            name: views[name].clone().unsqueeze(-1) for name in ("done", "terminated", "truncated")
-        }
-        entries["observation"] = views["observation"].clone()
+        world = self.world
+        flags = {"done": world.done, "terminated": world.terminated, "truncated": world.truncated}
+        entries: dict[str, Any] = {name: self._batched(flag.torch).unsqueeze(-1) for name, flag in flags.items()}
+        entries["observation"] = self._batched(world.observation.torch)
         if self.reward_terms:
-            columns = views["terms"].clone().split(1, dim=-1)
+            columns = self._batched(world.terms.torch).split(1, dim=-1)
             entries["reward_terms"] = dict(zip(self.term_names, columns, strict=True))
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
-    def _set_seed(self, seed: int | None) -> None:
-        """Starts the random streams of all worlds anew, at their episode 0."""
-        if seed is None:
-            seed = secrets.randbits(32)
-        seed = check_seed(seed)
-        self.seed = seed
-        self._views["seed"].fill_(seed)
-        self._views["episode"].zero_()
+    def _batched(self, rows: torch.Tensor) -> torch.Tensor:
+        """Returns a copy of an array with one row per world, in the environment's batch size."""
+        return rows.clone() if self.batch_size else rows[0].clone()
 
-    def health(self) -> TensorDict:
-        """Returns what went wrong in the physics since the environment was made.
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Resets the worlds that are done, without reading from the device.
 
-        ``"worlds"`` (batch ``(num_envs,)``) and ``"total"`` count control steps in which
+        Args:
+            tensordict: what ``step_mdp`` makes of a step, batch ``(num_envs,)``.
 
-        - ``constraint_overflow``, ``contact_overflow``: constraints or contacts found no room and were left out.
-          Contacts are pooled: if some find no room, that counts in every world.
-        - ``iteration_limit``, ``line_search_limit``: the solver or its line search used up its iterations, which is the
-          rule under ``protocol="playground"``.
-        - ``non_finite``: the world was no longer finite, and terminated.
-
-        ``"peak"`` holds the most ``constraints`` of a world and ``contacts`` of all worlds together that any physics
-        step asked for, to choose ``njmax`` and ``naconmax`` by. Nothing waits for the device until you read a number.
+        Returns:
+            The same, batch ``(num_envs,)``, with new episodes in the worlds that were done.
         """
-        return self._health.report()
+        return reset_done_worlds(self, tensordict)
 
-    # State.
+    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        """Returns what ``reset`` returns, without a state that was passed to it, which would become stale."""
+        if tensordict is not None and any(key in tensordict for key in State.KEYS):
+            kept = {key: value for key, value in tensordict.items() if key not in State.KEYS}
+            tensordict = TensorDict(kept, batch_size=tensordict.batch_size, device=self.device)
+        return super()._reset_proc_data(tensordict, tensordict_reset)
 
-    def get_state(self) -> State:
-        """Returns a copy of the state of all worlds, for ``env.reset(state, set_state=True)``."""
-        return State(
-            {
-                "qpos": self.sim.qpos.clone(),
-                "qvel": self.sim.qvel.clone(),
-                "qacc_warmstart": self.sim.qacc_warmstart.clone(),
-                "elapsed_steps": self._views["elapsed_steps"].clone(),
-                "episode": self._views["episode"].clone(),
-            },
-            batch_size=self.batch_size,
-            device=self.device,
+    def _set_seed(self, seed: int | None) -> None:
+        """Starts the random streams of all worlds again, at their episode 0."""
+        self.seed = secrets.randbits(32) if seed is None else check_int("seed", seed, SEED)
+        self._episodes = None
+        if self._world is not None:
+            self._world.set_seed(self.seed)
+
+    def to(self, device: Any) -> "LocoEnv":
+        """Returns the environment itself if it lives on ``device``; the physics cannot move.
+
+        Raises:
+            TypeError: ``device`` is something else, such as a dtype.
+            ValueError: ``device`` is another one.
+        """
+        if not isinstance(device, torch.device | str):
+            raise TypeError(
+                f"an environment cannot be converted to {device!r}: it computes in float32 on {self.device}. "
+                "To cast what it returns, use torchrl.envs.DTypeCastTransform"
+            )
+        if check_device(device) != self.device:
+            raise ValueError(
+                f"the physics lives on {self.device} and cannot move: make a new environment with device={device!r}"
+            )
+        return self
+
+    # The worlds.
+
+    def _open(self) -> None:
+        """Makes the worlds. Those of an environment that was open before continue with their next episodes."""
+        self._world: World | None = World(self)
+        if self._episodes is not None:
+            self._world.episode.torch.copy_(self._episodes)
+        self.is_closed = False
+
+    @property
+    def world(self) -> World:
+        """The worlds on the device.
+
+        Raises:
+            RuntimeError: the environment is closed.
+        """
+        if self._world is None:
+            raise RuntimeError(f"this {type(self).__name__} is closed: reset() opens it again")
+        return self._world
+
+    @property
+    def sim(self) -> Simulation:
+        """The physics of all worlds."""
+        return self.world.sim
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Frees the memory of the worlds; a ``reset()`` opens the environment again, with its next episodes.
+
+        TorchRL's collectors close their environment when they end. Counters start again. Other methods that need the
+        worlds raise an error until then.
+
+        Args:
+            raise_if_closed: of TorchRL's signature; closing twice is no error here.
+        """
+        super().close(raise_if_closed=False)
+        world, self._world = self._world, None
+        if world is not None:
+            self._episodes = world.episode.torch.cpu()
+            world.close()
+
+    def __del__(self) -> None:
+        """Leaves the end to the world: TorchRL's own ``__del__`` would swallow what the monitors raise."""
+
+    def __reduce__(self) -> Any:
+        raise TypeError(
+            "an environment cannot be copied or pickled: pass on what makes it, functools.partial(torchrl_loco.make, "
+            "...), or what it holds, env.get_state()"
         )
-
-    def _describe(self) -> dict[str, Any]:
-        """Returns what it takes to make an environment like this one."""
-        cls = type(self)
-        return {
-            **{"env": f"{cls.__module__}.{cls.__qualname__}", "protocol": self.protocol, "seed": self.seed},
-            **{"config": dataclasses.asdict(self.config), "device": str(self.device), "num_envs": self.num_envs},
-        }
-
-    def _restore(self, state: TensorDictBase | None) -> None:
-        """Writes a state into the worlds in the mask."""
-        mask, elapsed_steps = self._views["mask"], self._views["elapsed_steps"]
-        targets = {name: getattr(self.sim, name) for name in ("qpos", "qvel", "qacc_warmstart")}
-        write_state(state, {**targets, "elapsed_steps": elapsed_steps, "episode": self._views["episode"]}, mask)
-        for flag in ("bad", "done", "terminated", "truncated"):
-            self._views[flag].masked_fill_(mask, False)
-        self.sim.time.copy_(torch.where(mask, elapsed_steps * self.config.ctrl_dt, self.sim.time))
-
-    # Pictures, and the way out.
 
     def render(self, camera: str = "side", width: int = 320, height: int = 240) -> torch.Tensor:
         """Ray-traces every world, on the CPU or CUDA, without OpenGL.
@@ -371,20 +341,95 @@ class LocoEnv(AsyncReset, Resumable, Closable):
             ValueError: the model has no such camera, or a size is not positive.
             TypeError: a size is not an integer.
         """
-        key = (camera, check_count("width", width), check_count("height", height))
-        if key not in self._renderers:
-            with self.device:
-                self._renderers[key] = Renderer(self.sim, *key)
-        return self._renderers[key].render()
+        model = self.mj_model
+        check_choice("camera", camera, [model.camera(i).name for i in range(model.ncam)])
+        pixels = self.world.render(camera, check_int("width", width), check_int("height", height))
+        return pixels if self.batch_size else pixels[0]
 
-    def to(self, device: Any) -> "LocoEnv":
-        """Returns the environment itself if it lives on ``device``; physics cannot move, so anything else raises.
+    def health(self) -> TensorDict:
+        """Returns what went wrong in the physics since the environment was opened.
+
+        ``"worlds"`` (batch ``(num_envs,)``) and ``"total"`` count control steps in which
+
+        - ``constraint_overflow``, ``contact_overflow``: constraints or contacts were dropped for want of room. Contacts
+          share one pool: if some are dropped, that counts in every world.
+        - ``iteration_limit``, ``line_search_limit``: the solver or its line search used up its iterations, as is usual
+          under ``protocol="playground"``.
+        - ``non_finite``: the world was no longer finite, and terminated.
+
+        ``"peak"`` holds the most ``constraints`` of a world and ``contacts`` of all worlds together that a physics step
+        needed, by which to choose ``njmax`` and ``naconmax``. Nothing waits for the device until you read a number.
+        """
+        return self.world.health.summary()
+
+    # State.
+
+    def get_state(self) -> State:
+        """Returns a copy of the state of all worlds, for ``env.reset(state, set_state=True)``."""
+        state = {key: self._batched(value) for key, value in self.world.state().items()}
+        return State(state, batch_size=self.batch_size, device=self.device)
+
+    def _set_state(self, state: TensorDictBase | None, mask: torch.Tensor | None) -> None:
+        """Writes a state into the worlds of ``mask``."""
+        if mask is None:
+            mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        if state is not None and not self.batch_size:
+            state = TensorDict({key: state[key][None] for key in State.KEYS if key in state}, batch_size=[1])
+        write_state(state, self.world.state(), mask)
+        self.world.refresh(mask, self.config.ctrl_dt)
+
+    def settings(self) -> dict[str, Any]:
+        """Returns the settings from which an equal environment can be made, except the seed, as JSON can hold them."""
+        cls = type(self)
+        return {
+            "env": f"{cls.__module__}.{cls.__qualname__}",
+            "protocol": self.protocol,
+            "num_envs": self.num_envs,
+            "world_offset": self.world_offset or 0,
+            "device": str(self.device),
+            "config": dataclasses.asdict(self.config),
+        }
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Returns what ``state_dict`` holds: the state of all worlds and the seed."""
+        return {**self._identity(), "seed": self.seed, "worlds": self.get_state().to_dict()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restores a ``state_dict``: the worlds, their random streams and the seed.
 
         Raises:
-            ValueError: ``device`` is another one.
+            ValueError: it was taken from an environment of another body, protocol, number of worlds or world offset.
         """
-        if check_device(device) != self.device:
-            raise ValueError(
-                f"the physics lives on {self.device} and cannot move: make a new one with device={device!r}"
-            )
-        return self
+        for name, value in self._identity().items():
+            if state[name] != value:
+                raise ValueError(f"the state is of {name}={state[name]!r}, this environment of {value!r}")
+        self._set_seed(state["seed"])
+        self.reset(State(state["worlds"], batch_size=self.batch_size, device=self.device), set_state=True)
+
+    def _identity(self) -> dict[str, Any]:
+        """Returns what two environments must share to exchange their ``state_dict``."""
+        settings = self.settings()
+        return {"body": self.body, **{name: settings[name] for name in ("protocol", "num_envs", "world_offset")}}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> Any:
+        """Restores a ``state_dict``; see :meth:`set_extra_state`.
+
+        With ``strict=False`` the worlds stay as they are: TorchRL's ``EnvCreator`` shares the state of transforms this
+        way with every environment that it makes, and each of them must keep its own worlds.
+
+        Returns:
+            The keys that were missing or not expected, as torch's own does.
+        """
+        if not strict:
+            state_dict = {name: value for name, value in state_dict.items() if not name.endswith("_extra_state")}
+        return super().load_state_dict(state_dict, strict=strict, **kwargs)
+
+
+def _warn_if_worlds_repeat() -> None:
+    """Warns where a seed is passed in one of several processes: the same seed makes the same worlds in each."""
+    ranks = torch.distributed.is_available() and torch.distributed.is_initialized()
+    if multiprocessing.parent_process() is not None or (ranks and torch.distributed.get_world_size() > 1):
+        warn(
+            "this process is one of several, and seed was passed without world_offset: workers that pass the same seed "
+            "step identical worlds. Worker k of n worlds each should pass world_offset=k*n (0 if it is alone)"
+        )

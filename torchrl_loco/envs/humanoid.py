@@ -5,6 +5,7 @@ import warp as wp
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
 from torchrl_loco.sim.sampling import draw_free_poses, make_skeleton
 
@@ -15,18 +16,45 @@ WALK_SPEED = 1.0
 RUN_SPEED = 10.0
 """Horizontal speed that counts as running (m/s)."""
 
-TORSO = wp.constant(1)
-"""Id of the torso; the world is body 0."""
-HEAD = wp.constant(2)
-"""Id of the head."""
 EXTREMITIES = ("left_hand", "left_foot", "right_hand", "right_foot")
 """Bodies whose position is observed, in order."""
 ROOT_QPOS = wp.constant(7)
 """Numbers of qpos that place the root: position and quaternion; the hinges follow."""
 
 
+@wp.func
+def humanoid_standing_reward(head_height: float) -> float:
+    return tolerance(head_height, STAND_HEIGHT, wp.inf, STAND_HEIGHT / 4.0)
+
+
+@wp.func
+def humanoid_upright_reward(torso_upright: float) -> float:
+    return tolerance(torso_upright, 0.9, wp.inf, 1.9, Sigmoid.LINEAR, 0.0)
+
+
+@wp.func
+def humanoid_small_control_reward(ctrl: wp.array[float]) -> float:
+    small = float(0.0)
+    for i in range(ctrl.shape[0]):
+        small += tolerance(ctrl[i], 0.0, 0.0, 1.0, Sigmoid.QUADRATIC, 0.0)
+    return (4.0 + small / float(ctrl.shape[0])) / 5.0
+
+
+@wp.func
+def humanoid_move_reward(velocity: wp.vec3, target_speed: float) -> float:
+    if target_speed > 0.0:
+        speed = wp.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
+        return (5.0 * tolerance(speed, target_speed, wp.inf, target_speed, Sigmoid.LINEAR, 0.0) + 1.0) / 6.0
+    return 0.5 * (tolerance(velocity[0], 0.0, 0.0, 2.0) + tolerance(velocity[1], 0.0, 0.0, 2.0))
+
+
 @wp.kernel(enable_backward=False)
 def observe_humanoid(
+    # Model:
+    torso: int,
+    head: int,
+    extremities: wp.array[int],
+    torso_velocity: int,
     # Data in:
     qpos_in: wp.array2d[float],
     qvel_in: wp.array2d[float],
@@ -35,8 +63,7 @@ def observe_humanoid(
     xmat_in: wp.array2d[wp.mat33],
     sensordata_in: wp.array2d[float],
     # In:
-    extremities: wp.array[int],
-    speed: float,
+    target_speed: float,
     mask_in: wp.array[bool],
     # Out:
     observation_out: wp.array2d[float],
@@ -46,10 +73,11 @@ def observe_humanoid(
     world = wp.tid()
     if not mask_in[world]:
         return
-    head_height = xpos_in[world, HEAD][2]
-    torso_pos = xpos_in[world, TORSO]
-    torso_mat = xmat_in[world, TORSO]
-    velocity = wp.vec3(sensordata_in[world, 0], sensordata_in[world, 1], sensordata_in[world, 2])
+    head_height = xpos_in[world, head][2]
+    torso_pos = xpos_in[world, torso]
+    torso_mat = xmat_in[world, torso]
+    v = torso_velocity
+    velocity = wp.vec3(sensordata_in[world, v], sensordata_in[world, v + 1], sensordata_in[world, v + 2])
 
     k = int(0)
     for i in range(ROOT_QPOS, qpos_in.shape[1]):
@@ -69,17 +97,10 @@ def observe_humanoid(
     for i in range(qvel_in.shape[1]):
         observation_out[world, k + i] = qvel_in[world, i]
 
-    standing = tolerance(head_height, STAND_HEIGHT, wp.inf, STAND_HEIGHT / 4.0)
-    upright = tolerance(torso_mat[2, 2], 0.9, wp.inf, 1.9, Sigmoid.LINEAR, 0.0)
-    effort = float(0.0)
-    for i in range(ctrl_in.shape[1]):
-        effort += tolerance(ctrl_in[world, i], 0.0, 0.0, 1.0, Sigmoid.QUADRATIC, 0.0)
-    small_control = (4.0 + effort / float(ctrl_in.shape[1])) / 5.0
-    if speed > 0.0:
-        horizontal = wp.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
-        move = (5.0 * tolerance(horizontal, speed, wp.inf, speed, Sigmoid.LINEAR, 0.0) + 1.0) / 6.0
-    else:
-        move = 0.5 * (tolerance(velocity[0], 0.0, 0.0, 2.0) + tolerance(velocity[1], 0.0, 0.0, 2.0))
+    standing = humanoid_standing_reward(head_height)
+    upright = humanoid_upright_reward(torso_mat[2, 2])
+    small_control = humanoid_small_control_reward(ctrl_in[world])
+    move = humanoid_move_reward(velocity, target_speed)
     reward_out[world] = standing * upright * small_control * move
     terms_out[world, 0] = standing
     terms_out[world, 1] = upright
@@ -88,34 +109,31 @@ def observe_humanoid(
 
 
 class Humanoid(LocoEnv):
-    """What the humanoid's three tasks share; they differ in ``speed`` (m/s, 0 to stand)."""
+    """What the humanoid's three tasks share; they differ in ``target_speed`` (m/s, 0 to stand)."""
 
     body = "humanoid"
     mjcf = models.PATHS["humanoid"]
     defaults = DEFAULTS["humanoid"]
     observation_size = 67
-    speed = 0.0
     term_names = ("standing", "upright", "small_control", "move")
+    target_speed = 0.0
 
-    def _prepare(self) -> None:
-        device = self.sim.device
-        ids = [self.mj_model.body(name).id for name in EXTREMITIES]
-        self._extremities = wp.array(ids, dtype=int, device=device)
-        if self.protocol == "dm_control":
-            self._skeleton = make_skeleton(self.mj_model, self.sim.model.nxn_geom_pair_filtered.numpy(), device)
+    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
+        """Returns the kernel that writes observation and reward, and its inputs."""
+        model, data = self.mj_model, world.sim.data
+        extremities = wp.array([model.body(name).id for name in EXTREMITIES], dtype=int, device=world.sim.device)
+        velocity = int(model.sensor("torso_velocity").adr[0])
+        names = [model.body("torso").id, model.body("head").id, extremities, velocity]
+        arrays = [data.qpos, data.qvel, data.ctrl, data.xpos, data.xmat, data.sensordata]
+        return observe_humanoid, [*names, *arrays, self.target_speed]
 
-    def _observation_kernel(self) -> tuple[wp.Kernel, list]:
-        d = self.sim.data
-        return observe_humanoid, [d.qpos, d.qvel, d.ctrl, d.xpos, d.xmat, d.sensordata, self._extremities, self.speed]
-
-    def _launch_pose(self) -> None:
-        if self.protocol == "dm_control":
-            d = self.sim.data
-            self._launch(
-                draw_free_poses,
-                [self._skeleton, self._seed, self._episode, self._mask],
-                [d.qpos, d.xpos, d.xquat],
-            )
+    def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list] | None:
+        """Returns the kernel that draws a pose free of contact under ``dm_control``, else the default pose."""
+        if self.protocol != "dm_control":
+            return None
+        sim = world.sim
+        skeleton = make_skeleton(self.mj_model, sim.model.nxn_geom_pair_filtered.numpy(), sim.device)
+        return draw_free_poses, [skeleton], [sim.data.qpos, sim.data.xpos, sim.data.xquat]
 
 
 class HumanoidStand(Humanoid):
@@ -160,7 +178,7 @@ class HumanoidWalk(Humanoid):
         ``fast = tolerance(|v_xy|, [1 m/s, inf), margin 1 m/s, linear, value_at_margin 0)``.
     """
 
-    speed = WALK_SPEED
+    target_speed = WALK_SPEED
 
 
 class HumanoidRun(Humanoid):
@@ -169,4 +187,4 @@ class HumanoidRun(Humanoid):
     As :class:`HumanoidWalk`, with target and margin of 10 m/s.
     """
 
-    speed = RUN_SPEED
+    target_speed = RUN_SPEED

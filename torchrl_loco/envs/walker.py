@@ -5,8 +5,8 @@ import warp as wp
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
-from torchrl_loco.sim.sampling import world_stream
 
 STAND_HEIGHT = wp.constant(1.2)
 """Height of the torso from which the walker counts as standing (m)."""
@@ -15,22 +15,33 @@ WALK_SPEED = 1.0
 RUN_SPEED = 8.0
 """Horizontal speed that counts as running (m/s)."""
 
-TORSO = wp.constant(1)
-"""Id of the torso; the world is body 0."""
-PITCH = wp.constant(2)
-"""Index of the torso's pitch in qpos; the hinges with limits follow it."""
+
+@wp.func
+def walker_stand_reward(torso_height: float, torso_upright: float) -> float:
+    standing = tolerance(torso_height, STAND_HEIGHT, wp.inf, STAND_HEIGHT / 2.0)
+    upright = wp.clamp((1.0 + torso_upright) / 2.0, 0.0, 1.0)  # torso_upright may pass 1 by a rounding error
+    return (3.0 * standing + upright) / 4.0
+
+
+@wp.func
+def walker_move_reward(horizontal_velocity: float, target_speed: float) -> float:
+    fast = tolerance(horizontal_velocity, target_speed, wp.inf, target_speed / 2.0, Sigmoid.LINEAR, 0.5)
+    return (5.0 * fast + 1.0) / 6.0
 
 
 @wp.kernel(enable_backward=False)
 def observe_walker(
+    # Model:
+    torso: int,
+    torso_velocity: int,
     # Data in:
     qvel_in: wp.array2d[float],
     xpos_in: wp.array2d[wp.vec3],
     xmat_in: wp.array2d[wp.mat33],
     sensordata_in: wp.array2d[float],
     # In:
-    speed: float,
-    true_height: bool,
+    target_speed: float,
+    observe_height: bool,
     mask_in: wp.array[bool],
     # Out:
     observation_out: wp.array2d[float],
@@ -40,73 +51,71 @@ def observe_walker(
     world = wp.tid()
     if not mask_in[world]:
         return
+    torso_height = xpos_in[world, torso][2]
+    torso_upright = xmat_in[world, torso][2, 2]
 
     k = int(0)
-    for body in range(TORSO, xmat_in.shape[1]):
+    for body in range(1, xmat_in.shape[1]):  # body 0 is the world
         xmat = xmat_in[world, body]
         observation_out[world, k] = xmat[0, 0]
         observation_out[world, k + 1] = xmat[0, 2]
         k += 2
-    height = xpos_in[world, TORSO][2]
-    torso_zz = xmat_in[world, TORSO][2, 2]
-    observation_out[world, k] = wp.where(true_height, height, torso_zz)
+    observation_out[world, k] = wp.where(observe_height, torso_height, torso_upright)
     k += 1
     for i in range(qvel_in.shape[1]):
         observation_out[world, k + i] = qvel_in[world, i]
 
-    standing = tolerance(height, STAND_HEIGHT, wp.inf, STAND_HEIGHT / 2.0)
-    upright = wp.clamp((1.0 + torso_zz) / 2.0, 0.0, 1.0)  # zz may pass 1 by a rounding error
-    stand = (3.0 * standing + upright) / 4.0
-    reward = stand
+    stand = walker_stand_reward(torso_height, torso_upright)
     terms_out[world, 0] = stand
-    if speed > 0.0:
-        fast = tolerance(sensordata_in[world, 0], speed, wp.inf, speed / 2.0, Sigmoid.LINEAR, 0.5)
-        move = (5.0 * fast + 1.0) / 6.0
-        reward *= move
+    reward_out[world] = stand
+    if target_speed > 0.0:
+        horizontal_velocity = sensordata_in[world, torso_velocity]  # along x
+        move = walker_move_reward(horizontal_velocity, target_speed)
         terms_out[world, 1] = move
-    reward_out[world] = reward
+        reward_out[world] = stand * move
 
 
 @wp.kernel(enable_backward=False)
 def pose_walker(
     # Model:
     jnt_range: wp.array2d[wp.vec2],
+    pitch: int,
     # In:
     mask_in: wp.array[bool],
-    seed_in: wp.array[wp.uint32],
-    episode_in: wp.array[int],
+    stream_in: wp.array[wp.uint32],
     # Data out:
     qpos_out: wp.array2d[float],
 ):
     world = wp.tid()
     if not mask_in[world]:
         return
-    stream = world_stream(seed_in, world, episode_in[world])
-    qpos_out[world, PITCH] = wp.randf(stream, -wp.pi, wp.pi)
-    for i in range(PITCH + 1, qpos_out.shape[1]):
+    stream = stream_in[world]
+    qpos_out[world, pitch] = wp.randf(stream, -wp.pi, wp.pi)
+    for i in range(pitch + 1, qpos_out.shape[1]):  # the hinges, all with limits
         limits = jnt_range[0, i]
         qpos_out[world, i] = wp.randf(stream, limits[0], limits[1])
 
 
 class Walker(LocoEnv):
-    """What the walker's three tasks share; they differ in ``speed`` (m/s, 0 to stand)."""
+    """What the walker's three tasks share; they differ in ``target_speed`` (m/s, 0 to stand)."""
 
     body = "walker"
     mjcf = models.PATHS["walker"]
     defaults = DEFAULTS["walker"]
     observation_size = 24
-    speed = 0.0
+    target_speed = 0.0
 
-    def _observation_kernel(self) -> tuple[wp.Kernel, list]:
-        d = self.sim.data
-        return observe_walker, [d.qvel, d.xpos, d.xmat, d.sensordata, self.speed, self.protocol == "dm_control"]
+    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
+        """Returns the kernel that writes observation and reward, and its inputs."""
+        model, data = self.mj_model, world.sim.data
+        names = [model.body("torso").id, int(model.sensor("torso_velocity").adr[0])]
+        arrays = [data.qvel, data.xpos, data.xmat, data.sensordata]
+        return observe_walker, [*names, *arrays, self.target_speed, self.protocol == "dm_control"]
 
-    def _launch_pose(self) -> None:
-        self._launch(
-            pose_walker,
-            [self.sim.model.jnt_range, self._mask, self._seed, self._episode],
-            [self.sim.data.qpos],
-        )
+    def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list]:
+        """Returns the kernel that draws pitch and hinges, its inputs and its outputs."""
+        pitch = int(self.mj_model.joint("rooty").qposadr[0])
+        return pose_walker, [world.sim.model.jnt_range, pitch], [world.sim.data.qpos]
 
 
 class WalkerStand(Walker):
@@ -152,7 +161,7 @@ class WalkerWalk(Walker):
         center of mass's along x.
     """
 
-    speed = WALK_SPEED
+    target_speed = WALK_SPEED
     term_names = ("stand", "move")
 
 
@@ -162,5 +171,5 @@ class WalkerRun(Walker):
     As :class:`WalkerWalk`, with a target of 8 m/s and a margin of 4 m/s.
     """
 
-    speed = RUN_SPEED
+    target_speed = RUN_SPEED
     term_names = ("stand", "move")

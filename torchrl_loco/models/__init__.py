@@ -3,29 +3,55 @@
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 _FOLDER = Path(__file__).parent
 PATHS = {name: _FOLDER / f"{name}.xml" for name in ("walker", "humanoid")}
 SCENE = _FOLDER / "scene.xml"
 """What all bodies can include by its name: light, materials, the look of the floor."""
 
-
-def load(name: str) -> mujoco.MjModel:
-    """Returns one of the bodies, compiled with dm_control's solver settings.
-
-    Raises:
-        ValueError: ``name`` is none of :data:`PATHS`.
-    """
-    if name not in PATHS:
-        raise ValueError(f"unknown model {name!r}: choose one of {', '.join(PATHS)}")
-    return from_path(PATHS[name])
+VELOCITY_SENSORS = {
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
+    for name in (
+        *("JOINTVEL", "BALLANGVEL", "VELOCIMETER", "GYRO"),
+        *("FRAMELINVEL", "FRAMEANGVEL", "SUBTREELINVEL", "SUBTREEANGMOM"),
+    )
+}
+"""Sensors that a simulation evaluates: they follow from what is computed after a step, and are zero at rest."""
 
 
-def from_path(path: Path) -> mujoco.MjModel:
-    """Returns the model of an MJCF file. What it includes as ``scene.xml`` is ours, unless one lies beside it.
+def load(path: Path) -> mujoco.MjModel:
+    """Returns the model of an MJCF file. It may include ``scene.xml``, which is ours unless one lies beside it.
 
     Raises:
         ValueError: there is no such file, or it is no valid MJCF.
     """
     own = path.with_name(SCENE.name).exists()
     return mujoco.MjModel.from_xml_path(str(path), {} if own else {SCENE.name: SCENE.read_bytes()})
+
+
+def check(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """Returns the model if an environment supports it.
+
+    Raises:
+        ValueError: the model uses something unsupported; the message names it.
+    """
+    wrong = []
+    if not np.array_equal(mj_model.actuator_ctrlrange, np.tile([-1.0, 1.0], (mj_model.nu, 1))):
+        wrong.append("every actuator needs ctrlrange -1 1, in which actions lie: scale by gear or gainprm")
+    unclipped = mj_model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    if unclipped or not mj_model.actuator_ctrllimited.all():
+        wrong.append("actions beyond -1 1 must be clipped: leave ctrllimited and the flag clampctrl on")
+    if mj_model.actuator_delay.any():
+        wrong.append("delays of actuators are not supported: they are not part of the state that is reset")
+    if mj_model.na:
+        wrong.append("actuators with activations are not supported: they are not part of the state that is reset")
+    for i in range(mj_model.nsensor):
+        camera = int(mujoco.mjtObj.mjOBJ_CAMERA)
+        of_camera = camera in (mj_model.sensor_objtype[i], mj_model.sensor_reftype[i])
+        if of_camera or mj_model.sensor_type[i] not in VELOCITY_SENSORS:
+            name = mj_model.sensor(i).name
+            wrong.append(f"sensor {name!r} is not evaluated, only velocities are: compute it from sim.data in a kernel")
+    if wrong:
+        raise ValueError("; ".join(wrong))
+    return mj_model

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from torchrl_loco.sim.buffer import Buffer as Buffer
 from torchrl_loco.sim.graph import EXCLUSIVE as EXCLUSIVE
 from torchrl_loco.sim.graph import Graph as Graph
 from torchrl_loco.sim.graph import current_stream as current_stream

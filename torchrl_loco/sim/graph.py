@@ -3,15 +3,14 @@
 import contextlib
 import os
 import threading
+from collections import defaultdict
 from collections.abc import Callable
 
 import torch
 import warp as wp
 
-from torchrl_loco.sim.scratch import ScratchPool
-
 EXCLUSIVE = threading.RLock()
-"""Held while Warp works in the calling thread: a recording takes in what other threads launch meanwhile, and on the CPU
+"""Held while Warp works in the calling thread: a recording includes what other threads launch meanwhile, and on the CPU
 two threads would share the scratch memory of tiles."""
 
 # A child of a fork has only the thread that forked: it must not find the lock held by another.
@@ -33,12 +32,12 @@ class Graph:
 
     Args:
         launch: makes the launches. It is called twice: once for real, which compiles the kernels and lets mujoco_warp
-            make what it makes lazily, and once to record. It must not read the device.
+            allocate what it allocates lazily, and once to record. It must not read from the device.
         device: the Warp device.
         scratch: where scratch memory comes from; needed on CUDA.
     """
 
-    def __init__(self, launch: Callable[[], None], device: wp.Device, scratch: ScratchPool | None = None) -> None:
+    def __init__(self, launch: Callable[[], None], device: wp.Device, scratch: "ScratchPool | None" = None) -> None:
         self._device = device
         self._scratch = scratch
         allocator = wp.ScopedAllocator(device, scratch) if device.is_cuda else contextlib.nullcontext()
@@ -52,3 +51,47 @@ class Graph:
         """Runs the recorded work on torch's current stream of the device, without waiting for it."""
         with contextlib.nullcontext() if self._device.is_cuda else EXCLUSIVE:
             wp.capture_launch(self._graph, stream=current_stream(self._device))
+
+
+class ScratchPool:
+    """A Warp allocator for launches that will be recorded. It reuses freed blocks and never returns them to the device.
+
+    Without it the arrays that mujoco_warp allocates within a step become allocation nodes of the CUDA graph, which are
+    not allowed inside a condition. Blocks are reused within one graph and between graphs, which is sound because graphs
+    are replayed one after another.
+
+    The memory of mujoco_warp's deterministic kernels belongs to the recording. Warp requests it on a stream that is not
+    being recorded; such requests go to the allocator that was active before.
+
+    Args:
+        device: a CUDA device.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self._warp_device = device
+        self._before = device.get_allocator()
+        self._from_before: set[int] = set()
+        self._device = wp.device_to_torch(device)
+        self._blocks: list[torch.Tensor] = []
+        self._free: dict[int, list[int]] = defaultdict(list)
+
+    def allocate(self, size_in_bytes: int) -> int:
+        """Returns the address of a block of that size."""
+        device = self._warp_device
+        if device.is_capturing and not device.stream.is_capturing:
+            ptr = self._before.allocate(size_in_bytes)
+            self._from_before.add(ptr)
+            return ptr
+        if not self._free[size_in_bytes]:
+            block = torch.empty(size_in_bytes, dtype=torch.uint8, device=self._device)
+            self._blocks.append(block)
+            return block.data_ptr()
+        return self._free[size_in_bytes].pop()
+
+    def deallocate(self, ptr: int, size_in_bytes: int) -> None:
+        """Takes a block back, to be given out again."""
+        if ptr in self._from_before:
+            self._from_before.remove(ptr)
+            self._before.deallocate(ptr, size_in_bytes)
+            return
+        self._free[size_in_bytes].append(ptr)

@@ -1,4 +1,4 @@
-"""What a world draws at its reset: a random stream of its own, a pose of a table, or one free of contact."""
+"""What a world draws at its reset: a random stream of its own, a pose from a table, or a pose free of contact."""
 
 from typing import Any
 
@@ -7,25 +7,24 @@ import numpy as np
 import warp as wp
 
 MAX_TRIES = 64
-"""Poses drawn before one in contact is kept; three of four humanoid poses are free, so it never comes to that."""
+"""Poses drawn before one in contact is kept. Three of four humanoid poses are free, so this does not happen."""
 
 
 @wp.func
-def world_stream(seed: wp.array[wp.uint32], world: int, episode: int) -> wp.uint32:
+def world_stream(seed: wp.uint32, world: int, episode: int) -> wp.uint32:
     """Start of the random stream of one episode: a function of (seed, world, episode) alone.
 
     It has 32 bits: of n episodes, about n^2 / 2^33 pairs start alike.
     """
-    return wp.rand_init(int(wp.rand_init(int(seed[0]), world)), episode)
+    return wp.rand_init(int(wp.rand_init(int(seed), world)), episode)
 
 
 @wp.kernel(enable_backward=False)
 def draw_from_table(
     # In:
     poses_in: wp.array2d[float],
-    seed_in: wp.array[wp.uint32],
-    episode_in: wp.array[int],
     mask_in: wp.array[bool],
+    stream_in: wp.array[wp.uint32],
     # Data out:
     qpos_out: wp.array2d[float],
 ):
@@ -33,7 +32,8 @@ def draw_from_table(
     world = wp.tid()
     if not mask_in[world]:
         return
-    row = wp.randi(world_stream(seed_in, world, episode_in[world]), 0, poses_in.shape[0])
+    stream = stream_in[world]
+    row = wp.randi(stream, 0, poses_in.shape[0])
     for i in range(qpos_out.shape[1]):
         qpos_out[world, i] = poses_in[row, i]
 
@@ -172,9 +172,8 @@ def in_contact(skeleton: Skeleton, xpos: wp.array[wp.vec3], xquat: wp.array[wp.q
 def draw_free_poses(
     # In:
     skeleton: Skeleton,
-    seed_in: wp.array[wp.uint32],
-    episode_in: wp.array[int],
     mask_in: wp.array[bool],
+    stream_in: wp.array[wp.uint32],
     # Data out:
     qpos_out: wp.array2d[float],
     xpos_out: wp.array2d[wp.vec3],
@@ -183,7 +182,7 @@ def draw_free_poses(
     world = wp.tid()
     if not mask_in[world]:
         return
-    stream = world_stream(seed_in, world, episode_in[world])
+    stream = stream_in[world]
     for _ in range(MAX_TRIES):
         stream = draw_joints(skeleton, stream, qpos_out[world])
         pose_bodies(skeleton, qpos_out[world], xpos_out[world], xquat_out[world])

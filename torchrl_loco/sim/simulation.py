@@ -1,28 +1,23 @@
-"""Many worlds of one model, stepped together by MuJoCo-Warp."""
+"""Many worlds of one model on one device, whichever engine steps them."""
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from pathlib import Path
 
 import mujoco
-import mujoco_warp as mjw
 import torch
 import warp as wp
 
 from torchrl_loco.config import SimConfig
-from torchrl_loco.sim.graph import Graph
-from torchrl_loco.sim.kernels import compile_kernels
-from torchrl_loco.sim.order import RowOrder
-from torchrl_loco.sim.scratch import ScratchPool
+from torchrl_loco.sim.compilation import compile_kernels
+from torchrl_loco.sim.graph import Graph, ScratchPool
+from torchrl_loco.sim.mujoco_warp import MujocoWarpEngine, data_bytes
 
-UNROLLED_ITERATIONS = 10
-"""Solver iterations up to which a recorded step holds them all, without a condition between them."""
-
-LANES = wp.constant(32)
-"""Threads that share the constraint rows of a world."""
+SCRATCH = 1.4
+"""Memory of a simulation as a multiple of its ``mjData``; the rest is scratch memory (measured: 1.3 to 1.4)."""
 
 
 @wp.kernel(enable_backward=False)
-def clear_worlds(
+def reset_worlds(
     # Model:
     qpos0: wp.array2d[float],
     # In:
@@ -36,6 +31,7 @@ def clear_worlds(
     cvel_out: wp.array2d[wp.spatial_vector],
     sensordata_out: wp.array2d[float],
 ):
+    """Puts worlds at rest in the default pose."""
     world = wp.tid()
     if not mask_in[world]:
         return
@@ -53,62 +49,24 @@ def clear_worlds(
         sensordata_out[world, i] = 0.0
 
 
-@wp.kernel(enable_backward=False)
-def clear_constraints(
-    # In:
-    mask_in: wp.array[bool],
-    # Data out:
-    efc_J_out: wp.array3d[float],  # noqa: N803
-    efc_D_out: wp.array2d[float],  # noqa: N803
-):
-    """Zeroes the constraint rows: the solver multiplies unused ones by zero, which leaves a NaN a NaN for ever."""
-    world, lane = wp.tid()
-    if not mask_in[world]:
-        return
-    for row in range(lane, efc_J_out.shape[1], LANES):
-        for i in range(efc_J_out.shape[2]):
-            efc_J_out[world, row, i] = 0.0
-        if row < efc_D_out.shape[1]:
-            efc_D_out[world, row] = 0.0
-
-
-@wp.kernel(enable_backward=False)
-def note_demand(
-    # Data in:
-    nefc_in: wp.array[int],
-    nacon_in: wp.array[int],
-    ncollision_in: wp.array[int],
-    # Out:
-    rows_out: wp.array[int],
-    contacts_out: wp.array[int],
-):
-    """Keeps the largest numbers of constraint rows and contacts that were asked for, also where there was no room."""
-    world = wp.tid()
-    rows_out[world] = wp.max(rows_out[world], nefc_in[world])
-    if world == 0:
-        contacts_out[0] = wp.max(contacts_out[0], wp.max(nacon_in[0], ncollision_in[0]))
-
-
 class Simulation:
-    """Owns the models, the state of all worlds, and the graphs that advance it.
+    """Owns the model, the state of all worlds and the engine that advances it.
 
-    ``step``, ``reset``, ``place`` and ``forward`` launch kernels on Warp's current stream and return at once;
-    :meth:`capture` records any sequence of them, with kernels of the caller's in between, to be replayed.
+    ``step``, ``reset``, ``forward`` and ``forward_at_rest`` launch kernels on Warp's current stream and return at once;
+    :meth:`capture` records any sequence of them, with the caller's own kernels in between, to be replayed.
 
-    The torch views share memory with the Warp arrays and keep their address for life. They always hold the current
-    state: clone what you want to keep.
+    The torch views share memory with the Warp arrays of ``data`` and never change their address. They always hold the
+    current state: clone what you want to keep.
 
     ==================  =========================  ========================================================
     ``qpos``            ``(nworld, nq)``           positions (m, rad, unit quaternions)
     ``qvel``            ``(nworld, nv)``           velocities (m/s, rad/s)
-    ``ctrl``            ``(nworld, nu)``           actions, clipped by the physics to the ctrlrange
-    ``qacc_warmstart``  ``(nworld, nv)``           where the constraint solver starts
+    ``ctrl``            ``(nworld, nu)``           controls
+    ``qacc_warmstart``  ``(nworld, nv)``           initial guess of the constraint solver
     ``xpos``            ``(nworld, nbody, 3)``     positions of the bodies (m)
     ``xmat``            ``(nworld, nbody, 3, 3)``  orientations of the bodies
     ``time``            ``(nworld,)``              time since the world's reset (s)
     ``overflow``        ``(nworld,)``              :class:`mujoco_warp.OverflowType` bits, kept until you zero them
-    ``peak_rows``       ``(nworld,)``              most constraint rows that a substep asked for
-    ``peak_contacts``   ``(1,)``                   most contacts that a substep asked for, over all worlds
     ==================  =========================  ========================================================
 
     Args:
@@ -116,32 +74,21 @@ class Simulation:
         config: settings of the simulation.
         num_envs: number of worlds.
         device: where they live.
+
+    Raises:
+        MemoryError: the device has no room for so many worlds.
     """
 
     def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: torch.device) -> None:
+        set_options(mj_model, config)
+        check_memory(int(SCRATCH * data_bytes(mj_model, config, num_envs)), num_envs, device)
         self.mj_model = mj_model
         self.num_envs = num_envs
-        self.substeps = config.substeps
         self.device = wp.get_device(str(device))
+        self.engine = MujocoWarpEngine(mj_model, config, num_envs, self.device)
+        self.model, self.data = self.engine.model, self.engine.data
         self.graphs: list[Graph] = []
         self._scratch = ScratchPool(self.device) if self.device.is_cuda else None
-
-        set_options(mj_model, config)
-        with wp.ScopedDevice(self.device):
-            self.model = mjw.put_model(mj_model)
-            self.data = mjw.make_data(mj_model, nworld=num_envs, naconmax=config.naconmax, njmax=config.njmax)
-        option = self.model.opt
-        # Printing from kernels costs more than the physics; the same facts stay readable in ``overflow``.
-        option.warn_overflow = 0
-        # A few iterations are cheaper in a row than in a loop that may stop early.
-        option.graph_conditional = config.iterations > UNROLLED_ITERATIONS
-        # The solver starts from the warm start; a second start that it would compare with costs a factorization.
-        option.run_qacc_smooth = False
-        # Threads to a world's matrices, which are small: measured in benchmarks/README.md.
-        self.model.block_dim.update_gradient_cholesky = 32
-        self.model.block_dim.update_gradient_JTDAJ_dense = 64
-
-        self._order = RowOrder(self.model, self.data) if config.deterministic else None
 
         self.qpos = wp.to_torch(self.data.qpos)
         self.qvel = wp.to_torch(self.data.qvel)
@@ -151,114 +98,45 @@ class Simulation:
         self.xmat = wp.to_torch(self.data.xmat)
         self.time = wp.to_torch(self.data.time)
         self.overflow = wp.to_torch(self.data.overflow)
-        self._peak_rows = wp.zeros(num_envs, dtype=int, device=self.device)
-        self._peak_contacts = wp.zeros(1, dtype=int, device=self.device)
-        self.peak_rows = wp.to_torch(self._peak_rows)
-        self.peak_contacts = wp.to_torch(self._peak_contacts)
 
     def step(self) -> None:
-        """Advances every world by one control step under ``ctrl``.
-
-        Afterwards poses, velocities of bodies and sensors belong to the new state, as in dm_control. dm_control gets
-        there by a whole first half of the next step; here it is only what an observation can ask for, which leaves
-        nothing else to bring up to date when a world is reset. Forces, contacts and constraints are those of the last
-        substep.
-        """
-        with self._lean():
-            for _ in range(self.substeps):
-                self._substep()
-                self._note_demand()
-        self._pose()
-
-    def _substep(self) -> None:
-        if self._order is None:
-            mjw.step(self.model, self.data)
-            return
-        mjw.step1(self.model, self.data)
-        self._order.apply()
-        # In the solver alone, where it costs the least: nothing before it adds up in any order.
-        self.model.opt.deterministic = mjw.DeterminismType.ATOMICS
-        mjw.step2(self.model, self.data)
-        self.model.opt.deterministic = mjw.DeterminismType.NONE
-
-    def _note_demand(self) -> None:
-        d = self.data
-        wp.launch(
-            note_demand,
-            dim=self.num_envs,
-            inputs=[d.nefc, d.nacon, d.ncollision],
-            outputs=[self._peak_rows, self._peak_contacts],
-            device=self.device,
-        )
-
-    def forward(self, mask: wp.array) -> None:
-        """Brings poses and sensors up to ``qpos`` and ``qvel``, changed where ``mask`` ``(nworld,)`` is set."""
-        self._clear_constraints(mask)
-        self._pose()
-
-    def place(self, mask: wp.array) -> None:
-        """As :meth:`forward`, for less: after a :meth:`reset`, and ``qpos`` alone was changed where ``mask`` is set."""
-        self._clear_constraints(mask)
-        mjw.kinematics(self.model, self.data)
-
-    def _clear_constraints(self, mask: wp.array) -> None:
-        efc = self.data.efc
-        wp.launch(
-            clear_constraints,
-            dim=(self.num_envs, LANES),
-            inputs=[mask],
-            outputs=[efc.J, efc.D],
-            device=self.device,
-        )
-
-    def _pose(self) -> None:
-        """Evaluates what an observation can ask for: poses and velocities of bodies, and sensors of them."""
-        mjw.kinematics(self.model, self.data)
-        mjw.com_pos(self.model, self.data)
-        mjw.com_vel(self.model, self.data)
-        mjw.sensor_vel(self.model, self.data)
-
-    @contextlib.contextmanager
-    def _lean(self) -> Iterator[None]:
-        """Launches nothing for sensors, cameras and lights: they are evaluated once they are asked for."""
-        model = self.model
-        kept = model.opt.disableflags, model.ncam, model.nlight
-        model.ncam = model.nlight = 0
-        model.opt.disableflags |= mjw.DisableBit.SENSOR
-        try:
-            yield
-        finally:
-            model.opt.disableflags, model.ncam, model.nlight = kept
+        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state."""
+        self.engine.step()
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds where ``mask`` (bool, ``(nworld,)``) is set at rest in the default pose; others stay."""
         d = self.data
         wp.launch(
-            clear_worlds,
+            reset_worlds,
             dim=self.num_envs,
             inputs=[self.model.qpos0, mask],
             outputs=[d.qpos, d.qvel, d.qacc_warmstart, d.ctrl, d.time, d.cvel, d.sensordata],
             device=self.device,
         )
 
+    def forward(self, mask: wp.array) -> None:
+        """Updates poses and sensors after ``qpos`` and ``qvel`` were changed where ``mask`` ``(nworld,)`` is set."""
+        self.engine.clear_constraints(mask)
+        self.engine.evaluate()
+
+    def forward_at_rest(self, mask: wp.array) -> None:
+        """As :meth:`forward`, for less: after :meth:`reset`, if only ``qpos`` was changed where ``mask`` is set."""
+        self.engine.clear_constraints(mask)
+        self.engine.evaluate_at_rest()
+
     def compile(self, *launches: Callable[[], None]) -> None:
-        """Compiles the kernels that ``launches`` would launch, in parallel and under a progress bar."""
+        """Compiles the kernels that ``launches`` would launch, in parallel and with a progress bar."""
         compile_kernels(launches, self.device)
 
     def capture(self, launch: Callable[[], None]) -> Graph:
-        """Returns a recording of the launches that ``launch`` makes. The state is arbitrary then: reset before use."""
+        """Returns a recording of the launches that ``launch`` makes. It also runs them: reset before use."""
         graph = Graph(launch, self.device, self._scratch)
         self.graphs.append(graph)
         return graph
 
-    @property
-    def num_captures(self) -> int:
-        """How many graphs were ever recorded."""
-        return len(self.graphs)
-
 
 def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
-    """Sets the options of a model as the settings say."""
+    """Sets the options of a model from ``config``."""
     option = mj_model.opt
     option.timestep = config.sim_dt
     option.iterations = config.iterations
@@ -267,3 +145,30 @@ def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
     option.disableflags = (
         option.disableflags & ~euler_damping if config.euler_damping else option.disableflags | euler_damping
     )
+
+
+def check_memory(needed: int, num_envs: int, device: torch.device) -> None:
+    """Checks that the worlds fit into the memory that is free.
+
+    Raises:
+        MemoryError: they do not; the message names the figures and how many worlds would fit.
+    """
+    free = free_memory(device)
+    if needed > free:
+        raise MemoryError(
+            f"num_envs={num_envs} needs about {needed / 2**30:.1f} GiB on {device}, which has {free / 2**30:.1f} GiB "
+            f"free: about {int(num_envs * free / needed)} worlds fit"
+        )
+
+
+def free_memory(device: torch.device) -> int:
+    """Returns the memory that a device has free (bytes). On the CPU, a limit of the control group counts too."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    meminfo = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+    free = int(meminfo["MemAvailable"].split()[0]) * 1024
+    group = Path("/sys/fs/cgroup")
+    limit, used = group / "memory.max", group / "memory.current"
+    if limit.is_file() and limit.read_text().strip() != "max":
+        free = min(free, int(limit.read_text()) - int(used.read_text()))
+    return free

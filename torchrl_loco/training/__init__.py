@@ -1,27 +1,6 @@
-"""Training as parts that read on their own: settings, networks, algorithms, evaluation, run folder, and the loop."""
+"""Training as parts that can be used on their own: settings, algorithms, evaluation, run folder and the loop."""
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from torchrl_loco._lazy import lazy
-
-if TYPE_CHECKING:
-    from torchrl_loco.training._api import *
-
-__all__ = [
-    "PPOConfig",
-    "REPPOConfig",
-    "RunFolder",
-    "Trainer",
-    "TrainingConfig",
-    "describe",
-    "evaluate_run",
-    "has_display",
-    "plot_runs",
-    "preset",
-    "record",
-    "untuned",
-    "view",
-]
-
-if not TYPE_CHECKING:  # to a type checker it would mean that there is every name
-    __getattr__, __dir__ = lazy(__name__, __all__)
+# Imported when asked for, as in torchrl_loco itself: the names are those of __init__.pyi.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

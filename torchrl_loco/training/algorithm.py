@@ -1,7 +1,8 @@
-"""What all algorithms share: gradient steps over the minibatches of a batch, recorded and replayed on CUDA."""
+"""What all algorithms share: gradient steps over the minibatches of a batch, recorded as a graph on CUDA."""
 
+import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, ClassVar
 
 import torch
@@ -9,8 +10,8 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
+from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training.config import TrainingConfig
-from torchrl_loco.training.networks import ObservationNorm
 
 
 class Algorithm(ABC):
@@ -38,28 +39,28 @@ class Algorithm(ABC):
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
         self._data: TensorDictBase | None = None
         on_cuda = self.device.type == "cuda"
-        self._step = Replay(self._minibatch_step, self.device) if on_cuda else self._minibatch_step
+        self._step = RecordedStep(self._minibatch_step, self.device) if on_cuda else self._minibatch_step
 
     @abstractmethod
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """Returns what gradient steps need of a ``batch`` of shape ``(num_envs, decisions)``, in the same shape."""
+        """Returns what gradient steps need of a ``batch`` of shape ``(num_envs, num_steps)``, in the same shape."""
 
     @abstractmethod
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
-        """Makes a gradient step, without reading from the device or copying to it: CUDA records it.
+        """Makes a gradient step without transfers between host and device, so that CUDA can record it.
 
         Args:
-            minibatch: decisions that :meth:`prepare` returned, batch ``(minibatch_size,)``.
+            minibatch: steps that :meth:`prepare` returned, batch ``(minibatch_size,)``.
 
         Returns:
             The metrics, a scalar each, in the order of ``metric_names``.
         """
 
     def make_optimizer(self, name: str, parameters: Iterable[Any]) -> torch.optim.Adam:
-        """Makes the optimizer ``name`` of ``parameters`` or groups, whose learning rate recorded steps can follow.
+        """Makes an optimizer of ``parameters`` or groups, whose learning rate recorded steps follow.
 
         Returns:
-            The optimizer, which is also in ``optimizers``.
+            The optimizer, which is kept as ``optimizers[name]``.
         """
         on_cuda = self.device.type == "cuda"
         lr = torch.tensor(self.config.lr, device=self.device)
@@ -71,14 +72,14 @@ class Algorithm(ABC):
         """Updates on one batch, without synchronising with the device.
 
         Args:
-            batch: experience of shape ``(num_envs, decisions)``.
-            progress: share of the run that is done, in [0, 1], which sets the learning rate.
+            batch: experience of shape ``(num_envs, num_steps)``.
+            progress: fraction of the run that is done, in [0, 1], which sets the learning rate.
 
         Returns:
             The mean of the metrics over all gradient steps, shape ``(len(metric_names),)``.
         """
         config = self.config
-        lr = config.lr * (1.0 - (1.0 - config.final_lr) * progress)
+        lr = config.lr * (1.0 - (1.0 - config.final_lr_fraction) * progress)
         for optimizer in self.optimizers.values():
             for group in optimizer.param_groups:
                 group["lr"].fill_(lr)
@@ -89,14 +90,14 @@ class Algorithm(ABC):
             else:
                 self._data.update_(data)
         self._totals.zero_()
-        # A rest smaller than a minibatch is left out: it would weigh as much as a full one.
+        # A remainder smaller than a minibatch is left out: it would weigh as much as a full one.
         minibatches = len(data) // config.minibatch_size
         for _ in range(config.epochs):
             order = torch.randperm(len(data), generator=self.generator, device=self.device)
             for indices in order[: minibatches * config.minibatch_size].split(config.minibatch_size):
                 self._indices.copy_(indices)
                 self._step()
-        self.norm.update(batch["observation"])  # after the update: the policy that collected stays what it was
+        self.norm.update(batch["observation"])  # after the update, which needs the policy as it collected
         return self._totals / (config.epochs * minibatches)
 
     def _minibatch_step(self) -> None:
@@ -112,24 +113,24 @@ class Algorithm(ABC):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from a ``state`` that :meth:`state_dict` returned."""
+        """Continues from a ``state`` that :meth:`state_dict` returned."""
         self.networks.load_state_dict(state["networks"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
         self.generator.set_state(state["generator"].cpu())
 
 
-class Replay:
-    """Work without arguments on CUDA that is recorded as a graph and replayed.
+class RecordedStep:
+    """Work on CUDA without arguments, recorded as a CUDA graph after some warm-up calls.
 
     ``tensordict.nn.CudaGraphModule`` waits for the device at every call; this does not.
 
     Args:
-        work: reads and writes tensors that stay where they are.
+        work: reads and writes tensors that keep their addresses.
         device: a CUDA device.
     """
 
-    WARMUP = 3  # calls that run as they are: optimizers and cuBLAS allocate at their first
+    WARMUP = 3  # optimizers and cuBLAS allocate at their first call
 
     def __init__(self, work: Callable[[], None], device: torch.device) -> None:
         self._work = work
@@ -138,7 +139,7 @@ class Replay:
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> None:
-        """Runs the work, or from the fourth call on its recording."""
+        """Runs the work as it is three times, then its recording."""
         if self._calls < self.WARMUP:
             self._calls += 1
             side = torch.cuda.Stream(self._device)
@@ -166,3 +167,19 @@ def clip_and_step(optimizer: torch.optim.Optimizer, max_norm: float) -> torch.Te
     norm = nn.utils.clip_grad_norm_(parameters, max_norm)
     optimizer.step()
     return norm
+
+
+@contextlib.contextmanager
+def settings_for_small_networks() -> Iterator[None]:
+    """Lets torch compute in one thread on the CPU, and matrix products in TF32 on CUDA; restores the settings after.
+
+    With small networks threads mostly wait for each other, the more so on busy cores. TF32 is three times as fast.
+    """
+    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    torch.set_num_threads(1)
+    torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        torch.set_float32_matmul_precision(precision)

@@ -1,4 +1,4 @@
-"""How good a policy is, and what it looks like."""
+"""Evaluation of policies, and pictures of them."""
 
 import os
 import sys
@@ -15,20 +15,22 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import trange
 
 from torchrl_loco.envs import LocoEnv
+from torchrl_loco.policy import SHIPPED, load_policy
 from torchrl_loco.registry import make
-from torchrl_loco.training.networks import settings_for_small_networks
+from torchrl_loco.training.algorithm import settings_for_small_networks
+from torchrl_loco.training.config import TrainingConfig
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 class Evaluator:
-    """Plays full episodes of a task in fresh worlds, without exploration; the same episodes every time.
+    """Plays full episodes of a task in worlds of its own, without exploration; the same episodes every time.
 
     Args:
         task: id of the environment.
-        episodes: how many, all side by side.
+        episodes: number of episodes, one a world.
         device: where to play.
-        seed: decides how they start.
+        seed: decides their initial states.
         protocol: settings of the solver and of the reset.
         action_repeat: frames for which an action is held.
     """
@@ -64,22 +66,47 @@ def summarize(returns: torch.Tensor) -> dict[str, float]:
 
 
 def describe(summary: dict[str, float]) -> str:
-    """Returns the ``summary`` of an evaluation as a line."""
+    """Returns the ``summary`` of an evaluation as a line of text."""
     return (
         f"return {summary['mean']:.1f} +- {summary['std']:.1f} over {summary['episodes']:.0f} episodes "
         f"(min {summary['min']:.1f}, max {summary['max']:.1f})"
     )
 
 
+POOR = 0.8
+"""Fraction of the shipped policy's return below which a return is called poor."""
+
+
+def poor_return(config: TrainingConfig, summary: dict[str, float]) -> str:
+    """Returns a sentence that says so if the return of a run is poor, and what to try, else an empty string.
+
+    It is compared with the policy that is shipped for the same task, if there is one.
+
+    Args:
+        config: settings of the run.
+        summary: what :func:`summarize` returned.
+    """
+    if not (SHIPPED / f"{config.task}.safetensors").is_file():
+        return ""
+    reference = load_policy(config.task, "cpu").info["mean"]
+    if summary["mean"] >= POOR * reference:
+        return ""
+    return (
+        f"This return is poor: the policy shipped for {config.task} earns {reference:.0f}. Returns vary with seeds and "
+        f"processors. Try another seed (--seed {config.seed + 1}) or twice the frames "
+        f"(--total_frames {2 * config.total_frames}); the learning curve shows whether it was still rising"
+    )
+
+
 def record(
     policy: Policy, env: LocoEnv, path: Path, seconds: float, action_repeat: int = 1, camera: str = "side"
 ) -> None:
-    """Writes a video of the first world of an environment from its reset on, in real time.
+    """Records the first world of an environment from its reset on, in real time.
 
     Args:
         policy: reads ``observation`` and writes ``action``.
         env: where it plays.
-        path: the video, H.264 in a container that its suffix names.
+        path: the video file; its suffix chooses the container, the codec is H.264.
         seconds: length of the video (s).
         action_repeat: frames for which an action is held.
         camera: ``"side"``, ``"back"`` or ``"egocentric"``.
@@ -92,8 +119,8 @@ def record(
 
 
 def has_display() -> bool:
-    """Returns whether MuJoCo's viewer can open a window here."""
-    if sys.platform == "darwin":  # there the viewer needs MuJoCo's own launcher
+    """Returns whether MuJoCo's viewer can open a window."""
+    if sys.platform == "darwin":  # where the viewer needs MuJoCo's own launcher
         return "mjpython" in Path(sys.argv[0]).name or "MJPYTHON_BIN" in os.environ
     import glfw
 
@@ -128,9 +155,9 @@ def view(policy: Policy, env: LocoEnv, action_repeat: int = 1) -> None:
 
 @torch.no_grad()
 def _play(policy: Policy, env: LocoEnv, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
-    """Yields what each of so many frames from a reset brings, with every action held for ``action_repeat`` of them."""
+    """Yields the result of each frame from a reset on, holding each action for ``action_repeat`` frames."""
     td = env.reset()
-    for frame in trange(frames, desc=label, leave=False, disable=None):  # in a log, a line a run is enough
+    for frame in trange(frames, desc=label, leave=False, disable=None):  # not in a log
         if frame % action_repeat == 0:
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 td = policy(td)

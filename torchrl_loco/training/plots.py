@@ -1,8 +1,9 @@
-"""Learning curves as pictures."""
+"""Plots of learning curves."""
 
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,13 +11,18 @@ from matplotlib.figure import Figure
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
 
+IRRELEVANT: dict[str, Any] = {
+    **{"seed": 0, "out": Path(), "device": "cpu"},
+    **{"eval_interval": 0, "eval_episodes": 1, "video_seconds": 0.0, "checkpoint_seconds": 0.0},
+}
+"""Settings that do not affect learning, each with a fixed value, so that runs can be grouped without them."""
+
 
 def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
-    """Draws return against frames of ``runs`` into ``picture``.
+    """Plots return against frames of ``runs`` into ``picture``.
 
-    Runs that differ in nothing but their seed share a line, their mean, and a band.
-
-    Evaluations are dots: the mean over episodes, with the standard deviation over episodes as a bar.
+    Runs that differ only in their seed, or in settings that do not change learning, share a line, their mean, and a
+    band from least to greatest. Evaluations are dots: the mean over episodes, with their standard deviation as a bar.
 
     Raises:
         ValueError: there are no runs, or one has no metrics yet.
@@ -25,11 +31,11 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
         raise ValueError("no runs to plot")
     groups: dict[TrainingConfig, list[RunFolder]] = {}
     for run in runs:
-        groups.setdefault(dataclasses.replace(run.load_config(), seed=0, out=Path()), []).append(run)
+        groups.setdefault(dataclasses.replace(run.load_config(), **IRRELEVANT), []).append(run)
     figure = Figure(figsize=(7, 4.2), layout="constrained")  # without pyplot: a caller's backend stays as it is
     axes = figure.subplots()
     for config, group in groups.items():
-        label = f"{config.task}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds on {config.device}"
+        label = f"{config.task}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds"
         metrics = [run.read_metrics() for run in group]
         length = min(len(m["frames"]) for m in metrics)
         returns = np.array([m["return"][:length] for m in metrics])

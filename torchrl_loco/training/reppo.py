@@ -1,8 +1,8 @@
 """Relative entropy pathwise policy optimization (Voelcker et al., 2025, arXiv 2507.11019).
 
-On-policy like PPO, but the actor climbs the gradient of a critic of actions, Q(s, a), instead of weighing sampled
-actions. Three things make that gradient trustworthy: the critic is a distribution over returns, it learns from fresh
-data alone, and the actor is drawn back wherever it has moved too far from the policy that collected the data.
+On-policy like PPO, but the actor ascends the gradient of a critic Q(s, a) instead of weighting sampled actions. Three
+things keep that gradient reliable: the critic is a distribution over returns, it learns from fresh data only, and the
+actor minimises the KL divergence from the policy that collected the data wherever it exceeds a bound.
 """
 
 import math
@@ -10,17 +10,20 @@ from collections.abc import Iterable
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import NormalParamExtractor
 from torch import nn
 from torch.nn.functional import cross_entropy, mse_loss, softplus
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
+from torchrl_loco.policy import ObservationNorm
+from torchrl_loco.training.actor import make_actor
 from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import REPPOConfig
-from torchrl_loco.training.networks import make_actor_q
 
 
 class REPPO(Algorithm):
-    """Soft lambda-returns, then minibatch epochs over the critic's cross entropy and the actor's bounded ascent."""
+    """Soft lambda-returns, then epochs of minibatches: the critic's cross entropy, the actor's constrained ascent."""
 
     metric_names = (
         *("loss_critic", "loss_aux", "value", "grad_norm_critic"),
@@ -31,21 +34,20 @@ class REPPO(Algorithm):
     def __init__(self, config: REPPOConfig) -> None:
         super().__init__(config)
         self.actor, self.critic, self.norm = make_actor_q(config)
-        self.distribution = self.actor[0].module  # from observations to means and deviations
-        self.weights = Weights(config).to(self.device)
-        self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "weights": self.weights})
-        self._actor_parameters = [*self.actor.parameters(), *self.weights.parameters()]
+        self.distribution = self.actor[0].module  # from observations to means and standard deviations
+        self.dual = DualVariables(config).to(self.device)
+        self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "dual": self.dual})
+        self._actor_parameters = [*self.actor.parameters(), *self.dual.parameters()]
         self.critic_optimizer = self.make_optimizer("critic", self.critic.parameters())
-        # The gradient of a weight's logarithm shrinks with the weight: an eps of 1e-5 would hold it down.
-        groups = [{"params": list(self.actor.parameters())}, {"params": list(self.weights.parameters()), "eps": 1e-8}]
+        # The gradient of a dual variable's logarithm shrinks with the variable: an eps of 1e-5 would keep it small.
+        groups = [{"params": list(self.actor.parameters())}, {"params": list(self.dual.parameters()), "eps": 1e-8}]
         self.actor_optimizer = self.make_optimizer("actor", groups)
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """Returns estimates, ``(num_envs, decisions)``, in which entropy counts as reward.
+        """Returns soft lambda-returns, ``(num_envs, num_steps)``, and the features to predict.
 
-        They take one action drawn in every next state.
-
-        At a time limit the true terminal observation is bootstrapped from; a termination ends the return.
+        Entropy counts as reward. Values of next states are those of one sampled action. At a time limit the value of
+        the true terminal observation is bootstrapped; termination ends the return.
         """
         config, after = self.config, batch["next"]
         loc, scale = self.distribution(after["observation"])
@@ -53,7 +55,7 @@ class REPPO(Algorithm):
         value, features = self.critic.value_and_features(after["observation"], action)
         alive = ~after["terminated"]
         reward = after["reward"] * config.reward_scale
-        reward = reward - config.gamma * self.weights.temperature * log_prob.unsqueeze(-1) * alive
+        reward = reward - config.gamma * self.dual.temperature * log_prob.unsqueeze(-1) * alive
         returns = td_lambda_return_estimate(
             config.gamma, config.lmbda, value.unsqueeze(-1), reward, after["done"], after["terminated"]
         )
@@ -61,54 +63,54 @@ class REPPO(Algorithm):
         return batch.select("observation", "action", "loc", "scale").update(estimates)
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
-        """Returns the metrics, a scalar each, of a step of the critic, then one of the actor and the two weights."""
+        """Returns the metrics, a scalar each, of a step of the critic, then one of the actor and the dual variables."""
         return [*self._critic_step(minibatch), *self._actor_step(minibatch)]
 
     def _critic_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
-        """The critic learns the distribution of returns, and to foresee its own features of the next step.
+        """The critic learns the distribution of returns, and to predict its own features of the next step.
 
         Returns:
             Its metrics.
         """
-        logits, foreseen = self.critic(minibatch["observation"], minibatch["action"])
+        logits, predicted = self.critic(minibatch["observation"], minibatch["action"])
         target = self.critic.bins.encode(minibatch["returns"])
         loss = cross_entropy(logits, target)
-        aux = (mse_loss(foreseen, minibatch["features"], reduction="none").mean(-1) * minibatch["alive"]).mean()
+        aux = (mse_loss(predicted, minibatch["features"], reduction="none").mean(-1) * minibatch["alive"]).mean()
         self.critic_optimizer.zero_grad()
         (loss + self.config.aux_coeff * aux).backward()
         grad_norm = clip_and_step(self.critic_optimizer, self.config.max_grad_norm)
         return [loss, aux, minibatch["returns"].mean(), grad_norm]
 
     def _actor_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
-        """The actor climbs value and entropy where it is near the old policy, and goes back to it where it is not.
+        """The actor ascends value and entropy where it is near the old policy, and returns to it where it is not.
 
         Returns:
             Its metrics.
         """
-        config, weights = self.config, self.weights
+        config, dual = self.config, self.dual
         loc, scale = self.distribution(minibatch["observation"])
         action, log_prob = sample(loc, scale)
         value, _ = self.critic.value_and_features(minibatch["observation"], action)
         divergence = kl(minibatch["loc"], minibatch["scale"], loc, scale)
         exceeded = divergence >= config.kl_bound
-        climb = weights.temperature.detach() * log_prob - value
-        loss = torch.where(exceeded, weights.kl_weight.detach() * divergence, climb).mean()
-        # Both weights rise while what they weigh is not yet as wanted: too little entropy, too much divergence.
+        objective = dual.temperature.detach() * log_prob - value
+        loss = torch.where(exceeded, dual.kl_weight.detach() * divergence, objective).mean()
+        # The dual variables rise while their constraint is violated: too little entropy, too much divergence.
         excess_entropy = (-log_prob.detach() - config.target_entropy * action.shape[-1]).mean()
         excess_kl = (divergence.detach() - config.kl_bound).mean()
-        dual = weights.temperature * excess_entropy - weights.kl_weight * excess_kl
+        dual_loss = dual.temperature * excess_entropy - dual.kl_weight * excess_kl
         self.actor_optimizer.zero_grad()
-        (loss + dual).backward(inputs=self._actor_parameters)  # and leave the critic's gradients alone
+        (loss + dual_loss).backward(inputs=self._actor_parameters)  # and leave the critic's gradients alone
         grad_norm = clip_and_step(self.actor_optimizer, config.max_grad_norm)
-        weights.clamp_()
+        dual.clamp_()
         return [
             *(loss, divergence.mean(), exceeded.float().mean(), -log_prob.mean()),
-            *(weights.temperature, weights.kl_weight, grad_norm),
+            *(dual.temperature, dual.kl_weight, grad_norm),
         ]
 
 
-class Weights(nn.Module):
-    """The two learned weights of the actor's loss: of entropy (temperature) and of divergence."""
+class DualVariables(nn.Module):
+    """The learned Lagrange multipliers of the actor's loss: of the entropy (temperature) and of the KL divergence."""
 
     def __init__(self, config: REPPOConfig) -> None:
         super().__init__()
@@ -118,7 +120,7 @@ class Weights(nn.Module):
 
     @torch.no_grad()
     def clamp_(self) -> None:
-        """Keeps the temperature at its least value or above."""
+        """Keeps the temperature at or above its minimum."""
         self.log_temperature.clamp_(min=self._min_log_temperature)
 
     @property
@@ -133,10 +135,13 @@ class Weights(nn.Module):
 
 
 def sample(loc: torch.Tensor, scale: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns an action ``tanh(u)``, u ~ N(loc, scale), drawn differentiably, and its log-probability.
+    """Returns actions ``tanh(u)``, u ~ N(loc, scale), by reparametrisation, and their log-probabilities ``(...)``.
 
-    Of means and deviations of shape ``(..., nu)`` come actions of that shape and log-probabilities of shape ``(...)``.
-    Taken from u and not from the action, the log-probability stays exact where tanh saturates.
+    The log-probability is computed from u, not from the action, so it stays exact where tanh saturates.
+
+    Args:
+        loc: means before tanh, shape ``(..., nu)``.
+        scale: standard deviations before tanh, of the same shape.
     """
     noise = torch.randn_like(loc)
     u = loc + scale * noise
@@ -146,9 +151,103 @@ def sample(loc: torch.Tensor, scale: torch.Tensor) -> tuple[torch.Tensor, torch.
 
 
 def kl(old_loc: torch.Tensor, old_scale: torch.Tensor, loc: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
-    """Returns the divergence KL(old || new) of diagonal Gaussians, which is that of their images under tanh.
+    """Returns KL(old || new) of diagonal Gaussians, shape ``(...)``, which equals that of their images under tanh.
 
-    Of means and deviations of shape ``(..., nu)`` come divergences of shape ``(...)``.
+    Means and standard deviations have shape ``(..., nu)``.
     """
     ratio = old_scale / scale
     return (0.5 * (ratio.square() + ((old_loc - loc) / scale).square() - 1.0) - ratio.log()).sum(-1)
+
+
+# The networks.
+
+
+class ValueBins(nn.Module):
+    """Returns as distributions over evenly spaced bins (HL-Gauss: Imani and White, 2018; Farebrother et al., 2024).
+
+    Args:
+        low: return at the center of the first bin.
+        high: return at the center of the last bin.
+        count: number of bins.
+
+    Attributes:
+        centers: returns at the centers of the bins, shape ``(count,)``.
+        edges: returns at the edges of the bins, shape ``(count + 1,)``.
+    """
+
+    SPREAD = 0.75
+    """Standard deviation of a target, in widths of a bin."""
+
+    centers: torch.Tensor
+    edges: torch.Tensor
+
+    def __init__(self, low: float, high: float, count: int) -> None:
+        super().__init__()
+        half = (high - low) / (count - 1) / 2
+        self.register_buffer("centers", torch.linspace(low, high, count), persistent=False)
+        self.register_buffer("edges", torch.linspace(low - half, high + half, count + 1), persistent=False)
+        self.low, self.high, self.sigma = low, high, 2 * half * self.SPREAD
+
+    def encode(self, returns: torch.Tensor) -> torch.Tensor:
+        """Returns the probabilities, shape ``(..., count)``, of a Gaussian about each return of shape ``(...)``."""
+        returns = returns.clamp(self.low, self.high).unsqueeze(-1)
+        below = torch.erf((self.edges - returns) / (math.sqrt(2.0) * self.sigma))
+        return below.diff(dim=-1) / (below[..., -1:] - below[..., :1])
+
+    def decode(self, logits: torch.Tensor) -> torch.Tensor:
+        """Returns the mean, shape ``(...)``, of distributions given as logits of shape ``(..., count)``."""
+        return logits.softmax(-1) @ self.centers
+
+
+class DistributionalQ(nn.Module):
+    """Critic Q(s, a) whose output is a distribution over returns, with a second head that predicts its next features.
+
+    Args:
+        norm: normalises observations.
+        sizes: length of an observation and of an action.
+        hidden: widths of the encoder's layers; the heads have one hidden layer of the last width.
+        bins: the bins of the distribution.
+    """
+
+    def __init__(self, norm: ObservationNorm, sizes: tuple[int, int], hidden: tuple[int, ...], bins: ValueBins) -> None:
+        super().__init__()
+        self.norm, self.bins = norm, bins
+        width = hidden[-1]
+        self.encoder = nn.Sequential(*normed_layers(sum(sizes), hidden), nn.Linear(width, width))
+        last = nn.Linear(width, len(bins.centers))
+        with torch.no_grad():  # the initial prediction is a return of zero
+            last.bias.add_(40.0 * bins.encode(torch.zeros(())))
+        self.value_head = nn.Sequential(nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), last)
+        self.predictor = nn.Sequential(
+            nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), nn.Linear(width, width)
+        )
+
+    def forward(self, observation: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns logits of shape ``(..., count)`` and the predicted next features of shape ``(..., hidden[-1])``."""
+        features = self.encoder(torch.cat([self.norm(observation), action], dim=-1))
+        return self.value_head(features), self.predictor(features)
+
+    def value_and_features(self, observation: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the mean return, shape ``(...)``, and the features, shape ``(..., hidden[-1])``."""
+        features = self.encoder(torch.cat([self.norm(observation), action], dim=-1))
+        return self.bins.decode(self.value_head(features)), features
+
+
+def normed_layers(inputs: int, hidden: tuple[int, ...]) -> list[nn.Module]:
+    """Returns layers of the given widths, each with layer norm and SiLU."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), nn.LayerNorm(width), nn.SiLU()]
+        inputs = width
+    return layers
+
+
+def make_actor_q(config: REPPOConfig) -> tuple[ProbabilisticActor, DistributionalQ, ObservationNorm]:
+    """Returns actor, critic and the observation norm that they share, for REPPO."""
+    norm = ObservationNorm(config.observation_size)
+    head = nn.Linear(config.hidden[-1], 2 * config.action_size)
+    body = normed_layers(config.observation_size, config.hidden)
+    actor = make_actor(config, nn.Sequential(norm, *body, head, NormalParamExtractor("exp")), log_prob=False)
+    bins = ValueBins(0.0, config.max_value, config.num_bins)
+    critic = DistributionalQ(norm, (config.observation_size, config.action_size), config.hidden, bins)
+    return actor, critic.to(config.device), norm

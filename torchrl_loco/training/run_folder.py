@@ -1,7 +1,9 @@
-"""Everything that a run leaves, in one folder."""
+"""The folder that holds everything a run produces."""
 
+import contextlib
 import csv
 import dataclasses
+import io
 import itertools
 import json
 import pickle
@@ -14,12 +16,12 @@ from typing import Any
 
 import torch
 
-from torchrl_loco.checks import check_device, check_run
+from torchrl_loco.checks import check_choice, check_device, check_run
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import env_class
 from torchrl_loco.training.config import CONFIGS, TrainingConfig
 
-CHECKPOINT_VERSION = 2
+CHECKPOINT_VERSION = 3
 ROOM_NEEDED = 200 * 2**20
 """Bytes that a run may need: checkpoints, video, metrics."""
 
@@ -27,18 +29,24 @@ _UNREADABLE = (
     *(zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, NotImplementedError),
     *(RuntimeError, OSError, EOFError, LookupError, TypeError, ValueError),
 )
-"""What reading a damaged checkpoint may raise."""
+"""Errors that reading a damaged checkpoint may raise."""
+
+
+def unused_path(path: Path) -> Path:
+    """Returns ``path``, with ``-2``, ``-3``, ... before its suffix if it is taken."""
+    numbered = (path.with_name(f"{path.stem}-{i}{path.suffix}") for i in itertools.count(2))
+    return next(candidate for candidate in itertools.chain([path], numbered) if not candidate.exists())
 
 
 class RunFolder:
     """A run on disk.
 
     It holds ``config.json``, ``metrics.csv``, ``tensorboard/``, ``evaluations.csv``, ``checkpoint.pt``,
-    ``policy.safetensors``, ``learning_curve.png`` and ``video.mp4``; and ``bad_world.safetensors``, should a world not
-    stay finite.
+    ``policy.safetensors``, ``learning_curve.png``, ``video.mp4``, and ``nan_dump.safetensors`` if a world became
+    non-finite.
 
     Args:
-        path: an existing folder of a run.
+        path: an existing run folder.
 
     Raises:
         FileNotFoundError: ``path`` is no folder with a ``config.json``.
@@ -55,25 +63,26 @@ class RunFolder:
             The folder, with ``config`` in it.
 
         Raises:
-            ValueError: the device is not here.
-            ImportError: the environment is another distribution's, which is broken.
+            ValueError: this machine does not have the device.
+            ImportError: the environment is a plug-in, which is broken.
             OSError: the folder cannot be made, or the disk has no room for a run.
         """
         check_device(config.device)
         env_class(config.task)
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         name = f"{config.task}-{stamp}-seed{config.seed}"
-        Path(config.out).mkdir(parents=True, exist_ok=True)
+        try:
+            Path(config.out).mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError):
+            raise OSError(f"out must be a folder for runs, but {config.out} is a file or lies below one") from None
         free = shutil.disk_usage(config.out).free
         if free < ROOM_NEEDED:
             raise OSError(f"{config.out} has {free / 2**20:.0f} MiB left, a run may need {ROOM_NEEDED / 2**20:.0f} MiB")
-        for suffix in itertools.count(1):  # runs may start within the same second
-            path = Path(config.out) / (name if suffix == 1 else f"{name}-{suffix}")
-            try:
+        while True:  # runs may start within the same second
+            path = unused_path(Path(config.out) / name)
+            with contextlib.suppress(FileExistsError):
                 path.mkdir()
                 break
-            except FileExistsError:
-                continue
         values = {"algorithm": config.algorithm, **dataclasses.asdict(config)}
         (path / "config.json").write_text(json.dumps(values, default=str, indent=2) + "\n")
         return cls(path)
@@ -82,38 +91,40 @@ class RunFolder:
         """Returns the settings of the run, with ``overrides`` on top, such as ``device="cpu"`` for a run from CUDA.
 
         Raises:
-            ValueError: it was trained by an algorithm that this release has not, or a field is out of range.
+            ValueError: ``config.json`` is damaged, or of another release.
         """
-        values = json.loads((self.path / "config.json").read_text())
-        values.update(out=Path(values["out"]), hidden=tuple(values["hidden"]))
-        algorithm = values.pop("algorithm", None)
-        if algorithm not in CONFIGS:
-            raise ValueError(f"{self.path} was trained by {algorithm!r}, this release has {', '.join(CONFIGS)}")
-        return CONFIGS[algorithm](**{**values, **overrides})
+        path = self.path / "config.json"
+        try:
+            values = json.loads(path.read_text())
+            values.update(out=Path(values["out"]), hidden=tuple(values["hidden"]))
+            algorithm = check_choice("algorithm", values.pop("algorithm", None), CONFIGS)
+            return CONFIGS[algorithm](**{**values, **overrides})
+        except (ValueError, TypeError, LookupError, AttributeError) as error:
+            raise ValueError(f"{path} cannot be read as the settings of a run: {error}") from error
 
     @property
     def video(self) -> Path:
-        """Where the video lies."""
+        """The video of the trained policy."""
         return self.path / "video.mp4"
 
     @property
     def policy(self) -> Path:
-        """Where the trained policy lies, without what only training needs."""
+        """The trained policy, without the parts that only training needs."""
         return self.path / "policy.safetensors"
 
     @property
     def has_checkpoint(self) -> bool:
-        """Whether there is something to resume from."""
+        """Whether there is a checkpoint to resume from."""
         return (self.path / "checkpoint.pt").is_file()
 
     @property
-    def bad_world(self) -> Path:
-        """Where the first world lies that did not stay finite, if any."""
-        return self.path / "bad_world.safetensors"
+    def nan_dump(self) -> Path:
+        """State and action from which a world first became non-finite, if any."""
+        return self.path / "nan_dump.safetensors"
 
     @property
     def is_finished(self) -> bool:
-        """Whether the trained policy has had its last evaluation."""
+        """Whether the trained policy had its last evaluation."""
         return self.policy.is_file() and "mean" in Policy.load(self.policy, "cpu").info
 
     def append_metrics(self, row: dict[str, Any]) -> None:
@@ -140,14 +151,14 @@ class RunFolder:
         return self._read("evaluations.csv")
 
     def forget_after(self, frames: int) -> None:
-        """Removes the lines of metrics and evaluations after so many ``frames``: a resumed run writes them again."""
+        """Removes the lines of metrics and evaluations after ``frames`` frames: a resumed run writes them again."""
         for name in ("metrics.csv", "evaluations.csv"):
             path, part = self.path / name, self.path / f"{name}.part"
             if not path.exists():
                 continue
             head, *lines = path.read_text().splitlines()
             at, count = head.split(",").index("frames"), head.count(",")
-            whole = [line for line in lines if line.count(",") == count]  # a crash may have torn the last one
+            whole = [line for line in lines if line.count(",") == count]  # a crash may have cut the last one
             part.write_text("\n".join([head, *(line for line in whole if float(line.split(",")[at]) <= frames)]) + "\n")
             part.replace(path)
 
@@ -168,10 +179,20 @@ class RunFolder:
             return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
 
     def save_checkpoint(self, entries: dict[str, Any]) -> None:
-        """Writes ``entries`` as the checkpoint; a crash while writing leaves the previous one."""
-        part = self.path / "checkpoint.pt.part"
-        torch.save({"version": CHECKPOINT_VERSION, **entries}, part)
-        part.replace(self.path / "checkpoint.pt")
+        """Writes ``entries`` as the checkpoint; a crash while writing leaves the previous one.
+
+        Raises:
+            OSError: it cannot be written, for example because the disk is full.
+        """
+        buffer = io.BytesIO()  # torch's own writer does not say what went wrong
+        torch.save({"version": CHECKPOINT_VERSION, **entries}, buffer)
+        path, part = self.path / "checkpoint.pt", self.path / "checkpoint.pt.part"
+        try:
+            part.write_bytes(buffer.getbuffer())
+            part.replace(path)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise OSError(error.errno, f"{error.strerror}; the previous checkpoint is kept", str(path)) from error
 
     def load_checkpoint(self, device: torch.device | str) -> dict[str, Any]:
         """Reads the checkpoint without executing code.
@@ -181,13 +202,13 @@ class RunFolder:
 
         Raises:
             FileNotFoundError: the run has none yet.
-            ValueError: it is of another version, or no checkpoint at all.
+            ValueError: it is damaged, or of another version.
         """
         path = self.path / "checkpoint.pt"
         if not self.has_checkpoint:
-            raise FileNotFoundError(f"{self.path} has no checkpoint.pt: the run did not get that far, train anew")
+            raise FileNotFoundError(f"{self.path} has no checkpoint.pt yet: train again")
         try:
-            with zipfile.ZipFile(path) as archive:  # torch.load looks at no checksum
+            with zipfile.ZipFile(path) as archive:  # torch.load ignores the checksums
                 damaged = archive.testzip()
             if damaged is not None:
                 raise ValueError(f"{damaged} is damaged")

@@ -1,4 +1,4 @@
-"""The training loop: collect, update, write down; now and then evaluate and save; at the end draw and record."""
+"""The training loop: collect, update, log; evaluate and save now and then; plot and record at the end."""
 
 import contextlib
 import math
@@ -14,15 +14,15 @@ from torch.utils.tensorboard import SummaryWriter
 from torchrl.envs import EnvBase, FrameSkipTransform
 from tqdm.auto import tqdm
 
-from torchrl_loco.checks import check_count, check_device, check_seed
+from torchrl_loco.checks import SEED, check_device, check_int
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs.autoreset import TransformedEnv
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import env_class, make
-from torchrl_loco.training.algorithm import Algorithm
+from torchrl_loco.training.actor import deterministic_policy
+from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.config import TrainingConfig
-from torchrl_loco.training.evaluation import Evaluator, describe, record, summarize
-from torchrl_loco.training.networks import deterministic, settings_for_small_networks
+from torchrl_loco.training.evaluation import Evaluator, describe, poor_return, record, summarize
 from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.ppo import PPO
 from torchrl_loco.training.reppo import REPPO
@@ -32,12 +32,12 @@ ALGORITHMS: dict[str, Callable[[Any], Algorithm]] = {"ppo": PPO, "reppo": REPPO}
 
 
 class Trainer:
-    """A run in progress: environment, algorithm, collector and counters.
+    """A training run: environment, algorithm, collector and counters.
 
     Args:
-        run: where the settings are read from and everything is written to.
-        resume: whether to go on from the run's checkpoint, exactly: on the CPU, a run that was stopped and resumed
-            equals one that was not, bit for bit.
+        run: the folder from which settings are read and into which everything is written.
+        resume: whether to continue from the run's checkpoint. On the CPU, a run that was stopped and resumed equals one
+            that was not, bit for bit.
 
     Raises:
         FileNotFoundError: there is no checkpoint to resume from.
@@ -50,7 +50,7 @@ class Trainer:
         check_device(config.device)
         checkpoint = run.load_checkpoint(config.device) if resume else None
         torch.manual_seed(config.seed)
-        self.env = make_env(config, run.bad_world)
+        self.env = make_env(config, run.nan_dump)
         self.algorithm = ALGORITHMS[config.algorithm](config)
         self.collector = RolloutCollector(self.env, self.algorithm.actor, frames_per_batch=config.batch_size)
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
@@ -59,14 +59,14 @@ class Trainer:
         self._evaluator: Evaluator | None = None
 
     def train(self) -> None:
-        """Trains to the last frame, then draws the learning curve and records a video.
+        """Trains to the last frame, then evaluates the best policy, plots the learning curve and records a video.
 
         A progress bar shows the return (mean reward of the last batch times the length of an episode) and the frames
-        per second. At Ctrl-C, or SIGTERM, the iteration is finished and a checkpoint written before KeyboardInterrupt
-        is raised; a second one ends at once.
+        per second. At Ctrl-C or SIGTERM the iteration is finished and a checkpoint written before KeyboardInterrupt is
+        raised; a second one stops at once.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C was pressed, or the process asked to end.
+            KeyboardInterrupt: Ctrl-C or SIGTERM.
         """
         with settings_for_small_networks():
             self._train()
@@ -97,7 +97,7 @@ class Trainer:
 
     @property
     def device_name(self) -> str:
-        """What the device calls itself."""
+        """Name of the device."""
         device = self.algorithm.device
         return torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
 
@@ -109,7 +109,7 @@ class Trainer:
     def _iterate(self) -> dict[str, float]:
         """Returns the metrics of collecting a batch and updating on it; reads from the device once."""
         config, algorithm, start = self.config, self.algorithm, time.perf_counter()
-        full_length = env_class(config.task).defaults.episode_length  # that of training may be shorter
+        full_length = env_class(config.task).defaults.episode_length  # in training, episodes may be shorter
         batch = self.collector.rollout()
         reward = batch["next", "reward"].mean() / config.action_repeat
         metrics = algorithm.update(batch, progress=self.frames / config.total_frames)
@@ -132,11 +132,11 @@ class Trainer:
         return interval > 0 and self.frames % interval < self.config.frames_per_batch
 
     def _evaluate(self) -> dict[str, float]:
-        """Returns the summary of an evaluation of the policy of the moment, which is kept if none before was better."""
+        """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""
         if self._evaluator is None:
             self._evaluator = make_evaluator(self.config, seed=evaluation_seed(self.config, 0))
         when = {"frames": self.frames, "seconds": round(self.seconds, 3)}
-        policy = deterministic(self.algorithm.actor, self.config, {**when, "trained_on": self.device_name})
+        policy = deterministic_policy(self.algorithm.actor, self.config, {**when, "trained_on": self.device_name})
         summary = summarize(self._evaluator(policy))
         best = max((row["mean"] for row in self.run.read_evaluations()), default=-math.inf)
         self.run.append_evaluation({**when, **summary})
@@ -145,7 +145,7 @@ class Trainer:
         return summary
 
     def _finish(self) -> None:
-        """Evaluates the best policy anew, in episodes that did not choose it, draws the curve and records a video."""
+        """Evaluates the best policy in episodes that did not select it, plots the learning curve, records a video."""
         config = self.config
         policy = Policy.load(self.run.policy, config.device)
         summary = evaluate_run(self.run)
@@ -155,10 +155,12 @@ class Trainer:
             record(policy, env, self.run.video, config.video_seconds, config.action_repeat)
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
-        print(f"best policy, evaluated anew: {describe(summary)}")
+        print(f"best policy, in new episodes: {describe(summary)}")
+        if note := poor_return(config, summary):
+            print(note)
 
     def save(self) -> None:
-        """Writes the checkpoint: all that an exact continuation needs."""
+        """Writes the checkpoint, from which a run continues exactly."""
         on_cuda = self.algorithm.device.type == "cuda"
         self.run.save_checkpoint(
             {
@@ -175,7 +177,9 @@ class Trainer:
     def _load(self, checkpoint: dict[str, Any]) -> None:
         self.frames, self.iteration, self.seconds = (checkpoint[key] for key in ("frames", "iteration", "seconds"))
         if self.frames >= self.last_frame and self.run.is_finished:
-            raise ValueError(f"{self.run.path} is complete: it has all of its {self.frames} frames")
+            raise ValueError(
+                f"{self.run.path} is complete: it has all of its {self.frames} frames. Train a new run for more"
+            )
         self.algorithm.load_state_dict(checkpoint["algorithm"])
         self.collector.load_state_dict(checkpoint["collector"])
         self.run.forget_after(self.frames)
@@ -184,10 +188,10 @@ class Trainer:
             torch.cuda.set_rng_state(checkpoint["cuda_rng"].cpu(), self.algorithm.device)
 
 
-def make_env(config: TrainingConfig, bad_world: Path) -> EnvBase:
-    """Returns the environment of a run: it holds an action for ``config.action_repeat`` frames and sums the reward.
+def make_env(config: TrainingConfig, nan_dump: Path) -> EnvBase:
+    """Returns the environment of a run: each action is held for ``config.action_repeat`` frames, rewards are summed.
 
-    Should a world not stay finite, what led to it is written to ``bad_world``, unless an earlier one lies there.
+    If a world becomes non-finite, a NaN dump is written to ``nan_dump``, unless one is already there.
     """
     env = make(
         config.task,
@@ -197,22 +201,22 @@ def make_env(config: TrainingConfig, bad_world: Path) -> EnvBase:
         config.protocol,
         stagger=True,
         episode_length=config.episode_length,
-        bad_world_file=None if bad_world.exists() else bad_world,
+        nan_dump=None if nan_dump.exists() else nan_dump,
     )
     return env if config.action_repeat == 1 else TransformedEnv(env, FrameSkipTransform(config.action_repeat))
 
 
 def make_evaluator(config: TrainingConfig, episodes: int | None = None, seed: int | None = None) -> Evaluator:
-    """Returns the evaluation of a run; ``None`` takes the run's own number, and the seed of its last evaluation."""
-    episodes = check_count("episodes", config.eval_episodes if episodes is None else episodes)
-    seed = evaluation_seed(config, 1) if seed is None else check_seed(seed)
+    """Returns the evaluator of a run; ``None`` takes its number of episodes and the seed of its last evaluation."""
+    episodes = check_int("episodes", config.eval_episodes if episodes is None else episodes)
+    seed = evaluation_seed(config, 1) if seed is None else check_int("seed", seed, SEED)
     return Evaluator(config.task, episodes, config.device, seed, config.protocol, config.action_repeat)
 
 
 def evaluation_seed(config: TrainingConfig, which: int) -> int:
-    """Returns the seed of the episodes that choose the best policy (0) or evaluate it at the end (1).
+    """Returns the seed of the episodes that select the best policy (0) or evaluate it at the end (1).
 
-    They are apart from those of training and from each other.
+    Both differ from the seed of training and from each other.
     """
     return (config.seed + (1 + which) * 1_000_003) % 2**32
 
@@ -225,8 +229,8 @@ def evaluate_run(
     Args:
         run: the run.
         episodes: number of episodes; ``None`` takes the run's own setting.
-        seed: seed that the episodes are drawn from; ``None`` plays those of the run's last evaluation again.
-        device: where to play them; ``None`` takes where the run was trained.
+        seed: seed of the episodes; ``None`` repeats those of the run's last evaluation.
+        device: where to play them; ``None`` takes the device on which the run was trained.
 
     Returns:
         Number, mean, standard deviation and extremes of the returns.
@@ -237,7 +241,9 @@ def evaluate_run(
     """
     config = run.load_config() if device is None else run.load_config(device=device)
     if not run.policy.is_file():
-        way = "torchrl-loco resume goes on with the run" if run.has_checkpoint else "nor a checkpoint, train anew"
+        way = (
+            "continue it with torchrl-loco resume" if run.has_checkpoint else "it has no checkpoint either, train again"
+        )
         raise FileNotFoundError(f"{run.path} has no policy yet: {way}")
     policy = Policy.load(run.policy, config.device)
     with settings_for_small_networks():
@@ -246,9 +252,9 @@ def evaluate_run(
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Yields whether Ctrl-C was pressed or the process asked to end (SIGTERM), instead of ending at the first time.
+    """Yields a function that tells whether SIGINT or SIGTERM has arrived. The first one does not stop the process.
 
-    In a thread, and where a signal is ignored (Ctrl-C by ``nohup``), all is left as it is.
+    Outside the main thread, and for signals that are ignored (as SIGINT is under ``nohup``), nothing is changed.
     """
     pressed = threading.Event()
     in_main = threading.current_thread() is threading.main_thread()

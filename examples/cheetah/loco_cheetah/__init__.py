@@ -7,18 +7,29 @@ import numpy as np
 import warp as wp
 
 from torchrl_loco import LocoEnv, SimConfig
+from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
 
 RUN_SPEED = wp.constant(10.0)
 """Horizontal speed that counts as running (m/s)."""
 
 
+@wp.func
+def cheetah_run_reward(horizontal_velocity: float) -> float:
+    return tolerance(horizontal_velocity, RUN_SPEED, wp.inf, RUN_SPEED, Sigmoid.LINEAR, 0.0)
+
+
 @wp.kernel(enable_backward=False)
 def observe_cheetah(
+    # Model:
+    torso_velocity: int,
+    # Data in:
     qpos_in: wp.array2d[float],
     qvel_in: wp.array2d[float],
     sensordata_in: wp.array2d[float],
+    # In:
     mask_in: wp.array[bool],
+    # Out:
     observation_out: wp.array2d[float],
     reward_out: wp.array[float],
     terms_out: wp.array2d[float],
@@ -26,12 +37,14 @@ def observe_cheetah(
     world = wp.tid()
     if not mask_in[world]:
         return
-    nq = qpos_in.shape[1]
-    for i in range(1, nq):  # where it is along x is nobody's business
-        observation_out[world, i - 1] = qpos_in[world, i]
+    k = int(0)
+    for i in range(1, qpos_in.shape[1]):  # without the position along x
+        observation_out[world, k] = qpos_in[world, i]
+        k += 1
     for i in range(qvel_in.shape[1]):
-        observation_out[world, nq - 1 + i] = qvel_in[world, i]
-    move = tolerance(sensordata_in[world, 0], RUN_SPEED, wp.inf, RUN_SPEED, Sigmoid.LINEAR, 0.0)
+        observation_out[world, k + i] = qvel_in[world, i]
+
+    move = cheetah_run_reward(sensordata_in[world, torso_velocity])  # along x
     terms_out[world, 0] = move
     reward_out[world] = move
 
@@ -42,7 +55,7 @@ class CheetahRun(LocoEnv):
     Observation: height and pitch of the torso and the hinges, qpos[1:] (8, m and rad); qvel (9, m/s and rad/s).
     Action: torques of the hinges as a share of their gear, in [-1, 1] (6).
     Reward: ``move``, the center of mass's speed along x as a share of 10 m/s, clipped to [0, 1].
-    Start: at rest, in one of 256 poses that random ones have settled into.
+    Start: at rest, in one of 256 poses into which random poses have settled.
     Source: dm_control ``suite/cheetah.py``; the settings under ``playground`` are MuJoCo Playground's.
     """
 
@@ -52,15 +65,17 @@ class CheetahRun(LocoEnv):
     observation_size = 17
     term_names = ("move",)
 
-    def _observation_kernel(self) -> tuple[wp.Kernel, list]:
-        d = self.sim.data
-        return observe_cheetah, [d.qpos, d.qvel, d.sensordata]
+    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
+        """Returns the kernel that writes observation and reward, and its inputs."""
+        torso_velocity = int(self.mj_model.sensor("torso_velocity").adr[0])
+        data = world.sim.data
+        return observe_cheetah, [torso_velocity, data.qpos, data.qvel, data.sensordata]
 
-    def _initial_poses(self) -> np.ndarray:
-        """Returns random poses that have settled for 2 s, as dm_control lets them before each episode.
+    def initial_poses(self) -> np.ndarray:
+        """Returns random poses that have settled for 2 s, as dm_control lets them settle before each episode.
 
-        Worlds of a batch begin at different times, so that they cannot settle in place; and they need not, because the
-        springs bring the draws back to much the same standing pose. The slight motion that remains is left out.
+        The worlds of a batch begin their episodes at different times, so they cannot settle in place. The springs bring
+        the hinges back to much the same standing pose; the slight motion that remains is left out.
         """
         model, rng = self.mj_model, np.random.default_rng(0)
         hinges = slice(3, None)  # x, z and pitch of the torso come first

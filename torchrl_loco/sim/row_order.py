@@ -1,7 +1,7 @@
-"""Constraint rows in an order of their own, whichever came first: what makes a rollout on CUDA repeat bit for bit.
+"""Sorts the constraint rows of each world, so that a rollout on CUDA repeats bit for bit.
 
-mujoco_warp hands out rows and contacts as its threads arrive, and the solver adds them up in that order, which decides
-how sums are rounded. Its own mode, ``opt.deterministic``, mends the additions; the ordering is empty in 4.0.
+mujoco_warp allocates rows and contacts in the order in which its threads arrive, and the solver sums in that order,
+which decides the rounding. Its own mode, ``opt.deterministic``, makes sums deterministic but, in 4.0, not the order.
 """
 
 from typing import Any
@@ -11,15 +11,15 @@ import mujoco_warp as mjw
 import warp as wp
 
 ROW_FIELDS = ("type", "id", "pos", "margin", "D", "vel", "aref", "frictionloss")
-"""Numbers of a constraint row, which move with its Jacobian."""
+"""Fields of a constraint row, which move with its Jacobian."""
 
 FIRST_CONTACT = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS))
-"""Least type of a row whose id is a contact; that of all others is fixed by the model."""
+"""Lowest type of a row whose id is a contact; the ids of all other types are fixed by the model."""
 
 
 @wp.struct
 class RowKey:
-    """What decides where a row stands. The members are compared one after the other."""
+    """Sort key of a row: the members are compared one after the other."""
 
     type: int
     first: int
@@ -62,7 +62,7 @@ def rank_rows(
     # Out:
     rank_out: wp.array2d[int],
 ):
-    """Counts the rows that come before each row: its place."""
+    """Counts the rows that come before each row: its rank."""
     world, row = wp.tid()
     rows = wp.min(nefc_in[world], rank_out.shape[1])
     if row >= rows:
@@ -85,13 +85,13 @@ def move_rows(
     # Out:
     rows_out: wp.array3d[Any],
 ):
-    """Moves a column of the rows to their places, in place: each cycle of the permutation from its least row."""
+    """Permutes a column of the rows in place: each cycle of the permutation starts at its lowest row."""
     world, column = wp.tid()
     for start in range(wp.min(nefc_in[world], rank_in.shape[1])):
         row = rank_in[world, start]
         while row > start:
             row = rank_in[world, row]
-        if row < start:  # not the least of its cycle
+        if row < start:  # not the lowest of its cycle
             continue
         carried = rows_out[world, start, column]
         row = rank_in[world, start]
@@ -113,7 +113,7 @@ def follow_rows(
     # Data out:
     contact_efc_address_out: wp.array2d[int],
 ):
-    """Tells the contacts where their rows are now."""
+    """Updates the row addresses of the contacts."""
     contact, i = wp.tid()
     if contact >= nacon_in[0]:
         return
@@ -123,14 +123,14 @@ def follow_rows(
 
 
 class RowOrder:
-    """Puts the constraint rows of every world into the order of the model: by type, then joint, or pair of geoms.
+    """Sorts the constraint rows of every world by type, then by joint or pair of geoms.
 
     Args:
         model: the model.
         data: the data whose rows :meth:`apply` moves, between ``mujoco_warp.step1`` and ``step2``.
 
     Raises:
-        ValueError: the model has something else whose order is not fixed.
+        ValueError: the model has something else whose order varies.
     """
 
     def __init__(self, model: mjw.Model, data: mjw.Data) -> None:
@@ -158,7 +158,7 @@ class RowOrder:
 
 
 def check_order(model: mjw.Model) -> None:
-    """Checks that constraint rows are all that arrives in any order before the solver starts.
+    """Checks that constraint rows are all that varies in order before the solver starts.
 
     Raises:
         ValueError: they are not.
@@ -175,4 +175,4 @@ def check_order(model: mjw.Model) -> None:
     }
     found = [name for name, here in others.items() if here]
     if found:
-        raise ValueError(f"deterministic=True does not know models with {', '.join(found)}: leave it out")
+        raise ValueError(f"deterministic=True does not support models with {', '.join(found)}: leave it out")

@@ -1,4 +1,4 @@
-"""Kernels are compiled before they are needed, all of them, and compiling does nothing else."""
+"""All kernels are compiled before they are needed, and compiling launches none."""
 
 import threading
 import time
@@ -10,7 +10,7 @@ import warp as wp
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS, sim_config
 from torchrl_loco.sim import Simulation
-from torchrl_loco.sim.kernels import compile_kernels
+from torchrl_loco.sim.compilation import compile_kernels
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -18,11 +18,11 @@ def count(total: wp.array[int]):
     wp.atomic_add(total, 0, 1)
 
 
-@pytest.mark.parametrize("protocol", ["playground", "dm_control"])  # without and with a condition in the solver
-@pytest.mark.parametrize("body", ["walker", "humanoid"])
+# Without and with a condition in the solver.
+@pytest.mark.parametrize(("body", "protocol"), [("walker", "playground"), ("humanoid", "dm_control")])
 def test_a_step_finds_every_kernel_compiled(body, protocol, device, monkeypatch):
     config = sim_config(DEFAULTS[body], protocol, 2, {})
-    sim = Simulation(models.load(body), config, 2, torch.device(device))
+    sim = Simulation(models.load(models.PATHS[body]), config, 2, torch.device(device))
     sim.compile(sim.step)
     load, asked = wp.Module.load, []
 
@@ -80,16 +80,16 @@ def test_an_error_leaves_warp_as_it_was():
 
 
 def test_two_threads_may_compile_at_once():
-    """Neither puts back what the other put in place."""
+    """Neither restores what the other has replaced."""
     before, total = wp.Module.load, wp.zeros(1, dtype=int, device="cpu")
     entered = threading.Event()
 
     def slow():
         entered.set()
-        time.sleep(0.3)
+        time.sleep(0.1)
 
     one = threading.Thread(target=compile_kernels, args=([slow], wp.get_device("cpu")))
-    other = threading.Thread(target=compile_kernels, args=([lambda: time.sleep(0.6)], wp.get_device("cpu")))
+    other = threading.Thread(target=compile_kernels, args=([lambda: time.sleep(0.2)], wp.get_device("cpu")))
     one.start()
     entered.wait()
     other.start()

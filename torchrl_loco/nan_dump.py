@@ -1,5 +1,6 @@
-"""What a bad world file holds, stepped again in Warp and in C MuJoCo."""
+"""A NaN dump: the state and action from which a world was no longer finite, stepped again in Warp and in C MuJoCo."""
 
+import contextlib
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,32 +14,32 @@ from tensordict import TensorDict
 from torchrl_loco import models, storage
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs import LocoEnv, State
-from torchrl_loco.envs.bad_world import KIND
-from torchrl_loco.envs.episode import MAX_VALUE
-from torchrl_loco.registry import usable_classes
+from torchrl_loco.envs.kernels import MAX_VALUE
+from torchrl_loco.envs.monitors import NAN_DUMP
+from torchrl_loco.registry import env_class, list_envs
 from torchrl_loco.sim.simulation import set_options
 
 STATE = ("qpos", "qvel", "qacc_warmstart")
 RESETS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-"""Warnings with which C MuJoCo resets a world."""
+"""Warnings at which C MuJoCo resets a world."""
 
 
 @dataclasses.dataclass(frozen=True)
-class BadWorld:
-    """A world from which a control step made one that is not finite.
+class NanDump:
+    """What led to a world that is not finite: its state and action before the control step, and its settings.
 
     Attributes:
         tensors: ``qpos`` ``(nq,)``, ``qvel`` ``(nv,)``, ``qacc_warmstart`` ``(nv,)`` and ``action`` ``(nu,)``, before
             the step.
         settings: ``env`` (module and name of the class), ``protocol``, ``config``, ``seed``, ``device``, ``num_envs``,
-            and ``world``, ``episode`` and ``elapsed_steps`` at the time.
+            ``world_offset``, and ``world``, ``episode`` and ``elapsed_steps`` before the step.
     """
 
     tensors: dict[str, torch.Tensor]
     settings: dict[str, Any]
 
     def make_env(self, device: torch.device | str | None = None, **config: Any) -> LocoEnv:
-        """Returns an environment of one world as the file describes it, with ``config`` on top."""
+        """Returns an environment of one world with the settings of the dump, and ``config`` on top."""
         env, settings = _classes()[self.settings["env"]], {**self.settings["config"], **config}
         return env(1, device, self.settings["seed"], self.settings["protocol"], on_overflow="ignore", **settings)
 
@@ -48,31 +49,36 @@ class BadWorld:
         return State({name: self.tensors[name][None] for name in STATE}, batch_size=[1])
 
 
-def load(path: Path) -> BadWorld:
-    """Returns what a bad world file holds, read without executing code.
+def load(path: Path) -> NanDump:
+    """Returns a NaN dump, read without executing code.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is something else, damaged, or of an environment that is not here.
+        ValueError: it is no NaN dump, damaged, or of an environment that is not installed.
     """
-    world = BadWorld(*storage.load(path, KIND))
+    dump = NanDump(*storage.load(path, NAN_DUMP))
     names = _classes()
-    if world.settings["env"] not in names:
-        raise ValueError(f"{path} is of {world.settings['env']!r}, there are {', '.join(names)}")
-    return world
+    if dump.settings["env"] not in names:
+        raise ValueError(f"{path} is of {dump.settings['env']!r}; installed are {', '.join(names)}")
+    return dump
 
 
 def _classes() -> dict[str, type[LocoEnv]]:
-    """Returns the classes of all environments by module and name, as a bad world file names them."""
-    return {f"{env.__module__}.{env.__qualname__}": env for env in usable_classes()}
+    """Returns the classes of all environments by module and name, without those of broken plug-ins."""
+    classes: dict[str, type[LocoEnv]] = {}
+    for id in list_envs():
+        with contextlib.suppress(ImportError):
+            env = env_class(id)
+            classes[f"{env.__module__}.{env.__qualname__}"] = env
+    return classes
 
 
-def warp_trace(world: BadWorld, device: torch.device | str | None = None) -> np.ndarray:
+def warp_trace(dump: NanDump, device: torch.device | str | None = None) -> np.ndarray:
     """Returns qpos and qvel after each substep in Warp, shape ``(substeps + 1, nq + nv)``, the start included."""
-    config = SimConfig(**world.settings["config"])
-    env = world.make_env(device, ctrl_dt=config.sim_dt)  # an action a substep, to see them all
-    env.reset(world.state.to(env.device), set_state=True)
-    action = TensorDict({"action": world.tensors["action"][None]}, batch_size=[1]).to(env.device)
+    config = SimConfig(**dump.settings["config"])
+    env = dump.make_env(device, ctrl_dt=config.sim_dt)  # one substep per step, to see them all
+    env.reset(dump.state.to(env.device), set_state=True)
+    action = TensorDict({"action": dump.tensors["action"][None]}, batch_size=[1]).to(env.device)
     trace = [env.get_state()]
     for _ in range(config.substeps):
         env.step(action.clone())
@@ -80,19 +86,19 @@ def warp_trace(world: BadWorld, device: torch.device | str | None = None) -> np.
     return np.stack([torch.cat([state["qpos"][0], state["qvel"][0]]).cpu().numpy() for state in trace])
 
 
-def c_trace(world: BadWorld) -> np.ndarray:
+def mujoco_trace(dump: NanDump) -> np.ndarray:
     """Returns the same as :func:`warp_trace`, from C MuJoCo in double precision.
 
     C MuJoCo resets a world that is not finite; from there on the trace is NaN.
     """
-    config = SimConfig(**world.settings["config"])
-    model = models.from_path(_classes()[world.settings["env"]].mjcf)
+    config = SimConfig(**dump.settings["config"])
+    model = models.load(_classes()[dump.settings["env"]].mjcf)
     set_options(model, config)
     data = mujoco.MjData(model)
     for name in STATE:
-        getattr(data, name)[:] = world.tensors[name].numpy()
+        getattr(data, name)[:] = dump.tensors[name].numpy()
     trace = [np.concatenate([data.qpos, data.qvel])]
-    data.ctrl[:] = world.tensors["action"].numpy()
+    data.ctrl[:] = dump.tensors["action"].numpy()
     mujoco.set_mju_user_warning(lambda message: None)  # else it prints, and writes a log into the working directory
     try:
         for _ in range(config.substeps):
@@ -104,32 +110,33 @@ def c_trace(world: BadWorld) -> np.ndarray:
     return np.stack(trace)
 
 
-def describe(world: BadWorld, device: torch.device | str | None = None) -> Iterator[str]:
-    """Yields lines of text: where the world was, what is wrong with it, and how it goes on in Warp and C MuJoCo.
+def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterator[str]:
+    """Describes where the world was, what is wrong with it, and the results of the step in Warp and in C MuJoCo.
 
     Yields:
-        The lines.
+        Lines of text.
     """
-    settings = world.settings
+    settings = dump.settings
     env = settings["env"].split(".")[-1]
     yield (
         f"{env}, protocol {settings['protocol']}, seed {settings['seed']}: world {settings['world']} of "
         f"{settings['num_envs']} on {settings['device']}, episode {settings['episode']}, "
         f"after {settings['elapsed_steps']} steps"
     )
-    bad = {name: ~(world.tensors[name].abs() < MAX_VALUE) for name in (*STATE, "action")}
+    bad = {name: ~(dump.tensors[name].abs() < MAX_VALUE) for name in STATE}
+    bad["action"] = ~dump.tensors["action"].isfinite()  # finite ones are clipped
     wrong = [name for name in bad if bad[name].any()]
     for name in wrong:
-        entries = ", ".join(f"{i} is {world.tensors[name][i]}" for i in torch.nonzero(bad[name]).flatten().tolist())
+        entries = ", ".join(f"{i} is {dump.tensors[name][i]}" for i in torch.nonzero(bad[name]).flatten().tolist())
         yield f"{name} is not finite before the step: entry {entries}"
     if "action" in wrong:
-        yield "such an action ends its world, which is stepped with zeros instead"
+        yield "an action that is not finite terminates its world, which is stepped with zeros instead"
     if any(name in STATE for name in wrong):
-        yield "it was written into the simulation from outside: there is nothing to step"
+        yield "this state was written into the simulation from outside: there is nothing to step"
         return
-    warp, c = warp_trace(world, device), c_trace(world)
+    warp, c = warp_trace(dump, device), mujoco_trace(dump)
     yield f"{'substep':>7}  {'largest |qvel| in Warp':>22}  {'in C MuJoCo':>12}  {'largest difference':>18}"
-    nq = len(world.tensors["qpos"])
+    nq = len(dump.tensors["qpos"])
     for i, (ours, theirs) in enumerate(zip(warp, c, strict=True)):
         speeds = (np.abs(values[nq:]).max() for values in (ours, theirs))
         yield "{:>7}  {:>22.6g}  {:>12.6g}  {:>18.3g}".format(i, *speeds, np.abs(ours - theirs).max())

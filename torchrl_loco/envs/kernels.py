@@ -1,4 +1,4 @@
-"""The course of an episode as kernels: action in, finiteness, time limit, beginning anew."""
+"""The course of an episode as kernels: action in, values that are not finite, time limit, new episode."""
 
 import warp as wp
 
@@ -20,56 +20,57 @@ def apply_action(
     # Data out:
     ctrl_out: wp.array2d[float],
     # Out:
-    bad_out: wp.array[bool],
+    non_finite_out: wp.array[bool],
 ):
+    """Clips the action into ``ctrl``. A world whose action is NaN or infinite is marked, and stepped with zeros."""
     world = wp.tid()
-    bad = bool(False)
+    non_finite = bool(False)
     for i in range(action_in.shape[1]):
-        if not is_finite(action_in[world, i]):
-            bad = True
+        if not wp.isfinite(action_in[world, i]):
+            non_finite = True
     for i in range(action_in.shape[1]):
-        ctrl_out[world, i] = wp.where(bad, 0.0, action_in[world, i])
-    bad_out[world] = bad
+        ctrl_out[world, i] = wp.where(non_finite, 0.0, wp.clamp(action_in[world, i], -1.0, 1.0))
+    non_finite_out[world] = non_finite
 
 
 @wp.kernel(enable_backward=False)
-def quench(
+def zero_non_finite(
     # In:
     mask_in: wp.array[bool],
     # Data in:
     qpos_in: wp.array2d[float],
     qvel_in: wp.array2d[float],
     # Out:
-    bad_out: wp.array[bool],
+    non_finite_out: wp.array[bool],
     observation_out: wp.array2d[float],
     reward_out: wp.array[float],
     terms_out: wp.array2d[float],
 ):
-    """Marks worlds that are no longer finite as bad, and zeroes what bad worlds report."""
+    """Marks worlds that are no longer finite, and zeroes observation, reward and terms of all marked worlds."""
     world = wp.tid()
     if not mask_in[world]:
         return
-    bad = bad_out[world]
+    non_finite = non_finite_out[world]
     for i in range(qpos_in.shape[1]):
-        bad = bad or not is_finite(qpos_in[world, i])
+        non_finite = non_finite or not is_finite(qpos_in[world, i])
     for i in range(qvel_in.shape[1]):
-        bad = bad or not is_finite(qvel_in[world, i])
+        non_finite = non_finite or not is_finite(qvel_in[world, i])
     for i in range(observation_out.shape[1]):
-        bad = bad or not is_finite(observation_out[world, i])
-    bad = bad or not is_finite(reward_out[world])
-    if bad:
+        non_finite = non_finite or not is_finite(observation_out[world, i])
+    non_finite = non_finite or not is_finite(reward_out[world])
+    if non_finite:
         for i in range(observation_out.shape[1]):
             observation_out[world, i] = 0.0
         for i in range(terms_out.shape[1]):
             terms_out[world, i] = 0.0
         reward_out[world] = 0.0
-    bad_out[world] = bad
+    non_finite_out[world] = non_finite
 
 
 @wp.kernel(enable_backward=False)
 def count_step(
     # In:
-    bad_in: wp.array[bool],
+    non_finite_in: wp.array[bool],
     episode_length: int,
     # Out:
     elapsed_steps_out: wp.array[int],
@@ -77,13 +78,14 @@ def count_step(
     terminated_out: wp.array[bool],
     truncated_out: wp.array[bool],
 ):
+    """Counts a control step: a world is truncated at the time limit, and terminated if it is not finite."""
     world = wp.tid()
     elapsed_steps = elapsed_steps_out[world] + 1
     truncated = elapsed_steps >= episode_length
     elapsed_steps_out[world] = elapsed_steps
-    terminated_out[world] = bad_in[world]
+    terminated_out[world] = non_finite_in[world]
     truncated_out[world] = truncated
-    done_out[world] = truncated or bad_in[world]
+    done_out[world] = truncated or non_finite_in[world]
 
 
 @wp.kernel(enable_backward=False)
@@ -103,27 +105,31 @@ def begin_episode(
     mask_in: wp.array[bool],
     stagger_in: wp.array[bool],
     seed_in: wp.array[wp.uint32],
+    world_offset: int,
     episode_length: int,
     # Out:
     episode_out: wp.array[int],
+    stream_out: wp.array[wp.uint32],
     elapsed_steps_out: wp.array[int],
-    bad_out: wp.array[bool],
+    non_finite_out: wp.array[bool],
     done_out: wp.array[bool],
     terminated_out: wp.array[bool],
     truncated_out: wp.array[bool],
 ):
+    """Starts the next episode: its random stream, its clock, its flags."""
     world = wp.tid()
     if not mask_in[world]:
         return
     episode = episode_out[world]
     elapsed_steps = int(0)
     if stagger_in[0]:
-        # The complement of the episode keeps this stream apart from the one that draws the pose.
-        stream = world_stream(seed_in, world, -1 - episode)
+        # The complement of the episode separates this stream from the one that draws the pose.
+        stream = world_stream(seed_in[0], world_offset + world, -1 - episode)
         elapsed_steps = wp.randi(stream, 0, episode_length)
+    stream_out[world] = world_stream(seed_in[0], world_offset + world, episode)
     episode_out[world] = episode + 1
     elapsed_steps_out[world] = elapsed_steps
-    bad_out[world] = False
+    non_finite_out[world] = False
     done_out[world] = False
     terminated_out[world] = False
     truncated_out[world] = False

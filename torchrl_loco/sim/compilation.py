@@ -1,4 +1,4 @@
-"""Compiles the kernels of recorded work before it first runs: side by side, and under a progress bar."""
+"""Compiles the kernels of a launch before it first runs: in parallel, and with a progress bar."""
 
 import contextlib
 import os
@@ -11,7 +11,7 @@ import warp as wp
 from tqdm.auto import tqdm
 
 SHOW_AFTER = 2.0
-"""Seconds after which the progress bar appears; kernels from the cache are there before."""
+"""Seconds after which the progress bar appears; loading from the cache is faster."""
 
 _COLLECTING = threading.Lock()
 
@@ -19,11 +19,11 @@ _COLLECTING = threading.Lock()
 def compile_kernels(launches: Iterable[Callable[[], None]], device: wp.Device) -> None:
     """Compiles and loads the kernels that ``launches`` would launch, without launching any.
 
-    Warp compiles a module when a kernel of it is first launched, one module after another. Known beforehand, they are
-    compiled on all cores, and how many are left can be shown.
+    Warp compiles a module when one of its kernels is first launched, one module after another. Once the modules are
+    known they can be compiled on all cores, and the progress bar knows how many are left.
 
     Args:
-        launches: make the launches. Whatever else they do is done.
+        launches: functions that make the launches. Whatever else they do takes effect.
         device: the Warp device.
     """
     with wp.ScopedDevice(device), _collecting() as variants:
@@ -40,11 +40,11 @@ def compile_kernels(launches: Iterable[Callable[[], None]], device: wp.Device) -
 
 @contextlib.contextmanager
 def _collecting() -> Iterator[dict[tuple[wp.Module, int], None]]:
-    """Yields the modules and block sizes, in order, that this thread's launches ask for; the launches come to nothing.
+    """Yields the modules and block sizes, in order, that this thread's launches need; the launches do nothing.
 
-    A launch asks its module for an executable and returns if there is none. What is conditional is gone through once.
+    A launch asks its module for an executable and returns if there is none. Conditional bodies are visited once.
     """
-    with _COLLECTING:  # one at a time: two would put back each other's
+    with _COLLECTING:  # one at a time: two would restore each other's functions
         yield from _collect()
 
 

@@ -1,0 +1,133 @@
+"""Closing an environment frees its memory; a reset opens it again."""
+
+import gc
+import weakref
+
+import pytest
+import torch
+from conftest import COARSE, assert_repeats, played
+
+import torchrl_loco
+from torchrl_loco.envs import world
+
+WORLDS = 4
+
+
+def made(device="cpu", seed=0, **options):
+    return torchrl_loco.make("walker_walk", WORLDS, device, seed, episode_length=6, **COARSE, **options)
+
+
+def test_closed_means_closed():
+    env = made()
+    td = env.reset()
+    env.close()
+    env.close()
+    assert env.is_closed
+    for use in (
+        lambda: env.step(td.set("action", torch.zeros(WORLDS, 6))),
+        lambda: env.world,
+        lambda: env.sim,
+        env.health,
+        env.get_state,
+        env.render,
+        env.state_dict,
+    ):
+        with pytest.raises(RuntimeError, match=r"this WalkerWalk is closed: reset\(\) opens it again"):
+            use()
+    mask = torch.tensor([[True], [False], [False], [False]])
+    with pytest.raises(ValueError, match="reset all of them"):
+        env.reset(td.set("_reset", mask))
+    assert env.mj_model.nu == 6
+    env.set_seed(7)
+    assert torch.equal(env.reset()["observation"], made(seed=7).reset()["observation"])
+
+
+def test_reset_opens_it_again(device, tmp_path, actions):
+    """As it was when it was made, but its random streams go on."""
+    options = {"reward_terms": True, "nan_dump": tmp_path / "dump"}
+    env, never_closed = made(device, **options), made(device)
+    moves = actions(env, 8)
+    for other in (env, never_closed):
+        played(other, moves)
+    env.close()
+    assert_repeats(played(env, moves), played(never_closed, moves))
+    assert env.health()["total", "non_finite"] == 0
+    assert not env.is_closed
+    env.step(env.reset().set("action", torch.full_like(moves[0], float("nan"))))
+    with pytest.warns(torchrl_loco.NonFiniteWarning):
+        env.close()
+    env.reset()  # although the file exists now
+
+
+def test_a_failed_opening_leaves_nothing_behind(actions, monkeypatch):
+    env, never_closed = made(), made()
+    moves = actions(env, 8)
+    for other in (env, never_closed):
+        played(other, moves)
+    env.close()
+    with monkeypatch.context() as broken:
+        broken.setattr(type(env), "pose_kernel", lambda self, world: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            env.reset()
+    env.close()
+    assert env.is_closed
+    assert_repeats(played(env, moves), played(never_closed, moves))
+
+
+@pytest.mark.parametrize("way", ["close", "del"])
+def test_nothing_holds_on_to_a_closed_environment(way):
+    env = made()
+    env.rollout(3)
+    env.render(width=16, height=12)
+    held = [weakref.ref(thing) for thing in (env.world, env.sim, env.sim.data, env.world.observation)]
+    if way == "close":
+        env = torchrl_loco.TransformedEnv(env)
+        env.close()
+    else:
+        del env
+    gc.collect()
+    assert [ref() for ref in held] == [None] * len(held)
+
+
+def test_an_environment_that_is_dropped_reports_as_if_closed(tmp_path):
+    env = made(nan_dump=tmp_path / "dump")
+    env.step(env.reset().set("action", torch.full((WORLDS, 6), torch.nan)))
+    del env
+    with pytest.warns(torchrl_loco.NonFiniteWarning):
+        gc.collect()
+    assert (tmp_path / "dump").exists()
+
+
+def test_at_exit_all_worlds_report(tmp_path):
+    env = made(nan_dump=tmp_path / "dump")
+    env.step(env.reset().set("action", torch.full((WORLDS, 6), torch.nan)))
+    with pytest.warns(torchrl_loco.NonFiniteWarning):
+        world._close_all()
+    assert (tmp_path / "dump").exists()
+
+
+@pytest.mark.gpu
+def test_close_frees_device_memory():
+    def used():
+        gc.collect()
+        torch.cuda.synchronize()
+        torch.cuda.empty_cache()
+        free, total = torch.cuda.mem_get_info()
+        return (total - free) / 2**20
+
+    def live(num_envs):
+        env = torchrl_loco.make("humanoid_walk", num_envs, "cuda", 0)
+        env.rollout(3)
+        return env
+
+    live(4096).close()  # loads what stays loaded
+    before = used()
+    left = []
+    for _ in range(3):
+        env = live(4096)
+        taken = used() - before
+        env.close()
+        left.append(used() - before)
+    assert taken > 300  # MiB
+    assert left[0] < 0.15 * taken  # Warp's pool keeps some
+    assert left[2] <= left[0]

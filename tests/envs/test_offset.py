@@ -1,0 +1,80 @@
+"""world_offset: worlds keep their place in a larger whole, whichever process steps them."""
+
+import functools
+import multiprocessing
+
+import pytest
+import torch
+from conftest import COARSE
+from torchrl.envs import EnvCreator, ParallelEnv
+
+import torchrl_loco
+
+WHOLE, OFFSET, PART = 6, 2, 3
+# Under playground the humanoid draws nothing.
+CASES = [("walker_run", "playground"), ("walker_run", "dm_control"), ("humanoid_run", "dm_control")]
+
+
+@pytest.mark.parametrize(("task", "protocol"), CASES)
+def test_an_offset_draws_what_these_worlds_of_a_larger_environment_draw(shared, actions, task, protocol):
+    """To the bit, across several episodes that do not end together."""
+    options = {"protocol": protocol, "episode_length": 4, "stagger": True, **COARSE}
+    whole = shared(task, WHOLE, "cpu", 5, **options)
+    part = shared(task, PART, "cpu", 5, world_offset=OFFSET, **options)
+    rows = slice(OFFSET, OFFSET + PART)
+    moves, td, part_td = actions(whole, 10), whole.reset(), part.reset()
+    assert torch.equal(part_td["observation"], td["observation"][rows])
+    for action in moves:
+        current, td = whole.step_and_maybe_reset(td.set("action", action))
+        part_current, part_td = part.step_and_maybe_reset(part_td.set("action", action[rows]))
+        assert (part_current == current[rows]).all()
+    assert (part.get_state() == whole.get_state()[rows]).all()
+
+
+def test_a_state_of_other_worlds_is_refused(shared):
+    state = shared("walker_run", 1, **COARSE).state_dict()
+    shared("walker_run", 1, world_offset=0, **COARSE).load_state_dict(state)  # None means 0
+    with pytest.raises(ValueError, match="world_offset=0, this environment of 4"):
+        shared("walker_run", 1, world_offset=4, **COARSE).load_state_dict(state)
+
+
+def test_a_seed_without_an_offset_is_warned_of_in_one_of_several_ranks(monkeypatch):
+    make = functools.partial(torchrl_loco.make, "walker_run", 1, "cpu", **COARSE)
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 1)
+    make(0)  # silent: warnings are errors here
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
+    with pytest.warns(UserWarning, match="world_offset=k"):
+        make(0)
+    make(0, world_offset=0)
+    make()
+
+
+def test_a_seed_without_an_offset_is_logged_in_a_worker(monkeypatch, caplog):
+    """TorchRL's workers silence warnings."""
+    make = functools.partial(torchrl_loco.make, "walker_run", 1, "cpu", **COARSE)
+    monkeypatch.setattr(multiprocessing, "parent_process", lambda: object())
+    make(0, world_offset=0)
+    make()
+    assert not caplog.records
+    make(0)
+    assert "world_offset=k" in caplog.text
+
+
+@pytest.mark.slow
+def test_parallel_env(capfd):
+    """Two workers with offsets collect what one environment of all worlds collects; the one without is told."""
+    make = functools.partial(torchrl_loco.make, "walker_walk", 3, "cpu", 0, episode_length=6, **COARSE)
+    workers = [EnvCreator(make), EnvCreator(functools.partial(make, world_offset=3))]
+    env = ParallelEnv(2, workers, mp_start_method="spawn")
+    try:
+        td = env.rollout(4)
+    finally:
+        env.close()
+    assert td.shape == (2, 3, 4)
+    assert capfd.readouterr().err.count("world_offset=k") == 1
+    whole = torchrl_loco.make("walker_walk", 6, "cpu", 0, episode_length=6, **COARSE)
+    steps = iter(td["action"].reshape(6, 4, 6).unbind(1))
+    expected = whole.rollout(4, lambda td: td.set("action", next(steps)))
+    assert torch.equal(td["next", "observation"].reshape(6, 4, 24), expected["next", "observation"])
+    assert not torch.equal(td["observation"][0], td["observation"][1])

@@ -1,0 +1,236 @@
+"""The first world that is not finite is written to a file, from which its step can be repeated."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import COARSE
+
+import torchrl_loco
+from torchrl_loco import NonFiniteWarning, cli, nan_dump, storage
+from torchrl_loco.envs.monitors import INTERVAL, NAN_DUMP
+
+WORLDS, BAD = 6, 4
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "dump.safetensors"
+
+
+def made(file, device="cpu", **options):
+    return torchrl_loco.make("walker_walk", WORLDS, device, 7, nan_dump=file, **{**COARSE, **options})
+
+
+def stepped(env, td, action):
+    return env.step(td.set("action", action))["next"].exclude("reward")
+
+
+def drive(env, actions, spoil):
+    """Plays 3 good steps, then one that ``spoil`` makes bad; returns the state and action that it began with."""
+    td, (*good, last) = env.reset(), actions(env, 4)
+    for action in good:
+        td = stepped(env, td, action)
+    state = env.get_state()
+    spoil(state, last)
+    td = env.reset(state, set_state=True)
+    td = stepped(env, td, last)
+    assert td["terminated"].flatten().tolist() == [i == BAD for i in range(WORLDS)]
+    return state, last, td
+
+
+def bad_action(state, action):
+    action[BAD, 2] = float("nan")
+
+
+def too_fast(state, action):
+    state["qvel"][BAD, 4] = 3e9
+
+
+@pytest.mark.parametrize("spoil", [bad_action, too_fast])
+def test_the_file_holds_what_the_step_began_with(device, file, actions, spoil):
+    env = made(file, device, njmax=90)
+    state, action, _ = drive(env, actions, spoil)
+    with pytest.warns(NonFiniteWarning, match=rf"world {BAD} was no longer finite after step 4 .*dump\.safe.*inspect"):
+        env.close()
+    dump = nan_dump.load(file)
+    for name in ("qpos", "qvel", "qacc_warmstart"):
+        assert torch.equal(dump.tensors[name], state[name][BAD].cpu()), name
+    torch.testing.assert_close(dump.tensors["action"], action[BAD].cpu(), rtol=0, atol=0, equal_nan=True)
+    settings = dump.settings
+    assert (settings["world"], settings["episode"], settings["elapsed_steps"], settings["seed"]) == (BAD, 1, 3, 7)
+    assert (settings["env"], settings["protocol"], settings["config"]["njmax"]) == (
+        "torchrl_loco.envs.walker.WalkerWalk",
+        "playground",
+        90,
+    )
+
+
+def test_only_the_first_is_kept(file, actions):
+    env = made(file)
+    state, _, td = drive(env, actions, too_fast)
+    for world in (0, BAD):
+        action = env.action_spec.zero()
+        action[world] = float("inf")
+        td = stepped(env, td, action)
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    assert torch.equal(nan_dump.load(file).tensors["qvel"], state["qvel"][BAD])
+
+
+def test_of_two_in_one_step_the_lower_is_kept(file):
+    env = made(file)
+    action = env.action_spec.zero()
+    action[1:4:2] = float("nan")
+    stepped(env, env.reset(), action)
+    with pytest.warns(NonFiniteWarning, match="world 1 "):
+        env.close()
+
+
+def test_it_is_written_while_stepping(device, file, actions):
+    env = made(file, device)
+    *_, td = drive(env, actions, bad_action)
+    zero = env.action_spec.zero()
+    for _ in range(INTERVAL - 5):  # 4 steps are done
+        td = stepped(env, td, zero)
+    assert not file.exists()
+    if device == "cuda":
+        td = stepped(env, td, zero)  # requests the numbers, which have arrived after
+        torch.cuda.synchronize()
+    with pytest.warns(NonFiniteWarning):
+        stepped(env, td, zero)
+    assert file.exists()
+
+
+def test_nothing_is_written_or_changed_if_all_is_finite(shared, file, actions):
+    env, plain = made(file), shared("walker_walk", WORLDS, seed=7, **COARSE)
+    td, expected = env.reset(), plain.reset()
+    for action in actions(env, 10):
+        td, expected = stepped(env, td, action), stepped(plain, expected, action)
+    assert torch.equal(td["observation"], expected["observation"])
+    for _ in range(INTERVAL):
+        td = stepped(env, td, action)
+    env.close()
+    assert not file.exists()
+
+
+def test_nothing_is_overwritten(file, actions):
+    env = made(file)
+    drive(env, actions, bad_action)
+    file.write_text("evidence")
+    with pytest.warns(NonFiniteWarning, match="already exists"):
+        env.close()
+    assert file.read_text() == "evidence"
+    with pytest.raises(ValueError, match="already exists: move it away"):
+        made(file)
+
+
+def test_warp_repeats_what_happened_and_c_mujoco_agrees_on_an_ordinary_step(file, actions):
+    """With the action repaired. From another warm start, few iterations of the solver end elsewhere."""
+
+    def far_warm_start(state, action):
+        state["qacc_warmstart"][BAD] = 1e4
+        bad_action(state, action)
+
+    env = made(file)
+    state, action, _ = drive(env, actions, far_warm_start)
+    action[BAD, 2] = 0.0
+    stepped(env, env.reset(state, set_state=True), action)
+    expected = env.get_state()["qvel"][BAD].numpy()
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    dump = nan_dump.load(file)
+    dump.tensors["action"][2] = 0.0
+    np.testing.assert_array_equal(nan_dump.warp_trace(dump, "cpu")[-1, 9:], expected)
+    dump.tensors["qacc_warmstart"].zero_()
+    assert (nan_dump.warp_trace(dump, "cpu")[-1, 9:] != expected).any()
+
+    for substeps in (10, 5):
+        file.unlink()
+        env = made(file, protocol="dm_control", sim_dt=0.025 / substeps)
+        drive(env, actions, bad_action)
+        with pytest.warns(NonFiniteWarning):
+            env.close()
+        dump = nan_dump.load(file)
+        dump.tensors["action"][2] = 0.0
+        warp, c = nan_dump.warp_trace(dump, "cpu"), nan_dump.mujoco_trace(dump)
+        assert warp.shape == c.shape == (substeps + 1, 18)
+        np.testing.assert_allclose(warp, c, atol=1e-3)
+        assert np.abs(warp[-1] - warp[0]).max() > 1e-3
+
+
+@pytest.mark.parametrize(("spoil", "said"), [(bad_action, "entry 2 is nan"), (too_fast, "C MuJoCo: not finite after")])
+def test_command(file, actions, capsys, spoil, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    env = made(file)
+    drive(env, actions, spoil)
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    with pytest.raises(SystemExit):
+        cli.main(["inspect", str(file), "--device", "cuda:9"])
+    assert capsys.readouterr().out == ""  # refused before the first line
+    assert cli.main(["inspect", str(file), "--device", "cpu"]) == 0
+    out = capsys.readouterr().out
+    assert f"world {BAD} of {WORLDS} on cpu, episode 1, after 3 steps" in out
+    assert said in out
+    assert [path.name for path in tmp_path.iterdir()] == [file.name]  # C MuJoCo would leave a log
+
+
+def test_a_state_written_from_outside_is_recognised(file):
+    env = made(file)
+    td = env.reset()
+    env.sim.qvel[BAD, 3] = float("nan")
+    stepped(env, td, env.action_spec.zero())
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    *_, entry, end = nan_dump.describe(nan_dump.load(file))
+    assert "qvel is not finite before the step: entry 3 is nan" in entry
+    assert "from outside" in end
+
+
+def test_files_that_are_no_nan_dump(file, tmp_path, capsys):
+    file.write_text("nothing")
+    with pytest.raises(ValueError, match="cannot be read as a NaN dump"):
+        nan_dump.load(file)
+    storage.save(file, "policy", {"x": torch.zeros(1)}, {})
+    with pytest.raises(SystemExit):
+        cli.main(["inspect", str(file)])
+    assert "its format is 'torchrl_loco policy 1'" in capsys.readouterr().err
+    storage.save(file, NAN_DUMP, {}, {"env": "Cheetah"})
+    with pytest.raises(ValueError, match=r"is of 'Cheetah'; installed are torchrl_loco\.envs\.walker\.WalkerStand"):
+        nan_dump.load(file)
+    with pytest.raises(FileNotFoundError, match="there is no NaN dump"):
+        nan_dump.load(tmp_path / "none")
+
+
+def test_an_overflow_that_raises_does_not_keep_the_file_from_being_written(file):
+    env = torchrl_loco.make("humanoid_stand", 2, "cpu", 0, njmax=5, on_overflow="raise", nan_dump=file, **COARSE)
+    td = env.reset()
+    for _ in range(60):
+        td = stepped(env, td, env.action_spec.zero())
+    stepped(env, td, torch.full_like(env.action_spec.zero(), float("nan")))
+    with pytest.warns(NonFiniteWarning), pytest.raises(torchrl_loco.PhysicsOverflowError):
+        env.close()
+    assert nan_dump.load(file).settings["elapsed_steps"] == 60
+    assert env.is_closed
+    with pytest.raises(RuntimeError, match="is closed"):
+        env.get_state()
+
+
+def test_the_path_does_not_follow_the_working_directory(tmp_path, monkeypatch, actions):
+    monkeypatch.chdir(tmp_path)
+    env = made("dump.safetensors")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    drive(env, actions, bad_action)
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    assert (tmp_path / "dump.safetensors").exists()
+
+
+def test_a_failed_write_leaves_no_empty_file(file, actions, monkeypatch):
+    env = made(file)
+    drive(env, actions, bad_action)
+    monkeypatch.setattr(storage, "save", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        env.close()
+    assert not file.exists()

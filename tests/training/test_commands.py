@@ -1,0 +1,110 @@
+"""The commands on runs: what they print and write, and what they refuse."""
+
+import shutil
+from pathlib import Path
+
+import imageio.v3 as imageio
+import pytest
+from small_runs import SMALL, made
+
+from torchrl_loco import cli, training
+from torchrl_loco.training import RunFolder
+from torchrl_loco.training.algorithm import Algorithm
+
+
+@pytest.mark.slow
+def test_from_training_to_a_video(tmp_path, capsys, monkeypatch):
+    """train, eval, plot, record and play. Without --out, a video replaces no file."""
+    small = [f"--{key}={value}" for key, value in SMALL.items() if key != "hidden"]
+    assert cli.main(["train", "walker_walk", *small, "--hidden", "16", f"--out={tmp_path}", "--device=cpu"]) == 0
+    (path,) = tmp_path.iterdir()
+    said = capsys.readouterr().out
+    assert f"run folder: {path}\n" in said
+    assert said.endswith(f": {path}\n")
+    config = RunFolder(path).load_config()
+    assert (config.algorithm, config.task, config.num_envs, config.hidden) == ("ppo", "walker_walk", 4, (16,))
+
+    assert cli.main(["eval", str(path), "--episodes", "2"]) == 0
+    said = capsys.readouterr()
+    assert "over 2 episodes" in said.out
+    assert "evaluation" not in said.err  # no progress bar, which would stay in a log
+
+    assert cli.main(["plot", str(path), f"--out={tmp_path / 'curve.png'}"]) == 0
+    assert (tmp_path / "curve.png").exists()
+
+    capsys.readouterr()
+    video = ["--seconds", "0.05", "--device", "cpu"]
+    (path / "video.mp4").write_text("mine")
+    assert cli.main(["record", str(path), *video, "--camera", "back"]) == 0
+    assert capsys.readouterr().out == f"{path / 'video-2.mp4'}\n"
+    assert imageio.imread(path / "video-2.mp4", plugin="pyav").shape[0] == 2
+    assert (path / "video.mp4").read_text() == "mine"
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(training, "has_display", lambda: False)
+    monkeypatch.setattr(training, "record", lambda policy, env, path, *rest: path.touch(exist_ok=False))
+    play = ["play", "walker_walk", "--policy", str(path), *video]
+    for options, name in (([], "walker_walk.mp4"), ([], "walker_walk-2.mp4"), (["--out", "x.mp4"], "x.mp4")):
+        assert cli.main([*play, *options]) == 0
+        head, returns, out = capsys.readouterr().out.splitlines()
+        assert (head.split(",")[0], returns.split()[0], Path(out).name) == ("walker_walk", "return", name)
+        assert Path(out).exists()
+
+
+def test_errors_of_the_user(ppo_run, tmp_path, capsys):
+    (tmp_path / "file.mp4").write_text("")
+    broken = shutil.copytree(ppo_run.path, tmp_path / "broken")
+    (broken / "config.json").write_text("{}")
+    cases = {
+        "train walker_wlak": "did you mean 'walker_walk'",
+        "train mjx/walker_walk-v0 --gamma 2": "gamma must lie in (0, 1]",
+        "train walker_walk --gama 0.9": "--gamma",
+        "train walker_walk --device cuda:9": "choose one of cpu",
+        "train walker_walk --task walker_run": "Unrecognized options: --task",
+        "train walker_walk --algorithm pppo": "did you mean 'ppo'",
+        "train walker_walk --device cpu --out {file}": "out must be a folder",
+        "eval no/such/run": "is not a run folder",
+        "eval {run} --episodes 0": "episodes must lie in [1, 2**31)",
+        "eval {broken}": "{broken}/config.json cannot be read",
+        "resume no/such/run": "is not a run folder",
+        "resume {run}": "is complete",
+        "resume {broken}": "{broken}/config.json cannot be read",
+        "record {run} --seconds 0": "seconds must lie in (0, inf)",
+        "record {run} --device cpu --out {file}": "already exists",
+        "play walker_walk --policy {run} --device cpu": "is a policy for walker_stand",
+        "plot": "no runs",
+        "plot {broken}": "{broken}/config.json cannot be read",
+        "fly": "train, resume, eval",
+    }
+    names = {"run": ppo_run.path, "broken": broken, "file": tmp_path / "file.mp4"}
+    for arguments, message in cases.items():
+        with pytest.raises(SystemExit) as ended:
+            cli.main(arguments.format(**names).split())
+        captured = capsys.readouterr()
+        said = " ".join((captured.out + captured.err).replace("│", " ").split())
+        assert (ended.value.code, message.format(**names) in said) == (2, True), f"{arguments}: {said}"
+
+
+def test_errors_while_training(tmp_path, monkeypatch, capsys):
+    """What the machine lacks is said in a line, with how to continue if that is possible; a bug keeps its traceback."""
+
+    def fail(error):
+        def update(self, batch, progress):
+            raise error
+
+        return update
+
+    command = ["train", "walker_walk", "--device", "cpu", "--out", str(tmp_path)]
+    for error, ended in ((OSError("no space left"), SystemExit), (TypeError("a bug"), TypeError)):
+        monkeypatch.setattr(Algorithm, "update", fail(error))
+        with pytest.raises(ended):
+            cli.main(command)
+        said = capsys.readouterr().err
+        assert ("torchrl-loco: no space left" in said) == (ended is SystemExit)
+        assert "to continue" not in said  # there is no checkpoint
+
+
+def test_what_a_run_without_a_policy_needs(tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["eval", str(made(tmp_path).path)])
+    assert "has no policy yet" in capsys.readouterr().err

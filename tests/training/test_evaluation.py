@@ -1,0 +1,97 @@
+"""Evaluations: full episodes, the same ones again, apart from those of training."""
+
+import itertools
+import json
+import math
+import shutil
+
+import pytest
+import torch
+from small_runs import EPISODE, made
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+import torchrl_loco
+from torchrl_loco.policy import Policy
+from torchrl_loco.training import RunFolder, evaluate_run, preset
+from torchrl_loco.training.evaluation import Evaluator, poor_return
+from torchrl_loco.training.trainer import evaluation_seed
+
+
+def test_evaluation_can_be_repeated(ppo_run):
+    first = Policy.load(ppo_run.policy, "cpu").info
+    again = evaluate_run(ppo_run)
+    assert again.items() <= first.items()
+    assert again["episodes"] == 3
+    assert again["min"] <= again["mean"] <= again["max"]
+    other = evaluate_run(ppo_run, episodes=2, seed=5)
+    assert other["episodes"] == 2
+    assert other["mean"] != first["mean"]
+    assert Policy.load(ppo_run.policy, "cpu").info == first
+
+
+def test_evaluation_is_apart_from_training(ppo_run, shared):
+    """No evaluated episode begins as one of the training's did, not even for the largest seed."""
+    for seed in (0, 2**32 - 1):
+        config = ppo_run.load_config(seed=seed)
+        seeds = (config.seed, evaluation_seed(config, 0), evaluation_seed(config, 1))
+        starts = [shared("walker_stand", 4, "cpu", s).reset()["observation"] for s in seeds]
+        for one, other in itertools.combinations(starts, 2):
+            assert (one != other).any(dim=1).all()
+
+
+def test_evaluation_plays_full_episodes():
+    """A policy that does nothing earns what the environment pays for that until the time limit or termination."""
+    env = torchrl_loco.make("walker_stand", 2, "cpu", seed=11)
+    expected = env.rollout(10 * EPISODE, lambda td: td.set("action", env.action_spec.zero()))["next", "reward"].sum(1)
+    for action_repeat in (1, 7):
+        evaluator = Evaluator("walker_stand", 2, "cpu", 11, action_repeat=action_repeat)
+        returns, again = (evaluator(lambda td: td.set("action", torch.zeros(2, 6))) for _ in range(2))
+        assert torch.equal(returns, again)
+        torch.testing.assert_close(returns, expected.squeeze(-1), rtol=1e-4, atol=0)
+
+    def policy(td):
+        """Ends the first world at its first step."""
+        assert exploration_type() is ExplorationType.DETERMINISTIC
+        action = torch.zeros(2, 6)
+        action[0] = math.nan if calls == [] else 0.0
+        calls.append(1)
+        return td.set("action", action)
+
+    calls = []
+    returns = evaluator(policy)
+    assert returns[0] == 0.0
+    torch.testing.assert_close(returns[1], expected[1, 0], rtol=1e-4, atol=0)
+
+
+def test_a_run_from_another_device(ppo_run, tmp_path):
+    """It can be evaluated where its device is not, if another one is named."""
+    folder = tmp_path / "from_cuda"
+    shutil.copytree(ppo_run.path, folder)
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "device": "cuda:7"}))
+    assert evaluate_run(RunFolder(folder), device="cpu") == evaluate_run(ppo_run)
+    with pytest.raises(ValueError, match="choose one of cpu"):
+        evaluate_run(RunFolder(folder))
+    with pytest.raises(ValueError, match="choose one of cpu"):
+        RunFolder.create(RunFolder(folder).load_config())
+
+
+def test_a_run_without_a_policy(tmp_path):
+    run = made(tmp_path)
+    for way in ("it has no checkpoint either, train again", "continue it with torchrl-loco resume"):
+        with pytest.raises(FileNotFoundError, match=f"has no policy yet: {way}"):
+            evaluate_run(run)
+        run.save_checkpoint({})
+
+
+def test_a_poor_return_is_said(monkeypatch):
+    """Poor is less than 0.8 of what the shipped policy earns; without a shipped policy nothing can be said."""
+    config = preset("walker_stand", "cpu", seed=7, total_frames=100_000)
+    shipped = torchrl_loco.load_policy("walker_stand", "cpu").info["mean"]
+    note = poor_return(config, {"mean": 0.79 * shipped})
+    assert f"poor: the policy shipped for walker_stand earns {shipped:.0f}" in note
+    assert "--seed 8" in note
+    assert "--total_frames 200000" in note
+    assert poor_return(config, {"mean": 0.81 * shipped}) == ""
+    monkeypatch.setattr("torchrl_loco.training.evaluation.SHIPPED", config.out / "none")
+    assert poor_return(config, {"mean": 0.0}) == ""

@@ -1,0 +1,126 @@
+"""The run folder: what is refused before training, and what happens to files that are damaged or cannot be written."""
+
+import contextlib
+import json
+import os
+import re
+import resource
+import shutil
+
+import pytest
+import torch
+from compare import assert_same
+from small_runs import made, networks
+
+from torchrl_loco import cli
+from torchrl_loco.training import RunFolder, Trainer, unused_path
+
+
+def test_unused_path(tmp_path):
+    names = []
+    for _ in range(3):
+        path = unused_path(tmp_path / "video.mp4")
+        path.touch()
+        names.append(path.name)
+    assert names == ["video.mp4", "video-2.mp4", "video-3.mp4"]
+
+
+def test_runs_of_the_same_second_have_folders_of_their_own(tmp_path):
+    assert len({made(tmp_path).path for _ in range(3)}) == 3
+
+
+def test_out_must_be_a_folder_with_room(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file", tmp_path / "file" / "runs"):
+        with pytest.raises(OSError, match=re.escape(f"out must be a folder for runs, but {out}")):
+            made(out)
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=2**20))
+    with pytest.raises(OSError, match="has 1 MiB left"):
+        made(tmp_path / "runs")
+
+
+def test_a_damaged_config_is_named(tmp_path):
+    run = made(tmp_path)
+    path = run.path / "config.json"
+    values = json.loads(path.read_text())
+    damaged = ['{"task": ', "[]", "{}", json.dumps({**values, "algorithm": "sac"})]
+    damaged += [json.dumps({**values, **wrong}) for wrong in ({"decisions": 8}, {"hidden": None}, {"gamma": 2.0})]
+    for text in damaged:
+        path.write_text(text)
+        with pytest.raises(ValueError, match=re.escape(f"{path} cannot be read as the settings of a run")):
+            run.load_config()
+    path.write_text(json.dumps(values))
+    assert run.load_config(seed=5).seed == 5
+
+
+def test_a_torn_line_does_not_keep_a_run_from_continuing(tmp_path):
+    run = made(tmp_path)
+    for frames in (128, 256, 384):
+        run.append_metrics({"iteration": frames // 128, "frames": frames, "return": 1.5})
+    path = run.path / "metrics.csv"
+    path.write_text(path.read_text() + "4,5")
+    run.forget_after(256)
+    assert path.read_text() == "iteration,frames,return\n1,128,1.5\n2,256,1.5\n"
+
+
+def test_a_run_needs_an_undamaged_checkpoint_of_this_version(ppo_run, tmp_path):
+    run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
+    path = run.path / "checkpoint.pt"
+    good = path.read_bytes()
+
+    def refused(error, message):
+        with pytest.raises(error, match=message):
+            Trainer(run, resume=True)
+
+    changed = bytearray(good)
+    changed[len(good) // 2] ^= 1
+    for bad in (b"no checkpoint at all", good[: len(good) // 2], bytes(changed)):
+        path.write_bytes(bad)
+        refused(ValueError, "checkpoint.pt cannot be read as a checkpoint")
+    torch.save({"version": 0}, path)
+    refused(ValueError, "has version 0, this release reads 3")
+    path.unlink()
+    refused(FileNotFoundError, "has no checkpoint")
+
+
+def test_a_checkpoint_executes_nothing(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "executed"),)
+
+    run = made(tmp_path)
+    run.save_checkpoint({"frames": 0, "rng": Trap()})
+    with pytest.raises(ValueError, match="cannot be read as a checkpoint"):
+        Trainer(run, resume=True)
+    assert not (tmp_path / "executed").exists()
+
+
+@contextlib.contextmanager
+def full_disk(size):
+    """No file may grow beyond ``size`` bytes: what a write to a full disk meets too, an error of the system."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_disk_that_fills_up_while_training(tmp_path, capsys):
+    """The previous checkpoint is kept, and the command says how to continue from it."""
+    run = made(tmp_path, hidden=(128,), checkpoint_seconds=1e-9)
+    trainer = Trainer(run)
+    trainer._iterate()
+    trainer.save()
+    before = networks(run)
+    with full_disk(2**16), pytest.raises(SystemExit, match="2"):
+        cli._train(trainer)
+    problem, way = capsys.readouterr().err.splitlines()[-2:]
+    assert problem.startswith("torchrl-loco: ")
+    assert problem.endswith(f"the previous checkpoint is kept: '{run.path / 'checkpoint.pt'}'")
+    assert way == f"to continue: torchrl-loco resume {run.path}"
+    assert not (run.path / "checkpoint.pt.part").exists()
+    assert_same(before, networks(run))
+    Trainer(run, resume=True).train()
+    assert run.is_finished

@@ -1,0 +1,31 @@
+from . import checks as checks
+from . import collector as collector
+from . import config as config
+from . import envs as envs
+from . import models as models
+from . import policy as policy
+from . import registry as registry
+from . import rendering as rendering
+from . import rewards as rewards
+from . import sim as sim
+from . import training as training
+from .collector import RolloutCollector as RolloutCollector
+from .config import SimConfig as SimConfig
+from .envs import HumanoidRun as HumanoidRun
+from .envs import HumanoidStand as HumanoidStand
+from .envs import HumanoidWalk as HumanoidWalk
+from .envs import LocoEnv as LocoEnv
+from .envs import NonFiniteWarning as NonFiniteWarning
+from .envs import PhysicsOverflowError as PhysicsOverflowError
+from .envs import PhysicsOverflowWarning as PhysicsOverflowWarning
+from .envs import State as State
+from .envs import TransformedEnv as TransformedEnv
+from .envs import WalkerRun as WalkerRun
+from .envs import WalkerStand as WalkerStand
+from .envs import WalkerWalk as WalkerWalk
+from .policy import Policy as Policy
+from .policy import load_policy as load_policy
+from .registry import list_envs as list_envs
+from .registry import make as make
+
+__version__: str

@@ -1,0 +1,374 @@
+"""What is monitored while worlds step: overflows of the physics are counted, and the first NaN is dumped to a file.
+
+A monitor works on the device. The host reads a few numbers of it now and then, and never waits for them.
+"""
+
+import logging
+import math
+import multiprocessing
+import warnings
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any
+
+import torch
+import warp as wp
+from mujoco_warp import OverflowType
+from tensordict import TensorDict
+
+from torchrl_loco import storage
+from torchrl_loco.sim import Buffer, Simulation
+
+INTERVAL = 100
+"""Control steps between two reads."""
+
+ON_OVERFLOW = ("warn", "raise", "ignore")
+"""What can be done when the physics dropped contacts or constraints."""
+
+NAN_DUMP = "NaN dump"
+"""Kind of file, stored in a NaN dump."""
+
+
+class PhysicsOverflowWarning(UserWarning):
+    """The physics dropped contacts or constraints for want of room."""
+
+
+class PhysicsOverflowError(RuntimeError):
+    """The physics dropped contacts or constraints for want of room."""
+
+
+class NonFiniteWarning(UserWarning):
+    """A world was no longer finite; the state and action that led to it were written to a file."""
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warns. In a worker process it logs instead, because TorchRL's workers silence warnings."""
+    if multiprocessing.parent_process() is None:
+        warnings.warn(message, category, stacklevel=3)
+    else:
+        logging.getLogger("torchrl_loco").warning(message)
+
+
+class Monitor(ABC):
+    """Launches kernels around each control step, reads a few numbers of theirs now and then, and reports.
+
+    Args:
+        count: how many numbers :meth:`numbers` returns.
+        device: where they are.
+    """
+
+    def __init__(self, count: int, device: torch.device) -> None:
+        self._device = device
+        on_cuda = device.type == "cuda"
+        self._host = torch.zeros(count, dtype=torch.long, device="cpu", pin_memory=on_cuda)
+        self._copied = torch.cuda.Event() if on_cuda else None
+        self._steps, self._pending = 0, False
+
+    def launch_before_step(self) -> None:  # noqa: B027
+        """Launches the monitor's kernels at the start of a control step, which is recorded."""
+
+    @abstractmethod
+    def launch_after_step(self) -> None:
+        """Launches the monitor's kernels at the end of a control step, which is recorded."""
+
+    @abstractmethod
+    def numbers(self) -> torch.Tensor:
+        """Returns the numbers to report on, shape ``(count,)`` and dtype int64, without waiting for the device."""
+
+    @abstractmethod
+    def report(self, numbers: list[int]) -> None:
+        """Reports what the numbers say: warns, raises or writes a file."""
+
+    @abstractmethod
+    def clear(self) -> None:
+        """Sets everything on the device to zero."""
+
+    def restart(self) -> None:
+        """Forgets everything."""
+        self._steps, self._pending = 0, False
+        self.clear()
+
+    def poll(self) -> None:
+        """Requests the numbers every :data:`INTERVAL` steps, and reports once they have arrived on the host."""
+        self._steps += 1
+        if self._steps % INTERVAL == 0 and not self._pending:
+            self._request()
+        if self._pending and (self._copied is None or self._copied.query()):  # on the CPU the copy is done at once
+            self._pending = False
+            self.report(self._host.tolist())
+
+    def check(self) -> None:
+        """Requests the numbers, waits for the device, and reports."""
+        self._request()
+        if self._copied is not None:
+            self._copied.synchronize()
+        self._pending = False
+        self.report(self._host.tolist())
+
+    def _request(self) -> None:
+        self._host.copy_(self.numbers(), non_blocking=True)
+        if self._copied is not None:
+            self._copied.record(torch.cuda.current_stream(self._device))
+        self._pending = True
+
+
+# Health: how often the physics dropped something, used up its iterations, or was not finite.
+
+COUNTERS = {
+    "constraint_overflow": OverflowType.NEFC | OverflowType.NJMAX_NNZ,
+    "contact_overflow": OverflowType.BROADPHASE | OverflowType.NARROWPHASE | OverflowType.CCD,
+    "iteration_limit": OverflowType.ITERATIONS,
+    "line_search_limit": OverflowType.LS_ITERATIONS,
+}
+"""Name of a counter and the bits of ``Data.overflow`` that it counts."""
+DROPPED = {"constraints": "njmax", "contacts": "naconmax"}
+"""What the first two counters say was dropped, and the setting that makes room for it."""
+MARGIN = 1.25
+"""Factor between the most that was needed and the value that is advised."""
+
+
+@wp.kernel(enable_backward=False)
+def count_health(
+    # In:
+    counter_bits: wp.array[int],
+    non_finite_in: wp.array[bool],
+    # Data out:
+    overflow_out: wp.array[int],
+    # Out:
+    counts_out: wp.array2d[int],
+):
+    """Adds a control step to the counters of what happened in it, and clears the bits."""
+    world = wp.tid()
+    bits = overflow_out[world]
+    for i in range(counter_bits.shape[0]):
+        if bits & counter_bits[i] != 0:
+            counts_out[world, i] += 1
+    if non_finite_in[world]:
+        counts_out[world, counter_bits.shape[0]] += 1
+    overflow_out[world] = 0
+
+
+class Health(Monitor):
+    """Counts, for each world, the control steps in which something went wrong in the physics.
+
+    Args:
+        sim: the simulation.
+        non_finite: flags of worlds that are no longer finite, ``(nworld,)``.
+        on_overflow: what to do when something was dropped, one of :data:`ON_OVERFLOW`.
+    """
+
+    def __init__(self, sim: Simulation, non_finite: Buffer, on_overflow: str) -> None:
+        self._sim, self._non_finite, self._on_overflow = sim, non_finite, on_overflow
+        self._bits = wp.array([int(bits) for bits in COUNTERS.values()], dtype=int, device=sim.device)
+        self._counts = Buffer((sim.num_envs, len(COUNTERS) + 1), int, sim.device)
+        super().__init__(len(DROPPED) + 2, self._counts.torch.device)
+        self._reported = 0
+
+    def launch_after_step(self) -> None:
+        """Launches the kernel that counts a control step."""
+        wp.launch(
+            count_health,
+            dim=self._sim.num_envs,
+            inputs=[self._bits, self._non_finite.warp],
+            outputs=[self._sim.data.overflow, self._counts.warp],
+            device=self._sim.device,
+        )
+
+    def numbers(self) -> torch.Tensor:
+        """Returns the steps in which constraints and contacts were dropped, and the most of each needed, ``(4,)``."""
+        dropped = self._counts.torch[:, : len(DROPPED)].sum(dim=0)
+        return torch.cat([dropped, torch.stack([*self._peaks().values()])])
+
+    def _peaks(self) -> dict[str, torch.Tensor]:
+        engine = self._sim.engine
+        return {"constraints": engine.peak_constraints.torch.max(), "contacts": engine.peak_contacts.torch.max()}
+
+    def report(self, numbers: list[int]) -> None:
+        """Warns or raises if something was dropped since the last report.
+
+        Raises:
+            PhysicsOverflowError: something was, and ``on_overflow`` is "raise".
+        """
+        dropped, needed = numbers[: len(DROPPED)], numbers[len(DROPPED) :]
+        if self._on_overflow == "ignore" or sum(dropped) <= self._reported:
+            return
+        self._reported = sum(dropped)
+        messages = [
+            f"{what} were dropped in {count} control steps of a world: at most {most} were needed, "
+            f"pass {setting}={with_margin(most)}"
+            for (what, setting), count, most in zip(DROPPED.items(), dropped, needed, strict=True)
+            if count
+        ]
+        message = "; ".join(messages) + "; or pass on_overflow='ignore'"
+        if self._on_overflow == "raise":
+            raise PhysicsOverflowError(message)
+        warn(message, PhysicsOverflowWarning)
+
+    def clear(self) -> None:
+        """Sets all counters and peaks to zero."""
+        engine = self._sim.engine
+        for counter in (self._counts, engine.peak_constraints, engine.peak_contacts):
+            counter.torch.zero_()
+        self._sim.overflow.zero_()
+        self._reported = 0
+
+    def summary(self) -> TensorDict:
+        """Returns the counters, without waiting for the device; see :meth:`torchrl_loco.LocoEnv.health`."""
+        names = [*COUNTERS, "non_finite"]
+        counts = self._counts.torch.clone()
+        worlds: dict[str, Any] = dict(zip(names, counts.unbind(1), strict=True))
+        total = dict(zip(names, counts.sum(dim=0).unbind(), strict=True))
+        device = counts.device
+        return TensorDict(
+            {
+                "worlds": TensorDict(worlds, batch_size=[len(counts)], device=device),
+                "total": TensorDict(total, batch_size=[], device=device),
+                "peak": TensorDict(self._peaks(), batch_size=[], device=device),
+            },
+            batch_size=[],
+            device=device,
+        )
+
+
+def with_margin(needed: int) -> int:
+    """Returns a setting with some room above what was needed."""
+    return math.ceil(needed * MARGIN)
+
+
+# NaN guard: keeps what each control step began with until a world comes out of one that is not finite.
+
+
+@wp.kernel(enable_backward=False)
+def keep_worlds(
+    # In:
+    found_in: wp.array[bool],
+    action_in: wp.array2d[float],
+    episode_in: wp.array[int],
+    elapsed_steps_in: wp.array[int],
+    # Data in:
+    qpos_in: wp.array2d[float],
+    qvel_in: wp.array2d[float],
+    qacc_warmstart_in: wp.array2d[float],
+    # Out:
+    action_out: wp.array2d[float],
+    episode_out: wp.array[int],
+    elapsed_steps_out: wp.array[int],
+    qpos_out: wp.array2d[float],
+    qvel_out: wp.array2d[float],
+    qacc_warmstart_out: wp.array2d[float],
+):
+    """Copies what a control step begins with, until a world that is not finite was found."""
+    world = wp.tid()
+    if found_in[0]:
+        return
+    for i in range(action_in.shape[1]):
+        action_out[world, i] = action_in[world, i]
+    episode_out[world] = episode_in[world]
+    elapsed_steps_out[world] = elapsed_steps_in[world]
+    for i in range(qpos_in.shape[1]):
+        qpos_out[world, i] = qpos_in[world, i]
+    for i in range(qvel_in.shape[1]):
+        qvel_out[world, i] = qvel_in[world, i]
+        qacc_warmstart_out[world, i] = qacc_warmstart_in[world, i]
+
+
+@wp.kernel(enable_backward=False)
+def find_first(
+    # In:
+    found_in: wp.array[bool],
+    non_finite_in: wp.array[bool],
+    # Out:
+    first_out: wp.array[int],
+):
+    world = wp.tid()
+    if non_finite_in[world] and not found_in[0]:
+        wp.atomic_min(first_out, 0, world)
+
+
+@wp.kernel(enable_backward=False)
+def set_found(
+    # In:
+    first_in: wp.array[int],
+    num_envs: int,
+    # Out:
+    found_out: wp.array[bool],
+):
+    found_out[0] = first_in[0] < num_envs
+
+
+class NanGuard(Monitor):
+    """Writes the state and action from which a world first became not finite to a file, a NaN dump.
+
+    Args:
+        path: the file, unless it exists by then.
+        sim: the simulation.
+        inputs: actions ``(nworld, nu)``, episodes and elapsed steps ``(nworld,)`` of all worlds.
+        non_finite: flags of worlds that are not finite, ``(nworld,)``.
+        seed: seed of the environment, ``(1,)``.
+        settings: further settings from which the environment can be made again.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        sim: Simulation,
+        inputs: tuple[Buffer, Buffer, Buffer],
+        non_finite: Buffer,
+        seed: Buffer,
+        settings: dict[str, Any],
+    ) -> None:
+        self._path, self._sim, self._seed, self._settings = path, sim, seed, settings
+        self._non_finite = non_finite
+        data = sim.data
+        self._inputs = [*(buffer.warp for buffer in inputs), data.qpos, data.qvel, data.qacc_warmstart]
+        self._kept = [wp.zeros_like(array) for array in self._inputs]
+        self._first = Buffer(1, int, sim.device)
+        self._found = Buffer(1, bool, sim.device)
+        super().__init__(1, self._first.torch.device)
+        self._reported = False
+
+    def launch_before_step(self) -> None:
+        """Launches the kernel that keeps what a control step begins with."""
+        self._launch(keep_worlds, self._sim.num_envs, [self._found.warp, *self._inputs], self._kept)
+
+    def launch_after_step(self) -> None:
+        """Launches the kernels that look for a world that is not finite."""
+        found, first = self._found.warp, self._first.warp
+        self._launch(find_first, self._sim.num_envs, [found, self._non_finite.warp], [first])
+        self._launch(set_found, 1, [first, self._sim.num_envs], [found])
+
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._sim.device)
+
+    def numbers(self) -> torch.Tensor:
+        """Returns the index of the world that was found, or the number of worlds if none was, shape ``(1,)``."""
+        return self._first.torch.long()
+
+    def clear(self) -> None:
+        """Starts to look again."""
+        self._first.torch.fill_(self._sim.num_envs)
+        self._found.torch.zero_()
+
+    def report(self, numbers: list[int]) -> None:
+        """Writes the file and warns, once, if a world was found."""
+        (world,) = numbers
+        if self._reported or world == self._sim.num_envs:
+            return
+        self._reported = True
+        names = ("action", "episode", "elapsed_steps", "qpos", "qvel", "qacc_warmstart")
+        kept = {name: wp.to_torch(array)[world].clone() for name, array in zip(names, self._kept, strict=True)}
+        counters = {name: int(kept.pop(name)) for name in ("episode", "elapsed_steps")}
+        settings = {**self._settings, "seed": int(self._seed.torch[0]), "world": world, **counters}
+        try:
+            self._path.open("x").close()  # nothing is overwritten
+        except FileExistsError:
+            where = f"{self._path} already exists and was left as it is"
+        else:
+            try:
+                storage.save(self._path, NAN_DUMP, kept, settings)
+            except BaseException:
+                self._path.unlink()  # an empty file would keep a later one from being written
+                raise
+            where = f"its state and action before that step are in {self._path}: see torchrl-loco inspect"
+        step = counters["elapsed_steps"] + 1
+        warn(f"world {world} was no longer finite after step {step} of its episode; {where}", NonFiniteWarning)

@@ -1,0 +1,271 @@
+"""Everything of an environment that lives on its device, and the control step from top to bottom."""
+
+import atexit
+import contextlib
+import os
+import warnings
+import weakref
+from pathlib import Path
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+
+from torchrl_loco.config import SimConfig
+from torchrl_loco.envs.kernels import any_world, apply_action, begin_episode, count_step, zero_non_finite
+from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
+from torchrl_loco.rendering import Renderer
+from torchrl_loco.sim import EXCLUSIVE, Buffer, Simulation
+
+
+class Task(Protocol):
+    """What :class:`World` needs of an environment: its model, its settings and its kernels."""
+
+    mj_model: mujoco.MjModel
+    config: SimConfig
+    num_envs: int
+    device: torch.device
+    seed: int
+    world_offset: int | None
+    observation_size: int
+    term_names: tuple[str, ...]
+    on_overflow: str
+    nan_dump: Path | None
+
+    def observation_kernel(self, world: "World") -> tuple[wp.Kernel, list]:
+        """Returns the kernel that writes observation and reward, and its inputs."""
+
+    def pose_kernel(self, world: "World") -> tuple[wp.Kernel, list, list] | None:
+        """Returns the kernel that draws initial poses, its inputs and its outputs, if there is one."""
+
+    def settings(self) -> dict[str, Any]:
+        """Returns what a NaN dump records of the environment."""
+
+
+class World:
+    """The worlds of an environment on their device: simulation, buffers, monitors and graphs.
+
+    It is made when the environment opens and dropped when it closes. Buffers hold one row per world and always show the
+    current values.
+
+    Args:
+        task: the environment. It is not kept.
+
+    Attributes:
+        sim: the physics.
+        action: actions of the control step, ``(nworld, nu)``.
+        observation: observations, ``(nworld, observation_size)``.
+        reward: rewards, ``(nworld,)``.
+        terms: factors of the rewards, ``(nworld, len(term_names))``.
+        mask: worlds that a reset concerns, ``(nworld,)``.
+        stream: start of the random stream of the current episode, ``(nworld,)`` uint32.
+        episode: episodes drawn so far, ``(nworld,)``.
+        elapsed_steps: control steps since the world's reset, ``(nworld,)``.
+        non_finite: whether the world is no longer finite, ``(nworld,)``.
+        done: terminated or truncated, ``(nworld,)``.
+        terminated: whether the episode ended because the world is not finite, ``(nworld,)``.
+        truncated: whether the episode reached the time limit, ``(nworld,)``.
+        seed: seed of all random streams, ``(1,)``.
+        health: counts what went wrong in the physics.
+    """
+
+    def __init__(self, task: Task) -> None:
+        n, nu = task.num_envs, task.mj_model.nu
+        self._episode_length, self._world_offset = task.config.episode_length, task.world_offset or 0
+        # inference_mode: the buffers must stay writable. device: torch's views would follow the caller's default.
+        with torch.inference_mode(False), EXCLUSIVE, task.device:
+            self.sim = Simulation(task.mj_model, task.config, n, task.device)
+            device = self.sim.device
+            self.action = Buffer((n, nu), float, device)
+            self.observation = Buffer((n, task.observation_size), float, device)
+            self.reward = Buffer(n, float, device)
+            self.terms = Buffer((n, len(task.term_names)), float, device)
+            self.mask = Buffer(n, bool, device)
+            self.stream = Buffer(n, wp.uint32, device)
+            self.episode = Buffer(n, int, device)
+            self.elapsed_steps = Buffer(n, int, device)
+            self.non_finite = Buffer(n, bool, device)
+            self.done = Buffer(n, bool, device)
+            self.terminated = Buffer(n, bool, device)
+            self.truncated = Buffer(n, bool, device)
+            self.seed = Buffer(1, wp.uint32, device)
+            self._stagger = Buffer(1, bool, device)
+            self._any = Buffer(1, int, device)
+            self._all = wp.ones(n, dtype=bool, device=device)
+            self.mask.torch.fill_(True)
+
+            self.health = Health(self.sim, self.non_finite, task.on_overflow)
+            self._monitors: list[Monitor] = [self.health]
+            if task.nan_dump is not None:
+                inputs = self.action, self.episode, self.elapsed_steps
+                guard = NanGuard(task.nan_dump, self.sim, inputs, self.non_finite, self.seed, task.settings())
+                self._monitors.append(guard)
+
+            self._observation_kernel = task.observation_kernel(self)
+            self._pose_kernel = task.pose_kernel(self)
+            self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
+            self._step_graph = self.sim.capture(self._launch_step)
+            self._reset_graph = self.sim.capture(self._launch_reset)
+            self._refresh_graph = self.sim.capture(self._launch_refresh)
+            wp.synchronize_device(device)  # made on Warp's stream, used on torch's
+            self.set_seed(task.seed)  # recording has drawn episodes
+            for monitor in self._monitors:
+                monitor.restart()
+        self._renderers: dict[tuple[str, int, int], Renderer] = {}
+        self._pid, self._closed = os.getpid(), False
+        _WORLDS.add(self)
+
+    # What the graphs record.
+
+    def _launch_step(self) -> None:
+        """The control step."""
+        for monitor in self._monitors:
+            monitor.launch_before_step()
+        self._launch(apply_action, [self.action.warp], [self.sim.data.ctrl, self.non_finite.warp])
+        self.sim.step()
+        self._launch_outputs(self._all)
+        self._launch(
+            count_step,
+            [self.non_finite.warp, self._episode_length],
+            [self.elapsed_steps.warp, self.done.warp, self.terminated.warp, self.truncated.warp],
+        )
+        for monitor in self._monitors:
+            monitor.launch_after_step()
+
+    def _launch_reset(self) -> None:
+        """A new episode in the worlds of the mask. It costs next to nothing if there are none."""
+        self._any.warp.zero_()
+        self._launch(any_world, [self.mask.warp], [self._any.warp])
+        wp.capture_if(self._any.warp, self._launch_masked_reset)
+
+    def _launch_masked_reset(self) -> None:
+        mask = self.mask.warp
+        flags = [self.non_finite.warp, self.done.warp, self.terminated.warp, self.truncated.warp]
+        self._launch(
+            begin_episode,
+            [mask, self._stagger.warp, self.seed.warp, self._world_offset, self._episode_length],
+            [self.episode.warp, self.stream.warp, self.elapsed_steps.warp, *flags],
+        )
+        self.sim.reset(mask)
+        if self._pose_kernel is not None:
+            kernel, inputs, outputs = self._pose_kernel
+            self._launch(kernel, [*inputs, mask, self.stream.warp], outputs)
+        self.sim.forward_at_rest(mask)
+        self._launch_outputs(mask)
+
+    def _launch_refresh(self) -> None:
+        """Outputs of a state that was written from outside, in the worlds of the mask."""
+        self.sim.forward(self.mask.warp)
+        self._launch_outputs(self.mask.warp)
+
+    def _launch_outputs(self, mask: wp.array) -> None:
+        data = self.sim.data
+        kernel, inputs = self._observation_kernel
+        outputs = [self.observation.warp, self.reward.warp, self.terms.warp]
+        self._launch(kernel, [*inputs, mask], outputs)
+        self._launch(zero_non_finite, [mask, data.qpos, data.qvel], [self.non_finite.warp, *outputs])
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=self.sim.num_envs, inputs=inputs, outputs=outputs, device=self.sim.device)
+
+    # What the environment calls. Nothing waits for the device.
+
+    def step(self, action: torch.Tensor) -> None:
+        """Steps all worlds under actions of shape ``(nworld, nu)``."""
+        self._refuse_after_fork()
+        self.action.torch.copy_(action.detach())  # else the buffer would keep every past policy's autograd graph
+        self._step_graph.replay()
+        for monitor in self._monitors:
+            monitor.poll()
+
+    def reset(self, mask: torch.Tensor | None, stagger: bool) -> None:
+        """Begins the next episode in the worlds of ``mask`` ``(nworld,)``, in all for ``None``.
+
+        Args:
+            mask: the worlds.
+            stagger: whether they begin at random points of their time limit.
+        """
+        self._refuse_after_fork()
+        self._set_mask(mask)
+        self._stagger.torch.fill_(stagger)
+        self._reset_graph.replay()
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Returns the buffers that make up the state of the worlds, by key of :class:`torchrl_loco.State`."""
+        sim = self.sim
+        physics = {"qpos": sim.qpos, "qvel": sim.qvel, "qacc_warmstart": sim.qacc_warmstart}
+        return {**physics, "elapsed_steps": self.elapsed_steps.torch, "episode": self.episode.torch}
+
+    def refresh(self, mask: torch.Tensor, ctrl_dt: float) -> None:
+        """Brings everything else up to date after :meth:`state` was written in the worlds of ``mask`` ``(nworld,)``.
+
+        Args:
+            mask: the worlds.
+            ctrl_dt: time of a control step (s).
+        """
+        self._refuse_after_fork()
+        self._set_mask(mask)
+        for flag in (self.non_finite, self.done, self.terminated, self.truncated):
+            flag.torch.masked_fill_(mask, False)
+        time = self.sim.time
+        time.copy_(torch.where(mask, self.elapsed_steps.torch * ctrl_dt, time))
+        self._refresh_graph.replay()
+
+    def _set_mask(self, mask: torch.Tensor | None) -> None:
+        if mask is None:
+            self.mask.torch.fill_(True)
+        else:
+            self.mask.torch.copy_(mask)
+
+    def set_seed(self, seed: int) -> None:
+        """Starts the random streams of all worlds again, at their episode 0."""
+        self.seed.torch.copy_(torch.from_numpy(np.array([seed], dtype=np.uint32)))
+        self.episode.torch.zero_()
+
+    def render(self, camera: str, width: int, height: int) -> torch.Tensor:
+        """Returns pixels of all worlds, uint8 of shape ``(nworld, height, width, 3)``."""
+        key = (camera, width, height)
+        if key not in self._renderers:
+            with self.sim.qpos.device:
+                self._renderers[key] = Renderer(self.sim, *key)
+        return self._renderers[key].render()
+
+    # The end.
+
+    def close(self) -> None:
+        """Lets all monitors report what they have not reported yet. The memory goes with the last reference."""
+        if self._closed or os.getpid() != self._pid:  # in a forked process: the parent reports
+            return
+        self._closed = True
+        with contextlib.ExitStack() as stack:  # if one raises, the others report all the same
+            for monitor in self._monitors:
+                stack.callback(monitor.check)
+
+    def _refuse_after_fork(self) -> None:
+        if self.sim.device.is_cuda and os.getpid() != self._pid:
+            raise RuntimeError("CUDA does not survive a fork: make the environment in the process that steps it")
+
+    def __del__(self) -> None:
+        if "_closed" in self.__dict__:  # it was made in full
+            _close_quietly(self)
+
+
+def _close_quietly(world: World) -> None:
+    """Closes a world where nothing can be raised: errors become warnings."""
+    with contextlib.suppress(Warning):  # which may be errors
+        try:
+            world.close()
+        except Exception as error:
+            warnings.warn(str(error), RuntimeWarning, stacklevel=2)
+
+
+_WORLDS: "weakref.WeakSet[World]" = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    """Closes all worlds before the interpreter takes torch apart."""
+    for world in list(_WORLDS):
+        _close_quietly(world)

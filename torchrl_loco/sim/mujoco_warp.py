@@ -1,0 +1,184 @@
+"""The engine that calls MuJoCo-Warp: its tuning, the order of a control step, and what it needs in memory."""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+from torchrl_loco.config import SimConfig
+from torchrl_loco.sim.buffer import Buffer
+from torchrl_loco.sim.row_order import RowOrder
+
+UNROLLED_ITERATIONS = 10
+"""Up to so many solver iterations a recorded step holds them all, without a condition between them."""
+
+LANES = wp.constant(32)
+"""Threads that share the constraint rows of a world."""
+
+
+@wp.kernel(enable_backward=False)
+def clear_constraints(
+    # In:
+    mask_in: wp.array[bool],
+    # Data out:
+    efc_J_out: wp.array3d[float],  # noqa: N803
+    efc_D_out: wp.array2d[float],  # noqa: N803
+):
+    """Zeroes the constraint rows: the solver multiplies unused ones by zero, which would keep a NaN forever."""
+    world, lane = wp.tid()
+    if not mask_in[world]:
+        return
+    for row in range(lane, efc_J_out.shape[1], LANES):
+        for i in range(efc_J_out.shape[2]):
+            efc_J_out[world, row, i] = 0.0
+        if row < efc_D_out.shape[1]:
+            efc_D_out[world, row] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def record_peaks(
+    # Data in:
+    nefc_in: wp.array[int],
+    nacon_in: wp.array[int],
+    ncollision_in: wp.array[int],
+    # Out:
+    constraints_out: wp.array[int],
+    contacts_out: wp.array[int],
+):
+    """Records the largest numbers of constraint rows and contacts that were needed, dropped ones included."""
+    world = wp.tid()
+    constraints_out[world] = wp.max(constraints_out[world], nefc_in[world])
+    if world == 0:
+        contacts_out[0] = wp.max(contacts_out[0], wp.max(nacon_in[0], ncollision_in[0]))
+
+
+class MujocoWarpEngine:
+    """Steps all worlds with MuJoCo-Warp.
+
+    Args:
+        mj_model: the compiled model, with the options of ``config``.
+        config: settings of the simulation.
+        num_envs: number of worlds.
+        device: where they live.
+
+    Attributes:
+        model: the model on the device.
+        data: the state of all worlds.
+        peak_constraints: most constraint rows that a substep needed, by world, ``(nworld,)``.
+        peak_contacts: most contacts that a substep needed, over all worlds, ``(1,)``.
+    """
+
+    def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
+        self._num_envs, self._device = num_envs, device
+        self._substeps = config.substeps
+        with wp.ScopedDevice(device):
+            self.model = mjw.put_model(mj_model)
+            self.data = mjw.make_data(mj_model, nworld=num_envs, naconmax=config.naconmax, njmax=config.njmax)
+        option = self.model.opt
+        # Printing from kernels costs more than the physics; ``data.overflow`` holds the same information.
+        option.warn_overflow = 0
+        # A few iterations in a row are cheaper than a loop that may stop early.
+        option.graph_conditional = config.iterations > UNROLLED_ITERATIONS
+        # The solver starts from the warm start; comparing it with a second start costs a factorization.
+        option.run_qacc_smooth = False
+        # Threads per small matrix of a world: measured in benchmarks/README.md.
+        self.model.block_dim.update_gradient_cholesky = 32
+        self.model.block_dim.update_gradient_JTDAJ_dense = 64
+        self._row_order = RowOrder(self.model, self.data) if config.deterministic else None
+        self.peak_constraints = Buffer(num_envs, int, device)
+        self.peak_contacts = Buffer(1, int, device)
+
+    def step(self) -> None:
+        """Advances every world by one control step under ``ctrl``.
+
+        Afterwards poses, velocities and sensors belong to the new state, as in dm_control. dm_control gets there by the
+        first half of the next step; here only what an observation can read is evaluated, so a reset has nothing else to
+        update. Forces, contacts and constraints are those of the last substep.
+        """
+        with self._without_sensors():
+            for _ in range(self._substeps):
+                self._substep()
+                self._record_peaks()
+        self.evaluate()
+
+    def _substep(self) -> None:
+        if self._row_order is None:
+            mjw.step(self.model, self.data)
+            return
+        mjw.step1(self.model, self.data)
+        self._row_order.apply()
+        # Only the solver sums in an order that varies; deterministic atomics elsewhere would be a waste.
+        self.model.opt.deterministic = mjw.DeterminismType.ATOMICS
+        mjw.step2(self.model, self.data)
+        self.model.opt.deterministic = mjw.DeterminismType.NONE
+
+    def _record_peaks(self) -> None:
+        d = self.data
+        wp.launch(
+            record_peaks,
+            dim=self._num_envs,
+            inputs=[d.nefc, d.nacon, d.ncollision],
+            outputs=[self.peak_constraints.warp, self.peak_contacts.warp],
+            device=self._device,
+        )
+
+    @contextlib.contextmanager
+    def _without_sensors(self) -> Iterator[None]:
+        """Skips sensors, cameras and lights in substeps: they are evaluated when they are needed."""
+        model = self.model
+        kept = model.opt.disableflags, model.ncam, model.nlight
+        model.ncam = model.nlight = 0
+        model.opt.disableflags |= mjw.DisableBit.SENSOR
+        try:
+            yield
+        finally:
+            model.opt.disableflags, model.ncam, model.nlight = kept
+
+    def evaluate(self) -> None:
+        """Evaluates what an observation can read: poses and velocities of bodies, and velocity sensors."""
+        mjw.kinematics(self.model, self.data)
+        mjw.com_pos(self.model, self.data)
+        mjw.com_vel(self.model, self.data)
+        mjw.sensor_vel(self.model, self.data)
+
+    def evaluate_at_rest(self) -> None:
+        """As :meth:`evaluate`, for less: every world whose ``qpos`` changed is at rest."""
+        mjw.kinematics(self.model, self.data)
+
+    def clear_constraints(self, mask: wp.array) -> None:
+        """Removes the constraints of the worlds where ``mask`` ``(nworld,)`` is set."""
+        efc = self.data.efc
+        wp.launch(
+            clear_constraints,
+            dim=(self._num_envs, LANES),
+            inputs=[mask],
+            outputs=[efc.J, efc.D],
+            device=self._device,
+        )
+
+
+def data_bytes(mj_model: mujoco.MjModel, config: SimConfig, num_envs: int) -> int:
+    """Returns the memory that ``mjData`` of so many worlds takes (bytes), without allocating it.
+
+    Its size is linear in the number of worlds and in ``naconmax``; three small instances give the coefficients.
+    """
+
+    def size(worlds: int, contacts: int) -> int:
+        with wp.ScopedDevice("cpu"):
+            return _array_bytes(mjw.make_data(mj_model, nworld=worlds, naconmax=contacts, njmax=config.njmax))
+
+    base = size(1, 1)
+    return base + (num_envs - 1) * (size(2, 1) - base) + (config.naconmax - 1) * (size(1, 2) - base)
+
+
+def _array_bytes(thing: Any) -> int:
+    """Returns the memory of all arrays in a dataclass, nested ones included (bytes)."""
+    if isinstance(thing, wp.array):
+        return thing.capacity
+    if dataclasses.is_dataclass(thing):
+        return sum(_array_bytes(getattr(thing, field.name)) for field in dataclasses.fields(thing))
+    return 0

@@ -1,0 +1,14 @@
+from .config import PPOConfig as PPOConfig
+from .config import REPPOConfig as REPPOConfig
+from .config import TrainingConfig as TrainingConfig
+from .evaluation import describe as describe
+from .evaluation import has_display as has_display
+from .evaluation import record as record
+from .evaluation import view as view
+from .plots import plot_runs as plot_runs
+from .presets import preset as preset
+from .presets import tuning_note as tuning_note
+from .run_folder import RunFolder as RunFolder
+from .run_folder import unused_path as unused_path
+from .trainer import Trainer as Trainer
+from .trainer import evaluate_run as evaluate_run
