@@ -6,8 +6,9 @@ TASK ?= walker_stand
 ARGS ?=
 PYTEST_ARGS ?= --numprocesses auto
 NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
+PYTEST := $(BIN)/python -m pytest $(PYTEST_ARGS)
 
-.PHONY: help train test test-fast lint format docs notebooks dist clean
+.PHONY: help train test test-fast test-all tests tests-ci lint format docs notebooks dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*##/\t/' | expand -t 12
@@ -15,22 +16,30 @@ help:  ## this list
 train: $(VENV)/installed  ## train a policy; TASK=walker_walk ARGS="--seed 1" to change what
 	$(BIN)/torchrl-loco train $(TASK) $(ARGS)
 
-test: lint  ## style, types and all tests, on real physics
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+test: lint tests  ## style, types and the tests, on real physics
 
 test-fast: $(VENV)/installed  ## the everyday part of the tests
-	$(BIN)/python -m pytest $(PYTEST_ARGS) -m "not slow"
+	$(PYTEST) -m "not slow and not ci"
+
+test-all: lint tests tests-ci  ## the same as test, then site, notebooks, wheel and a training run
+
+# The parts of these, for workflows.
+tests: $(VENV)/installed
+	$(PYTEST) -m "not ci"
+
+tests-ci: $(VENV)/installed
+	$(PYTEST) -m ci
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: $(VENV)/installed
+format: $(VENV)/installed  ## format the code and apply safe fixes
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-dist: $(VENV)/installed  ## wheel and sdist, looked through and tried out, into dist/
+dist: $(VENV)/installed  ## wheel and sdist, checked and tried out, into dist/
 	rm -rf dist
 	$(BIN)/python -m hatchling build
 	$(BIN)/python -m pytest tests/test_packaging.py
@@ -38,7 +47,7 @@ dist: $(VENV)/installed  ## wheel and sdist, looked through and tried out, into 
 docs: $(VENV)/installed  ## the site, into docs/_build/html; warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
 
-notebooks: $(VENV)/installed  ## run the notebooks anew and store what they print; NOTEBOOKS=notebooks/rewards.ipynb for one
+notebooks: $(VENV)/installed  ## run the notebooks and store their output; NOTEBOOKS=notebooks/rewards.ipynb for one
 	$(BIN)/python notebooks/execute.py $(NOTEBOOKS)
 
 # PIP_ARGS can constrain versions, for example to a CPU build of torch: make test PIP_ARGS="torch==2.13.0"
