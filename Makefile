@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 TASK ?= walker_stand
 ARGS ?=
-PYTEST_ARGS ?= --numprocesses auto
+PYTEST_ARGS ?= --numprocesses auto --dist loadfile
 NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
 PYTEST := $(BIN)/python -m pytest $(PYTEST_ARGS)
 

@@ -5,16 +5,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads
 
 import pytest
 import torch
+from cases import BODIES, PROTOCOLS, TASKS
 
 import torchrl_loco
-from torchrl_loco import registry
-
-TASKS = list(registry.OURS)  # not those of plug-ins that happen to be installed
-PROTOCOLS = ("playground", "dm_control")
-BODIES = ("walker_run", "humanoid_run")
-"""A task of each body, for what does not depend on the task."""
-COARSE = {"sim_dt": 0.0125}
-"""Two physics steps in a control step, for tests in which the physics does not matter: the fewer, the faster."""
 
 
 def pytest_collection_modifyitems(items):
@@ -74,18 +67,3 @@ def actions():
         return drawn.to(env.device)
 
     return draw
-
-
-def played(env, moves):
-    """Returns the observations of a rollout of ``moves`` across episodes."""
-    td, observations = env.reset(), []
-    for action in moves:
-        current, td = env.step_and_maybe_reset(td.set("action", action))
-        observations.append(current["next", "observation"])
-    return torch.stack(observations)
-
-
-def assert_repeats(first, second):
-    """Equal bit for bit on the CPU; on CUDA, where the order of sums varies, as long as rounding stays small."""
-    exact = first.device.type == "cpu"
-    torch.testing.assert_close(first, second, rtol=0 if exact else 2e-2, atol=0 if exact else 2e-2)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from conftest import COARSE
+from cases import COARSE
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, RewardSum

@@ -131,6 +131,7 @@ def test_observation_and_reward_agree_with_c_mujoco(cheetah):
     assert max(rewards) == 1
 
 
+@pytest.mark.slow
 def test_starts(cheetah):
     """They are distributed as dm_control's, stand at rest on the floor, and a masked reset draws from them too."""
     env = cheetah(64)
@@ -174,6 +175,7 @@ def test_a_nan_dump_knows_its_class(cheetah, tmp_path):
     assert "world 1 of 3" in next(nan_dump.describe(nan_dump.load(file), "cpu"))
 
 
+@pytest.mark.slow
 def test_doctor(cheetah, monkeypatch):
     _, error = doctor.self_test("cheetah_run", "cpu")
     assert error < doctor.TOLERANCE

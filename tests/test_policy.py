@@ -1,5 +1,6 @@
 """Policies on disk: small, exact enough, and safe to load."""
 
+import errno
 from pathlib import Path
 
 import pytest
@@ -57,15 +58,16 @@ def test_an_interrupted_write_leaves_the_file_as_it_was(policy, tmp_path, monkey
     def disk_full(path, data):
         with path.open("wb") as file:
             file.write(data[:100])
-        raise OSError("no space left")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     path = tmp_path / "policy.safetensors"
     policy.save(path)
     before = path.read_bytes()
     monkeypatch.setattr(Path, "write_bytes", disk_full)
-    with pytest.raises(OSError, match="no space left"):
+    with pytest.raises(OSError, match=r"No space left.*previous file is kept"):
         policy.save(path)
     assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_files_that_are_no_policy(policy, tmp_path):

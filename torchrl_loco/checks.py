@@ -102,11 +102,11 @@ def suggestion(word: str, choices: Collection[str]) -> str:
 
 
 def check_fields(config: Any, intervals: Mapping[str, str]) -> None:
-    """Checks the fields of a dataclass that are numbers or flags.
+    """Checks the fields of a dataclass that are numbers or flags, and stores them in their canonical type.
 
     Args:
-        config: an instance.
-        intervals: the interval of a field whose default is not :data:`POSITIVE_INT` or :data:`POSITIVE`.
+        config: an instance, which may be frozen and just being made.
+        intervals: intervals of the fields that are not simply positive.
 
     Raises:
         TypeError: a field has the wrong type.
@@ -115,15 +115,16 @@ def check_fields(config: Any, intervals: Mapping[str, str]) -> None:
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if field.type is bool:
-            check_bool(field.name, value)
+            value = check_bool(field.name, value)
         elif field.type is int:
-            check_int(field.name, value, intervals.get(field.name, POSITIVE_INT))
+            value = check_int(field.name, value, intervals.get(field.name, POSITIVE_INT))
         elif field.type is float:
-            check_float(field.name, value, intervals.get(field.name, POSITIVE))
+            value = check_float(field.name, value, intervals.get(field.name, POSITIVE))
+        object.__setattr__(config, field.name, value)
 
 
 def check_multiple(name: str, value: float, base_name: str, base: float) -> int:
-    """Returns how many times ``base`` goes into ``value``.
+    """Returns ``value / base`` as a whole number.
 
     Raises:
         ValueError: it is no whole number of at least 1.

@@ -5,6 +5,7 @@ Modules that take seconds to import are imported where they are used, so that he
 
 import contextlib
 import dataclasses
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -78,7 +79,7 @@ def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None =
     """Print versions, devices and the kernel cache, and test the physics of each device against C MuJoCo.
 
     Args:
-        size: instead, measure the njmax and naconmax that this task needs.
+        size: a task: measure its njmax and naconmax instead.
         num_envs: number of worlds to measure with.
         device: where to measure; default: CUDA if there is any.
     """
@@ -87,7 +88,7 @@ def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None =
     if size is not None:
         with _user_errors():
             for name, (needed, advised) in doctor.size(size, num_envs, device).items():
-                print(f"{name:<9} at most {needed} needed under random actions, {advised} advised")
+                print(f"{name:<9} up to {needed} needed under random actions, {advised} advised")
         return
     problems = []
     for finding in doctor.diagnose():
@@ -95,7 +96,7 @@ def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None =
         if finding.problem:
             problems.append(finding.subject)
     if problems:
-        print(f"verdict: NOT RIGHT, see {', '.join(problems)}")
+        print(f"verdict: problems with {', '.join(problems)}")
         raise SystemExit(1)
     print("verdict: everything works")
 
@@ -119,8 +120,12 @@ def evaluate(
         from torchrl_loco import training
 
         check_run(run)
-        summary = training.evaluate_run(training.RunFolder(run), episodes, seed, device)
+        folder = training.RunFolder(run)
+        summary = training.evaluate_run(folder, episodes, seed, device)
+        note = training.poor_return(folder.load_config(), summary)
     print(training.describe(summary))
+    if note:
+        print(note)
 
 
 def resume(run: tyro.conf.Positional[Path], /) -> None:
@@ -139,7 +144,7 @@ def resume(run: tyro.conf.Positional[Path], /) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Video:
-    """Which part of an episode is shown, and how."""
+    """Options of a video."""
 
     seconds: float = 10.0
     """Length of the video (s)."""
@@ -172,7 +177,8 @@ class Video:
 
     def env(self, policy: "torchrl_loco.Policy") -> "torchrl_loco.LocoEnv":
         """Returns one world of the policy's task."""
-        return torchrl_loco.make(policy.info["task"], 1, self.device, self.seed, policy.info["protocol"])
+        info = policy.info
+        return torchrl_loco.make(info["task"], 1, self.device, self.seed, info["protocol"], world_offset=0)
 
 
 VideoOptions = Annotated[Video, tyro.conf.arg(name="")]
@@ -323,7 +329,7 @@ def _task_config(args: list[str]) -> Any:
 
 
 def _fixed_task(config: "training.TrainingConfig") -> "training.TrainingConfig":
-    """Returns the settings with their task fixed: the preset is for no other."""
+    """Returns the settings with their task fixed: a preset belongs to one task."""
     hidden = Annotated[str, tyro.conf.Suppress, tyro.conf.Fixed]
     kind = type(config)
     cls = dataclasses.make_dataclass(kind.__name__, [("task", hidden, config.task)], bases=(kind,), frozen=True)
@@ -339,7 +345,11 @@ def _begin(config: "training.TrainingConfig") -> "training.Trainer":
     if note := training.tuning_note(config):
         print(note)
     print(f"run folder: {run.path}")
-    return trainer(run)
+    try:
+        return trainer(run)
+    except BaseException:  # an empty run folder is of no use
+        shutil.rmtree(run.path)
+        raise
 
 
 def _train(trainer: "training.Trainer") -> None:

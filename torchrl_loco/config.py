@@ -1,4 +1,4 @@
-"""The settings of a simulation and the one place of their defaults."""
+"""Simulation settings and their defaults."""
 
 import dataclasses
 import math
@@ -11,7 +11,7 @@ PROTOCOLS = ("playground", "dm_control")
 
 # The documented naconmax is for this many worlds (Playground's default batch) and scales with num_envs.
 NACONMAX_WORLDS = 2048
-# Fewer worlds share this much at least: a curled-up humanoid has more pairs of geoms near each other than contacts.
+# Minimum for few worlds: naconmax also limits broadphase pairs, and a curled-up humanoid has more pairs than contacts.
 NACONMAX_FLOOR = 1024
 
 
@@ -96,4 +96,6 @@ def sim_config(
     if "naconmax" in overrides:
         return config
     scaled = math.ceil(config.naconmax * num_envs / NACONMAX_WORLDS)
+    if scaled >= 2**31:
+        raise ValueError(f"num_envs={num_envs} is too large: contacts are indexed with 32 bits")
     return dataclasses.replace(config, naconmax=max(scaled, NACONMAX_FLOOR))

@@ -74,7 +74,7 @@ def diagnose() -> Iterator[Finding]:
             yield Finding(f"{body} on {device}", f"{verdict}, made in {seconds:.1f} s", problem=not right)
 
 
-def _gib(size: int) -> str:
+def _gib(size: float) -> str:
     return f"{size / 2**30:.0f} GiB"
 
 
@@ -87,7 +87,7 @@ def _describe_cache() -> str:
 
 
 def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) -> dict[str, tuple[int, int]]:
-    """Measures the ``njmax`` and ``naconmax`` that a task needs, in steps under random actions with room to spare.
+    """Measures the ``njmax`` and ``naconmax`` that a task needs under random actions, with limits far above the need.
 
     Args:
         task: id of the environment.
@@ -98,7 +98,7 @@ def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) 
     Returns:
         For each setting the most that was needed and the advised value.
     """
-    env = make(task, num_envs, device, seed=0, on_overflow="raise", njmax=1000, naconmax=200 * num_envs)
+    env = make(task, num_envs, device, seed=0, world_offset=0, on_overflow="raise", njmax=1000, naconmax=200 * num_envs)
     with torch.no_grad():
         td = env.reset()
         for _ in trange(steps, desc=f"{task}, {num_envs} worlds", leave=False):
@@ -116,7 +116,7 @@ def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float]:
     anything was not finite.
     """
     start = time.perf_counter()
-    env = make(task, 4, device, seed=0, protocol="dm_control")
+    env = make(task, 4, device, seed=0, protocol="dm_control", world_offset=0)
     seconds = time.perf_counter() - start
     generator = torch.Generator().manual_seed(0)
     errors, data = [], mujoco.MjData(env.mj_model)

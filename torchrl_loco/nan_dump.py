@@ -1,4 +1,4 @@
-"""A NaN dump: the state and action from which a world was no longer finite, stepped again in Warp and in C MuJoCo."""
+"""NaN dumps: the state and action that led to a non-finite world, stepped again in Warp and in C MuJoCo."""
 
 import contextlib
 import dataclasses
@@ -41,7 +41,8 @@ class NanDump:
     def make_env(self, device: torch.device | str | None = None, **config: Any) -> LocoEnv:
         """Returns an environment of one world with the settings of the dump, and ``config`` on top."""
         env, settings = _classes()[self.settings["env"]], {**self.settings["config"], **config}
-        return env(1, device, self.settings["seed"], self.settings["protocol"], on_overflow="ignore", **settings)
+        arguments = (1, device, self.settings["seed"], self.settings["protocol"])
+        return env(*arguments, world_offset=0, on_overflow="ignore", **settings)
 
     @property
     def state(self) -> State:
@@ -132,7 +133,7 @@ def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterato
     if "action" in wrong:
         yield "an action that is not finite terminates its world, which is stepped with zeros instead"
     if any(name in STATE for name in wrong):
-        yield "this state was written into the simulation from outside: there is nothing to step"
+        yield "the state was already non-finite before the step: there is nothing to step"
         return
     warp, c = warp_trace(dump, device), mujoco_trace(dump)
     yield f"{'substep':>7}  {'largest |qvel| in Warp':>22}  {'in C MuJoCo':>12}  {'largest difference':>18}"

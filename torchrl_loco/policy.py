@@ -75,7 +75,7 @@ class Policy(TensorDictModule):
     def save(self, path: Path) -> None:
         """Writes the policy to ``path`` in half precision, which changes an action by some thousandths at most."""
         layers = [_LAYER_NAMES[type(layer)] for layer in self.module]
-        tensors = {  # half precision has not the range for the observation's statistics
+        tensors = {  # half precision has too small a range for the observation's statistics
             name: tensor.to(torch.float32 if name.startswith("0.") else torch.float16)
             for name, tensor in self.module.state_dict().items()
         }

@@ -1,4 +1,4 @@
-"""From an id to an environment. Importing this module imports no environment, so names are known at once."""
+"""Ids of environments, and ``make``. No environment is imported until it is made."""
 
 import dataclasses
 import functools
@@ -23,7 +23,7 @@ class Entry:
 
     Attributes:
         target: where its class is, as ``"module:Class"``.
-        summary: what the task asks for, in a sentence; empty for a plug-in, whose class says it.
+        summary: what the task asks for, in a sentence; empty for a plug-in: its class docstring is used.
         distribution: name and version of the distribution that a plug-in comes from; empty for ours.
     """
 
@@ -128,7 +128,7 @@ def make(id: str, *args: Any, **kwargs: Any) -> "LocoEnv":
             them, such as ``episode_length=500``.
 
     Returns:
-        The environment, with batch size ``(num_envs,)``, ready for ``reset()``.
+        The environment, ready for ``reset()``; its batch size is ``(num_envs,)``, or ``()`` for ``num_envs=None``.
 
     Raises:
         ValueError: an argument is out of range or unknown; the message names the valid choices.

@@ -23,9 +23,23 @@ def save(path: Path, kind: str, tensors: dict[str, torch.Tensor], settings: dict
     """
     metadata = {"format": _format(kind), **{name: json.dumps(value) for name, value in settings.items()}}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    part = Path(f"{path}.part")  # an interrupted write leaves the file as it was
-    part.write_bytes(serialize(tensors, {**metadata, "sha256": digest(tensors, metadata)}))
-    part.replace(path)
+    replace_file(Path(path), serialize(tensors, {**metadata, "sha256": digest(tensors, metadata)}))
+
+
+def replace_file(path: Path, content: bytes | memoryview) -> None:
+    """Writes a file as a whole: if that fails or is interrupted, the file stays as it was.
+
+    Raises:
+        OSError: it cannot be written, for example because the disk is full.
+    """
+    part = Path(f"{path}.part")
+    try:
+        part.write_bytes(content)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        kept = "; the previous file is kept" if path.exists() else ""
+        raise OSError(error.errno or 0, f"{error.strerror or error}{kept}", str(path)) from error
 
 
 def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

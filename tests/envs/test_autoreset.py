@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from conftest import COARSE
+from cases import COARSE
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 

@@ -5,7 +5,8 @@ import weakref
 
 import pytest
 import torch
-from conftest import COARSE, assert_repeats, played
+from cases import COARSE
+from compare import assert_repeats, played
 
 import torchrl_loco
 from torchrl_loco.envs import world
@@ -35,7 +36,7 @@ def test_closed_means_closed():
         with pytest.raises(RuntimeError, match=r"this WalkerWalk is closed: reset\(\) opens it again"):
             use()
     mask = torch.tensor([[True], [False], [False], [False]])
-    with pytest.raises(ValueError, match="reset all of them"):
+    with pytest.raises(ValueError, match="reset all worlds"):
         env.reset(td.set("_reset", mask))
     assert env.mj_model.nu == 6
     env.set_seed(7)
@@ -74,6 +75,7 @@ def test_a_failed_opening_leaves_nothing_behind(actions, monkeypatch):
     assert_repeats(played(env, moves), played(never_closed, moves))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["close", "del"])
 def test_nothing_holds_on_to_a_closed_environment(way):
     env = made()

@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from conftest import BODIES, TASKS, assert_repeats
+from cases import BODIES, COARSE, TASKS
+from compare import assert_repeats
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv, check_env_specs
 
@@ -41,8 +42,9 @@ def test_rollout(env):
     assert all((term == 0).all() for term in env.reset()["reward_terms"].values())
 
 
-def test_a_step_returns_no_live_buffer(env, actions):
+def test_a_step_returns_no_live_buffer(shared, body_task, device, actions):
     """A rollout holds what a loop with copies holds, and no two steps share memory."""
+    env = shared(body_task, 5, device, reward_terms=True)
     moves = actions(env, 6)
     env.reset()
     state = env.get_state()
@@ -69,8 +71,8 @@ def test_a_step_returns_no_live_buffer(env, actions):
 
 
 def test_truncation_is_exact_and_the_terminal_observation_true(shared, body_task, protocol, device):
-    env = shared(body_task, 4, device, 3, protocol=protocol, episode_length=7)
-    twin = shared(body_task, 4, device, 3, protocol=protocol)  # not truncated here
+    env = shared(body_task, 4, device, 3, protocol=protocol, episode_length=7, **COARSE)
+    twin = shared(body_task, 4, device, 3, protocol=protocol, **COARSE)  # not truncated here
     carried, td = env.reset(), twin.reset()
     for step in range(1, 8):
         action = env.action_spec.zero()
@@ -154,6 +156,5 @@ def test_making_an_environment_leaves_no_overflow_behind():
     assert env.health()["total", "iteration_limit"] > 0
 
 
-def test_repr():
-    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=3)
-    assert repr(env) == "WalkerWalk(num_envs=2, device='cpu', seed=3, protocol='playground')"
+def test_repr(shared):
+    assert repr(shared(seed=3)) == "WalkerRun(num_envs=4, device='cpu', seed=3, protocol='playground')"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from conftest import BODIES, TASKS
+from cases import BODIES, TASKS
 from oracle import Oracle, recorded
 
 import torchrl_loco

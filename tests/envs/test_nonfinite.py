@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 import warp as wp
+from cases import COARSE
 from tensordict import TensorDict
 
 from torchrl_loco.envs.kernels import zero_non_finite
@@ -33,7 +34,7 @@ def assert_goes_on_as(env, twin, after, expected, moves, exact):
 
 @pytest.mark.parametrize(("task", "protocol"), CASES)
 def test_a_bad_action_ends_only_its_world(shared, task, protocol, device, actions):
-    env, twin = (shared(task, 4, device, copy=copy, protocol=protocol, reward_terms=True) for copy in (0, 1))
+    env, twin = (shared(task, 4, device, copy=copy, protocol=protocol, reward_terms=True, **COARSE) for copy in (0, 1))
     exact = {"rtol": 0, "atol": 0} if device == "cpu" else {"rtol": 1e-3, "atol": 1e-3}
     others = torch.tensor([0, 2, 3], device=device)
     ended = torch.tensor([[False], [True], [False], [False]], device=device)
@@ -56,7 +57,7 @@ def test_a_bad_action_ends_only_its_world(shared, task, protocol, device, action
 
 def test_a_bad_action_is_stepped_with_zeros(shared, body_task, actions):
     """All of it, so that the state stays finite."""
-    env, twin = (shared(body_task, copy=copy) for copy in (0, 1))
+    env, twin = (shared(body_task, copy=copy, **COARSE) for copy in (0, 1))
     bad, expected = actions(env, 1)[0], actions(env, 1)[0]
     bad[1, 2], expected[1] = torch.nan, 0.0
     step_all(env, env.reset(), bad)
@@ -66,7 +67,7 @@ def test_a_bad_action_is_stepped_with_zeros(shared, body_task, actions):
 
 
 def test_a_finite_action_of_any_size_is_clipped(shared, body_task, actions):
-    env, twin = (shared(body_task, copy=copy) for copy in (0, 1))
+    env, twin = (shared(body_task, copy=copy, **COARSE) for copy in (0, 1))
     good, huge = actions(env, 1)[0], actions(env, 1)[0]
     huge[0, 1], huge[1, 2], huge[2, 0], huge[3, 3] = 1e10, -3e38, 1.5, 2e11
     good[0, 1], good[1, 2], good[2, 0], good[3, 3] = 1.0, -1.0, 1.0, 1.0
@@ -78,7 +79,7 @@ def test_a_finite_action_of_any_size_is_clipped(shared, body_task, actions):
 
 @pytest.mark.parametrize(("task", "protocol"), CASES)
 def test_a_state_that_is_not_finite_ends_only_its_world(shared, task, protocol, actions):
-    env, twin = (shared(task, 3, copy=copy, protocol=protocol) for copy in (0, 1))
+    env, twin = (shared(task, 3, copy=copy, protocol=protocol, **COARSE) for copy in (0, 1))
     exact = {"rtol": 0, "atol": 0}
     for field in ("qpos", "qvel"):
         td, twin_td = env.reset(), twin.reset()
@@ -94,7 +95,7 @@ def test_a_state_that_is_not_finite_ends_only_its_world(shared, task, protocol, 
 
 def test_a_reset_clears_constraints_that_are_not_finite(shared, protocol):
     """The solver multiplies unused rows by zero: a NaN would remain."""
-    env, twin = (shared("walker_run", copy=copy, protocol=protocol) for copy in (0, 1))
+    env, twin = (shared("walker_run", copy=copy, protocol=protocol, **COARSE) for copy in (0, 1))
     for field in ("J", "D"):
         wp.to_torch(getattr(env.sim.data.efc, field)).fill_(torch.nan)
         td, twin_td = env.reset(), twin.reset()
@@ -104,7 +105,7 @@ def test_a_reset_clears_constraints_that_are_not_finite(shared, protocol):
 
 
 def test_a_world_that_is_not_reset_stays_ended_and_harms_no_other(shared, actions):
-    env, twin = (shared("humanoid_run", 3, copy=copy) for copy in (0, 1))
+    env, twin = (shared("humanoid_run", 3, copy=copy, **COARSE) for copy in (0, 1))
     td, twin_td = env.reset(), twin.reset()
     env.sim.qvel[1] = math.nan
     for action in actions(env, 4):
@@ -118,7 +119,7 @@ def test_a_world_that_is_not_reset_stays_ended_and_harms_no_other(shared, action
 
 
 def test_a_rollout_goes_on_past_a_bad_action(shared):
-    env, calls = shared(), iter(range(100))
+    env, calls = shared(**COARSE), iter(range(100))
 
     def policy(td):
         action = env.action_spec.zero()
@@ -154,7 +155,7 @@ def test_everything_that_can_be_not_finite_is_looked_at():
 
 
 def test_an_ended_world_is_well_again_after_its_state_is_restored(shared, actions):
-    env = shared()
+    env = shared(**COARSE)
     td = env.reset()
     good = env.get_state()
     bad = actions(env, 1)[0]

@@ -68,6 +68,7 @@ def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol
         assert torch.equal(observation[kept], undisturbed[kept])
 
 
+@pytest.mark.slow
 def test_walker_starts_uniformly(draws, device):
     qpos = draws("walker_walk", 4096, 1, seed=12, device=device)[0].numpy().astype(np.float64)
     model = models.load(models.PATHS["walker"])
@@ -82,6 +83,7 @@ def test_walker_starts_uniformly(draws, device):
     assert np.abs(correlation).max() < 5 / np.sqrt(len(qpos))
 
 
+@pytest.mark.slow
 def test_humanoid_starts_free_of_contact(draws, device):
     """dm_control's start, judged by C MuJoCo, with the distribution that dm_control recorded."""
     qpos = draws("humanoid_walk", 2048, 1, seed=5, protocol="dm_control", device=device)[0].numpy().astype(np.float64)
@@ -156,6 +158,7 @@ def test_without_a_seed_environments_differ():
     assert not torch.equal(first, env.reset()["observation"])
 
 
+@pytest.mark.slow
 def test_stagger_spreads_the_time_limits():
     env = torchrl_loco.make("walker_stand", 2000, "cpu", seed=0, stagger=True, episode_length=100)
     env.reset()

@@ -4,7 +4,7 @@ import functools
 
 import pytest
 import torch
-from conftest import COARSE
+from cases import COARSE
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv, VecNormV2
 from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder

@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from conftest import COARSE, assert_repeats
+from cases import COARSE
+from compare import assert_repeats
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, check_env_specs
 

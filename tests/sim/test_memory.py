@@ -64,6 +64,7 @@ def test_free_memory_is_what_the_machine_and_its_control_group_leave(tmp_path, m
     for limit in (None, "max", "40000", "90000"):
         if limit is not None:
             (group / "memory.max").write_text(f"{limit}\n")
-            (group / "memory.current").write_text("10000\n")
+            (group / "memory.current").write_text("30000\n")
+            (group / "memory.stat").write_text("anon 9000\ninactive_file 20000\n")  # the page cache is free
         found.append(simulation.free_memory(torch.device("cpu")))
     assert found == [51200, 51200, 30000, 51200]

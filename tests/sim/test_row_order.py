@@ -12,6 +12,8 @@ from torchrl_loco.config import DEFAULTS, sim_config
 from torchrl_loco.sim import Simulation
 from torchrl_loco.sim.row_order import FIRST_CONTACT, ROW_FIELDS, RowOrder
 
+pytestmark = pytest.mark.slow
+
 WORLDS = 8
 
 

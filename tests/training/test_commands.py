@@ -65,15 +65,15 @@ def test_errors_of_the_user(ppo_run, tmp_path, capsys):
         "train walker_walk --device cpu --out {file}": "out must be a folder",
         "eval no/such/run": "is not a run folder",
         "eval {run} --episodes 0": "episodes must lie in [1, 2**31)",
-        "eval {broken}": "{broken}/config.json cannot be read",
+        "eval {broken}": "{broken}/config.json is damaged",
         "resume no/such/run": "is not a run folder",
         "resume {run}": "is complete",
-        "resume {broken}": "{broken}/config.json cannot be read",
+        "resume {broken}": "{broken}/config.json is damaged",
         "record {run} --seconds 0": "seconds must lie in (0, inf)",
         "record {run} --device cpu --out {file}": "already exists",
         "play walker_walk --policy {run} --device cpu": "is a policy for walker_stand",
         "plot": "no runs",
-        "plot {broken}": "{broken}/config.json cannot be read",
+        "plot {broken}": "{broken}/config.json is damaged",
         "fly": "train, resume, eval",
     }
     names = {"run": ppo_run.path, "broken": broken, "file": tmp_path / "file.mp4"}

@@ -48,7 +48,7 @@ def test_a_damaged_config_is_named(tmp_path):
     damaged += [json.dumps({**values, **wrong}) for wrong in ({"decisions": 8}, {"hidden": None}, {"gamma": 2.0})]
     for text in damaged:
         path.write_text(text)
-        with pytest.raises(ValueError, match=re.escape(f"{path} cannot be read as the settings of a run")):
+        with pytest.raises(ValueError, match=re.escape(f"{path} is damaged")):
             run.load_config()
     path.write_text(json.dumps(values))
     assert run.load_config(seed=5).seed == 5
@@ -118,7 +118,7 @@ def test_a_disk_that_fills_up_while_training(tmp_path, capsys):
         cli._train(trainer)
     problem, way = capsys.readouterr().err.splitlines()[-2:]
     assert problem.startswith("torchrl-loco: ")
-    assert problem.endswith(f"the previous checkpoint is kept: '{run.path / 'checkpoint.pt'}'")
+    assert problem.endswith(f"the previous file is kept: '{run.path / 'checkpoint.pt'}'")
     assert way == f"to continue: torchrl-loco resume {run.path}"
     assert not (run.path / "checkpoint.pt.part").exists()
     assert_same(before, networks(run))

@@ -20,12 +20,12 @@ def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBas
         The same TensorDict, batch ``(num_envs,)``, with the first observation of the next episode in the worlds that
         were done.
     """
-    mask = tensordict.get("done").clone()
-    request = TensorDict({"_reset": mask}, batch_size=tensordict.batch_size, device=tensordict.device)
+    mask, batch = tensordict.get("done").clone(), tensordict.batch_size
+    request = TensorDict({"_reset": mask}, batch_size=batch, device=tensordict.device)
     fresh = env._reset(request, set_state=False)
 
     def merge(old: torch.Tensor, new: torch.Tensor | None) -> torch.Tensor:
-        rows = mask.view(-1, *[1] * (old.ndim - 1))
+        rows = mask.view(*batch, *[1] * (old.ndim - len(batch)))
         return old.masked_fill(rows, 0) if new is None else torch.where(rows, new, old)
 
     # As in TorchRL, entries that a reset does not return (a policy's other outputs) are zero where a world was reset.

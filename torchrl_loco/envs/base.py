@@ -1,8 +1,9 @@
-"""What all locomotion environments share, TorchRL's side of it: specs, step, reset, seeding, state. Knows no task."""
+"""LocoEnv, the base of all environments: TorchRL's specs, step, reset, seeding and state."""
 
 import dataclasses
 import inspect
 import multiprocessing
+import os
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
@@ -44,17 +45,18 @@ class LocoEnv(EnvBase):
     Args:
         num_envs: number of worlds, the batch size. ``None`` makes one world without a batch dimension.
         device: where physics and tensors live; ``None`` takes CUDA if there is any, else the CPU.
-        seed: integer in [0, 2**32) that, with world and episode, decides every random draw; ``None`` draws one.
+        seed: integer in [0, 2**32). Every random draw is a function of seed, world and episode; ``None`` draws a seed.
         protocol: ``"playground"`` (few solver iterations, fast) or ``"dm_control"`` (the solver converges).
-        world_offset: index of the first world in a larger whole. Workers or ranks that share a seed and step different
-            worlds pass different offsets: worker k of n worlds each passes ``k * n``. ``None`` means 0.
+        world_offset: index of the first world among the worlds of all workers. Workers or ranks that share a seed and
+            step different worlds pass different offsets: worker k of n worlds each passes ``k * n``. ``None`` means 0.
         reward_terms: whether to return each factor of the reward under ``("next", "reward_terms", name)``.
         stagger: whether a full ``reset()`` starts each world at a random point of its time limit, so that the worlds
             are not truncated together.
-        on_overflow: what to do when the physics drops contacts or constraints for want of room: ``"warn"``, ``"raise"``
-            or ``"ignore"``. It is noticed within some 100 steps, without waiting for the device; see :meth:`health`.
-        nan_dump: a file that does not exist yet. It receives the state and action from which a world first became not
-            finite, for ``torchrl-loco inspect``, within some 100 steps or at :meth:`close`.
+        on_overflow: what to do when contacts or constraints are dropped because ``naconmax`` or ``njmax`` is too small:
+            ``"warn"``, ``"raise"`` or ``"ignore"``. It is reported within about 100 steps, without waiting for the
+            device; see :meth:`health`.
+        nan_dump: a file that does not exist yet. The state and action before the first step that made a world
+            non-finite are written to it, within about 100 steps or at :meth:`close`; see ``torchrl-loco inspect``.
         config: fields of :class:`torchrl_loco.SimConfig` to override.
 
     Raises:
@@ -89,13 +91,14 @@ class LocoEnv(EnvBase):
         self.check_class()
         worlds = 1 if num_envs is None else check_int("num_envs", num_envs)
         device = check_device(device)
-        if seed is not None:
-            seed = check_int("seed", seed, SEED)
-            if world_offset is None:
-                _warn_if_worlds_repeat()
+        seed = None if seed is None else check_int("seed", seed, SEED)
         arguments = list(inspect.signature(LocoEnv.__init__).parameters)[1:-1]
         sim_settings = sim_config(self.defaults, protocol, worlds, config, arguments)
-        world_offset = None if world_offset is None else check_int("world_offset", world_offset, "[0, 2**31)")
+        if world_offset is not None:
+            world_offset = check_int("world_offset", world_offset, "[0, 2**31)")
+            check_int("world_offset + num_envs", world_offset + worlds)
+        elif seed is not None:
+            _warn_if_worlds_repeat()
         reward_terms, stagger = check_bool("reward_terms", reward_terms), check_bool("stagger", stagger)
         check_choice("on_overflow", on_overflow, ON_OVERFLOW)
         nan_dump = None if nan_dump is None else check_output_file("nan_dump", nan_dump)
@@ -107,6 +110,9 @@ class LocoEnv(EnvBase):
         self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
         self.reward_terms, self.stagger = reward_terms, stagger
         self.on_overflow, self.nan_dump = on_overflow, nan_dump
+        self._action_shape = torch.Size([*self.batch_size, mj_model.nu])
+        self._pid = os.getpid()
+        self._world: World | None = None
         self._episodes: torch.Tensor | None = None  # of a closed environment
         self._open()
         self._make_specs()
@@ -138,14 +144,15 @@ class LocoEnv(EnvBase):
         observation_size)``, ``reward`` ``(num_envs,)`` and ``terms`` ``(num_envs, len(term_names))``.
 
         Args:
-            world: where the arrays are, in ``world.sim.data`` above all.
+            world: the worlds; the physics arrays are in ``world.sim.data``.
         """
         raise NotImplementedError
 
     def initial_poses(self) -> np.ndarray | None:
         """Returns a table of poses, ``(count, nq)``, of which each reset draws one; ``None`` for the default pose.
 
-        It is called when the environment is made, and again when it opens after :meth:`close`. Use a fixed seed.
+        It is called when the environment is made, and again when it opens after :meth:`close`, so it must return the
+        same table every time.
         """
         return None
 
@@ -153,11 +160,11 @@ class LocoEnv(EnvBase):
         """Returns the kernel that draws initial poses, its inputs and its outputs; by default it draws from the table.
 
         Its parameters are the inputs, the mask of the worlds that begin an episode (bool, ``(num_envs,)``), the start
-        of each world's random stream (uint32, ``(num_envs,)``), then the outputs. These worlds are at rest in the
-        default pose before, and stay at rest: it draws ``qpos`` alone.
+        of each world's random stream (uint32, ``(num_envs,)``), then the outputs. The worlds are at rest in the default
+        pose. The kernel writes ``qpos`` only.
 
         Args:
-            world: where the arrays are, in ``world.sim.data`` above all.
+            world: the worlds; the physics arrays are in ``world.sim.data``.
 
         Raises:
             ValueError: the table has the wrong shape.
@@ -182,14 +189,15 @@ class LocoEnv(EnvBase):
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.observation_spec = Composite(observation, shape=batch, device=device)
         self.action_spec = Bounded(-1.0, 1.0, (*batch, self.mj_model.nu), **as_float)
-        # In [0, 1], but RewardSum takes the bounds over for the sum.
+        # Rewards lie in [0, 1], but RewardSum would copy the bounds to the sum.
         self.reward_spec = Unbounded((*batch, 1), **as_float)
         self.done_spec = Composite(
             done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, device=device
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        shape = self.action_spec.shape
+        self._refuse_after_fork()
+        shape = self._action_shape
         action = tensordict.get("action", None)
         if action is None:
             raise KeyError(f"step needs an 'action' of shape {tuple(shape)} in its TensorDict")
@@ -201,14 +209,17 @@ class LocoEnv(EnvBase):
         return result
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False) -> TensorDictBase:
+        self._refuse_after_fork()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is not None:
             if mask.dtype != torch.bool:
                 raise TypeError(f"'_reset' must be a mask of dtype bool, got {mask.dtype}")
+            if mask.numel() != self.num_envs:
+                raise ValueError(f"'_reset' must have shape {(*self.batch_size, 1)}, got {tuple(mask.shape)}")
             mask = mask.reshape(self.num_envs).to(self.device)
         if self._world is None:
             if mask is not None and not mask.all():
-                raise ValueError("a closed environment has no worlds to keep: reset all of them")
+                raise ValueError("this environment is closed: reset all worlds to open it again")
             self._open()
         if set_state:
             self._set_state(tensordict, mask)
@@ -255,9 +266,10 @@ class LocoEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         """Starts the random streams of all worlds again, at their episode 0."""
         self.seed = secrets.randbits(32) if seed is None else check_int("seed", seed, SEED)
-        self._episodes = None
         if self._world is not None:
             self._world.set_seed(self.seed)
+        elif self._episodes is not None:
+            self._episodes.zero_()
 
     def to(self, device: Any) -> "LocoEnv":
         """Returns the environment itself if it lives on ``device``; the physics cannot move.
@@ -281,7 +293,7 @@ class LocoEnv(EnvBase):
 
     def _open(self) -> None:
         """Makes the worlds. Those of an environment that was open before continue with their next episodes."""
-        self._world: World | None = World(self)
+        self._world = World(self)
         if self._episodes is not None:
             self._world.episode.torch.copy_(self._episodes)
         self.is_closed = False
@@ -294,7 +306,9 @@ class LocoEnv(EnvBase):
             RuntimeError: the environment is closed.
         """
         if self._world is None:
-            raise RuntimeError(f"this {type(self).__name__} is closed: reset() opens it again")
+            being_made = self._episodes is None
+            state = "being made: use the hook's argument world" if being_made else "closed: reset() opens it again"
+            raise RuntimeError(f"this {type(self).__name__} is {state}")
         return self._world
 
     @property
@@ -306,10 +320,10 @@ class LocoEnv(EnvBase):
         """Frees the memory of the worlds; a ``reset()`` opens the environment again, with its next episodes.
 
         TorchRL's collectors close their environment when they end. Counters start again. Other methods that need the
-        worlds raise an error until then.
+        worlds raise an error while it is closed.
 
         Args:
-            raise_if_closed: of TorchRL's signature; closing twice is no error here.
+            raise_if_closed: ignored; part of TorchRL's signature.
         """
         super().close(raise_if_closed=False)
         world, self._world = self._world, None
@@ -317,13 +331,17 @@ class LocoEnv(EnvBase):
             self._episodes = world.episode.torch.cpu()
             world.close()
 
+    def _refuse_after_fork(self) -> None:
+        if self.device.type == "cuda" and os.getpid() != self._pid:
+            raise RuntimeError("CUDA cannot be used after a fork: make the environment in the process that steps it")
+
     def __del__(self) -> None:
-        """Leaves the end to the world: TorchRL's own ``__del__`` would swallow what the monitors raise."""
+        """Does nothing: World reports at its own end, and TorchRL's ``__del__`` would hide the monitors' errors."""
 
     def __reduce__(self) -> Any:
         raise TypeError(
-            "an environment cannot be copied or pickled: pass on what makes it, functools.partial(torchrl_loco.make, "
-            "...), or what it holds, env.get_state()"
+            "an environment cannot be copied or pickled: pass functools.partial(torchrl_loco.make, ...) to make "
+            "another, or env.get_state() to copy its worlds"
         )
 
     def render(self, camera: str = "side", width: int = 320, height: int = 240) -> torch.Tensor:
@@ -351,14 +369,15 @@ class LocoEnv(EnvBase):
 
         ``"worlds"`` (batch ``(num_envs,)``) and ``"total"`` count control steps in which
 
-        - ``constraint_overflow``, ``contact_overflow``: constraints or contacts were dropped for want of room. Contacts
-          share one pool: if some are dropped, that counts in every world.
+        - ``constraint_overflow``, ``contact_overflow``: constraints or contacts were dropped. Contacts share one
+          pool: if some are dropped, that counts in every world.
         - ``iteration_limit``, ``line_search_limit``: the solver or its line search used up its iterations, as is usual
           under ``protocol="playground"``.
-        - ``non_finite``: the world was no longer finite, and terminated.
+        - ``non_finite``: the world became non-finite, and terminated.
 
-        ``"peak"`` holds the most ``constraints`` of a world and ``contacts`` of all worlds together that a physics step
-        needed, by which to choose ``njmax`` and ``naconmax``. Nothing waits for the device until you read a number.
+        ``"peak"`` holds the largest number of ``constraints`` in a world and of ``contacts`` in all worlds that a
+        physics step needed; use it to choose ``njmax`` and ``naconmax``. Nothing waits for the device until you read a
+        number.
         """
         return self.world.health.summary()
 
@@ -376,7 +395,7 @@ class LocoEnv(EnvBase):
         if state is not None and not self.batch_size:
             state = TensorDict({key: state[key][None] for key in State.KEYS if key in state}, batch_size=[1])
         write_state(state, self.world.state(), mask)
-        self.world.refresh(mask, self.config.ctrl_dt)
+        self.world.refresh(mask)
 
     def settings(self) -> dict[str, Any]:
         """Returns the settings from which an equal environment can be made, except the seed, as JSON can hold them."""
@@ -398,18 +417,20 @@ class LocoEnv(EnvBase):
         """Restores a ``state_dict``: the worlds, their random streams and the seed.
 
         Raises:
-            ValueError: it was taken from an environment of another body, protocol, number of worlds or world offset.
+            ValueError: it was taken from an environment of another body, protocol, batch size or world offset.
         """
         for name, value in self._identity().items():
-            if state[name] != value:
-                raise ValueError(f"the state is of {name}={state[name]!r}, this environment of {value!r}")
-        self._set_seed(state["seed"])
+            if state.get(name) != value:
+                raise ValueError(f"the state has {name}={state.get(name)!r}, this environment has {value!r}")
         self.reset(State(state["worlds"], batch_size=self.batch_size, device=self.device), set_state=True)
+        self.seed = state["seed"]
+        self.world.seed.torch.fill_(self.seed)
 
     def _identity(self) -> dict[str, Any]:
         """Returns what two environments must share to exchange their ``state_dict``."""
         settings = self.settings()
-        return {"body": self.body, **{name: settings[name] for name in ("protocol", "num_envs", "world_offset")}}
+        same = {name: settings[name] for name in ("protocol", "world_offset")}
+        return {"body": self.body, "batch_size": list(self.batch_size), **same}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> Any:
         """Restores a ``state_dict``; see :meth:`set_extra_state`.
@@ -427,9 +448,11 @@ class LocoEnv(EnvBase):
 
 def _warn_if_worlds_repeat() -> None:
     """Warns where a seed is passed in one of several processes: the same seed makes the same worlds in each."""
-    ranks = torch.distributed.is_available() and torch.distributed.is_initialized()
-    if multiprocessing.parent_process() is not None or (ranks and torch.distributed.get_world_size() > 1):
+    distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
+    ranks = torch.distributed.get_world_size() if distributed else int(os.environ.get("WORLD_SIZE", "1"))
+    if multiprocessing.parent_process() is not None or ranks > 1:
         warn(
-            "this process is one of several, and seed was passed without world_offset: workers that pass the same seed "
-            "step identical worlds. Worker k of n worlds each should pass world_offset=k*n (0 if it is alone)"
+            "torchrl_loco: this process is one of several and passes a seed without world_offset. Workers with the "
+            "same seed step identical worlds: give worker k of n worlds each its own function, with world_offset=k*n "
+            "(ParallelEnv and collectors take a list of functions)"
         )

@@ -23,33 +23,34 @@ ROOT_QPOS = wp.constant(7)
 
 
 @wp.func
-def humanoid_standing_reward(head_height: float) -> float:
-    return tolerance(head_height, STAND_HEIGHT, wp.inf, STAND_HEIGHT / 4.0)
-
-
-@wp.func
-def humanoid_upright_reward(torso_upright: float) -> float:
-    return tolerance(torso_upright, 0.9, wp.inf, 1.9, Sigmoid.LINEAR, 0.0)
-
-
-@wp.func
-def humanoid_small_control_reward(ctrl: wp.array[float]) -> float:
+def mean_small_control(ctrl: wp.array[float]) -> float:
     small = float(0.0)
     for i in range(ctrl.shape[0]):
         small += tolerance(ctrl[i], 0.0, 0.0, 1.0, Sigmoid.QUADRATIC, 0.0)
-    return (4.0 + small / float(ctrl.shape[0])) / 5.0
+    return small / float(ctrl.shape[0])
 
 
 @wp.func
-def humanoid_move_reward(velocity: wp.vec3, target_speed: float) -> float:
+def humanoid_reward(
+    head_height: float, torso_upright: float, ctrl: wp.array[float], velocity: wp.vec3, target_speed: float
+):
+    """Returns the reward and its factors ``standing``, ``upright``, ``small_control`` and ``move``.
+
+    A target speed of 0 asks for standing still.
+    """
+    standing = tolerance(head_height, STAND_HEIGHT, wp.inf, STAND_HEIGHT / 4.0)
+    upright = tolerance(torso_upright, 0.9, wp.inf, 1.9, Sigmoid.LINEAR, 0.0)
+    small_control = (4.0 + mean_small_control(ctrl)) / 5.0
     if target_speed > 0.0:
         speed = wp.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
-        return (5.0 * tolerance(speed, target_speed, wp.inf, target_speed, Sigmoid.LINEAR, 0.0) + 1.0) / 6.0
-    return 0.5 * (tolerance(velocity[0], 0.0, 0.0, 2.0) + tolerance(velocity[1], 0.0, 0.0, 2.0))
+        move = (5.0 * tolerance(speed, target_speed, wp.inf, target_speed, Sigmoid.LINEAR, 0.0) + 1.0) / 6.0
+    else:
+        move = 0.5 * (tolerance(velocity[0], 0.0, 0.0, 2.0) + tolerance(velocity[1], 0.0, 0.0, 2.0))
+    return standing * upright * small_control * move, standing, upright, small_control, move
 
 
 @wp.kernel(enable_backward=False)
-def observe_humanoid(
+def observe_and_reward_humanoid(
     # Model:
     torso: int,
     head: int,
@@ -97,11 +98,10 @@ def observe_humanoid(
     for i in range(qvel_in.shape[1]):
         observation_out[world, k + i] = qvel_in[world, i]
 
-    standing = humanoid_standing_reward(head_height)
-    upright = humanoid_upright_reward(torso_mat[2, 2])
-    small_control = humanoid_small_control_reward(ctrl_in[world])
-    move = humanoid_move_reward(velocity, target_speed)
-    reward_out[world] = standing * upright * small_control * move
+    reward, standing, upright, small_control, move = humanoid_reward(
+        head_height, torso_mat[2, 2], ctrl_in[world], velocity, target_speed
+    )
+    reward_out[world] = reward
     terms_out[world, 0] = standing
     terms_out[world, 1] = upright
     terms_out[world, 2] = small_control
@@ -123,9 +123,9 @@ class Humanoid(LocoEnv):
         model, data = self.mj_model, world.sim.data
         extremities = wp.array([model.body(name).id for name in EXTREMITIES], dtype=int, device=world.sim.device)
         velocity = int(model.sensor("torso_velocity").adr[0])
-        names = [model.body("torso").id, model.body("head").id, extremities, velocity]
+        ids = [model.body("torso").id, model.body("head").id, extremities, velocity]
         arrays = [data.qpos, data.qvel, data.ctrl, data.xpos, data.xmat, data.sensordata]
-        return observe_humanoid, [*names, *arrays, self.target_speed]
+        return observe_and_reward_humanoid, [*ids, *arrays, self.target_speed]
 
     def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list] | None:
         """Returns the kernel that draws a pose free of contact under ``dm_control``, else the default pose."""
@@ -160,7 +160,7 @@ class HumanoidStand(Humanoid):
         At rest; the default pose under ``playground``, a random one free of contact under ``dm_control``.
 
     Termination:
-        None by falling; truncation after 1000 steps; a world that is no longer finite is terminated with reward 0 and a
+        None by falling; truncation after 1000 steps; a non-finite world is terminated with reward 0 and a
         zero observation.
 
     Source:

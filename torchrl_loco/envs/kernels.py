@@ -1,4 +1,4 @@
-"""The course of an episode as kernels: action in, values that are not finite, time limit, new episode."""
+"""Kernels of an episode: clip actions, mark and zero non-finite worlds, count steps, begin episodes."""
 
 import warp as wp
 
@@ -46,7 +46,7 @@ def zero_non_finite(
     reward_out: wp.array[float],
     terms_out: wp.array2d[float],
 ):
-    """Marks worlds that are no longer finite, and zeroes observation, reward and terms of all marked worlds."""
+    """Marks worlds that are non-finite, and zeroes observation, reward and terms of all marked worlds."""
     world = wp.tid()
     if not mask_in[world]:
         return

@@ -1,6 +1,6 @@
-"""What is monitored while worlds step: overflows of the physics are counted, and the first NaN is dumped to a file.
+"""Monitors: counters of overflows, and a dump of the first world that becomes non-finite.
 
-A monitor works on the device. The host reads a few numbers of it now and then, and never waits for them.
+A monitor works on the device. The host reads a few of its numbers every 100 steps, and never waits for them.
 """
 
 import logging
@@ -30,27 +30,26 @@ NAN_DUMP = "NaN dump"
 
 
 class PhysicsOverflowWarning(UserWarning):
-    """The physics dropped contacts or constraints for want of room."""
+    """The physics dropped contacts or constraints because ``naconmax`` or ``njmax`` is too small."""
 
 
 class PhysicsOverflowError(RuntimeError):
-    """The physics dropped contacts or constraints for want of room."""
+    """The physics dropped contacts or constraints because ``naconmax`` or ``njmax`` is too small."""
 
 
 class NonFiniteWarning(UserWarning):
-    """A world was no longer finite; the state and action that led to it were written to a file."""
+    """A world became non-finite; the state and action before that step were written to a file."""
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warns. In a worker process it logs instead, because TorchRL's workers silence warnings."""
-    if multiprocessing.parent_process() is None:
-        warnings.warn(message, category, stacklevel=3)
-    else:
+    """Warns. TorchRL's workers silence all warnings: there the message is logged too."""
+    warnings.warn(message, category, stacklevel=3)
+    if multiprocessing.parent_process() is not None and warnings.filters[:1] == [("ignore", None, Warning, None, 0)]:
         logging.getLogger("torchrl_loco").warning(message)
 
 
 class Monitor(ABC):
-    """Launches kernels around each control step, reads a few numbers of theirs now and then, and reports.
+    """Launches kernels around each control step, reads a few of their numbers every 100 steps, and reports.
 
     Args:
         count: how many numbers :meth:`numbers` returns.
@@ -65,11 +64,11 @@ class Monitor(ABC):
         self._steps, self._pending = 0, False
 
     def launch_before_step(self) -> None:  # noqa: B027
-        """Launches the monitor's kernels at the start of a control step, which is recorded."""
+        """Launches the monitor's kernels at the start of the recorded control step."""
 
     @abstractmethod
     def launch_after_step(self) -> None:
-        """Launches the monitor's kernels at the end of a control step, which is recorded."""
+        """Launches the monitor's kernels at the end of the recorded control step."""
 
     @abstractmethod
     def numbers(self) -> torch.Tensor:
@@ -81,10 +80,10 @@ class Monitor(ABC):
 
     @abstractmethod
     def clear(self) -> None:
-        """Sets everything on the device to zero."""
+        """Resets what is on the device."""
 
     def restart(self) -> None:
-        """Forgets everything."""
+        """Starts from zero."""
         self._steps, self._pending = 0, False
         self.clear()
 
@@ -122,9 +121,9 @@ COUNTERS = {
 }
 """Name of a counter and the bits of ``Data.overflow`` that it counts."""
 DROPPED = {"constraints": "njmax", "contacts": "naconmax"}
-"""What the first two counters say was dropped, and the setting that makes room for it."""
+"""What the first two counters count as dropped, and the setting that prevents it."""
 MARGIN = 1.25
-"""Factor between the most that was needed and the value that is advised."""
+"""Advised setting divided by the largest need."""
 
 
 @wp.kernel(enable_backward=False)
@@ -153,7 +152,7 @@ class Health(Monitor):
 
     Args:
         sim: the simulation.
-        non_finite: flags of worlds that are no longer finite, ``(nworld,)``.
+        non_finite: flags of non-finite worlds, ``(nworld,)``.
         on_overflow: what to do when something was dropped, one of :data:`ON_OVERFLOW`.
     """
 
@@ -187,14 +186,14 @@ class Health(Monitor):
         """Warns or raises if something was dropped since the last report.
 
         Raises:
-            PhysicsOverflowError: something was, and ``on_overflow`` is "raise".
+            PhysicsOverflowError: something was dropped and ``on_overflow`` is "raise".
         """
         dropped, needed = numbers[: len(DROPPED)], numbers[len(DROPPED) :]
         if self._on_overflow == "ignore" or sum(dropped) <= self._reported:
             return
         self._reported = sum(dropped)
         messages = [
-            f"{what} were dropped in {count} control steps of a world: at most {most} were needed, "
+            f"{what} were dropped in {count} world-steps; a physics step needed up to {most}: "
             f"pass {setting}={with_margin(most)}"
             for (what, setting), count, most in zip(DROPPED.items(), dropped, needed, strict=True)
             if count
@@ -235,7 +234,7 @@ def with_margin(needed: int) -> int:
     return math.ceil(needed * MARGIN)
 
 
-# NaN guard: keeps what each control step began with until a world comes out of one that is not finite.
+# NaN guard: keeps the inputs of the last control step until a world becomes non-finite.
 
 
 @wp.kernel(enable_backward=False)
@@ -297,13 +296,13 @@ def set_found(
 
 
 class NanGuard(Monitor):
-    """Writes the state and action from which a world first became not finite to a file, a NaN dump.
+    """Writes the state and action before the first step that made a world non-finite to a file, a NaN dump.
 
     Args:
-        path: the file, unless it exists by then.
+        path: the file; never overwritten.
         sim: the simulation.
         inputs: actions ``(nworld, nu)``, episodes and elapsed steps ``(nworld,)`` of all worlds.
-        non_finite: flags of worlds that are not finite, ``(nworld,)``.
+        non_finite: flags of non-finite worlds, ``(nworld,)``.
         seed: seed of the environment, ``(1,)``.
         settings: further settings from which the environment can be made again.
     """
@@ -332,7 +331,7 @@ class NanGuard(Monitor):
         self._launch(keep_worlds, self._sim.num_envs, [self._found.warp, *self._inputs], self._kept)
 
     def launch_after_step(self) -> None:
-        """Launches the kernels that look for a world that is not finite."""
+        """Launches the kernels that look for a non-finite world."""
         found, first = self._found.warp, self._first.warp
         self._launch(find_first, self._sim.num_envs, [found, self._non_finite.warp], [first])
         self._launch(set_found, 1, [first, self._sim.num_envs], [found])
@@ -345,7 +344,7 @@ class NanGuard(Monitor):
         return self._first.torch.long()
 
     def clear(self) -> None:
-        """Starts to look again."""
+        """Clears the finding."""
         self._first.torch.fill_(self._sim.num_envs)
         self._found.torch.zero_()
 
@@ -371,4 +370,4 @@ class NanGuard(Monitor):
                 raise
             where = f"its state and action before that step are in {self._path}: see torchrl-loco inspect"
         step = counters["elapsed_steps"] + 1
-        warn(f"world {world} was no longer finite after step {step} of its episode; {where}", NonFiniteWarning)
+        warn(f"world {world} became non-finite in step {step} of its episode; {where}", NonFiniteWarning)

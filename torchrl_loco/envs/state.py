@@ -19,7 +19,7 @@ class State(TensorDict):
     ``qvel``            ``(N, nv)``  velocities (m/s, rad/s)
     ``qacc_warmstart``  ``(N, nv)``  initial guess of the constraint solver
     ``elapsed_steps``   ``(N,)``     control steps since the world's reset
-    ``episode``         ``(N,)``     episodes drawn so far: the world's random counter
+    ``episode``         ``(N,)``     episodes begun: index of the next random stream
     ==================  ===========  =====================================================
 
     To make a state by hand: ``State({"qpos": ..., "qvel": ...}, batch_size=[num_envs])``.
@@ -64,7 +64,7 @@ class State(TensorDict):
 
 
 def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor], mask: torch.Tensor) -> None:
-    """Writes a state into the worlds of a mask. Missing entries other than qpos and qvel become zero; episode stays.
+    """Writes a state into the worlds of a mask. Missing entries become zero; a missing episode is left as it is.
 
     Args:
         state: the state; a plain TensorDict with the same keys works too.

@@ -17,20 +17,20 @@ RUN_SPEED = 8.0
 
 
 @wp.func
-def walker_stand_reward(torso_height: float, torso_upright: float) -> float:
+def walker_reward(torso_height: float, torso_upright: float, horizontal_velocity: float, target_speed: float):
+    """Returns the reward and its factors ``stand`` and ``move``; a target speed of 0 asks for standing only."""
     standing = tolerance(torso_height, STAND_HEIGHT, wp.inf, STAND_HEIGHT / 2.0)
     upright = wp.clamp((1.0 + torso_upright) / 2.0, 0.0, 1.0)  # torso_upright may pass 1 by a rounding error
-    return (3.0 * standing + upright) / 4.0
-
-
-@wp.func
-def walker_move_reward(horizontal_velocity: float, target_speed: float) -> float:
-    fast = tolerance(horizontal_velocity, target_speed, wp.inf, target_speed / 2.0, Sigmoid.LINEAR, 0.5)
-    return (5.0 * fast + 1.0) / 6.0
+    stand = (3.0 * standing + upright) / 4.0
+    move = float(1.0)
+    if target_speed > 0.0:
+        fast = tolerance(horizontal_velocity, target_speed, wp.inf, target_speed / 2.0, Sigmoid.LINEAR, 0.5)
+        move = (5.0 * fast + 1.0) / 6.0
+    return stand * move, stand, move
 
 
 @wp.kernel(enable_backward=False)
-def observe_walker(
+def observe_and_reward_walker(
     # Model:
     torso: int,
     torso_velocity: int,
@@ -65,14 +65,12 @@ def observe_walker(
     for i in range(qvel_in.shape[1]):
         observation_out[world, k + i] = qvel_in[world, i]
 
-    stand = walker_stand_reward(torso_height, torso_upright)
+    horizontal_velocity = sensordata_in[world, torso_velocity]  # along x
+    reward, stand, move = walker_reward(torso_height, torso_upright, horizontal_velocity, target_speed)
+    reward_out[world] = reward
     terms_out[world, 0] = stand
-    reward_out[world] = stand
-    if target_speed > 0.0:
-        horizontal_velocity = sensordata_in[world, torso_velocity]  # along x
-        move = walker_move_reward(horizontal_velocity, target_speed)
+    if terms_out.shape[1] > 1:
         terms_out[world, 1] = move
-        reward_out[world] = stand * move
 
 
 @wp.kernel(enable_backward=False)
@@ -108,9 +106,9 @@ class Walker(LocoEnv):
     def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
         """Returns the kernel that writes observation and reward, and its inputs."""
         model, data = self.mj_model, world.sim.data
-        names = [model.body("torso").id, int(model.sensor("torso_velocity").adr[0])]
+        ids = [model.body("torso").id, int(model.sensor("torso_velocity").adr[0])]
         arrays = [data.qvel, data.xpos, data.xmat, data.sensordata]
-        return observe_walker, [*names, *arrays, self.target_speed, self.protocol == "dm_control"]
+        return observe_and_reward_walker, [*ids, *arrays, self.target_speed, self.protocol == "dm_control"]
 
     def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list]:
         """Returns the kernel that draws pitch and hinges, its inputs and its outputs."""
@@ -139,7 +137,7 @@ class WalkerStand(Walker):
         At rest, pitch uniform in (-pi, pi), hinges uniform in their ranges.
 
     Termination:
-        None by falling; truncation after 1000 steps; a world that is no longer finite is terminated with reward 0 and a
+        None by falling; truncation after 1000 steps; a non-finite world is terminated with reward 0 and a
         zero observation.
 
     Source:

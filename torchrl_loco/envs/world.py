@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import mujoco
-import numpy as np
 import torch
 import warp as wp
 
@@ -51,7 +50,7 @@ class World:
     current values.
 
     Args:
-        task: the environment. It is not kept.
+        task: the environment. No reference to it is kept.
 
     Attributes:
         sim: the physics.
@@ -59,11 +58,11 @@ class World:
         observation: observations, ``(nworld, observation_size)``.
         reward: rewards, ``(nworld,)``.
         terms: factors of the rewards, ``(nworld, len(term_names))``.
-        mask: worlds that a reset concerns, ``(nworld,)``.
+        mask: worlds to reset, ``(nworld,)``.
         stream: start of the random stream of the current episode, ``(nworld,)`` uint32.
         episode: episodes drawn so far, ``(nworld,)``.
         elapsed_steps: control steps since the world's reset, ``(nworld,)``.
-        non_finite: whether the world is no longer finite, ``(nworld,)``.
+        non_finite: whether the world is non-finite, ``(nworld,)``.
         done: terminated or truncated, ``(nworld,)``.
         terminated: whether the episode ended because the world is not finite, ``(nworld,)``.
         truncated: whether the episode reached the time limit, ``(nworld,)``.
@@ -72,9 +71,12 @@ class World:
     """
 
     def __init__(self, task: Task) -> None:
+        self._closed = True  # until it is made in full
         n, nu = task.num_envs, task.mj_model.nu
-        self._episode_length, self._world_offset = task.config.episode_length, task.world_offset or 0
-        # inference_mode: the buffers must stay writable. device: torch's views would follow the caller's default.
+        self._episode_length, self._ctrl_dt = task.config.episode_length, task.config.ctrl_dt
+        self._world_offset = task.world_offset or 0
+        # Buffers made in inference mode could not be written outside it; without the device, torch's views would be on
+        # the caller's default device.
         with torch.inference_mode(False), EXCLUSIVE, task.device:
             self.sim = Simulation(task.mj_model, task.config, n, task.device)
             device = self.sim.device
@@ -94,7 +96,7 @@ class World:
             self._stagger = Buffer(1, bool, device)
             self._any = Buffer(1, int, device)
             self._all = wp.ones(n, dtype=bool, device=device)
-            self.mask.torch.fill_(True)
+            self.mask.warp.fill_(True)
 
             self.health = Health(self.sim, self.non_finite, task.on_overflow)
             self._monitors: list[Monitor] = [self.health]
@@ -110,7 +112,7 @@ class World:
             self._reset_graph = self.sim.capture(self._launch_reset)
             self._refresh_graph = self.sim.capture(self._launch_refresh)
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
-            self.set_seed(task.seed)  # recording has drawn episodes
+            self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
             for monitor in self._monitors:
                 monitor.restart()
         self._renderers: dict[tuple[str, int, int], Renderer] = {}
@@ -135,7 +137,7 @@ class World:
             monitor.launch_after_step()
 
     def _launch_reset(self) -> None:
-        """A new episode in the worlds of the mask. It costs next to nothing if there are none."""
+        """A new episode in the worlds of the mask. It costs almost nothing if the mask is empty."""
         self._any.warp.zero_()
         self._launch(any_world, [self.mask.warp], [self._any.warp])
         wp.capture_if(self._any.warp, self._launch_masked_reset)
@@ -156,7 +158,7 @@ class World:
         self._launch_outputs(mask)
 
     def _launch_refresh(self) -> None:
-        """Outputs of a state that was written from outside, in the worlds of the mask."""
+        """Computes the outputs after the state of the masked worlds was written."""
         self.sim.forward(self.mask.warp)
         self._launch_outputs(self.mask.warp)
 
@@ -174,7 +176,6 @@ class World:
 
     def step(self, action: torch.Tensor) -> None:
         """Steps all worlds under actions of shape ``(nworld, nu)``."""
-        self._refuse_after_fork()
         self.action.torch.copy_(action.detach())  # else the buffer would keep every past policy's autograd graph
         self._step_graph.replay()
         for monitor in self._monitors:
@@ -185,9 +186,8 @@ class World:
 
         Args:
             mask: the worlds.
-            stagger: whether they begin at random points of their time limit.
+            stagger: whether they begin with a random number of elapsed steps.
         """
-        self._refuse_after_fork()
         self._set_mask(mask)
         self._stagger.torch.fill_(stagger)
         self._reset_graph.replay()
@@ -198,19 +198,13 @@ class World:
         physics = {"qpos": sim.qpos, "qvel": sim.qvel, "qacc_warmstart": sim.qacc_warmstart}
         return {**physics, "elapsed_steps": self.elapsed_steps.torch, "episode": self.episode.torch}
 
-    def refresh(self, mask: torch.Tensor, ctrl_dt: float) -> None:
-        """Brings everything else up to date after :meth:`state` was written in the worlds of ``mask`` ``(nworld,)``.
-
-        Args:
-            mask: the worlds.
-            ctrl_dt: time of a control step (s).
-        """
-        self._refuse_after_fork()
+    def refresh(self, mask: torch.Tensor) -> None:
+        """Updates everything else after :meth:`state` was written in the worlds of ``mask`` ``(nworld,)``."""
         self._set_mask(mask)
         for flag in (self.non_finite, self.done, self.terminated, self.truncated):
             flag.torch.masked_fill_(mask, False)
         time = self.sim.time
-        time.copy_(torch.where(mask, self.elapsed_steps.torch * ctrl_dt, time))
+        time.copy_(torch.where(mask, self.elapsed_steps.torch * self._ctrl_dt, time))
         self._refresh_graph.replay()
 
     def _set_mask(self, mask: torch.Tensor | None) -> None:
@@ -220,8 +214,8 @@ class World:
             self.mask.torch.copy_(mask)
 
     def set_seed(self, seed: int) -> None:
-        """Starts the random streams of all worlds again, at their episode 0."""
-        self.seed.torch.copy_(torch.from_numpy(np.array([seed], dtype=np.uint32)))
+        """Restarts all random streams at episode 0."""
+        self.seed.torch.fill_(seed)
         self.episode.torch.zero_()
 
     def render(self, camera: str, width: int, height: int) -> torch.Tensor:
@@ -232,29 +226,26 @@ class World:
                 self._renderers[key] = Renderer(self.sim, *key)
         return self._renderers[key].render()
 
-    # The end.
+    # Closing.
 
     def close(self) -> None:
-        """Lets all monitors report what they have not reported yet. The memory goes with the last reference."""
+        """Makes all monitors report, then drops everything on the device."""
         if self._closed or os.getpid() != self._pid:  # in a forked process: the parent reports
             return
         self._closed = True
-        with contextlib.ExitStack() as stack:  # if one raises, the others report all the same
+        with contextlib.ExitStack() as stack:  # if one monitor raises, the others report all the same
+            stack.callback(self.__dict__.update, {"_closed": True})
+            stack.callback(self.__dict__.clear)  # an exception may keep a reference to this world
             for monitor in self._monitors:
                 stack.callback(monitor.check)
 
-    def _refuse_after_fork(self) -> None:
-        if self.sim.device.is_cuda and os.getpid() != self._pid:
-            raise RuntimeError("CUDA does not survive a fork: make the environment in the process that steps it")
-
     def __del__(self) -> None:
-        if "_closed" in self.__dict__:  # it was made in full
-            _close_quietly(self)
+        _close_quietly(self)
 
 
 def _close_quietly(world: World) -> None:
-    """Closes a world where nothing can be raised: errors become warnings."""
-    with contextlib.suppress(Warning):  # which may be errors
+    """Closes a world in a finalizer, where errors can only be warnings."""
+    with contextlib.suppress(Warning):  # warnings may be configured as errors
         try:
             world.close()
         except Exception as error:
@@ -266,6 +257,6 @@ _WORLDS: "weakref.WeakSet[World]" = weakref.WeakSet()
 
 @atexit.register
 def _close_all() -> None:
-    """Closes all worlds before the interpreter takes torch apart."""
+    """Closes all worlds before torch is torn down."""
     for world in list(_WORLDS):
         _close_quietly(world)

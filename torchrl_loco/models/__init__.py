@@ -1,4 +1,4 @@
-"""The bodies as MJCF files of our own writing; their figures are dm_control's (see NOTICE)."""
+"""The bodies as MJCF files of our own writing; model parameters are dm_control's (see NOTICE)."""
 
 from pathlib import Path
 

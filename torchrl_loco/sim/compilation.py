@@ -40,9 +40,9 @@ def compile_kernels(launches: Iterable[Callable[[], None]], device: wp.Device) -
 
 @contextlib.contextmanager
 def _collecting() -> Iterator[dict[tuple[wp.Module, int], None]]:
-    """Yields the modules and block sizes, in order, that this thread's launches need; the launches do nothing.
+    """Yields the modules and block sizes, in order, that this thread's launches need, without running them.
 
-    A launch asks its module for an executable and returns if there is none. Conditional bodies are visited once.
+    A launch returns early if its module has no executable. Conditional bodies are visited once.
     """
     with _COLLECTING:  # one at a time: two would restore each other's functions
         yield from _collect()

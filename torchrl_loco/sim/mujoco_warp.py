@@ -14,7 +14,7 @@ from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.row_order import RowOrder
 
 UNROLLED_ITERATIONS = 10
-"""Up to so many solver iterations a recorded step holds them all, without a condition between them."""
+"""Up to this many solver iterations, the recorded step contains all of them, without an early exit."""
 
 LANES = wp.constant(32)
 """Threads that share the constraint rows of a world."""
@@ -95,9 +95,9 @@ class MujocoWarpEngine:
     def step(self) -> None:
         """Advances every world by one control step under ``ctrl``.
 
-        Afterwards poses, velocities and sensors belong to the new state, as in dm_control. dm_control gets there by the
-        first half of the next step; here only what an observation can read is evaluated, so a reset has nothing else to
-        update. Forces, contacts and constraints are those of the last substep.
+        Afterwards poses, velocities and sensors belong to the new state, as in dm_control. dm_control reaches this by
+        running the first half of the next step. Here only what an observation can read is computed, so a reset has
+        nothing else to update. Forces, contacts and constraints are those of the last substep.
         """
         with self._without_sensors():
             for _ in range(self._substeps):

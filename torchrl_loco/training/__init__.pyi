@@ -3,6 +3,7 @@ from .config import REPPOConfig as REPPOConfig
 from .config import TrainingConfig as TrainingConfig
 from .evaluation import describe as describe
 from .evaluation import has_display as has_display
+from .evaluation import poor_return as poor_return
 from .evaluation import record as record
 from .evaluation import view as view
 from .plots import plot_runs as plot_runs

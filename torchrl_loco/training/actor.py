@@ -19,8 +19,8 @@ from torchrl_loco.training.config import TrainingConfig
 class SquashedNormal(TransformedDistribution):
     """Independent normal variables under tanh.
 
-    TorchRL's ``TanhNormal`` is the same, but reads its bounds whenever it is made: on CUDA the host would wait for that
-    at every step, and gradient steps could not be recorded.
+    TorchRL's ``TanhNormal`` is the same, but reads its bounds at every construction: on CUDA the host would wait for
+    that at every step, and gradient steps could not be recorded.
 
     Args:
         loc: means before tanh, shape ``(..., n)``.
@@ -38,7 +38,7 @@ class SquashedNormal(TransformedDistribution):
 
 
 def make_actor(config: TrainingConfig, network: nn.Module, log_prob: bool) -> ProbabilisticActor:
-    """Returns a tanh-normal actor around a network that gives means and log deviations.
+    """Returns a tanh-normal actor around a network that gives means and standard deviations.
 
     It reads ``observation`` and writes ``loc``, ``scale``, ``action`` and, if asked to, ``action_log_prob``.
     """

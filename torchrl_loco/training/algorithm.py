@@ -97,7 +97,9 @@ class Algorithm(ABC):
             for indices in order[: minibatches * config.minibatch_size].split(config.minibatch_size):
                 self._indices.copy_(indices)
                 self._step()
-        self.norm.update(batch["observation"])  # after the update, which needs the policy as it collected
+        self.norm.update(
+            batch["observation"]
+        )  # after the update: the losses need the normalisation used while collecting
         return self._totals / (config.epochs * minibatches)
 
     def _minibatch_step(self) -> None:
@@ -139,7 +141,7 @@ class RecordedStep:
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> None:
-        """Runs the work as it is three times, then its recording."""
+        """Runs the work directly in the first three calls, then replays its recording."""
         if self._calls < self.WARMUP:
             self._calls += 1
             side = torch.cuda.Stream(self._device)

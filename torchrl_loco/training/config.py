@@ -24,7 +24,7 @@ INTERVALS = {
     "aux_coeff": "[0, inf)",
     "num_bins": "[2, 2**31)",
 }
-"""Where a number must lie, if it may be something else than positive."""
+"""Intervals of the fields that are not simply positive."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ class TrainingConfig:
     """Frames for which an action is held."""
     episode_length: int = 400
     """Frames after which an episode is truncated in training; evaluation always plays the task's own length. Shorter
-    episodes practise their beginning, getting up, more often."""
+    episodes practise getting up more often."""
     num_steps: int = 32
     """Steps of the policy in each world between two updates."""
 
@@ -68,7 +68,7 @@ class TrainingConfig:
     gamma: float = 0.98
     """Discount of a step."""
     lmbda: float = 0.95
-    """Decay of the return's estimate over steps (the lambda of GAE and TD)."""
+    """Lambda of GAE and TD(lambda)."""
     lr: float = 1e-3
     """Learning rate of Adam at the start; it falls linearly to lr * final_lr_fraction at the end."""
     final_lr_fraction: float = 0.0
@@ -95,7 +95,9 @@ class TrainingConfig:
         object.__setattr__(self, "task", canonical_id(self.task))
         check_choice("protocol", self.protocol, PROTOCOLS)
         check_fields(self, INTERVALS)
-        if not re.fullmatch(r"cpu|cuda(:\d+)?", str(self.device)):  # where it is used, it must also be on the machine
+        if not re.fullmatch(
+            r"cpu|cuda(:\d+)?", str(self.device)
+        ):  # whether the machine has it is checked when the run starts
             raise ValueError(f"no device {self.device!r}: choose one of cpu, cuda, cuda:0, ...")
         if not self.hidden:
             raise ValueError("hidden must name the width of at least one layer")

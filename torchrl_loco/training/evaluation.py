@@ -1,4 +1,4 @@
-"""Evaluation of policies, and pictures of them."""
+"""Evaluation, videos and the viewer."""
 
 import os
 import sys
@@ -28,7 +28,7 @@ class Evaluator:
 
     Args:
         task: id of the environment.
-        episodes: number of episodes, one a world.
+        episodes: number of episodes, one per world.
         device: where to play.
         seed: decides their initial states.
         protocol: settings of the solver and of the reset.
@@ -38,7 +38,7 @@ class Evaluator:
     def __init__(
         self, task: str, episodes: int, device: str, seed: int, protocol: str = "playground", action_repeat: int = 1
     ) -> None:
-        self._env = make(task, episodes, device, seed, protocol)
+        self._env = make(task, episodes, device, seed, protocol, world_offset=0)
         self._seed = seed
         self._action_repeat = action_repeat
 
@@ -78,7 +78,7 @@ POOR = 0.8
 
 
 def poor_return(config: TrainingConfig, summary: dict[str, float]) -> str:
-    """Returns a sentence that says so if the return of a run is poor, and what to try, else an empty string.
+    """Returns a note if the return of a run is poor, with what to try, else an empty string.
 
     It is compared with the policy that is shipped for the same task, if there is one.
 
@@ -88,8 +88,9 @@ def poor_return(config: TrainingConfig, summary: dict[str, float]) -> str:
     """
     if not (SHIPPED / f"{config.task}.safetensors").is_file():
         return ""
-    reference = load_policy(config.task, "cpu").info["mean"]
-    if summary["mean"] >= POOR * reference:
+    info = load_policy(config.task, "cpu").info
+    reference = info["mean"]
+    if config.protocol != info["protocol"] or summary["mean"] >= POOR * reference:
         return ""
     return (
         f"This return is poor: the policy shipped for {config.task} earns {reference:.0f}. Returns vary with seeds and "
@@ -157,7 +158,7 @@ def view(policy: Policy, env: LocoEnv, action_repeat: int = 1) -> None:
 def _play(policy: Policy, env: LocoEnv, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
     """Yields the result of each frame from a reset on, holding each action for ``action_repeat`` frames."""
     td = env.reset()
-    for frame in trange(frames, desc=label, leave=False, disable=None):  # not in a log
+    for frame in trange(frames, desc=label, leave=False, disable=None):  # no bar in logs
         if frame % action_repeat == 0:
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 td = policy(td)

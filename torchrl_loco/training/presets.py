@@ -70,9 +70,9 @@ SETTINGS: dict[tuple[str, str], Settings] = {
 """By algorithm and kind of device."""
 
 NO_FLOOR: Settings = {"min_temperature": 1e-9}
-"""The temperature may fall to nothing in tasks where that was never seen to do harm."""
+"""No effective lower bound of the temperature: these tasks train well without one."""
 GETTING_UP: Settings = {"episode_length": 400, "final_lr_fraction": 0.1}
-"""For tasks in which a walker that stands earns nearly everything: what is left is to get up sooner, from any pose."""
+"""For tasks whose remaining return is in getting up sooner."""
 TASKS: dict[tuple[str, str], Settings] = {
     ("reppo", "walker_stand"): {"total_frames": 10_000_000, **GETTING_UP, **NO_FLOOR},
     ("reppo", "walker_walk"): {"total_frames": 10_000_000, **GETTING_UP, **NO_FLOOR},
@@ -84,7 +84,7 @@ TASKS: dict[tuple[str, str], Settings] = {
 """Further settings of a task on CUDA, by algorithm and task."""
 
 TUNED_ON_CPU = ("ppo", "walker_stand")
-"""The task that a CPU learns in minutes."""
+"""Algorithm and task that were tuned on a CPU."""
 
 DEFAULT_ALGORITHM = {"cpu": "ppo", "cuda": "reppo"}
 
@@ -116,7 +116,7 @@ def preset(
 
 
 def tuning_note(config: TrainingConfig) -> str:
-    """Returns a sentence that says so if ``config.task`` was not tuned on its device, else an empty string."""
+    """Returns a note if ``config.task`` was not tuned on its device, else an empty string."""
     if config.task not in OURS:
         return f"No settings were tuned for {config.task}: these were tuned on the walker and the humanoid."
     if config.device == "cpu" and (config.algorithm, config.task) != TUNED_ON_CPU:

@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 
+from torchrl_loco import storage
 from torchrl_loco.checks import check_choice, check_device, check_run
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import env_class
@@ -33,8 +34,9 @@ _UNREADABLE = (
 
 
 def unused_path(path: Path) -> Path:
-    """Returns ``path``, with ``-2``, ``-3``, ... before its suffix if it is taken."""
-    numbered = (path.with_name(f"{path.stem}-{i}{path.suffix}") for i in itertools.count(2))
+    """Returns ``path`` if it is free, else the first free of ``-2``, ``-3``, ... (before the suffix of a file)."""
+    stem, suffix = (path.name, "") if path.is_dir() else (path.stem, path.suffix)
+    numbered = (path.with_name(f"{stem}-{i}{suffix}") for i in itertools.count(2))
     return next(candidate for candidate in itertools.chain([path], numbered) if not candidate.exists())
 
 
@@ -98,9 +100,10 @@ class RunFolder:
             values = json.loads(path.read_text())
             values.update(out=Path(values["out"]), hidden=tuple(values["hidden"]))
             algorithm = check_choice("algorithm", values.pop("algorithm", None), CONFIGS)
-            return CONFIGS[algorithm](**{**values, **overrides})
+            config = CONFIGS[algorithm](**values)
         except (ValueError, TypeError, LookupError, AttributeError) as error:
-            raise ValueError(f"{path} cannot be read as the settings of a run: {error}") from error
+            raise ValueError(f"{path} is damaged or from another release: {error}") from error
+        return dataclasses.replace(config, **overrides)
 
     @property
     def video(self) -> Path:
@@ -153,14 +156,14 @@ class RunFolder:
     def forget_after(self, frames: int) -> None:
         """Removes the lines of metrics and evaluations after ``frames`` frames: a resumed run writes them again."""
         for name in ("metrics.csv", "evaluations.csv"):
-            path, part = self.path / name, self.path / f"{name}.part"
+            path = self.path / name
             if not path.exists():
                 continue
             head, *lines = path.read_text().splitlines()
             at, count = head.split(",").index("frames"), head.count(",")
             whole = [line for line in lines if line.count(",") == count]  # a crash may have cut the last one
-            part.write_text("\n".join([head, *(line for line in whole if float(line.split(",")[at]) <= frames)]) + "\n")
-            part.replace(path)
+            kept = [head, *(line for line in whole if float(line.split(",")[at]) <= frames)]
+            storage.replace_file(path, "".join(f"{line}\n" for line in kept).encode())
 
     def _append(self, name: str, row: dict[str, Any]) -> None:
         path = self.path / name
@@ -186,13 +189,7 @@ class RunFolder:
         """
         buffer = io.BytesIO()  # torch's own writer does not say what went wrong
         torch.save({"version": CHECKPOINT_VERSION, **entries}, buffer)
-        path, part = self.path / "checkpoint.pt", self.path / "checkpoint.pt.part"
-        try:
-            part.write_bytes(buffer.getbuffer())
-            part.replace(path)
-        except OSError as error:
-            part.unlink(missing_ok=True)
-            raise OSError(error.errno, f"{error.strerror}; the previous checkpoint is kept", str(path)) from error
+        storage.replace_file(self.path / "checkpoint.pt", buffer.getbuffer())
 
     def load_checkpoint(self, device: torch.device | str) -> dict[str, Any]:
         """Reads the checkpoint without executing code.
@@ -206,7 +203,7 @@ class RunFolder:
         """
         path = self.path / "checkpoint.pt"
         if not self.has_checkpoint:
-            raise FileNotFoundError(f"{self.path} has no checkpoint.pt yet: train again")
+            raise FileNotFoundError(f"{self.path} has no checkpoint.pt: start a new run")
         try:
             with zipfile.ZipFile(path) as archive:  # torch.load ignores the checksums
                 damaged = archive.testzip()

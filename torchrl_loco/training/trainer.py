@@ -151,7 +151,7 @@ class Trainer:
         summary = evaluate_run(self.run)
         plot_runs([self.run], self.run.path / "learning_curve.png")
         if config.video_seconds > 0:
-            env = make(config.task, 1, config.device, evaluation_seed(config, 1), config.protocol)
+            env = make(config.task, 1, config.device, evaluation_seed(config, 1), config.protocol, world_offset=0)
             record(policy, env, self.run.video, config.video_seconds, config.action_repeat)
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
@@ -199,6 +199,7 @@ def make_env(config: TrainingConfig, nan_dump: Path) -> EnvBase:
         config.device,
         config.seed,
         config.protocol,
+        world_offset=0,
         stagger=True,
         episode_length=config.episode_length,
         nan_dump=None if nan_dump.exists() else nan_dump,
@@ -241,9 +242,7 @@ def evaluate_run(
     """
     config = run.load_config() if device is None else run.load_config(device=device)
     if not run.policy.is_file():
-        way = (
-            "continue it with torchrl-loco resume" if run.has_checkpoint else "it has no checkpoint either, train again"
-        )
+        way = "continue it with torchrl-loco resume" if run.has_checkpoint else "it has no checkpoint: start a new run"
         raise FileNotFoundError(f"{run.path} has no policy yet: {way}")
     policy = Policy.load(run.policy, config.device)
     with settings_for_small_networks():

@@ -1,0 +1,10 @@
+"""What tests are run for."""
+
+from torchrl_loco import registry
+
+TASKS = list(registry.OURS)  # not those of plug-ins that happen to be installed
+PROTOCOLS = ("playground", "dm_control")
+BODIES = ("walker_run", "humanoid_run")
+"""A task of each body, for what does not depend on the task."""
+COARSE = {"sim_dt": 0.0125}
+"""Two physics steps in a control step, for tests in which the physics does not matter: the fewer, the faster."""
