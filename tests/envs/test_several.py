@@ -181,7 +181,7 @@ def test_a_fork_is_refused_on_cuda():
         os.waitpid(pid, 0)
         """
     found = run(program)
-    assert "RuntimeError CUDA does not survive a fork" in found.stdout, found.stdout + found.stderr
+    assert "RuntimeError CUDA cannot be used after a fork" in found.stdout, found.stdout + found.stderr
 
 
 @pytest.mark.gpu
