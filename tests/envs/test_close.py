@@ -100,7 +100,8 @@ def test_an_environment_that_is_dropped_reports_as_if_closed(tmp_path):
     assert (tmp_path / "dump").exists()
 
 
-def test_at_exit_all_worlds_report(tmp_path):
+def test_at_exit_all_worlds_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(world, "_WORLDS", weakref.WeakSet())  # the environments that tests share stay open
     env = made(nan_dump=tmp_path / "dump")
     env.step(env.reset().set("action", torch.full((WORLDS, 6), torch.nan)))
     with pytest.warns(torchrl_loco.NonFiniteWarning):
