@@ -4,6 +4,7 @@ from torchrl_loco import registry
 
 TASKS = list(registry.OURS)  # not those of plug-ins that happen to be installed
 PROTOCOLS = ("playground", "dm_control")
+ENGINES = ("compiled", "mujoco_warp")
 BODIES = ("walker_run", "humanoid_run")
 """A task of each body, for what does not depend on the task."""
 COARSE = {"sim_dt": 0.0125}

@@ -5,7 +5,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads
 
 import pytest
 import torch
-from cases import BODIES, PROTOCOLS, TASKS
+from cases import BODIES, ENGINES, PROTOCOLS, TASKS
 
 import torchrl_loco
 
@@ -35,6 +35,11 @@ def body_task(request):
 
 @pytest.fixture(params=PROTOCOLS)
 def protocol(request):
+    return request.param
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request):
     return request.param
 
 

@@ -34,6 +34,7 @@ BAD = {
     "euler_damping": (1, TypeError),
     "episode_length": (2**31, ValueError),
     "deterministic": (None, TypeError),
+    "engine": ("compield", ValueError),
 }
 
 

@@ -20,7 +20,7 @@ def test_wrong_physics(capsys, monkeypatch):
     make = doctor.make
 
     def spoilt(*args, **kwargs):
-        env = make(*args, **kwargs)
+        env = make(*args, **kwargs, engine="mujoco_warp")  # whose model can be changed
         env.sim.model.opt.gravity.fill_(0.0 if env.body == "walker" else float("nan"))
         return env
 
@@ -37,7 +37,7 @@ def test_a_body_that_fails_does_not_hide_the_others(monkeypatch):
     def self_test(task, device):
         if task.startswith("walker"):
             raise RuntimeError("no compiler")
-        return 0.0, 0.0
+        return 0.0, 0.0, "compiled"
 
     monkeypatch.setattr(doctor, "self_test", self_test)
     findings = {finding.subject: finding for finding in doctor.diagnose()}
@@ -54,7 +54,8 @@ def test_size():
     dropped = []
     for share in (1, 3):
         settings = {name: advised // share for name, (_, advised) in sizes.items()}
-        env = torchrl_loco.make("humanoid_run", 8, "cpu", seed=1, on_overflow="ignore", **settings)
+        settings |= {"engine": "mujoco_warp", "on_overflow": "ignore"}
+        env = torchrl_loco.make("humanoid_run", 8, "cpu", seed=1, **settings)
         env.rollout(60)
         dropped.append(int(env.health()["total", "constraint_overflow"] + env.health()["total", "contact_overflow"]))
     assert dropped[0] == 0 < dropped[1]

@@ -177,10 +177,11 @@ def test_a_nan_dump_knows_its_class(cheetah, tmp_path):
 
 @pytest.mark.slow
 def test_doctor(cheetah, monkeypatch):
-    _, error = doctor.self_test("cheetah_run", "cpu")
+    _, error, engine = doctor.self_test("cheetah_run", "cpu")
     assert error < doctor.TOLERANCE
+    assert engine == "compiled"
     tested = []
-    monkeypatch.setattr(doctor, "self_test", lambda *args: tested.append(args) or (0.0, 0.0))
+    monkeypatch.setattr(doctor, "self_test", lambda *args: tested.append(args) or (0.0, 0.0, "compiled"))
     assert "cheetah on cpu" in [finding.subject for finding in doctor.diagnose()]
     assert ("cheetah_run", "cpu") in tested
 
@@ -297,7 +298,7 @@ def test_broken_plug_ins_are_named_and_harm_no_other(tmp_path, discover, capsys,
     assert "'ant_0' of broken_loco 1.2" in capsys.readouterr().err
     assert not (tmp_path / "runs").exists()
 
-    monkeypatch.setattr(doctor, "self_test", lambda *args: (0.0, 0.0))
+    monkeypatch.setattr(doctor, "self_test", lambda *args: (0.0, 0.0, "compiled"))
     problems = [finding.subject for finding in doctor.diagnose() if finding.problem]
     assert problems == [f"ant_{i}" for i in range(len(broken))]
 

@@ -47,8 +47,8 @@ def too_fast(state, action):
 
 
 @pytest.mark.parametrize("spoil", [bad_action, too_fast])
-def test_the_file_holds_what_the_step_began_with(device, file, actions, spoil):
-    env = made(file, device, njmax=90)
+def test_the_file_holds_what_the_step_began_with(device, engine, file, actions, spoil):
+    env = made(file, device, engine=engine, njmax=90)
     state, action, _ = drive(env, actions, spoil)
     with pytest.warns(NonFiniteWarning, match=rf"world {BAD} became non-finite in step 4 .*dump\.safe.*inspect"):
         env.close()
@@ -58,11 +58,8 @@ def test_the_file_holds_what_the_step_began_with(device, file, actions, spoil):
     torch.testing.assert_close(dump.tensors["action"], action[BAD].cpu(), rtol=0, atol=0, equal_nan=True)
     settings = dump.settings
     assert (settings["world"], settings["episode"], settings["elapsed_steps"], settings["seed"]) == (BAD, 1, 3, 7)
-    assert (settings["env"], settings["protocol"], settings["config"]["njmax"]) == (
-        "torchrl_loco.envs.walker.WalkerWalk",
-        "playground",
-        90,
-    )
+    assert (settings["env"], settings["protocol"]) == ("torchrl_loco.envs.walker.WalkerWalk", "playground")
+    assert (settings["config"]["njmax"], settings["config"]["engine"]) == (90, engine)
 
 
 def test_only_the_first_is_kept(file, actions):
@@ -93,11 +90,15 @@ def test_it_is_written_while_stepping(device, file, actions):
     for _ in range(INTERVAL - 5):  # 4 steps are done
         td = stepped(env, td, zero)
     assert not file.exists()
-    if device == "cuda":
-        td = stepped(env, td, zero)  # requests the numbers, which have arrived after
-        torch.cuda.synchronize()
+
+    def steps():
+        next_td = stepped(env, td, zero)  # requests the numbers
+        if device == "cuda":
+            torch.cuda.synchronize()  # now they have arrived
+            stepped(env, next_td, zero)
+
     with pytest.warns(NonFiniteWarning):
-        stepped(env, td, zero)
+        steps()
     assert file.exists()
 
 
@@ -124,14 +125,14 @@ def test_nothing_is_overwritten(file, actions):
         made(file)
 
 
-def test_warp_repeats_what_happened_and_c_mujoco_agrees_on_an_ordinary_step(file, actions):
+def test_warp_repeats_what_happened_and_c_mujoco_agrees_on_an_ordinary_step(file, engine, actions):
     """With the action repaired. From another warm start, few iterations of the solver end elsewhere."""
 
     def far_warm_start(state, action):
         state["qacc_warmstart"][BAD] = 1e4
         bad_action(state, action)
 
-    env = made(file)
+    env = made(file, engine=engine)
     state, action, _ = drive(env, actions, far_warm_start)
     action[BAD, 2] = 0.0
     stepped(env, env.reset(state, set_state=True), action)
@@ -146,7 +147,7 @@ def test_warp_repeats_what_happened_and_c_mujoco_agrees_on_an_ordinary_step(file
 
     for substeps in (10, 5):
         file.unlink()
-        env = made(file, protocol="dm_control", sim_dt=0.025 / substeps)
+        env = made(file, engine=engine, protocol="dm_control", sim_dt=0.025 / substeps)
         drive(env, actions, bad_action)
         with pytest.warns(NonFiniteWarning):
             env.close()
@@ -203,7 +204,8 @@ def test_files_that_are_no_nan_dump(file, tmp_path, capsys):
 
 
 def test_an_overflow_that_raises_does_not_keep_the_file_from_being_written(file):
-    env = torchrl_loco.make("humanoid_stand", 2, "cpu", 0, njmax=5, on_overflow="raise", nan_dump=file, **COARSE)
+    options = {"engine": "mujoco_warp", "njmax": 5, "on_overflow": "raise", "nan_dump": file, **COARSE}
+    env = torchrl_loco.make("humanoid_stand", 2, "cpu", 0, **options)
     td = env.reset()
     for _ in range(60):
         td = stepped(env, td, env.action_spec.zero())

@@ -57,6 +57,7 @@ def test_every_field_can_be_overridden():
         "euler_damping": True,
         "episode_length": 11,
         "deterministic": True,
+        "engine": "mujoco_warp",
     }
     assert set(changed) == {field.name for field in dataclasses.fields(SimConfig)}
     env = make("walker_walk", 2, "cpu", **changed)
@@ -70,4 +71,4 @@ def test_every_field_can_be_overridden():
 def test_naconmax_grows_with_the_worlds():
     for num_envs, expected in ((1, 1024), (2048, 50_000), (4096, 100_000)):
         assert sim_config(DEFAULTS["walker"], "playground", num_envs, {}).naconmax == expected
-    assert make("walker_stand", 100, "cpu").sim.data.naconmax == 2442
+    assert make("walker_stand", 100, "cpu", engine="mujoco_warp").sim.data.naconmax == 2442

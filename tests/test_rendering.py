@@ -11,8 +11,8 @@ def orange(pixels):
     return red > blue + 40
 
 
-def test_every_camera_sees_its_world_and_changes_nothing(shared, body_task, device):
-    env = shared(body_task, 2, device)
+def test_every_camera_sees_its_world_and_changes_nothing(shared, body_task, engine, device):
+    env = shared(body_task, 2, device, engine=engine)
     env.rollout(2)
     before, pictures = env.get_state(), {}
     for camera in ("side", "back", "egocentric"):

@@ -1,5 +1,6 @@
 """What is on this machine, and whether the physics computes correctly on it."""
 
+import contextlib
 import dataclasses
 import os
 import platform
@@ -15,8 +16,8 @@ import warp as wp
 from tqdm.auto import trange
 
 import torchrl_loco
-from torchrl_loco.envs.monitors import with_margin
 from torchrl_loco.registry import env_class, list_envs, make
+from torchrl_loco.sim.mujoco_warp import with_margin
 from torchrl_loco.sim.simulation import free_memory
 
 PACKAGES = ("torch", "torchrl", "tensordict", "warp-lang", "mujoco-warp", "mujoco")
@@ -65,13 +66,15 @@ def diagnose() -> Iterator[Finding]:
     for device in devices:
         for body, task in tasks.items():
             try:
-                seconds, deviation = self_test(task, device)
+                seconds, deviation, engine = self_test(task, device)
             except Exception as reason:  # the other bodies are still worth testing
                 yield Finding(f"{body} on {device}", f"FAILED: {type(reason).__name__}: {reason}", problem=True)
                 continue
             right = deviation < TOLERANCE  # false for NaN
             verdict = f"{'ok' if right else 'WRONG'}: differs from C MuJoCo by {deviation:.1e} (limit {TOLERANCE:.0e})"
-            yield Finding(f"{body} on {device}", f"{verdict}, made in {seconds:.1f} s", problem=not right)
+            yield Finding(
+                f"{body} on {device}", f"{verdict}, made in {seconds:.1f} s; engine {engine}", problem=not right
+            )
 
 
 def _gib(size: float) -> str:
@@ -81,13 +84,20 @@ def _gib(size: float) -> str:
 def _describe_cache() -> str:
     wp.init()  # else there is no folder yet
     folder = Path(wp.config.kernel_cache_dir)
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    modules = len({path.parent for path in files if path.suffix in (".o", ".cubin", ".ptx")})
-    return f"{folder}, {modules} modules, {sum(path.stat().st_size for path in files) / 1e6:.0f} MB"
+    modules, size = set(), 0
+    for name, _, files in os.walk(folder):
+        for path in (Path(name, file) for file in files):
+            with contextlib.suppress(FileNotFoundError):  # another process is compiling
+                size += path.stat().st_size
+            if path.suffix in (".o", ".cubin", ".ptx"):
+                modules.add(path.parent)
+    return f"{folder}, {len(modules)} modules, {size / 1e6:.0f} MB"
 
 
 def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) -> dict[str, tuple[int, int]]:
-    """Measures the ``njmax`` and ``naconmax`` that a task needs under random actions, with limits far above the need.
+    """Measures the ``njmax`` and ``naconmax`` that a task needs under MuJoCo-Warp, with limits far above the need.
+
+    Actions are random.
 
     Args:
         task: id of the environment.
@@ -98,7 +108,8 @@ def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) 
     Returns:
         For each setting the most that was needed and the advised value.
     """
-    env = make(task, num_envs, device, seed=0, world_offset=0, on_overflow="raise", njmax=1000, naconmax=200 * num_envs)
+    limits = {"njmax": 1000, "naconmax": 200 * num_envs}
+    env = make(task, num_envs, device, seed=0, world_offset=0, on_overflow="raise", engine="mujoco_warp", **limits)
     with torch.no_grad():
         td = env.reset()
         for _ in trange(steps, desc=f"{task}, {num_envs} worlds", leave=False):
@@ -109,8 +120,8 @@ def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) 
     return {name: (value, with_margin(value)) for name, value in needed.items()}
 
 
-def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float]:
-    """Returns the seconds that making the environment took, and the error of ``steps`` random control steps.
+def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, str]:
+    """Returns the seconds that making the environment took, the error of ``steps`` random control steps, the engine.
 
     The error is the median over worlds and steps of the largest deviation of qpos from C MuJoCo (m, rad); NaN if
     anything was not finite.
@@ -118,6 +129,7 @@ def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float]:
     start = time.perf_counter()
     env = make(task, 4, device, seed=0, protocol="dm_control", world_offset=0)
     seconds = time.perf_counter() - start
+    engine = env.engine if env.engine == "compiled" else f"{env.engine}: {env.engine_reason}"
     generator = torch.Generator().manual_seed(0)
     errors, data = [], mujoco.MjData(env.mj_model)
     td = env.reset()
@@ -127,11 +139,11 @@ def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float]:
         td = env.step(td.set("action", action.to(env.device)))["next"]
         after = env.get_state()["qpos"].cpu().numpy()
         if td["terminated"].any():  # a world was not finite
-            return seconds, float("nan")
+            return seconds, float("nan"), engine
         for world in range(env.num_envs):
             for name in ("qpos", "qvel", "qacc_warmstart"):
                 getattr(data, name)[:] = before[name][world]
             data.ctrl[:] = action[world]
             mujoco.mj_step(env.mj_model, data, env.config.substeps)
             errors.append(np.abs(data.qpos - after[world]).max())
-    return seconds, float(np.median(errors))
+    return seconds, float(np.median(errors)), engine

@@ -37,8 +37,9 @@ class Renderer:
         """Returns the current state of all worlds as uint8 pixels, shape ``(num_envs, height, width, 3)``."""
         sim = self._sim
         with EXCLUSIVE, wp.ScopedDevice(sim.device), wp.ScopedStream(current_stream(sim.device)):
-            mjw.camlight(sim.model, sim.data)
-            mjw.refit_bvh(sim.model, sim.data, self._context)
-            mjw.render(sim.model, sim.data, self._context)
+            data = sim.mujoco_data()
+            mjw.camlight(sim.model, data)
+            mjw.refit_bvh(sim.model, data, self._context)
+            mjw.render(sim.model, data, self._context)
             mjw.get_rgb(self._context, 0, self._rgb)
         return self._pixels.clamp(0.0, 1.0).mul(255.0).round().to(torch.uint8)

@@ -77,8 +77,8 @@ def test_a_failed_opening_leaves_nothing_behind(actions, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["close", "del"])
-def test_nothing_holds_on_to_a_closed_environment(way):
-    env = made()
+def test_nothing_holds_on_to_a_closed_environment(way, engine):
+    env = made(engine=engine)
     env.rollout(3)
     env.render(width=16, height=12)
     held = [weakref.ref(thing) for thing in (env.world, env.sim, env.sim.data, env.world.observation)]
@@ -110,7 +110,8 @@ def test_at_exit_all_worlds_report(tmp_path, monkeypatch):
 
 
 @pytest.mark.gpu
-def test_close_frees_device_memory():
+@pytest.mark.parametrize(("engine", "num_envs"), [("compiled", 2**18), ("mujoco_warp", 4096)])
+def test_close_frees_device_memory(engine, num_envs):
     def used():
         gc.collect()
         torch.cuda.synchronize()
@@ -118,16 +119,16 @@ def test_close_frees_device_memory():
         free, total = torch.cuda.mem_get_info()
         return (total - free) / 2**20
 
-    def live(num_envs):
-        env = torchrl_loco.make("humanoid_walk", num_envs, "cuda", 0)
+    def live():
+        env = torchrl_loco.make("humanoid_walk", num_envs, "cuda", 0, engine=engine)
         env.rollout(3)
         return env
 
-    live(4096).close()  # loads what stays loaded
+    live().close()  # loads what stays loaded
     before = used()
     left = []
     for _ in range(3):
-        env = live(4096)
+        env = live()
         taken = used() - before
         env.close()
         left.append(used() - before)

@@ -10,13 +10,17 @@ from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, Transform
 import torchrl_loco
 from torchrl_loco import State
 
-CASES = [*((task, "playground") for task in TASKS), *((task, "dm_control") for task in BODIES)]
+CASES = [
+    *((task, "playground", "compiled") for task in TASKS),
+    *((task, "dm_control", "compiled") for task in BODIES),
+    *((task, "playground", "mujoco_warp") for task in BODIES),
+]
 
 
 @pytest.fixture(params=CASES, ids="-".join)
 def env(request, shared, device):
-    task, protocol = request.param
-    return shared(task, 5, device, protocol=protocol, reward_terms=True)
+    task, protocol, engine = request.param
+    return shared(task, 5, device, protocol=protocol, engine=engine, reward_terms=True)
 
 
 def test_specs(env):
@@ -147,9 +151,9 @@ def test_the_callers_default_device_does_not_matter(elsewhere, shared):
         assert env.render(width=8, height=8).device == env.health()["total"].device == torch.device("cpu")
 
 
-def test_making_an_environment_leaves_no_overflow_behind():
+def test_making_an_environment_leaves_no_overflow_behind(engine):
     """Recording steps through states that nobody asked for; what overflowed there does not count."""
-    env = torchrl_loco.make("humanoid_run", 4, "cpu", seed=0, protocol="dm_control", iterations=1)
+    env = torchrl_loco.make("walker_run", 4, "cpu", seed=0, protocol="dm_control", iterations=1, engine=engine)
     assert (env.sim.overflow == 0).all()
     assert all(count == 0 for count in env.health()["total"].values())
     env.rollout(40)
@@ -157,4 +161,6 @@ def test_making_an_environment_leaves_no_overflow_behind():
 
 
 def test_repr(shared):
-    assert repr(shared(seed=3)) == "WalkerRun(num_envs=4, device='cpu', seed=3, protocol='playground')"
+    start = "WalkerRun(num_envs=4, device='cpu', seed=3, protocol='playground', engine="
+    assert repr(shared(seed=3)) == start + "'compiled')"
+    assert repr(shared(seed=3, engine="mujoco_warp")) == start + "'mujoco_warp (as asked)')"

@@ -1,9 +1,13 @@
-"""What repeats to the bit: everything on the CPU; on CUDA the starts, and with deterministic=True everything."""
+"""What repeats to the bit: everything under the engine ``compiled``, on CUDA too, for any number of worlds.
+
+Under ``mujoco_warp`` it is everything on the CPU; on CUDA the starts, and with deterministic=True everything.
+"""
 
 import pytest
 import torch
 
 import torchrl_loco
+from torchrl_loco import State
 
 
 def rollouts(task, device, protocol, num_envs, steps, **settings):
@@ -22,10 +26,17 @@ def rollouts(task, device, protocol, num_envs, steps, **settings):
     return results
 
 
-@pytest.mark.parametrize(("task", "protocol"), [("walker_run", "playground"), ("humanoid_run", "dm_control")])
-def test_the_cpu_always_repeats(shared, task, protocol, actions):
+@pytest.mark.parametrize(
+    ("task", "protocol", "engine"),
+    [
+        ("walker_run", "playground", "compiled"),
+        ("humanoid_run", "dm_control", "compiled"),
+        ("humanoid_run", "dm_control", "mujoco_warp"),
+    ],
+)
+def test_the_cpu_always_repeats(shared, task, protocol, engine, actions):
     """An environment that was used, and in which worlds were not finite, does what a new one does."""
-    options = {"protocol": protocol, "episode_length": 20, "stagger": True}
+    options = {"protocol": protocol, "engine": engine, "episode_length": 20, "stagger": True}
     used, new = shared(task, **options), torchrl_loco.make(task, 4, "cpu", 0, **options)
     used.rollout(10)
     used.step(used.reset().set("action", torch.full(used.action_spec.shape, torch.nan)))
@@ -38,11 +49,34 @@ def test_the_cpu_always_repeats(shared, task, protocol, actions):
         assert (current == expected).all()
 
 
+@pytest.mark.parametrize(("task", "protocol"), [("walker_run", "playground"), ("humanoid_run", "dm_control")])
+def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protocol, device, actions):
+    """Under ``compiled``, bit for bit, whatever their number, its place, and what happens in the others."""
+    many, few = (shared(task, n, device, protocol=protocol, episode_length=500) for n in (131, 3))
+    td, moves = many.reset(), actions(many, 70)
+    for action in moves[:60]:  # until most lie on the ground
+        td = many.step(td.set("action", action))["next"].exclude("reward")
+    state, places = many.get_state(), torch.tensor([130, 64, 7])
+    alone = few.reset(State({key: state[key][places.to(device)] for key in State.KEYS}, batch_size=[3]), set_state=True)
+    beside = many.reset(state, set_state=True)
+    others = torch.ones(131, dtype=torch.bool)
+    others[places] = False
+    many.sim.qvel[others.to(device)] = many.sim.qvel.new_tensor([torch.nan, 1e9]).repeat(64).unsqueeze(-1)
+    for action in moves[60:]:
+        spoilt = action.clone()
+        spoilt[others.to(device)] *= torch.inf
+        beside = many.step(beside.set("action", spoilt))["next"].exclude("reward")
+        alone = few.step(alone.set("action", action[places.to(device)]))["next"].exclude("reward")
+        assert torch.equal(beside["observation"][places.to(device)], alone["observation"])
+        assert beside["terminated"].sum() == len(others) - 3
+    assert all(torch.equal(many.get_state()[key][places.to(device)], few.get_state()[key]) for key in State.KEYS)
+
+
 def test_the_setting_leaves_the_physics_as_it_is(shared):
     """The order of the constraints decides how sums are rounded, and nothing else."""
     steps = []
     for deterministic in (False, True):
-        env = shared("humanoid_run", 8, protocol="dm_control", deterministic=deterministic)
+        env = shared("humanoid_run", 8, protocol="dm_control", engine="mujoco_warp", deterministic=deterministic)
         td = env.reset()
         for _ in range(5):
             td = env.step(td.set("action", env.action_spec.one()))["next"]
@@ -51,15 +85,21 @@ def test_the_setting_leaves_the_physics_as_it_is(shared):
 
 
 @pytest.mark.gpu
-def test_cuda_repeats_bit_for_bit_with_deterministic(body_task, protocol):
-    assert torch.equal(*rollouts(body_task, "cuda", protocol, 1024, 60, deterministic=True))
+def test_cuda_always_repeats(body_task, protocol):
+    assert torch.equal(*rollouts(body_task, "cuda", protocol, 1024, 60))
 
 
 @pytest.mark.gpu
-def test_cuda_repeats_starts_bit_for_bit_and_a_step_nearly(body_task, protocol):
+def test_cuda_repeats_bit_for_bit_with_deterministic(body_task, protocol):
+    options = {"engine": "mujoco_warp", "deterministic": True}
+    assert torch.equal(*rollouts(body_task, "cuda", protocol, 1024, 60, **options))
+
+
+@pytest.mark.gpu
+def test_mujoco_warp_on_cuda_repeats_starts_bit_for_bit_and_a_step_nearly(body_task, protocol):
     starts, steps = [], []
     for _ in range(2):
-        env = torchrl_loco.make(body_task, 1024, "cuda", 0, protocol)
+        env = torchrl_loco.make(body_task, 1024, "cuda", 0, protocol, engine="mujoco_warp")
         td = env.reset()
         starts.append(td["observation"].clone())
         steps.append(env.step(td.set("action", env.action_spec.zero()))["next", "observation"])

@@ -22,8 +22,9 @@ def test_each_graph_is_recorded_once(body_task, device, actions, monkeypatch):
 
 
 @pytest.mark.gpu
-def test_cuda_agrees_with_the_cpu_after_one_step(body_task, protocol, actions):
-    envs = [torchrl_loco.make(body_task, 64, device, seed=6, protocol=protocol) for device in ("cpu", "cuda")]
+def test_cuda_agrees_with_the_cpu_after_one_step(body_task, protocol, engine, actions):
+    options = {"seed": 6, "protocol": protocol, "engine": engine}
+    envs = [torchrl_loco.make(body_task, 64, device, **options) for device in ("cpu", "cuda")]
     results = []
     for env in envs:
         td = env.reset()
@@ -36,8 +37,8 @@ def test_cuda_agrees_with_the_cpu_after_one_step(body_task, protocol, actions):
 
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")
-def test_no_host_synchronisation_in_a_step(body_task):
-    env = torchrl_loco.make(body_task, 256, "cuda", seed=0)
+def test_no_host_synchronisation_in_a_step(body_task, engine):
+    env = torchrl_loco.make(body_task, 256, "cuda", seed=0, engine=engine)
     td = env.reset()
     td.set("action", torch.zeros_like(env.action_spec.zero()))
     env._step(td)

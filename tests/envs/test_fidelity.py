@@ -28,9 +28,12 @@ def test_the_oracle_agrees_with_dm_control(task):
     np.testing.assert_allclose([oracle.reward(*row) for row in rows], record["reward"], rtol=0, atol=1e-6)
 
 
-def test_observation_and_physics_agree_with_dm_control(shared, task, device):
+@pytest.mark.parametrize(
+    ("task", "engine"), [*((task, "compiled") for task in TASKS), *((task, "mujoco_warp") for task in BODIES)]
+)
+def test_observation_and_physics_agree_with_dm_control(shared, task, engine, device):
     record = recorded(task)
-    env = shared(task, 192, device, protocol="dm_control")
+    env = shared(task, 192, device, protocol="dm_control", engine=engine)
     after = {"qpos": record["next_qpos"], "qvel": record["next_qvel"]}
     td = env.reset(state(after).to(device), set_state=True)
     np.testing.assert_allclose(td["observation"].cpu(), record["obs"], rtol=0, atol=1e-5)
@@ -52,11 +55,16 @@ def interpolated_states(task):
 
 
 @pytest.mark.parametrize(
-    ("task", "protocol"), [*((task, "dm_control") for task in TASKS), *((task, "playground") for task in BODIES)]
+    ("task", "protocol", "engine"),
+    [
+        *((task, "dm_control", "compiled") for task in TASKS),
+        *((task, "playground", "compiled") for task in BODIES),
+        *((task, "dm_control", "mujoco_warp") for task in BODIES),
+    ],
 )
-def test_reward_agrees_with_numpy(shared, task, protocol, device):
+def test_reward_agrees_with_numpy(shared, task, protocol, engine, device):
     record = interpolated_states(task)
-    env = shared(task, 192, device, protocol=protocol)
+    env = shared(task, 192, device, protocol=protocol, engine=engine)
     td = env.reset(state(record).to(device), set_state=True)
     action = torch.as_tensor(record["action"], dtype=torch.float32, device=device)
     rewards = env.step(td.set("action", action))["next", "reward"].squeeze(-1).cpu().numpy()

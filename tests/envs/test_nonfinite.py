@@ -11,7 +11,11 @@ from tensordict import TensorDict
 from torchrl_loco.envs.kernels import zero_non_finite
 
 BAD = [math.nan, math.inf, -math.inf]
-CASES = [("walker_run", "playground"), ("humanoid_run", "dm_control")]
+CASES = [
+    ("walker_run", "playground", "compiled"),
+    ("humanoid_run", "dm_control", "compiled"),
+    ("humanoid_run", "dm_control", "mujoco_warp"),
+]
 
 
 def step_all(env, td, action):
@@ -32,10 +36,11 @@ def assert_goes_on_as(env, twin, after, expected, moves, exact):
         td, twin_td = td.exclude("reward"), twin_td.exclude("reward")
 
 
-@pytest.mark.parametrize(("task", "protocol"), CASES)
-def test_a_bad_action_ends_only_its_world(shared, task, protocol, device, actions):
-    env, twin = (shared(task, 4, device, copy=copy, protocol=protocol, reward_terms=True, **COARSE) for copy in (0, 1))
-    exact = {"rtol": 0, "atol": 0} if device == "cpu" else {"rtol": 1e-3, "atol": 1e-3}
+@pytest.mark.parametrize(("task", "protocol", "engine"), CASES)
+def test_a_bad_action_ends_only_its_world(shared, task, protocol, engine, device, actions):
+    options = {"protocol": protocol, "engine": engine, "reward_terms": True, **COARSE}
+    env, twin = (shared(task, 4, device, copy=copy, **options) for copy in (0, 1))
+    exact = {"rtol": 0, "atol": 0} if device == "cpu" or engine == "compiled" else {"rtol": 1e-3, "atol": 1e-3}
     others = torch.tensor([0, 2, 3], device=device)
     ended = torch.tensor([[False], [True], [False], [False]], device=device)
     for bad in BAD:
@@ -77,9 +82,9 @@ def test_a_finite_action_of_any_size_is_clipped(shared, body_task, actions):
     assert torch.equal(after["reward"], expected["reward"])
 
 
-@pytest.mark.parametrize(("task", "protocol"), CASES)
-def test_a_state_that_is_not_finite_ends_only_its_world(shared, task, protocol, actions):
-    env, twin = (shared(task, 3, copy=copy, protocol=protocol, **COARSE) for copy in (0, 1))
+@pytest.mark.parametrize(("task", "protocol", "engine"), CASES)
+def test_a_state_that_is_not_finite_ends_only_its_world(shared, task, protocol, engine, actions):
+    env, twin = (shared(task, 3, copy=copy, protocol=protocol, engine=engine, **COARSE) for copy in (0, 1))
     exact = {"rtol": 0, "atol": 0}
     for field in ("qpos", "qvel"):
         td, twin_td = env.reset(), twin.reset()
@@ -95,7 +100,8 @@ def test_a_state_that_is_not_finite_ends_only_its_world(shared, task, protocol, 
 
 def test_a_reset_clears_constraints_that_are_not_finite(shared, protocol):
     """The solver multiplies unused rows by zero: a NaN would remain."""
-    env, twin = (shared("walker_run", copy=copy, protocol=protocol, **COARSE) for copy in (0, 1))
+    options = {"protocol": protocol, "engine": "mujoco_warp", **COARSE}
+    env, twin = (shared("walker_run", copy=copy, **options) for copy in (0, 1))
     for field in ("J", "D"):
         wp.to_torch(getattr(env.sim.data.efc, field)).fill_(torch.nan)
         td, twin_td = env.reset(), twin.reset()
@@ -104,8 +110,8 @@ def test_a_reset_clears_constraints_that_are_not_finite(shared, protocol):
             assert torch.equal(td["observation"], twin_td["observation"])
 
 
-def test_a_world_that_is_not_reset_stays_ended_and_harms_no_other(shared, actions):
-    env, twin = (shared("humanoid_run", 3, copy=copy, **COARSE) for copy in (0, 1))
+def test_a_world_that_is_not_reset_stays_ended_and_harms_no_other(shared, engine, actions):
+    env, twin = (shared("humanoid_run", 3, copy=copy, engine=engine, **COARSE) for copy in (0, 1))
     td, twin_td = env.reset(), twin.reset()
     env.sim.qvel[1] = math.nan
     for action in actions(env, 4):

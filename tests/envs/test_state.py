@@ -23,11 +23,18 @@ def assert_same(one, other):
     assert all(torch.equal(one[key], other[key]) for key in State.KEYS)
 
 
-@pytest.mark.parametrize(("task", "protocol"), [("walker_run", "playground"), ("humanoid_run", "dm_control")])
+@pytest.mark.parametrize(
+    ("task", "protocol", "engine"),
+    [
+        ("walker_run", "playground", "compiled"),
+        ("humanoid_run", "dm_control", "compiled"),
+        ("humanoid_run", "dm_control", "mujoco_warp"),
+    ],
+)
 @pytest.mark.parametrize("transformed", [False, True])
-def test_restores_the_continuation(shared, task, protocol, device, actions, transformed):
-    """Bitwise on the CPU; across a time limit, so that step count and random counter take part."""
-    env = shared(task, 4, device, protocol=protocol, episode_length=9)
+def test_restores_the_continuation(shared, task, protocol, engine, device, actions, transformed):
+    """Bitwise; across a time limit, so that step count and random counter take part."""
+    env = shared(task, 4, device, protocol=protocol, engine=engine, episode_length=9)
     if transformed:
         env = TransformedEnv(env, Compose(InitTracker(), RewardSum(), StepCounter()))
     moves = actions(env, 10)
@@ -42,7 +49,7 @@ def test_restores_the_continuation(shared, task, protocol, device, actions, tran
     for _ in range(2):  # a state can be restored again
         second = walk(env, env.reset(state, set_state=True), moves)
         for key in ("observation", "reward", "done", "truncated"):
-            assert_repeats(first[key], second[key])
+            assert_repeats(first[key], second[key], engine)
         state = kept.clone()  # TransformedEnv writes into what it is given
 
 

@@ -9,8 +9,7 @@ import warp as wp
 import torchrl_loco
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS, sim_config
-from torchrl_loco.sim import Simulation, simulation
-from torchrl_loco.sim.mujoco_warp import MujocoWarpEngine, data_bytes
+from torchrl_loco.sim import Simulation, compiled, mujoco_warp, simulation
 
 
 def allocated(thing):
@@ -24,27 +23,32 @@ def allocated(thing):
     return found
 
 
-def test_the_estimate_is_what_is_allocated():
-    for body, num_envs, overrides in [
-        ("walker", 1, {}),
-        ("walker", 40, {"naconmax": 3}),
-        ("humanoid", 100, {"njmax": 77}),
-    ]:
-        config = sim_config(DEFAULTS[body], "playground", num_envs, overrides)
-        model = models.load(models.PATHS[body])
-        engine = MujocoWarpEngine(model, config, num_envs, wp.get_device("cpu"))
-        assert data_bytes(model, config, num_envs) == sum(allocated(engine.data).values())
+@pytest.mark.parametrize(
+    ("body", "num_envs", "overrides"),
+    [("walker", 1, {}), ("walker", 40, {"naconmax": 3}), ("humanoid", 100, {"njmax": 77})],
+)
+def test_the_estimate_is_what_is_allocated(body, num_envs, overrides):
+    config = sim_config(DEFAULTS[body], "playground", num_envs, overrides)
+    model, device = models.load(models.PATHS[body]), wp.get_device("cpu")
+    engine = mujoco_warp.MujocoWarpEngine(model, config, num_envs, device)
+    assert mujoco_warp.data_bytes(model, config, num_envs) == sum(allocated(engine.data).values())
+    data = compiled.CompiledEngine(model, config, num_envs, device).data
+    arrays = [array for array in vars(data).values() if isinstance(array, wp.array)]
+    assert compiled.data_bytes(model, num_envs) == sum(array.capacity for array in arrays)
 
 
-def test_too_many_worlds_are_refused_before_they_are_allocated(monkeypatch):
-    monkeypatch.setattr(simulation, "MujocoWarpEngine", None)
+def test_too_many_worlds_are_refused_before_they_are_allocated(engine, monkeypatch):
+    monkeypatch.setattr(mujoco_warp, "MujocoWarpEngine", None)
+    monkeypatch.setattr(compiled, "CompiledEngine", None)
+    monkeypatch.setattr(simulation, "free_memory", lambda device: 2**30)
     with pytest.raises(MemoryError, match=r"num_envs=10000000 needs about \d+\.\d GiB on cpu.* \d+ worlds fit"):
-        torchrl_loco.make("walker_walk", 10**7, "cpu")
+        torchrl_loco.make("walker_walk", 10**7, "cpu", engine=engine)
 
 
-def test_as_many_as_fit_are_made(monkeypatch):
-    config = sim_config(DEFAULTS["walker"], "playground", 8, {})
-    needed = simulation.SCRATCH * data_bytes(models.load(models.PATHS["walker"]), config, 8)
+def test_as_many_as_fit_are_made(engine, monkeypatch):
+    config = sim_config(DEFAULTS["walker"], "playground", 8, {"engine": engine})
+    model = models.load(models.PATHS["walker"])
+    needed = simulation.memory(engine, model, config, 8, torch.device("cpu"))
     for free, fits in ((needed + 1, True), (needed / 2, False)):
         monkeypatch.setattr(simulation, "free_memory", lambda device, free=free: free)
         if fits:

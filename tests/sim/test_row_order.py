@@ -21,7 +21,7 @@ WORLDS = 8
 def sim(request):
     """A simulation of a body that fell under random actions: contacts, and joints at their limits."""
     body = request.param
-    config = sim_config(DEFAULTS[body], "dm_control", WORLDS, {"deterministic": True})
+    config = sim_config(DEFAULTS[body], "dm_control", WORLDS, {"deterministic": True, "engine": "mujoco_warp"})
     sim = Simulation(models.load(models.PATHS[body]), config, WORLDS, check_device("cpu"))
     rng = np.random.default_rng(0)
     step = sim.capture(sim.step)

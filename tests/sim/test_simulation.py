@@ -24,8 +24,8 @@ def body(request):
     return request.param
 
 
-def test_views_are_zero_copy_and_never_rebound(body, device):
-    sim, mask = simulation(body, device)
+def test_views_are_zero_copy_and_never_rebound(body, device, engine):
+    sim, mask = simulation(body, device, engine=engine)
     pointers = {name: getattr(sim, name).data_ptr() for name in VIEWS}
     graph = sim.capture(lambda: (sim.reset(mask), sim.forward(mask), sim.step()))
     for _ in range(3):
@@ -36,11 +36,11 @@ def test_views_are_zero_copy_and_never_rebound(body, device):
     assert (sim.data.qpos.numpy() == 0.25).all()
 
 
-def test_replay_equals_eager(body):
+def test_replay_equals_eager(body, engine):
     """The recorded step does bitwise what the launched one does, on the CPU."""
     traces = []
     for captured in (True, False):
-        sim, mask = simulation(body, "cpu")
+        sim, mask = simulation(body, "cpu", engine=engine)
         step = sim.capture(sim.step).replay if captured else sim.step
         start = sim.capture(lambda s=sim, m=mask: (s.reset(m), s.forward(m))).replay
         start()
@@ -53,9 +53,9 @@ def test_replay_equals_eager(body):
     assert torch.equal(*traces)
 
 
-def test_derived_quantities_belong_to_the_new_state(body, device):
+def test_derived_quantities_belong_to_the_new_state(body, device, engine):
     """dm_control's order: after a step, xpos, xmat and sensors are those of the qpos and qvel at hand."""
-    sim, mask = simulation(body, device)
+    sim, mask = simulation(body, device, engine=engine)
     sim.reset(mask)
     sim.forward(mask)
     for _ in range(8):
@@ -70,11 +70,15 @@ def test_derived_quantities_belong_to_the_new_state(body, device):
         np.testing.assert_allclose(sim.data.sensordata.numpy()[world], data.sensordata, atol=1e-4)
 
 
-def test_forward_at_rest_is_forward_for_worlds_at_rest(body, device):
+def test_forward_at_rest_is_forward_for_worlds_at_rest(body, device, engine):
     """What it leaves out is zero after a reset, and the worlds beside keep what they have."""
     states = []
     for forward in (Simulation.forward, Simulation.forward_at_rest):
-        sim, mask = simulation(body, device)
+        sim, mask = simulation(body, device, engine=engine)
+        d = sim.data
+        arrays = [d.xpos, d.xmat, d.cvel, d.sensordata]
+        if engine == "mujoco_warp":
+            arrays += [d.geom_xpos, d.efc.J]
         generator = torch.Generator(device).manual_seed(0)
         sim.reset(mask)
         sim.forward(mask)
@@ -84,15 +88,39 @@ def test_forward_at_rest_is_forward_for_worlds_at_rest(body, device):
         sim.reset(mask)
         sim.qpos[0, -5:].uniform_(-1, 1, generator=generator)
         forward(sim, mask)
-        d = sim.data
-        states.append([wp.to_torch(x).clone() for x in (d.xpos, d.xmat, d.geom_xpos, d.cvel, d.sensordata, d.efc.J)])
+        states.append([wp.to_torch(x).clone() for x in arrays])
     for full, less in zip(*states, strict=True):
         torch.testing.assert_close(less, full, rtol=0, atol=0)
     assert all(array[1:].any() for array in states[0])
 
 
-def test_time_and_substeps(body):
-    sim, mask = simulation(body, "cpu", ctrl_dt=0.05)
+def test_mujoco_data_shows_the_present_state(body, engine):
+    """Poses of geoms, and contacts where they are asked for, as C MuJoCo finds them; the state stays as it is."""
+    sim, mask = simulation(body, "cpu", engine=engine)
+    sim.reset(mask)
+    height, start = (2, 1.4) if body == "humanoid" else (0, 0.0)
+    for step in range(2):
+        sim.qpos[:, -6:] = 0.1 * step
+        sim.qpos[:, height] = start - torch.linspace(0.15, 1.33, 4)
+        before = [view.clone() for view in (sim.qpos, sim.qvel, sim.ctrl, sim.qacc_warmstart, sim.time, sim.overflow)]
+        found = sim.mujoco_data(contacts=True)
+        after = sim.qpos, sim.qvel, sim.ctrl, sim.qacc_warmstart, sim.time, sim.overflow
+        assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+        data, touching = mujoco.MjData(sim.mj_model), set()
+        for world in range(sim.num_envs):
+            data.qpos[:] = sim.qpos[world]
+            mujoco.mj_fwdPosition(sim.mj_model, data)
+            np.testing.assert_allclose(found.geom_xpos.numpy()[world], data.geom_xpos, atol=1e-5)
+            touching |= {(world, *geoms) for geoms in data.contact.geom.tolist()}
+        count, contact = int(found.nacon.numpy()[0]), found.contact
+        rows = np.column_stack([contact.worldid.numpy(), contact.geom.numpy()])[:count]
+        deep = contact.dist.numpy()[:count] < 0  # MuJoCo-Warp may list others that are near
+        assert len(touching) > 4
+        assert set(map(tuple, rows[deep].tolist())) == touching
+
+
+def test_time_and_substeps(engine):
+    sim, mask = simulation("walker", "cpu", ctrl_dt=0.05, engine=engine)
     sim.reset(mask)
     sim.forward(mask)
     sim.step()
@@ -100,7 +128,7 @@ def test_time_and_substeps(body):
 
 
 def test_overflow_is_kept_and_not_printed(capfd):
-    sim, mask = simulation("humanoid", "cpu", njmax=2)
+    sim, mask = simulation("humanoid", "cpu", njmax=2, engine="mujoco_warp")
     sim.reset(mask)
     sim.qpos[0, 2] = 0.3  # one world on the floor, with more contacts than fit
     sim.qpos[1:, 2] = 5.0
@@ -113,8 +141,8 @@ def test_overflow_is_kept_and_not_printed(capfd):
     assert "overflow" not in capfd.readouterr().out
 
 
-def test_options_come_from_the_config():
-    sim, _ = simulation("walker", "cpu", sim_dt=0.005, iterations=7, ls_iterations=9)
+def test_options_come_from_the_config(engine):
+    sim, _ = simulation("walker", "cpu", sim_dt=0.005, iterations=7, ls_iterations=9, engine=engine)
     assert sim.mj_model.opt.timestep == 0.005
     assert (sim.model.opt.iterations, sim.model.opt.ls_iterations) == (7, 9)
     playground = sim_config(DEFAULTS["walker"], "playground", 1, {})

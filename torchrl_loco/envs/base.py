@@ -132,7 +132,8 @@ class LocoEnv(EnvBase):
     def __repr__(self) -> str:
         num_envs = self.num_envs if self.batch_size else None
         device, protocol, seed = str(self.device), self.protocol, self.seed
-        return f"{type(self).__name__}({num_envs=}, {device=}, {seed=}, {protocol=})"
+        engine = self.engine if self.engine == "compiled" else f"{self.engine} ({self.engine_reason})"
+        return f"{type(self).__name__}({num_envs=}, {device=}, {seed=}, {protocol=}, {engine=})"
 
     # What a body adds.
 
@@ -294,6 +295,7 @@ class LocoEnv(EnvBase):
     def _open(self) -> None:
         """Makes the worlds. Those of an environment that was open before continue with their next episodes."""
         self._world = World(self)
+        self.engine, self.engine_reason = self._world.sim.engine_choice
         if self._episodes is not None:
             self._world.episode.torch.copy_(self._episodes)
         self.is_closed = False

@@ -133,7 +133,8 @@ class Humanoid(LocoEnv):
             return None
         sim = world.sim
         skeleton = make_skeleton(self.mj_model, sim.model.nxn_geom_pair_filtered.numpy(), sim.device)
-        return draw_free_poses, [skeleton], [sim.data.qpos, sim.data.xpos, sim.data.xquat]
+        xquat = wp.empty(sim.data.xpos.shape, dtype=wp.quat, device=sim.device)
+        return draw_free_poses, [skeleton], [sim.data.qpos, sim.data.xpos, xquat]
 
 
 class HumanoidStand(Humanoid):

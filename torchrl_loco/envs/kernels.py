@@ -9,8 +9,12 @@ MAX_VALUE = 1.0e10
 
 
 @wp.func
-def is_finite(x: float) -> bool:
-    return wp.abs(x) < MAX_VALUE  # false for NaN too
+def count_non_finite(row: wp.array[float]) -> int:
+    """Counts without a branch: else a thread would wait for each number before it asks for the next."""
+    count = int(0)
+    for i in range(row.shape[0]):
+        count += wp.where(wp.abs(row[i]) < MAX_VALUE, 0, 1)  # counts NaN too
+    return count
 
 
 @wp.kernel(enable_backward=False)
@@ -24,13 +28,35 @@ def apply_action(
 ):
     """Clips the action into ``ctrl``. A world whose action is NaN or infinite is marked, and stepped with zeros."""
     world = wp.tid()
-    non_finite = bool(False)
+    count = int(0)
     for i in range(action_in.shape[1]):
-        if not wp.isfinite(action_in[world, i]):
-            non_finite = True
+        count += wp.where(wp.isfinite(action_in[world, i]), 0, 1)
+    non_finite = count > 0
     for i in range(action_in.shape[1]):
         ctrl_out[world, i] = wp.where(non_finite, 0.0, wp.clamp(action_in[world, i], -1.0, 1.0))
     non_finite_out[world] = non_finite
+
+
+@wp.func
+def zero_if_non_finite(
+    non_finite: bool,
+    qpos: wp.array[float],
+    qvel: wp.array[float],
+    observation: wp.array[float],
+    reward: wp.array[float],
+    terms: wp.array[float],
+    world: int,
+) -> bool:
+    """Returns whether a world is non-finite; if it is, zeroes its observation, reward and terms."""
+    found = count_non_finite(qpos) + count_non_finite(qvel) + count_non_finite(observation)
+    non_finite = non_finite or found > 0 or not (wp.abs(reward[world]) < MAX_VALUE)
+    if non_finite:
+        for i in range(observation.shape[0]):
+            observation[i] = 0.0
+        for i in range(terms.shape[0]):
+            terms[i] = 0.0
+        reward[world] = 0.0
+    return non_finite
 
 
 @wp.kernel(enable_backward=False)
@@ -50,42 +76,67 @@ def zero_non_finite(
     world = wp.tid()
     if not mask_in[world]:
         return
-    non_finite = non_finite_out[world]
-    for i in range(qpos_in.shape[1]):
-        non_finite = non_finite or not is_finite(qpos_in[world, i])
-    for i in range(qvel_in.shape[1]):
-        non_finite = non_finite or not is_finite(qvel_in[world, i])
-    for i in range(observation_out.shape[1]):
-        non_finite = non_finite or not is_finite(observation_out[world, i])
-    non_finite = non_finite or not is_finite(reward_out[world])
-    if non_finite:
-        for i in range(observation_out.shape[1]):
-            observation_out[world, i] = 0.0
-        for i in range(terms_out.shape[1]):
-            terms_out[world, i] = 0.0
-        reward_out[world] = 0.0
-    non_finite_out[world] = non_finite
+    non_finite_out[world] = zero_if_non_finite(
+        non_finite_out[world],
+        qpos_in[world],
+        qvel_in[world],
+        observation_out[world],
+        reward_out,
+        terms_out[world],
+        world,
+    )
 
 
 @wp.kernel(enable_backward=False)
-def count_step(
+def finish_step(
     # In:
-    non_finite_in: wp.array[bool],
     episode_length: int,
+    counter_bits: wp.array[int],
+    # Data in:
+    qpos_in: wp.array2d[float],
+    qvel_in: wp.array2d[float],
+    # Data out:
+    overflow_out: wp.array[int],
     # Out:
+    non_finite_out: wp.array[bool],
+    observation_out: wp.array2d[float],
+    reward_out: wp.array[float],
+    terms_out: wp.array2d[float],
     elapsed_steps_out: wp.array[int],
     done_out: wp.array[bool],
     terminated_out: wp.array[bool],
     truncated_out: wp.array[bool],
+    counts_out: wp.array2d[int],
 ):
-    """Counts a control step: a world is truncated at the time limit, and terminated if it is not finite."""
+    """Ends a control step: marks and zeroes non-finite worlds, applies the time limit, counts what went wrong.
+
+    A world is truncated at the time limit, and terminated if it is not finite. The bits of ``overflow`` are cleared.
+    """
     world = wp.tid()
+    non_finite = zero_if_non_finite(
+        non_finite_out[world],
+        qpos_in[world],
+        qvel_in[world],
+        observation_out[world],
+        reward_out,
+        terms_out[world],
+        world,
+    )
     elapsed_steps = elapsed_steps_out[world] + 1
     truncated = elapsed_steps >= episode_length
+    non_finite_out[world] = non_finite
     elapsed_steps_out[world] = elapsed_steps
-    terminated_out[world] = non_finite_in[world]
+    terminated_out[world] = non_finite
     truncated_out[world] = truncated
-    done_out[world] = truncated or non_finite_in[world]
+    done_out[world] = truncated or non_finite
+
+    bits = overflow_out[world]
+    for i in range(counter_bits.shape[0]):
+        if bits & counter_bits[i] != 0:
+            counts_out[world, i] += 1
+    if non_finite:
+        counts_out[world, counter_bits.shape[0]] += 1
+    overflow_out[world] = 0
 
 
 @wp.kernel(enable_backward=False)

@@ -4,7 +4,6 @@ A monitor works on the device. The host reads a few of its numbers every 100 ste
 """
 
 import logging
-import math
 import multiprocessing
 import warnings
 from abc import ABC, abstractmethod
@@ -66,8 +65,7 @@ class Monitor(ABC):
     def launch_before_step(self) -> None:  # noqa: B027
         """Launches the monitor's kernels at the start of the recorded control step."""
 
-    @abstractmethod
-    def launch_after_step(self) -> None:
+    def launch_after_step(self) -> None:  # noqa: B027
         """Launches the monitor's kernels at the end of the recorded control step."""
 
     @abstractmethod
@@ -120,62 +118,34 @@ COUNTERS = {
     "line_search_limit": OverflowType.LS_ITERATIONS,
 }
 """Name of a counter and the bits of ``Data.overflow`` that it counts."""
-DROPPED = {"constraints": "njmax", "contacts": "naconmax"}
-"""What the first two counters count as dropped, and the setting that prevents it."""
-MARGIN = 1.25
-"""Advised setting divided by the largest need."""
-
-
-@wp.kernel(enable_backward=False)
-def count_health(
-    # In:
-    counter_bits: wp.array[int],
-    non_finite_in: wp.array[bool],
-    # Data out:
-    overflow_out: wp.array[int],
-    # Out:
-    counts_out: wp.array2d[int],
-):
-    """Adds a control step to the counters of what happened in it, and clears the bits."""
-    world = wp.tid()
-    bits = overflow_out[world]
-    for i in range(counter_bits.shape[0]):
-        if bits & counter_bits[i] != 0:
-            counts_out[world, i] += 1
-    if non_finite_in[world]:
-        counts_out[world, counter_bits.shape[0]] += 1
-    overflow_out[world] = 0
+DROPPED = ("constraints", "contacts")
+"""What the first two counters count as dropped."""
 
 
 class Health(Monitor):
     """Counts, for each world, the control steps in which something went wrong in the physics.
 
+    The kernel that ends a control step counts (:func:`torchrl_loco.envs.kernels.finish_step`).
+
     Args:
         sim: the simulation.
-        non_finite: flags of non-finite worlds, ``(nworld,)``.
         on_overflow: what to do when something was dropped, one of :data:`ON_OVERFLOW`.
+
+    Attributes:
+        counter_bits: the bits of ``overflow`` that each counter but the last counts.
+        counts: counters of each world; the last counts steps that ended non-finite.
     """
 
-    def __init__(self, sim: Simulation, non_finite: Buffer, on_overflow: str) -> None:
-        self._sim, self._non_finite, self._on_overflow = sim, non_finite, on_overflow
-        self._bits = wp.array([int(bits) for bits in COUNTERS.values()], dtype=int, device=sim.device)
-        self._counts = Buffer((sim.num_envs, len(COUNTERS) + 1), int, sim.device)
-        super().__init__(len(DROPPED) + 2, self._counts.torch.device)
+    def __init__(self, sim: Simulation, on_overflow: str) -> None:
+        self._sim, self._on_overflow = sim, on_overflow
+        self.counter_bits = wp.array([int(bits) for bits in COUNTERS.values()], dtype=int, device=sim.device)
+        self.counts = Buffer((sim.num_envs, len(COUNTERS) + 1), int, sim.device)
+        super().__init__(len(DROPPED) + 2, self.counts.torch.device)
         self._reported = 0
-
-    def launch_after_step(self) -> None:
-        """Launches the kernel that counts a control step."""
-        wp.launch(
-            count_health,
-            dim=self._sim.num_envs,
-            inputs=[self._bits, self._non_finite.warp],
-            outputs=[self._sim.data.overflow, self._counts.warp],
-            device=self._sim.device,
-        )
 
     def numbers(self) -> torch.Tensor:
         """Returns the steps in which constraints and contacts were dropped, and the most of each needed, ``(4,)``."""
-        dropped = self._counts.torch[:, : len(DROPPED)].sum(dim=0)
+        dropped = self.counts.torch[:, : len(DROPPED)].sum(dim=0)
         return torch.cat([dropped, torch.stack([*self._peaks().values()])])
 
     def _peaks(self) -> dict[str, torch.Tensor]:
@@ -193,9 +163,8 @@ class Health(Monitor):
             return
         self._reported = sum(dropped)
         messages = [
-            f"{what} were dropped in {count} world-steps; a physics step needed up to {most}: "
-            f"pass {setting}={with_margin(most)}"
-            for (what, setting), count, most in zip(DROPPED.items(), dropped, needed, strict=True)
+            f"{what} were dropped in {count} world-steps; {self._sim.engine.remedy(what, most)}"
+            for what, count, most in zip(DROPPED, dropped, needed, strict=True)
             if count
         ]
         message = "; ".join(messages) + "; or pass on_overflow='ignore'"
@@ -206,7 +175,7 @@ class Health(Monitor):
     def clear(self) -> None:
         """Sets all counters and peaks to zero."""
         engine = self._sim.engine
-        for counter in (self._counts, engine.peak_constraints, engine.peak_contacts):
+        for counter in (self.counts, engine.peak_constraints, engine.peak_contacts):
             counter.torch.zero_()
         self._sim.overflow.zero_()
         self._reported = 0
@@ -214,7 +183,7 @@ class Health(Monitor):
     def summary(self) -> TensorDict:
         """Returns the counters, without waiting for the device; see :meth:`torchrl_loco.LocoEnv.health`."""
         names = [*COUNTERS, "non_finite"]
-        counts = self._counts.torch.clone()
+        counts = self.counts.torch.clone()
         worlds: dict[str, Any] = dict(zip(names, counts.unbind(1), strict=True))
         total = dict(zip(names, counts.sum(dim=0).unbind(), strict=True))
         device = counts.device
@@ -227,11 +196,6 @@ class Health(Monitor):
             batch_size=[],
             device=device,
         )
-
-
-def with_margin(needed: int) -> int:
-    """Returns a setting with some room above what was needed."""
-    return math.ceil(needed * MARGIN)
 
 
 # NaN guard: keeps the inputs of the last control step until a world becomes non-finite.

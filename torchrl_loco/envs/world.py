@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 from torchrl_loco.config import SimConfig
-from torchrl_loco.envs.kernels import any_world, apply_action, begin_episode, count_step, zero_non_finite
+from torchrl_loco.envs.kernels import any_world, apply_action, begin_episode, finish_step, zero_non_finite
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import EXCLUSIVE, Buffer, Simulation
@@ -98,7 +98,7 @@ class World:
             self._all = wp.ones(n, dtype=bool, device=device)
             self.mask.warp.fill_(True)
 
-            self.health = Health(self.sim, self.non_finite, task.on_overflow)
+            self.health = Health(self.sim, task.on_overflow)
             self._monitors: list[Monitor] = [self.health]
             if task.nan_dump is not None:
                 inputs = self.action, self.episode, self.elapsed_steps
@@ -127,11 +127,17 @@ class World:
             monitor.launch_before_step()
         self._launch(apply_action, [self.action.warp], [self.sim.data.ctrl, self.non_finite.warp])
         self.sim.step()
-        self._launch_outputs(self._all)
+        self._launch_observation(self._all)
+        data, health = self.sim.data, self.health
         self._launch(
-            count_step,
-            [self.non_finite.warp, self._episode_length],
-            [self.elapsed_steps.warp, self.done.warp, self.terminated.warp, self.truncated.warp],
+            finish_step,
+            [self._episode_length, health.counter_bits, data.qpos, data.qvel],
+            [
+                *(data.overflow, self.non_finite.warp),
+                *(self.observation.warp, self.reward.warp, self.terms.warp),
+                *(self.elapsed_steps.warp, self.done.warp, self.terminated.warp, self.truncated.warp),
+                health.counts.warp,
+            ],
         )
         for monitor in self._monitors:
             monitor.launch_after_step()
@@ -163,11 +169,13 @@ class World:
         self._launch_outputs(self.mask.warp)
 
     def _launch_outputs(self, mask: wp.array) -> None:
-        data = self.sim.data
-        kernel, inputs = self._observation_kernel
-        outputs = [self.observation.warp, self.reward.warp, self.terms.warp]
-        self._launch(kernel, [*inputs, mask], outputs)
+        self._launch_observation(mask)
+        data, outputs = self.sim.data, [self.observation.warp, self.reward.warp, self.terms.warp]
         self._launch(zero_non_finite, [mask, data.qpos, data.qvel], [self.non_finite.warp, *outputs])
+
+    def _launch_observation(self, mask: wp.array) -> None:
+        kernel, inputs = self._observation_kernel
+        self._launch(kernel, [*inputs, mask], [self.observation.warp, self.reward.warp, self.terms.warp])
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=self.sim.num_envs, inputs=inputs, outputs=outputs, device=self.sim.device)

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -40,6 +41,24 @@ def clear_constraints(
 
 
 @wp.kernel(enable_backward=False)
+def rest(
+    # In:
+    mask_in: wp.array[bool],
+    # Data out:
+    cvel_out: wp.array2d[wp.spatial_vector],
+    sensordata_out: wp.array2d[float],
+):
+    """Zeroes what is not evaluated after a reset."""
+    world = wp.tid()
+    if not mask_in[world]:
+        return
+    for i in range(cvel_out.shape[1]):
+        cvel_out[world, i] = wp.spatial_vector()
+    for i in range(sensordata_out.shape[1]):
+        sensordata_out[world, i] = 0.0
+
+
+@wp.kernel(enable_backward=False)
 def record_peaks(
     # Data in:
     nefc_in: wp.array[int],
@@ -54,6 +73,17 @@ def record_peaks(
     constraints_out[world] = wp.max(constraints_out[world], nefc_in[world])
     if world == 0:
         contacts_out[0] = wp.max(contacts_out[0], wp.max(nacon_in[0], ncollision_in[0]))
+
+
+ROOM = {"constraints": "njmax", "contacts": "naconmax"}
+"""The settings that make room for constraint rows and contacts."""
+MARGIN = 1.25
+"""Advised setting divided by the largest need."""
+
+
+def with_margin(needed: int) -> int:
+    """Returns a setting with some room above what was needed."""
+    return math.ceil(needed * MARGIN)
 
 
 class MujocoWarpEngine:
@@ -71,6 +101,8 @@ class MujocoWarpEngine:
         peak_constraints: most constraint rows that a substep needed, by world, ``(nworld,)``.
         peak_contacts: most contacts that a substep needed, over all worlds, ``(1,)``.
     """
+
+    name = "mujoco_warp"
 
     def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
         self._num_envs, self._device = num_envs, device
@@ -92,6 +124,15 @@ class MujocoWarpEngine:
         self.peak_constraints = Buffer(num_envs, int, device)
         self.peak_contacts = Buffer(1, int, device)
 
+    def remedy(self, dropped: str, most: int) -> str:
+        """Returns what prevents that something is dropped, if a substep needed so many."""
+        return f"a physics step needed up to {most}: pass {ROOM[dropped]}={with_margin(most)}"
+
+    def reset(self, mask: wp.array) -> None:
+        """Puts velocities and sensors to rest where ``mask`` ``(nworld,)`` is set."""
+        d = self.data
+        wp.launch(rest, dim=self._num_envs, inputs=[mask], outputs=[d.cvel, d.sensordata], device=self._device)
+
     def step(self) -> None:
         """Advances every world by one control step under ``ctrl``.
 
@@ -103,7 +144,7 @@ class MujocoWarpEngine:
             for _ in range(self._substeps):
                 self._substep()
                 self._record_peaks()
-        self.evaluate()
+        self._evaluate()
 
     def _substep(self) -> None:
         if self._row_order is None:
@@ -138,18 +179,24 @@ class MujocoWarpEngine:
         finally:
             model.opt.disableflags, model.ncam, model.nlight = kept
 
-    def evaluate(self) -> None:
+    def forward(self, mask: wp.array) -> None:
+        """Updates poses and sensors after ``qpos`` and ``qvel`` were changed where ``mask`` ``(nworld,)`` is set."""
+        self._clear_constraints(mask)
+        self._evaluate()
+
+    def forward_at_rest(self, mask: wp.array) -> None:
+        """As :meth:`forward`, for less: the worlds that changed are at rest."""
+        self._clear_constraints(mask)
+        mjw.kinematics(self.model, self.data)
+
+    def _evaluate(self) -> None:
         """Evaluates what an observation can read: poses and velocities of bodies, and velocity sensors."""
         mjw.kinematics(self.model, self.data)
         mjw.com_pos(self.model, self.data)
         mjw.com_vel(self.model, self.data)
         mjw.sensor_vel(self.model, self.data)
 
-    def evaluate_at_rest(self) -> None:
-        """As :meth:`evaluate`, for less: every world whose ``qpos`` changed is at rest."""
-        mjw.kinematics(self.model, self.data)
-
-    def clear_constraints(self, mask: wp.array) -> None:
+    def _clear_constraints(self, mask: wp.array) -> None:
         """Removes the constraints of the worlds where ``mask`` ``(nworld,)`` is set."""
         efc = self.data.efc
         wp.launch(

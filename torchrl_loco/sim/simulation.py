@@ -1,18 +1,20 @@
 """Many worlds of one model on one device, whichever engine steps them."""
 
 import gc
+import logging
 import math
 from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
+import mujoco_warp as mjw
 import torch
 import warp as wp
 
 from torchrl_loco.config import SimConfig
+from torchrl_loco.sim import compiled, mujoco_warp
 from torchrl_loco.sim.compilation import compile_kernels
 from torchrl_loco.sim.graph import Graph, ScratchPool
-from torchrl_loco.sim.mujoco_warp import MujocoWarpEngine, data_bytes
 
 SCRATCH = 1.4
 """Memory of a simulation as a multiple of its ``mjData``; the rest is scratch memory (measured: 1.3 to 1.4)."""
@@ -33,8 +35,6 @@ def reset_worlds(
     qacc_warmstart_out: wp.array2d[float],
     ctrl_out: wp.array2d[float],
     time_out: wp.array[float],
-    cvel_out: wp.array2d[wp.spatial_vector],
-    sensordata_out: wp.array2d[float],
 ):
     """Puts worlds at rest in the default pose."""
     world = wp.tid()
@@ -48,10 +48,6 @@ def reset_worlds(
     for i in range(ctrl_out.shape[1]):
         ctrl_out[world, i] = 0.0
     time_out[world] = 0.0
-    for i in range(cvel_out.shape[1]):
-        cvel_out[world, i] = wp.spatial_vector()
-    for i in range(sensordata_out.shape[1]):
-        sensordata_out[world, i] = 0.0
 
 
 class Simulation:
@@ -80,19 +76,28 @@ class Simulation:
         num_envs: number of worlds.
         device: where they live.
 
+    Attributes:
+        engine: what advances the worlds.
+        engine_choice: its name, and why it is not another one.
+
     Raises:
+        ValueError: ``config.engine`` is "compiled", and the model needs something that it does not have.
         MemoryError: the device has no room for so many worlds.
     """
 
+    engine: compiled.CompiledEngine | mujoco_warp.MujocoWarpEngine
+
     def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: torch.device) -> None:
         set_options(mj_model, config)
-        scratch = DETERMINISTIC_SCRATCH if config.deterministic and device.type == "cuda" else SCRATCH
-        check_memory(int(scratch * data_bytes(mj_model, config, num_envs)), num_envs, device)
-        self.mj_model = mj_model
+        self.engine_choice = name, _ = choose_engine(mj_model, config)
+        check_memory(memory(name, mj_model, config, num_envs, device), num_envs, device)
+        self.mj_model, self.config = mj_model, config
         self.num_envs = num_envs
         self.device = wp.get_device(str(device))
-        self.engine = MujocoWarpEngine(mj_model, config, num_envs, self.device)
+        engines: dict[str, type] = {"compiled": compiled.CompiledEngine, "mujoco_warp": mujoco_warp.MujocoWarpEngine}
+        self.engine = engines[name](mj_model, config, num_envs, self.device)
         self.model, self.data = self.engine.model, self.engine.data
+        self._mujoco_data: mjw.Data | None = None
         self.graphs: list[Graph] = []
         self._scratch = ScratchPool(self.device) if self.device.is_cuda else None
 
@@ -116,19 +121,44 @@ class Simulation:
             reset_worlds,
             dim=self.num_envs,
             inputs=[self.model.qpos0, mask],
-            outputs=[d.qpos, d.qvel, d.qacc_warmstart, d.ctrl, d.time, d.cvel, d.sensordata],
+            outputs=[d.qpos, d.qvel, d.qacc_warmstart, d.ctrl, d.time],
             device=self.device,
         )
+        self.engine.reset(mask)
 
     def forward(self, mask: wp.array) -> None:
         """Updates poses and sensors after ``qpos`` and ``qvel`` were changed where ``mask`` ``(nworld,)`` is set."""
-        self.engine.clear_constraints(mask)
-        self.engine.evaluate()
+        self.engine.forward(mask)
 
     def forward_at_rest(self, mask: wp.array) -> None:
         """As :meth:`forward`, but cheaper; valid after :meth:`reset` if only ``qpos`` changed since."""
-        self.engine.clear_constraints(mask)
-        self.engine.evaluate_at_rest()
+        self.engine.forward_at_rest(mask)
+
+    def mujoco_data(self, *, contacts: bool = False) -> mjw.Data:
+        """Returns the present state as ``mjData`` of MuJoCo-Warp, with poses of geoms, sites and cameras.
+
+        Under the engine ``compiled`` it is made at the first call, and takes the memory of the other engine: several
+        KiB a world, and ``njmax`` rows of constraints. It is not updated by later steps.
+
+        Args:
+            contacts: whether contacts and constraints are found too; that takes a part of a physics step.
+        """
+        if isinstance(self.data, mjw.Data):
+            data = self.data
+        else:
+            if self._mujoco_data is None:
+                with wp.ScopedDevice(self.device):
+                    self._mujoco_data = mjw.make_data(
+                        self.mj_model, nworld=self.num_envs, naconmax=self.config.naconmax, njmax=self.config.njmax
+                    )
+            data = self._mujoco_data
+            for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time"):
+                wp.copy(getattr(data, name), getattr(self.data, name))
+            mjw.kinematics(self.model, data)
+            mjw.com_pos(self.model, data)
+        if contacts:
+            mjw.fwd_position(self.model, data)
+        return data
 
     def compile(self, *launches: Callable[[], None]) -> None:
         """Compiles the kernels that ``launches`` would launch, in parallel and with a progress bar."""
@@ -151,6 +181,32 @@ def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
     option.disableflags = (
         option.disableflags & ~euler_damping if config.euler_damping else option.disableflags | euler_damping
     )
+
+
+def choose_engine(mj_model: mujoco.MjModel, config: SimConfig) -> tuple[str, str]:
+    """Returns the name of the engine that steps a model, and why.
+
+    Raises:
+        ValueError: ``config.engine`` is "compiled", and the model needs something that it does not have.
+    """
+    if config.engine == "mujoco_warp":
+        return config.engine, "as asked"
+    missing = compiled.unsupported(mj_model)
+    if not missing:
+        return "compiled", "it has all that the model needs"
+    if config.engine == "compiled":
+        raise ValueError(f"engine='compiled' does not have: {'; '.join(missing)}. Pass engine='auto' or 'mujoco_warp'")
+    why = f"engine 'compiled' does not have: {'; '.join(missing)}"
+    logging.getLogger("torchrl_loco").warning("stepping with MuJoCo-Warp: %s", why)
+    return "mujoco_warp", why
+
+
+def memory(engine: str, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: torch.device) -> int:
+    """Returns the memory that a simulation takes (bytes)."""
+    if engine == "compiled":
+        return compiled.data_bytes(mj_model, num_envs)
+    scratch = DETERMINISTIC_SCRATCH if config.deterministic and device.type == "cuda" else SCRATCH
+    return int(scratch * mujoco_warp.data_bytes(mj_model, config, num_envs))
 
 
 def check_memory(needed: int, num_envs: int, device: torch.device) -> None:

@@ -1,0 +1,181 @@
+"""Small random models of everything that the compiled step supports, as MJCF, and states that they reach."""
+
+import mujoco
+import numpy as np
+from hypothesis import strategies as st
+
+DECIMALS = 3
+"""Of the numbers drawn, so that a failing model can be read."""
+DEEPEST = -0.02
+"""Distance of geoms (m) below which a state is not used: forces of deep contacts leave no digits for the rest."""
+FASTEST = 30.0
+"""Velocity (m/s, rad/s) above which a state is not used."""
+
+AXES = st.sampled_from([(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, -1, 0), (1, 2, 0.5), (-0.3, 0.7, 1)])
+SOLREF = st.sampled_from([(0.02, 1), (0.015, 1.2), (0.05, 0.7), (-800, -30)])
+SOLIMP = st.sampled_from(
+    [
+        (0.9, 0.95, 0.001, 0.5, 2),
+        (0, 0.99, 0.01, 0.5, 2),
+        (0.8, 0.9, 0.02, 0.3, 3),
+        (0.9, 0.95, 0.01, 0.4, 1),
+        (0.95, 0.95, 0.01, 0.5, 2.5),
+    ]
+)
+SURFACES = {
+    "condim": [1, 3, 3],
+    "margin": [0.0, 0.01],
+    "gap": [0.0, 0.005],
+    "priority": [0, 0, 0, 1],
+    "solmix": [1.0, 1.0, 0.3, 2.0],
+}
+"""Choices for what a geom's contacts are like; frequent ones are repeated."""
+
+
+def numbers(low, high):
+    return st.floats(low, high, allow_subnormal=False).map(lambda x: round(x, DECIMALS))
+
+
+def vectors(low, high, count=3):
+    return st.lists(numbers(low, high), min_size=count, max_size=count)
+
+
+def rarely():
+    return st.sampled_from([False, False, True])
+
+
+def element(kind, *inner, **attributes):
+    """Returns an element of MJCF; attributes that are tuples or lists become vectors."""
+    values = {name: value if isinstance(value, tuple | list) else (value,) for name, value in attributes.items()}
+    texts = [
+        f' {name}="{" ".join(x if isinstance(x, str) else f"{x:g}" for x in row)}"' for name, row in values.items()
+    ]
+    return f"<{kind}{''.join(texts)}>{''.join(inner)}</{kind}>"
+
+
+@st.composite
+def surfaces(draw):
+    """Returns the attributes of a geom that its contacts follow."""
+    chosen = {name: draw(st.sampled_from(choices)) for name, choices in SURFACES.items()}
+    return {**chosen, "friction": draw(numbers(0.2, 1.5)), "solref": draw(SOLREF), "solimp": draw(SOLIMP)}
+
+
+@st.composite
+def geoms(draw):
+    """Returns a sphere or a capsule."""
+    size = [draw(numbers(0.03, 0.12))]
+    kind = draw(st.sampled_from(["sphere", "capsule", "capsule"]))
+    if kind == "capsule":
+        size.append(draw(numbers(0.05, 0.25)))
+    pose = {"pos": draw(vectors(-0.15, 0.15)), "euler": draw(vectors(-180, 180))}
+    return element("geom", type=kind, size=size, density=draw(numbers(200, 2000)), **pose, **draw(surfaces()))
+
+
+@st.composite
+def joints(draw, name, kind):
+    """Returns a joint with springs, dampers, limits and dry friction, as far as its kind has them."""
+    if kind == "free":
+        return element("freejoint", name=name)
+    fields = {"armature": draw(numbers(0.001, 0.05)), "damping": draw(st.sampled_from([0.0, 0.3, 2.0]))}
+    if kind != "ball":
+        fields |= {"axis": draw(AXES), "ref": draw(st.sampled_from([0.0, 0.0, 0.1]))}
+        fields |= {"stiffness": draw(st.sampled_from([0.0, 0.0, 5.0])), "springref": draw(numbers(-10, 10))}
+    if draw(st.booleans()):
+        low, high = {"hinge": (40, 60), "slide": (0.2, 0.2), "ball": (0, 60)}[kind]
+        fields |= {"range": (-draw(numbers(0, low)), draw(numbers(high / 10, high))), "limited": "true"}
+        fields |= {"solreflimit": draw(SOLREF), "solimplimit": draw(SOLIMP), "margin": draw(st.sampled_from([0, 0.01]))}
+    if draw(rarely()):
+        fields["frictionloss"] = draw(numbers(0.05, 2))
+    return element("joint", name=name, type=kind, pos=draw(vectors(-0.1, 0.1)), **fields)
+
+
+@st.composite
+def actuators(draw, joint):
+    """Returns an actuator of a hinge or slide."""
+    kind = draw(st.sampled_from(["motor", "position", "velocity"]))
+    fields = {"joint": joint, "gear": draw(numbers(0.5, 20)), "ctrlrange": (-1, 1), "ctrllimited": "true"}
+    if kind == "position":
+        fields["kp"] = draw(numbers(0.5, 10))
+    if kind == "velocity":
+        fields["kv"] = draw(numbers(0.1, 2))
+    if draw(st.booleans()):
+        fields |= {"forcerange": (-2, 2), "forcelimited": "true"}
+    return element(kind, **fields)
+
+
+@st.composite
+def trees(draw, children, body, parent, actuated):
+    """Returns a body with all that hangs on it, and adds the joints that may have an actuator to ``actuated``."""
+    root, parts = parent < 0, []
+    count = draw(st.sampled_from([1, 1, 1, 2, 3])) if root or draw(st.integers(0, 7)) else 0
+    for i in range(count):
+        kinds = ["hinge", "slide"] if i else ["hinge", "slide", "ball", "free" if root else "hinge"]
+        name, kind = f"joint{body}_{i}", draw(st.sampled_from(kinds))
+        parts.append(draw(joints(name, kind)))
+        if kind in ("free", "ball"):
+            break  # MuJoCo allows no rotation after these
+        actuated.append(name)
+    parts += [draw(geoms()) for _ in range(draw(st.sampled_from([1, 1, 2])))]
+    height = numbers(0.2, 0.8) if root else numbers(0.0, 0.3)
+    position = [*draw(vectors(-0.3, 0.3, 2)), draw(height)]
+    inner = [draw(trees(children, child, body, actuated)) for child in children[body]]
+    return element("body", *parts, *inner, name=f"body{body}", pos=position, euler=draw(vectors(-60, 60)))
+
+
+@st.composite
+def models(draw, max_bodies=8):
+    """Returns MJCF of one or more trees of bodies, over one or two planes and at times a capsule that stands still."""
+    count, actuated = draw(st.integers(1, max_bodies)), []
+    children = {i: [] for i in range(-1, count)}
+    for i in range(count):
+        children[draw(st.integers(-1, i - 1))].append(i)
+    scene = [element("geom", type="plane", size=(5, 5, 0.1), **draw(surfaces()))]
+    if draw(rarely()):
+        pose = {"pos": (-0.4, 0, 0), "euler": draw(vectors(-40, 40))}
+        scene.append(element("geom", type="plane", size=(5, 5, 0.1), **pose, **draw(surfaces())))
+    if draw(rarely()):
+        pose = {"pos": (0.2, 0, 0.1), "euler": draw(vectors(-90, 90))}
+        scene.append(element("geom", type="capsule", size=(0.1, 0.3), **pose, **draw(surfaces())))
+    bodies = [draw(trees(children, i, -1, actuated)) for i in children[-1]]
+    exclude = [element("exclude", body1="body0", body2="body1")] if count > 1 and draw(st.booleans()) else []
+    flag = element("flag", eulerdamp=draw(st.sampled_from(["enable", "disable"])))
+    option = {
+        "timestep": draw(st.sampled_from([0.002, 0.005])),
+        "impratio": draw(st.sampled_from([1.0, 3.0])),
+        "gravity": draw(st.sampled_from([(0, 0, -9.81), (1, -2, -9)])),
+        "iterations": 100,
+        "ls_iterations": 50,
+        "cone": "pyramidal",
+    }
+    return element(
+        "mujoco",
+        element("option", flag, **option),
+        element("worldbody", *scene, *bodies),
+        element("contact", *exclude),
+        element("actuator", *(draw(actuators(joint)) for joint in actuated if draw(st.integers(0, 3)))),
+        element("sensor", element("subtreelinvel", body="body0")),
+    )
+
+
+def states(model, rng, count, longest=600):
+    """Returns float32 states along trajectories of C MuJoCo: qpos, qvel, qacc_warmstart and ctrl, ``(count, …)`` each.
+
+    Those that go too deep or too fast are left out, so there may be fewer than ``count``.
+    """
+    found, data = [], mujoco.MjData(model)
+    for _ in range(count + 20):
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv) * 0.2, 1.0)
+        data.qvel[:] = rng.normal(size=model.nv)
+        for step in range(int(rng.integers(1, longest))):
+            if step % 20 == 0:
+                data.ctrl[:] = rng.uniform(-1.5, 1.5, model.nu)
+            mujoco.mj_step(model, data)
+        shallow = not data.ncon or data.contact.dist.min() > DEEPEST
+        if shallow and not data.warning.number.any() and np.abs(data.qvel).max() < FASTEST:
+            rows = data.qpos, data.qvel, data.qacc_warmstart, data.ctrl
+            found.append([row.astype(np.float32) for row in rows])
+        if len(found) == count:
+            break
+    sizes = model.nq, model.nv, model.nv, model.nu
+    return [np.array([rows[i] for rows in found]).reshape(len(found), size) for i, size in enumerate(sizes)]

@@ -1,0 +1,338 @@
+"""The engine ``compiled``: what it can do, when it is chosen, its physics on small scenes, and what has no place."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from mujoco_warp import OverflowType
+
+import torchrl_loco
+from torchrl_loco import models
+from torchrl_loco.config import DEFAULTS, SimConfig, sim_config
+from torchrl_loco.sim import Simulation
+from torchrl_loco.sim.compiled import collision, contacts, lanes, step, unsupported
+from torchrl_loco.sim.simulation import choose_engine
+
+BODY = '<body name="arm"><joint name="elbow" damping="1"/><geom name="hand" type="capsule" size="0.1 0.2"/></body>'
+BALL = '<body name="ball" pos="1 0 1"><freejoint name="loose"/><geom name="marble" size="0.1"/></body>'
+MOTOR = '<motor name="pull" joint="elbow"/>'
+SENSOR = '<subtreelinvel name="speed" body="arm"/>'
+MODEL = f"""
+<mujoco>
+  <option/>
+  <worldbody><geom type="plane" size="5 5 0.1"/>{BODY}{BALL}</worldbody>
+  <actuator>{MOTOR}</actuator>
+  <sensor>{SENSOR}</sensor>
+</mujoco>
+"""
+MANY = "".join(f'<body pos="{i} 5 1"><freejoint/><geom size="0.1"/></body>' for i in range(10))
+OTHERS = [
+    ("<option/>", '<option cone="elliptic"/>', "elliptic friction cones"),
+    ("<option/>", '<option solver="CG"/>', "a solver other than Newton"),
+    ("<option/>", '<option integrator="implicitfast"/>', "an integrator other than Euler"),
+    ("<option/>", '<option noslip_iterations="2"/>', "noslip iterations"),
+    ("<option/>", '<option viscosity="1"/>', "forces of a fluid"),
+    ("<option/>", '<option><flag gravity="disable"/></option>', "disabled gravity"),
+    ("<option/>", '<option><flag energy="enable"/></option>', "enabled energy"),
+    ("</worldbody>", '</worldbody><tendon><fixed><joint joint="elbow" coef="1"/></fixed></tendon>', "tendons"),
+    ("</worldbody>", '</worldbody><equality><weld body1="arm"/></equality>', "equality constraints"),
+    ("<sensor>", '<contact><pair geom1="hand" geom2="marble"/></contact><sensor>', "explicit contact pairs"),
+    ("</worldbody>", '<body mocap="true"/></worldbody>', "mocap bodies"),
+    ("</worldbody>", f"{MANY}</worldbody>", "67 degrees of freedom, more than 64"),
+    ('<body name="arm"', '<body name="arm" gravcomp="1"', "gravity compensation"),
+    ('<freejoint name="loose"/>', '<joint name="loose" type="free" stiffness="1"/>', "'loose': stiffness of a free"),
+    ('<freejoint name="loose"/>', '<joint name="loose" type="ball" stiffness="1"/>', "'loose': stiffness of a"),
+    ('damping="1"', 'actuatorfrcrange="-1 1"', "'elbow': limits of actuator forces"),
+    ('damping="1"', 'damping="1 2"', "dampers that are not linear"),
+    ('damping="1"', 'stiffness="1 2"', "'elbow': springs that are not linear"),
+    ('type="capsule" size="0.1 0.2"', 'type="box" size="0.1 0.1 0.1" contype="0"', "contacts of plane and box"),
+    ('size="0.1 0.2"', 'size="0.1 0.2" condim="6"', "contacts with condim 6"),
+    ('<geom name="marble"', '<geom name="marble" condim="4"', "contacts with condim 4"),
+    (MOTOR, MOTOR.replace("elbow", "loose"), "'pull': a transmission other than a hinge or slide"),
+    (MOTOR, '<general name="pull" joint="elbow" dyntype="filter" dynprm="1"/>', "'pull': activation dynamics"),
+    (MOTOR, '<general name="pull" joint="elbow" gaintype="affine" gainprm="1 1"/>', "'pull': a gain that is not fixed"),
+    (MOTOR, MOTOR.replace("/>", ' damping="1"/>'), "'pull': delay, damping or armature"),
+    (SENSOR, '<jointpos name="angle" joint="elbow"/>', "sensor 'angle'"),
+    (SENSOR, SENSOR.replace("/>", ' cutoff="1"/>'), "sensor 'speed'"),
+]
+
+
+def config(engine="compiled", ctrl_dt=0.02, sim_dt=0.002, **overrides):
+    settings = {"naconmax": 64, "njmax": 64, "iterations": 50, "ls_iterations": 20, "euler_damping": True}
+    return SimConfig(ctrl_dt=ctrl_dt, sim_dt=sim_dt, engine=engine, **{**settings, **overrides})
+
+
+# Which models, and which engine.
+
+
+@pytest.mark.parametrize(("old", "new", "named"), OTHERS, ids=[named for *_, named in OTHERS])
+def test_what_a_model_must_not_need_is_named(old, new, named):
+    assert MODEL.count(old) == 1
+    found = unsupported(mujoco.MjModel.from_xml_string(MODEL.replace(old, new)))
+    assert named in found[0]
+    assert len(found) == (2 if "box" in named else 1)  # a box may touch the plane and the ball
+
+
+def test_a_model_needs_a_joint():
+    assert unsupported(mujoco.MjModel.from_xml_string("<mujoco/>")) == ["a model without joints"]
+
+
+def test_what_changes_nothing_is_supported():
+    for old, new in [
+        ("", ""),
+        ("<option/>", '<option><flag eulerdamp="disable" filterparent="disable" warmstart="disable"/></option>'),
+        ('type="capsule" size="0.1 0.2"', 'type="box" size="0.1 0.1 0.1" contype="0" conaffinity="0"'),
+    ]:
+        assert unsupported(mujoco.MjModel.from_xml_string(MODEL.replace(old, new))) == []
+    for path in models.PATHS.values():
+        assert unsupported(models.load(path)) == []
+
+
+def test_the_engine_is_chosen_by_what_the_model_needs(caplog):
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    assert choose_engine(model, config("auto"))[0] == choose_engine(model, config("compiled"))[0] == "compiled"
+    assert choose_engine(model, config("mujoco_warp")) == ("mujoco_warp", "as asked")
+    model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    model.opt.viscosity = 1.0
+    assert choose_engine(model, config("mujoco_warp")) == ("mujoco_warp", "as asked")
+    assert not caplog.records
+    needs = "does not have: elliptic friction cones; forces of a fluid"
+    name, why = choose_engine(model, config("auto"))
+    assert name == "mujoco_warp"
+    assert needs in why
+    assert needs in caplog.text
+    with pytest.raises(ValueError, match=rf"engine='compiled' {needs}.*'auto' or 'mujoco_warp'"):
+        choose_engine(model, config("compiled"))
+
+
+def test_an_environment_falls_back_and_says_why(tmp_path, caplog):
+    class Capped(torchrl_loco.WalkerWalk):
+        """A walker whose sensor is cut off."""
+
+        mjcf = tmp_path / "walker.xml"
+
+    text = models.PATHS["walker"].read_text()
+    Capped.mjcf.write_text(text.replace("<subtreelinvel ", '<subtreelinvel cutoff="100" '))
+    with pytest.raises(ValueError, match="sensor 'torso_velocity'"):
+        Capped(2, "cpu", engine="compiled")
+    env = Capped(2, "cpu")
+    assert "stepping with MuJoCo-Warp" in caplog.text
+    assert env.engine == "mujoco_warp"
+    assert "mujoco_warp (engine 'compiled' does not have: sensor 'torso_velocity'" in repr(env)
+    assert env.rollout(3).shape == (2, 3)
+
+
+def test_a_misspelt_engine_is_refused():
+    with pytest.raises(ValueError, match=r"did you mean 'compiled'.*auto, compiled, mujoco_warp"):
+        torchrl_loco.make("walker_walk", 2, "cpu", engine="compield")
+
+
+# Physics.
+
+
+@pytest.fixture(params=[31, 0], ids=["traced", "lanes"])
+def form(request, monkeypatch):
+    """Takes one of the two forms of the compiled step for any model; compiled without optimisation, it is quick."""
+    monkeypatch.setattr(step, "TRACED_DOFS", request.param)
+    monkeypatch.setattr(wp.config, "optimization_level", 0)
+
+
+def scene(*elements, gravity="0 0 -9.81", actuator="", body="root"):
+    return mujoco.MjModel.from_xml_string(
+        f'<mujoco><option gravity="{gravity}"/><worldbody>{"".join(elements)}</worldbody>'
+        f'<actuator>{actuator}</actuator><sensor><subtreelinvel body="{body}"/></sensor></mujoco>'
+    )
+
+
+def simulated(model, num_envs=1, **overrides):
+    return Simulation(model, config(**overrides), num_envs, torch.device("cpu"))
+
+
+def in_c_mujoco(model, sim, world=0):
+    """Returns the state of a world as data of C MuJoCo, with energies and momenta."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = sim.qpos[world].double(), sim.qvel[world].double()
+    mujoco.mj_forward(model, data)
+    mujoco.mj_energyPos(model, data)
+    mujoco.mj_energyVel(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    return data
+
+
+def link(name, joint, inner="", pos="0 0 -0.4"):
+    geom = '<geom type="capsule" fromto="0 0 0 0.05 0 -0.4" size="0.03" contype="0" conaffinity="0"/>'
+    return f'<body name="{name}" pos="{pos}">{joint}{geom}{inner}</body>'
+
+
+def test_a_swinging_chain_keeps_its_energy(form):
+    """A hinge, a ball joint and a hinge, without friction, for two seconds."""
+    hand = link("hand", '<joint axis="0 1 0"/>')
+    model = scene(link("root", '<joint axis="1 0 0"/>', link("arm", '<joint type="ball"/>', hand), pos="0 0 2"))
+    sim = simulated(model, ctrl_dt=0.02, sim_dt=0.0001)
+    sim.qpos[0] = torch.tensor([1.0, 0.9, 0.3, -0.3, 0.1, 0.5])
+    sim.qpos[0, 1:5] /= sim.qpos[0, 1:5].norm()
+    sim.qvel[0] = torch.tensor([0.3, 0.6, -0.3, 0.9, 0.6])
+    total, potential = [], []
+    for _ in range(100):
+        data = in_c_mujoco(model, sim)
+        total.append(data.energy.sum())
+        potential.append(data.energy[0])
+        sim.step()
+    assert np.ptp(potential) > 2.0
+    assert np.ptp(total) < 0.1  # as much as C MuJoCo's at this time step
+
+
+def test_a_free_body_keeps_its_momentum(form):
+    """A tree that drives itself by actuators and springs, far from everything."""
+    hand = link("hand", '<joint name="wrist" axis="0 1 0" range="-20 20" limited="true"/>')
+    leg = link("leg", '<joint name="hip" axis="1 0 0" stiffness="5" frictionloss="0.1"/>', pos="0.1 0 0")
+    arm = link("arm", '<joint type="ball" damping="0.1"/>', hand)
+    model = scene(link("root", "<freejoint/>", arm + leg), gravity="0 0 0", actuator='<motor joint="wrist" gear="2"/>')
+    sim = simulated(model, ctrl_dt=0.02, sim_dt=0.0001)
+    sim.qvel[0] = torch.linspace(-2.0, 2.0, model.nv)
+    sim.qpos[0] = torch.as_tensor(model.qpos0)
+    start = in_c_mujoco(model, sim)
+    for i in range(50):
+        sim.ctrl.fill_(1.0 if i % 20 < 10 else -1.0)
+        sim.step()
+    end = in_c_mujoco(model, sim)
+    assert np.abs(end.qvel - start.qvel).max() > 1.0
+    np.testing.assert_allclose(end.subtree_linvel[1], start.subtree_linvel[1], atol=1e-3)
+    np.testing.assert_allclose(end.subtree_angmom[1], start.subtree_angmom[1], atol=1e-3)
+    np.testing.assert_allclose(sim.data.sensordata.numpy()[0], end.subtree_linvel[1], atol=1e-5)
+
+
+def test_contacts_whose_damping_differs_by_rounding_are_all_damped_once(form):
+    """0.95 mixed with 0.95 is not always 0.95."""
+    surface = 'solref="-800 -30" solimp="0.95 0.95 0.01 0.5 2.5"'
+    mixes = (0.3, 0.7, 1.0, 1.3, 2.0, 2.7)
+    joint = '<joint type="slide" axis="0 0 1"/>'
+    balls = [
+        f'<body name="{i or "root"}" pos="{i} 0 0.09">{joint}<geom size="0.1" solmix="{mix}" {surface}/></body>'
+        for i, mix in enumerate(mixes)
+    ]
+    model = scene(f'<geom type="plane" size="9 9 1" {surface}/>', *balls)
+    assert len({pair.solimp[1] for pair in collision.pairs(model) if 0 in pair.geoms}) > 1
+    data = mujoco.MjData(model)
+    data.qvel[:] = -1.0
+    sim = simulated(model, sim_dt=0.02)
+    sim.qvel.fill_(-1.0)
+    sim.step()
+    mujoco.mj_step(model, data)
+    np.testing.assert_allclose(sim.qvel[0], data.qvel, rtol=1e-5)
+
+
+SPHERE = '<body name="root" pos="{pos}"><freejoint/><geom size="0.1" condim="{condim}"/></body>'
+PLANE = '<geom type="plane" size="5 5 0.1" euler="{euler}"/>'
+
+
+def settled(model, seconds=2.0):
+    """Returns the state after some time, and the positions a moment before."""
+    sim = simulated(model)
+    sim.qpos[0] = torch.as_tensor(model.qpos0)
+    for _ in range(round(seconds / 0.02)):
+        before = sim.qpos[0].clone()
+        sim.step()
+    return sim.qpos[0], sim.qvel[0], before
+
+
+@pytest.mark.parametrize("condim", [1, 3])
+def test_a_ball_comes_to_rest_on_the_floor(form, condim):
+    qpos, qvel, before = settled(scene(PLANE.format(euler="0 0 0"), SPHERE.format(pos="0 0 0.11", condim=condim)))
+    assert 0.099 < qpos[2] < 0.1
+    assert qvel.abs().max() < 1e-4
+    torch.testing.assert_close(qpos, before, rtol=0, atol=1e-6)
+
+
+def test_a_ball_comes_to_rest_in_a_corner(form):
+    """Of two planes, at the place that is symmetric."""
+    planes = [PLANE.format(euler=f"0 {angle} 0") for angle in (40, -40)]
+    qpos, qvel, _ = settled(scene(*planes, SPHERE.format(pos="0.02 0 0.2", condim=3)), seconds=4.0)
+    height = 0.1 / np.cos(np.deg2rad(40))
+    assert qpos[:2].abs().max() < 1e-3
+    assert height - 2e-3 < qpos[2] < height
+    assert qvel.abs().max() < 1e-2
+
+
+@pytest.mark.parametrize(("friction", "stays"), [(0.6, True), (0.05, False)])
+def test_friction_holds_a_stack(form, friction, stays):
+    """A capsule on one across it, which lies on two that are fixed, under gravity that leans by 0.2."""
+    geom = f'<geom type="capsule" size="0.05 0.3" friction="{friction}" '
+    slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))  # nothing rolls
+    rails = [f'{geom} pos="0 {y} 0" euler="0 90 0"/>' for y in (-0.15, 0.15)]
+    lower = f'<body name="root" pos="0 0 0.1">{slides}{geom} euler="90 0 0"/></body>'
+    upper = f'<body pos="0 0 0.2">{slides}{geom} euler="0 90 0"/></body>'
+    qpos, qvel, _ = settled(scene(*rails, lower, upper, gravity="1.5 1.2 -9.6"), seconds=0.4)
+    assert (qpos.abs().max() < 0.02) == stays
+    assert (qvel.abs().max() < 0.2) == stays
+
+
+# What has no place.
+
+
+SLIDE = '<joint type="slide" axis="1 0 0"/><geom size="0.1"/>'
+ROW = "".join(f'<body name="{i or "root"}" pos="0 0 {0.19 * i}">{SLIDE}</body>' for i in range(6))
+"""Spheres in a column, each of which touches the next."""
+
+
+def column(places, monkeypatch, qpos, qvel):
+    """Returns the simulation after a control step, with so many places for contacts between moving bodies."""
+    with monkeypatch.context() as patched:
+        patched.setattr(contacts, "MAX_DENSE", places)
+        patched.setattr(lanes, "ENOUGH_FRICTIONAL", places)
+        patched.setattr(lanes, "MOST_FRICTIONAL", places)
+        sim = simulated(scene(ROW, gravity="0 0 0"), len(qpos))
+        sim.qpos.copy_(qpos)
+        sim.qvel.copy_(qvel)
+        sim.step()
+    return sim
+
+
+def test_contacts_without_a_place_are_marked_in_their_world(form, monkeypatch):
+    """The others are stepped as if there were places enough."""
+    generator = torch.Generator().manual_seed(0)
+    qpos, qvel = 0.02 * torch.randn(5, 6, generator=generator), torch.randn(5, 6, generator=generator)
+    qpos[1:4] += torch.arange(6) % 2  # only neighbours touch: here none does
+    qpos[2, 1] = qpos[2, 0]  # here one, or two
+    few, enough = (column(places, monkeypatch, qpos, qvel) for places in (3, 12))
+    dropped = OverflowType.NARROWPHASE
+    assert [bool(bits & dropped) for bits in few.overflow.tolist()] == [True, False, False, False, True]
+    assert not any(bits & dropped for bits in enough.overflow.tolist())
+    assert torch.equal(few.qvel[1:4], enough.qvel[1:4])
+    assert few.qpos.isfinite().all()
+    assert (few.qvel[0] != enough.qvel[0]).any()
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, 1e30, -1e12])
+def test_a_bad_world_harms_no_other(form, monkeypatch, bad):
+    generator = torch.Generator().manual_seed(0)
+    qpos, qvel = 0.02 * torch.randn(5, 6, generator=generator), torch.randn(5, 6, generator=generator)
+    expected = column(12, monkeypatch, qpos, qvel)
+    qpos[1, 3] = qvel[3, 0] = bad
+    found = column(12, monkeypatch, qpos, qvel)
+    for name in ("qpos", "qvel", "qacc_warmstart", "xpos", "xmat", "overflow"):
+        assert torch.equal(getattr(found, name)[::2], getattr(expected, name)[::2]), name
+
+
+def test_a_dropped_contact_is_reported_with_what_helps():
+    env = torchrl_loco.make("walker_walk", 3, "cpu", seed=0)
+    td = env.reset()
+    env.sim.overflow[1] = int(OverflowType.NARROWPHASE)
+    env.step(td.set("action", env.action_spec.zero()))
+    assert env.health()["worlds", "contact_overflow"].tolist() == [0, 1, 0]
+    with pytest.warns(torchrl_loco.PhysicsOverflowWarning, match="contacts were dropped in 1 .*engine='mujoco_warp'"):
+        env.close()
+
+
+def test_settings_of_room_change_nothing():
+    """``njmax`` and ``naconmax`` are for the other engine."""
+    reached = []
+    for overrides in ({}, {"njmax": 1, "naconmax": 1}):
+        settings = sim_config(DEFAULTS["walker"], "playground", 3, {"engine": "compiled", **overrides})
+        sim = Simulation(models.load(models.PATHS["walker"]), settings, 3, torch.device("cpu"))
+        sim.qpos[:, 0] = -0.5
+        sim.step()
+        reached.append(sim.qvel)
+    assert torch.equal(*reached)
+    assert (sim.overflow & int(OverflowType.NEFC | OverflowType.NARROWPHASE) == 0).all()

@@ -1,0 +1,83 @@
+"""One control step of each body under both engines, and against C MuJoCo in float64, from states of rollouts."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from cases import BODIES, ENGINES
+
+import torchrl_loco
+from torchrl_loco import State, models
+from torchrl_loco.sim.compiled import collision
+from torchrl_loco.sim.simulation import set_options
+
+WORLDS, AGES = 80, (10, 30, 50, 80)
+
+
+@pytest.fixture(scope="module", params=BODIES)
+def states(request):
+    """A task of each body, and states of worlds that begin, fall and lie, with an action for each."""
+    env = torchrl_loco.make(request.param, WORLDS, "cpu", seed=0, protocol="dm_control", stagger=True)
+    generator, td, found = torch.Generator().manual_seed(0), env.reset(), []
+    for step in range(1, AGES[-1] + 1):
+        td = td.set("action", torch.rand(env.action_spec.shape, generator=generator) * 2 - 1)
+        td = env.step(td)["next"].exclude("reward")
+        if step in AGES:
+            found.append(env.get_state())
+    action = torch.rand(len(AGES) * WORLDS, env.action_spec.shape[-1], generator=generator) * 2 - 1
+    return request.param, torch.cat(found), action
+
+
+def after(env, state, action):
+    """Returns the positions after one control step, ``(num_envs, nq)``."""
+    td = env.reset(State({key: state[key] for key in State.KEYS}, batch_size=len(state)), set_state=True)
+    env.step(td.set("action", action))
+    return env.get_state()["qpos"].double().numpy()
+
+
+def of_c_mujoco(env, state, action):
+    """Returns the same from C MuJoCo, and the share of worlds that touch something."""
+    model = models.load(models.PATHS[env.body])
+    set_options(model, env.config)
+    data, rows, touching = mujoco.MjData(model), [], 0
+    for world in range(len(state)):
+        mujoco.mj_resetData(model, data)
+        for name in ("qpos", "qvel", "qacc_warmstart"):
+            getattr(data, name)[:] = state[name][world]
+        data.ctrl[:] = action[world]
+        for _ in range(env.config.substeps):
+            mujoco.mj_step(model, data)
+        rows.append(data.qpos.copy())
+        touching += data.ncon > 0
+    return np.array(rows), touching / len(state)
+
+
+def assert_agree(ours, theirs):
+    """Positions differ by rounding, except where rounding takes a solver to another branch: in one world of 300."""
+    error = np.abs(ours - theirs)
+    assert np.quantile(error, 0.95) < 1e-6
+    assert (error.max(axis=1) > 1e-4).sum() <= len(error) / 300
+
+
+def test_both_engines_agree(shared, states, protocol):
+    task, state, action = states
+    results = [after(shared(task, len(state), protocol=protocol, engine=engine), state, action) for engine in ENGINES]
+    assert_agree(*results)
+
+
+def test_converged_steps_agree_with_c_mujoco(shared, states, monkeypatch):
+    """With its rule for the contact frames of upright capsules, such as the humanoid's shins.
+
+    Under MuJoCo-Warp's own rule both engines differ from C MuJoCo alike.
+    """
+    task, state, action = states
+    env = shared(task, len(state), protocol="dm_control")
+    expected, touching = of_c_mujoco(env, state, action)
+    assert touching > 0.5
+    if task.startswith("humanoid"):
+        assert np.quantile(np.abs(after(env, state, action) - expected), 0.95) > 1e-5
+        monkeypatch.setattr(collision, "UPRIGHT", 1e-6)
+        monkeypatch.setattr(wp.config, "optimization_level", 0)  # it is compiled for this test alone
+        env = torchrl_loco.make(task, len(state), "cpu", protocol="dm_control")
+    assert_agree(after(env, state, action), expected)

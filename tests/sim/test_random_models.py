@@ -1,0 +1,174 @@
+"""The compiled step on small random models against C MuJoCo in float64: one physics step along trajectories."""
+
+import collections
+
+import hypothesis
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from random_models import models, states
+
+from torchrl_loco.config import SimConfig
+from torchrl_loco.sim import Simulation
+from torchrl_loco.sim.compiled import collision, step, unsupported
+
+STATES = 16
+NOISE = 3e-7
+"""Relative noise in a state: about what rounding to float32 makes."""
+KINDS = ("plane", "dense", "frictionless", "pyramid", "hinge limit", "slide limit", "ball limit", "dry friction")
+"""Kinds of constraints that a state can have."""
+SETTINGS = {
+    "deadline": None,
+    "derandomize": True,
+    "database": None,
+    "phases": [hypothesis.Phase.generate],
+    "suppress_health_check": list(hypothesis.HealthCheck),
+}
+
+
+@pytest.fixture(autouse=True)
+def c_mujocos_frames_and_quick_compilation(monkeypatch):
+    """Contact frames of upright capsules are as in C MuJoCo, not as in MuJoCo-Warp."""
+    monkeypatch.setattr(collision, "UPRIGHT", 1e-6)
+    monkeypatch.setattr(wp.config, "optimization_level", 0)
+    mujoco.set_mju_user_warning(lambda message: None)  # else it writes a log into the working directory
+    yield
+    mujoco.set_mju_user_warning(None)
+
+
+def compiled_step(model, state):
+    """Returns the simulation of all states after one physics step."""
+    option, count = model.opt, len(state[0])
+    config = SimConfig(
+        ctrl_dt=option.timestep,
+        sim_dt=option.timestep,
+        naconmax=1,
+        njmax=1,
+        iterations=option.iterations,
+        ls_iterations=option.ls_iterations,
+        euler_damping=not option.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP,
+        engine="compiled",
+    )
+    sim = Simulation(model, config, count, torch.device("cpu"))
+    assert sim.data.cvel.shape == (count, model.nbody)  # asking for it makes the step compute it
+    for view, rows in zip((sim.qpos, sim.qvel, sim.qacc_warmstart, sim.ctrl), state, strict=True):
+        view.copy_(torch.as_tensor(rows))
+    sim.step()
+    return sim
+
+
+def c_data(model, qpos, qvel, warmstart, ctrl):
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = qpos, qvel, warmstart, ctrl
+    return data
+
+
+def c_step(model, *state):
+    data = c_data(model, *state)
+    mujoco.mj_step(model, data)
+    return data.qvel.copy()
+
+
+def sensitivity(model, state, expected, rng):
+    """Returns how much the velocity that C MuJoCo reaches changes under noise as small as rounding."""
+    largest, (qpos, qvel, *rest) = 0.0, state
+    for _ in range(4):
+        near = qpos.astype(np.float64)
+        mujoco.mj_integratePos(model, near, rng.normal(size=model.nv) * NOISE, 1.0)
+        other = c_step(model, near, qvel * (1 + rng.normal(size=model.nv) * NOISE), *rest)
+        largest = max(largest, np.abs(other - expected).max())
+    return largest
+
+
+def cost(model, data, qacc):
+    """Returns what the solver minimises at an acceleration, in float64."""
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    x = data.efc_J.reshape(-1, model.nv) @ qacc - data.efc_aref
+    friction = data.efc_type == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF
+    rows = 0.5 * data.efc_D * x**2 * (friction | (x < 0))
+    largest = data.efc_frictionloss
+    beyond = friction & (np.abs(x) * data.efc_D > largest)
+    rows[beyond] = (largest * (np.abs(x) - 0.5 * largest / data.efc_D))[beyond]
+    apart = qacc - data.qacc_smooth
+    return 0.5 * apart @ mass @ apart + rows.sum()
+
+
+def constraints(model, data):
+    """Returns the kinds of constraints of a state, from :data:`KINDS`."""
+    kinds, row_types, ids = set(), data.efc_type, data.efc_id
+    for geoms in data.contact.geom[data.contact.efc_address >= 0]:
+        kinds.add("plane" if mujoco.mjtGeom.mjGEOM_PLANE in model.geom_type[geoms] else "dense")
+    names = {"mjCNSTR_CONTACT_FRICTIONLESS": "frictionless", "mjCNSTR_CONTACT_PYRAMIDAL": "pyramid"}
+    names["mjCNSTR_FRICTION_DOF"] = "dry friction"
+    kinds |= {kind for name, kind in names.items() if (row_types == getattr(mujoco.mjtConstraint, name)).any()}
+    for joint in ids[row_types == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT]:
+        kinds.add(mujoco.mjtJoint(model.jnt_type[joint]).name.removeprefix("mjJNT_").lower() + " limit")
+    return kinds
+
+
+def assert_poses_belong_to_the_state(model, sim, world):
+    """Poses, velocities and the sensor are those of C MuJoCo at the state that was reached."""
+    data = c_data(model, *(view[world].double() for view in (sim.qpos, sim.qvel, sim.qacc_warmstart, sim.ctrl)))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    far, fast = 2e-6 * (1 + np.abs(data.xpos).max()), 1e-5 * (1 + np.abs(data.cvel).max())
+    np.testing.assert_allclose(sim.xpos[world], data.xpos, rtol=0, atol=far)
+    np.testing.assert_allclose(sim.xmat[world].reshape(-1, 9), data.xmat, rtol=0, atol=4e-6)
+    np.testing.assert_allclose(sim.data.cvel.numpy()[world], data.cvel, rtol=0, atol=fast)
+    velocity = data.subtree_linvel[model.body("body0").id]
+    np.testing.assert_allclose(sim.data.sensordata.numpy()[world], velocity, rtol=0, atol=fast)
+
+
+def compare(xml, count=STATES):
+    """Holds the model's states to C MuJoCo; returns how many there were, how many agreed closely, and their kinds."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    hypothesis.assume(not unsupported(model))
+    rng, found = np.random.default_rng(0), collections.Counter()
+    starts = states(model, rng, count)
+    if not len(starts[0]):
+        return found
+    sim = compiled_step(model, starts)
+    for world, state in enumerate(zip(*starts, strict=True)):
+        if sim.overflow[world]:
+            found["overflow"] += 1
+            continue
+        data = c_data(model, *state)
+        mujoco.mj_forward(model, data)
+        found.update(["states", *constraints(model, data)])
+        expected = c_step(model, *state)
+        error, change = np.abs(sim.qvel[world].numpy() - expected).max(), np.abs(expected - state[1]).max()
+        if error <= 1e-4 + 2e-5 * change + 10 * sensitivity(model, state, expected, rng):
+            found["close"] += 1
+        else:  # a direction without much cost: as near to the minimum as float32 can tell from where the solver starts
+            ours = sim.qacc_warmstart[world].double().numpy()
+            start, least, reached = (cost(model, data, qacc) for qacc in (state[2], data.qacc, ours))
+            assert reached - least < 1e-7 * max(start, least), f"world {world}: qvel differs by {error} of {change}"
+        qpos = state[0].astype(np.float64)
+        mujoco.mj_integratePos(model, qpos, sim.qvel[world].double().numpy(), model.opt.timestep)
+        np.testing.assert_allclose(sim.qpos[world], qpos, rtol=1e-6, atol=1e-6)
+        assert_poses_belong_to_the_state(model, sim, world)
+    return found
+
+
+@pytest.mark.parametrize("traced_dofs", [31, 0], ids=["traced", "lanes"])
+@pytest.mark.parametrize("count", [10, pytest.param(200, marks=pytest.mark.ci)])
+def test_a_step_agrees_with_c_mujoco(traced_dofs, count, monkeypatch):
+    """Both forms of the compiled step, which one takes small bodies and the other large ones, step any model."""
+    monkeypatch.setattr(step, "TRACED_DOFS", traced_dofs)
+    total = collections.Counter()
+
+    @hypothesis.settings(max_examples=count, **SETTINGS)
+    @hypothesis.given(models())
+    def check(xml):
+        total.update(compare(xml))
+
+    check()
+    print(dict(total))
+    assert total["states"] > 8 * count
+    assert total["close"] > 0.95 * total["states"]
+    assert total["overflow"] < 0.01 * total["states"]
+    if count == 200:
+        assert min(total[kind] for kind in KINDS) > 50, total

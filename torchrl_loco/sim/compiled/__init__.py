@@ -1,0 +1,25 @@
+"""The compiled step: a whole control step of one model as one kernel, without a table of constraints.
+
+Small bodies are traced: the physics is written on symbolic scalars and run once for a model, so that its constants
+fold, zeros vanish, and common terms are computed once. Larger ones are stepped by a group of lanes, in loops over
+tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps)`` shows it.
+
+================  =========================================================================
+``engine``        all worlds at once
+``step``          the choice of a schedule, and the size of a launch
+``support``       what a model may not need
+``collision``     which geoms may touch, and with which parameters
+``traced``        one thread a world: a control step from top to bottom
+``symbols``       scalars whose arithmetic is traced, and blocks of C++
+``dynamics``      poses, inertias, forces; M x and (M + K)^-1 x by sweeps over the tree
+``constraints``   softness of constraints; rows of limits and dry friction
+``contacts``      rows of contacts
+``solver``        Newton iterations and their line search
+``lanes``         a group of lanes a world: what ``lanes.h`` has to know about a model
+================  =========================================================================
+"""
+
+from torchrl_loco.sim.compiled.engine import CompiledEngine as CompiledEngine
+from torchrl_loco.sim.compiled.engine import data_bytes as data_bytes
+from torchrl_loco.sim.compiled.step import source as source
+from torchrl_loco.sim.compiled.support import unsupported as unsupported

@@ -1,0 +1,151 @@
+"""Collision of spheres and capsules with planes and with each other, traced for one model.
+
+What MuJoCo decides per contact (which pairs may touch, mixing of parameters, contact frames) is decided here per pair
+of geoms, once, in Python. Source: MuJoCo's documentation, chapter Computation ("Collision detection"), and
+mujoco_warp's ``collision_primitive``.
+"""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.sim.compiled.dynamics import Poses, constant_matrix
+from torchrl_loco.sim.compiled.symbols import array, dot, select, sqrt
+
+PLANE, SPHERE, CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("PLANE", "SPHERE", "CAPSULE"))
+MINVAL = 1e-15
+"""MuJoCo's mjMINVAL."""
+UPRIGHT = 0.5
+"""Sine of the angle to a plane's normal below which a capsule does not orient the frame of its contact.
+
+It is mujoco_warp's, so that both engines agree. C MuJoCo always takes the direction of the capsule: this is what makes
+the humanoid, whose shins stand upright, differ from C MuJoCo under both engines.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """Two geoms that may touch, and the parameters of their contacts.
+
+    Attributes:
+        geoms: their ids, the simpler shape first; the normal points from the first to the second.
+        condim: 1 (no friction) or 3 (sliding friction).
+        friction: sliding friction coefficient.
+        margin: distance below which a contact is active (m).
+        solref: reference parameters of the constraint, ``(2,)``.
+        solimp: impedance parameters, ``(5,)``.
+        weight: approximate inverse inertia of the two bodies (1/kg).
+    """
+
+    geoms: tuple[int, int]
+    condim: int
+    friction: float
+    margin: float
+    solref: tuple[float, ...]
+    solimp: tuple[float, ...]
+    weight: float
+
+
+def pairs(m: mujoco.MjModel) -> list[Pair]:
+    """Returns all pairs of geoms that may touch: MuJoCo's filters by type, body, parent, and exclusion."""
+    weld = m.body_weldid[m.geom_bodyid]
+    parent_weld = m.body_weldid[m.body_parentid[weld]]
+    filter_parent = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
+    excluded = set(m.exclude_signature.tolist())
+    found = []
+    for a in range(m.ngeom):
+        for b in range(a + 1, m.ngeom):
+            bodies = sorted((m.geom_bodyid[a], m.geom_bodyid[b]))
+            masked = not (m.geom_contype[a] & m.geom_conaffinity[b] or m.geom_contype[b] & m.geom_conaffinity[a])
+            related = weld[a] and weld[b] and (weld[a] == parent_weld[b] or weld[b] == parent_weld[a])
+            if masked or weld[a] == weld[b] or (filter_parent and related):
+                continue
+            if (bodies[0] << 16) + bodies[1] in excluded:
+                continue
+            found.append(_pair(m, *sorted((a, b), key=lambda g: (m.geom_type[g], g))))
+    return found
+
+
+def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
+    """Returns a pair with its mixed parameters (MuJoCo's ``mj_contactParam``)."""
+    if m.geom_priority[a] != m.geom_priority[b]:
+        first = 1.0 if m.geom_priority[a] > m.geom_priority[b] else 0.0
+        condim = m.geom_condim[a if first else b]
+        friction = m.geom_friction[a if first else b, 0]
+    else:
+        mix = m.geom_solmix[[a, b]]
+        large = mix >= MINVAL
+        first = mix[0] / mix.sum() if large.all() else (0.5 if not large.any() else float(large[0]))
+        condim = max(m.geom_condim[a], m.geom_condim[b])
+        friction = max(m.geom_friction[a, 0], m.geom_friction[b, 0])
+    solref = m.geom_solref[[a, b]]
+    if first in (0.0, 1.0) or (solref[:, 0] > 0).all():
+        solref = first * solref[0] + (1 - first) * solref[1]
+    else:
+        solref = solref.min(axis=0)
+    solimp = first * m.geom_solimp[a] + (1 - first) * m.geom_solimp[b]
+    weight = m.body_invweight0[m.geom_bodyid[[a, b]], 0].sum()
+    margin = m.geom_margin[a] + m.geom_margin[b]
+    return Pair((a, b), int(condim), float(friction), float(margin), tuple(solref), tuple(solimp), float(weight))
+
+
+# Contacts with a plane of the world.
+
+
+@dataclasses.dataclass(frozen=True)
+class Corner:
+    """A sphere, or an end of a capsule, that may touch a plane.
+
+    Attributes:
+        pair: the geoms and their parameters.
+        end: 0 for a sphere, 1 and -1 for the ends of a capsule.
+    """
+
+    pair: Pair
+    end: int
+
+
+def corners(m: mujoco.MjModel, found: list[Pair]) -> dict[int, list[Corner]]:
+    """Returns what may touch each plane, by geom id of the plane, in the order of the model."""
+    result: dict[int, list[Corner]] = {}
+    for pair in found:
+        plane, geom = pair.geoms
+        if m.geom_type[plane] == PLANE:
+            ends = (1, -1) if m.geom_type[geom] == CAPSULE else (0,)
+            result.setdefault(plane, []).extend(Corner(pair, end) for end in ends)
+    return result
+
+
+def geom_pose(m: mujoco.MjModel, poses: Poses, geom: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns center and z axis of a geom in the world's frame, ``(3,)`` each."""
+    body = m.geom_bodyid[geom]
+    center = poses.xpos[body] + poses.xmat[body] @ array(m.geom_pos[geom])
+    return center, (poses.xmat[body] @ constant_matrix(m.geom_quat[geom]))[:, 2]
+
+
+def frame(normal: np.ndarray, axis: np.ndarray | None) -> np.ndarray:
+    """Returns the first tangent of a contact with a plane, ``(3,)``; the second is normal x first.
+
+    MuJoCo aligns the first with the axis of a capsule, unless that is nearly normal to the plane. Tangents that are
+    exchanged or reversed give the same pyramid: where the axis of the capsule stays in one plane with the normal, one
+    constant direction serves for all cases.
+
+    Args:
+        normal: the plane's normal, constants.
+        axis: axis of the capsule; ``None`` for a sphere.
+    """
+    n = np.array([x.constant for x in normal])
+    fallback = np.eye(3)[1] if -0.5 < n[1] < 0.5 else np.eye(3)[2]
+    level = fallback - n * (n @ fallback)
+    level /= np.linalg.norm(level)
+    sideways = np.cross(level, n)
+    if axis is None:
+        return array(sideways)
+    if np.allclose(level, fallback, atol=1e-12):
+        for direction, other in ((sideways, level), (level, sideways)):
+            if dot(other, axis).constant == 0:
+                return array(direction)
+    along = axis - normal * dot(normal, axis)
+    length = sqrt(dot(along, along))
+    return np.array([select(length, "<", UPRIGHT, fallback[i], along[i] / length) for i in range(3)], dtype=object)

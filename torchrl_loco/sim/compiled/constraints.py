@@ -1,0 +1,276 @@
+"""Constraint rows of one substep, traced for one model: their softness, joint limits and dry friction.
+
+A row has a residual ``x = J a - a_ref`` of the acceleration ``a`` and a weight ``D``. It costs ``D x^2 / 2`` where
+``x < 0`` and nothing elsewhere; a row of dry friction costs that on both sides, and grows linearly beyond a force.
+Along a search direction ``s`` the residual changes by ``v = J s``. Source: MuJoCo's documentation, chapter Computation
+("Constraint model"), and chapter Modeling ("Solver parameters") for ``a_ref`` and ``D``.
+
+====================  ===========================================================================================
+:class:`JointLimits`  J is plus or minus one at one degree of freedom; each limit has a place of its own
+:class:`DryFriction`  J is one at one degree of freedom
+``contacts``          the rows of contacts, in a module of their own
+====================  ===========================================================================================
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.sim.compiled.collision import MINVAL
+from torchrl_loco.sim.compiled.dynamics import BALL, FREE
+from torchrl_loco.sim.compiled.symbols import (
+    Block,
+    Scalar,
+    absolute,
+    call,
+    cell,
+    literal,
+    maximum,
+    minimum,
+    name,
+    scalar,
+    select,
+)
+
+MINIMP, MAXIMP, MINMU = 1e-4, 0.9999, 1e-5
+"""MuJoCo's mjMINIMP, mjMAXIMP and mjMINMU."""
+
+MIN_TOLERANCE = 1e-6
+"""Tolerance below which a solver in single precision would only see rounding; mujoco_warp has the same bound."""
+
+State = tuple[list[Scalar], list[Scalar], list[Scalar]]
+"""Symbols of qpos, qvel and qacc."""
+
+
+def tolerance(m: mujoco.MjModel) -> float:
+    """Returns the tolerance of the solver, relative to the inertia of the model."""
+    return max(m.opt.tolerance, MIN_TOLERANCE)
+
+
+@dataclasses.dataclass(frozen=True)
+class Softness:
+    """Stiffness, damping and impedance of a constraint, from its ``solref`` and ``solimp``.
+
+    Numbers, or scalars that read tables. The impedance rises from ``dmin`` by ``rise`` within a width: as a power of
+    the distance up to the midpoint, and mirrored beyond.
+
+    Attributes:
+        stiffness: restoring acceleration per distance (1/s^2).
+        damping: restoring acceleration per velocity (1/s).
+        dmin: impedance at distance zero.
+        rise: how much larger it becomes.
+        per_width: one over the width (1/m or 1/rad).
+        midpoint: where the two powers meet, as a share of the width.
+        power: the power.
+        lower: factor of the power below the midpoint.
+        upper: factor of the power above it.
+    """
+
+    stiffness: Any
+    damping: Any
+    dmin: Any
+    rise: Any
+    per_width: Any
+    midpoint: Any
+    power: Any
+    lower: Any
+    upper: Any
+
+    @classmethod
+    def make(cls, m: mujoco.MjModel, solref: Sequence[float], solimp: Sequence[float]) -> "Softness":
+        """Returns the softness for the parameters of a model."""
+        dmin, dmax, midpoint = (float(np.clip(solimp[i], MINIMP, MAXIMP)) for i in (0, 1, 3))
+        safe = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
+        time = max(solref[0], 2 * m.opt.timestep) if safe else solref[0]
+        if solref[0] <= 0:
+            stiffness = -solref[0] / max(MINVAL, dmax**2)
+        else:
+            stiffness = 1 / max(MINVAL, (dmax * time * solref[1]) ** 2)
+        damping = -solref[1] / max(MINVAL, dmax) if solref[1] <= 0 else 2 / max(MINVAL, dmax * time)
+        width, power = float(solimp[2]), max(1.0, float(solimp[4]))
+        if width <= MINVAL:
+            dmin, dmax, width = (dmin + dmax) / 2, (dmin + dmax) / 2, 1.0
+        lower, upper = midpoint ** (1 - power), (1 - midpoint) ** (1 - power)
+        return cls(float(stiffness), float(damping), dmin, dmax - dmin, 1 / width, midpoint, power, lower, upper)
+
+    @classmethod
+    def from_table(cls, table: "Table", rows: "list[Softness]") -> "Softness":
+        """Returns the softness of the row of a table that the C++ variable of ``table`` names."""
+        fields = [field.name for field in dataclasses.fields(cls)]
+        return cls(**{field: table.column(field, [getattr(row, field) for row in rows]) for field in fields})
+
+    def impedance(self, position: Scalar) -> Scalar:
+        """Returns the impedance at a distance."""
+        if scalar(self.rise).constant == 0:
+            return scalar(self.dmin)
+        x = minimum(absolute(position) * self.per_width, 1)
+        below = self.lower * raised(x, self.power)
+        above = 1 - self.upper * raised(1 - x, self.power)
+        return self.dmin + select(x, "<=", self.midpoint, below, above) * self.rise
+
+    def row(self, weight: float | Scalar, position: Scalar) -> tuple[Scalar, Scalar]:
+        """Returns D, and the part of the residual that the position makes.
+
+        Args:
+            weight: approximate inverse inertia along the row.
+            position: distance, negative if violated (m or rad).
+        """
+        impedance = self.impedance(position)
+        regularisation = maximum(scalar(weight) * (1 - impedance) / impedance, MINVAL)
+        return 1 / regularisation, self.stiffness * impedance * position
+
+
+def raised(x: Scalar, power: float | Scalar) -> Scalar:
+    """Returns ``x`` to a power."""
+    constant = scalar(power).constant
+    if constant is None or constant != int(constant) or constant > 8:
+        return call("powf", x, power)
+    result = x
+    for _ in range(int(constant) - 1):
+        result = result * x
+    return result
+
+
+class Table:
+    """Numbers that differ between the rows of a loop, as constant C++ arrays; equal ones fold.
+
+    Args:
+        block: where the arrays are declared.
+        prefix: start of their names.
+        index: the C++ variable that names the row.
+    """
+
+    def __init__(self, block: Block, prefix: str, index: str) -> None:
+        self.block, self.prefix, self.index = block, prefix, index
+
+    def column(self, title: str, values: Sequence[float]) -> Scalar:
+        """Returns the number of the current row."""
+        if len({float(x) for x in values}) == 1:
+            return scalar(values[0])
+        listed = ", ".join(literal(x) for x in values)
+        self.block(f"static const float {self.prefix}_{title}[{len(values)}] = {{{listed}}};")
+        return name(f"{self.prefix}_{title}[{self.index}]")
+
+    def integers(self, title: str, values: Sequence[int]) -> str:
+        """Returns the C++ expression of the integer of the current row."""
+        listed = ", ".join(str(int(x)) for x in values)
+        self.block(f"static const int {self.prefix}_{title}[{len(values)}] = {{{listed}}};")
+        return f"{self.prefix}_{title}[{self.index}]"
+
+
+class JointLimits:
+    """Limits of hinges and slides. Each has a place of its own, whose weight is zero while the joint is within them.
+
+    Args:
+        m: the model.
+    """
+
+    def __init__(self, m: mujoco.MjModel) -> None:
+        self.m = m
+        self.joints = [j for j in range(m.njnt) if m.jnt_limited[j] and m.jnt_type[j] not in (FREE, BALL)]
+        self.count = len(self.joints)
+        self.arrays = {f"limit_{field}": self.count for field in ("D", "x", "v", "sign")}
+
+    def create(self, block: Block, state: State) -> None:
+        """Sets weights, signs and residuals."""
+        m, (qpos, qvel, qacc) = self.m, state
+        for i, j in enumerate(self.joints):
+            d, (low, high) = int(m.jnt_dofadr[j]), m.jnt_range[j]
+            below, above = qpos[m.jnt_qposadr[j]] - low, high - qpos[m.jnt_qposadr[j]]
+            position, sign = minimum(below, above) - m.jnt_margin[j], select(below, "<", above, 1, -1)
+            block.set(f"limit_sign[{i}]", sign)
+            block(f"limit_D[{i}] = limit_x[{i}] = 0.0f;")
+            with block.scope(f"if ({block.value(position)} < 0.0f)") as violated:
+                softness = Softness.make(m, m.jnt_solref[j], m.jnt_solimp[j])
+                weight, residual = softness.row(m.dof_invweight0[d], position)
+                violated.set(f"limit_D[{i}]", weight)
+                violated.set(f"limit_x[{i}]", residual + sign * (softness.damping * qvel[d] + qacc[d]))
+
+    def project(self, block: Block, search: list[Scalar]) -> None:
+        """Sets how the residuals change along the search direction."""
+        for i, j in enumerate(self.joints):
+            block.set(f"limit_v[{i}]", cell(f"limit_sign[{i}]") * search[self.m.jnt_dofadr[j]])
+
+    def add_to(self, gradient: list[Scalar], diagonal: list[Scalar]) -> None:
+        """Adds the rows to the gradient of the cost and to the diagonal of its Hessian."""
+        for i, j in enumerate(self.joints):
+            d, x, sign = self.m.jnt_dofadr[j], cell(f"limit_x[{i}]"), cell(f"limit_sign[{i}]")
+            weight = select(x, "<", 0, cell(f"limit_D[{i}]"), 0)
+            gradient[d] = gradient[d] + weight * sign * x
+            diagonal[d] = diagonal[d] + weight
+
+    def loop(self, body: str) -> str:
+        """Returns a C++ loop over the rows, with x, v and D."""
+        head = f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i)"
+        return f"{head} {{ const float x = limit_x[i], v = limit_v[i], D = limit_D[i]; {body} }}" if self.count else ""
+
+    def advance(self) -> str:
+        """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides."""
+        if not self.count:
+            return ""
+        return (
+            f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ "
+            "const float x = limit_x[i] + alpha * limit_v[i]; "
+            "changed |= limit_D[i] > 0.0f && (x < 0.0f) != (limit_x[i] < 0.0f); limit_x[i] = x; }"
+        )
+
+
+class DryFriction:
+    """Friction loss of degrees of freedom: a force of constant size against the motion.
+
+    Args:
+        m: the model.
+    """
+
+    def __init__(self, m: mujoco.MjModel) -> None:
+        self.m = m
+        self.dofs = [d for d in range(m.nv) if m.dof_frictionloss[d] > 0]
+        self.count = len(self.dofs)
+        self.arrays = {f"friction_{field}": self.count for field in ("x", "v")}
+        self.softness = [Softness.make(m, m.dof_solref[d], m.dof_solimp[d]) for d in self.dofs]
+        weights = m.dof_invweight0[self.dofs]
+        rows = zip(weights, self.softness, strict=True)
+        self.weight = [1 / max(w * (1 - softness.dmin) / softness.dmin, MINVAL) for w, softness in rows]
+        self.limit = [float(m.dof_frictionloss[d]) for d in self.dofs]
+
+    def create(self, block: Block, state: State) -> None:
+        """Sets the residuals."""
+        _, qvel, qacc = state
+        for i, d in enumerate(self.dofs):
+            block.set(f"friction_x[{i}]", qacc[d] + self.softness[i].damping * qvel[d])
+
+    def project(self, block: Block, search: list[Scalar]) -> None:
+        """Sets how the residuals change along the search direction."""
+        for i, d in enumerate(self.dofs):
+            block.set(f"friction_v[{i}]", search[d])
+
+    def add_to(self, gradient: list[Scalar], diagonal: list[Scalar]) -> None:
+        """Adds the rows to the gradient of the cost and to the diagonal of its Hessian."""
+        for i, d in enumerate(self.dofs):
+            weight, limit, x = self.weight[i], self.limit[i], cell(f"friction_x[{i}]")
+            gradient[d] = gradient[d] + maximum(minimum(weight * x, limit), -limit)
+            diagonal[d] = diagonal[d] + select(absolute(x), "<", limit / weight, weight, 0)
+
+    def loop(self, body: str) -> str:
+        """Returns a C++ loop over the rows, with x, v, D and the largest force."""
+        listed = [", ".join(map(literal, values)) for values in (self.weight, self.limit)]
+        return (
+            f"static const float friction_D[] = {{{listed[0]}}}, friction_limit[] = {{{listed[1]}}};\n"
+            f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ const float x = friction_x[i], "
+            f"v = friction_v[i], D = friction_D[i], limit = friction_limit[i]; {body} }}"
+        )
+
+    def advance(self) -> str:
+        """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides."""
+        if not self.count:
+            return ""
+        bounds = ", ".join(literal(limit / weight) for limit, weight in zip(self.limit, self.weight, strict=True))
+        return (
+            f"static const float friction_bound[] = {{{bounds}}};\n"
+            f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ const float b = friction_bound[i], "
+            "old = friction_x[i], x = old + alpha * friction_v[i]; "
+            "changed |= (x < b) != (old < b) || (x > -b) != (old > -b); friction_x[i] = x; }"
+        )

@@ -1,0 +1,238 @@
+"""The engine that steps all worlds with the compiled step."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from torchrl_loco.config import SimConfig
+from torchrl_loco.sim.buffer import Buffer
+from torchrl_loco.sim.compiled.step import launch_size, source
+
+ROWS = {
+    "qpos": ("nq", wp.float32),
+    "qvel": ("nv", wp.float32),
+    "qacc_warmstart": ("nv", wp.float32),
+    "ctrl": ("nu", wp.float32),
+    "time": (None, wp.float32),
+    "xpos": ("nbody", wp.vec3),
+    "xmat": ("nbody", wp.mat33),
+    "cvel": ("nbody", wp.spatial_vector),
+    "sensordata": ("nsensordata", wp.float32),
+    "overflow": (None, wp.int32),
+}
+"""Type of each array of :class:`Data`, and the size in the model that is the length of its rows."""
+
+
+class Data:
+    """The state of all worlds, and what an observation reads. Names, shapes and units are those of ``mjData``.
+
+    Args:
+        m: the model.
+        nworld: number of worlds.
+        device: where they live.
+
+    Attributes:
+        qpos: positions, ``(nworld, nq)``.
+        qvel: velocities, ``(nworld, nv)``.
+        qacc_warmstart: accelerations of the last substep, from which the solver starts, ``(nworld, nv)``.
+        ctrl: controls, ``(nworld, nu)``.
+        time: time since the world's reset (s), ``(nworld,)``.
+        xpos: positions of the bodies (m), ``(nworld, nbody)`` vec3.
+        xmat: orientations of the bodies, ``(nworld, nbody)`` mat33.
+        sensordata: sensors, ``(nworld, nsensordata)``.
+        overflow: :class:`mujoco_warp.OverflowType` bits, ``(nworld,)``.
+    """
+
+    qpos: wp.array
+    qvel: wp.array
+    qacc_warmstart: wp.array
+    ctrl: wp.array
+    time: wp.array
+    xpos: wp.array
+    xmat: wp.array
+    sensordata: wp.array
+    overflow: wp.array
+
+    def __init__(self, m: mujoco.MjModel, nworld: int, device: wp.Device) -> None:
+        def make(name: str) -> wp.array:
+            return wp.zeros(_shape(m, nworld, name), dtype=ROWS[name][1], device=device)
+
+        self._make: Callable[[str], wp.array] | None = make
+        self._cvel: wp.array | None = None
+        for name in ROWS:
+            if name != "cvel":
+                setattr(self, name, make(name))
+        start = mujoco.MjData(m)
+        mujoco.mj_kinematics(m, start)
+        for array, row in ((self.xpos, start.xpos), (self.xmat, start.xmat)):  # the step leaves out what is constant
+            array.assign(np.broadcast_to(row.reshape(-1, *array.numpy().shape[2:]), array.numpy().shape))
+
+    @property
+    def cvel(self) -> wp.array:
+        """Velocities of the bodies about the center of mass of their tree (rad/s, m/s), ``(nworld, nbody)``.
+
+        They are computed if they were asked for before the first step, as an environment's ``observation_kernel`` does.
+
+        Raises:
+            RuntimeError: it is too late.
+        """
+        if self._cvel is None:
+            if self._make is None:
+                raise RuntimeError("cvel is not computed: ask for data.cvel before the first step")
+            self._cvel = self._make("cvel")
+        return self._cvel
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        raise AttributeError(
+            f"the compiled engine has no data.{name}, only {', '.join(ROWS)}: pass engine='mujoco_warp', or set it in "
+            "the defaults of the body"
+        )
+
+    def outputs(self) -> dict[str, wp.array | None]:
+        """Returns what the kernels write, by name; ``None`` if it was not asked for, which can no longer be done."""
+        self._make = None
+        written = {name: self._cvel if name == "cvel" else getattr(self, name) for name in ROWS}
+        del written["ctrl"]
+        return written
+
+
+def _shape(m: mujoco.MjModel, nworld: int, name: str) -> tuple[int, ...]:
+    size = ROWS[name][0]
+    return (nworld,) if size is None else (nworld, getattr(m, size))
+
+
+def data_bytes(m: mujoco.MjModel, num_envs: int) -> int:
+    """Returns the memory that the state of so many worlds takes, without ``cvel`` (bytes)."""
+    sizes = {name: math.prod(_shape(m, num_envs, name)) * wp.types.type_size_in_bytes(ROWS[name][1]) for name in ROWS}
+    return sum(sizes.values()) - sizes["cvel"]
+
+
+class CompiledEngine:
+    """Steps all worlds with one kernel, made for the model.
+
+    There is no table of constraints, and nothing of one world depends on another: a trajectory is a function of its own
+    state and actions, bit for bit, for any number of worlds.
+
+    Args:
+        mj_model: the compiled model, with the options of ``config``.
+        config: settings of the simulation.
+        num_envs: number of worlds.
+        device: where they live.
+
+    Attributes:
+        model: the model on the device.
+        data: the state of all worlds.
+        peak_constraints: zero: no row of constraints needs room, ``(nworld,)``.
+        peak_contacts: zero likewise, ``(1,)``.
+    """
+
+    def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
+        self._mj_model, self._substeps, self._num_envs, self._device = mj_model, config.substeps, num_envs, device
+        with wp.ScopedDevice(device):
+            self.model = mjw.put_model(mj_model)
+        self.data = Data(mj_model, num_envs, device)
+        self._kernels: dict[int, wp.Kernel] = {}
+        self._all = wp.ones(num_envs, dtype=bool, device=device)
+        self.peak_constraints = Buffer(num_envs, int, device)
+        self.peak_contacts = Buffer(1, int, device)
+
+    def remedy(self, dropped: str, most: int) -> str:
+        """Returns what prevents that something is dropped."""
+        return f"a world of the compiled engine has no more places for {dropped}: pass engine='mujoco_warp'"
+
+    def reset(self, mask: wp.array) -> None:
+        """Does nothing: the state is all that a world has."""
+
+    def step(self) -> None:
+        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state."""
+        self._launch(self._substeps, self._all)
+
+    def forward(self, mask: wp.array) -> None:
+        """Updates poses and sensors where ``mask`` ``(nworld,)`` is set."""
+        self._launch(0, mask)
+
+    forward_at_rest = forward
+
+    def _launch(self, substeps: int, mask: wp.array) -> None:
+        outputs = self.data.outputs()
+        threads, block, worlds_per_warp = launch_size(self._mj_model, self._num_envs, self._device)
+        wp.launch(
+            self._kernel(substeps, outputs["cvel"] is not None),
+            dim=threads,
+            inputs=[worlds_per_warp, mask, self.data.ctrl],
+            outputs=list(outputs.values()),
+            device=self._device,
+            block_dim=block,
+        )
+
+    def _kernel(self, substeps: int, with_cvel: bool) -> wp.Kernel:
+        if substeps not in self._kernels:
+            self._kernels[substeps] = _kernel(source(self._mj_model, substeps, with_cvel=with_cvel))
+        return self._kernels[substeps]
+
+
+@functools.cache
+def _kernel(text: str) -> wp.Kernel:
+    """Returns a kernel around the C++ of :func:`~torchrl_loco.sim.compiled.step.source`."""
+
+    @wp.func_native(text)
+    def advance(
+        thread: int,
+        worlds_per_warp: int,
+        mask_in: wp.array[bool],
+        ctrl_in: wp.array2d[float],
+        qpos_out: wp.array2d[float],
+        qvel_out: wp.array2d[float],
+        qacc_warmstart_out: wp.array2d[float],
+        time_out: wp.array[float],
+        xpos_out: wp.array2d[wp.vec3],
+        xmat_out: wp.array2d[wp.mat33],
+        cvel_out: wp.array2d[wp.spatial_vector],
+        sensordata_out: wp.array2d[float],
+        overflow_out: wp.array[int],
+    ): ...
+
+    # Denormals are flushed, and what divisions and roots are left are fast: 3 % of a step. The CPU ignores it.
+    @wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": True})
+    def compiled_step(
+        # In:
+        worlds_per_warp: int,
+        mask_in: wp.array[bool],
+        # Data in:
+        ctrl_in: wp.array2d[float],
+        # Data out:
+        qpos_out: wp.array2d[float],
+        qvel_out: wp.array2d[float],
+        qacc_warmstart_out: wp.array2d[float],
+        time_out: wp.array[float],
+        xpos_out: wp.array2d[wp.vec3],
+        xmat_out: wp.array2d[wp.mat33],
+        cvel_out: wp.array2d[wp.spatial_vector],
+        sensordata_out: wp.array2d[float],
+        overflow_out: wp.array[int],
+    ):
+        advance(
+            wp.tid(),
+            worlds_per_warp,
+            mask_in,
+            ctrl_in,
+            qpos_out,
+            qvel_out,
+            qacc_warmstart_out,
+            time_out,
+            xpos_out,
+            xmat_out,
+            cvel_out,
+            sensordata_out,
+            overflow_out,
+        )
+
+    return compiled_step

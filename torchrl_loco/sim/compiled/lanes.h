@@ -1,0 +1,1393 @@
+// One control step of one world, taken by a group of lanes: a warp of a GPU with the world's state in shared memory, or
+// one lane of a CPU. All of it is the body of a single function, so that Warp can carry it; what depends on the model
+// (struct Model: sizes, constants and tables) is written into it by lanes.py.
+//
+// The lanes share every loop over links, geoms, contacts or rows. Each of them owns the degrees of freedom lane,
+// lane + LANES, ... (its slots), and with them their rows of the mass matrix and of the Hessian, which it keeps in
+// registers. Loops stay rolled where they can: on a GPU, fetching instructions is what limits a text of this size.
+//
+// Sums are written with the accumulator first, so that a compiler fuses each product with its addition.
+
+#ifdef __CUDA_ARCH__
+#define INLINE __device__ __forceinline__
+#define ROLLED _Pragma("unroll 1")
+#define UNROLLED _Pragma("unroll")
+enum { LANES = 32 };
+#else
+#define INLINE inline
+#define ROLLED
+#define UNROLLED
+enum { LANES = 1 };
+#endif
+
+// ---- Arithmetic ----------------------------------------------------------------------------------------------------
+
+static constexpr float MINVAL = 1e-15f;  // MuJoCo's mjMINVAL
+
+struct Math {
+  static INLINE float smaller(float a, float b) { return a < b ? a : b; }
+  static INLINE float larger(float a, float b) { return a > b ? a : b; }
+  static INLINE float clamp(float x, float low, float high) { return smaller(larger(x, low), high); }
+#ifdef __CUDA_ARCH__
+  static INLINE float divide(float a, float b) { return __fdividef(a, b); }
+  static INLINE float root(float x) { return x * rsqrtf(larger(x, 1e-30f)); }
+  static INLINE int bits(unsigned x) { return __popc(x); }
+  static INLINE int lowest_bit(unsigned x) { return __ffs(x) - 1; }
+  static INLINE int lowest_bit(unsigned long long x) { return __ffsll(x) - 1; }
+#else
+  static INLINE float divide(float a, float b) { return a / b; }
+  static INLINE float root(float x) { return sqrtf(x); }
+  static INLINE int bits(unsigned x) { return __builtin_popcount(x); }
+  static INLINE int lowest_bit(unsigned x) { return __builtin_ctz(x); }
+  static INLINE int lowest_bit(unsigned long long x) { return __builtin_ctzll(x); }
+#endif
+
+  // Sine and cosine at once: x is reduced to a quarter turn about 0 (Cody and Waite), there both are polynomials.
+  static INLINE void sincos(float x, float& sine, float& cosine) {
+    const float quarters = rintf(x * 0.636619772f);
+    const float y = x - quarters * 1.57079601f - quarters * 3.13916473e-7f - quarters * 5.39030253e-15f, z = y * y;
+    const float s = y + ((((2.86567956e-6f * z - 1.98559923e-4f) * z + 8.33338592e-3f) * z - 1.66666672e-1f) * z) * y;
+    const float c = (((2.44677067e-5f * z - 1.38877297e-3f) * z + 4.16666567e-2f) * z - 0.5f) * z + 1.0f;
+    const int quadrant = (int)quarters;
+    sine = quadrant & 1 ? c : s;
+    cosine = quadrant & 1 ? s : c;
+    if (quadrant & 2) sine = -sine;
+    if ((quadrant + 1) & 2) cosine = -cosine;
+  }
+};
+
+struct Vec {
+  float x, y, z;
+  INLINE Vec operator+(Vec b) const { return {x + b.x, y + b.y, z + b.z}; }
+  INLINE Vec operator-(Vec b) const { return {x - b.x, y - b.y, z - b.z}; }
+  INLINE Vec operator*(float k) const { return {x * k, y * k, z * k}; }
+  INLINE float dot(Vec b) const { return x * b.x + y * b.y + z * b.z; }
+  INLINE Vec cross(Vec b) const { return {y * b.z - z * b.y, z * b.x - x * b.z, x * b.y - y * b.x}; }
+  INLINE float norm() const { return Math::root(dot(*this)); }
+  INLINE float component(int i) const { return i == 0 ? x : i == 1 ? y : z; }
+};
+
+struct Quat {  // of unit length, as MuJoCo orders it
+  float w, x, y, z;
+  INLINE Quat operator*(Quat b) const {
+    return {w * b.w - x * b.x - y * b.y - z * b.z, w * b.x + x * b.w + y * b.z - z * b.y,
+            w * b.y - x * b.z + y * b.w + z * b.x, w * b.z + x * b.y - y * b.x + z * b.w};
+  }
+  INLINE Quat conjugate() const { return {w, -x, -y, -z}; }
+  INLINE Quat normalized() const {
+    const float k = Math::divide(1.0f, Math::root(w * w + x * x + y * y + z * z));
+    return {w * k, x * k, y * k, z * k};
+  }
+  INLINE Vec rotate(Vec v) const {
+    const Vec u = {x, y, z}, t = u.cross(v) * 2.0f;
+    return v + t * w + u.cross(t);
+  }
+  // The rotation as a vector: its axis times its angle, at most half a turn.
+  INLINE Vec rotation_vector() const {
+    const float sine = Vec{x, y, z}.norm();
+    float angle = 2.0f * atan2f(sine, w);
+    if (angle > 3.14159265f) angle -= 6.28318531f;
+    return Vec{x, y, z} * (sine > MINVAL ? Math::divide(angle, sine) : 0.0f);
+  }
+};
+
+struct Mat {  // by rows
+  Vec row0, row1, row2;
+  INLINE Vec operator*(Vec v) const { return {row0.dot(v), row1.dot(v), row2.dot(v)}; }
+  INLINE Vec transposed_times(Vec v) const { return row0 * v.x + row1 * v.y + row2 * v.z; }
+  INLINE Vec column(int i) const { return {row0.component(i), row1.component(i), row2.component(i)}; }
+  static INLINE Mat from(Quat q) {
+    const float w = q.w, x = q.x, y = q.y, z = q.z;
+    return {{w * w + x * x - y * y - z * z, 2.0f * (x * y - w * z), 2.0f * (x * z + w * y)},
+            {2.0f * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0f * (y * z - w * x)},
+            {2.0f * (x * z - w * y), 2.0f * (y * z + w * x), w * w - x * x - y * y + z * z}};
+  }
+};
+
+struct Symmetric {
+  float xx, xy, xz, yy, yz, zz;
+  INLINE Vec operator*(Vec v) const {
+    return {xx * v.x + xy * v.y + xz * v.z, xy * v.x + yy * v.y + yz * v.z, xz * v.x + yz * v.y + zz * v.z};
+  }
+  // The same in axes turned by r: r S r'.
+  INLINE Symmetric turned(Mat r) const {
+    const Vec a = *this * r.row0, b = *this * r.row1, c = *this * r.row2;
+    return {r.row0.dot(a), r.row0.dot(b), r.row0.dot(c), r.row1.dot(b), r.row1.dot(c), r.row2.dot(c)};
+  }
+};
+
+// Spatial vectors (Featherstone, "Rigid Body Dynamics Algorithms", 2008), in world axes about the centre of mass of
+// their tree.
+struct alignas(16) Motion {
+  Vec angular, linear;
+  INLINE Motion operator+(Motion b) const { return {angular + b.angular, linear + b.linear}; }
+  INLINE Motion operator*(float k) const { return {angular * k, linear * k}; }
+  INLINE float dot(Motion b) const { return angular.dot(b.angular) + linear.dot(b.linear); }
+  INLINE Motion cross_motion(Motion m) const {  // rate of change of a motion that moves with this velocity
+    return {angular.cross(m.angular), angular.cross(m.linear) + linear.cross(m.angular)};
+  }
+  INLINE Motion cross_force(Motion f) const {  // the same for a force
+    return {angular.cross(f.angular) + linear.cross(f.linear), angular.cross(f.linear)};
+  }
+};
+
+struct Inertia {
+  Symmetric rotational;  // about the origin
+  Vec first;             // mass times the offset of the centre of mass
+  float mass;
+  INLINE Motion operator*(Motion m) const {
+    return {rotational * m.angular + first.cross(m.linear), m.linear * mass - first.cross(m.angular)};
+  }
+};
+
+struct Softness {  // of a constraint: solref and solimp
+  float stiffness, damping, dmin, range, inverse_width, midpoint, power, below, above;
+  // The impedance rises from dmin by the range as the violation grows to the width.
+  INLINE float impedance(float position) const {
+    const float x = Math::smaller(fabsf(position) * inverse_width, 1.0f);
+    return dmin + (x <= midpoint ? below * raised(x) : 1.0f - above * raised(1.0f - x)) * range;
+  }
+  INLINE float raised(float x) const { return power == 1.0f ? x : power == 2.0f ? x * x : powf(x, power); }
+};
+
+// ---- The model -----------------------------------------------------------------------------------------------------
+
+enum Joint { FREE, BALL, SLIDE_JOINT, HINGE_JOINT };
+enum Shape { SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX };
+enum Dof { TRANSLATION, ROTATION, SLIDE, HINGE };  // of a free joint; of a free or ball joint; the two others
+
+//MODEL
+
+// ---- The state of a world ------------------------------------------------------------------------------------------
+
+enum {
+  DOFS = Model::DOFS,
+  STRIDE = (DOFS + 3) / 4 * 4,  // of a row of a matrix; the columns beyond DOFS are zero
+  QUADS = STRIDE / 4,
+  SLOTS = (STRIDE + LANES - 1) / LANES,
+  CONTACTS = Model::FRICTIONAL + Model::FRICTIONLESS,
+};
+#define OWN_DOFS(slot, dof) UNROLLED for (int slot = 0, dof = lane; slot < SLOTS; ++slot, dof += LANES)
+#define SHARED_LOOP(i, count) ROLLED for (int i = lane; i < (count); i += LANES)
+
+struct alignas(16) Quad { float v[4]; };
+
+struct alignas(16) LocalPose { Quat orientation; Vec position; };
+struct alignas(16) Pose { Mat orientation; Vec position; };
+struct alignas(16) Body { Inertia inertia; Vec torque, force; };  // 16 floats
+struct alignas(16) Geom { Vec center, half_axis; float radius; };  // a sphere has no half axis
+struct alignas(16) Contact { Vec point; float distance; Vec normal; int pair; };
+
+struct alignas(16) World {
+  float qpos[(Model::POSITIONS + 3) / 4 * 4];
+  float qvel[STRIDE], qacc[STRIDE], search[STRIDE];
+  float residual[STRIDE];     // M qacc minus the smooth forces
+  float mass_search[STRIDE];  // M times the search direction
+  Motion axes[DOFS];          // motion of the tree for a unit velocity of each degree of freedom (MuJoCo's cdof)
+  float mass[DOFS * STRIDE];
+  // Constraint rows: residual J qacc - aref, weight D. They cost D x^2 / 2 where x < 0.
+  float x[Model::ROWS], weight[Model::ROWS];
+  union {
+    struct {  // until the rows are set up
+      Contact contacts[CONTACTS];
+      Vec tangents[Model::FRICTIONAL + 1];
+    };
+    struct {  // while solving
+      float pivots[2][2][STRIDE + 4], couplings[DOFS / 2 + 1], change[Model::ROWS];
+    };
+    Motion velocity[Model::LINKS];  // of each link relative to its parent; with a single lane, to the world
+  };
+  float projected[Model::JACOBIAN_ROWS];  // Jacobian times the search direction
+  union {
+    struct {  // until the contacts are known
+      union {
+        LocalPose local[Model::LINKS];
+        Motion acceleration[Model::LINKS];
+      };
+      Pose pose[Model::LINKS];
+      Body bodies[Model::LINKS];
+      Geom geoms[Model::GEOMS + 1];
+      unsigned short candidates[Model::CANDIDATES];
+    };
+    float jacobian[Model::JACOBIAN_ROWS * STRIDE];
+  };
+  Vec com[Model::TREES];
+  unsigned char limits[Model::LIMITS + 1];  // the degree of freedom of each row of a limit, plus 128 for the upper one
+  unsigned zones[Model::TOUCH ? CONTACTS : 1];  // the touch sensors that feel each contact, one bit each
+};
+
+// ---- One substep ---------------------------------------------------------------------------------------------------
+
+struct Step : Math {
+  World& w;
+  const int lane;
+  const float* const ctrl;  // of all worlds
+  int* const overflow;      // of all worlds
+  const int world;
+  int frictional, frictionless;  // contacts
+  int limits;                    // violated limits of hinges and slides
+  int limit_row[SLOTS];          // the row of the limit of each own degree of freedom, or -1
+
+  INLINE Step(World& w, int lane, const float* ctrl, int* overflow, int world)
+      : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world) {}
+
+  // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for its normal and
+  // two for its tangents (times the friction coefficient), and a constraint row for each of the four edges of its
+  // pyramid. Limits of hinges and slides, and dry friction in joints, need no Jacobian: they act along one degree of
+  // freedom.
+  INLINE int jacobian_rows() const { return 3 * frictional + frictionless; }
+  INLINE int first_frictionless() const { return 4 * frictional; }
+  INLINE int first_limit() const { return 4 * frictional + frictionless; }
+  INLINE int first_friction() const { return first_limit() + limits; }
+  INLINE int rows() const { return first_friction() + Model::FRICTION_LOSSES; }
+
+  // ---- What the lanes do together
+
+#ifdef __CUDA_ARCH__
+  INLINE void sync() const { __syncwarp(); }
+  INLINE unsigned ballot(bool x) const { return __ballot_sync(~0u, x); }
+  INLINE float read(float x, int from) const { return __shfl_sync(~0u, x, from); }
+
+  // Replaces each of n values by its sum over the lanes. With many of them, pairs of lanes first exchange halves, so
+  // that each lane goes on with a quarter of the values.
+  INLINE void sum(float* x, const int n) const {
+    if (n < 6) {
+      UNROLLED for (int i = 0; i < n; ++i)
+        UNROLLED for (int o = 16; o; o >>= 1) x[i] += __shfl_xor_sync(~0u, x[i], o);
+      return;
+    }
+    const bool odd = lane & 1, upper = lane & 2;
+    float half[6], quarter[3];
+    UNROLLED for (int i = 0; i < (n + 1) / 2; ++i) {
+      const float a = x[2 * i], b = 2 * i + 1 < n ? x[2 * i + 1] : 0.0f;
+      half[i] = (odd ? b : a) + __shfl_xor_sync(~0u, odd ? a : b, 1);
+    }
+    UNROLLED for (int i = 0; i < (n + 3) / 4; ++i) {
+      const float a = half[2 * i], b = 2 * i + 1 < (n + 1) / 2 ? half[2 * i + 1] : 0.0f;
+      quarter[i] = (upper ? b : a) + __shfl_xor_sync(~0u, upper ? a : b, 2);
+      UNROLLED for (int o = 4; o < 32; o <<= 1) quarter[i] += __shfl_xor_sync(~0u, quarter[i], o);
+    }
+    UNROLLED for (int i = 0; i < n; ++i) x[i] = read(quarter[i / 4], i & 3);
+  }
+#else
+  INLINE void sync() const {}
+  INLINE unsigned ballot(bool x) const { return x; }
+  INLINE float read(float x, int) const { return x; }
+  INLINE void sum(float*, const int) const {}
+#endif
+  INLINE unsigned lanes_below() const { return (1u << lane) - 1; }
+
+  // ---- Kinematics
+
+  // The next link to visit when something is summed over a link and its ancestors. A single lane visits the links in
+  // their order, parents first, so that what it finds at the parent already includes the parent's ancestors.
+  static INLINE int next_ancestor(int link) { return LANES == 1 ? -1 : Model::parent(link); }
+
+  INLINE Motion sum_to_root(const Motion* own, int link) const {
+    Motion total = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
+    ROLLED for (int a = link; a >= 0; a = next_ancestor(a)) total = total + own[a];
+    return total;
+  }
+
+  INLINE Vec qpos_vec(int i) const { return {w.qpos[i], w.qpos[i + 1], w.qpos[i + 2]}; }
+  INLINE Quat qpos_quat(int i) const {
+    return Quat{w.qpos[i], w.qpos[i + 1], w.qpos[i + 2], w.qpos[i + 3]}.normalized();
+  }
+
+  // The pose of a link relative to its parent; leaves axes and anchors of hinges and slides in the parent's frame.
+  INLINE LocalPose local_pose(int link) {
+    Vec position = Model::link_position(link);
+    Quat orientation = Model::link_orientation(link);
+    const int end = Model::first_joint(link + 1);
+    ROLLED for (int j = Model::first_joint(link); j < end; ++j) {
+      const int q = Model::joint_qpos(j), kind = Model::joint_kind(j);
+      if (Model::HAS_FREE && kind == FREE) {
+        position = qpos_vec(q);
+        orientation = qpos_quat(q + 3);
+        continue;
+      }
+      const Vec offset = Model::joint_position(j), anchor = position + orientation.rotate(offset);
+      if (Model::HAS_BALL && kind == BALL) {
+        orientation = orientation * qpos_quat(q);
+      } else {
+        const Vec axis = Model::joint_axis(j), direction = orientation.rotate(axis);
+        const float displacement = w.qpos[q] - Model::joint_qpos0(j);
+        w.axes[Model::joint_dof(j)] = {direction, anchor};
+        if (Model::HAS_SLIDE && kind == SLIDE_JOINT) {
+          position = position + direction * displacement;
+          continue;
+        }
+        float sine, cosine;
+        sincos(0.5f * displacement, sine, cosine);
+        orientation = orientation * Quat{cosine, sine * axis.x, sine * axis.y, sine * axis.z};
+      }
+      position = anchor - orientation.rotate(offset);
+    }
+    return {orientation, position};
+  }
+
+  INLINE Pose pose_of(int link) const {
+    if (link < 0) return {{{1.0f, 0.0f, 0.0f}, {0.0f, 1.0f, 0.0f}, {0.0f, 0.0f, 1.0f}}, {0.0f, 0.0f, 0.0f}};
+    return w.pose[link];
+  }
+
+  INLINE Vec center_of_mass(int link, const Pose& pose) const {
+    return pose.position + pose.orientation * Model::link_center(link);
+  }
+
+  // Poses of the links, and the centres of mass of the trees.
+  INLINE void poses() {
+    SHARED_LOOP(b, Model::LINKS) w.local[b] = local_pose(b);
+    sync();
+    SHARED_LOOP(b, Model::LINKS) {
+      LocalPose pose = w.local[b];
+      ROLLED for (int a = Model::parent(b); a >= 0; a = next_ancestor(a)) {
+        const LocalPose parent = w.local[a];
+        pose.position = parent.position + parent.orientation.rotate(pose.position);
+        pose.orientation = parent.orientation * pose.orientation;
+      }
+      if (LANES == 1) w.local[b] = pose;
+      w.pose[b] = {Mat::from(pose.orientation), pose.position};
+    }
+    ROLLED for (int t = 0; t < Model::TREES; ++t) {
+      Vec moment = {0.0f, 0.0f, 0.0f};
+      SHARED_LOOP(b, Model::LINKS)
+        if (Model::tree(b) == t) moment = moment + center_of_mass(b, w.pose[b]) * Model::link_mass(b);
+      float total[3] = {moment.x, moment.y, moment.z};
+      sum(total, 3);
+      w.com[t] = (Vec{total[0], total[1], total[2]} + Model::fixed_moment(t)) * Model::inverse_mass(t);
+    }
+    sync();
+  }
+
+  // The motion of the tree for a unit velocity of each degree of freedom, and the velocity that each link adds.
+  INLINE void velocities() {
+    SHARED_LOOP(d, DOFS) {
+      const int link = Model::dof_link(d), kind = Model::dof_kind(d), k = Model::dof_component(d);
+      const Vec com = w.com[Model::tree(link)];
+      Motion axis = w.axes[d];  // direction and anchor in the parent's frame
+      if (kind == TRANSLATION) {
+        axis = {{0.0f, 0.0f, 0.0f}, {k == 0 ? 1.0f : 0.0f, k == 1 ? 1.0f : 0.0f, k == 2 ? 1.0f : 0.0f}};
+      } else if (kind == ROTATION) {
+        const Pose pose = w.pose[link];
+        const Vec anchor = Model::HAS_BALL ? pose.position + pose.orientation * Model::dof_anchor(d) : pose.position;
+        const Vec direction = pose.orientation.column(k);
+        axis = {direction, direction.cross(com - anchor)};
+      } else {
+        const Pose parent = pose_of(Model::parent(link));
+        const Vec direction = parent.orientation * axis.angular;
+        const Vec anchor = parent.position + parent.orientation * axis.linear;
+        axis = {direction, direction.cross(com - anchor)};
+        if (Model::HAS_SLIDE && kind == SLIDE) axis = {{0.0f, 0.0f, 0.0f}, direction};
+      }
+      w.axes[d] = axis;
+    }
+    sync();
+    SHARED_LOOP(b, Model::LINKS) {
+      const int parent = Model::parent(b), end = Model::first_dof(b + 1);
+      Motion velocity = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
+      if (LANES == 1 && parent >= 0) velocity = w.velocity[parent];
+      ROLLED for (int d = Model::first_dof(b); d < end; ++d) velocity = velocity + w.axes[d] * w.qvel[d];
+      w.velocity[b] = velocity;
+    }
+    sync();
+  }
+
+  // ---- Dynamics
+
+  // Bias forces (Coriolis, centrifugal, gravity) and inertias of the links, by recursive Newton-Euler; then both of
+  // each subtree, which is all that the mass matrix needs (composite rigid bodies).
+  INLINE void subtrees() {
+    SHARED_LOOP(b, Model::LINKS) {  // accelerations that the velocities cause
+      const int parent = Model::parent(b), end = Model::first_joint(b + 1);
+      Motion velocity = sum_to_root(w.velocity, parent), acceleration = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
+      if (LANES == 1 && parent >= 0) acceleration = w.acceleration[parent];
+      ROLLED for (int j = Model::first_joint(b); j < end; ++j) {
+        int d = Model::joint_dof(j);
+        const int kind = Model::joint_kind(j);
+        if (Model::HAS_FREE && kind == FREE) {  // its translations have axes that do not move
+          velocity.linear = velocity.linear + Vec{w.qvel[d], w.qvel[d + 1], w.qvel[d + 2]};
+          d += 3;
+        }
+        Motion relative = w.axes[d] * w.qvel[d];
+        if (Model::QUATERNIONS > 0 && kind <= BALL)
+          relative = relative + w.axes[d + 1] * w.qvel[d + 1] + w.axes[d + 2] * w.qvel[d + 2];
+        acceleration = acceleration + velocity.cross_motion(relative);
+        velocity = velocity + relative;
+      }
+      w.acceleration[b] = acceleration;
+    }
+    sync();
+    SHARED_LOOP(b, Model::LINKS) {
+      const Motion velocity = sum_to_root(w.velocity, b);
+      Motion acceleration = sum_to_root(w.acceleration, b);
+      acceleration.linear = acceleration.linear - Model::gravity();
+      const Pose pose = w.pose[b];
+      const float mass = Model::link_mass(b);
+      const Vec offset = center_of_mass(b, pose) - w.com[Model::tree(b)], first = offset * mass;
+      Symmetric s = Model::link_inertia(b).turned(pose.orientation);
+      s = {s.xx + first.y * offset.y + first.z * offset.z, s.xy - first.x * offset.y, s.xz - first.x * offset.z,
+           s.yy + first.x * offset.x + first.z * offset.z, s.yz - first.y * offset.z,
+           s.zz + first.x * offset.x + first.y * offset.y};
+      const Inertia inertia = {s, first, mass};
+      const Motion force = inertia * acceleration + velocity.cross_force(inertia * velocity);
+      w.bodies[b] = {inertia, force.angular, force.linear};
+    }
+    sync();
+    float* const bodies = reinterpret_cast<float*>(w.bodies);
+    if (LANES == 1) {
+      for (int b = Model::LINKS - 1; b > 0; --b)
+        if (Model::parent(b) >= 0)
+          for (int i = 0; i < 16; ++i) bodies[16 * Model::parent(b) + i] += bodies[16 * b + i];
+    } else if (lane < 16) {  // a lane for each of the 16 numbers of a body
+      float total[Model::LINKS];
+      UNROLLED for (int b = 0; b < Model::LINKS; ++b) total[b] = bodies[16 * b + lane];
+      Model::add_children(total);
+      UNROLLED for (int b = 0; b < Model::LINKS; ++b) bodies[16 * b + lane] = total[b];
+    }
+    sync();
+  }
+
+  // Passive and actuator forces of a degree of freedom.
+  INLINE float joint_force(int d) const {
+    const int q = Model::dof_qpos(d);
+    float force = -Model::damping(d) * w.qvel[d];
+    if (Model::HAS_QUATERNION_SPRINGS && Model::dof_kind(d) == ROTATION) {
+      const Quat rest = {Model::spring(q), Model::spring(q + 1), Model::spring(q + 2), Model::spring(q + 3)};
+      const Vec turn = (rest.conjugate() * qpos_quat(q)).rotation_vector();
+      force = force - Model::stiffness(d) * turn.component(Model::dof_component(d));
+    } else if (Model::HAS_SPRINGS) {
+      force = force - Model::stiffness(d) * (w.qpos[q] - Model::spring(q));
+    }
+    const int end = Model::first_actuator(d + 1);
+    ROLLED for (int a = Model::first_actuator(d); a < end; ++a) {
+      const float gear = Model::gear(a);
+      const float control = ctrl[world * Model::CONTROLS + Model::control(a)];
+      float f = Model::gain(a) * clamp(control, Model::control_low(a), Model::control_high(a));
+      if (Model::HAS_ACTUATOR_BIAS)
+        f = f + Model::bias(a) + gear * (Model::bias_position(a) * w.qpos[q] + Model::bias_velocity(a) * w.qvel[d]);
+      if (Model::HAS_FORCE_LIMITS) f = clamp(f, Model::force_low(a), Model::force_high(a));
+      force = force + gear * f;
+    }
+    return force;
+  }
+
+  // The mass matrix, and the residual: minus the smooth forces, until M qacc is added. Entries of degrees of freedom of
+  // which neither is an ancestor of the other stay zero.
+  INLINE void mass_matrix() {
+    OWN_DOFS(slot, d) {
+      if (d >= DOFS) continue;
+      const Body body = w.bodies[Model::dof_link(d)];
+      const Motion axis = w.axes[d], momentum = body.inertia * axis, bias = {body.torque, body.force};
+      w.residual[d] = axis.dot(bias) - joint_force(d);
+      ROLLED for (Model::Dofs left = Model::ancestors(d); left; left &= left - 1) {
+        const int j = lowest_bit(left);
+        const float m = w.axes[j].dot(momentum) + (j == d ? Model::armature(d) : 0.0f);
+        w.mass[STRIDE * d + j] = m;
+        w.mass[STRIDE * j + d] = m;
+      }
+    }
+    sync();
+  }
+
+  // ---- Contacts. Points are relative to the centre of mass of the first tree.
+
+  INLINE void place_geoms() {
+    SHARED_LOOP(g, Model::GEOMS) {
+      const Pose pose = pose_of(Model::geom_link(g));
+      w.geoms[g] = {pose.position - w.com[0] + pose.orientation * Model::geom_position(g),
+                    pose.orientation * Model::geom_half_axis(g), Model::geom_radius(g)};
+    }
+    sync();
+  }
+
+  // Stores a contact where `touches`. The first tangent follows the hint, unless that is nearly normal (or nothing);
+  // then a coordinate axis. All lanes call this together, so that contacts lie in the order of the lanes.
+  INLINE void add_contact(bool touches, const bool friction, int pair, Vec point, float distance, Vec normal,
+                          Vec hint) {
+    const int left = Model::JACOBIAN_ROWS - 3 * frictional;
+    const int places = friction ? Model::FRICTIONAL : left < Model::FRICTIONLESS ? left : Model::FRICTIONLESS;
+    int& count = friction ? frictional : frictionless;
+    const unsigned hits = ballot(touches);
+    const int place = count + bits(hits & lanes_below());
+    count += bits(hits);
+    if (count > places) {
+      count = places;
+      if (lane == 0) overflow[world] |= Model::NO_PLACE;
+    }
+    if (!touches || place >= places) return;
+    w.contacts[friction ? place : Model::FRICTIONAL + place] = {point, distance - Model::margin(pair), normal, pair};
+    if (!friction) return;
+    Vec tangent = hint - normal * normal.dot(hint);
+    float length = tangent.norm();
+    if (length < Model::least_aligned()) {
+      const bool steep = fabsf(normal.y) < 0.5f;
+      const Vec axis = {0.0f, steep ? 1.0f : 0.0f, steep ? 0.0f : 1.0f};
+      tangent = axis - normal * normal.dot(axis);
+      length = tangent.norm();
+    }
+    w.tangents[place] = tangent * divide(1.0f, length);
+  }
+
+  // Spheres and the ends of capsules against planes of the world.
+  INLINE void collide_with_planes(const int begin, const int end, const bool friction) {
+    ROLLED for (int base = begin; base < end; base += LANES) {
+      const bool valid = base + lane < end;
+      const int pair = valid ? base + lane : begin;
+      const Geom geom = w.geoms[Model::second_geom(pair)];
+      const Vec normal = Model::plane_normal(pair);
+      const float height = normal.dot(geom.center) + normal.dot(w.com[0]) - Model::plane_offset(pair) - geom.radius;
+      const float rise = normal.dot(geom.half_axis), inverse_half = Model::inverse_half_length(pair);
+      ROLLED for (int side = 0; side < 2; ++side) {
+        const float sign = side ? -1.0f : 1.0f, distance = height + sign * rise;
+        const bool exists = valid && (side == 0 || inverse_half > 0.0f);
+        add_contact(exists && distance < Model::margin(pair), friction, pair,
+                    geom.center + geom.half_axis * sign - normal * (geom.radius + 0.5f * distance), distance, normal,
+                    geom.half_axis * inverse_half);
+      }
+    }
+  }
+
+  struct Nearest {  // points of two segments, as fractions of their lengths from the start
+    float first, second;
+  };
+
+  // Spheres and capsules against each other: first by bounding spheres, then the nearest points of the two segments.
+  INLINE void collide_geoms(const int begin, const int end, const bool friction) {
+    int candidates = 0;
+    ROLLED for (int base = begin; base < end; base += LANES) {
+      const bool valid = base + lane < end;
+      const int pair = valid ? base + lane : begin;
+      const Vec between = w.geoms[Model::first_geom(pair)].center - w.geoms[Model::second_geom(pair)].center;
+      const bool near = valid && between.dot(between) < Model::reach_squared(pair);
+      const unsigned hits = ballot(near);
+      if (near) w.candidates[candidates + bits(hits & lanes_below())] = (unsigned short)pair;
+      candidates += bits(hits);
+    }
+    sync();
+    ROLLED for (int base = 0; base < candidates; base += LANES) {
+      const bool valid = base + lane < candidates;
+      const int pair = valid ? w.candidates[base + lane] : begin;
+      const Geom a = w.geoms[Model::first_geom(pair)], b = w.geoms[Model::second_geom(pair)];
+      const Vec start_a = a.center - a.half_axis, start_b = b.center - b.half_axis;
+      const Vec along_a = a.half_axis * 2.0f, along_b = b.half_axis * 2.0f, between = start_a - start_b;
+      const float aa = along_a.dot(along_a), bb = along_b.dot(along_b), ab = along_a.dot(along_b);
+      const float a_between = along_a.dot(between), b_between = along_b.dot(between);
+      const Vec normal_to_both = along_a.cross(along_b);
+      const float determinant = normal_to_both.dot(normal_to_both);
+      Nearest nearest[2] = {{0.0f, 0.0f}, {0.0f, 0.0f}};
+      int points = valid ? 1 : 0;
+      if (aa <= MINVAL || bb <= MINVAL) {  // a sphere
+        if (bb > MINVAL) nearest[0].second = clamp(divide(b_between, bb), 0.0f, 1.0f);
+        else if (aa > MINVAL) nearest[0].first = clamp(divide(-a_between, aa), 0.0f, 1.0f);
+      } else {
+        // The point of a that is nearest to the start and to the end of b.
+        const float to_start = clamp(divide(-a_between, aa), 0.0f, 1.0f);
+        const float to_end = clamp(divide(ab - a_between, aa), 0.0f, 1.0f);
+        const bool parallel = determinant <= 1e-8f * aa * bb;
+        const float crossing = divide(normal_to_both.dot(along_b.cross(between)), determinant);
+        float first = parallel ? 0.0f : clamp(crossing, 0.0f, 1.0f);
+        UNROLLED for (int i = 0; i < 2; ++i) {  // parallel segments may touch at both ends
+          const float second = divide(ab * first + b_between, bb);
+          nearest[i] = {second < 0.0f ? to_start : second > 1.0f ? to_end : first, clamp(second, 0.0f, 1.0f)};
+          first = 1.0f;
+        }
+        if (parallel) points *= 2;
+      }
+      ROLLED for (int i = 0; i < 2; ++i) {
+        const Nearest at = i ? nearest[1] : nearest[0];
+        const Vec point = start_a + along_a * at.first, gap = start_b + along_b * at.second - point;
+        const float length = gap.norm(), distance = length - (a.radius + b.radius);
+        const Vec normal = length > 0.0f ? gap * divide(1.0f, length) : Vec{1.0f, 0.0f, 0.0f};
+        add_contact(i < points && distance < Model::margin(pair), friction, pair,
+                    point + normal * (a.radius + 0.5f * distance), distance, normal, {0.0f, 0.0f, 0.0f});
+      }
+    }
+    sync();
+  }
+
+  // The limit of a ball joint is a row along three degrees of freedom; it lies among the contacts without friction.
+  INLINE void limit_balls() {
+    ROLLED for (int base = 0; base < Model::BALL_LIMITS; base += LANES) {
+      const bool valid = base + lane < Model::BALL_LIMITS;
+      const int i = valid ? base + lane : 0, pair = Model::PAIRS + i;
+      const Vec turn = qpos_quat(Model::ball_qpos(i)).rotation_vector();
+      const float angle = turn.norm(), distance = Model::ball_range(i) - angle;
+      add_contact(valid && distance < Model::margin(pair), false, pair, {0.0f, 0.0f, 0.0f}, distance,
+                  turn * divide(-1.0f, larger(angle, MINVAL)), {0.0f, 0.0f, 0.0f});
+    }
+  }
+
+  INLINE void find_contacts() {
+    frictional = frictionless = 0;
+    if (Model::GEOMS > 0) place_geoms();
+    collide_with_planes(0, Model::PLANE_FRICTIONAL_END, true);
+    collide_geoms(Model::PLANE_END, Model::GEOM_FRICTIONAL_END, true);
+    limit_balls();
+    collide_with_planes(Model::PLANE_FRICTIONAL_END, Model::PLANE_END, false);
+    collide_geoms(Model::GEOM_FRICTIONAL_END, Model::PAIRS, false);
+    sync();
+    if (Model::TOUCH) feel_contacts();
+    sync();
+  }
+
+  // ---- Constraint rows
+
+  // Contacts with friction come first, then those without, each from a place of its own.
+  INLINE int place_of(int i) const { return i < frictional ? i : Model::FRICTIONAL + i - frictional; }
+  INLINE const Contact& contact(int i) const { return w.contacts[place_of(i)]; }
+
+  INLINE void jacobians() {
+    Motion axes[SLOTS];
+    OWN_DOFS(slot, d) axes[slot] = w.axes[d < DOFS ? d : 0];
+    ROLLED for (int i = 0; i < frictional + frictionless; ++i) {
+      const Contact c = contact(i);
+      const bool friction = i < frictional, ball = c.pair >= Model::PAIRS;
+      const int pair = ball ? 0 : c.pair;
+      const Model::Dofs against = Model::first_dofs(pair), with = Model::second_dofs(pair);
+      Vec tangent = {0.0f, 0.0f, 0.0f}, other = tangent;
+      if (friction) {
+        tangent = w.tangents[i] * Model::friction(pair);
+        other = c.normal.cross(tangent);
+      }
+      float* const row = w.jacobian + STRIDE * (friction ? 3 * i : 2 * frictional + i);
+      OWN_DOFS(slot, d) {
+        if (d >= STRIDE) continue;
+        Vec point = c.point;
+        if (Model::TREES > 1) point = point + w.com[0] - w.com[Model::tree(Model::dof_link(d < DOFS ? d : 0))];
+        Vec velocity = axes[slot].linear + axes[slot].angular.cross(point);
+        velocity = velocity * (d < DOFS ? (float)((int)(with >> d & 1) - (int)(against >> d & 1)) : 0.0f);
+        if (Model::BALL_LIMITS && ball) {
+          const int k = d - Model::ball_dof(c.pair - Model::PAIRS);
+          row[d] = k >= 0 && k < 3 ? c.normal.component(k) : 0.0f;
+          continue;
+        }
+        row[d] = velocity.dot(c.normal);
+        if (friction) {
+          row[STRIDE + d] = velocity.dot(tangent);
+          row[2 * STRIDE + d] = velocity.dot(other);
+        }
+      }
+    }
+  }
+
+  // A row from the inverse inertia along it and how far it is violated. Velocity and acceleration follow in solve().
+  INLINE void set_row(int r, Softness softness, float inverse_inertia, float position) {
+    const float impedance = softness.impedance(position);
+    w.weight[r] = divide(1.0f, larger(divide(inverse_inertia * (1.0f - impedance), impedance), MINVAL));
+    w.x[r] = softness.stiffness * impedance * position;
+  }
+
+  INLINE int contact_of_row(int r) const { return r < first_frictionless() ? r / 4 : r - 3 * frictional; }
+
+  INLINE void set_rows() {
+    SHARED_LOOP(r, first_limit()) {
+      const Contact& c = contact(contact_of_row(r));
+      set_row(r, Model::contact_softness(c.pair), Model::inverse_inertia(c.pair), c.distance);
+    }
+    limits = 0;
+    OWN_DOFS(slot, d) {
+      limit_row[slot] = -1;
+      if (Model::LIMITS == 0) continue;
+      const int e = d < DOFS ? d : 0;
+      const float q = w.qpos[Model::dof_qpos(e)], below = q - Model::limit_low(e), above = Model::limit_high(e) - q;
+      const float position = smaller(below, above) - Model::limit_margin(e);
+      const bool violated = d < DOFS && position < 0.0f;
+      const unsigned hits = ballot(violated);
+      if (violated) {
+        const int i = limits + bits(hits & lanes_below());
+        limit_row[slot] = first_limit() + i;
+        w.limits[i] = (unsigned char)(below < above ? d : d + 128);
+        set_row(limit_row[slot], Model::limit_softness(d), Model::limit_inverse_inertia(d), position);
+      }
+      limits += bits(hits);
+    }
+    SHARED_LOOP(i, Model::FRICTION_LOSSES) {
+      w.weight[first_friction() + i] = Model::friction_weight(i);
+      w.x[first_friction() + i] = 0.0f;
+    }
+    sync();
+  }
+
+  INLINE float row_damping(int r) const {
+    if (r < first_limit()) return Model::contact_softness(contact(contact_of_row(r)).pair).damping;
+    if (r < first_friction()) return Model::limit_softness(w.limits[r - first_limit()] & 127).damping;
+    return Model::friction_damping(Model::FRICTION_LOSSES ? r - first_friction() : 0);
+  }
+
+  // Row r of J times the search direction.
+  INLINE float row_velocity(int r) const {
+    if (r < first_frictionless()) {  // edges of a pyramid: the normal, plus or minus a tangent
+      const float* const p = w.projected + 3 * (r / 4);
+      const float tangent = p[r & 2 ? 2 : 1];
+      return r & 1 ? p[0] - tangent : p[0] + tangent;
+    }
+    if (r < first_limit()) return w.projected[r - frictional];
+    if (r < first_friction()) {
+      const int limit = w.limits[r - first_limit()];
+      return limit < 128 ? w.search[limit] : -w.search[limit - 128];
+    }
+    return w.search[Model::friction_dof(Model::FRICTION_LOSSES ? r - first_friction() : 0)];
+  }
+
+  // Which piece of its cost a row is on. Dry friction costs D x^2 / 2 near zero and grows linearly beyond: -1, 0, 1 are
+  // the linear piece below, the parabola, and the linear piece above. Other rows: 0 where active, 1 where not.
+  INLINE int piece(int r, float x) const {
+    if (Model::FRICTION_LOSSES && r >= first_friction()) {
+      const float bound = Model::friction_bound(r - first_friction());
+      return x <= -bound ? -1 : x >= bound ? 1 : 0;
+    }
+    return x < 0.0f ? 0 : 1;
+  }
+
+  // ---- Newton's method: the minimum over qacc of  (qacc - smooth)' M (qacc - smooth) / 2  +  the cost of the rows.
+
+  struct Slots {  // of the Hessian (or of M + h D) and of its factor: the rows that this lane owns
+    float row[SLOTS][STRIDE];  // left of the diagonal
+    float diagonal[SLOTS], gradient[SLOTS];
+  };
+
+  static INLINE Quad read4(const float* p) { return *reinterpret_cast<const Quad*>(p); }
+  static INLINE void write4(float* p, Quad q) { *reinterpret_cast<Quad*>(p) = q; }
+
+  INLINE void start_from_mass(Slots& h) const {
+    OWN_DOFS(slot, d) {
+      const int e = d < DOFS ? d : DOFS - 1;
+      UNROLLED for (int i = 0; i < QUADS; ++i) {
+        if (4 * i >= LANES * (slot + 1)) break;
+        const Quad m = read4(w.mass + STRIDE * e + 4 * i);
+        UNROLLED for (int k = 0; k < 4; ++k) h.row[slot][4 * i + k] = m.v[k];
+      }
+      h.diagonal[slot] = w.mass[STRIDE * e + e];
+      h.gradient[slot] = d < DOFS ? w.residual[d] : 0.0f;
+    }
+  }
+
+  // M + J' D J over the active rows, and the gradient.
+  INLINE void add_constraints(Slots& h) const {
+    OWN_DOFS(slot, d) {
+      if (limit_row[slot] >= 0) {
+        const int r = limit_row[slot];
+        const float x = w.x[r], weight = w.weight[r];
+        if (x < 0.0f) {
+          h.diagonal[slot] += weight;
+          h.gradient[slot] += (w.limits[r - first_limit()] < 128 ? weight : -weight) * x;
+        }
+      }
+      const int loss = Model::friction_row(d < DOFS ? d : 0);
+      if (Model::FRICTION_LOSSES && d < DOFS && loss >= 0) {
+        const int r = first_friction() + loss, on = piece(r, w.x[r]);
+        if (on == 0) h.diagonal[slot] += w.weight[r];
+        h.gradient[slot] += w.weight[r] * (on == 0 ? w.x[r] : on * Model::friction_bound(loss));
+      }
+    }
+    ROLLED for (int k = 0; k < frictional; ++k) {
+      // The four edges n + t, n - t, n + u, n - u in the basis of the Jacobian rows n, t, u.
+      const Quad x = read4(w.x + 4 * k);
+      const float weight = w.weight[4 * k];
+      float d[4];
+      UNROLLED for (int i = 0; i < 4; ++i) d[i] = x.v[i] < 0.0f ? weight : 0.0f;
+      const float tt = d[0] + d[1], uu = d[2] + d[3], nn = tt + uu, nt = d[0] - d[1], nu = d[2] - d[3];
+      const float ft = d[0] * x.v[0] - d[1] * x.v[1], fu = d[2] * x.v[2] - d[3] * x.v[3];
+      const float fn = d[0] * x.v[0] + d[1] * x.v[1] + d[2] * x.v[2] + d[3] * x.v[3];
+      if (nn == 0.0f) continue;
+      const float *n = w.jacobian + 3 * STRIDE * k, *t = n + STRIDE, *u = t + STRIDE;
+      OWN_DOFS(slot, dof) {
+        const int e = dof < STRIDE ? dof : STRIDE - 1;
+        const float n0 = n[e], t0 = t[e], u0 = u[e];
+        const float cn = nn * n0 + nt * t0 + nu * u0, ct = nt * n0 + tt * t0, cu = nu * n0 + uu * u0;
+        h.gradient[slot] = h.gradient[slot] + fn * n0 + ft * t0 + fu * u0;
+        h.diagonal[slot] = h.diagonal[slot] + cn * n0 + ct * t0 + cu * u0;
+        if (LANES == 1 && cn == 0.0f && ct == 0.0f && cu == 0.0f) continue;
+        UNROLLED for (int i = 0; i < QUADS; ++i) {
+          if (4 * i >= LANES * (slot + 1)) break;
+          const Quad a = read4(n + 4 * i), b = read4(t + 4 * i), c = read4(u + 4 * i);
+          UNROLLED for (int j = 0; j < 4; ++j)
+            h.row[slot][4 * i + j] = h.row[slot][4 * i + j] + cn * a.v[j] + ct * b.v[j] + cu * c.v[j];
+        }
+      }
+    }
+    ROLLED for (int k = 0; k < frictionless; ++k) {
+      const float x = w.x[4 * frictional + k], weight = w.weight[4 * frictional + k];
+      if (!(x < 0.0f)) continue;
+      const float* n = w.jacobian + STRIDE * (3 * frictional + k);
+      OWN_DOFS(slot, dof) {
+        const float n0 = n[dof < STRIDE ? dof : STRIDE - 1], c = weight * n0;
+        h.gradient[slot] += c * x;
+        h.diagonal[slot] += c * n0;
+        if (LANES == 1 && c == 0.0f) continue;
+        UNROLLED for (int i = 0; i < QUADS; ++i) {
+          if (4 * i >= LANES * (slot + 1)) break;
+          const Quad a = read4(n + 4 * i);
+          UNROLLED for (int j = 0; j < 4; ++j) h.row[slot][4 * i + j] += c * a.v[j];
+        }
+      }
+    }
+  }
+
+  // Eliminates rows `first` down to `last` + 1 of H = L' D L, two at a time: their owners hand them to all lanes, which
+  // subtract them from their own rows. The right-hand side, here the gradient, is carried along like a column.
+  INLINE void eliminate(Slots& h, const int first, const int last) {
+    const int quads = first / 4 + 1;
+    ROLLED for (int k = first; k > last; k -= 2) {
+      float *const upper = w.pivots[k >> 1 & 1][0], *const lower = w.pivots[k >> 1 & 1][1];  // rows k and k - 1
+      OWN_DOFS(slot, d) {
+        if (slot > first / LANES || (d != k && d != k - 1)) continue;
+        float* const row = d == k ? upper : lower;
+        UNROLLED for (int i = 0; i < quads; ++i) {
+          const float* const own = h.row[slot] + 4 * i;
+          write4(row + 4 * i, {own[0], own[1], own[2], own[3]});
+        }
+        row[STRIDE] = h.diagonal[slot];
+        row[STRIDE + 1] = h.gradient[slot];
+      }
+      sync();
+      const float inverse1 = divide(1.0f, upper[STRIDE]), gradient1 = upper[STRIDE + 1];
+      const float coupling = upper[k - 1] * inverse1;
+      const float inverse2 = divide(1.0f, lower[STRIDE] - upper[k - 1] * coupling), gradient2 = lower[STRIDE + 1];
+      if (lane == 0) w.couplings[k / 2] = coupling;
+      float c1[SLOTS], c2[SLOTS];
+      OWN_DOFS(slot, d) {
+        if (slot > first / LANES) break;
+        const float x1 = d < k ? upper[d] : 0.0f, x2 = d < k - 1 ? lower[d] - coupling * x1 : 0.0f;
+        c1[slot] = x1 * inverse1;
+        c2[slot] = x2 * inverse2;
+        h.diagonal[slot] = h.diagonal[slot] - c2[slot] * x2 - c1[slot] * x1;
+        c1[slot] = c1[slot] - c2[slot] * coupling;
+        h.gradient[slot] = h.gradient[slot] - c2[slot] * gradient2 - c1[slot] * gradient1;
+      }
+      UNROLLED for (int i = 0; i < quads; ++i) {
+        const Quad a = read4(upper + 4 * i), b = read4(lower + 4 * i);
+        UNROLLED for (int slot = 0; slot <= first / LANES; ++slot) {
+          if (4 * i >= LANES * (slot + 1)) continue;
+          UNROLLED for (int j = 0; j < 4; ++j)
+            h.row[slot][4 * i + j] = h.row[slot][4 * i + j] - c2[slot] * b.v[j] - c1[slot] * a.v[j];
+        }
+      }
+    }
+  }
+
+  // Solves H x = gradient and sets the search direction to -x.
+  INLINE void factor_and_solve(Slots& h) {
+    if (LANES == 1) {
+      factor_and_solve_alone(h);
+      return;
+    }
+//ELIMINATE
+    sync();
+    // Substitution from the first row to the last, in the same pairs. All subtract; those who are done take no harm.
+    float inverse[SLOTS], solution[SLOTS];
+    OWN_DOFS(slot, d) {
+      inverse[slot] = divide(1.0f, h.diagonal[slot]);
+      solution[slot] = 0.0f;
+    }
+    if (DOFS % 2) {
+      const float x = read(h.gradient[0] * inverse[0], 0);
+      if (lane == 0) solution[0] = x;
+      OWN_DOFS(slot, d) h.gradient[slot] -= h.row[slot][0] * x;
+    }
+    UNROLLED for (int j = DOFS % 2; j + 1 < DOFS; j += 2) {
+      const int a = j / LANES, b = (j + 1) / LANES;
+      const float x1 = read(h.gradient[a] * inverse[a], j % LANES);
+      const float x2 = read(h.gradient[b] * inverse[b], (j + 1) % LANES) - w.couplings[(j + 1) / 2] * x1;
+      if (lane == j % LANES) solution[a] = x1;
+      if (lane == (j + 1) % LANES) solution[b] = x2;
+      UNROLLED for (int slot = a; slot < SLOTS; ++slot)
+        h.gradient[slot] = h.gradient[slot] - h.row[slot][j + 1] * x2 - h.row[slot][j] * x1;
+    }
+    OWN_DOFS(slot, d) if (d < DOFS) w.search[d] = -solution[slot];
+  }
+
+  // The same with a single lane, which can skip what is zero: branches of the tree that do not meet.
+  INLINE void factor_and_solve_alone(Slots& h) {
+    for (int k = DOFS - 1; k > 0; --k) {
+      const float inverse = divide(1.0f, h.diagonal[k]);
+      for (int i = 0; i < k; ++i) {
+        if (h.row[k][i] == 0.0f) continue;
+        const float c = h.row[k][i] * inverse;
+        for (int j = 0; j < i; j += 4)  // by fours, for vector instructions; right of the diagonal nothing is used
+          for (int l = j; l < j + 4; ++l) h.row[i][l] -= c * h.row[k][l];
+        h.diagonal[i] -= c * h.row[k][i];
+        h.gradient[i] -= c * h.gradient[k];
+      }
+    }
+    for (int i = 0; i < DOFS; ++i) {
+      float x = h.gradient[i];
+      for (int j = 0; j < i; ++j) x += h.row[i][j] * w.search[j];
+      w.search[i] = divide(-x, h.diagonal[i]);
+    }
+  }
+
+  // A row of a matrix times the search direction, in four sums that do not wait for each other.
+  INLINE float times_search(const float* matrix_row) const {
+    float sums[4] = {0.0f, 0.0f, 0.0f, 0.0f};
+    UNROLLED for (int i = 0; i < QUADS; ++i) {
+      const Quad a = read4(matrix_row + 4 * i), s = read4(w.search + 4 * i);
+      UNROLLED for (int k = 0; k < 4; ++k) sums[k] = sums[k] + a.v[k] * s.v[k];
+    }
+    return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+  }
+
+  // M and J times the search direction.
+  INLINE void project_search() {
+    OWN_DOFS(slot, d) if (d < DOFS) w.mass_search[d] = times_search(w.mass + STRIDE * d);
+    SHARED_LOOP(r, jacobian_rows()) w.projected[r] = times_search(w.jacobian + STRIDE * r);
+    sync();
+  }
+
+  // ---- Line search, as in mujoco_warp: the cost along the search direction is convex, piecewise quadratic
+
+  struct Point {
+    float alpha, cost, slope, curvature;  // the cost relative to alpha = 0
+    INLINE float newton() const { return curvature == 0.0f ? alpha : alpha - Math::divide(slope, curvature); }
+    // Whether this improves on alpha = 0 and is nearly a minimum.
+    INLINE bool flat(float tolerance) const { return fabsf(slope) < tolerance && cost < 0.0f; }
+    // Whether p lies between this and the minimum: its slope has the same sign, and is smaller.
+    INLINE bool outside(const Point& p) const {
+      return (slope < p.slope && p.slope < 0.0f) || (slope > p.slope && p.slope > 0.0f);
+    }
+    INLINE bool move(const Point& p, bool wanted) {
+      if (wanted) *this = p;
+      return wanted;
+    }
+  };
+
+  struct Row {
+    float x, v, weight, linear, square, constant, cost;  // cost at alpha = 0; its parabola
+  };
+
+  INLINE Row row_at(int r) const {
+    const float x = w.x[r], v = w.change[r], weight = w.weight[r], constant = 0.5f * weight * x * x;
+    return {x, v, weight, weight * v * x, weight * v * v, constant, x < 0.0f ? constant : 0.0f};
+  }
+
+  // Adds cost, slope and curvature of a row at alpha to three sums.
+  INLINE void add_row(int r, const Row& row, float alpha, float* sums) const {
+    if (Model::FRICTION_LOSSES && r >= first_friction()) {
+      add_friction(row, alpha, Model::friction_bound(r - first_friction()), sums);
+      return;
+    }
+    const bool active = row.x + alpha * row.v < 0.0f;
+    sums[0] += (active ? row.constant + alpha * (row.linear + 0.5f * alpha * row.square) : 0.0f) - row.cost;
+    sums[1] += active ? row.linear + alpha * row.square : 0.0f;
+    sums[2] += active ? row.square : 0.0f;
+  }
+
+  static INLINE float friction_cost(float weight, float x, float bound) {
+    return fabsf(x) < bound ? 0.5f * weight * x * x : weight * bound * (fabsf(x) - 0.5f * bound);
+  }
+
+  static INLINE void add_friction(const Row& row, float alpha, float bound, float* sums) {
+    const float x = row.x + alpha * row.v;
+    sums[0] += friction_cost(row.weight, x, bound) - friction_cost(row.weight, row.x, bound);
+    sums[1] += row.weight * row.v * clamp(x, -bound, bound);
+    sums[2] += fabsf(x) < bound ? row.square : 0.0f;
+  }
+
+  struct Search {
+    float alpha, improvement;
+    INLINE void take(const Point& p, bool acceptable) {
+      if (!acceptable || -p.cost <= improvement) return;
+      alpha = p.alpha;
+      improvement = -p.cost;
+    }
+  };
+
+  static INLINE Point point_at(float alpha, float slope, float curvature, const float* sums) {
+    const float cost = alpha * slope + 0.5f * alpha * alpha * curvature + sums[0];
+    return {alpha, cost, slope + alpha * curvature + sums[1], curvature + sums[2]};
+  }
+
+  INLINE Search line_search() {
+    // The smooth part: slope and curvature of the quadratic form; then the rows at alpha = 0.
+    float t[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+    OWN_DOFS(slot, d) {
+      if (d >= DOFS) continue;
+      const float s = w.search[d];
+      t[0] += s * w.residual[d];
+      t[1] += s * w.mass_search[d];
+      t[2] += s * s;
+    }
+    SHARED_LOOP(r, rows()) {
+      const Row row = row_at(r);
+      if (Model::FRICTION_LOSSES && r >= first_friction()) {
+        const float bound = Model::friction_bound(r - first_friction());
+        t[3] += friction_cost(row.weight, row.x, bound);
+        add_friction(row, 0.0f, bound, t + 3);
+      } else if (row.x < 0.0f) {
+        t[3] += row.constant;
+        t[4] += row.linear;
+        t[5] += row.square;
+      }
+    }
+    sum(t, 6);
+    const float slope = t[0], curvature = t[1];
+    const Point start = {0.0f, 0.0f, slope + t[4], curvature + t[5]};
+    // Slopes below `noise` are rounding: the sums behind them are that large.
+    const float tolerance = larger(Model::ls_tolerance() * divide(root(t[2]), Model::scale()), 1e-6f);
+    const float noise = 8.0f * 1.1920929e-7f * (root(2.0f * larger(t[3], 0.0f) * larger(t[5], 0.0f)) + fabsf(slope));
+    const float accept = larger(tolerance, noise);
+    Search result = {0.0f, 0.0f};
+    if (fabsf(start.slope) < noise) return result;
+
+    float sums[9] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+    const float newton = start.newton();
+    SHARED_LOOP(r, rows()) add_row(r, row_at(r), newton, sums);
+    sum(sums, 3);
+    const Point first = point_at(newton, slope, curvature, sums);
+    result.take(first, first.flat(accept));
+    const bool less = first.slope < start.slope;
+    Point low = less ? first : start, high = less ? start : first;
+    bool found = result.improvement > 0.0f;
+    ROLLED for (int i = 0; i < Model::LS_ITERATIONS && !found; ++i) {
+      const float a = low.newton(), b = high.newton(), c = 0.5f * (low.alpha + high.alpha);
+      UNROLLED for (int k = 0; k < 9; ++k) sums[k] = 0.0f;
+      SHARED_LOOP(r, rows()) {
+        const Row row = row_at(r);
+        add_row(r, row, a, sums);
+        add_row(r, row, b, sums + 3);
+        add_row(r, row, c, sums + 6);
+      }
+      sum(sums, 9);
+      const Point next_low = point_at(a, slope, curvature, sums), next_high = point_at(b, slope, curvature, sums + 3);
+      const Point middle = point_at(c, slope, curvature, sums + 6);
+      const bool flat_low = next_low.flat(accept), flat_high = next_high.flat(accept);
+      const bool flat_middle = middle.flat(accept);
+      found = flat_low || flat_high || flat_middle;
+      if (found) {
+        result = {0.0f, 0.0f};
+        result.take(next_low, flat_low);
+        result.take(next_high, flat_high);
+        result.take(middle, flat_middle);
+      } else {
+        bool moved = low.move(next_low, low.outside(next_low));
+        moved |= low.move(middle, low.outside(middle));
+        moved |= low.move(next_high, low.outside(next_high));
+        moved |= high.move(next_high, high.outside(next_high) || (high.slope < 0.0f && next_high.slope > 0.0f));
+        moved |= high.move(middle, high.outside(middle));
+        moved |= high.move(next_low, high.outside(next_low));
+        if (low.cost < 0.0f || high.cost < 0.0f) {
+          const bool lower = low.cost < high.cost;
+          result = {lower ? low.alpha : high.alpha, -smaller(low.cost, high.cost)};
+        }
+        found = !moved || (low.flat(tolerance) && low.slope < 0.0f) || (high.flat(tolerance) && high.slope > 0.0f);
+      }
+    }
+    return result;
+  }
+
+  INLINE bool small(Search step) const {
+    return step.improvement > 0.0f && step.improvement * Model::scale() < Model::tolerance();
+  }
+
+  // Leaves the acceleration in qacc; with implicit damping, search is what has to be added to it before integration.
+  INLINE void solve() {
+    enum { VELOCITY = -2, ACCELERATION = -1 };  // two passes first, which bring both into the rows
+    float remaining = 1.0f, gradient_squared = 0.0f, decrement = 0.0f;  // of the current direction
+    Search step = {0.0f, 0.0f};
+    bool changed = true, stop = false;  // whether the set of active rows changed; whether qacc is final
+    ROLLED for (int iteration = VELOCITY;; ++iteration) {
+      if (!stop && iteration == Model::ITERATIONS) {
+        stop = true;
+        if (lane == 0 && !small(step)) overflow[world] |= Model::LIMIT_REACHED;
+      }
+      if (stop && !Model::IMPLICIT_DAMPING) break;
+      if (iteration < 0) {
+        SHARED_LOOP(d, DOFS) w.search[d] = iteration == VELOCITY ? w.qvel[d] : w.qacc[d];
+      } else if (changed || stop) {
+        Slots h;
+        start_from_mass(h);
+        if (Model::IMPLICIT_DAMPING && stop) {  // (M + h D) a = M qacc, solved for the difference of a and qacc
+          OWN_DOFS(slot, d) {
+            const float damping = d < DOFS ? Model::timestep() * Model::damping(d) : 0.0f;
+            h.diagonal[slot] += damping;
+            h.gradient[slot] = d < DOFS ? damping * w.qacc[d] : 0.0f;
+          }
+        } else {
+          add_constraints(h);
+        }
+        float gradient[SLOTS], t[2] = {0.0f, 0.0f};
+        OWN_DOFS(slot, d) gradient[slot] = d < DOFS ? h.gradient[slot] : 0.0f;
+        factor_and_solve(h);
+        if (stop) break;
+        OWN_DOFS(slot, d) {
+          t[0] += gradient[slot] * gradient[slot];
+          if (d < DOFS) t[1] -= gradient[slot] * w.search[d];
+        }
+        sum(t, 2);
+        gradient_squared = t[0];
+        decrement = t[1];
+        remaining = 1.0f;
+      }
+      if (iteration > 0) {
+        const bool small_slope = Model::scale() * root(gradient_squared) < Model::tolerance();
+        if (small(step) || small_slope || Model::scale() * 0.5f * decrement < Model::tolerance()) {
+          stop = true;
+          continue;
+        }
+      }
+      if (changed) {
+        sync();
+        project_search();
+        SHARED_LOOP(r, rows()) {
+          const float v = row_velocity(r);
+          if (iteration == VELOCITY) w.x[r] += row_damping(r) * v;
+          else if (iteration == ACCELERATION) w.x[r] += v;
+          else w.change[r] = v;
+        }
+        if (iteration == ACCELERATION) SHARED_LOOP(d, DOFS) w.residual[d] += w.mass_search[d];
+        sync();
+        if (iteration < 0) continue;
+      }
+      step = line_search();
+      if (step.alpha == 0.0f) {
+        stop = true;
+        continue;
+      }
+      OWN_DOFS(slot, d) {
+        if (d >= DOFS) continue;
+        w.qacc[d] += step.alpha * w.search[d];
+        w.residual[d] += step.alpha * w.mass_search[d];
+      }
+      bool crossed = false;
+      SHARED_LOOP(r, rows()) {
+        const float x = w.x[r], next = x + step.alpha * w.change[r];
+        crossed = crossed || piece(r, x) != piece(r, next);
+        w.x[r] = next;
+      }
+      sync();
+      const bool repeated = !changed;
+      changed = ballot(crossed) != 0;
+      stop = repeated && !changed;  // a second search of one parabola: rounding is left
+      if (!changed) {  // the same parabola: gradient and decrement shrink with what remains of the Newton step
+        const float ratio = remaining == 0.0f ? 0.0f : divide(remaining - step.alpha, remaining);
+        remaining -= step.alpha;
+        gradient_squared *= ratio * ratio;
+        decrement *= ratio * ratio;
+      }
+    }
+    sync();
+  }
+
+  // ---- Integration: semi-implicit Euler
+
+  INLINE void integrate() {
+    const float h = Model::timestep();
+    OWN_DOFS(slot, d) {
+      if (d >= DOFS) continue;
+      const float v = w.qvel[d] + h * (Model::IMPLICIT_DAMPING ? w.qacc[d] + w.search[d] : w.qacc[d]);
+      w.qvel[d] = v;
+      if (Model::dof_kind(d) != ROTATION) w.qpos[Model::dof_qpos(d)] += h * v;
+    }
+    sync();
+    SHARED_LOOP(i, Model::QUATERNIONS) {
+      const int q = Model::quaternion_qpos(i), d = Model::quaternion_dof(i);
+      const Vec rate = {w.qvel[d], w.qvel[d + 1], w.qvel[d + 2]};
+      const float speed = rate.norm();
+      float sine, cosine;
+      sincos(0.5f * h * speed, sine, cosine);
+      const Vec u = rate * (speed > 0.0f ? divide(sine, speed) : 0.0f);
+      const Quat now = {w.qpos[q], w.qpos[q + 1], w.qpos[q + 2], w.qpos[q + 3]};
+      const Quat next = (now * Quat{cosine, u.x, u.y, u.z}).normalized();
+      w.qpos[q] = next.w;
+      w.qpos[q + 1] = next.x;
+      w.qpos[q + 2] = next.y;
+      w.qpos[q + 3] = next.z;
+    }
+    sync();
+  }
+
+  // ---- Touch sensors
+
+  struct Interval {  // of a ray's parameter
+    float from, to;
+    INLINE Interval both(Interval b) const { return {Math::larger(from, b.from), Math::smaller(to, b.to)}; }
+    INLINE bool ahead() const { return from <= to && to >= 0.0f; }
+    // Where a t^2 + 2 b t + c <= 0.
+    static INLINE Interval quadratic(float a, float b, float c) {
+      const float discriminant = b * b - a * c;
+      if (a < MINVAL) return {c <= 0.0f ? -1e30f : 1e30f, c <= 0.0f ? 1e30f : -1e30f};
+      if (discriminant < 0.0f) return {1e30f, -1e30f};
+      const float r = Math::root(discriminant);
+      return {Math::divide(-b - r, a), Math::divide(-b + r, a)};
+    }
+    static INLINE Interval sphere(Vec p, Vec v, float radius) {
+      return quadratic(v.dot(v), p.dot(v), p.dot(p) - radius * radius);
+    }
+    static INLINE Interval cylinder(Vec p, Vec v, float radius) {
+      return sphere({p.x, p.y, 0.0f}, {v.x, v.y, 0.0f}, radius);
+    }
+    static INLINE Interval slab(float p, float v, float half) { return quadratic(v * v, p * v, p * p - half * half); }
+  };
+
+  // Whether a ray from p along v, in the frame of a site, meets the site.
+  static INLINE bool meets_site(int s, Vec p, Vec v) {
+    const Vec size = Model::site_size(s);
+    const int shape = Model::site_shape(s);
+    const Interval along_z = Interval::slab(p.z, v.z, shape == BOX ? size.z : size.y);
+    if (shape == BOX)
+      return along_z.both(Interval::slab(p.x, v.x, size.x)).both(Interval::slab(p.y, v.y, size.y)).ahead();
+    if (shape == CYLINDER) return along_z.both(Interval::cylinder(p, v, size.x)).ahead();
+    if (shape == CAPSULE) {
+      const Vec end = {0.0f, 0.0f, size.y};
+      return along_z.both(Interval::cylinder(p, v, size.x)).ahead() || Interval::sphere(p - end, v, size.x).ahead() ||
+             Interval::sphere(p + end, v, size.x).ahead();
+    }
+    // An ellipsoid, squeezed to a unit sphere.
+    const Vec inverse = {divide(1.0f, size.x), divide(1.0f, size.y), divide(1.0f, size.z)};
+    const Vec q = {p.x * inverse.x, p.y * inverse.y, p.z * inverse.z};
+    return Interval::sphere(q, {v.x * inverse.x, v.y * inverse.y, v.z * inverse.z}, 1.0f).ahead();
+  }
+
+  // A touch sensor feels a contact of its body if the ray from the point along the normal, into the body, meets its
+  // site.
+  INLINE void feel_contacts() {
+    SHARED_LOOP(i, frictional + frictionless) {
+      const Contact c = contact(i);
+      unsigned felt = 0;
+      ROLLED for (int s = 0; s < Model::TOUCH && c.pair < Model::PAIRS; ++s) {
+        const int body = Model::site_body(s);
+        const bool first = body == Model::first_body(c.pair), second = body == Model::second_body(c.pair);
+        const Pose pose = pose_of(Model::site_link(s));
+        const Mat site = Model::site_orientation(s);
+        const Vec p = c.point + w.com[0] - pose.position;
+        const Vec offset = pose.orientation.transposed_times(p) - Model::site_position(s);
+        const Vec ray = pose.orientation.transposed_times(c.normal) * (second ? -1.0f : 1.0f);
+        const bool meets = meets_site(s, site.transposed_times(offset), site.transposed_times(ray));
+        if ((first || second) && meets) felt |= 1u << s;
+      }
+      w.zones[place_of(i)] = felt;
+    }
+  }
+
+  // The sum of the normal forces of the contacts that each sensor feels.
+  INLINE void write_touch(float* sensordata) const {
+    ROLLED for (int s = 0; s < Model::TOUCH; ++s) {
+      float force = 0.0f;
+      SHARED_LOOP(r, first_limit()) {
+        const bool felt = w.zones[place_of(contact_of_row(r))] >> s & 1;
+        if (felt) force -= w.weight[r] * smaller(w.x[r], 0.0f);
+      }
+      sum(&force, 1);
+      if (lane == 0) sensordata[Model::touch_address(s)] = force;
+    }
+  }
+
+  // ---- The whole
+
+  INLINE void kinematics() {
+    poses();
+    velocities();
+  }
+
+  INLINE void dynamics() {
+    subtrees();
+    mass_matrix();
+    find_contacts();
+    jacobians();
+    set_rows();
+  }
+
+  // Poses of all bodies, and their velocities unless nobody asked for them.
+  INLINE void write_bodies(float* xpos, float* xmat, float* cvel) const {
+    SHARED_LOOP(b, Model::BODIES) {
+      const int link = Model::body_link(b);
+      const Pose pose = pose_of(link);
+      const Vec position = pose.position + pose.orientation * Model::body_position(b);
+      const Mat orientation = Model::body_orientation(b);
+      const Motion velocity = sum_to_root(w.velocity, link);
+      xpos[3 * b] = position.x;
+      xpos[3 * b + 1] = position.y;
+      xpos[3 * b + 2] = position.z;
+      UNROLLED for (int i = 0; i < 3; ++i) {
+        const Vec column = pose.orientation * orientation.column(i);
+        xmat[9 * b + i] = column.x;
+        xmat[9 * b + 3 + i] = column.y;
+        xmat[9 * b + 6 + i] = column.z;
+        if (!cvel) continue;
+        cvel[6 * b + i] = velocity.angular.component(i);
+        cvel[6 * b + 3 + i] = velocity.linear.component(i);
+      }
+    }
+  }
+
+  // Momentum of a subtree over its mass.
+  INLINE void write_subtree_velocities(float* sensordata) const {
+    ROLLED for (int s = 0; s < Model::SUBTREES; ++s) {
+      float total[3] = {0.0f, 0.0f, 0.0f};
+      const int end = Model::first_part(s + 1);
+      ROLLED for (int i = Model::first_part(s) + lane; i < end; i += LANES) {
+        const int link = Model::part_link(i);
+        const Pose pose = w.pose[link];
+        const Vec offset = pose.position + pose.orientation * Model::part_center(i) - w.com[Model::tree(link)];
+        const Motion velocity = sum_to_root(w.velocity, link);
+        const Vec v = velocity.linear + velocity.angular.cross(offset);
+        UNROLLED for (int k = 0; k < 3; ++k) total[k] += Model::part_share(i) * v.component(k);
+      }
+      sum(total, 3);
+      SHARED_LOOP(k, 3) sensordata[Model::subtree_address(s) + k] = k == 0 ? total[0] : k == 1 ? total[1] : total[2];
+    }
+  }
+};
+
+// ---- The control step ----------------------------------------------------------------------------------------------
+
+#ifdef __CUDA_ARCH__
+static_assert(sizeof(World) == Model::WORLD_BYTES, "lanes.py counts on this size");
+static __shared__ World worlds[Model::WORLDS_PER_BLOCK];
+World& w = worlds[threadIdx.x / LANES];
+const int world = thread / LANES, lane = threadIdx.x % LANES;
+// Warps that run in step share what they fetch of the text. Lanes without a world keep to the step but do nothing else.
+#define LOCKSTEP() if (Model::LOCKSTEP) __syncthreads()
+#else
+World storage;
+World& w = storage;
+const int world = thread, lane = 0;
+#define LOCKSTEP()
+#endif
+const bool live = world < mask_in.shape[0] && mask_in.data[world < mask_in.shape[0] ? world : 0];
+float* const sensors = sensordata_out.data + (live ? world : 0) * Model::SENSOR_VALUES;
+Step step(w, lane, ctrl_in.data, overflow_out.data, world);
+if (live) {
+  SHARED_LOOP(i, Model::POSITIONS) w.qpos[i] = qpos_out.data[world * Model::POSITIONS + i];
+  SHARED_LOOP(i, STRIDE) {
+    w.qvel[i] = i < DOFS ? qvel_out.data[world * DOFS + i] : 0.0f;
+    w.qacc[i] = i < DOFS ? qacc_warmstart_out.data[world * DOFS + i] : 0.0f;
+    w.search[i] = 0.0f;
+  }
+  SHARED_LOOP(i, DOFS * STRIDE) w.mass[i] = 0.0f;
+  step.sync();
+}
+ROLLED for (int substep = 0;; ++substep) {
+  LOCKSTEP();
+  if (live) step.kinematics();
+  if (substep == Model::SUBSTEPS) break;
+  if (live) step.dynamics();
+  LOCKSTEP();
+  if (live) {
+    step.solve();
+    if (Model::TOUCH && substep == Model::SUBSTEPS - 1) step.write_touch(sensors);
+    step.integrate();
+  }
+}
+if (live) {
+  const int first_body = world * Model::BODIES;
+  step.write_bodies(reinterpret_cast<float*>(xpos_out.data + first_body), reinterpret_cast<float*>(xmat_out.data + first_body),
+                    cvel_out.data ? reinterpret_cast<float*>(cvel_out.data + first_body) : nullptr);
+  step.write_subtree_velocities(sensors);
+  if (Model::SUBSTEPS == 0) SHARED_LOOP(s, Model::TOUCH) sensors[Model::touch_address(s)] = 0.0f;  // no force is known
+  if (Model::SUBSTEPS > 0) {
+    SHARED_LOOP(i, Model::POSITIONS) qpos_out.data[world * Model::POSITIONS + i] = w.qpos[i];
+    SHARED_LOOP(i, DOFS) {
+      qvel_out.data[world * DOFS + i] = w.qvel[i];
+      qacc_warmstart_out.data[world * DOFS + i] = w.qacc[i];
+    }
+    if (lane == 0) time_out.data[world] += Model::SUBSTEPS * Model::timestep();
+  }
+}
+#undef INLINE
+#undef ROLLED
+#undef UNROLLED
+#undef OWN_DOFS
+#undef SHARED_LOOP
+#undef LOCKSTEP

@@ -1,0 +1,660 @@
+"""One world stepped by a group of lanes: the text of a compiled control step for bodies of more than a few joints.
+
+:func:`source` puts a model's sizes, constants and tables in front of the algorithm in ``lanes.h``, as functions of a
+struct ``Model``: a parameter that is the same everywhere is a constant there, any other a table.
+"""
+
+import dataclasses
+import itertools
+import math
+import pathlib
+from collections.abc import Iterator, Sequence
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+from mujoco_warp import OverflowType
+from numpy.typing import ArrayLike
+
+from torchrl_loco.sim.compiled import collision
+from torchrl_loco.sim.compiled.collision import CAPSULE, MINVAL, PLANE, Pair, pairs
+from torchrl_loco.sim.compiled.constraints import Softness, tolerance
+from torchrl_loco.sim.compiled.contacts import contact_weight
+from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, SLIDE
+
+TEMPLATE = pathlib.Path(__file__).with_name("lanes.h")
+TRANSLATION, ROTATION = 0, 1
+"""Kinds of a degree of freedom in ``lanes.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
+SHAPES = {
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")): i
+    for i, kind in enumerate(("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"))
+}
+UNLIMITED = 1e30
+BLOCK_BYTES = 48 * 1024
+"""Static shared memory that a block of a GPU may have."""
+WORLD_BYTES = (11136, BLOCK_BYTES // 4, BLOCK_BYTES // 3, BLOCK_BYTES // 2, BLOCK_BYTES)
+"""Shared memory that a world may fill: the first that leaves room for enough contacts. With 11136 bytes, 20 worlds in
+blocks of 4 fit a multiprocessor of an H100 or H200."""
+MOST_WORLDS = 4
+"""Worlds of a block, at most."""
+LOCKSTEP = True
+"""Whether the worlds of a block wait for each other twice a substep, so that they share what they fetch of the text."""
+ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 16, 16
+"""Places for contacts with friction, which a world should have and may have, and for those without."""
+
+
+# Rigid links: bodies welded together.
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where a body is: in a link, or in the world if ``link`` is -1.
+
+    Attributes:
+        link: index of the link.
+        position: of the body in the frame of the link, ``(3,)`` (m).
+        quaternion: the same for its orientation, ``(4,)``.
+    """
+
+    link: int
+    position: np.ndarray
+    quaternion: np.ndarray
+
+    def point(self, offset: np.ndarray) -> np.ndarray:
+        """Returns a point of the body in the frame of the link."""
+        return self.position + matrix(self.quaternion) @ offset
+
+    def turn(self, quaternion: np.ndarray) -> np.ndarray:
+        """Returns an orientation in the body as one in the link."""
+        return product(self.quaternion, quaternion)
+
+
+@dataclasses.dataclass
+class Mass:
+    """Mass, center and moments of inertia of a part of a link, in its frame."""
+
+    mass: float
+    center: np.ndarray
+    moments: np.ndarray
+
+    @classmethod
+    def join(cls, m: mujoco.MjModel, places: Sequence[Place], bodies: Sequence[int]) -> "Mass":
+        """Returns several bodies of one link as one."""
+        masses = m.body_mass[bodies]
+        centers = np.array([places[b].point(m.body_ipos[b]) for b in bodies])
+        mass = masses.sum()
+        center = masses @ centers / mass if mass > 0 else centers[0]
+        moments = np.zeros((3, 3))
+        for b, d in zip(bodies, centers - center, strict=True):
+            axes = matrix(places[b].turn(m.body_iquat[b]))
+            moments += axes @ np.diag(m.body_inertia[b]) @ axes.T
+            moments += m.body_mass[b] * (d @ d * np.eye(3) - np.outer(d, d))
+        return cls(float(mass), center, moments)
+
+
+def matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Returns the matrix of a quaternion, exact zeros where rounding left something else."""
+    result = np.zeros(9)
+    mujoco.mju_quat2Mat(result, np.asarray(quaternion, float))
+    result[np.abs(result) < 1e-12] = 0
+    return result.reshape(3, 3)
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns the product of two quaternions."""
+    result = np.zeros(4)
+    mujoco.mju_mulQuat(result, a, b)
+    return result
+
+
+def moving_bodies(m: mujoco.MjModel) -> list[int]:
+    """Returns the bodies that have joints, each the first body of a link."""
+    return [b for b in range(1, m.nbody) if m.body_dofnum[b]]
+
+
+def places(m: mujoco.MjModel) -> list[Place]:
+    """Returns where each body is."""
+    links = {b: i for i, b in enumerate(moving_bodies(m))}
+    found = [Place(-1, np.zeros(3), np.array([1.0, 0, 0, 0]))]
+    for b in range(1, m.nbody):
+        parent = found[m.body_parentid[b]]
+        if b in links:
+            found.append(Place(links[b], np.zeros(3), np.array([1.0, 0, 0, 0])))
+        else:
+            found.append(Place(parent.link, parent.point(m.body_pos[b]), parent.turn(m.body_quat[b])))
+    return found
+
+
+# Functions and constants of struct Model.
+
+
+class Tables:
+    """The members of struct ``Model``."""
+
+    COMPONENTS: ClassVar = {"Vec": 3, "Quat": 4, "Symmetric": 6, "Mat": 9, "Softness": 9}
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def size(self, **values: int) -> None:
+        """Adds integer constants."""
+        self.lines += [f"  enum {{ {name} = {int(value)} }};" for name, value in values.items()]
+
+    def constant(self, **values: float) -> None:
+        """Adds functions that return a number."""
+        for name, value in values.items():
+            self._function("float", name, [f"return {literal(value)};"], parameter="")
+
+    def vector(self, name: str, value: ArrayLike) -> None:
+        """Adds a function that returns a vector."""
+        self._function("Vec", name, [f"return {{{', '.join(map(literal, np.asarray(value, float)))}}};"], parameter="")
+
+    def procedure(self, name: str, parameter: str, statements: list[str]) -> None:
+        """Adds a function that returns nothing."""
+        self._function("void", name, statements, parameter)
+
+    def floats(self, name: str, values: Sequence[float] | np.ndarray) -> None:
+        """Adds a function from an index to a number."""
+        statements, result = column([literal(x) for x in values], "float", "table")
+        self._function("float", name, [*statements, f"return {result};"])
+
+    def integers(self, name: str, values: Sequence[int] | np.ndarray, type_: str = "int") -> None:
+        """Adds a function from an index to an integer."""
+        values = [int(x) for x in values]
+        stored = type_
+        if type_ == "int" and all(-128 <= x < 128 for x in values):
+            stored = "signed char"
+        elif type_ == "int":
+            stored = "short"
+        suffix = {"unsigned": "u", "unsigned long long": "ull"}.get(type_, "")
+        statements, result = column([f"{x}{suffix}" for x in values], stored, "table")
+        self._function(type_, name, [*statements, f"return {result};"])
+
+    def structs(self, type_: str, name: str, values: Sequence[ArrayLike] | np.ndarray) -> None:
+        """Adds a function from an index to a struct of numbers."""
+        count = self.COMPONENTS[type_]
+        rows = [[literal(x) for x in row] for row in np.asarray(values, float).reshape(-1, count)]
+        if type_ == "Softness":  # member by member, since constraints often share all but one
+            columns = [column([row[k] for row in rows], "float", f"table{k}") for k in range(count)]
+            statements, parts = [s for c in columns for s in c[0]], [c[1] for c in columns]
+        elif all(row == rows[0] for row in rows):
+            statements, parts = [], rows[0] if rows else ["0.0f"] * count
+        else:
+            statements = [f"static const float table[] = {{{', '.join(x for row in rows for x in row)}}};"]
+            parts = [f"table[{count} * i + {k}]" for k in range(count)]
+        if type_ == "Mat":
+            parts = [f"{{{', '.join(parts[k : k + 3])}}}" for k in (0, 3, 6)]
+        self._function(type_, name, [*statements, f"return {{{', '.join(parts)}}};"])
+
+    def _function(self, type_: str, name: str, statements: list[str], parameter: str = "int i") -> None:
+        head, body = f"  static INLINE {type_} {name}({parameter}) {{", " ".join(statements)
+        if len(head) + len(body) + 3 <= 120:
+            self.lines.append(f"{head} {body} }}")
+        else:
+            self.lines += [head, *(f"    {s}" for s in statements), "  }"]
+
+    def text(self) -> str:
+        """Returns the struct."""
+        return "\n".join(["struct Model {", *self.lines, "};"])
+
+
+def column(values: list[str], type_: str, table: str) -> tuple[list[str], str]:
+    """Returns statements, and an expression for the value at index ``i``: a constant if possible, else from a table."""
+    distinct = [v for k, v in enumerate(values) if k == 0 or v != values[k - 1]]
+    if len(distinct) <= 1:
+        return [], distinct[0] if distinct else "0"
+    if len(distinct) == 2:
+        return [], f"i < {values.index(distinct[1])} ? {distinct[0]} : {distinct[1]}"
+    return [f"static const {type_} {table}[] = {{{', '.join(values)}}};"], f"{table}[i]"
+
+
+def literal(x: float) -> str:
+    """Returns a float32 literal of C++."""
+    text = repr(float(np.float32(x)))
+    return f"{np.format_float_scientific(np.float32(x), trim='0') if 'e' in text or len(text) > 14 else text}f"
+
+
+# The model.
+
+
+@dataclasses.dataclass
+class Layout:
+    """Sizes of the state of a world, as ``struct World`` has them."""
+
+    positions: int
+    dofs: int
+    links: int
+    geoms: int
+    trees: int
+    limits: int
+    friction_losses: int
+    touch: int
+    candidates: int
+    frictional: int
+    frictionless: int
+    jacobian_rows: int
+
+    @property
+    def stride(self) -> int:
+        """Length of a row of a matrix."""
+        return pad(self.dofs, 4)
+
+    @property
+    def rows(self) -> int:
+        """Constraint rows: four for a contact with friction, one for anything else."""
+        contacts = 4 * self.frictional + min(self.frictionless, self.jacobian_rows - 3 * self.frictional)
+        return pad(contacts + self.limits + self.friction_losses, 4) or 4
+
+    @property
+    def bytes(self) -> int:
+        """Size of ``struct World``."""
+        contacts = self.frictional + self.frictionless
+        vectors = pad(self.positions, 4) + 5 * self.stride + 8 * self.dofs + self.dofs * self.stride + 2 * self.rows
+        before = 32 * contacts + 12 * (self.frictional + 1)
+        solving = 4 * (4 * (self.stride + 4) + self.dofs // 2 + 1 + self.rows)
+        kinematics = 144 * self.links + 32 * (self.geoms + 1) + 2 * self.candidates
+        total = 4 * vectors + pad(max(before, solving, 32 * self.links), 16)
+        total = pad(total + 4 * self.jacobian_rows, 16)
+        total += pad(max(kinematics, 4 * self.jacobian_rows * self.stride), 16)
+        total += 12 * self.trees + self.limits + 1
+        return pad(pad(total, 4) + 4 * (contacts if self.touch else 1), 16)
+
+
+def pad(x: int, unit: int) -> int:
+    """Returns ``x`` rounded up to a multiple of a unit."""
+    return -(-x // unit) * unit
+
+
+class Description:
+    """What ``lanes.h`` has to know about a model.
+
+    Args:
+        m: the model.
+    """
+
+    def __init__(self, m: mujoco.MjModel) -> None:
+        self.m = m
+        self.places = places(m)
+        self.moving = moving_bodies(m)
+        if not self.moving or m.nv > 64:
+            raise ValueError(f"{m.nv} degrees of freedom, more than 64")
+        self.roots = sorted({int(m.body_rootid[b]) for b in self.moving})
+        self.members = [[b for b in range(1, m.nbody) if self.places[b].link == i] for i in range(len(self.moving))]
+        self.masses = [Mass.join(m, self.places, bodies) for bodies in self.members]
+        self.ancestors = [sum(1 << int(j) for j in self._dofs_to_root(d)) for d in range(m.nv)]
+        self.pairs = [] if self.disabled("CONSTRAINT", "CONTACT") else self._sorted_pairs(pairs(m))
+        self.geoms = sorted({g for p in self.pairs for g in p.geoms if m.geom_type[g] != PLANE})
+        limited = [] if self.disabled("CONSTRAINT", "LIMIT") else [j for j in range(m.njnt) if m.jnt_limited[j]]
+        self.limited = [j for j in limited if m.jnt_type[j] in (SLIDE, HINGE)]
+        self.limited_balls = [j for j in limited if m.jnt_type[j] == BALL]
+        self.losses = (
+            [] if self.disabled("CONSTRAINT", "FRICTIONLOSS") else [d for d in range(m.nv) if m.dof_frictionloss[d] > 0]
+        )
+        sensors = [(int(m.sensor_type[i]), int(m.sensor_objid[i]), int(m.sensor_adr[i])) for i in range(m.nsensor)]
+        self.subtrees = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL)]
+        self.touch = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_TOUCH)]
+        self.layout = self._layout()
+
+    def disabled(self, *parts: str) -> bool:
+        """Returns whether one of these parts of the physics is switched off by a flag of the model."""
+        flags = [int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}")) for part in parts]
+        return any(self.m.opt.disableflags & flag for flag in flags)
+
+    def _dofs_to_root(self, dof: int) -> Iterator[int]:
+        while dof >= 0:
+            yield dof
+            dof = self.m.dof_parentid[dof]
+
+    def is_plane(self, pair: Pair) -> bool:
+        """Returns whether the first geom of a pair is a plane."""
+        return self.m.geom_type[pair.geoms[0]] == PLANE
+
+    def _sorted_pairs(self, found: list[Pair]) -> list[Pair]:
+        """Returns planes before others, and in both parts those with friction first."""
+        return sorted(found, key=lambda p: (not self.is_plane(p), p.condim == 1))
+
+    def points(self, pair: Pair) -> int:
+        """Returns how many contacts a pair can have."""
+        capsules = sum(self.m.geom_type[g] == CAPSULE for g in pair.geoms)
+        return 2 if capsules == (1 if self.is_plane(pair) else 2) else 1
+
+    def _layout(self) -> Layout:
+        """Returns the sizes, with as many places for contacts as there is room for.
+
+        Raises:
+            ValueError: a world does not fit the shared memory of a GPU.
+        """
+        m = self.m
+        frictional = sum(self.points(p) for p in self.pairs if p.condim != 1)
+        frictionless = sum(self.points(p) for p in self.pairs if p.condim == 1)
+        frictionless = min(frictionless, MOST_FRICTIONLESS) + len(self.limited_balls)
+        if not frictional and not frictionless:
+            frictionless = 1  # C++ has no empty arrays
+        empty = Layout(
+            positions=m.nq,
+            dofs=m.nv,
+            links=len(self.moving),
+            geoms=len(self.geoms),
+            trees=len(self.roots),
+            limits=len(self.limited),
+            friction_losses=len(self.losses),
+            touch=len(self.touch),
+            candidates=max(1, sum(not self.is_plane(p) for p in self.pairs)),
+            frictional=0,
+            frictionless=frictionless,
+            jacobian_rows=0,
+        )
+
+        def sized(places: int, more_rows: int = 0) -> Layout:
+            rows = max(3 * places + more_rows, frictionless, 1)
+            return dataclasses.replace(empty, frictional=places, jacobian_rows=rows)
+
+        enough, most = min(frictional, ENOUGH_FRICTIONAL), min(frictional, MOST_FRICTIONAL)
+        budget = next((b for b in WORLD_BYTES if sized(enough).bytes <= b), None)
+        if budget is None:
+            raise ValueError(
+                f"a body so large: a world needs {sized(enough).bytes} bytes of shared memory, of {BLOCK_BYTES}"
+            )
+        count = max(n for n in range(enough, most + 1) if sized(n).bytes <= budget)
+        more = max(r for r in range(frictionless + 1) if sized(count, r).bytes <= budget)
+        return sized(count, more)
+
+    def tables(self, substeps: int) -> str:
+        """Returns struct ``Model``."""
+        m, layout, tables = self.m, self.layout, Tables()
+        mask = "unsigned" if m.nv <= 32 else "unsigned long long"
+        tables.lines.append(f"  typedef {mask} Dofs;  // a bit for each degree of freedom")
+        tables.size(
+            SUBSTEPS=substeps,
+            ITERATIONS=m.opt.iterations,
+            LS_ITERATIONS=m.opt.ls_iterations,
+            NO_PLACE=int(OverflowType.NARROWPHASE),
+            LIMIT_REACHED=int(OverflowType.ITERATIONS),
+            WORLD_BYTES=layout.bytes,
+            WORLDS_PER_BLOCK=self.worlds_per_block(),
+            LOCKSTEP=LOCKSTEP,
+            POSITIONS=m.nq,
+            DOFS=m.nv,
+            CONTROLS=m.nu,
+            BODIES=m.nbody,
+            SENSOR_VALUES=m.nsensordata,
+            LINKS=layout.links,
+            TREES=layout.trees,
+            GEOMS=layout.geoms,
+            LIMITS=layout.limits,
+            FRICTION_LOSSES=layout.friction_losses,
+            CANDIDATES=layout.candidates,
+            FRICTIONAL=layout.frictional,
+            FRICTIONLESS=layout.frictionless,
+            JACOBIAN_ROWS=layout.jacobian_rows,
+            ROWS=layout.rows,
+        )
+        tables.constant(
+            timestep=m.opt.timestep,
+            scale=1 / (m.stat.meaninertia * m.nv),
+            tolerance=tolerance(m),
+            ls_tolerance=tolerance(m) * m.opt.ls_tolerance,
+            least_aligned=collision.UPRIGHT,
+        )
+        tables.vector("gravity", np.zeros(3) if self.disabled("GRAVITY") else m.opt.gravity)
+        self._add_links(tables)
+        self._add_joints(tables)
+        self._add_forces(tables, mask)
+        self._add_geoms(tables, mask)
+        self._add_limits(tables)
+        self._add_outputs(tables)
+        return tables.text()
+
+    def _add_links(self, tables: Tables) -> None:
+        m, moving = self.m, self.moving
+        parents = [self.places[m.body_parentid[b]] for b in moving]
+        attached = list(zip(parents, moving, strict=True))
+        tables.integers("parent", [p.link for p in parents])
+        tables.structs("Vec", "link_position", [p.point(m.body_pos[b]) for p, b in attached])
+        tables.structs("Quat", "link_orientation", [p.turn(m.body_quat[b]) for p, b in attached])
+        tables.floats("link_mass", [x.mass for x in self.masses])
+        tables.structs("Vec", "link_center", [x.center for x in self.masses])
+        tables.structs("Symmetric", "link_inertia", [x.moments[np.triu_indices(3)] for x in self.masses])
+        tables.integers("tree", [self.roots.index(m.body_rootid[b]) for b in moving])
+        tables.integers("first_joint", [*m.body_jntadr[moving], m.njnt])
+        tables.integers("first_dof", [*m.body_dofadr[moving], m.nv])
+        moments, totals = [], []
+        for root in self.roots:
+            bodies = [b for b in range(1, m.nbody) if m.body_rootid[b] == root]
+            totals.append(m.body_mass[bodies].sum())
+            fixed = [m.body_mass[b] * self.places[b].point(m.body_ipos[b]) for b in bodies if self.places[b].link < 0]
+            moments.append(np.sum(fixed, axis=0) if fixed else np.zeros(3))
+        tables.structs("Vec", "fixed_moment", moments)
+        tables.floats("inverse_mass", [1 / total for total in totals])
+        steps = [f"x[{p.link}] += x[{i}];" for i, p in reversed(list(enumerate(parents))) if p.link >= 0]
+        tables.procedure("add_children", "float* x", steps)
+
+    def _add_joints(self, tables: Tables) -> None:
+        m = self.m
+        kinds = set(m.jnt_type.tolist())
+        tables.size(HAS_FREE=FREE in kinds, HAS_BALL=BALL in kinds, HAS_SLIDE=SLIDE in kinds)
+        tables.integers("joint_kind", m.jnt_type)
+        tables.integers("joint_qpos", m.jnt_qposadr)
+        tables.integers("joint_dof", m.jnt_dofadr)
+        tables.structs("Vec", "joint_axis", m.jnt_axis)
+        tables.structs("Vec", "joint_position", m.jnt_pos)
+        tables.floats("joint_qpos0", m.qpos0[m.jnt_qposadr])
+        of_dof = m.dof_jntid
+        component = np.arange(m.nv) - m.jnt_dofadr[of_dof]
+        joint = m.jnt_type[of_dof]
+        turning = (joint == BALL) | ((joint == FREE) & (component >= 3))
+        kind = np.where(turning, ROTATION, np.where(joint == FREE, TRANSLATION, joint))
+        address = m.jnt_qposadr[of_dof] + np.where(turning, np.where(joint == FREE, 3, 0), component)
+        tables.integers("dof_kind", kind)
+        tables.integers("dof_component", np.where(kind <= ROTATION, component % 3, 0))
+        tables.integers("dof_qpos", address)
+        tables.integers("dof_link", [self.moving.index(b) for b in m.dof_bodyid])
+        tables.structs("Vec", "dof_anchor", m.jnt_pos[of_dof] * (joint == BALL)[:, None])
+        quaternions = [j for j in range(m.njnt) if m.jnt_type[j] in (FREE, BALL)]
+        shift = [3 * (m.jnt_type[j] == FREE) for j in quaternions]
+        tables.size(QUATERNIONS=len(quaternions))
+        tables.integers("quaternion_qpos", [m.jnt_qposadr[j] + s for j, s in zip(quaternions, shift, strict=True)])
+        tables.integers("quaternion_dof", [m.jnt_dofadr[j] + s for j, s in zip(quaternions, shift, strict=True)])
+
+    def _add_forces(self, tables: Tables, mask: str) -> None:
+        m = self.m
+        springs, dampers = not self.disabled("SPRING"), not self.disabled("DAMPER")
+        stiffness = m.jnt_stiffness[m.dof_jntid] * springs
+        damping = m.dof_damping * dampers
+        turning = np.isin(m.jnt_type[m.dof_jntid], (FREE, BALL))
+        tables.size(
+            HAS_SPRINGS=stiffness.any(),
+            HAS_QUATERNION_SPRINGS=stiffness[turning].any(),
+            IMPLICIT_DAMPING=damping.any() and not self.disabled("EULERDAMP"),
+        )
+        tables.floats("stiffness", stiffness)
+        tables.floats("spring", m.qpos_spring)
+        tables.floats("damping", damping)
+        tables.floats("armature", m.dof_armature)
+        tables.integers("ancestors", self.ancestors, mask)
+        acting = sorted(self._actions())
+        used = [a for _, a, _ in acting]
+        unbiased = m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE)
+        bias = np.where(unbiased[:, None], 0, m.actuator_biasprm[:, :3])[used]
+        clamped = m.actuator_ctrllimited.astype(bool) & (not self.disabled("CLAMPCTRL"))
+        limited = m.actuator_forcelimited.astype(bool)
+        limits = np.where(clamped[:, None], m.actuator_ctrlrange, [-UNLIMITED, UNLIMITED])[used]
+        forces = np.where(limited[:, None], m.actuator_forcerange, [-UNLIMITED, UNLIMITED])[used]
+        tables.size(HAS_ACTUATOR_BIAS=bool(bias.any()), HAS_FORCE_LIMITS=limited[used].any())
+        tables.integers("first_actuator", [sum(d < k for d, _, _ in acting) for k in range(m.nv + 1)])
+        tables.integers("control", used)
+        tables.floats("gear", [gear for _, _, gear in acting])
+        tables.floats("gain", m.actuator_gainprm[used, 0])
+        for k, name in enumerate(("bias", "bias_position", "bias_velocity")):
+            tables.floats(name, bias[:, k])
+        for k, name in enumerate(("low", "high")):
+            tables.floats(f"control_{name}", limits[:, k])
+            tables.floats(f"force_{name}", forces[:, k])
+
+    def _actions(self) -> Iterator[tuple[int, int, float]]:
+        """Yields degree of freedom, actuator and gear, wherever an actuator acts.
+
+        Raises:
+            ValueError: an actuator is not supported.
+        """
+        m = self.m
+        for a in [] if self.disabled("ACTUATION") else range(m.nu):
+            joint = m.actuator_trnid[a, 0]
+            count = {FREE: 6, BALL: 3}.get(int(m.jnt_type[joint]), 1)
+            if count > 1 and m.actuator_biastype[a] != int(mujoco.mjtBias.mjBIAS_NONE):
+                raise ValueError(f"actuator {a}: those of free and ball joints have no bias here")
+            for k in range(count):
+                if m.actuator_gear[a, k]:
+                    yield int(m.jnt_dofadr[joint]) + k, a, float(m.actuator_gear[a, k])
+
+    def _geom(self, g: int) -> tuple[int, np.ndarray, np.ndarray]:
+        """Returns the link of a geom, and its center and z axis in the frame of the link."""
+        place = self.places[self.m.geom_bodyid[g]]
+        return place.link, place.point(self.m.geom_pos[g]), matrix(place.turn(self.m.geom_quat[g]))[:, 2]
+
+    def _half_length(self, g: int) -> float:
+        return float(self.m.geom_size[g, 1]) if self.m.geom_type[g] == CAPSULE else 0.0
+
+    def _add_geoms(self, tables: Tables, mask: str) -> None:
+        m, found = self.m, self.pairs
+        geoms = [self._geom(g) for g in self.geoms]
+        half = [self._half_length(g) for g in self.geoms]
+        tables.integers("geom_link", [link for link, _, _ in geoms])
+        tables.structs("Vec", "geom_position", [center for _, center, _ in geoms])
+        tables.structs("Vec", "geom_half_axis", [axis * h for (_, _, axis), h in zip(geoms, half, strict=True)])
+        tables.floats("geom_radius", m.geom_size[self.geoms, 0])
+        planes = [p for p in found if self.is_plane(p)]
+        solid = found[len(planes) :]
+        tables.size(
+            PLANE_FRICTIONAL_END=sum(p.condim != 1 for p in planes),
+            PLANE_END=len(planes),
+            GEOM_FRICTIONAL_END=len(planes) + sum(p.condim != 1 for p in solid),
+            PAIRS=len(found),
+        )
+        index = {g: i for i, g in enumerate(self.geoms)}
+        tables.integers("first_geom", [index.get(p.geoms[0], 0) for p in found])
+        tables.integers("second_geom", [index[p.geoms[1]] for p in found])
+        tables.integers("first_dofs", [self._dofs_of_geom(p.geoms[0]) for p in found], mask)
+        tables.integers("second_dofs", [self._dofs_of_geom(p.geoms[1]) for p in found], mask)
+        frames = [self._geom(p.geoms[0]) for p in planes]
+        tables.structs("Vec", "plane_normal", [normal for _, _, normal in frames])
+        tables.floats("plane_offset", [normal @ center for _, center, normal in frames])
+        half = [self._half_length(p.geoms[1]) for p in planes]
+        tables.floats("inverse_half_length", [1 / h if h else 0.0 for h in half])
+        reach = [sum(m.geom_size[g, 0] + self._half_length(g) for g in p.geoms) + p.margin for p in solid]
+        tables.floats("reach_squared", [0.0] * len(planes) + [r * r for r in reach])
+        tables.floats("friction", [p.friction for p in found])
+        # The limits of ball joints follow the pairs.
+        balls = self.limited_balls
+        tables.size(BALL_LIMITS=len(balls))
+        tables.integers("ball_qpos", [m.jnt_qposadr[j] for j in balls])
+        tables.integers("ball_dof", [m.jnt_dofadr[j] for j in balls])
+        tables.floats("ball_range", [m.jnt_range[j].max() for j in balls])
+        tables.floats("margin", [*(p.margin for p in found), *m.jnt_margin[balls]])
+        soft = [*((p.solref, p.solimp) for p in found), *((m.jnt_solref[j], m.jnt_solimp[j]) for j in balls)]
+        tables.structs("Softness", "contact_softness", [self._softness(*s) for s in soft])
+        weights = [contact_weight(m, pair) for pair in found]
+        tables.floats("inverse_inertia", [*weights, *m.dof_invweight0[m.jnt_dofadr[balls]]])
+
+    def _dofs_of_geom(self, g: int) -> int:
+        """Returns a bit for each degree of freedom that moves a geom."""
+        link = self.places[self.m.geom_bodyid[g]].link
+        return (
+            0
+            if link < 0
+            else self.ancestors[self.m.body_dofadr[self.moving[link]] + self.m.body_dofnum[self.moving[link]] - 1]
+        )
+
+    def _softness(self, solref: Sequence[float], solimp: Sequence[float]) -> list[float]:
+        """Returns the members of struct Softness."""
+        return list(dataclasses.astuple(Softness.make(self.m, solref, solimp)))
+
+    def _add_limits(self, tables: Tables) -> None:
+        m = self.m
+        joint = {int(m.jnt_dofadr[j]): j for j in self.limited}
+        of = [joint.get(d) for d in range(m.nv)]
+        tables.floats("limit_low", [-UNLIMITED if j is None else m.jnt_range[j, 0] for j in of])
+        tables.floats("limit_high", [UNLIMITED if j is None else m.jnt_range[j, 1] for j in of])
+        some = [self.limited[0] if j is None and self.limited else j for j in of]  # so that equal ones fold
+        tables.floats("limit_margin", [0.0 if j is None else m.jnt_margin[j] for j in some])
+        tables.floats("limit_inverse_inertia", m.dof_invweight0)
+        soft = [self._softness(m.jnt_solref[j], m.jnt_solimp[j]) for j in some if j is not None]
+        tables.structs("Softness", "limit_softness", soft)
+        # Dry friction: a row at distance zero, so that its weight and damping are constant.
+        friction = [self._softness(m.dof_solref[d], m.dof_solimp[d]) for d in self.losses]
+        damping, impedance = [s[1] for s in friction], np.array([s[2] for s in friction])
+        weight = 1 / np.maximum(MINVAL, m.dof_invweight0[self.losses] * (1 - impedance) / impedance)
+        tables.integers("friction_row", [self.losses.index(d) if d in self.losses else -1 for d in range(m.nv)])
+        tables.integers("friction_dof", self.losses)
+        tables.floats("friction_damping", damping)
+        tables.floats("friction_weight", weight)
+        tables.floats("friction_bound", m.dof_frictionloss[self.losses] / weight)
+
+    def _add_outputs(self, tables: Tables) -> None:
+        m = self.m
+        tables.integers("body_link", [p.link for p in self.places])
+        tables.structs("Vec", "body_position", [p.position for p in self.places])
+        tables.structs("Mat", "body_orientation", [matrix(p.quaternion).ravel() for p in self.places])
+        parts: list[list[tuple[int, np.ndarray, float]]] = []
+        for _, body, _ in self.subtrees:
+            inside = {b for b in range(1, m.nbody) if self._is_below(b, body)}
+            by_link = [(i, [b for b in bodies if b in inside]) for i, bodies in enumerate(self.members)]
+            joined = [(i, Mass.join(m, self.places, bodies)) for i, bodies in by_link if bodies]
+            parts.append([(i, x.center, x.mass / m.body_subtreemass[body]) for i, x in joined])
+        flat = [part for group in parts for part in group]
+        tables.size(SUBTREES=len(self.subtrees), TOUCH=len(self.touch))
+        tables.integers("subtree_address", [address for _, _, address in self.subtrees])
+        tables.integers("first_part", np.cumsum([0, *map(len, parts)]))
+        tables.integers("part_link", [link for link, _, _ in flat])
+        tables.structs("Vec", "part_center", [center for _, center, _ in flat])
+        tables.floats("part_share", [share for _, _, share in flat])
+        self._add_touch(tables)
+
+    def _add_touch(self, tables: Tables) -> None:
+        m, sites = self.m, [site for _, site, _ in self.touch]
+        at = [(s, self.places[m.site_bodyid[s]]) for s in sites]
+        sphere = int(mujoco.mjtGeom.mjGEOM_SPHERE)
+        sizes = [m.site_size[s, [0, 0, 0]] if m.site_type[s] == sphere else m.site_size[s] for s in sites]
+        tables.integers("touch_address", [address for _, _, address in self.touch])
+        tables.integers("site_body", m.site_bodyid[sites])
+        tables.integers("site_link", [p.link for _, p in at])
+        tables.integers("site_shape", [SHAPES[int(m.site_type[s])] for s in sites])
+        tables.structs("Vec", "site_size", sizes)
+        tables.structs("Vec", "site_position", [p.point(m.site_pos[s]) for s, p in at])
+        tables.structs("Mat", "site_orientation", [matrix(p.turn(m.site_quat[s])).ravel() for s, p in at])
+        bodies = [m.geom_bodyid[list(p.geoms)] for p in self.pairs] if sites else []
+        tables.integers("first_body", [first for first, _ in bodies])
+        tables.integers("second_body", [second for _, second in bodies])
+
+    def _is_below(self, body: int, top: int) -> bool:
+        while body and body != top:
+            body = self.m.body_parentid[body]
+        return body == top
+
+    def worlds_per_block(self) -> int:
+        """Returns how many worlds share a block of threads: a power of two, as shared memory allows."""
+        return max(1, min(MOST_WORLDS, 1 << int(math.log2(max(1, BLOCK_BYTES // self.layout.bytes)))))
+
+    def elimination(self) -> str:
+        """Returns calls that eliminate all rows, two by two, in parts: the fewer rows are left, the fewer columns."""
+        last = self.m.nv - 1
+        shares = () if last < 8 else (0.5,) if last < 16 else (0.25, 0.55)
+        edges = [last, *(last - 2 * int(last * share / 2) for share in shares), -(last % 2)]
+        return "\n".join(f"    eliminate(h, {first}, {end});" for first, end in itertools.pairwise(edges))
+
+
+def source(m: mujoco.MjModel, substeps: int) -> str:
+    """Returns the C++ of a control step of one world, the body of a function of its arrays.
+
+    Args:
+        m: the model.
+        substeps: physics steps; 0 evaluates the state without stepping.
+    """
+    description = Description(m)
+    text = TEMPLATE.read_text().replace("//MODEL", description.tables(substeps))
+    return text.replace("//ELIMINATE", description.elimination())
+
+
+def worlds_per_block(m: mujoco.MjModel) -> int:
+    """Returns how many worlds share a block of threads on a GPU: a block has 32 times as many, and all must be full."""
+    return Description(m).worlds_per_block()

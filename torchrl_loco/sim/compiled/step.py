@@ -1,0 +1,48 @@
+"""A control step of one model as one function of C++: all substeps of a world, then what an observation reads."""
+
+import math
+
+import mujoco
+import warp as wp
+
+from torchrl_loco.sim.compiled import lanes, traced
+
+TRACED_DOFS = 16
+"""Most degrees of freedom of a body that is traced. A thread holds its state; for the humanoid that would be 12 KiB and
+340 KB of code, which takes 2.5 times as long on a GPU as a warp of lanes. For the walker lanes take 3 times as long."""
+
+WARP = 32
+"""Threads of a CUDA warp, which wait for each other wherever they diverge."""
+WARPS = 2
+"""Warps that each multiprocessor gets before warps are filled with worlds: a warp takes as long as its slowest world,
+and more warps wait for each other's instructions (measured)."""
+
+
+def is_traced(m: mujoco.MjModel) -> bool:
+    """Returns whether one thread steps a world, in straight-line code; else a group of lanes does, in loops."""
+    return m.nv <= TRACED_DOFS
+
+
+def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
+    """Returns the C++ of a control step of one world, the body of a function of its arrays.
+
+    Args:
+        m: the model.
+        substeps: physics steps; 0 evaluates the state without stepping.
+        with_cvel: whether the velocities of the bodies are written.
+    """
+    return traced.source(m, substeps, with_cvel=with_cvel) if is_traced(m) else lanes.source(m, substeps)
+
+
+def launch_size(m: mujoco.MjModel, num_envs: int, device: wp.Device) -> tuple[int, int, int]:
+    """Returns the threads of a launch, those of a block, and how many worlds share a warp."""
+    if is_traced(m):
+        worlds = WARP
+        if device.is_cuda:
+            share = num_envs / (WARPS * device.sm_count)
+            worlds = min(WARP, 2 ** math.ceil(math.log2(max(share, 1))))
+        return WARP * math.ceil(num_envs / worlds), WARP, worlds
+    if not device.is_cuda:
+        return num_envs, 1, 1
+    block = lanes.worlds_per_block(m)
+    return WARP * block * math.ceil(num_envs / block), WARP * block, 1

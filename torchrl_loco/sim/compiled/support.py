@@ -1,0 +1,128 @@
+"""Which models the compiled step can do. What is not listed here, it does."""
+
+import mujoco
+
+from torchrl_loco.sim.compiled import lanes
+from torchrl_loco.sim.compiled.collision import CAPSULE, PLANE, SPHERE, Pair, pairs
+from torchrl_loco.sim.compiled.dynamics import BALL, FREE
+from torchrl_loco.sim.compiled.step import is_traced
+
+IGNORED_FLAGS = ("EULERDAMP", "FILTERPARENT", "REFSAFE", "MIDPHASE", "NATIVECCD", "ISLAND", "AUTORESET", "WARMSTART")
+"""Flags that may be set: the compiled step follows them, or they change nothing in it."""
+
+
+def unsupported(m: mujoco.MjModel) -> list[str]:
+    """Returns what a model needs that the compiled step does not have, in words; an empty list if nothing."""
+    found = [*_options(m), *_elements(m), *_joints(m), *_actuators(m), *_contacts(m), *_sensors(m)]
+    return found or _size(m)
+
+
+def _size(m: mujoco.MjModel) -> list[str]:
+    if is_traced(m):
+        return []
+    try:
+        lanes.Description(m)
+    except ValueError as error:
+        return [str(error)]
+    return []
+
+
+def _options(m: mujoco.MjModel) -> list[str]:
+    option, found = m.opt, []
+    if option.cone != int(mujoco.mjtCone.mjCONE_PYRAMIDAL):
+        found.append("elliptic friction cones")
+    if option.solver != int(mujoco.mjtSolver.mjSOL_NEWTON):
+        found.append("a solver other than Newton")
+    if option.integrator != int(mujoco.mjtIntegrator.mjINT_EULER):
+        found.append("an integrator other than Euler")
+    if option.noslip_iterations:
+        found.append("noslip iterations")
+    if option.density or option.viscosity:
+        found.append("forces of a fluid")
+    allowed = sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}", 0)) for flag in IGNORED_FLAGS)
+    found += [f"disabled {flag}" for flag in _flags(mujoco.mjtDisableBit, option.disableflags & ~allowed)]
+    found += [f"enabled {flag}" for flag in _flags(mujoco.mjtEnableBit, option.enableflags)]
+    return found
+
+
+def _flags(kind: type, bits: int) -> list[str]:
+    titles = {int(getattr(kind, title)): title for title in dir(kind) if title.startswith(("mjDSBL_", "mjENBL_"))}
+    return [title.split("_", 1)[1].lower() for bit, title in titles.items() if bits & bit]
+
+
+def _elements(m: mujoco.MjModel) -> list[str]:
+    counts = {
+        "tendons": m.ntendon,
+        "equality constraints": m.neq,
+        "explicit contact pairs": m.npair,
+        "flexes": m.nflex,
+        "plugins": m.nplugin,
+        "mocap bodies": m.nmocap,
+        "plastic joints": m.nplastic,
+        "gravity compensation": m.ngravcomp,
+        "adhesive geoms": m.flg_adhesion,
+        "moving surfaces": m.flg_surfacevel,
+    }
+    found = [title for title, count in counts.items() if count]
+    if m.nv == 0:
+        found.append("a model without joints")
+    return found
+
+
+def _joints(m: mujoco.MjModel) -> list[str]:
+    found = []
+    for j in range(m.njnt):
+        title = f"joint {m.joint(j).name!r}"
+        if m.jnt_type[j] in (FREE, BALL) and m.jnt_stiffness[j]:
+            found.append(f"{title}: stiffness of a free or ball joint")
+        if m.jnt_actfrclimited[j]:
+            found.append(f"{title}: limits of actuator forces at a joint")
+        if m.jnt_stiffnesspoly[j].any():
+            found.append(f"{title}: springs that are not linear")
+    if m.dof_dampingpoly.any():
+        found.append("dampers that are not linear")
+    return found
+
+
+def _actuators(m: mujoco.MjModel) -> list[str]:
+    found = []
+    for i in range(m.nu):
+        title = f"actuator {m.actuator(i).name!r}"
+        joint = m.actuator_trnid[i, 0]
+        if m.actuator_trntype[i] != int(mujoco.mjtTrn.mjTRN_JOINT) or m.jnt_type[joint] in (FREE, BALL):
+            found.append(f"{title}: a transmission other than a hinge or slide")
+        if m.actuator_dyntype[i] != int(mujoco.mjtDyn.mjDYN_NONE):
+            found.append(f"{title}: activation dynamics")
+        biases = [int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)]
+        if m.actuator_gaintype[i] != int(mujoco.mjtGain.mjGAIN_FIXED) or m.actuator_biastype[i] not in biases:
+            found.append(f"{title}: a gain that is not fixed or a bias that is not affine")
+        if m.actuator_delay[i] or m.actuator_damping[i] or m.actuator_armature[i] or m.actuator_dampingpoly[i].any():
+            found.append(f"{title}: delay, damping or armature of an actuator")
+    return found
+
+
+def _contacts(m: mujoco.MjModel) -> list[str]:
+    found = set()
+    for pair in pairs(m):
+        if not _collides(m, pair):
+            kinds = [mujoco.mjtGeom(int(m.geom_type[geom])).name.removeprefix("mjGEOM_").lower() for geom in pair.geoms]
+            found.add(f"contacts of {kinds[0]} and {kinds[1]}, unless the first is a plane of the world")
+        if pair.condim not in (1, 3):
+            found.add(f"contacts with condim {pair.condim}")
+    return sorted(found)
+
+
+def _collides(m: mujoco.MjModel, pair: Pair) -> bool:
+    first, second = (m.geom_type[geom] for geom in pair.geoms)
+    if second not in (SPHERE, CAPSULE):
+        return False
+    return bool(m.body_weldid[m.geom_bodyid[pair.geoms[0]]] == 0) if first == PLANE else True
+
+
+def _sensors(m: mujoco.MjModel) -> list[str]:
+    velocity = int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL)
+    return [
+        f"sensor {m.sensor(i).name!r}: anything but the velocity of a subtree, as it is"
+        for i in range(m.nsensor)
+        if m.sensor_type[i] != velocity or m.sensor_cutoff[i] or m.sensor_interval[i].any() or m.sensor_delay[i]
+    ]

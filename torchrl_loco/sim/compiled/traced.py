@@ -1,0 +1,194 @@
+"""The schedule of one thread a world: a control step of one model, traced to straight-line C++."""
+
+import mujoco
+from mujoco_warp import OverflowType
+
+from torchrl_loco.sim.compiled.collision import pairs
+from torchrl_loco.sim.compiled.dynamics import BALL, FREE, Dynamics
+from torchrl_loco.sim.compiled.solver import NewtonSolver
+from torchrl_loco.sim.compiled.symbols import (
+    Block,
+    Scalar,
+    cells,
+    dot,
+    literal,
+    names,
+    scalar,
+    select,
+    sincos,
+    sqrt,
+    zeros,
+)
+
+PRELUDE = """
+#ifdef __CUDA_ARCH__
+#define DIV(a, b) __fdividef(a, b)
+#define SQRT(a) ((a) * rsqrtf(wp::max(a, 1e-30f)))
+#else
+#define DIV(a, b) ((a) / (b))
+#define SQRT(a) sqrtf(a)
+#endif
+#define CLAMP01(x) wp::min(wp::max(x, 0.0f), 1.0f)
+#define WP_LENGTH(a) SQRT(wp::dot(a, a))
+// Sine and cosine together: reduction to a quarter turn, then polynomials (errors below 1e-7 for angles of joints).
+#define SINCOS(x, s, c) { \\
+  const float quarter = rintf((x) * 0.636619772f); \\
+  float r = fmaf(quarter, -1.57079601f, x); \\
+  r = fmaf(quarter, -3.13916473e-07f, r); \\
+  r = fmaf(quarter, -5.39030253e-15f, r); \\
+  const float z = r * r; \\
+  float sine = fmaf(fmaf(2.86567956e-6f, z, -1.98559923e-4f), z, 8.33338592e-3f); \\
+  sine = fmaf(fmaf(sine, z, -1.66666672e-1f), z * r, r); \\
+  float cosine = fmaf(fmaf(2.44677067e-5f, z, -1.38877297e-3f), z, 4.16666567e-2f); \\
+  cosine = fmaf(fmaf(cosine, z, -0.5f), z, 1.0f); \\
+  const int turns = (int)quarter; \\
+  s = turns & 1 ? cosine : sine; \\
+  c = turns & 1 ? sine : cosine; \\
+  if (turns & 2) s = -s; \\
+  if ((turns + 1) & 2) c = -c; }
+"""
+
+INPUTS = {"qpos": "nq", "qvel": "nv", "qacc": "nv", "ctrl": "nu"}
+"""What a world reads, and how many numbers of it. ``qacc`` starts as the warm start."""
+
+
+SUBTREE_VELOCITY = int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL)
+
+
+def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
+    """Returns the C++ of a control step of one world, the body of a function of its arrays.
+
+    Args:
+        m: the model.
+        substeps: physics steps; 0 evaluates the state without stepping.
+        with_cvel: whether the velocities of the bodies are written.
+    """
+    world = Block()
+    world("// Threads of a warp beyond its worlds, and worlds that are not masked, do nothing.")
+    world("const int lane = thread % 32, world = thread / 32 * worlds_per_warp + lane;")
+    world("if (lane >= worlds_per_warp || world >= mask_in.shape[0] || !mask_in.data[world]) return;")
+    for title, size in INPUTS.items():
+        argument = {"qacc": "qacc_warmstart_out", "ctrl": "ctrl_in"}.get(title, f"{title}_out")
+        count = getattr(m, size)
+        world(f"float* {title}_global = {argument}.data + (size_t)world * {count};")
+        world(f"float {title}[{max(count, 1)}];")
+        world(f"for (int i = 0; i < {count}; ++i) {title}[i] = {title}_global[i];")
+    world("int overflow = 0;")
+    if substeps:
+        step, arrays = _substep(m)
+        for title, count in arrays.items():
+            if count and title != "qacc":
+                world(f"float {title}[{count}];")
+        world(f"int contact_body[{max(arrays['contact_D'], 1)}];")
+        world("#pragma unroll 1")
+        world(f"for (int step = 0; step < {substeps}; ++step) {{")
+        world.lines += [f"  {line}" for line in "\n".join(step.lines).splitlines()]
+        world("}")
+        for title, size in INPUTS.items():
+            if title != "ctrl":
+                world(f"for (int i = 0; i < {getattr(m, size)}; ++i) {title}_global[i] = {title}[i];")
+        world(f"time_out.data[world] += {literal(substeps * m.opt.timestep)};")
+        world("overflow_out.data[world] |= overflow;")
+    _outputs(world, m, with_cvel)
+    bits = f"#define NO_PLACE {int(OverflowType.NARROWPHASE)}\n#define LIMIT_REACHED {int(OverflowType.ITERATIONS)}\n"
+    return PRELUDE + bits + world.text() + "\n"
+
+
+def _substep(m: mujoco.MjModel) -> tuple[Block, dict[str, int]]:
+    """Returns one physics step, and the arrays that it needs."""
+    block = Block()
+    qpos, qvel, ctrl = names("qpos", m.nq), names("qvel", m.nv), names("ctrl", m.nu)
+    tree = Dynamics(m, qpos, qvel, ctrl)
+    tree.keep(block)
+    for i, force in enumerate(tree.force):
+        block.set(f"force[{i}]", force)
+    solver = NewtonSolver(tree, pairs(m))
+    solver.write(block, (qpos, qvel, cells("qacc", m.nv)))
+    _integrate(block, m, tree)
+    return block, solver.arrays
+
+
+def _integrate(block: Block, m: mujoco.MjModel, tree: Dynamics) -> None:
+    """Advances velocities, then positions with the new velocities (semi-implicit Euler).
+
+    With implicit damping the acceleration is that of (M + h B) a' = M a.
+    """
+    h, qacc = m.opt.timestep, cells("qacc", m.nv)
+    implicit = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    if implicit and m.dof_damping.any():
+        diagonal = [scalar(h * damping) for damping in m.dof_damping]
+        factor = tree.factor([zeros(6, 6) for _ in range(m.nbody)], diagonal)
+        qacc = [block.keep(a) for a in factor.solve(cells("M_qacc", m.nv))]
+    for i in range(m.nv):
+        block.set(f"qvel[{i}]", qacc[i] * h, "+=")
+    qvel = cells("qvel", m.nv)
+    for j in range(m.njnt):
+        q, d, kind = int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j]), m.jnt_type[j]
+        if kind in (FREE, BALL):
+            if kind == FREE:
+                for i in range(3):
+                    block.set(f"qpos[{q + i}]", h * qvel[d + i], "+=")
+                q, d = q + 3, d + 3
+            turned = _turn(block, cells("qpos", m.nq)[q : q + 4], qvel[d : d + 3], h)
+            for i, component in enumerate([block.keep(x) for x in turned]):
+                block.set(f"qpos[{q + i}]", component)
+        else:
+            block.set(f"qpos[{q}]", h * qvel[d], "+=")
+
+
+def _turn(block: Block, q: list[Scalar], omega: list[Scalar], h: float) -> list[Scalar]:
+    """Returns a quaternion (w, x, y, z) turned by an angular velocity in its own frame for a time ``h``."""
+    speed = block.keep(sqrt(dot(omega, omega)))
+    sine, cosine = sincos(0.5 * h * speed)
+    scale = block.keep(select(0, "<", speed, sine / speed, 0))
+    w, (x, y, z) = block.keep(cosine), (component * scale for component in omega)
+    product = [
+        q[0] * w - q[1] * x - q[2] * y - q[3] * z,
+        q[0] * x + q[1] * w + q[2] * z - q[3] * y,
+        q[0] * y - q[1] * z + q[2] * w + q[3] * x,
+        q[0] * z + q[1] * y - q[2] * x + q[3] * w,
+    ]
+    norm = 1 / sqrt(dot(product, product))
+    return [component * norm for component in product]
+
+
+def _outputs(world: Block, m: mujoco.MjModel, with_cvel: bool) -> None:
+    """Appends what an observation reads: poses and velocities of the bodies, and sensors, of the present state.
+
+    Constants are left out: they are in the arrays from the start.
+    """
+    tree = Dynamics(m, names("qpos", m.nq), names("qvel", m.nv), names("ctrl", m.nu))
+    rows = {
+        "xpos": [x for position in tree.poses.xpos for x in position],
+        "xmat": [x for orientation in tree.poses.xmat for x in orientation.flat],
+        "sensordata": _sensors(m, tree),
+    }
+    if with_cvel:
+        rows["cvel"] = [x for twist in tree.cvel for x in twist]
+    for title, row in rows.items():
+        world(f"float* {title}_global = (float*){title}_out.data + (size_t)world * {len(row)};")
+        for i, x in enumerate(row):
+            if x is not None and scalar(x).constant is None:
+                world.set(f"{title}_global[{i}]", x)
+
+
+def _sensors(m: mujoco.MjModel, tree: Dynamics) -> list[Scalar | None]:
+    """Returns the sensors that depend on the present state."""
+    row: list[Scalar | None] = [None] * m.nsensordata
+    for sensor in range(m.nsensor):
+        if m.sensor_type[sensor] == SUBTREE_VELOCITY:
+            first = m.sensor_adr[sensor]
+            row[first : first + 3] = subtree_velocity(m, tree, int(m.sensor_objid[sensor]))
+    return row
+
+
+def subtree_velocity(m: mujoco.MjModel, tree: Dynamics, root: int) -> list[Scalar]:
+    """Returns the velocity of the center of mass of a body and all bodies below it (m/s)."""
+    momentum, below = zeros(3), {root}
+    for body in range(root, m.nbody):
+        if body != root and m.body_parentid[body] not in below:
+            continue
+        below.add(body)
+        if body:
+            momentum = momentum + (tree.inertia[body] @ tree.cvel[body])[3:]
+    return list(momentum / m.body_subtreemass[root])
