@@ -12,7 +12,7 @@ def small():
 
 @pytest.mark.ci
 def test_learns_to_stand(tmp_path):
-    """Half of the default run lifts the walker well above what an untrained policy gets.
+    """A quarter of the default run lifts the walker well above what an untrained policy gets.
 
     Seen: 120 to 142 untrained (six seeds), 611 trained; 340 and 882 of 150,000 frames (two seeds).
     """
@@ -22,5 +22,5 @@ def test_learns_to_stand(tmp_path):
         Trainer(run).train()
         return evaluate_run(run)["mean"]
 
-    assert mean(total_frames=2048, lr=1e-9) < 180
-    assert mean(total_frames=180_000) > 300
+    assert mean(total_frames=8192, lr=1e-9) < 200
+    assert mean(total_frames=800_000) > 400

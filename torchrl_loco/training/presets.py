@@ -12,11 +12,11 @@ if TYPE_CHECKING:
 Settings = dict[str, Any]
 
 PPO_ON_CPU: Settings = {
-    "num_envs": 32,
-    "total_frames": 330_000,
+    "num_envs": 128,
+    "total_frames": 3_000_000,
     "action_repeat": 2,
-    "lr": 2e-3,
-    "minibatch_size": 256,
+    "epochs": 6,
+    "minibatch_size": 1024,
     "video_seconds": 5.0,
 }
 PPO_ON_CUDA: Settings = {
@@ -83,8 +83,8 @@ TASKS: dict[tuple[str, str], Settings] = {
 }
 """Further settings of a task on CUDA, by algorithm and task."""
 
-TUNED_ON_CPU = ("ppo", "walker_stand")
-"""Algorithm and task that were tuned on a CPU."""
+TUNED_ON_CPU = ("ppo", ("walker_stand", "walker_walk"))
+"""Algorithm and tasks that were tuned on a CPU."""
 
 DEFAULT_ALGORITHM = {"cpu": "ppo", "cuda": "reppo"}
 
@@ -119,7 +119,8 @@ def tuning_note(config: TrainingConfig) -> str:
     """Returns a note if ``config.task`` was not tuned on its device, else an empty string."""
     if config.task not in OURS:
         return f"No settings were tuned for {config.task}: these were tuned on the walker and the humanoid."
-    if config.device == "cpu" and (config.algorithm, config.task) != TUNED_ON_CPU:
-        algorithm, task = TUNED_ON_CPU
-        return f"On a CPU only {task} by {algorithm} was tuned: other tasks need a GPU, or many more frames."
+    algorithm, tasks = TUNED_ON_CPU
+    if config.device == "cpu" and (config.algorithm != algorithm or config.task not in tasks):
+        tuned = " and ".join(tasks)
+        return f"On a CPU only {tuned} by {algorithm} were tuned: other tasks need a GPU, or many more frames."
     return ""
