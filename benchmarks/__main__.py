@@ -27,6 +27,8 @@ def add(name: str, description: str, worlds: list[int]) -> argparse.ArgumentPars
 
 small = [256] if DEVICE == "cpu" else [8192]
 add("throughput", "from the bare simulator to a collector", small if DEVICE == "cpu" else [512, 2048, 8192, 32768])
+add("engines", "the compiled engine beside MuJoCo-Warp", small if DEVICE == "cpu" else [2048, 8192, 32768, 131072])
+commands.choices["engines"].add_argument("--base-up-to", type=int, default=131072, help="most worlds of MuJoCo-Warp")
 add("startup", "time from process start to the first step, and memory per world", small)
 add("peers", "other simulators compared with ours, in processes of their own", small)
 add("fidelity", "deviation from C MuJoCo in double precision", [256])
@@ -59,6 +61,10 @@ if args.command == "throughput":
 
     rows = throughput(args.bodies, args.worlds, args.cases, args.device)
     show(phases(rows), {"body": "", "worlds": "d", **dict.fromkeys(PHASES, ".3f")})
+elif args.command == "engines":
+    from benchmarks.engines import COLUMNS, engines
+
+    rows = engines(args.bodies, args.worlds, args.device, args.base_up_to)
 elif args.command == "startup":
     from benchmarks.startup import COLUMNS, startup
 

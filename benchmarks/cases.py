@@ -28,9 +28,9 @@ def waiter(device: torch.device) -> Callable[[], None]:
     return (lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else (lambda: None)
 
 
-def bare_default(body: str, n: int, device: torch.device) -> Callable[[], None]:
+def bare_default(body: str, n: int, device: torch.device, protocol: str = "playground") -> Callable[[], None]:
     """A plain loop of ``mujoco_warp.step`` in a graph, with mujoco_warp's own settings but for the printing."""
-    config = sim_config(DEFAULTS[body], "playground", n, {})
+    config = sim_config(DEFAULTS[body], protocol, n, {"engine": "mujoco_warp"})
     sim = Simulation(models.load(models.PATHS[body]), config, n, device)
     sim.model.opt.graph_conditional, sim.model.opt.run_qacc_smooth = True, True
     mask = wp.ones(n, dtype=bool, device=sim.device)
@@ -50,8 +50,18 @@ def bare_default(body: str, n: int, device: torch.device) -> Callable[[], None]:
 
 
 def bare_tuned(body: str, n: int, device: torch.device) -> Callable[[], None]:
-    """Our simulation's recorded control step, without observation or reward."""
-    sim = Simulation(models.load(models.PATHS[body]), sim_config(DEFAULTS[body], "playground", n, {}), n, device)
+    """MuJoCo-Warp as this library sets it, in a graph, without observation or reward."""
+    return _bare(body, n, device, "mujoco_warp")
+
+
+def bare_compiled(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """The compiled step, without observation or reward."""
+    return _bare(body, n, device, "compiled")
+
+
+def _bare(body: str, n: int, device: torch.device, engine: str) -> Callable[[], None]:
+    config = sim_config(DEFAULTS[body], "playground", n, {"engine": engine})
+    sim = Simulation(models.load(models.PATHS[body]), config, n, device)
     mask = wp.ones(n, dtype=bool, device=sim.device)
     graph = sim.capture(sim.step)
     sim.capture(lambda: (sim.reset(mask), sim.forward(mask))).replay()
@@ -92,8 +102,8 @@ def env_dm_control(body: str, n: int, device: torch.device) -> Callable[[], None
 
 
 def env_deterministic(body: str, n: int, device: torch.device) -> Callable[[], None]:
-    """The same with ``deterministic=True``."""
-    return env_step_and_maybe_reset(body, n, device, deterministic=True)
+    """The same with ``deterministic=True`` under MuJoCo-Warp; the compiled engine is deterministic as it is."""
+    return env_step_and_maybe_reset(body, n, device, engine="mujoco_warp", deterministic=True)
 
 
 def rollout_collector(body: str, n: int, device: torch.device) -> Callable[[], None]:
@@ -151,7 +161,15 @@ def every_batch(collector: Iterable[TensorDictBase]) -> Callable[[], None]:
 
 CASES = {
     case.__name__: case
-    for case in (bare_default, bare_tuned, env_step, env_step_and_maybe_reset, rollout_collector, torchrl_collector)
+    for case in (
+        bare_default,
+        bare_tuned,
+        bare_compiled,
+        env_step,
+        env_step_and_maybe_reset,
+        rollout_collector,
+        torchrl_collector,
+    )
 }
 """From the bare simulator to a collector."""
 VARIANTS = {case.__name__: case for case in (env_dm_control, env_deterministic)}

@@ -14,8 +14,8 @@ from benchmarks.timing import milliseconds
 
 COLUMNS = {"body": "", "worlds": "d", "case": "", "ms": ".3f", "ratio": ".3f", "million steps/s": ".3f"}
 PHASES = {
-    "physics": ("bare_tuned", None),
-    "observation, reward, time limit": ("env_step", "bare_tuned"),
+    "physics": ("bare_compiled", None),
+    "observation, reward, time limit": ("env_step", "bare_compiled"),
     "resets, TensorDicts": ("env_step_and_maybe_reset", "env_step"),
     "policy, storage": ("rollout_collector", "env_step_and_maybe_reset"),
 }
@@ -40,7 +40,7 @@ def phases(rows: Sequence[Row]) -> list[Row]:
     """Returns the time of each part of a collected step, as far as the rows tell: a row for body and worlds."""
     table = []
     for row in rows:
-        if row["case"] != "bare_tuned":
+        if row["case"] != "bare_compiled":
             continue
         parts: Row = {"body": row["body"], "worlds": row["worlds"]}
         for phase, (case, before) in PHASES.items():

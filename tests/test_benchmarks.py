@@ -21,11 +21,11 @@ def rows(**ms):
 
 def test_phases_add_up_to_the_collected_step():
     measured = rows(
-        bare_default=6.0, bare_tuned=5.0, env_step=5.5, env_step_and_maybe_reset=5.75, rollout_collector=6.5
+        bare_default=6.0, bare_compiled=5.0, env_step=5.5, env_step_and_maybe_reset=5.75, rollout_collector=6.5
     )
     (parts,) = phases(measured)
     assert list(parts.values())[2:] == [5.0, 0.5, 0.25, 0.75]
-    (parts,) = phases(rows(bare_tuned=5.0, rollout_collector=6.5))  # not all was measured
+    (parts,) = phases(rows(bare_compiled=5.0, rollout_collector=6.5))  # not all was measured
     assert list(parts.values())[2:] == [5.0, None, None, None]
 
 
