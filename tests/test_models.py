@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from oracle import reference_model
 
+import torchrl_loco
 from torchrl_loco import models
 
 SECTIONS = ("names", "sizes", "option", "source")
@@ -81,3 +82,12 @@ def test_load(tmp_path):
     assert models.load(path).nmat == 3
     (tmp_path / "scene.xml").write_text('<mujoco><asset><material name="sand"/></asset></mujoco>')
     assert models.load(path).nmat == 1
+
+
+def test_an_environment_refuses_such_a_model(tmp_path):
+    unclipped = models.PATHS["walker"].read_text().replace('ctrlrange="-1 1"', 'ctrlrange="-2 2"')
+    path = tmp_path / "walker.xml"
+    path.write_text(unclipped)
+    body = type("Strong", (torchrl_loco.WalkerWalk,), {"mjcf": path})
+    with pytest.raises(ValueError, match="every actuator needs ctrlrange -1 1"):
+        body(2, "cpu", seed=0)
