@@ -336,3 +336,21 @@ def test_settings_of_room_change_nothing():
         reached.append(sim.qvel)
     assert torch.equal(*reached)
     assert (sim.overflow & int(OverflowType.NEFC | OverflowType.NARROWPHASE) == 0).all()
+
+
+@pytest.mark.parametrize(
+    "first", ['solref="-800 -30"', 'solref="-800 -30" solmix="0"', 'solref="-800 -30" priority="1"']
+)
+@pytest.mark.parametrize("second", ['solmix="2"', 'solmix="0"', 'friction="0"', 'condim="1" friction="0.3"'])
+def test_contact_parameters_are_mixed_as_in_mujoco(first, second):
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody><geom size='0.1' {first}/>"
+        f"<body pos='0 0 0.15'><freejoint/><geom size='0.1' {second}/></body></worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    (pair,) = collision.pairs(model)
+    assert (pair.condim, pair.solref) == (data.contact.dim[0], tuple(data.contact.solref[0]))
+    np.testing.assert_allclose(pair.solimp, data.contact.solimp[0])
+    if pair.condim > 1:
+        assert pair.friction == data.contact.friction[0, 0]

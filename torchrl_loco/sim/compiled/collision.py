@@ -14,8 +14,8 @@ from torchrl_loco.sim.compiled.dynamics import Poses, constant_matrix
 from torchrl_loco.sim.compiled.symbols import array, dot, select, sqrt
 
 PLANE, SPHERE, CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("PLANE", "SPHERE", "CAPSULE"))
-MINVAL = 1e-15
-"""MuJoCo's mjMINVAL."""
+MINVAL, MINMU = 1e-15, 1e-5
+"""MuJoCo's mjMINVAL and mjMINMU."""
 UPRIGHT = 0.5
 """Sine of the angle to a plane's normal below which a capsule does not orient the frame of its contact.
 
@@ -31,7 +31,7 @@ class Pair:
     Attributes:
         geoms: their ids, the simpler shape first; the normal points from the first to the second.
         condim: 1 (no friction) or 3 (sliding friction).
-        friction: sliding friction coefficient.
+        friction: sliding friction coefficient, 0 without friction.
         margin: distance below which a contact is active (m).
         solref: reference parameters of the constraint, ``(2,)``.
         solimp: impedance parameters, ``(5,)``.
@@ -69,7 +69,8 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
 
 def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
     """Returns a pair with its mixed parameters (MuJoCo's ``mj_contactParam``)."""
-    if m.geom_priority[a] != m.geom_priority[b]:
+    one_decides = m.geom_priority[a] != m.geom_priority[b]
+    if one_decides:
         first = 1.0 if m.geom_priority[a] > m.geom_priority[b] else 0.0
         condim = m.geom_condim[a if first else b]
         friction = m.geom_friction[a if first else b, 0]
@@ -80,14 +81,15 @@ def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
         condim = max(m.geom_condim[a], m.geom_condim[b])
         friction = max(m.geom_friction[a, 0], m.geom_friction[b, 0])
     solref = m.geom_solref[[a, b]]
-    if first in (0.0, 1.0) or (solref[:, 0] > 0).all():
+    if one_decides or (solref[:, 0] > 0).all():
         solref = first * solref[0] + (1 - first) * solref[1]
     else:
         solref = solref.min(axis=0)
     solimp = first * m.geom_solimp[a] + (1 - first) * m.geom_solimp[b]
     weight = m.body_invweight0[m.geom_bodyid[[a, b]], 0].sum()
     margin = m.geom_margin[a] + m.geom_margin[b]
-    return Pair((a, b), int(condim), float(friction), float(margin), tuple(solref), tuple(solimp), float(weight))
+    friction = max(float(friction), MINMU) if condim > 1 else 0.0
+    return Pair((a, b), int(condim), friction, float(margin), tuple(solref), tuple(solimp), float(weight))
 
 
 # Contacts with a plane of the world.
@@ -106,14 +108,14 @@ class Corner:
     end: int
 
 
-def corners(m: mujoco.MjModel, found: list[Pair]) -> dict[int, list[Corner]]:
-    """Returns what may touch each plane, by geom id of the plane, in the order of the model."""
-    result: dict[int, list[Corner]] = {}
+def corners(m: mujoco.MjModel, found: list[Pair]) -> list[Corner]:
+    """Returns what may touch a plane, in the order of the pairs."""
+    result = []
     for pair in found:
         plane, geom = pair.geoms
         if m.geom_type[plane] == PLANE:
             ends = (1, -1) if m.geom_type[geom] == CAPSULE else (0,)
-            result.setdefault(plane, []).extend(Corner(pair, end) for end in ends)
+            result += [Corner(pair, end) for end in ends]
     return result
 
 

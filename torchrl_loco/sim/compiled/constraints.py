@@ -35,13 +35,13 @@ from torchrl_loco.sim.compiled.symbols import (
     select,
 )
 
-MINIMP, MAXIMP, MINMU = 1e-4, 0.9999, 1e-5
-"""MuJoCo's mjMINIMP, mjMAXIMP and mjMINMU."""
+MINIMP, MAXIMP = 1e-4, 0.9999
+"""MuJoCo's mjMINIMP and mjMAXIMP."""
 
 MIN_TOLERANCE = 1e-6
 """Tolerance below which a solver in single precision would only see rounding; mujoco_warp has the same bound."""
 
-State = tuple[list[Scalar], list[Scalar], list[Scalar]]
+Variables = tuple[list[Scalar], list[Scalar], list[Scalar]]
 """Symbols of qpos, qvel and qacc."""
 
 
@@ -174,9 +174,9 @@ class JointLimits:
         self.count = len(self.joints)
         self.arrays = {f"limit_{field}": self.count for field in ("D", "x", "v", "sign")}
 
-    def create(self, block: Block, state: State) -> None:
+    def create(self, block: Block, variables: Variables) -> None:
         """Sets weights, signs and residuals."""
-        m, (qpos, qvel, qacc) = self.m, state
+        m, (qpos, qvel, qacc) = self.m, variables
         for i, j in enumerate(self.joints):
             d, (low, high) = int(m.jnt_dofadr[j]), m.jnt_range[j]
             below, above = qpos[m.jnt_qposadr[j]] - low, high - qpos[m.jnt_qposadr[j]]
@@ -236,9 +236,9 @@ class DryFriction:
         self.weight = [1 / max(w * (1 - softness.dmin) / softness.dmin, MINVAL) for w, softness in rows]
         self.limit = [float(m.dof_frictionloss[d]) for d in self.dofs]
 
-    def create(self, block: Block, state: State) -> None:
+    def create(self, block: Block, variables: Variables) -> None:
         """Sets the residuals."""
-        _, qvel, qacc = state
+        _, qvel, qacc = variables
         for i, d in enumerate(self.dofs):
             block.set(f"friction_x[{i}]", qacc[d] + self.softness[i].damping * qvel[d])
 

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.collision import CAPSULE, Corner, Pair, corners, frame, geom_pose
-from torchrl_loco.sim.compiled.constraints import MINMU, Softness, State, Table
+from torchrl_loco.sim.compiled.constraints import Softness, Table, Variables
 from torchrl_loco.sim.compiled.dynamics import BALL, Dynamics
 from torchrl_loco.sim.compiled.symbols import (
     Block,
@@ -115,8 +115,7 @@ def contact_weight(m: mujoco.MjModel, pair: Pair) -> float:
     """Returns the approximate inverse inertia along a row of a contact."""
     if pair.condim == 1:
         return pair.weight
-    mu = max(pair.friction, MINMU)
-    return pair.weight * (1 + mu**2) * 2 * mu**2 / m.opt.impratio
+    return pair.weight * (1 + pair.friction**2) * 2 * pair.friction**2 / m.opt.impratio
 
 
 class GroundContacts:
@@ -129,7 +128,7 @@ class GroundContacts:
 
     def __init__(self, tree: Dynamics, found: list[Pair]) -> None:
         m, self.tree = tree.m, tree
-        self.corners = [corner for listed in corners(m, found).values() for corner in listed]
+        self.corners = corners(m, found)
         self.count = len(self.corners)
         self.bodies = sorted({self.body(corner) for corner in self.corners})
         twists = tree.twists(names("search", m.nv))
@@ -187,8 +186,7 @@ class GroundContacts:
         pair = corner.pair
         normal = self._plane(corner)[1]
         axis = geom_pose(self.tree.m, self.tree.poses, pair.geoms[1])[1] if corner.end else None
-        friction = max(pair.friction, MINMU) if pair.condim > 1 else 0.0
-        return normal, frame(normal, axis) * friction
+        return normal, frame(normal, axis) * pair.friction
 
     def _varying(self, title: str, vectors: list[np.ndarray]) -> np.ndarray:
         """Returns a vector of contact ``k``: constants where all contacts agree, else what is stored."""
@@ -212,9 +210,9 @@ class GroundContacts:
         linear = twist[3:] + cross(twist[:3], self._lever)
         return [dot(direction, linear) for direction in self._directions]
 
-    def create(self, block: Block, state: State) -> None:
+    def create(self, block: Block, variables: Variables) -> None:
         """Finds the contacts, and sets weights and residuals."""
-        m, (_, qvel, qacc) = self.tree.m, state
+        m, (_, qvel, qacc) = self.tree.m, variables
         block("int ground = 0;")
         dampings = []
         for corner, (normal, tangent) in zip(self.corners, self._frames, strict=True):
@@ -372,15 +370,15 @@ class DenseContacts:
             "mode_solution": self.modes * m.nv,
         }
 
-    def create(self, block: Block, state: State) -> None:
+    def create(self, block: Block, variables: Variables) -> None:
         """Finds the contacts, and sets Jacobians, weights and residuals."""
         block("int contacts = ground;")
         if self.pairs:
-            self._find(block, state)
+            self._find(block, variables)
         for joint in self.balls:
-            self._limit_ball(block, joint, state)
+            self._limit_ball(block, joint, variables)
 
-    def _find(self, block: Block, state: State) -> None:
+    def _find(self, block: Block, variables: Variables) -> None:
         m, tree, nv = self.tree.m, self.tree, self.tree.m.nv
         origin = tree.com[next(b for b in range(1, m.nbody) if m.body_weldid[b])]
         half = {g: float(m.geom_size[g, 1]) if m.geom_type[g] == CAPSULE else 0.0 for g in self.geoms}
@@ -413,7 +411,7 @@ class DenseContacts:
         shares = [contact_weight(m, pair) for pair in self.pairs]
         weight = table.column("weight", shares)
         share = table.column("share", [self.pyramid.share(pair.condim) for pair in self.pairs])
-        friction = table.column("friction", [max(p.friction, MINMU) if p.condim > 1 else 0.0 for p in self.pairs])
+        friction = table.column("friction", [pair.friction for pair in self.pairs])
         softness = Softness.from_table(table, [Softness.make(m, pair.solref, pair.solimp) for pair in self.pairs])
         with block.loop("c", "candidates") as candidate:
             candidate(f"const int pair = candidate[c], first = {geoms[0]}, second = {geoms[1]};")
@@ -440,7 +438,7 @@ class DenseContacts:
                         moment = cross(lever, axes[i])
                         jacobians[i][d] = sign * dot(tree.cdof[d], np.concatenate([moment, axes[i]]))
                 contact_weight_, residual = softness.row(weight, name("position"))
-                self._store(point, jacobians, contact_weight_ * share, residual, softness.damping, state)
+                self._store(point, jacobians, contact_weight_ * share, residual, softness.damping, variables)
 
     def _store(
         self,
@@ -449,10 +447,10 @@ class DenseContacts:
         weight: Scalar,
         residual: Scalar,
         damping: float | Scalar,
-        state: State,
+        variables: Variables,
     ) -> None:
         """Stores contact ``k``."""
-        nv, (_, qvel, qacc) = self.tree.m.nv, state
+        nv, (_, qvel, qacc) = self.tree.m.nv, variables
         block.set("contact_D[k]", weight)
         for i, jacobian in enumerate(jacobians):
             velocity = total(jacobian[d] * (qacc[d] + damping * qvel[d]) for d in range(nv))
@@ -460,9 +458,9 @@ class DenseContacts:
             for d in range(nv):
                 block.set(f"dense_J{i}[(k - ground) * {nv} + {d}]", jacobian[d])
 
-    def _limit_ball(self, block: Block, joint: int, state: State) -> None:
+    def _limit_ball(self, block: Block, joint: int, variables: Variables) -> None:
         """Adds the limit of a ball joint: one row against its rotation from the reference."""
-        m, (qpos, *_) = self.tree.m, state
+        m, (qpos, *_) = self.tree.m, variables
         address, dof = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
         softness = Softness.make(m, m.jnt_solref[joint], m.jnt_solimp[joint])
         with block.scope("") as scope:
@@ -479,7 +477,7 @@ class DenseContacts:
                     jacobians[0][dof + i] = name(f"axis[{i}]")
                 weight, residual = softness.row(m.dof_invweight0[dof], name("position"))
                 share = self.pyramid.share(1)
-                self._store(violated, jacobians, weight * share, residual, softness.damping, state)
+                self._store(violated, jacobians, weight * share, residual, softness.damping, variables)
 
     def _moved_by(self, body: int) -> int:
         """Returns the degrees of freedom that move a body, as bits."""

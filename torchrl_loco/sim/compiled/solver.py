@@ -11,7 +11,7 @@ stopping tests are those of mujoco_warp, so that both engines stop at the same i
 from collections.abc import Callable
 
 from torchrl_loco.sim.compiled.collision import Pair
-from torchrl_loco.sim.compiled.constraints import DryFriction, JointLimits, State, tolerance
+from torchrl_loco.sim.compiled.constraints import DryFriction, JointLimits, Variables, tolerance
 from torchrl_loco.sim.compiled.contacts import DenseContacts, GroundContacts
 from torchrl_loco.sim.compiled.dynamics import Dynamics
 from torchrl_loco.sim.compiled.symbols import Block, cell, cells, dot, literal, total
@@ -133,16 +133,16 @@ class NewtonSolver:
         if self.dense.count:
             self.arrays.update({"gradient": m.nv, "solution": m.nv})
 
-    def write(self, block: Block, state: State) -> None:
+    def write(self, block: Block, variables: Variables) -> None:
         """Appends constraints and solver to a block, after which ``qacc`` is the acceleration.
 
         Args:
             block: the block, in which ``force`` is set and ``qacc`` holds the start.
-            state: symbols of qpos, qvel and qacc.
+            variables: symbols of qpos, qvel and qacc.
         """
         m, option = self.m, self.m.opt
         for rows in (self.limits, self.friction, self.ground, self.dense):
-            rows.create(block, state)
+            rows.create(block, variables)
         for i, product in enumerate(self.tree.mass_times(cells("qacc", m.nv))):
             block.set(f"M_qacc[{i}]", product)
         scale = 1 / (m.stat.meaninertia * max(m.nv, 1))
