@@ -135,11 +135,12 @@ class CompiledEngine:
     """
 
     def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
-        self._mj_model, self._substeps, self._num_envs, self._device = mj_model, config.substeps, num_envs, device
+        self._mj_model, self._substeps, self._device = mj_model, config.substeps, device
         with wp.ScopedDevice(device):
             self.model = mjw.put_model(mj_model)
         self.data = Data(mj_model, num_envs, device)
         self._kernels: dict[int, wp.Kernel] = {}
+        self._launch_size = launch_size(mj_model, num_envs, device)
         self._all = wp.ones(num_envs, dtype=bool, device=device)
         self.peak_constraints = Buffer(num_envs, int, device)
         self.peak_contacts = Buffer(1, int, device)
@@ -163,7 +164,7 @@ class CompiledEngine:
 
     def _launch(self, substeps: int, mask: wp.array) -> None:
         outputs = self.data.outputs()
-        threads, block, worlds_per_warp = launch_size(self._mj_model, self._num_envs, self._device)
+        threads, block, worlds_per_warp = self._launch_size
         wp.launch(
             self._kernel(substeps, outputs["cvel"] is not None),
             dim=threads,

@@ -9,7 +9,7 @@ from torchrl_loco.sim.compiled import lanes, traced
 
 TRACED_DOFS = 16
 """Most degrees of freedom of a body that is traced. A thread holds its state; for the humanoid that would be 12 KiB and
-340 KB of code, which takes 2.5 times as long on a GPU as a warp of lanes. For the walker lanes take 3 times as long."""
+340 KB of code, which takes twice as long on a GPU as a warp of lanes. For the walker lanes take 3 times as long."""
 
 WARP = 32
 """Threads of a CUDA warp, which wait for each other wherever they diverge."""

@@ -51,7 +51,6 @@ PRELUDE = """
 INPUTS = {"qpos": "nq", "qvel": "nv", "qacc": "nv", "ctrl": "nu"}
 """What a world reads, and how many numbers of it. ``qacc`` starts as the warm start."""
 
-
 SUBTREE_VELOCITY = int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL)
 
 
