@@ -379,7 +379,8 @@ class LocoEnv(EnvBase):
 
         ``"peak"`` holds the largest number of ``constraints`` in a world and of ``contacts`` in all worlds that a
         physics step needed; use it to choose ``njmax`` and ``naconmax``. Nothing waits for the device until you read a
-        number.
+        number. The engine ``compiled`` counts neither peaks nor ``constraint_overflow`` nor ``line_search_limit``: they
+        stay 0.
         """
         return self.world.health.summary()
 

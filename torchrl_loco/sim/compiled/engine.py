@@ -201,7 +201,7 @@ def _kernel(text: str) -> wp.Kernel:
         overflow_out: wp.array[int],
     ): ...
 
-    # Denormals are flushed, and what divisions and roots are left are fast: 3 % of a step. The CPU ignores it.
+    # fast_math flushes denormals and approximates divisions and roots: 1 to 3 % faster on CUDA; the CPU ignores it.
     @wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": True})
     def compiled_step(
         # In:
