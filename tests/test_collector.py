@@ -5,7 +5,7 @@ import torch
 from cases import COARSE
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, InitTracker, RewardSum, VecNormV2
+from torchrl.envs import Compose, FiniteTensorDictCheck, InitTracker, RewardSum
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 import torchrl_loco
@@ -107,7 +107,11 @@ def test_why_batches_are_not_recorded(make, monkeypatch):
         (made, policy(made), None),
         (made, lambda td: td, "no nn.Module"),
         (torchrl_loco.TransformedEnv(made, RewardSum()), policy(made), None),
-        (torchrl_loco.TransformedEnv(made, Compose(RewardSum(), VecNormV2())), policy(made), "VecNormV2 may keep"),
+        (
+            torchrl_loco.TransformedEnv(made, Compose(RewardSum(), FiniteTensorDictCheck())),
+            policy(made),
+            "FiniteTensorDictCheck may keep",
+        ),
     ]
     monkeypatch.setattr(made, "_device", torch.device("cuda"))
     for env, chosen, why in cases:
