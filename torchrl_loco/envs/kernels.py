@@ -21,13 +21,18 @@ def count_non_finite(row: wp.array[float]) -> int:
 def apply_action(
     # In:
     action_in: wp.array2d[float],
+    # Out:
+    action_out: wp.array2d[float],
     # Data out:
     ctrl_out: wp.array2d[float],
     # Out:
     non_finite_out: wp.array[bool],
     any_out: wp.array[int],
 ):
-    """Clips the action into ``ctrl``. A world whose action is NaN or infinite is marked, and stepped with zeros."""
+    """Keeps the action, and clips it into ``ctrl``.
+
+    A world whose action is NaN or infinite is marked, and stepped with zeros.
+    """
     world = wp.tid()
     if world == 0:
         any_out[0] = 0  # until finish_step finds a world that is done
@@ -36,7 +41,9 @@ def apply_action(
         count += wp.where(wp.isfinite(action_in[world, i]), 0, 1)
     non_finite = count > 0
     for i in range(action_in.shape[1]):
-        ctrl_out[world, i] = wp.where(non_finite, 0.0, wp.clamp(action_in[world, i], -1.0, 1.0))
+        action = action_in[world, i]
+        action_out[world, i] = action
+        ctrl_out[world, i] = wp.where(non_finite, 0.0, wp.clamp(action, -1.0, 1.0))
     non_finite_out[world] = non_finite
 
 
