@@ -5,6 +5,7 @@ A message says what is wrong and what is valid. Intervals are written as in math
 
 import dataclasses
 import difflib
+import importlib.util
 import math
 import numbers
 import operator
@@ -187,3 +188,21 @@ def check_run(path: Path) -> Path:
     if not (Path(path) / "config.json").is_file():
         raise FileNotFoundError(f"{path} is not a run folder: it has no config.json")
     return Path(path)
+
+
+def check_packages(purpose: str, packages: Collection[str], extra: str) -> None:
+    """Checks that packages are installed, without importing them.
+
+    Args:
+        purpose: what needs them.
+        packages: names by which they are imported.
+        extra: the extra of this package that installs them.
+
+    Raises:
+        ImportError: one is not installed; the message says how to install it.
+    """
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ImportError(
+            f"{purpose} needs {', '.join(missing)}: pip install 'torchrl-loco[{extra}]', or pip install '.[{extra}]'"
+        )

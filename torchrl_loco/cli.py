@@ -232,6 +232,49 @@ def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: 
             video.make(trained, Path(f"{trained.info['task']}.mp4"))
 
 
+def export(
+    run_or_task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN_OR_TASK")],
+    /,
+    format: Literal["onnx", "torch"] = "onnx",
+    out: Path | None = None,
+) -> None:
+    """Write a policy as a file for programs without this package, and compare it with the policy.
+
+    Args:
+        run_or_task: a run folder, a policy file, or the id of an environment for the policy shipped with the package.
+        format: onnx, or torch for a program of torch.export (.pt2).
+        out: the file, a new one; default: a new file beside the policy, or TASK.onnx for a shipped one.
+    """
+    with _user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
+        source = Path(run_or_task)
+        task = None if source.exists() else _shipped_task(run_or_task)
+        from torchrl_loco import training
+        from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy
+
+        suffix = SUFFIXES[format]
+        if out is not None:
+            check_output_file("out", out, (suffix,))
+        if task is not None:
+            policy, default = torchrl_loco.load_policy(task, "cpu"), Path(f"{task}{suffix}")
+        else:
+            file = training.RunFolder(source).policy if source.is_dir() else source
+            policy, default = torchrl_loco.Policy.load(file, "cpu"), file.with_suffix(suffix)
+        out = training.unused_path(default) if out is None else out
+        error = export_policy(policy, out)
+    print(f"largest difference from the policy, on random observations: {error:.1e} (at most {TOLERANCE:.0e})")
+    print(out)
+
+
+def _shipped_task(name: str) -> str:
+    """Returns the id of the environment that was named instead of a file or a folder."""
+    from torchrl_loco.registry import canonical_id
+
+    try:
+        return canonical_id(name)
+    except ValueError as error:
+        raise ValueError(f"there is no run folder or policy file {name!r}, and {error}") from None
+
+
 def inspect(file: tyro.conf.Positional[Path], /, device: str | None = None) -> None:
     """Inspect a NaN dump: step its world again, substep by substep, in Warp and in C MuJoCo.
 
@@ -290,6 +333,7 @@ def _run(args: list[str]) -> None:
         "record": record,
         "play": play,
         "plot": plot,
+        "export": export,
         "inspect": inspect,
         "list": list_tasks,
         "doctor": diagnose,
