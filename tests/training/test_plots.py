@@ -38,13 +38,19 @@ def test_runs_share_a_curve_unless_they_learn_differently(tmp_path, monkeypatch)
 
     monkeypatch.setattr(Axes, "plot", note)
     same = [{}, {"seed": 1, "batches": 3}, {"device": "cuda:7"}]
-    same += [{"eval_interval": 128}, {"eval_episodes": 9}, {"video_seconds": 3.0}, {"checkpoint_seconds": 5.0}]
+    same += [
+        {"eval_interval": 128},
+        {"eval_episodes": 9},
+        {"video_seconds": 3.0},
+        {"checkpoint_seconds": 5.0},
+        {"logger": "csv"},
+    ]
     other = [{"lr": 1e-4}, {"algorithm": "reppo"}]
     runs = [measured(tmp_path / str(i), **settings) for i, settings in enumerate([*same, *other])]
     plot_runs(runs, tmp_path / "curves.png")
     curves = [curve for curve, _ in drawn]
-    assert curves == [[100.0 + 100 / 7, 200.0 + 100 / 7], [100.0, 200.0], [100.0, 200.0]]
-    assert ["7 seeds" in label for _, label in drawn] == [True, False, False]
+    assert curves == [[100.0 + 100 / 8, 200.0 + 100 / 8], [100.0, 200.0], [100.0, 200.0]]
+    assert ["8 seeds" in label for _, label in drawn] == [True, False, False]
 
 
 def test_nothing_to_plot(tmp_path):

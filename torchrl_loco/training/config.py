@@ -4,12 +4,13 @@ import dataclasses
 import math
 import re
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 from torchrl_loco.checks import SEED, check_choice, check_fields, check_int
 from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.registry import canonical_id, env_class
 
+LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow"]
 INTERVALS = {
     "seed": SEED,
     "eval_interval": "[0, 2**31)",
@@ -90,11 +91,17 @@ class TrainingConfig:
     """Length of the video of the trained policy (s); 0 makes none."""
     checkpoint_seconds: float = 60.0
     """Time between two checkpoints (s)."""
+    logger: tuple[LoggerName, ...] = ("tensorboard",)
+    """Where metrics go besides the run's CSV files, which are always written; csv adds nothing to them."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "task", canonical_id(self.task))
         check_choice("protocol", self.protocol, PROTOCOLS)
         check_fields(self, INTERVALS)
+        loggers = (self.logger,) if isinstance(self.logger, str) else tuple(self.logger)
+        for name in loggers:
+            check_choice("logger", name, get_args(LoggerName))
+        object.__setattr__(self, "logger", tuple(dict.fromkeys(loggers)))
         if not re.fullmatch(
             r"cpu|cuda(:\d+)?", str(self.device)
         ):  # whether the machine has it is checked when the run starts

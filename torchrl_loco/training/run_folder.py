@@ -21,6 +21,7 @@ from torchrl_loco.checks import check_choice, check_device, check_run
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import env_class
 from torchrl_loco.training.config import CONFIGS, TrainingConfig
+from torchrl_loco.training.loggers import check_loggers
 
 CHECKPOINT_VERSION = 3
 ROOM_NEEDED = 200 * 2**20
@@ -43,9 +44,9 @@ def unused_path(path: Path) -> Path:
 class RunFolder:
     """A run on disk.
 
-    It holds ``config.json``, ``metrics.csv``, ``tensorboard/``, ``evaluations.csv``, ``checkpoint.pt``,
-    ``policy.safetensors``, ``learning_curve.png``, ``video.mp4``, and ``nan_dump.safetensors`` if a world became
-    non-finite.
+    It holds ``config.json``, ``metrics.csv``, ``evaluations.csv``, ``checkpoint.pt``, ``policy.safetensors``,
+    ``learning_curve.png``, ``video.mp4``, what its loggers write (``tensorboard/``, ``wandb/``, ``mlflow.db``), and
+    ``nan_dump.safetensors`` if a world became non-finite.
 
     Args:
         path: an existing run folder.
@@ -66,11 +67,12 @@ class RunFolder:
 
         Raises:
             ValueError: this machine does not have the device.
-            ImportError: the environment is a plug-in, which is broken.
+            ImportError: the package of a logger is missing, or the environment is a plug-in, which is broken.
             OSError: the folder cannot be made, or the disk has no room for a run.
         """
         check_device(config.device)
         env_class(config.task)
+        check_loggers(config.logger)
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         name = f"{config.task}-{stamp}-seed{config.seed}"
         try:
@@ -152,6 +154,16 @@ class RunFolder:
     def read_evaluations(self) -> list[dict[str, float]]:
         """Returns the lines of ``evaluations.csv``, none if there was no evaluation yet."""
         return self._read("evaluations.csv")
+
+    def read_logger_ids(self) -> dict[str, str]:
+        """Returns the ids under which W&B and MLflow know the run, by logger."""
+        path = self.path / "loggers.json"
+        return json.loads(path.read_text()) if path.exists() else {}
+
+    def write_logger_ids(self, ids: dict[str, str]) -> None:
+        """Keeps the ids that :meth:`read_logger_ids` returns."""
+        if ids:
+            storage.replace_file(self.path / "loggers.json", f"{json.dumps(ids)}\n".encode())
 
     def forget_after(self, frames: int) -> None:
         """Removes the lines of metrics and evaluations after ``frames`` frames: a resumed run writes them again."""
