@@ -179,15 +179,24 @@ def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> 
     return path
 
 
-def check_run(path: Path) -> Path:
-    """Returns ``path`` as that of a run folder.
+def check_run(path: Path, or_group: bool = False) -> Path:
+    """Returns ``path`` as that of a run folder, or of a folder with the runs of several seeds if that will do.
 
     Raises:
         FileNotFoundError: it is no folder with a ``config.json``.
     """
+    if is_run_group(path):
+        if or_group:
+            return Path(path)
+        raise FileNotFoundError(f"{path} holds the runs of several seeds: name the folder of one of them, in it")
     if not (Path(path) / "config.json").is_file():
         raise FileNotFoundError(f"{path} is not a run folder: it has no config.json")
     return Path(path)
+
+
+def is_run_group(path: Path) -> bool:
+    """Returns whether ``path`` is a folder with the runs of several seeds."""
+    return (Path(path) / "group.json").is_file()
 
 
 def check_packages(purpose: str, packages: Collection[str], extra: str) -> None:

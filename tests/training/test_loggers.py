@@ -1,5 +1,6 @@
 """Loggers: what they are given, what a resumed run continues, and what their failures leave as it was."""
 
+import dataclasses
 import os
 import signal
 import sys
@@ -10,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torchrl.record.loggers import CSVLogger
 
 from torchrl_loco import cli
-from torchrl_loco.training import Trainer, loggers
+from torchrl_loco.training import RunFolder, RunGroup, Trainer, loggers
 from torchrl_loco.training.algorithm import Algorithm
 
 
@@ -118,6 +119,28 @@ def test_a_logger_that_cannot_be_opened_is_said_in_a_line(tmp_path, monkeypatch,
         cli._train(Trainer(made(tmp_path, logger=("wandb", "mlflow"))))
     assert capsys.readouterr().err == "torchrl-loco: the logger mlflow cannot be opened: no login\n"
     assert closed == ["first"]
+
+
+def test_seeds_share_a_group_in_wandb(tmp_path, monkeypatch):
+    given = []
+
+    class Fake(CSVLogger):
+        def __init__(self, name, save_dir, **options):
+            given.append((name, options))
+            super().__init__(name, save_dir)
+            self.experiment.id = f"id{len(given)}"
+
+    monkeypatch.setattr(loggers, "WandbLogger", Fake)
+    monkeypatch.setattr(loggers, "check_packages", lambda *_: None)
+    monkeypatch.delenv("WANDB_PROJECT", raising=False)
+    group = RunGroup.create(made(tmp_path / "template", logger="wandb").load_config(out=tmp_path), [0, 1])
+    runs = [RunFolder.create(dataclasses.replace(group.config, seed=seed, out=group.path)) for seed in (0, 1)]
+    for run in [*runs, made(tmp_path, logger="wandb"), runs[0]]:
+        with loggers.Loggers(run, 0):
+            pass
+    assert [options["group"] for _, options in given] == [group.path.name, group.path.name, None, group.path.name]
+    assert [options["id"] for _, options in given] == [None, None, None, "id1"]
+    assert {options["project"] for _, options in given} == {"torchrl_loco"}
 
 
 @pytest.mark.slow

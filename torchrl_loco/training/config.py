@@ -4,7 +4,7 @@ import dataclasses
 import math
 import re
 from pathlib import Path
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 from torchrl_loco.checks import SEED, check_choice, check_fields, check_int
 from torchrl_loco.config import PROTOCOLS
@@ -122,6 +122,11 @@ class TrainingConfig:
                 f"action_repeat ({self.frames_per_batch})"
             )
 
+    def to_json(self) -> dict[str, Any]:
+        """Returns the settings as values that JSON can hold, from which :func:`config_from_json` makes them again."""
+        words = {"device": str(self.device), "out": str(self.out)}
+        return {"algorithm": self.algorithm, **dataclasses.asdict(self), **words}
+
     @property
     def batch_size(self) -> int:
         """Steps in one batch, over all worlds."""
@@ -196,3 +201,16 @@ class REPPOConfig(TrainingConfig):
 
 
 CONFIGS: dict[str, type[TrainingConfig]] = {config.algorithm: config for config in (PPOConfig, REPPOConfig)}
+
+
+def config_from_json(values: dict[str, Any]) -> TrainingConfig:
+    """Returns the settings that :meth:`TrainingConfig.to_json` has turned into ``values``.
+
+    Raises:
+        ValueError: a field is out of range, or there is no such algorithm.
+        TypeError: a field is unknown, or has the wrong type.
+        LookupError: a field is missing.
+    """
+    algorithm = check_choice("algorithm", values.get("algorithm"), CONFIGS)
+    fields = {name: value for name, value in values.items() if name != "algorithm"}
+    return CONFIGS[algorithm](**{**fields, "out": Path(values["out"]), "hidden": tuple(values["hidden"])})

@@ -1,6 +1,5 @@
 """Where the metrics of a run go besides its CSV files: TorchRL's loggers."""
 
-import dataclasses
 import os
 import warnings
 from collections.abc import Collection
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl.record.loggers import Logger, MLFlowLogger, TensorboardLogger, WandbLogger
 
-from torchrl_loco.checks import check_packages
+from torchrl_loco.checks import check_packages, is_run_group
 
 if TYPE_CHECKING:
     from torchrl_loco.training.run_folder import RunFolder
@@ -55,7 +54,7 @@ class Loggers:
             OSError: one cannot be opened.
         """
         config = self._run.load_config()
-        settings = {"algorithm": config.algorithm, **dataclasses.asdict(config), "out": str(config.out)}
+        settings = config.to_json()
         ids: dict[str, str | None] = {**self._run.read_logger_ids()}
         for name in config.logger:
             if name == "csv":
@@ -118,7 +117,8 @@ def _open_tensorboard(folder: Path, frames: int, _: str | None, settings: dict[s
 
 def _open_wandb(folder: Path, _: int, of: str | None, settings: dict[str, Any]) -> Opened:
     project = os.environ.get("WANDB_PROJECT", PROJECT)
-    logger = WandbLogger(folder.name, save_dir=str(folder), project=project, id=of)
+    group = folder.absolute().parent.name if is_run_group(folder.parent) else None
+    logger = WandbLogger(folder.name, save_dir=str(folder), project=project, id=of, group=group)
     logger.log_hparams(settings)
     return logger, logger.experiment.id
 

@@ -160,7 +160,7 @@ class Trainer:
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
         print(f"best policy, in new episodes: {describe(summary)}")
-        if note := poor_return(config, summary):
+        if note := poor_return(config, summary, self.run.seeds):
             print(note)
 
     def save(self) -> None:
