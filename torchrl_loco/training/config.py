@@ -123,7 +123,7 @@ class TrainingConfig:
             )
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the settings as values that JSON can hold, from which :func:`config_from_json` makes them again."""
+        """Returns the settings as values that JSON can hold, from which ``config_from_json`` makes them again."""
         words = {"device": str(self.device), "out": str(self.out)}
         return {"algorithm": self.algorithm, **dataclasses.asdict(self), **words}
 
