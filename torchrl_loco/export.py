@@ -122,7 +122,7 @@ Exported = tuple[bytes, Callable[[torch.Tensor], torch.Tensor]]
 
 
 def _as_program(network: _Network, example: torch.Tensor, facts: dict[str, Any]) -> Exported:
-    shapes = {"observation": {0: torch.export.Dim("batch", min=1)}}
+    shapes = {"observation": {0: torch.export.Dim("batch")}}
     program = torch.export.export(network, (example,), dynamic_shapes=shapes)
     file = io.BytesIO()
     torch.export.save(program, file, extra_files={"metadata.json": json.dumps(facts, indent=2)})

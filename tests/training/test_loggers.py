@@ -73,9 +73,12 @@ def test_a_missing_package_is_named_before_anything_is_made(tmp_path, monkeypatc
 def test_a_logger_that_fails_does_not_end_the_run(tmp_path, monkeypatch):
     """Neither while it logs nor when it is closed; the others go on."""
 
+    failures = []
+
     class Fails(CSVLogger):
         def log_metrics(self, metrics, step):
             if step > 128:
+                failures.append(step)
                 raise ConnectionError("the server is away")
             super().log_metrics(metrics, step)
 
@@ -93,6 +96,7 @@ def test_a_logger_that_fails_does_not_end_the_run(tmp_path, monkeypatch):
     ):
         run = trained(tmp_path, logger=("wandb", "mlflow"))
     assert run.is_finished
+    assert failures == [256]
     logged = {
         name: (run.path / name / "scalars" / "return.csv").read_text().splitlines()
         for name in files(run)
