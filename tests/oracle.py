@@ -7,7 +7,11 @@ import mujoco
 import numpy as np
 
 DATA = Path(__file__).parent / "data"
-SPEEDS = {"walker": {"stand": 0, "walk": 1, "run": 8}, "humanoid": {"stand": 0, "walk": 1, "run": 10}}
+SPEEDS = {
+    "walker": {"stand": 0, "walk": 1, "run": 8},
+    "humanoid": {"stand": 0, "walk": 1, "run": 10},
+    "cheetah": {"run": 10},
+}
 
 
 def reference_model(body):
@@ -64,22 +68,46 @@ class Oracle:
         mujoco.mj_forward(self.model, self.data)
         return self.data
 
+    def observation(self, qpos, qvel, protocol):
+        """Returns the observation of a state."""
+        return np.array(getattr(self, f"_observe_{self.body}")(self.forward(qpos, qvel), protocol))
+
+    def _observe_walker(self, d, protocol):
+        mats = d.xmat[1:].reshape(-1, 3, 3)
+        height = d.body("torso").xpos[2] if protocol == "dm_control" else mats[0, 2, 2]
+        return [*mats[:, 0, [0, 2]].ravel(), height, *d.qvel]
+
+    def _observe_humanoid(self, d, protocol):
+        torso, mat = d.body("torso").xpos, d.body("torso").xmat.reshape(3, 3)
+        limbs = ("left_hand", "left_foot", "right_hand", "right_foot")
+        near = np.concatenate([(d.body(name).xpos - torso) @ mat for name in limbs])
+        return [*d.qpos[7:], d.body("head").xpos[2], *near, *mat[2], *d.sensordata, *d.qvel]
+
+    def _observe_cheetah(self, d, protocol):
+        return [*d.qpos[1:], *d.qvel]
+
     def reward(self, qpos, qvel, action):
-        d = self.forward(qpos, qvel)
+        """Returns the reward of a state that the action led to."""
+        return float(getattr(self, f"_reward_{self.body}")(self.forward(qpos, qvel), action))
+
+    def _reward_walker(self, d, action):
+        standing = tolerance(d.body("torso").xpos[2], 1.2, np.inf, 0.6)
+        stand = (3 * standing + (1 + d.body("torso").xmat[8]) / 2) / 4
+        if self.speed == 0:
+            return stand
+        move = tolerance(d.sensordata[0], self.speed, np.inf, self.speed / 2, "linear", 0.5)
+        return stand * (5 * move + 1) / 6
+
+    def _reward_humanoid(self, d, action):
         vx, vy, _ = d.sensordata
-        upright = d.body("torso").xmat[8]
-        if self.body == "walker":
-            standing = tolerance(d.body("torso").xpos[2], 1.2, np.inf, 0.6)
-            stand = (3 * standing + (1 + upright) / 2) / 4
-            if self.speed == 0:
-                return float(stand)
-            move = tolerance(vx, self.speed, np.inf, self.speed / 2, "linear", 0.5)
-            return float(stand * (5 * move + 1) / 6)
         standing = tolerance(d.body("head").xpos[2], 1.4, np.inf, 0.35)
-        upright = tolerance(upright, 0.9, np.inf, 1.9, "linear", 0)
+        upright = tolerance(d.body("torso").xmat[8], 0.9, np.inf, 1.9, "linear", 0)
         control = (4 + tolerance(action, margin=1, sigmoid="quadratic", value=0).mean()) / 5
         if self.speed == 0:
             still = (tolerance(vx, margin=2) + tolerance(vy, margin=2)) / 2
-            return float(standing * upright * control * still)
+            return standing * upright * control * still
         move = tolerance(np.hypot(vx, vy), self.speed, np.inf, self.speed, "linear", 0)
-        return float(standing * upright * control * (5 * move + 1) / 6)
+        return standing * upright * control * (5 * move + 1) / 6
+
+    def _reward_cheetah(self, d, action):
+        return tolerance(d.sensordata[0], 10, np.inf, 10, "linear", 0)

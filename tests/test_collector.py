@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cases import COARSE
+from cases import coarse
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, RewardSum
@@ -10,14 +10,14 @@ from torchrl.envs import Compose, InitTracker, RewardSum
 import torchrl_loco
 from torchrl_loco import RolloutCollector
 
-QUICK = {"episode_length": 7, "on_overflow": "ignore", **COARSE}
-"""Steps so coarse make a humanoid fly apart, with more contacts than there are places."""
+QUICK = {"episode_length": 7, "on_overflow": "ignore"}
+"""Coarse steps make a humanoid fly apart, with more contacts than there are places."""
 
 
 @pytest.fixture
 def make(shared):
     def make(task, wrap, device="cpu", num_envs=4, copy=0, **settings):
-        env = shared(task, num_envs, device, stagger=True, copy=copy, **{**QUICK, **settings})
+        env = shared(task, num_envs, device, stagger=True, copy=copy, **{**QUICK, **coarse(task), **settings})
         return torchrl_loco.TransformedEnv(env, Compose(InitTracker(), RewardSum())) if wrap else env
 
     return make

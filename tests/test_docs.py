@@ -97,26 +97,31 @@ def test_every_entry_of_the_observation_tables(body_task, protocol, shared, acti
 def test_reward_formulas(task, shared, actions):
     """The numbers in the formulas of the pages, put together as the pages do, give the terms of the reward."""
     after, worlds = scattered(shared(task, 6, "cpu", 3, protocol="playground", reward_terms=True), actions)
-    parts = rewards.tolerances(task)
+    parts = rewards.reward(task).parts
 
     def tol(name, x):
         part = parts[name]
         return float(np.mean(tolerance(x, part.lower, part.upper, part.margin, part.sigmoid, part.value)))
 
-    for world, data in enumerate(worlds):
-        vx, vy, _ = data.sensordata
-        u = data.body("torso").xmat[8]
+    def walker(d):
+        yield (3 * tol("standing", d.body("torso").xpos[2]) + (1 + d.body("torso").xmat[8]) / 2) / 4
         if "fast" in parts:
-            speed = vx if task.startswith("walker") else np.hypot(vx, vy)
-            move = (1 + 5 * tol("fast", speed)) / 6
-        if task.startswith("walker"):
-            terms = [(3 * tol("standing", data.body("torso").xpos[2]) + (1 + u) / 2) / 4]
-            terms += [move] if "fast" in parts else []
-        else:
-            if "fast" not in parts:
-                move = (tol("still_x", vx) + tol("still_y", vy)) / 2
-            control = (4 + tol("gentle", data.ctrl)) / 5
-            terms = [tol("standing", data.body("head").xpos[2]), tol("upright", u), control, move]
+            yield (1 + 5 * tol("fast", d.sensordata[0])) / 6
+
+    def humanoid(d):
+        vx, vy, _ = d.sensordata
+        yield tol("standing", d.body("head").xpos[2])
+        yield tol("upright", d.body("torso").xmat[8])
+        yield (4 + tol("gentle", d.ctrl)) / 5
+        moving = "fast" in parts
+        yield (1 + 5 * tol("fast", np.hypot(vx, vy))) / 6 if moving else (tol("still_x", vx) + tol("still_y", vy)) / 2
+
+    def cheetah(d):
+        yield tol("fast", d.sensordata[0])
+
+    terms_of = {"walker": walker, "humanoid": humanoid, "cheetah": cheetah}[env_class(task).body]
+    for world, data in enumerate(worlds):
+        terms = list(terms_of(data))
         seen = [after["reward_terms", name][world].item() for name in env_class(task).term_names]
         np.testing.assert_allclose(seen, terms, rtol=0, atol=2e-4)
 

@@ -22,12 +22,14 @@ def assert_figures_are_dm_controls(model, body):
         np.testing.assert_allclose(getattr(model.opt, option), value, err_msg=option)
 
 
-@pytest.mark.parametrize("body", ["walker", "humanoid"])
+@pytest.mark.parametrize("body", models.PATHS)
 def test_figures_names_and_scene(body):
     model = models.load(models.PATHS[body])
     assert_figures_are_dm_controls(model, body)
-    for kind, names in reference_model(body)["names"].items():
-        assert [getattr(model, kind)(i).name for i in range(len(names))] == names
+    names = reference_model(body)["names"]
+    for kind in ("body", "joint", "actuator"):
+        assert [getattr(model, kind)(i).name for i in range(len(names[kind]))] == names[kind]
+    assert [model.geom(i).name for i in range(1, model.ngeom)] == names["geom"][1:]  # the floor has one name here
     assert {model.camera(i).name for i in range(model.ncam)} == {"side", "back", "egocentric"}
     assert model.geom("floor").type == mujoco.mjtGeom.mjGEOM_PLANE
     assert model.nlight == 1

@@ -11,6 +11,7 @@ from . import sim as sim
 from . import training as training
 from .collector import RolloutCollector as RolloutCollector
 from .config import SimConfig as SimConfig
+from .envs import CheetahRun as CheetahRun
 from .envs import HumanoidRun as HumanoidRun
 from .envs import HumanoidStand as HumanoidStand
 from .envs import HumanoidWalk as HumanoidWalk

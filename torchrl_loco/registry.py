@@ -39,6 +39,7 @@ OURS = {
     "humanoid_stand": Entry("torchrl_loco.envs.humanoid:HumanoidStand", "Stand still and upright."),
     "humanoid_walk": Entry("torchrl_loco.envs.humanoid:HumanoidWalk", "Walk at 1 m/s or faster, in any direction."),
     "humanoid_run": Entry("torchrl_loco.envs.humanoid:HumanoidRun", "Run at 10 m/s or faster, in any direction."),
+    "cheetah_run": Entry("torchrl_loco.envs.cheetah:CheetahRun", "Run at 10 m/s or faster."),
 }
 """The environments of this package by id."""
 

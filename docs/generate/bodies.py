@@ -31,8 +31,7 @@ class Entry:
 
 def observation(body: str, protocol: str) -> list[Entry]:
     """Returns the entries of a body's observation in order."""
-    model = models.load(models.PATHS[body])
-    return list(_walker(model, protocol) if body == "walker" else _humanoid(model))
+    return list(BODIES[body](models.load(models.PATHS[body]), protocol))
 
 
 def observation_table(body: str) -> str:
@@ -76,10 +75,8 @@ def _walker(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
     yield from _velocities(model)
 
 
-def _humanoid(model: mujoco.MjModel) -> Iterator[Entry]:
-    for i in range(1, model.njnt):
-        joint = model.joint(i)
-        yield Entry(f"angle of `{joint.name}`", "rad", lambda d, k=joint.qposadr[0]: d.qpos[k])
+def _humanoid(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
+    yield from _positions(model, 1)
     yield Entry("height of `head`", "m", lambda d: d.body("head").xpos[2])
     for name in humanoid.EXTREMITIES:
         for k, axis in enumerate("xyz"):
@@ -96,6 +93,20 @@ def _humanoid(model: mujoco.MjModel) -> Iterator[Entry]:
     yield from _velocities(model)
 
 
+def _cheetah(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
+    yield from _positions(model, 1)
+    yield from _velocities(model)
+
+
+def _positions(model: mujoco.MjModel, first: int) -> Iterator[Entry]:
+    """Yields the positions of slides and hinges, from a joint on."""
+    for i in range(first, model.njnt):
+        joint = model.joint(i)
+        slide = joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE
+        name = f"{'position' if slide else 'angle'} of `{joint.name}`"
+        yield Entry(name, "m" if slide else "rad", lambda d, k=joint.qposadr[0]: d.qpos[k])
+
+
 def _velocities(model: mujoco.MjModel) -> Iterator[Entry]:
     """Yields the velocities of slides and hinges."""
     for i in range(model.njnt):
@@ -109,3 +120,7 @@ def _seen(data: mujoco.MjData, name: str) -> np.ndarray:
     """Returns where a body is in the frame of the torso."""
     torso = data.body("torso")
     return torso.xmat.reshape(3, 3).T @ (data.body(name).xpos - torso.xpos)
+
+
+BODIES = {"walker": _walker, "humanoid": _humanoid, "cheetah": _cheetah}
+"""What yields the entries of a body's observation from its model and the protocol."""

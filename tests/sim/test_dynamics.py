@@ -56,6 +56,6 @@ def test_random_models(xml):
     assert_agrees(model, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("body", ["walker", "humanoid"])
+@pytest.mark.parametrize("body", torchrl_loco.models.PATHS)
 def test_our_bodies(body):
     assert_agrees(torchrl_loco.models.load(torchrl_loco.models.PATHS[body]), np.random.default_rng(0))

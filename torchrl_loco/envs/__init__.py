@@ -2,6 +2,7 @@
 
 from torchrl_loco.envs.autoreset import TransformedEnv as TransformedEnv
 from torchrl_loco.envs.base import LocoEnv as LocoEnv
+from torchrl_loco.envs.cheetah import CheetahRun as CheetahRun
 from torchrl_loco.envs.humanoid import HumanoidRun as HumanoidRun
 from torchrl_loco.envs.humanoid import HumanoidStand as HumanoidStand
 from torchrl_loco.envs.humanoid import HumanoidWalk as HumanoidWalk

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 _FOLDER = Path(__file__).parent
-PATHS = {name: _FOLDER / f"{name}.xml" for name in ("walker", "humanoid")}
+PATHS = {name: _FOLDER / f"{name}.xml" for name in ("walker", "humanoid", "cheetah")}
 SCENE = _FOLDER / "scene.xml"
 """What all bodies can include by its name: light, materials, the look of the floor."""
 

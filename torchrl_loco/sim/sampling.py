@@ -1,4 +1,4 @@
-"""What a world draws at its reset: a random stream of its own, a pose from a table, or a pose free of contact."""
+"""What a world draws at its reset: a random stream of its own, a state from a table, or a pose free of contact."""
 
 from typing import Any
 
@@ -22,20 +22,24 @@ def world_stream(seed: wp.uint32, world: int, episode: int) -> wp.uint32:
 @wp.kernel(enable_backward=False)
 def draw_from_table(
     # In:
-    poses_in: wp.array2d[float],
+    states_in: wp.array2d[float],
     mask_in: wp.array[bool],
     stream_in: wp.array[wp.uint32],
     # Data out:
     qpos_out: wp.array2d[float],
+    qvel_out: wp.array2d[float],
 ):
-    """Draws ``qpos`` uniformly from the rows of a table."""
+    """Draws a row of a table uniformly: ``qpos``, then ``qvel`` if the table has columns for it."""
     world = wp.tid()
     if not mask_in[world]:
         return
     stream = stream_in[world]
-    row = wp.randi(stream, 0, poses_in.shape[0])
-    for i in range(qpos_out.shape[1]):
-        qpos_out[world, i] = poses_in[row, i]
+    row = wp.randi(stream, 0, states_in.shape[0])
+    nq = qpos_out.shape[1]
+    for i in range(nq):
+        qpos_out[world, i] = states_in[row, i]
+    for i in range(states_in.shape[1] - nq):
+        qvel_out[world, i] = states_in[row, nq + i]
 
 
 @wp.func
