@@ -72,6 +72,14 @@ def geoms(draw):
 
 
 @st.composite
+def zones(draw, body):
+    """Returns a site of any shape that a touch sensor of a body feels with."""
+    kind = draw(st.sampled_from(["sphere", "capsule", "ellipsoid", "cylinder", "box"]))
+    pose = {"pos": draw(vectors(-0.15, 0.15)), "euler": draw(vectors(-180, 180))}
+    return element("site", name=f"zone{body}", type=kind, size=draw(vectors(0.03, 0.3)), **pose)
+
+
+@st.composite
 def joints(draw, name, kind):
     """Returns a joint with springs, dampers, limits and dry friction, as far as its kind has them."""
     if kind == "free":
@@ -116,6 +124,7 @@ def trees(draw, children, body, parent, actuated):
             break  # MuJoCo allows no rotation after these
         actuated.append(name)
     parts += [draw(geoms()) for _ in range(draw(st.sampled_from([1, 1, 2])))]
+    parts.append(draw(zones(body)))
     height = numbers(0.2, 0.8) if root else numbers(0.0, 0.3)
     position = [*draw(vectors(-0.3, 0.3, 2)), draw(height)]
     inner = [draw(trees(children, child, body, actuated)) for child in children[body]]
@@ -153,7 +162,11 @@ def models(draw, max_bodies=8):
         element("worldbody", *scene, *bodies),
         element("contact", *exclude),
         element("actuator", *(draw(actuators(joint)) for joint in actuated if draw(st.integers(0, 3)))),
-        element("sensor", element("subtreelinvel", body="body0")),
+        element(
+            "sensor",
+            element("subtreelinvel", body="body0"),
+            *(element("touch", site=f"zone{i}") for i in range(count)),
+        ),
     )
 
 

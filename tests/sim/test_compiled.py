@@ -55,6 +55,7 @@ OTHERS = [
     (MOTOR, MOTOR.replace("/>", ' damping="1"/>'), "'pull': delay, damping or armature"),
     (SENSOR, '<jointpos name="angle" joint="elbow"/>', "sensor 'angle'"),
     (SENSOR, SENSOR.replace("/>", ' cutoff="1"/>'), "sensor 'speed'"),
+    ('<joint name="elbow"', '<joint name="elbow" type="ball"', "'pull': a transmission other than a hinge or slide"),
 ]
 
 
@@ -138,10 +139,11 @@ def form(request, monkeypatch):
     monkeypatch.setattr(wp.config, "optimization_level", 0)
 
 
-def scene(*elements, gravity="0 0 -9.81", actuator="", body="root"):
+def scene(*elements, gravity="0 0 -9.81", actuator="", body="root", touch=None):
+    sensors = f'<subtreelinvel body="{body}"/>' + (f'<touch site="{touch}"/>' if touch else "")
     return mujoco.MjModel.from_xml_string(
         f'<mujoco><option gravity="{gravity}"/><worldbody>{"".join(elements)}</worldbody>'
-        f'<actuator>{actuator}</actuator><sensor><subtreelinvel body="{body}"/></sensor></mujoco>'
+        f"<actuator>{actuator}</actuator><sensor>{sensors}</sensor></mujoco>"
     )
 
 
@@ -158,6 +160,22 @@ def in_c_mujoco(model, sim, world=0):
     mujoco.mj_energyVel(model, data)
     mujoco.mj_subtreeVel(model, data)
     return data
+
+
+def test_the_touch_of_a_state_that_was_set_is_that_of_its_contacts(form):
+    """Nothing was stepped yet, and the motor counts as switched off, as in dm_control after a reset."""
+    site = '<site name="sole" size="0.2"/>'
+    body = (
+        f'<body name="root" pos="0 0 0.099"><joint name="up" type="slide" axis="0 0 1"/><geom size="0.1"/>{site}</body>'
+    )
+    model = scene('<geom type="plane" size="5 5 0.1"/>', body, actuator='<motor joint="up" gear="50"/>', touch="sole")
+    sim = simulated(model, num_envs=2)
+    sim.qpos[1] = 0.5
+    sim.ctrl.fill_(1.0)
+    sim.forward(wp.ones(2, dtype=bool, device="cpu"))
+    expected = in_c_mujoco(model, sim).sensordata[3]
+    assert expected > 1.0
+    np.testing.assert_allclose(sim.data.sensordata.numpy()[:, 3], [expected, 0.0], rtol=1e-3)
 
 
 def link(name, joint, inner="", pos="0 0 -0.4"):

@@ -119,7 +119,20 @@ def assert_poses_belong_to_the_state(model, sim, world):
     np.testing.assert_allclose(sim.xmat[world].reshape(-1, 9), data.xmat, rtol=0, atol=4e-6)
     np.testing.assert_allclose(sim.data.cvel.numpy()[world], data.cvel, rtol=0, atol=fast)
     velocity = data.subtree_linvel[model.body("body0").id]
-    np.testing.assert_allclose(sim.data.sensordata.numpy()[world], velocity, rtol=0, atol=fast)
+    np.testing.assert_allclose(sim.data.sensordata.numpy()[world, :3], velocity, rtol=0, atol=fast)
+
+
+def assert_touch_belongs_to_the_acceleration(model, data, sim, world):
+    """The touch sensors are those of C MuJoCo at the acceleration that was reached; returns how many feel something."""
+    data.qacc[:] = sim.qacc_warmstart[world].double()
+    jacobian = data.efc_J.reshape(-1, model.nv)
+    mujoco.mj_constraintUpdate(model, data, jacobian @ data.qacc - data.efc_aref, None, 0)
+    mujoco.mj_sensorAcc(model, data)
+    terms = np.abs(jacobian) @ np.abs(data.qacc) + np.abs(data.efc_aref)
+    rounding = 1e-5 * (data.efc_D * terms).max(initial=0)
+    touch = sim.data.sensordata.numpy()[world, 3:]
+    np.testing.assert_allclose(touch, data.sensordata[3:], rtol=1e-2, atol=rounding)
+    return int((touch > 1e-3).sum())
 
 
 def compare(xml, count=STATES):
@@ -150,6 +163,7 @@ def compare(xml, count=STATES):
         mujoco.mj_integratePos(model, qpos, sim.qvel[world].double().numpy(), model.opt.timestep)
         np.testing.assert_allclose(sim.qpos[world], qpos, rtol=1e-6, atol=1e-6)
         assert_poses_belong_to_the_state(model, sim, world)
+        found["touch"] += assert_touch_belongs_to_the_acceleration(model, data, sim, world)
     return found
 
 

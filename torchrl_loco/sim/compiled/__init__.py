@@ -15,6 +15,7 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 ``constraints``   softness of constraints; rows of limits and dry friction
 ``contacts``      rows of contacts
 ``solver``        Newton iterations and their line search
+``sensors``       velocities of subtrees, and touch
 ``lanes``         a group of lanes a world: what ``lanes.h`` has to know about a model
 ================  =========================================================================
 """

@@ -18,6 +18,7 @@ import numpy as np
 from torchrl_loco.sim.compiled.collision import CAPSULE, Corner, Pair, corners, frame, geom_pose
 from torchrl_loco.sim.compiled.constraints import Softness, Table, Variables
 from torchrl_loco.sim.compiled.dynamics import BALL, Dynamics
+from torchrl_loco.sim.compiled.sensors import TouchSensors
 from torchrl_loco.sim.compiled.symbols import (
     Block,
     Scalar,
@@ -85,6 +86,11 @@ class Pyramid:
                 hessian[direction, direction] = hessian.get((direction, direction), scalar(0)) + active
         return gradient, hessian
 
+    def normal_force(self) -> Scalar:
+        """Returns the normal force of contact ``k`` (N)."""
+        gradient, _ = self.response(cell("contact_D[k]"), [cell(f"contact_x{d}[k]") for d in self.directions])
+        return -gradient[0]
+
     def loop(self, first: str, count: str, body: str) -> str:
         """Returns a C++ loop over the edges of contacts, with x, v and D."""
         lines = [f"#pragma unroll 1\nfor (int k = {first}; k < {count}; ++k) {{"]
@@ -124,10 +130,11 @@ class GroundContacts:
     Args:
         tree: the dynamics.
         found: pairs of geoms that may touch.
+        touch: the sensors that may feel them.
     """
 
-    def __init__(self, tree: Dynamics, found: list[Pair]) -> None:
-        m, self.tree = tree.m, tree
+    def __init__(self, tree: Dynamics, found: list[Pair], touch: TouchSensors) -> None:
+        m, self.tree, self.touch = tree.m, tree, touch
         self.corners = corners(m, found)
         self.count = len(self.corners)
         self.bodies = sorted({self.body(corner) for corner in self.corners})
@@ -230,6 +237,7 @@ class GroundContacts:
                 for title, vector in (("lever", self._point(corner)), ("normal", normal), ("tangent", tangent)):
                     for i in range(3):
                         touching.set(f"contact_{title}{i}[k]", vector[i])
+                self._feel(touching, corner)
         distinct = sorted({float(np.float32(damping)) for damping in dampings})
         for damping in distinct:
             with block.scope("if (ground > 0)") as some:
@@ -238,6 +246,17 @@ class GroundContacts:
                     if len(distinct) > 1:
                         contact(f"if (contact_damping[k] != {literal(damping)}) continue;")
                     self._set(contact, "x", "+=")
+
+    def _feel(self, block: Block, corner: Corner) -> None:
+        """Notes which touch sensors feel contact ``k``."""
+        bodies = self.tree.m.geom_bodyid[list(corner.pair.geoms)]
+        first, second = (self.touch.of_body(body) for body in bodies)
+        if len(self.touch):
+            block("contact_zones[k] = 0;")
+        for s in range(len(self.touch)):
+            if (first | second) >> s & 1:
+                point, normal = self._point(corner) + self.tree.com[bodies[1]], self._plane(corner)[1]
+                self.touch.mark(block, s, point, normal if first >> s & 1 else -normal)
 
     def _store_twists(self, block: Block, velocity: list[Scalar]) -> None:
         """Stores the twists of the bodies for velocities of the joints."""
@@ -350,10 +369,11 @@ class DenseContacts:
         tree: the dynamics.
         found: pairs of geoms that may touch.
         ground: the contacts that come before these.
+        touch: the sensors that may feel them.
     """
 
-    def __init__(self, tree: Dynamics, found: list[Pair], ground: GroundContacts) -> None:
-        m, self.tree, self.ground = tree.m, tree, ground
+    def __init__(self, tree: Dynamics, found: list[Pair], ground: GroundContacts, touch: TouchSensors) -> None:
+        m, self.tree, self.ground, self.touch = tree.m, tree, ground, touch
         planes = {corner.pair for corner in ground.corners}
         self.pairs = [pair for pair in found if pair not in planes]
         self.balls = [j for j in range(m.njnt) if m.jnt_limited[j] and m.jnt_type[j] == BALL]
@@ -413,6 +433,10 @@ class DenseContacts:
         share = table.column("share", [self.pyramid.share(pair.condim) for pair in self.pairs])
         friction = table.column("friction", [pair.friction for pair in self.pairs])
         softness = Softness.from_table(table, [Softness.make(m, pair.solref, pair.solimp) for pair in self.pairs])
+        touching = [
+            table.integers(title, [self.touch.of_body(m.geom_bodyid[pair.geoms[i]]) for pair in self.pairs])
+            for i, title in enumerate(("first_sensors", "second_sensors") if len(self.touch) else ())
+        ]
         with block.loop("c", "candidates") as candidate:
             candidate(f"const int pair = candidate[c], first = {geoms[0]}, second = {geoms[1]};")
             candidate(f"const int first_dofs = {masks[0]}, second_dofs = {masks[1]};")
@@ -439,6 +463,7 @@ class DenseContacts:
                         jacobians[i][d] = sign * dot(tree.cdof[d], np.concatenate([moment, axes[i]]))
                 contact_weight_, residual = softness.row(weight, name("position"))
                 self._store(point, jacobians, contact_weight_ * share, residual, softness.damping, variables)
+                self._feel(point, touching, contact_point + origin)
 
     def _store(
         self,
@@ -451,12 +476,28 @@ class DenseContacts:
     ) -> None:
         """Stores contact ``k``."""
         nv, (_, qvel, qacc) = self.tree.m.nv, variables
+        if len(self.touch):
+            block("contact_zones[k] = 0;")
         block.set("contact_D[k]", weight)
         for i, jacobian in enumerate(jacobians):
             velocity = total(jacobian[d] * (qacc[d] + damping * qvel[d]) for d in range(nv))
             block.set(f"contact_x{i}[k]", (residual if i == 0 else 0) + velocity)
             for d in range(nv):
                 block.set(f"dense_J{i}[(k - ground) * {nv} + {d}]", jacobian[d])
+
+    def _feel(self, block: Block, sensors: list[str], at: np.ndarray) -> None:
+        """Notes which touch sensors feel contact ``k``.
+
+        Args:
+            block: where the contact is made.
+            sensors: C++ expressions of the sensors of either body.
+            at: the contact in the world's frame (m), ``(3,)``.
+        """
+        for s in range(len(self.touch)):
+            first, second = (f"{body} >> {s} & 1" for body in sensors)
+            with block.scope(f"if (({first}) | ({second}))") as near:
+                away = name(f"({first} ? 1.0f : -1.0f)")
+                self.touch.mark(near, s, at, np.array(names("n", 3), dtype=object) * away)
 
     def _limit_ball(self, block: Block, joint: int, variables: Variables) -> None:
         """Adds the limit of a ball joint: one row against its rotation from the reference."""

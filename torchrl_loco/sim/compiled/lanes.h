@@ -73,7 +73,6 @@ struct Quat {  // of unit length, as MuJoCo orders it
     return {w * b.w - x * b.x - y * b.y - z * b.z, w * b.x + x * b.w + y * b.z - z * b.y,
             w * b.y - x * b.z + y * b.w + z * b.x, w * b.z + x * b.y - y * b.x + z * b.w};
   }
-  INLINE Quat conjugate() const { return {w, -x, -y, -z}; }
   INLINE Quat normalized() const {
     const float k = Math::divide(1.0f, Math::root(w * w + x * x + y * y + z * z));
     return {w * k, x * k, y * k, z * k};
@@ -452,17 +451,11 @@ struct Step : Math {
   INLINE float joint_force(int d) const {
     const int q = Model::dof_qpos(d);
     float force = -Model::damping(d) * w.qvel[d];
-    if (Model::HAS_QUATERNION_SPRINGS && Model::dof_kind(d) == ROTATION) {
-      const Quat rest = {Model::spring(q), Model::spring(q + 1), Model::spring(q + 2), Model::spring(q + 3)};
-      const Vec turn = (rest.conjugate() * qpos_quat(q)).rotation_vector();
-      force = force - Model::stiffness(d) * turn.component(Model::dof_component(d));
-    } else if (Model::HAS_SPRINGS) {
-      force = force - Model::stiffness(d) * (w.qpos[q] - Model::spring(q));
-    }
+    if (Model::HAS_SPRINGS) force = force - Model::stiffness(d) * (w.qpos[q] - Model::spring(q));
     const int end = Model::first_actuator(d + 1);
     ROLLED for (int a = Model::first_actuator(d); a < end; ++a) {
       const float gear = Model::gear(a);
-      const float control = ctrl[world * Model::CONTROLS + Model::control(a)];
+      const float control = Model::SUBSTEPS ? ctrl[world * Model::CONTROLS + Model::control(a)] : 0.0f;
       float f = Model::gain(a) * clamp(control, Model::control_low(a), Model::control_high(a));
       if (Model::HAS_ACTUATOR_BIAS)
         f = f + Model::bias(a) + gear * (Model::bias_position(a) * w.qpos[q] + Model::bias_velocity(a) * w.qvel[d]);
@@ -513,7 +506,7 @@ struct Step : Math {
     count += bits(hits);
     if (count > places) {
       count = places;
-      if (lane == 0) overflow[world] |= Model::NO_PLACE;
+      if (lane == 0 && Model::SUBSTEPS) overflow[world] |= Model::NO_PLACE;
     }
     if (!touches || place >= places) return;
     w.contacts[friction ? place : Model::FRICTIONAL + place] = {point, distance - Model::margin(pair), normal, pair};
@@ -1089,7 +1082,7 @@ struct Step : Math {
     ROLLED for (int iteration = VELOCITY;; ++iteration) {
       if (!stop && iteration == Model::ITERATIONS) {
         stop = true;
-        if (lane == 0 && !small(step)) overflow[world] |= Model::LIMIT_REACHED;
+        if (lane == 0 && Model::SUBSTEPS && !small(step)) overflow[world] |= Model::LIMIT_REACHED;
       }
       if (stop && !Model::IMPLICIT_DAMPING) break;
       if (iteration < 0) {
@@ -1358,6 +1351,12 @@ if (live) {
   SHARED_LOOP(i, DOFS * STRIDE) w.mass[i] = 0.0f;
   step.sync();
 }
+if (live && Model::TOUCH && Model::SUBSTEPS == 0) {  // touch is a force: a step that is not taken finds it
+  step.kinematics();
+  step.dynamics();
+  step.solve();
+  step.write_touch(sensors);
+}
 ROLLED for (int substep = 0;; ++substep) {
   LOCKSTEP();
   if (live) step.kinematics();
@@ -1375,7 +1374,6 @@ if (live) {
   step.write_bodies(reinterpret_cast<float*>(xpos_out.data + first_body), reinterpret_cast<float*>(xmat_out.data + first_body),
                     cvel_out.data ? reinterpret_cast<float*>(cvel_out.data + first_body) : nullptr);
   step.write_subtree_velocities(sensors);
-  if (Model::SUBSTEPS == 0) SHARED_LOOP(s, Model::TOUCH) sensors[Model::touch_address(s)] = 0.0f;  // no force is known
   if (Model::SUBSTEPS > 0) {
     SHARED_LOOP(i, Model::POSITIONS) qpos_out.data[world * Model::POSITIONS + i] = w.qpos[i];
     SHARED_LOOP(i, DOFS) {

@@ -282,23 +282,16 @@ class Description:
         self.members = [[b for b in range(1, m.nbody) if self.places[b].link == i] for i in range(len(self.moving))]
         self.masses = [Mass.join(m, self.places, bodies) for bodies in self.members]
         self.ancestors = [sum(1 << int(j) for j in self._dofs_to_root(d)) for d in range(m.nv)]
-        self.pairs = [] if self.disabled("CONSTRAINT", "CONTACT") else self._sorted_pairs(pairs(m))
+        self.pairs = self._sorted_pairs(pairs(m))
         self.geoms = sorted({g for p in self.pairs for g in p.geoms if m.geom_type[g] != PLANE})
-        limited = [] if self.disabled("CONSTRAINT", "LIMIT") else [j for j in range(m.njnt) if m.jnt_limited[j]]
+        limited = [j for j in range(m.njnt) if m.jnt_limited[j]]
         self.limited = [j for j in limited if m.jnt_type[j] in (SLIDE, HINGE)]
         self.limited_balls = [j for j in limited if m.jnt_type[j] == BALL]
-        self.losses = (
-            [] if self.disabled("CONSTRAINT", "FRICTIONLOSS") else [d for d in range(m.nv) if m.dof_frictionloss[d] > 0]
-        )
+        self.losses = [d for d in range(m.nv) if m.dof_frictionloss[d] > 0]
         sensors = [(int(m.sensor_type[i]), int(m.sensor_objid[i]), int(m.sensor_adr[i])) for i in range(m.nsensor)]
         self.subtrees = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL)]
         self.touch = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_TOUCH)]
         self.layout = self._layout()
-
-    def disabled(self, *parts: str) -> bool:
-        """Returns whether one of these parts of the physics is switched off by a flag of the model."""
-        flags = [int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}")) for part in parts]
-        return any(self.m.opt.disableflags & flag for flag in flags)
 
     def _dofs_to_root(self, dof: int) -> Iterator[int]:
         while dof >= 0:
@@ -396,7 +389,7 @@ class Description:
             ls_tolerance=tolerance(m) * m.opt.ls_tolerance,
             least_aligned=collision.UPRIGHT,
         )
-        tables.vector("gravity", np.zeros(3) if self.disabled("GRAVITY") else m.opt.gravity)
+        tables.vector("gravity", m.opt.gravity)
         self._add_links(tables)
         self._add_joints(tables)
         self._add_forces(tables, mask)
@@ -458,54 +451,32 @@ class Description:
 
     def _add_forces(self, tables: Tables, mask: str) -> None:
         m = self.m
-        springs, dampers = not self.disabled("SPRING"), not self.disabled("DAMPER")
-        stiffness = m.jnt_stiffness[m.dof_jntid] * springs
-        damping = m.dof_damping * dampers
-        turning = np.isin(m.jnt_type[m.dof_jntid], (FREE, BALL))
-        tables.size(
-            HAS_SPRINGS=stiffness.any(),
-            HAS_QUATERNION_SPRINGS=stiffness[turning].any(),
-            IMPLICIT_DAMPING=damping.any() and not self.disabled("EULERDAMP"),
-        )
+        stiffness, damping = m.jnt_stiffness[m.dof_jntid], m.dof_damping
+        explicit = m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        tables.size(HAS_SPRINGS=stiffness.any(), IMPLICIT_DAMPING=damping.any() and not explicit)
         tables.floats("stiffness", stiffness)
         tables.floats("spring", m.qpos_spring)
         tables.floats("damping", damping)
         tables.floats("armature", m.dof_armature)
         tables.integers("ancestors", self.ancestors, mask)
-        acting = sorted(self._actions())
-        used = [a for _, a, _ in acting]
+        dofs = m.jnt_dofadr[m.actuator_trnid[:, 0]]
+        used = sorted(range(m.nu), key=lambda a: dofs[a])
         unbiased = m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE)
         bias = np.where(unbiased[:, None], 0, m.actuator_biasprm[:, :3])[used]
-        clamped = m.actuator_ctrllimited.astype(bool) & (not self.disabled("CLAMPCTRL"))
+        clamped = m.actuator_ctrllimited.astype(bool)
         limited = m.actuator_forcelimited.astype(bool)
         limits = np.where(clamped[:, None], m.actuator_ctrlrange, [-UNLIMITED, UNLIMITED])[used]
         forces = np.where(limited[:, None], m.actuator_forcerange, [-UNLIMITED, UNLIMITED])[used]
         tables.size(HAS_ACTUATOR_BIAS=bool(bias.any()), HAS_FORCE_LIMITS=limited[used].any())
-        tables.integers("first_actuator", [sum(d < k for d, _, _ in acting) for k in range(m.nv + 1)])
+        tables.integers("first_actuator", [sum(d < k for d in dofs) for k in range(m.nv + 1)])
         tables.integers("control", used)
-        tables.floats("gear", [gear for _, _, gear in acting])
+        tables.floats("gear", m.actuator_gear[used, 0])
         tables.floats("gain", m.actuator_gainprm[used, 0])
         for k, name in enumerate(("bias", "bias_position", "bias_velocity")):
             tables.floats(name, bias[:, k])
         for k, name in enumerate(("low", "high")):
             tables.floats(f"control_{name}", limits[:, k])
             tables.floats(f"force_{name}", forces[:, k])
-
-    def _actions(self) -> Iterator[tuple[int, int, float]]:
-        """Yields degree of freedom, actuator and gear, wherever an actuator acts.
-
-        Raises:
-            ValueError: an actuator is not supported.
-        """
-        m = self.m
-        for a in [] if self.disabled("ACTUATION") else range(m.nu):
-            joint = m.actuator_trnid[a, 0]
-            count = {FREE: 6, BALL: 3}.get(int(m.jnt_type[joint]), 1)
-            if count > 1 and m.actuator_biastype[a] != int(mujoco.mjtBias.mjBIAS_NONE):
-                raise ValueError(f"actuator {a}: those of free and ball joints have no bias here")
-            for k in range(count):
-                if m.actuator_gear[a, k]:
-                    yield int(m.jnt_dofadr[joint]) + k, a, float(m.actuator_gear[a, k])
 
     def _geom(self, g: int) -> tuple[int, np.ndarray, np.ndarray]:
         """Returns the link of a geom, and its center and z axis in the frame of the link."""

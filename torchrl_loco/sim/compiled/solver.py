@@ -14,6 +14,7 @@ from torchrl_loco.sim.compiled.collision import Pair
 from torchrl_loco.sim.compiled.constraints import DryFriction, JointLimits, Variables, tolerance
 from torchrl_loco.sim.compiled.contacts import DenseContacts, GroundContacts
 from torchrl_loco.sim.compiled.dynamics import Dynamics
+from torchrl_loco.sim.compiled.sensors import TouchSensors
 from torchrl_loco.sim.compiled.symbols import Block, cell, cells, dot, literal, total
 
 LINE_SEARCH = """
@@ -121,8 +122,9 @@ class NewtonSolver:
         self.tree = tree
         m = self.m = tree.m
         self.limits, self.friction = JointLimits(m), DryFriction(m)
-        self.ground = GroundContacts(tree, found)
-        self.dense = DenseContacts(tree, found, self.ground)
+        self.touch = TouchSensors(m, tree.poses)
+        self.ground = GroundContacts(tree, found, self.touch)
+        self.dense = DenseContacts(tree, found, self.ground, self.touch)
         self.arrays = dict.fromkeys(("qacc", "force", "search", "M_qacc", "M_search"), m.nv)
         for rows in (self.limits, self.friction, self.ground, self.dense):
             self.arrays.update(rows.arrays)
@@ -130,6 +132,7 @@ class NewtonSolver:
         directions = max(len(rows.pyramid.directions) for rows in (self.ground, self.dense))
         self.arrays["contact_D"] = self.places
         self.arrays.update({f"contact_{field}{d}": self.places for field in "xv" for d in range(directions)})
+        self.arrays["touch"] = len(self.touch)
         if self.dense.count:
             self.arrays.update({"gradient": m.nv, "solution": m.nv})
 
@@ -166,6 +169,14 @@ class NewtonSolver:
             iteration("if (alpha == 0.0f) { converged = true; break; }")
             self._advance(iteration)
         block(f"if (!converged && !({tests[0]})) overflow |= LIMIT_REACHED;")
+
+    def read_touch(self, block: Block) -> None:
+        """Sets the touch sensors from the forces that were found."""
+        block(f"for (int i = 0; i < {len(self.touch)}; ++i) touch[i] = 0.0f;")
+        if self.ground.count:
+            self.touch.add(block, "0", "ground", self.ground.pyramid.normal_force())
+        if self.dense.count:
+            self.touch.add(block, "ground", "contacts", self.dense.pyramid.normal_force())
 
     def _direction(self, block: Block) -> None:
         """Sets ``search`` to -H^-1 gradient, and the two measures of convergence."""

@@ -5,6 +5,7 @@ import mujoco
 from torchrl_loco.sim.compiled import lanes
 from torchrl_loco.sim.compiled.collision import CAPSULE, PLANE, SPHERE, Pair, pairs
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE
+from torchrl_loco.sim.compiled.sensors import SUBTREE_VELOCITY, TOUCH
 from torchrl_loco.sim.compiled.step import is_traced
 
 IGNORED_FLAGS = ("EULERDAMP", "FILTERPARENT", "REFSAFE", "MIDPHASE", "NATIVECCD", "ISLAND", "AUTORESET", "WARMSTART")
@@ -120,9 +121,11 @@ def _collides(m: mujoco.MjModel, pair: Pair) -> bool:
 
 
 def _sensors(m: mujoco.MjModel) -> list[str]:
-    velocity = int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL)
     return [
-        f"sensor {m.sensor(i).name!r}: anything but the velocity of a subtree, as it is"
+        f"sensor {m.sensor(i).name!r}: anything but touch and the velocity of a subtree, as they are"
         for i in range(m.nsensor)
-        if m.sensor_type[i] != velocity or m.sensor_cutoff[i] or m.sensor_interval[i].any() or m.sensor_delay[i]
+        if m.sensor_type[i] not in (SUBTREE_VELOCITY, TOUCH)
+        or m.sensor_cutoff[i]
+        or m.sensor_interval[i].any()
+        or m.sensor_delay[i]
     ]

@@ -3,8 +3,10 @@
 import mujoco
 from mujoco_warp import OverflowType
 
+from torchrl_loco.sim.compiled import sensors
 from torchrl_loco.sim.compiled.collision import pairs
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, Dynamics
+from torchrl_loco.sim.compiled.sensors import TOUCH, TouchSensors
 from torchrl_loco.sim.compiled.solver import NewtonSolver
 from torchrl_loco.sim.compiled.symbols import (
     Block,
@@ -51,8 +53,6 @@ PRELUDE = """
 INPUTS = {"qpos": "nq", "qvel": "nv", "qacc": "nv", "ctrl": "nu"}
 """What a world reads, and how many numbers of it. ``qacc`` starts as the warm start."""
 
-SUBTREE_VELOCITY = int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL)
-
 
 def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
@@ -73,16 +73,21 @@ def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
         world(f"float {title}[{max(count, 1)}];")
         world(f"for (int i = 0; i < {count}; ++i) {title}[i] = {title}_global[i];")
     world("int overflow = 0;")
-    if substeps:
-        step, arrays = _substep(m)
+    if substeps or TOUCH in m.sensor_type:
+        if not substeps:
+            world("// Touch is a force: a step that is not taken finds it, without control.")
+            world(f"for (int i = 0; i < {m.nu}; ++i) ctrl[i] = 0.0f;")
+        step, arrays = _substep(m, substeps)
         for title, count in arrays.items():
             if count and title != "qacc":
                 world(f"float {title}[{count}];")
-        world(f"int contact_body[{max(arrays['contact_D'], 1)}];")
+        for title in ("contact_body", "contact_zones") if arrays["touch"] else ("contact_body",):
+            world(f"int {title}[{max(arrays['contact_D'], 1)}];")
         world("#pragma unroll 1")
-        world(f"for (int step = 0; step < {substeps}; ++step) {{")
+        world(f"for (int step = 0; step < {max(substeps, 1)}; ++step) {{")
         world.lines += [f"  {line}" for line in "\n".join(step.lines).splitlines()]
         world("}")
+    if substeps:
         for title, size in INPUTS.items():
             if title != "ctrl":
                 world(f"for (int i = 0; i < {getattr(m, size)}; ++i) {title}_global[i] = {title}[i];")
@@ -93,8 +98,8 @@ def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
     return PRELUDE + bits + world.text() + "\n"
 
 
-def _substep(m: mujoco.MjModel) -> tuple[Block, dict[str, int]]:
-    """Returns one physics step, and the arrays that it needs."""
+def _substep(m: mujoco.MjModel, substeps: int) -> tuple[Block, dict[str, int]]:
+    """Returns one of ``substeps`` physics steps, and the arrays that it needs; with 0 it does not integrate."""
     block = Block()
     qpos, qvel, ctrl = names("qpos", m.nq), names("qvel", m.nv), names("ctrl", m.nu)
     tree = Dynamics(m, qpos, qvel, ctrl)
@@ -103,7 +108,11 @@ def _substep(m: mujoco.MjModel) -> tuple[Block, dict[str, int]]:
         block.set(f"force[{i}]", force)
     solver = NewtonSolver(tree, pairs(m))
     solver.write(block, (qpos, qvel, cells("qacc", m.nv)))
-    _integrate(block, m, tree)
+    if solver.touch:
+        with block.scope(f"if (step == {max(substeps - 1, 0)})") as last:
+            solver.read_touch(last)
+    if substeps:
+        _integrate(block, m, tree)
     return block, solver.arrays
 
 
@@ -160,7 +169,7 @@ def _outputs(world: Block, m: mujoco.MjModel, with_cvel: bool) -> None:
     rows = {
         "xpos": [x for position in tree.poses.xpos for x in position],
         "xmat": [x for orientation in tree.poses.xmat for x in orientation.flat],
-        "sensordata": _sensors(m, tree),
+        "sensordata": sensors.read(m, tree, TouchSensors(m, tree.poses)),
     }
     if with_cvel:
         rows["cvel"] = [x for twist in tree.cvel for x in twist]
@@ -169,25 +178,3 @@ def _outputs(world: Block, m: mujoco.MjModel, with_cvel: bool) -> None:
         for i, x in enumerate(row):
             if x is not None and scalar(x).constant is None:
                 world.set(f"{title}_global[{i}]", x)
-
-
-def _sensors(m: mujoco.MjModel, tree: Dynamics) -> list[Scalar | None]:
-    """Returns the sensors that depend on the present state."""
-    row: list[Scalar | None] = [None] * m.nsensordata
-    for sensor in range(m.nsensor):
-        if m.sensor_type[sensor] == SUBTREE_VELOCITY:
-            first = m.sensor_adr[sensor]
-            row[first : first + 3] = subtree_velocity(m, tree, int(m.sensor_objid[sensor]))
-    return row
-
-
-def subtree_velocity(m: mujoco.MjModel, tree: Dynamics, root: int) -> list[Scalar]:
-    """Returns the velocity of the center of mass of a body and all bodies below it (m/s)."""
-    momentum, below = zeros(3), {root}
-    for body in range(root, m.nbody):
-        if body != root and m.body_parentid[body] not in below:
-            continue
-        below.add(body)
-        if body:
-            momentum = momentum + (tree.inertia[body] @ tree.cvel[body])[3:]
-    return list(momentum / m.body_subtreemass[root])

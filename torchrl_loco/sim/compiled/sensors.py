@@ -1,0 +1,174 @@
+"""Sensors of one world, traced for one model: velocities of subtrees, and touch.
+
+===========================  ===========================================================================
+:func:`subtree_velocity`     of the present state
+:class:`TouchSensors`        of the forces of the last substep, as acceleration sensors are in MuJoCo
+===========================  ===========================================================================
+"""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.sim.compiled.collision import MINVAL, SPHERE
+from torchrl_loco.sim.compiled.dynamics import Dynamics, Poses, constant_matrix
+from torchrl_loco.sim.compiled.symbols import (
+    Block,
+    Scalar,
+    array,
+    dot,
+    maximum,
+    minimum,
+    name,
+    scalar,
+    select,
+    sqrt,
+    zeros,
+)
+
+SUBTREE_VELOCITY, TOUCH = (int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}")) for kind in ("SUBTREELINVEL", "TOUCH"))
+ELLIPSOID, CYLINDER, BOX = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("ELLIPSOID", "CYLINDER", "BOX"))
+NEVER, ALWAYS = 1e30, -1e30
+
+
+def subtree_velocity(m: mujoco.MjModel, tree: Dynamics, root: int) -> list[Scalar]:
+    """Returns the velocity of the center of mass of a body and all bodies below it (m/s)."""
+    momentum, below = zeros(3), {root}
+    for body in range(root, m.nbody):
+        if body != root and m.body_parentid[body] not in below:
+            continue
+        below.add(body)
+        if body:
+            momentum = momentum + (tree.inertia[body] @ tree.cvel[body])[3:]
+    return list(momentum / m.body_subtreemass[root])
+
+
+@dataclasses.dataclass(frozen=True)
+class Interval:
+    """The part of a ray that lies in a convex shape: parameters ``low`` to ``high``, empty if ``high < low``."""
+
+    low: Scalar
+    high: Scalar
+
+    @classmethod
+    def quadratic(cls, a: Scalar, b: Scalar, c: Scalar) -> "Interval":
+        """Returns where ``a t^2 + 2 b t + c <= 0``, for ``a >= 0``; where ``a`` vanishes, so must ``b``."""
+        discriminant = b * b - a * c
+        root = sqrt(maximum(discriminant, 0))
+        divisor = maximum(a, MINVAL)
+        still = select(a, "<", MINVAL, 1, 0)
+        low = select(discriminant, "<", 0, NEVER, (-b - root) / divisor)
+        high = select(discriminant, "<", 0, ALWAYS, (root - b) / divisor)
+        inside = select(c, "<=", 0, 1, -1)
+        return cls(select(0, "<", still, inside * ALWAYS, low), select(0, "<", still, inside * NEVER, high))
+
+    @classmethod
+    def ball(cls, p: np.ndarray, v: np.ndarray, radius: float) -> "Interval":
+        """Returns where the ray ``p + t v`` lies in a ball about the origin; in the plane, in a disc."""
+        return cls.quadratic(dot(v, v), dot(p, v), dot(p, p) - radius**2)
+
+    def both(self, other: "Interval") -> "Interval":
+        """Returns the intersection."""
+        return Interval(maximum(self.low, other.low), minimum(self.high, other.high))
+
+    def ahead(self) -> Scalar:
+        """Returns 1 if some of it has a parameter of zero or more, else 0."""
+        return select(self.low, "<=", self.high, select(0, "<=", self.high, 1, 0), 0)
+
+
+def meets(kind: int, size: np.ndarray, p: np.ndarray, v: np.ndarray) -> Scalar:
+    """Returns 1 if the ray ``p + t v``, ``t >= 0``, in the frame of a site meets it, else 0.
+
+    Args:
+        kind: shape of the site.
+        size: its size (m), ``(3,)``, as in ``MjModel.site_size``.
+        p: start of the ray (m), ``(3,)``.
+        v: its direction, ``(3,)``.
+    """
+    if kind == BOX:
+        x, y, z = (Interval.ball(p[i : i + 1], v[i : i + 1], size[i]) for i in range(3))
+        return x.both(y).both(z).ahead()
+    if kind in (SPHERE, ELLIPSOID):
+        scale = 1 / (size[[0, 0, 0]] if kind == SPHERE else size)
+        return Interval.ball(p * scale, v * scale, 1.0).ahead()
+    shaft = Interval.ball(p[:2], v[:2], size[0]).both(Interval.ball(p[2:], v[2:], size[1])).ahead()
+    if kind == CYLINDER:
+        return shaft
+    end = array([0.0, 0.0, size[1]])
+    caps = [Interval.ball(p - side * end, v, size[0]).ahead() for side in (1, -1)]
+    return maximum(shaft, maximum(*caps))
+
+
+class TouchSensors:
+    """Touch sensors: each adds up the normal forces of the contacts of its body that its site feels.
+
+    A contact is felt if the ray from its point, along the normal and away from the body, meets the site; from a point
+    within the site every ray does.
+
+    C++ variables: ``contact_zones``, the sensors that feel contact ``k``, one bit each, and ``touch``, the sums (N).
+
+    Args:
+        m: the model.
+        poses: where the bodies are.
+    """
+
+    def __init__(self, m: mujoco.MjModel, poses: Poses) -> None:
+        self.m, self.poses = m, poses
+        found = [i for i in range(m.nsensor) if m.sensor_type[i] == TOUCH]
+        self.sites = [int(m.sensor_objid[i]) for i in found]
+        self.addresses = [int(m.sensor_adr[i]) for i in found]
+
+    def __len__(self) -> int:
+        return len(self.sites)
+
+    def of_body(self, body: int) -> int:
+        """Returns the sensors of a body, as bits."""
+        return sum(1 << s for s, site in enumerate(self.sites) if self.m.site_bodyid[site] == body)
+
+    def mark(self, block: Block, sensor: int, point: np.ndarray, ray: np.ndarray) -> None:
+        """Notes whether a sensor feels contact ``k``.
+
+        Args:
+            block: where contact ``k`` is made.
+            sensor: index of the sensor.
+            point: the contact in the world's frame (m), ``(3,)``.
+            ray: the normal that points away from the sensor's body, ``(3,)``.
+        """
+        m, site = self.m, self.sites[sensor]
+        body = m.site_bodyid[site]
+        axes = self.poses.xmat[body] @ constant_matrix(m.site_quat[site])
+        center = self.poses.xpos[body] + self.poses.xmat[body] @ array(m.site_pos[site])
+        felt = meets(int(m.site_type[site]), m.site_size[site], axes.T @ (point - center), axes.T @ ray)
+        block(f"if ({block.value(felt)} > 0.0f) contact_zones[k] |= {1 << sensor};")
+
+    def add(self, block: Block, first: str, count: str, force: Scalar) -> None:
+        """Adds the normal forces of the contacts from ``first`` to ``count``.
+
+        Args:
+            block: a block after the solver.
+            first: C++ expression.
+            count: C++ expression.
+            force: normal force of contact ``k`` (N).
+        """
+        with block.scope(f"for (int k = {first}; k < {count}; ++k)") as contact:
+            contact("if (!contact_zones[k]) continue;")
+            contact(f"const float force_normal = {contact.value(force)};")
+            for s in range(len(self)):
+                contact(f"if (contact_zones[k] & {1 << s}) touch[{s}] += force_normal;")
+
+    def outputs(self) -> dict[int, Scalar]:
+        """Returns the sums by their address in ``sensordata``."""
+        return {address: name(f"touch[{s}]") for s, address in enumerate(self.addresses)}
+
+
+def read(m: mujoco.MjModel, tree: Dynamics, touch: TouchSensors) -> list[Scalar | None]:
+    """Returns the row of ``sensordata``; ``None`` where no sensor of this module writes."""
+    row: list[Scalar | None] = [None] * m.nsensordata
+    for sensor in range(m.nsensor):
+        if m.sensor_type[sensor] == SUBTREE_VELOCITY:
+            first = m.sensor_adr[sensor]
+            row[first : first + 3] = subtree_velocity(m, tree, int(m.sensor_objid[sensor]))
+    for address, force in touch.outputs().items():
+        row[address] = scalar(force)
+    return row
