@@ -5,7 +5,7 @@ from torchrl_loco import registry
 TASKS = list(registry.OURS)  # not those of plug-ins that happen to be installed
 PROTOCOLS = ("playground", "dm_control")
 ENGINES = ("compiled", "mujoco_warp")
-BODIES = ("walker_run", "humanoid_run", "cheetah_run")
+BODIES = ("walker_run", "humanoid_run", "cheetah_run", "hopper_hop")
 """A task of each body, for what does not depend on the task."""
 COARSE = {"sim_dt": 0.0125}
 """Two physics steps in a control step, for tests in which the physics does not matter: the fewer, the faster."""

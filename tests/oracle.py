@@ -11,7 +11,17 @@ SPEEDS = {
     "walker": {"stand": 0, "walk": 1, "run": 8},
     "humanoid": {"stand": 0, "walk": 1, "run": 10},
     "cheetah": {"run": 10},
+    "hopper": {"stand": 0, "hop": 2},
 }
+
+
+FORCES = {"hopper": slice(13, 15)}
+"""By body, the entries of an observation that are forces: of the last physics step, not of the state after it."""
+
+
+def without_forces(body, observation):
+    """Returns the entries that follow from the state."""
+    return np.delete(np.asarray(observation), FORCES.get(body, slice(0)), axis=-1)
 
 
 def reference_model(body):
@@ -86,6 +96,9 @@ class Oracle:
     def _observe_cheetah(self, d, protocol):
         return [*d.qpos[1:], *d.qvel]
 
+    def _observe_hopper(self, d, protocol):
+        return [*d.qpos[1:], *d.qvel, *np.log1p(d.sensordata[3:])]
+
     def reward(self, qpos, qvel, action):
         """Returns the reward of a state that the action led to."""
         return float(getattr(self, f"_reward_{self.body}")(self.forward(qpos, qvel), action))
@@ -111,3 +124,10 @@ class Oracle:
 
     def _reward_cheetah(self, d, action):
         return tolerance(d.sensordata[0], 10, np.inf, 10, "linear", 0)
+
+    def _reward_hopper(self, d, action):
+        height = d.body("torso").xipos[2] - d.body("foot").xipos[2]
+        standing = tolerance(height, 0.6, 2)
+        if self.speed == 0:
+            return standing * (4 + tolerance(action, margin=1, sigmoid="quadratic", value=0).mean()) / 5
+        return standing * tolerance(d.sensordata[0], 2, np.inf, 1, "linear", 0.5)

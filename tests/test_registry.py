@@ -11,9 +11,15 @@ from torchrl_loco.config import DEFAULTS, sim_config
 EXPECTED = {
     "walker": {"nu": 6, "obs": 24, "ctrl_dt": 0.025, "sim_dt": 0.0025, "naconmax": 50_000, "njmax": 100},
     "humanoid": {"nu": 21, "obs": 67, "ctrl_dt": 0.025, "sim_dt": 0.005, "naconmax": 200_000, "njmax": 250},
+    "hopper": {"nu": 4, "obs": 15, "ctrl_dt": 0.02, "sim_dt": 0.005, "naconmax": 50_000, "njmax": 50},
     "cheetah": {"nu": 6, "obs": 17, "ctrl_dt": 0.01, "sim_dt": 0.01, "naconmax": 100_000, "njmax": 100},
 }
-GOALS = {"walker": ("stand", "walk", "run"), "humanoid": ("stand", "walk", "run"), "cheetah": ("run",)}
+GOALS = {
+    "walker": ("stand", "walk", "run"),
+    "humanoid": ("stand", "walk", "run"),
+    "cheetah": ("run",),
+    "hopper": ("stand", "hop"),
+}
 
 
 def test_our_environments():
@@ -43,7 +49,7 @@ def test_defaults(body):
         for field in ("ctrl_dt", "sim_dt", "naconmax", "njmax"):
             assert getattr(config, field) == EXPECTED[body][field]
         assert config.episode_length == 1000
-    cut = {"walker": (2, 5), "humanoid": (4, 8), "cheetah": (4, 8)}[body]
+    cut = {"walker": (2, 5), "humanoid": (4, 8), "cheetah": (4, 8), "hopper": (4, 10)}[body]
     playground, dm_control = (sim_config(DEFAULTS[body], name, 2048, {}) for name in ("playground", "dm_control"))
     assert (playground.iterations, playground.ls_iterations, playground.euler_damping) == (*cut, False)
     assert (dm_control.iterations, dm_control.ls_iterations, dm_control.euler_damping) == (100, 50, True)

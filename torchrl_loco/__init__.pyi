@@ -12,6 +12,8 @@ from . import training as training
 from .collector import RolloutCollector as RolloutCollector
 from .config import SimConfig as SimConfig
 from .envs import CheetahRun as CheetahRun
+from .envs import HopperHop as HopperHop
+from .envs import HopperStand as HopperStand
 from .envs import HumanoidRun as HumanoidRun
 from .envs import HumanoidStand as HumanoidStand
 from .envs import HumanoidWalk as HumanoidWalk

@@ -21,12 +21,13 @@ class Entry:
     Args:
         name: what it is, in Markdown.
         unit: its unit, empty for pure numbers.
-        value: computes it from a state of C MuJoCo.
+        value: computes it from a state of C MuJoCo; ``None`` for forces of the last physics step, which no longer
+            follow from the state.
     """
 
     name: str
     unit: str
-    value: Value
+    value: Value | None
 
 
 def observation(body: str, protocol: str) -> list[Entry]:
@@ -98,6 +99,13 @@ def _cheetah(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
     yield from _velocities(model)
 
 
+def _hopper(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
+    yield from _positions(model, 1)
+    yield from _velocities(model)
+    for part in ("toe", "heel"):
+        yield Entry(f"touch of the {part}", "log(1 + N)", None)
+
+
 def _positions(model: mujoco.MjModel, first: int) -> Iterator[Entry]:
     """Yields the positions of slides and hinges, from a joint on."""
     for i in range(first, model.njnt):
@@ -122,5 +130,5 @@ def _seen(data: mujoco.MjData, name: str) -> np.ndarray:
     return torso.xmat.reshape(3, 3).T @ (data.body(name).xpos - torso.xpos)
 
 
-BODIES = {"walker": _walker, "humanoid": _humanoid, "cheetah": _cheetah}
+BODIES = {"walker": _walker, "humanoid": _humanoid, "cheetah": _cheetah, "hopper": _hopper}
 """What yields the entries of a body's observation from its model and the protocol."""

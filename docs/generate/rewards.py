@@ -3,7 +3,7 @@
 import dataclasses
 import math
 
-from torchrl_loco.envs import humanoid, walker
+from torchrl_loco.envs import hopper, humanoid, walker
 from torchrl_loco.registry import env_class
 
 UPRIGHT = "$u$ the z component of the torso's z axis (1 upright, -1 upside down)"
@@ -46,7 +46,8 @@ class Reward:
 def reward(task: str) -> Reward:
     """Returns how the reward of a task is put together."""
     cls = env_class(task)
-    return {"walker": _walker, "humanoid": _humanoid, "cheetah": _cheetah}[cls.body](cls.target_speed)
+    of_body = {"walker": _walker, "humanoid": _humanoid, "cheetah": _cheetah, "hopper": _hopper}[cls.body]
+    return of_body(cls.target_speed)
 
 
 def _walker(speed: float) -> Reward:
@@ -92,6 +93,18 @@ def _cheetah(speed: float) -> Reward:
     return Reward(parts, [("move", parts["fast"].latex())], VELOCITY)
 
 
+def _hopper(speed: float) -> Reward:
+    parts = {"standing": Tolerance("z", float(hopper.STAND_HEIGHT), float(hopper.MAX_HEIGHT), 0.0)}
+    symbols = "$z$ the height of the torso's center of mass above the foot's (m)"
+    if speed > 0:
+        parts["fast"] = Tolerance("v_x", speed, math.inf, speed / 2, "linear", 0.5)
+        line, symbols = ("hopping", parts["fast"].latex()), f"{symbols}, {VELOCITY}"
+    else:
+        parts["gentle"] = Tolerance("a_i", 0.0, 0.0, 1.0, "quadratic", 0.0)
+        line, symbols = ("small_control", _gentle(parts["gentle"], 4)), f"{symbols}, $a$ the action"
+    return Reward(parts, [("standing", parts["standing"].latex()), line], symbols)
+
+
 def _share(fast: Tolerance) -> str:
     """Returns the factor by which dm_control rewards speed beside standing."""
     return rf"\tfrac{{1}}{{6}} \left(1 + 5\,{fast.latex()}\right)"
@@ -113,6 +126,6 @@ def formula(task: str) -> str:
         f"$$\n\\begin{{aligned}}\n{aligned}\n\\end{{aligned}}\n$$\n\n"
         f"with {made.symbols}. $\\operatorname{{tol}}$ is dm_control's "
         "[tolerance](../api/rewards.md): 1 within the bounds; outside it decreases to 0.1 at the margin, as a Gaussian "
-        "unless another sigmoid and value are given.\n\n"
+        "unless another sigmoid and value are given, and is 0 without a margin.\n\n"
         f"{listed if len(names) > 1 else f'The only term under `reward_terms=True` is {terms}.'}\n"
     )

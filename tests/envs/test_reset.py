@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from oracle import DATA
+from oracle import DATA, FORCES, Oracle
 from tensordict import TensorDict
 
 import torchrl_loco
@@ -12,7 +12,7 @@ from torchrl_loco import State, models
 
 SIGNIFICANCE = 1e-4
 # Under playground the humanoid draws nothing.
-DRAWING = [("walker_run", "playground"), ("humanoid_run", "dm_control")]
+DRAWING = [("walker_run", "playground"), ("humanoid_run", "dm_control"), ("hopper_hop", "playground")]
 
 
 def from_one_distribution(ours, theirs):
@@ -57,6 +57,8 @@ def draws(shared):
         ("humanoid_run", "dm_control", "mujoco_warp"),
         ("cheetah_run", "playground", "compiled"),
         ("cheetah_run", "dm_control", "mujoco_warp"),
+        ("hopper_hop", "dm_control", "compiled"),
+        ("hopper_hop", "playground", "mujoco_warp"),
     ],
 )
 def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol, engine, device, actions):
@@ -91,9 +93,11 @@ def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol
 
 
 @pytest.mark.slow
-def test_walker_starts_uniformly(draws, device):
-    qpos = draws("walker_walk", 4096, 1, seed=12, device=device)[0].numpy().astype(np.float64)
-    model = models.load(models.PATHS["walker"])
+@pytest.mark.parametrize("task", ["walker_walk", "hopper_stand"])
+def test_planar_bodies_start_uniformly(draws, task, device):
+    body = task.split("_")[0]
+    qpos = draws(task, 4096, 1, seed=12, device=device)[0].numpy().astype(np.float64)
+    model = models.load(models.PATHS[body])
     assert (qpos[:, :2] == 0).all()
     ranges = [(-np.pi, np.pi), *model.jnt_range[3:]]
     for angle, (low, high) in zip(qpos[:, 2:].T, ranges, strict=True):
@@ -101,8 +105,26 @@ def test_walker_starts_uniformly(draws, device):
         assert angle.max() <= high
         distance, critical = kolmogorov_smirnov(angle, lambda x, low=low, high=high: (x - low) / (high - low))
         assert distance < critical
-    correlation = np.corrcoef(qpos[:, 2:].T) - np.eye(7)
+    correlation = np.corrcoef(qpos[:, 2:].T) - np.eye(model.nq - 2)
     assert np.abs(correlation).max() < 5 / np.sqrt(len(qpos))
+    assert from_one_distribution(qpos[:, 2:], np.load(DATA / f"{body}_resets_dm_control.npz")["qpos"][:, 2:])
+
+
+@pytest.mark.parametrize("lowered", [0.0, 0.2])
+def test_a_hopper_feels_the_ground_before_its_first_step(shared, engine, lowered, device):
+    """What C MuJoCo finds without control, and not the forces of the episode before."""
+    env = shared("hopper_hop", 64, device, protocol="dm_control", engine=engine)
+    env.rollout(30, break_when_any_done=False)
+    td, state = env.reset(), env.get_state()
+    if lowered:
+        state["qpos"][:, 1] -= lowered
+        td = env.reset(state, set_state=True)
+    reference = Oracle("hopper_hop", env.mjcf)
+    rows = zip(*(state[key].cpu().double().numpy() for key in ("qpos", "qvel")), strict=True)
+    expected = np.array([reference.observation(*row, "dm_control") for row in rows])
+    error = np.abs(td["observation"].cpu().numpy() - expected)[:, FORCES["hopper"]].max(axis=1)
+    assert (expected[:, FORCES["hopper"]] > 0).any() == (lowered > 0)
+    assert np.quantile(error, 0.95) < 1e-4
 
 
 @pytest.mark.slow

@@ -3,6 +3,8 @@
 from torchrl_loco.envs.autoreset import TransformedEnv as TransformedEnv
 from torchrl_loco.envs.base import LocoEnv as LocoEnv
 from torchrl_loco.envs.cheetah import CheetahRun as CheetahRun
+from torchrl_loco.envs.hopper import HopperHop as HopperHop
+from torchrl_loco.envs.hopper import HopperStand as HopperStand
 from torchrl_loco.envs.humanoid import HumanoidRun as HumanoidRun
 from torchrl_loco.envs.humanoid import HumanoidStand as HumanoidStand
 from torchrl_loco.envs.humanoid import HumanoidWalk as HumanoidWalk

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 _FOLDER = Path(__file__).parent
-PATHS = {name: _FOLDER / f"{name}.xml" for name in ("walker", "humanoid", "cheetah")}
+PATHS = {name: _FOLDER / f"{name}.xml" for name in ("walker", "humanoid", "cheetah", "hopper")}
 SCENE = _FOLDER / "scene.xml"
 """What all bodies can include by its name: light, materials, the look of the floor."""
 
@@ -17,7 +17,12 @@ VELOCITY_SENSORS = {
         *("FRAMELINVEL", "FRAMEANGVEL", "SUBTREELINVEL", "SUBTREEANGMOM"),
     )
 }
-"""Sensors that a simulation evaluates: they follow from what is computed after a step, and are zero at rest."""
+"""Sensors of velocities: they belong to the state after a step, and are zero at rest."""
+
+FORCE_SENSORS = {
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}")) for name in ("TOUCH", "ACCELEROMETER", "FORCE", "TORQUE")
+}
+"""Sensors of forces and accelerations: those of the last physics step, or without control if none was taken yet."""
 
 
 def load(path: Path) -> mujoco.MjModel:
@@ -49,9 +54,12 @@ def check(mj_model: mujoco.MjModel) -> mujoco.MjModel:
     for i in range(mj_model.nsensor):
         camera = int(mujoco.mjtObj.mjOBJ_CAMERA)
         of_camera = camera in (mj_model.sensor_objtype[i], mj_model.sensor_reftype[i])
-        if of_camera or mj_model.sensor_type[i] not in VELOCITY_SENSORS:
+        if of_camera or mj_model.sensor_type[i] not in VELOCITY_SENSORS | FORCE_SENSORS:
             name = mj_model.sensor(i).name
-            wrong.append(f"sensor {name!r} is not evaluated, only velocities are: compute it from sim.data in a kernel")
+            wrong.append(
+                f"sensor {name!r} is not evaluated, only velocities, touch, accelerometers, forces and torques are: "
+                "compute it from sim.data in a kernel"
+            )
     if wrong:
         raise ValueError("; ".join(wrong))
     return mj_model

@@ -42,6 +42,28 @@ def draw_from_table(
         qvel_out[world, i] = states_in[row, nq + i]
 
 
+@wp.kernel(enable_backward=False)
+def draw_pitch_and_hinges(
+    # Model:
+    jnt_range: wp.array2d[wp.vec2],
+    pitch: int,
+    # In:
+    mask_in: wp.array[bool],
+    stream_in: wp.array[wp.uint32],
+    # Data out:
+    qpos_out: wp.array2d[float],
+):
+    """Draws the pitch of a planar body in (-pi, pi), and the hinges that follow it uniformly in their ranges."""
+    world = wp.tid()
+    if not mask_in[world]:
+        return
+    stream = stream_in[world]
+    qpos_out[world, pitch] = wp.randf(stream, -wp.pi, wp.pi)
+    for i in range(pitch + 1, qpos_out.shape[1]):  # the hinges, all with limits
+        limits = jnt_range[0, i]
+        qpos_out[world, i] = wp.randf(stream, limits[0], limits[1])
+
+
 @wp.func
 def positive_quaternion(stream: wp.uint32):
     """Draws four numbers from U(0, 1) and normalises them; returns (w, x, y, z) and the advanced stream.
