@@ -160,7 +160,6 @@ class GroundContacts:
             "body_gradient": len(self.bodies) * len(self.live),
             "body_stiffness": len(self.bodies) * packed,
             **{f"contact_{title}{i}": self.count for title in ("lever", "normal", "tangent") for i in range(3)},
-            "contact_damping": self.count,
         }
 
     def body(self, corner: Corner) -> int:
@@ -219,33 +218,41 @@ class GroundContacts:
 
     def create(self, block: Block, variables: Variables) -> None:
         """Finds the contacts, and sets weights and residuals."""
-        m, (_, qvel, qacc) = self.tree.m, variables
         block("int ground = 0;")
-        dampings = []
-        for corner, (normal, tangent) in zip(self.corners, self._frames, strict=True):
+        for i, (corner, (normal, tangent)) in enumerate(zip(self.corners, self._frames, strict=True)):
             position = self._distance(corner) - corner.pair.margin
             with block.scope(f"if ({block.value(position)} < 0.0f)") as touching:
                 touching("const int k = ground++;")
-                touching(f"contact_body[k] = {self.bodies.index(self.body(corner))};")
-                softness = Softness.make(m, corner.pair.solref, corner.pair.solimp)
-                weight, residual = softness.row(contact_weight(m, corner.pair), position)
-                touching.set("contact_D[k]", weight * self.pyramid.share(corner.pair.condim))
-                touching.set("contact_x0[k]", residual)
-                touching(" ".join(f"contact_x{d}[k] = 0.0f;" for d in self.pyramid.directions[1:]))
-                dampings.append(softness.damping)
-                touching.set("contact_damping[k]", softness.damping)
+                touching(f"contact_corner[k] = {i}; contact_body[k] = {self.bodies.index(self.body(corner))};")
+                touching.set("contact_x0[k]", position)
                 for title, vector in (("lever", self._point(corner)), ("normal", normal), ("tangent", tangent)):
-                    for i in range(3):
-                        touching.set(f"contact_{title}{i}[k]", vector[i])
+                    for component in range(3):
+                        touching.set(f"contact_{title}{component}[k]", vector[component])
                 self._feel(touching, corner)
-        distinct = sorted({float(np.float32(damping)) for damping in dampings})
-        for damping in distinct:
+        if self.corners:
+            self._create_rows(block, variables)
+
+    def _create_rows(self, block: Block, variables: Variables) -> None:
+        """Sets weights and residuals.
+
+        It is a loop over the contacts: at the corners, the worlds of a warp would wait for each other's.
+        """
+        m, (_, qvel, qacc) = self.tree.m, variables
+        table = Table(block, "corner", "contact_corner[k]")
+        rows = [Softness.make(m, corner.pair.solref, corner.pair.solimp) for corner in self.corners]
+        softness = Softness.from_table(table, rows)
+        weight = table.column("weight", [contact_weight(m, corner.pair) for corner in self.corners])
+        share = table.column("share", [self.pyramid.share(corner.pair.condim) for corner in self.corners])
+        for damping in sorted({float(np.float32(row.damping)) for row in rows}):
             with block.scope("if (ground > 0)") as some:
                 self._store_twists(some, [a + damping * v for a, v in zip(qacc, qvel, strict=True)])
                 with some.loop("k", "ground") as contact:
-                    if len(distinct) > 1:
-                        contact(f"if (contact_damping[k] != {literal(damping)}) continue;")
-                    self._set(contact, "x", "+=")
+                    if scalar(softness.damping).constant is None:
+                        contact(f"if ({contact.value(softness.damping)} != {literal(damping)}) continue;")
+                    position = contact.keep(cell("contact_x0[k]"))
+                    inertia, residual = softness.row(weight, position)
+                    contact.set("contact_D[k]", inertia * share)
+                    self._set(contact, "x", residual)
 
     def _feel(self, block: Block, corner: Corner) -> None:
         """Notes which touch sensors feel contact ``k``."""
@@ -265,10 +272,10 @@ class GroundContacts:
             for i, component in enumerate(self.live):
                 block.set(f"body_twist[{len(self.live) * b + i}]", twists[body][component])
 
-    def _set(self, block: Block, field: str, how: str) -> None:
+    def _set(self, block: Block, field: str, residual: Scalar | float = 0.0) -> None:
         velocity = self._velocity(self._stored_twist())
         for d in self.pyramid.directions:
-            block.set(f"contact_{field}{d}[k]", velocity[d], how)
+            block.set(f"contact_{field}{d}[k]", velocity[d] if d else residual + velocity[d])
 
     def project(self, block: Block, search: list[Scalar]) -> None:
         """Sets how the residuals change along the search direction."""
@@ -276,7 +283,7 @@ class GroundContacts:
             with block.scope("if (ground > 0)") as some:
                 self._store_twists(some, search)
                 with some.loop("k", "ground") as contact:
-                    self._set(contact, "v", "=")
+                    self._set(contact, "v")
 
     def gather(self, block: Block) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Adds up gradient and Hessian of the cost at each body.

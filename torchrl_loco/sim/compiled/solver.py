@@ -25,14 +25,14 @@ auto smooth = [&](float step) {
   const float cost = step * (slope_smooth + 0.5f * step * curvature_smooth);
   return Point{step, cost, slope_smooth + step * curvature_smooth, curvature_smooth};
 };
-// A row whose residual is x + step * v.
+// A row whose residual is x + step * v. It costs something where that is negative: its cost grows by D / 2 (y^2 - x^2),
+// with both cut off at zero.
+#define ROW const float slope = D * v, curvature = slope * v, half = 0.5f * D, at_zero = wp::min(x, 0.0f);
 #define ADD_ROW(p) { \\
-  const bool active = fmaf(p.step, v, x) < 0.0f; \\
-  p.cost += (active ? fmaf(p.step, fmaf(0.5f * p.step, curvature, slope), cost) : 0.0f) - cost_at_zero; \\
-  p.slope += active ? fmaf(p.step, curvature, slope) : 0.0f; \\
-  p.curvature += active ? curvature : 0.0f; }
-#define ROW \\
-  const float slope = D * v * x, curvature = D * v * v, cost = 0.5f * D * x * x, cost_at_zero = x < 0.0f ? cost : 0.0f;
+  const float y = wp::min(fmaf(p.step, v, x), 0.0f); \\
+  p.cost = fmaf(half * (y - at_zero), y + at_zero, p.cost); \\
+  p.slope = fmaf(slope, y, p.slope); \\
+  p.curvature += y < 0.0f ? curvature : 0.0f; }
 // A row of dry friction: quadratic up to the largest force, linear beyond.
 #define FRICTION_COST(y) (fabsf(y) < bound ? 0.5f * D * (y) * (y) : limit * (fabsf(y) - 0.5f * bound))
 #define ADD_FRICTION(p) { \\

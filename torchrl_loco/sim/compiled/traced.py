@@ -81,7 +81,7 @@ def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
         for title, count in arrays.items():
             if count and title != "qacc":
                 world(f"float {title}[{count}];")
-        for title in ("contact_body", "contact_zones") if arrays["touch"] else ("contact_body",):
+        for title in ("contact_corner", "contact_body", *(["contact_zones"] if arrays["touch"] else [])):
             world(f"int {title}[{max(arrays['contact_D'], 1)}];")
         world("#pragma unroll 1")
         world(f"for (int step = 0; step < {max(substeps, 1)}; ++step) {{")
