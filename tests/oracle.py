@@ -12,16 +12,18 @@ SPEEDS = {
     "humanoid": {"stand": 0, "walk": 1, "run": 10},
     "cheetah": {"run": 10},
     "hopper": {"stand": 0, "hop": 2},
+    "quadruped": {"walk": 0.5, "run": 5},
 }
 
 
-FORCES = {"hopper": slice(13, 15)}
-"""By body, the entries of an observation that are forces: of the last physics step, not of the state after it."""
+FORCES = {"hopper": np.r_[13:15], "quadruped": np.r_[48:51, 54:78]}
+"""By body, the entries of an observation that are forces or accelerations: of the last physics step, not of the state
+after it."""
 
 
 def without_forces(body, observation):
     """Returns the entries that follow from the state."""
-    return np.delete(np.asarray(observation), FORCES.get(body, slice(0)), axis=-1)
+    return np.delete(np.asarray(observation), FORCES.get(body, []), axis=-1)
 
 
 def reference_model(body):
@@ -73,14 +75,14 @@ class Oracle:
         self.model = mujoco.MjModel.from_xml_path(str(path))
         self.data = mujoco.MjData(self.model)
 
-    def forward(self, qpos, qvel):
-        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+    def forward(self, qpos, qvel, act=0.0):
+        self.data.qpos[:], self.data.qvel[:], self.data.act[:] = qpos, qvel, act
         mujoco.mj_forward(self.model, self.data)
         return self.data
 
-    def observation(self, qpos, qvel, protocol):
+    def observation(self, protocol, qpos, qvel, act=0.0):
         """Returns the observation of a state."""
-        return np.array(getattr(self, f"_observe_{self.body}")(self.forward(qpos, qvel), protocol))
+        return np.array(getattr(self, f"_observe_{self.body}")(self.forward(qpos, qvel, act), protocol))
 
     def _observe_walker(self, d, protocol):
         mats = d.xmat[1:].reshape(-1, 3, 3)
@@ -98,6 +100,11 @@ class Oracle:
 
     def _observe_hopper(self, d, protocol):
         return [*d.qpos[1:], *d.qvel, *np.log1p(d.sensordata[3:])]
+
+    def _observe_quadruped(self, d, protocol):
+        accelerometer, gyro, velocimeter, forces = np.split(d.sensordata, [3, 6, 9])
+        upright = d.body("torso").xmat[8]
+        return [*d.qpos[7:], *d.qvel[6:], *d.act, *velocimeter, upright, *accelerometer, *gyro, *np.arcsinh(forces)]
 
     def reward(self, qpos, qvel, action):
         """Returns the reward of a state that the action led to."""
@@ -131,3 +138,7 @@ class Oracle:
         if self.speed == 0:
             return standing * (4 + tolerance(action, margin=1, sigmoid="quadratic", value=0).mean()) / 5
         return standing * tolerance(d.sensordata[0], 2, np.inf, 1, "linear", 0.5)
+
+    def _reward_quadruped(self, d, action):
+        upright = tolerance(d.body("torso").xmat[8], 1, np.inf, 2, "linear", 0)
+        return upright * tolerance(d.sensor("velocimeter").data[0], self.speed, np.inf, self.speed, "linear", 0.5)

@@ -90,7 +90,7 @@ def test_every_entry_of_the_observation_tables(body_task, protocol, shared, acti
     after, worlds = scattered(env, actions)
     entries = bodies.observation(env.body, protocol)
     assert len(entries) == env.observation_size
-    known = [i for i, entry in enumerate(entries) if entry.value]  # forces are in test_fidelity
+    known = [i for i, entry in enumerate(entries) if entry.value]  # the others are in test_fidelity
     expected = np.array([[entries[i].value(data) for i in known] for data in worlds])
     np.testing.assert_allclose(after["observation"][:, known], expected, rtol=0, atol=2e-4)
 
@@ -125,7 +125,11 @@ def test_reward_formulas(task, shared, actions):
         yield tol("standing", d.body("torso").xipos[2] - d.body("foot").xipos[2])
         yield tol("fast", d.sensordata[0]) if "fast" in parts else (4 + tol("gentle", d.ctrl)) / 5
 
-    terms_of = {"walker": walker, "humanoid": humanoid, "cheetah": cheetah, "hopper": hopper}[env_class(task).body]
+    def quadruped(d):
+        yield tol("upright", d.body("torso").xmat[8])
+        yield tol("fast", d.sensor("velocimeter").data[0])
+
+    terms_of = {terms.__name__: terms for terms in (walker, humanoid, cheetah, hopper, quadruped)}[env_class(task).body]
     for world, data in enumerate(worlds):
         terms = list(terms_of(data))
         seen = [after["reward_terms", name][world].item() for name in env_class(task).term_names]

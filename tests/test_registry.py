@@ -12,6 +12,7 @@ EXPECTED = {
     "walker": {"nu": 6, "obs": 24, "ctrl_dt": 0.025, "sim_dt": 0.0025, "naconmax": 50_000, "njmax": 100},
     "humanoid": {"nu": 21, "obs": 67, "ctrl_dt": 0.025, "sim_dt": 0.005, "naconmax": 200_000, "njmax": 250},
     "hopper": {"nu": 4, "obs": 15, "ctrl_dt": 0.02, "sim_dt": 0.005, "naconmax": 50_000, "njmax": 50},
+    "quadruped": {"nu": 12, "obs": 78, "ctrl_dt": 0.02, "sim_dt": 0.005, "naconmax": 50_000, "njmax": 100},
     "cheetah": {"nu": 6, "obs": 17, "ctrl_dt": 0.01, "sim_dt": 0.01, "naconmax": 100_000, "njmax": 100},
 }
 GOALS = {
@@ -19,6 +20,7 @@ GOALS = {
     "humanoid": ("stand", "walk", "run"),
     "cheetah": ("run",),
     "hopper": ("stand", "hop"),
+    "quadruped": ("walk", "run"),
 }
 
 
@@ -49,9 +51,10 @@ def test_defaults(body):
         for field in ("ctrl_dt", "sim_dt", "naconmax", "njmax"):
             assert getattr(config, field) == EXPECTED[body][field]
         assert config.episode_length == 1000
-    cut = {"walker": (2, 5), "humanoid": (4, 8), "cheetah": (4, 8), "hopper": (4, 10)}[body]
+    cut = {"walker": (2, 5), "humanoid": (4, 8), "cheetah": (4, 8), "hopper": (4, 10), "quadruped": (4, 10)}[body]
     playground, dm_control = (sim_config(DEFAULTS[body], name, 2048, {}) for name in ("playground", "dm_control"))
-    assert (playground.iterations, playground.ls_iterations, playground.euler_damping) == (*cut, False)
+    damped = body == "quadruped"
+    assert (playground.iterations, playground.ls_iterations, playground.euler_damping) == (*cut, damped)
     assert (dm_control.iterations, dm_control.ls_iterations, dm_control.euler_damping) == (100, 50, True)
 
 

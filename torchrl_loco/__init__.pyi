@@ -21,6 +21,8 @@ from .envs import LocoEnv as LocoEnv
 from .envs import NonFiniteWarning as NonFiniteWarning
 from .envs import PhysicsOverflowError as PhysicsOverflowError
 from .envs import PhysicsOverflowWarning as PhysicsOverflowWarning
+from .envs import QuadrupedRun as QuadrupedRun
+from .envs import QuadrupedWalk as QuadrupedWalk
 from .envs import State as State
 from .envs import TransformedEnv as TransformedEnv
 from .envs import WalkerRun as WalkerRun

@@ -19,7 +19,7 @@ from torchrl_loco.envs.monitors import NAN_DUMP
 from torchrl_loco.registry import env_class, list_envs
 from torchrl_loco.sim.simulation import set_options
 
-STATE = ("qpos", "qvel", "qacc_warmstart")
+STATE = ("qpos", "qvel", "qacc_warmstart", "act")
 RESETS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 """Warnings at which C MuJoCo resets a world."""
 
@@ -29,8 +29,8 @@ class NanDump:
     """What led to a world that is not finite: its state and action before the control step, and its settings.
 
     Attributes:
-        tensors: ``qpos`` ``(nq,)``, ``qvel`` ``(nv,)``, ``qacc_warmstart`` ``(nv,)`` and ``action`` ``(nu,)``, before
-            the step.
+        tensors: ``qpos`` ``(nq,)``, ``qvel`` ``(nv,)``, ``qacc_warmstart`` ``(nv,)``, ``act`` ``(na,)`` and ``action``
+            ``(nu,)``, before the step.
         settings: ``env`` (module and name of the class), ``protocol``, ``config``, ``seed``, ``device``, ``num_envs``,
             ``world_offset``, and ``world``, ``episode`` and ``elapsed_steps`` before the step.
     """
@@ -47,7 +47,7 @@ class NanDump:
     @property
     def state(self) -> State:
         """The state before the step, of one world."""
-        return State({name: self.tensors[name][None] for name in STATE}, batch_size=[1])
+        return State({name: self.tensors[name][None] for name in STATE if len(self.tensors[name])}, batch_size=[1])
 
 
 def load(path: Path) -> NanDump:
@@ -99,7 +99,7 @@ def mujoco_trace(dump: NanDump) -> np.ndarray:
     for name in STATE:
         getattr(data, name)[:] = dump.tensors[name].numpy()
     trace = [np.concatenate([data.qpos, data.qvel])]
-    data.ctrl[:] = dump.tensors["action"].numpy()
+    data.ctrl[:] = models.control(model, dump.tensors["action"].numpy())
     mujoco.set_mju_user_warning(lambda message: None)  # else it prints, and writes a log into the working directory
     try:
         for _ in range(config.substeps):

@@ -21,8 +21,8 @@ class Entry:
     Args:
         name: what it is, in Markdown.
         unit: its unit, empty for pure numbers.
-        value: computes it from a state of C MuJoCo; ``None`` for forces of the last physics step, which no longer
-            follow from the state.
+        value: computes it from a state of C MuJoCo; ``None`` for what does not follow from qpos and qvel: activations,
+            and forces of the last physics step.
     """
 
     name: str
@@ -52,6 +52,8 @@ def observation_table(body: str) -> str:
 def action_table(body: str) -> str:
     """Returns the table of a body's actuators."""
     model = models.load(models.PATHS[body])
+    if model.na:
+        return _set_points(model)
     rows = []
     for index in range(model.nu):
         actuator = model.actuator(index)
@@ -60,6 +62,22 @@ def action_table(body: str) -> str:
         control = "[{:g}, {:g}]".format(*actuator.ctrlrange)
         rows.append((index, f"`{joint.name}`", control, f"{actuator.gear[0]:g}", f"{low:.0f} to {high:.0f}"))
     return table(("index", "joint", "action", "gear: torque at 1 (Nm)", "range of the joint (degrees)"), rows)
+
+
+def _set_points(model: mujoco.MjModel) -> str:
+    """Returns the table of actuators that pull joints and tendons to a set point."""
+    rows = []
+    for index in range(model.nu):
+        actuator = model.actuator(index)
+        moved = int(actuator.trnid[0])
+        if actuator.trntype[0] == mujoco.mjtTrn.mjTRN_JOINT:
+            what = f"`{model.joint(moved).name}`"
+        else:
+            parts = range(model.tendon_adr[moved], model.tendon_adr[moved] + model.tendon_num[moved])
+            what = " ".join(f"{model.wrap_prm[i]:+g} `{model.joint(model.wrap_objid[i]).name}`" for i in parts)
+        control = "[{:g}, {:g}]".format(*actuator.ctrlrange)
+        rows.append((index, f"`{actuator.name}`", what, control))
+    return table(("index", "actuator", "what it moves", "control at an action of -1 and 1 (rad)"), rows)
 
 
 def _walker(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
@@ -106,6 +124,28 @@ def _hopper(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
         yield Entry(f"touch of the {part}", "log(1 + N)", None)
 
 
+def _quadruped(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
+    yield from _positions(model, 1)
+    yield from _velocities(model)
+    for i in range(model.na):
+        yield Entry(f"activation of `{model.actuator(i).name}`", "rad", None)
+    for k, axis in enumerate("xyz"):
+        yield Entry(
+            f"velocity of `torso` along its own {axis} axis", "m/s", lambda d, k=k: d.sensor("velocimeter").data[k]
+        )
+    yield Entry("z component of the z axis of `torso`", "", lambda d: d.body("torso").xmat[8])
+    for axis in "xyz":
+        yield Entry(f"acceleration of `torso` along its own {axis} axis", "m/s^2", None)
+    for k, axis in enumerate("xyz"):
+        name = f"angular velocity of `torso` about its own {axis} axis"
+        yield Entry(name, "rad/s", lambda d, k=k: d.sensor("imu_gyro").data[k])
+    toes = [model.site(i).name for i in range(model.nsite) if model.site(i).name.startswith("toe")]
+    for quantity, unit in (("force", "arcsinh(N)"), ("torque", "arcsinh(Nm)")):
+        for toe in toes:
+            for axis in "xyz":
+                yield Entry(f"{quantity} on `{toe}` along its {axis} axis", unit, None)
+
+
 def _positions(model: mujoco.MjModel, first: int) -> Iterator[Entry]:
     """Yields the positions of slides and hinges, from a joint on."""
     for i in range(first, model.njnt):
@@ -130,5 +170,5 @@ def _seen(data: mujoco.MjData, name: str) -> np.ndarray:
     return torso.xmat.reshape(3, 3).T @ (data.body(name).xpos - torso.xpos)
 
 
-BODIES = {"walker": _walker, "humanoid": _humanoid, "cheetah": _cheetah, "hopper": _hopper}
+BODIES = {"walker": _walker, "humanoid": _humanoid, "cheetah": _cheetah, "hopper": _hopper, "quadruped": _quadruped}
 """What yields the entries of a body's observation from its model and the protocol."""

@@ -46,8 +46,7 @@ class Reward:
 def reward(task: str) -> Reward:
     """Returns how the reward of a task is put together."""
     cls = env_class(task)
-    of_body = {"walker": _walker, "humanoid": _humanoid, "cheetah": _cheetah, "hopper": _hopper}[cls.body]
-    return of_body(cls.target_speed)
+    return BODIES[cls.body](cls.target_speed)
 
 
 def _walker(speed: float) -> Reward:
@@ -103,6 +102,19 @@ def _hopper(speed: float) -> Reward:
         parts["gentle"] = Tolerance("a_i", 0.0, 0.0, 1.0, "quadratic", 0.0)
         line, symbols = ("small_control", _gentle(parts["gentle"], 4)), f"{symbols}, $a$ the action"
     return Reward(parts, [("standing", parts["standing"].latex()), line], symbols)
+
+
+def _quadruped(speed: float) -> Reward:
+    parts = {
+        "upright": Tolerance("u", 1.0, math.inf, 2.0, "linear", 0.0),
+        "fast": Tolerance("v_x", speed, math.inf, speed, "linear", 0.5),
+    }
+    lines = [("upright", parts["upright"].latex()), ("move", parts["fast"].latex())]
+    return Reward(parts, lines, f"{UPRIGHT}, $v$ the velocity of the torso in its own frame (m/s)")
+
+
+BODIES = {"walker": _walker, "humanoid": _humanoid, "cheetah": _cheetah, "hopper": _hopper, "quadruped": _quadruped}
+"""What puts the reward of a body's task together from its target speed."""
 
 
 def _share(fast: Tolerance) -> str:

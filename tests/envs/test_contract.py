@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cases import BODIES, TASKS, coarse
+from cases import BODIES, COMPILED, TASKS, coarse
 from compare import assert_repeats
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv, check_env_specs
@@ -11,9 +11,9 @@ import torchrl_loco
 from torchrl_loco import State
 
 CASES = [
-    *((task, "playground", "compiled") for task in TASKS),
-    *((task, "dm_control", "compiled") for task in BODIES),
-    *((task, "playground", "mujoco_warp") for task in BODIES),
+    *((task, "playground", "auto") for task in TASKS),
+    *((task, "dm_control", "auto") for task in BODIES),
+    *((task, "playground", "mujoco_warp") for task in COMPILED),
 ]
 
 

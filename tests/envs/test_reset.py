@@ -8,11 +8,14 @@ from oracle import DATA, FORCES, Oracle
 from tensordict import TensorDict
 
 import torchrl_loco
-from torchrl_loco import State, models
+from torchrl_loco import models
 
 SIGNIFICANCE = 1e-4
 # Under playground the humanoid draws nothing.
-DRAWING = [("walker_run", "playground"), ("humanoid_run", "dm_control"), ("hopper_hop", "playground")]
+DRAWING = [
+    *(("walker_run", "playground"), ("humanoid_run", "dm_control"), ("hopper_hop", "playground")),
+    ("quadruped_run", "dm_control"),
+]
 
 
 def from_one_distribution(ours, theirs):
@@ -59,6 +62,7 @@ def draws(shared):
         ("cheetah_run", "dm_control", "mujoco_warp"),
         ("hopper_hop", "dm_control", "compiled"),
         ("hopper_hop", "playground", "mujoco_warp"),
+        ("quadruped_run", "dm_control", "mujoco_warp"),
     ],
 )
 def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol, engine, device, actions):
@@ -71,14 +75,14 @@ def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol
     after_td = env.reset(td.clone().set("_reset", mask))
     after = env.get_state()
     kept = ~mask.squeeze(-1)
-    for key in State.KEYS:
-        assert torch.equal(before[key][kept], after[key][kept]), key
+    for key, value in before.items():
+        assert torch.equal(value[kept], after[key][kept]), key
     assert (env.health() == health).all()
     assert torch.equal(after_td["observation"][kept], td["observation"][kept])
     assert (after["elapsed_steps"][~kept] == 0).all()
     assert (after["elapsed_steps"][kept] == 8).all()
     assert (after["episode"][~kept] == 2).all()
-    for name in ("qvel", "qacc_warmstart", "ctrl", "time"):
+    for name in ("qvel", "qacc_warmstart", "ctrl", "time", *(("act",) if "act" in before else ())):
         values = getattr(env.sim, name)
         if (name, task) != ("qvel", "cheetah_run"):  # it begins in motion
             assert (values[~kept] == 0).all(), name
@@ -121,10 +125,32 @@ def test_a_hopper_feels_the_ground_before_its_first_step(shared, engine, lowered
         td = env.reset(state, set_state=True)
     reference = Oracle("hopper_hop", env.mjcf)
     rows = zip(*(state[key].cpu().double().numpy() for key in ("qpos", "qvel")), strict=True)
-    expected = np.array([reference.observation(*row, "dm_control") for row in rows])
+    expected = np.array([reference.observation("dm_control", *row) for row in rows])
     error = np.abs(td["observation"].cpu().numpy() - expected)[:, FORCES["hopper"]].max(axis=1)
     assert (expected[:, FORCES["hopper"]] > 0).any() == (lowered > 0)
     assert np.quantile(error, 0.95) < 1e-4
+
+
+@pytest.mark.slow
+def test_quadruped_starts_just_above_the_floor(draws, device):
+    """In any orientation, 1 cm above the highest place of a centimeter grid where C MuJoCo finds a contact."""
+    qpos = draws("quadruped_run", 2048, 1, seed=5, protocol="dm_control", device=device)[0].numpy().astype(np.float64)
+    model = models.load(models.PATHS["quadruped"])
+    assert (qpos[:, :2] == 0).all()
+    assert (qpos[:, 7:] == 0).all()
+    np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(qpos[:, 2], qpos[:, 2].round(2), atol=1e-6)
+    data, contacts = mujoco.MjData(model), []
+    for lowered in (0.0, 0.01):
+        for q in qpos[:512]:
+            data.qpos[:] = q
+            data.qpos[2] -= lowered
+            mujoco.mj_fwdPosition(model, data)
+            contacts.append(data.ncon)
+    free, touching = np.split(np.array(contacts), 2)
+    assert (free == 0).all()
+    assert (touching > 0).all()
+    assert from_one_distribution(qpos[:, 2:7], np.load(DATA / "quadruped_resets_dm_control.npz")["qpos"][:, 2:7])
 
 
 @pytest.mark.slow

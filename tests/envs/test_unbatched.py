@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, check_env_specs
 
 import torchrl_loco
-from torchrl_loco import RolloutCollector, State
+from torchrl_loco import RolloutCollector
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_state(env, shared, body_task, device):
     env.reset()
     env.reset(state, set_state=True)
     now = env.get_state()
-    assert all(torch.equal(now[key], state[key]) for key in State.KEYS)
+    assert all(torch.equal(now[key], value) for key, value in state.items())
     env.load_state_dict(env.state_dict())
     many = shared(body_task, 3, device, **coarse(body_task))
     many.reset(state.branch(0, 3), set_state=True)

@@ -11,6 +11,8 @@ from torchrl_loco.envs.humanoid import HumanoidWalk as HumanoidWalk
 from torchrl_loco.envs.monitors import NonFiniteWarning as NonFiniteWarning
 from torchrl_loco.envs.monitors import PhysicsOverflowError as PhysicsOverflowError
 from torchrl_loco.envs.monitors import PhysicsOverflowWarning as PhysicsOverflowWarning
+from torchrl_loco.envs.quadruped import QuadrupedRun as QuadrupedRun
+from torchrl_loco.envs.quadruped import QuadrupedWalk as QuadrupedWalk
 from torchrl_loco.envs.state import State as State
 from torchrl_loco.envs.walker import WalkerRun as WalkerRun
 from torchrl_loco.envs.walker import WalkerStand as WalkerStand

@@ -19,6 +19,8 @@ def count_non_finite(row: wp.array[float]) -> int:
 
 @wp.kernel(enable_backward=False)
 def apply_action(
+    # Model:
+    actuator_ctrlrange: wp.array2d[wp.vec2],
     # In:
     action_in: wp.array2d[float],
     # Data out:
@@ -26,14 +28,16 @@ def apply_action(
     # Out:
     non_finite_out: wp.array[bool],
 ):
-    """Clips the action into ``ctrl``. A world whose action is NaN or infinite is marked, and stepped with zeros."""
+    """Clips the action and scales it to ``ctrl``. A world whose action is NaN or infinite is marked, and gets zeros."""
     world = wp.tid()
     count = int(0)
     for i in range(action_in.shape[1]):
         count += wp.where(wp.isfinite(action_in[world, i]), 0, 1)
     non_finite = count > 0
     for i in range(action_in.shape[1]):
-        ctrl_out[world, i] = wp.where(non_finite, 0.0, wp.clamp(action_in[world, i], -1.0, 1.0))
+        limits = actuator_ctrlrange[0, i]
+        action = wp.where(non_finite, 0.0, wp.clamp(action_in[world, i], -1.0, 1.0))
+        ctrl_out[world, i] = 0.5 * (limits[0] + limits[1]) + 0.5 * (limits[1] - limits[0]) * action
     non_finite_out[world] = non_finite
 
 

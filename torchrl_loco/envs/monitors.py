@@ -212,6 +212,7 @@ def keep_worlds(
     qpos_in: wp.array2d[float],
     qvel_in: wp.array2d[float],
     qacc_warmstart_in: wp.array2d[float],
+    act_in: wp.array2d[float],
     # Out:
     action_out: wp.array2d[float],
     episode_out: wp.array[int],
@@ -219,6 +220,7 @@ def keep_worlds(
     qpos_out: wp.array2d[float],
     qvel_out: wp.array2d[float],
     qacc_warmstart_out: wp.array2d[float],
+    act_out: wp.array2d[float],
 ):
     """Copies what a control step begins with, until a world that is not finite was found."""
     world = wp.tid()
@@ -233,6 +235,8 @@ def keep_worlds(
     for i in range(qvel_in.shape[1]):
         qvel_out[world, i] = qvel_in[world, i]
         qacc_warmstart_out[world, i] = qacc_warmstart_in[world, i]
+    for i in range(act_in.shape[1]):
+        act_out[world, i] = act_in[world, i]
 
 
 @wp.kernel(enable_backward=False)
@@ -283,7 +287,7 @@ class NanGuard(Monitor):
         self._path, self._sim, self._seed, self._settings = path, sim, seed, settings
         self._non_finite = non_finite
         data = sim.data
-        self._inputs = [*(buffer.warp for buffer in inputs), data.qpos, data.qvel, data.qacc_warmstart]
+        self._inputs = [*(buffer.warp for buffer in inputs), data.qpos, data.qvel, data.qacc_warmstart, data.act]
         self._kept = [wp.zeros_like(array) for array in self._inputs]
         self._first = Buffer(1, int, sim.device)
         self._found = Buffer(1, bool, sim.device)
@@ -318,7 +322,7 @@ class NanGuard(Monitor):
         if self._reported or world == self._sim.num_envs:
             return
         self._reported = True
-        names = ("action", "episode", "elapsed_steps", "qpos", "qvel", "qacc_warmstart")
+        names = ("action", "episode", "elapsed_steps", "qpos", "qvel", "qacc_warmstart", "act")
         kept = {name: wp.to_torch(array)[world].clone() for name, array in zip(names, self._kept, strict=True)}
         counters = {name: int(kept.pop(name)) for name in ("episode", "elapsed_steps")}
         settings = {**self._settings, "seed": int(self._seed.torch[0]), "world": world, **counters}

@@ -127,7 +127,8 @@ class World:
         """The control step."""
         for monitor in self._monitors:
             monitor.launch_before_step()
-        self._launch(apply_action, [self.action.warp], [self.sim.data.ctrl, self.non_finite.warp])
+        ranges = self.sim.model.actuator_ctrlrange
+        self._launch(apply_action, [ranges, self.action.warp], [self.sim.data.ctrl, self.non_finite.warp])
         self.sim.step()
         self._launch_observation(self._all)
         data, health = self.sim.data, self.health
@@ -206,6 +207,8 @@ class World:
         """Returns the buffers that make up the state of the worlds, by key of :class:`torchrl_loco.State`."""
         sim = self.sim
         physics = {"qpos": sim.qpos, "qvel": sim.qvel, "qacc_warmstart": sim.qacc_warmstart}
+        if sim.mj_model.na:
+            physics["act"] = sim.act
         return {**physics, "elapsed_steps": self.elapsed_steps.torch, "episode": self.episode.torch}
 
     def refresh(self, mask: torch.Tensor) -> None:
