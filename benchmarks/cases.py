@@ -130,6 +130,7 @@ def torchrl_collector(body: str, n: int, device: torch.device) -> Callable[[], N
 
 def env_and_policy(body: str, n: int, device: torch.device) -> tuple[EnvBase, TensorDictModule]:
     """An environment with staggered episodes, and a policy for it."""
+    torch.set_float32_matmul_precision("high")  # TF32, as training does
     env = torchrl_loco.make(TASKS[body], n, device, seed=0, stagger=True)
     policy = NoisyMLP(env.observation_size, env.action_spec.shape[-1]).to(device)
     return env, TensorDictModule(policy, in_keys=["observation"], out_keys=["action"])

@@ -5,10 +5,12 @@ import torch
 from cases import coarse
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, InitTracker, RewardSum
+from torchrl.envs import Compose, FiniteTensorDictCheck, InitTracker, RewardSum
+from torchrl.envs.utils import ExplorationType, exploration_type
 
 import torchrl_loco
 from torchrl_loco import RolloutCollector
+from torchrl_loco.collector import what_forbids_recording
 
 QUICK = {"episode_length": 7, "on_overflow": "ignore"}
 """Coarse steps make a humanoid fly apart, with more contacts than there are places."""
@@ -71,13 +73,96 @@ def test_its_state_goes_on_in_another_collector(make):
     assert (first.rollout() == second.rollout()).all()
 
 
+class Noisy(torch.nn.Module):
+    """Writes a stochastic action, its mean, and a count of the steps that the world has been alive."""
+
+    in_keys, out_keys = ("observation", "steps"), ("loc", "action", "steps")
+
+    def __init__(self, env):
+        super().__init__()
+        torch.manual_seed(0)
+        layer = torch.nn.Linear(env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1])
+        self.layer = layer.to(env.device)
+
+    def forward(self, td):
+        loc = self.layer(td["observation"]).tanh()
+        noise = torch.randn_like(loc) if exploration_type() == ExplorationType.RANDOM else 0
+        steps = td.get("steps", None)
+        td["steps"] = torch.ones_like(loc[..., :1]) if steps is None else steps + 1
+        return td.set("loc", loc).set("action", (loc + noise).clamp(-1, 1))
+
+
+def test_what_the_policy_carries_along_starts_anew_with_an_episode(make):
+    made = make("walker_run", False)
+    batch = RolloutCollector(made, Noisy(made), frames_per_batch=4 * 20).rollout()
+    begins = torch.cat([torch.ones(4, 1, 1, dtype=torch.bool), batch["next", "done"][:, :-1]], dim=1)
+    assert begins.sum() > 8
+    assert ((batch["steps"] == 1) == begins).all()
+
+
+def test_why_batches_are_not_recorded(make, monkeypatch):
+    made = make("walker_run", False)
+    assert "CUDA" in RolloutCollector(made, policy(made), frames_per_batch=8).step_by_step
+    cases = [
+        (made, policy(made), None),
+        (made, lambda td: td, "no nn.Module"),
+        (torchrl_loco.TransformedEnv(made, RewardSum()), policy(made), None),
+        (
+            torchrl_loco.TransformedEnv(made, Compose(RewardSum(), FiniteTensorDictCheck())),
+            policy(made),
+            "FiniteTensorDictCheck may keep",
+        ),
+    ]
+    monkeypatch.setattr(made, "_device", torch.device("cuda"))
+    for env, chosen, why in cases:
+        found = what_forbids_recording(env, made, chosen)
+        assert found is None if why is None else why in found
+    monkeypatch.setattr(made, "engine", "mujoco_warp")
+    assert "'mujoco_warp'" in what_forbids_recording(made, made, policy(made))
+
+
+def on_cuda(task, wrap=False, num_envs=64, **settings):
+    options = {"seed": 0, "stagger": True, "episode_length": 13, **settings}
+    env = torchrl_loco.make(task, num_envs, "cuda", **options)
+    return torchrl_loco.TransformedEnv(env, Compose(InitTracker(), RewardSum())) if wrap else env
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("exploration", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+@pytest.mark.parametrize("wrap", [False, True])
+def test_recorded_batches_equal_steps_taken_one_by_one(body_task, protocol, wrap, exploration):
+    """To the bit: across resets, with noise, and while the weights change in place."""
+    batches = []
+    for recorded in (True, False):
+        env = on_cuda(body_task, wrap, protocol=protocol)
+        chosen = Noisy(env)
+        collector = RolloutCollector(env, chosen, frames_per_batch=64 * 5, exploration_type=exploration)
+        assert collector.step_by_step is None
+        if not recorded:
+            collector.step_by_step = "as asked"
+        torch.cuda.manual_seed(3)
+        found = []
+        for _ in range(5):
+            found.append(collector.rollout())
+            chosen.layer.weight.data.add_(0.01)
+        assert (collector.step_by_step is None) == recorded
+        batches.append(torch.cat(found, dim=1))
+        env.close()
+    got, expected = batches
+    assert expected["next", "done"].sum() > 64
+    assert set(got.keys(True, True)) == set(expected.keys(True, True))
+    for key in expected.keys(True, True):
+        assert torch.equal(got[key], expected[key]), key
+
+
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")
 @pytest.mark.parametrize("wrap", [False, True])
-def test_no_synchronisation(make, task, wrap):
-    made = make(task, wrap, "cuda", 256, episode_length=50)
-    batches = iter(RolloutCollector(made, policy(made), frames_per_batch=256 * 10))
-    next(batches)
+def test_no_synchronisation(task, wrap):
+    env = on_cuda(task, wrap, 256, episode_length=50)
+    batches = iter(RolloutCollector(env, policy(env), frames_per_batch=256 * 10))
+    next(batches)  # step by step
+    next(batches)  # recorded
     torch.cuda.synchronize()
     try:
         torch.cuda.set_sync_debug_mode("error")
@@ -85,6 +170,88 @@ def test_no_synchronisation(make, task, wrap):
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert (torch.cat(done, dim=1).sum(dim=1) >= 2).all()
+
+
+@pytest.mark.gpu
+def test_recorded_batches_share_no_memory_and_need_no_more_of_it(body_task):
+    env = on_cuda(body_task)
+    collector = RolloutCollector(env, policy(env), frames_per_batch=64 * 5)
+    first, second, third = (collector.rollout() for _ in range(3))
+    kept = third.clone()
+    assert len({batch["observation"].data_ptr() for batch in (first, second, third)}) == 3
+    used = None
+    for i in range(1000):
+        collector.rollout()
+        if i == 10:
+            torch.cuda.synchronize()
+            used = torch.cuda.memory_allocated(), torch.cuda.memory_reserved()
+    torch.cuda.synchronize()
+    assert (torch.cuda.memory_allocated(), torch.cuda.memory_reserved()) == used
+    assert (third == kept).all()
+
+
+@pytest.mark.gpu
+def test_a_recording_goes_on_from_a_state_and_from_a_closed_environment(body_task):
+    env, other = on_cuda(body_task), on_cuda(body_task)
+    collector, second = (RolloutCollector(made, policy(made), frames_per_batch=64 * 5) for made in (env, other))
+    for _ in range(3):
+        collector.rollout()
+        second.rollout()
+    state = collector.state_dict()
+    expected = collector.rollout()
+    second.load_state_dict(state)
+    assert (second.rollout() == expected).all()
+    collector.load_state_dict(state)
+    assert (collector.rollout() == expected).all()
+    env.close()
+    again = [collector.rollout() for _ in range(3)]
+    assert (again[0]["observation"][:, 0, 15:24] == 0).all()  # at rest
+    assert collector.step_by_step is None
+    going_on = ~again[1]["next", "done"][:, -1].squeeze(-1)
+    assert torch.equal(again[1]["next", "observation"][:, -1][going_on], again[2]["observation"][:, 0][going_on])
+
+
+@pytest.mark.gpu
+def test_what_cannot_be_recorded_is_told_and_runs_step_by_step(caplog):
+    class Waits(Noisy):
+        def forward(self, td):
+            td = super().forward(td)
+            assert td["action"].isfinite().all()
+            return td
+
+    class Surprises(Noisy):
+        """Waits for the device from its seventh call on, when it is being recorded."""
+
+        calls = 0
+
+        def forward(self, td):
+            self.calls += 1
+            td = super().forward(td)
+            assert self.calls != 7 or td["action"].isfinite().all()
+            return td
+
+    def collected(chosen, env):
+        caplog.clear()
+        collector = RolloutCollector(env, chosen, frames_per_batch=64 * 5)
+        torch.cuda.manual_seed(3)
+        return collector, torch.cat([collector.rollout() for _ in range(3)], dim=1)
+
+    env = on_cuda("walker_walk")
+    expected = collected(Noisy(env), env)[1]
+    for kind, told in ((Waits, "waits for the device"), (Surprises, "cannot be recorded")):
+        env = on_cuda("walker_walk")
+        collector, batch = collected(kind(env), env)
+        assert told in collector.step_by_step
+        assert told in caplog.text
+        assert (batch == expected).all()
+
+    env = on_cuda("walker_walk")
+    chosen = Noisy(env)
+    collector, _ = collected(chosen, env)
+    assert collector.step_by_step is None
+    chosen.layer.weight = torch.nn.Parameter(torch.zeros_like(chosen.layer.weight))
+    assert (collector.rollout()["loc"] == chosen.layer.bias.tanh()).all()
+    assert "weights were replaced" in collector.step_by_step
 
 
 def test_a_closed_environment_begins_new_episodes():

@@ -217,6 +217,8 @@ def test_tables_that_are_none(starting):
     for shape in ((5,), (4, 6), (0, 5), (2, 2, 5)):
         with pytest.raises(ValueError, match=r"initial_states must return .* shape \(count > 0, 5\) or .* 10\), got"):
             starting(np.zeros(shape))
+    with pytest.raises(ValueError, match="initial_states must return finite numbers"):
+        starting(np.full((3, 10), np.nan))
 
 
 # What plug-ins may get wrong.

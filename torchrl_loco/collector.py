@@ -1,15 +1,40 @@
-"""A collector that never waits for the device."""
+"""A collector that never waits for the device, and records whole rollouts as CUDA graphs."""
 
+import contextlib
+import logging
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase
+from torch import nn
+from torchrl.envs import (
+    ClipTransform,
+    Compose,
+    DoubleToFloat,
+    EnvBase,
+    FrameSkipTransform,
+    InitTracker,
+    ObservationNorm,
+    RewardClipping,
+    RewardScaling,
+    RewardSum,
+    StepCounter,
+    Transform,
+)
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.state import State
+from torchrl_loco.sim import TorchGraph
+
+RECORDED_TRANSFORMS = (
+    *(ClipTransform, Compose, DoubleToFloat, FrameSkipTransform, InitTracker),
+    *(ObservationNorm, RewardClipping, RewardScaling, RewardSum, StepCounter),
+)
+"""Transforms that keep nothing on the host from step to step. Others may, and a recording would leave that out."""
 
 
 class RolloutCollector:
@@ -19,12 +44,20 @@ class RolloutCollector:
     result of the step under ``"next"``. Each batch continues where the last one ended. Environment and policy run
     without gradients, and without synchronisation with the device unless the policy itself synchronises.
 
+    On CUDA the second batch is recorded as one CUDA graph, policy and resets included, and every further batch is a
+    replay of it: the host has nothing to do but to start it. The data is the same, to the bit. That needs the engine
+    ``compiled`` and a policy that is an ``nn.Module`` without synchronisation or state on the host, whose weights are
+    updated in place; :attr:`step_by_step` tells why something else is not recorded.
+
     Args:
         env: an environment of this package, or one in :class:`torchrl_loco.TransformedEnv`.
         policy: reads the observation ``(num_envs, n)`` from a TensorDict and writes the action ``(num_envs, nu)``.
         frames_per_batch: steps in a batch, over all worlds; a multiple of the number of worlds.
         total_frames: steps over all batches, rounded up to whole batches; -1 never ends.
         exploration_type: how a stochastic policy chooses actions.
+
+    Attributes:
+        step_by_step: why batches are collected step by step; ``None`` if they are recorded, or will be.
 
     Raises:
         ValueError: ``frames_per_batch`` is not a positive multiple of the number of worlds.
@@ -45,12 +78,15 @@ class RolloutCollector:
                 f"frames_per_batch must be a positive multiple of the {worlds} worlds, got {frames_per_batch}"
             )
         self._env = env
+        self._base = env.base_env if isinstance(env, TorchRLTransformedEnv) else env
         self._policy = policy
         self._steps = frames_per_batch // worlds
         self._frames_per_batch = frames_per_batch
         self._total_frames = total_frames
         self._exploration_type = exploration_type
         self._carried: TensorDictBase | None = None
+        self._recording: Recording | None = None
+        self.step_by_step = what_forbids_recording(env, self._base, policy)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         """Yields batches until ``total_frames`` are collected."""
@@ -61,22 +97,78 @@ class RolloutCollector:
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
-        """Returns the next batch, of shape ``(num_envs, steps)``."""
-        td = self._env.reset() if self._carried is None or self._env.is_closed else self._carried
-        steps = []
+        """Returns the next batch, of shape ``(num_envs, steps)``, in memory of its own."""
+        if self._carried is None or self._base.is_closed:
+            self._carried, self._recording = self._env.reset(), None
         with set_exploration_type(self._exploration_type):
-            for _ in range(self._steps):
-                current, td = self._env.step_and_maybe_reset(self._policy(td))
-                steps.append(current)
-        self._carried = td
+            steps = self._recorded_steps() if self._can_replay() else self._watched_steps()
         return TensorDict.stack(steps, dim=-1).refine_names(..., "time")
+
+    def _take_steps(self, td: TensorDictBase) -> tuple[list[TensorDictBase], TensorDictBase]:
+        """Returns the steps of a batch that begins with ``td``, and what the next one begins with."""
+        steps = []
+        # What the policy writes anew at every step need not be zeroed where a world is reset.
+        rewritten = set(getattr(self._policy, "out_keys", ())) - set(getattr(self._policy, "in_keys", ())) - {"action"}
+        for _ in range(self._steps):
+            current = self._policy(td)
+            if rewritten and self._env is self._base:
+                kept, td = self._env.step_and_maybe_reset(current.exclude(*rewritten))
+                current.set("next", kept.get("next"))
+            else:
+                current, td = self._env.step_and_maybe_reset(current)
+            steps.append(current)
+        return steps, td
+
+    def _watched_steps(self) -> list[TensorDictBase]:
+        """Returns steps that are taken one by one; if nothing waits for the device, the next ones are recorded."""
+        with contextlib.ExitStack() as stack:
+            waits: list[str] = []
+            if self.step_by_step is None and not self._base.is_closed:
+                waits = stack.enter_context(noted_synchronisation())
+            steps, self._carried = self._take_steps(self._carried)
+        if waits:
+            self._go_step_by_step(f"something waits for the device ({waits[0]})")
+        elif self.step_by_step is None:
+            self._recording = Recording(self._take_steps, self._carried, self._policy, self._base)
+        return steps
+
+    def _can_replay(self) -> bool:
+        """Returns whether there is a recording that belongs to the present worlds and weights."""
+        if self._recording is None:
+            return False
+        if self._recording.world is not self._base.world:
+            self._recording = None  # the environment was closed and opened again
+        elif self._recording.has_other_weights():
+            self._go_step_by_step(
+                "the policy's weights were replaced, or it changed between training and evaluation mode; update "
+                "weights in place to keep the recording"
+            )
+        return self._recording is not None
+
+    def _recorded_steps(self) -> list[TensorDictBase]:
+        assert self._recording is not None
+        if self._carried is not self._recording.carried:
+            self._recording.carried.update_(self._carried)
+        try:
+            steps = self._recording.replay()
+        except RuntimeError as error:
+            if self._recording.works:
+                raise
+            self._go_step_by_step(f"the policy cannot be recorded as a CUDA graph: {error}")
+            return self._watched_steps()
+        self._carried = self._recording.carried
+        self._base.world.poll(self._steps)
+        return steps
+
+    def _go_step_by_step(self, why: str) -> None:
+        self.step_by_step, self._recording = why, None
+        logging.getLogger("torchrl_loco").warning("batches are collected step by step: %s", why)
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the state of the worlds and the data that the next batch begins with."""
         if self._carried is None:
             return {}
-        env = self._env.base_env if isinstance(self._env, TorchRLTransformedEnv) else self._env
-        return {"carried": self._carried.to_dict(), "env": env.get_state().to_dict()}
+        return {"carried": self._carried.clone().to_dict(), "env": self._base.get_state().to_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from a ``state`` that :meth:`state_dict` returned, in an environment of the same settings."""
@@ -89,3 +181,90 @@ class RolloutCollector:
 
     def shutdown(self) -> None:
         """Does nothing: TorchRL's ``Collector`` has this method."""
+
+
+class Recording:
+    """The steps of a batch as one CUDA graph.
+
+    Args:
+        take_steps: takes the steps of a batch that begins with a TensorDict; returns them, and what the next begins
+            with.
+        carried: what the batch begins with, batch ``(num_envs,)``.
+        policy: the policy, an ``nn.Module``.
+        env: the environment, without transforms.
+
+    Attributes:
+        carried: what the next batch begins with, at an address that stays.
+        world: the worlds that are stepped.
+        works: whether it was replayed at least once.
+    """
+
+    def __init__(
+        self,
+        take_steps: Callable[[TensorDictBase], tuple[list[TensorDictBase], TensorDictBase]],
+        carried: TensorDictBase,
+        policy: Any,
+        env: LocoEnv,
+    ) -> None:
+        self.carried, self.world, self.works = carried.clone(), env.world, False
+        self._policy, self._addresses = policy, addresses(policy)
+        self._take_steps, self._taken = take_steps, [carried]
+        self._graph = TorchGraph(self._work, env.device)
+
+    def has_other_weights(self) -> bool:
+        """Returns whether the policy computes with other tensors than those that were recorded."""
+        return self._addresses != addresses(self._policy)
+
+    def _work(self) -> None:
+        self._taken, carried = self._take_steps(self.carried.clone())
+        self.carried.update_(carried)
+
+    def replay(self) -> list[TensorDictBase]:
+        """Returns the steps; the next call overwrites them."""
+        self._graph()
+        self.works = True
+        return self._taken
+
+
+def what_forbids_recording(env: EnvBase, base: LocoEnv, policy: Any) -> str | None:
+    """Returns why the rollouts of a policy in an environment are not recorded, or ``None`` if they can be."""
+    if base.device.type != "cuda":
+        return "only CUDA has graphs of torch's work"
+    if base.engine != "compiled":
+        return f"engine {base.engine!r} launches too many kernels to gain from it"
+    if not isinstance(policy, nn.Module):
+        return "the policy is no nn.Module, so it would not be noticed if its weights were replaced"
+    transforms = env.transform.modules() if isinstance(env, TorchRLTransformedEnv) else ()
+    for transform in transforms:
+        if isinstance(transform, Transform) and type(transform) not in RECORDED_TRANSFORMS:
+            return f"{type(transform).__name__} may keep something on the host from step to step"
+    return None
+
+
+def addresses(module: nn.Module) -> list[int | bool]:
+    """Returns what a recording of a module depends on: where its tensors are, and whether its parts train."""
+    tensors = [*module.parameters(), *module.buffers()]
+    return [*(tensor.data_ptr() for tensor in tensors), *(part.training for part in module.modules())]
+
+
+@contextlib.contextmanager
+def noted_synchronisation() -> Iterator[list[str]]:
+    """Yields a list that holds, afterwards, where the host waited for CUDA."""
+    found: list[str] = []
+    before = torch.cuda.get_sync_debug_mode()
+    if before != 0:  # somebody else watches, who will say so
+        yield found
+        return
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            yield found
+        finally:
+            torch.cuda.set_sync_debug_mode(before)
+    for warning in caught:
+        text = str(warning.message)
+        if "called a synchronizing CUDA operation" in text:
+            found.append(f"{warning.filename}:{warning.lineno}")
+        elif "Synchronization debug mode is a prototype" not in text:
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)

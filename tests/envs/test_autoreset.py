@@ -13,20 +13,30 @@ def transforms():
     return Compose(InitTracker(), RewardSum(), StepCounter(max_steps=9))
 
 
-def play(env, moves, maybe_reset):
+def step_by_step(env, maybe_reset):
+    """Returns a function like ``step_and_maybe_reset``, from its parts."""
+
+    def step(td):
+        td = env.step(td)
+        return td, maybe_reset(env._step_mdp(td))
+
+    return step
+
+
+def play(env, moves, step_and_maybe_reset):
     """Steps and resets, and carries another output of the policy along."""
     td, trace = env.reset(), []
     for i, action in enumerate(moves):
         td = td.set("action", action).set("loc", torch.full_like(action, i + 1.0))
-        td = env.step(td)
-        after = maybe_reset(env._step_mdp(td))
+        td, after = step_and_maybe_reset(td)
         trace.append(td.clone().set("carried", after.clone()))
         td = after
     return torch.stack(trace)
 
 
+@pytest.mark.parametrize("at_once", [False, True])
 @pytest.mark.parametrize("wrap", [False, True])
-def test_same_data_as_torchrl(shared, body_task, actions, wrap):
+def test_same_data_as_torchrl(shared, body_task, actions, wrap, at_once):
     """Worlds end at different times: at the environment's limit, at a transform's, and by a NaN action."""
     options = {"protocol": "dm_control", "episode_length": 12, "stagger": True, "reward_terms": True}
     options |= coarse(body_task)
@@ -36,8 +46,8 @@ def test_same_data_as_torchrl(shared, body_task, actions, wrap):
         ours = torchrl_loco.TransformedEnv(ours, transforms())
     moves = actions(ours, 30)
     moves[7, 3] = torch.nan
-    expected = play(theirs, moves, lambda td: EnvBase.maybe_reset(theirs, td))
-    got = play(ours, moves, ours.maybe_reset)
+    expected = play(theirs, moves, step_by_step(theirs, lambda td: EnvBase.maybe_reset(theirs, td)))
+    got = play(ours, moves, ours.step_and_maybe_reset if at_once else step_by_step(ours, ours.maybe_reset))
     assert set(expected.keys(True, True)) == set(got.keys(True, True))
     for key in expected.keys(True, True):
         torch.testing.assert_close(got[key], expected[key], rtol=0, atol=0, equal_nan=True, msg=str(key))

@@ -11,14 +11,14 @@ def test_each_graph_is_recorded_once(body_task, device, actions, monkeypatch):
     captures, capture = [], wp.ScopedCapture
     monkeypatch.setattr(wp, "ScopedCapture", lambda **options: captures.append(options) or capture(**options))
     env = torchrl_loco.make(body_task, 3, device, seed=0, episode_length=4)
-    assert len(env.sim.graphs) == len(captures) == 3  # step, reset, and refresh after set_state
+    assert len(env.sim.graphs) == len(captures) == 4  # step, reset, reset after a step, and refresh after set_state
     td = env.reset()
     for action in actions(env, 10):
         _, td = env.step_and_maybe_reset(td.set("action", action))
     env.reset(env.get_state(), set_state=True)
     env.set_seed(3)
     env.reset()
-    assert len(env.sim.graphs) == len(captures) == 3
+    assert len(env.sim.graphs) == len(captures) == 4
 
 
 @pytest.mark.gpu

@@ -1,9 +1,58 @@
 """Resets by mask, without reading from the device whether a world is done."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
+
+if TYPE_CHECKING:
+    from torchrl_loco.envs.base import LocoEnv
+
+
+def is_plain(env: "LocoEnv", tensordict: TensorDictBase) -> bool:
+    """Returns whether :func:`step_and_reset` does what TorchRL would do with ``tensordict``.
+
+    TorchRL has further features: partial steps, results given in advance, checks of types, hooks.
+    """
+    return (
+        type(tensordict) is TensorDict
+        and tensordict.batch_size == env.batch_size
+        and tensordict.device == env.device
+        and not env.run_type_checks
+        and env._post_step_mdp_hooks is None
+        and all(isinstance(value, torch.Tensor) for value in tensordict.values())
+        and "_step" not in tensordict
+    )
+
+
+def step_and_reset(env: "LocoEnv", tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+    """Steps an environment and begins new episodes in the worlds that are done.
+
+    Args:
+        env: the environment.
+        tensordict: has an ``action``, batch ``(num_envs,)``; ``next`` is added to it.
+
+    Returns:
+        It, and what the next step begins with, as TorchRL's ``step_and_maybe_reset``.
+    """
+    after = env._step(tensordict)
+    env.world.reset_done()
+    begin = env._outputs()  # in the worlds that go on, nothing has changed
+    done = after.get("done")
+    if env.reward_terms:
+        begin.get("reward_terms").apply_(lambda terms: terms.masked_fill_(done, 0))  # nothing was rewarded yet
+    for key, value in tensordict.items():
+        if key not in begin:  # as in TorchRL, the policy's outputs are zero where a world was reset
+            begin._set_str(key, _zeroed(value, done), inplace=False, validated=True)
+    tensordict.set("next", after)
+    return tensordict, begin
+
+
+def _zeroed(value: torch.Tensor, done: torch.Tensor) -> torch.Tensor:
+    """Returns a copy of an entry, ``(*batch, ...)``, that is zero in the worlds that are ``done``, ``(*batch, 1)``."""
+    return value.masked_fill(done.view(*done.shape[:-1], *[1] * (value.ndim - done.ndim + 1)), 0)
 
 
 def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:

@@ -27,9 +27,12 @@ def apply_action(
     ctrl_out: wp.array2d[float],
     # Out:
     non_finite_out: wp.array[bool],
+    any_out: wp.array[int],
 ):
     """Clips the action and scales it to ``ctrl``. A world whose action is NaN or infinite is marked, and gets zeros."""
     world = wp.tid()
+    if world == 0:
+        any_out[0] = 0  # until finish_step finds a world that is done
     count = int(0)
     for i in range(action_in.shape[1]):
         count += wp.where(wp.isfinite(action_in[world, i]), 0, 1)
@@ -110,11 +113,14 @@ def finish_step(
     done_out: wp.array[bool],
     terminated_out: wp.array[bool],
     truncated_out: wp.array[bool],
+    mask_out: wp.array[bool],
+    any_out: wp.array[int],
     counts_out: wp.array2d[int],
 ):
     """Ends a control step: marks and zeroes non-finite worlds, applies the time limit, counts what went wrong.
 
-    A world is truncated at the time limit, and terminated if it is not finite. The bits of ``overflow`` are cleared.
+    A world is truncated at the time limit, and terminated if it is not finite; what is done is masked for the reset
+    that may follow. The bits of ``overflow`` are cleared.
     """
     world = wp.tid()
     non_finite = zero_if_non_finite(
@@ -132,7 +138,11 @@ def finish_step(
     elapsed_steps_out[world] = elapsed_steps
     terminated_out[world] = non_finite
     truncated_out[world] = truncated
-    done_out[world] = truncated or non_finite
+    done = truncated or non_finite
+    done_out[world] = done
+    mask_out[world] = done
+    if done:
+        any_out[0] = 1
 
     bits = overflow_out[world]
     for i in range(counter_bits.shape[0]):

@@ -85,10 +85,14 @@ class Monitor(ABC):
         self._steps, self._pending = 0, False
         self.clear()
 
-    def poll(self) -> None:
-        """Requests the numbers every :data:`INTERVAL` steps, and reports once they have arrived on the host."""
-        self._steps += 1
-        if self._steps % INTERVAL == 0 and not self._pending:
+    def poll(self, steps: int = 1) -> None:
+        """Requests the numbers every :data:`INTERVAL` steps, and reports once they have arrived on the host.
+
+        Args:
+            steps: control steps since the last call.
+        """
+        before, self._steps = self._steps, self._steps + steps
+        if self._steps // INTERVAL > before // INTERVAL and not self._pending:
             self._request()
         if self._pending and (self._copied is None or self._copied.query()):  # on the CPU the copy is done at once
             self._pending = False

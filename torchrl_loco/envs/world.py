@@ -5,6 +5,7 @@ import contextlib
 import os
 import warnings
 import weakref
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,7 +17,7 @@ from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.kernels import any_world, apply_action, begin_episode, finish_step, zero_non_finite
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.rendering import Renderer
-from torchrl_loco.sim import EXCLUSIVE, Buffer, Simulation
+from torchrl_loco.sim import EXCLUSIVE, Buffer, Graph, Simulation, joined_to_torch, torch_is_recording
 
 
 class Task(Protocol):
@@ -63,6 +64,7 @@ class World:
         episode: episodes drawn so far, ``(nworld,)``.
         elapsed_steps: control steps since the world's reset, ``(nworld,)``.
         non_finite: whether the world is non-finite, ``(nworld,)``.
+        flags: the three flags that follow, ``(3, nworld)``.
         done: terminated or truncated, ``(nworld,)``.
         terminated: whether the episode ended because the world is not finite, ``(nworld,)``.
         truncated: whether the episode reached the time limit, ``(nworld,)``.
@@ -89,9 +91,8 @@ class World:
             self.episode = Buffer(n, int, device)
             self.elapsed_steps = Buffer(n, int, device)
             self.non_finite = Buffer(n, bool, device)
-            self.done = Buffer(n, bool, device)
-            self.terminated = Buffer(n, bool, device)
-            self.truncated = Buffer(n, bool, device)
+            self.flags = Buffer((3, n), bool, device)
+            self.done, self.terminated, self.truncated = self.flags.rows()
             self.seed = Buffer(1, wp.uint32, device)
             self._stagger = Buffer(1, bool, device)
             self._any = Buffer(1, int, device)
@@ -112,6 +113,7 @@ class World:
             self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
             self._step_graph = self.sim.capture(self._launch_step)
             self._reset_graph = self.sim.capture(self._launch_reset)
+            self._reset_done_graph = self.sim.capture(self._launch_reset_done)
             self._refresh_graph = self.sim.capture(self._launch_refresh)
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
@@ -127,8 +129,8 @@ class World:
         """The control step."""
         for monitor in self._monitors:
             monitor.launch_before_step()
-        ranges = self.sim.model.actuator_ctrlrange
-        self._launch(apply_action, [ranges, self.action.warp], [self.sim.data.ctrl, self.non_finite.warp])
+        ranges, marks = self.sim.model.actuator_ctrlrange, [self.non_finite.warp, self._any.warp]
+        self._launch(apply_action, [ranges, self.action.warp], [self.sim.data.ctrl, *marks])
         self.sim.step()
         self._launch_observation(self._all)
         data, health = self.sim.data, self.health
@@ -139,7 +141,7 @@ class World:
                 *(data.overflow, self.non_finite.warp),
                 *(self.observation.warp, self.reward.warp, self.terms.warp),
                 *(self.elapsed_steps.warp, self.done.warp, self.terminated.warp, self.truncated.warp),
-                health.counts.warp,
+                *(self.mask.warp, self._any.warp, health.counts.warp),
             ],
         )
         for monitor in self._monitors:
@@ -149,6 +151,10 @@ class World:
         """A new episode in the worlds of the mask. It costs almost nothing if the mask is empty."""
         self._any.warp.zero_()
         self._launch(any_world, [self.mask.warp], [self._any.warp])
+        self._launch_reset_done()
+
+    def _launch_reset_done(self) -> None:
+        """The same after a step, which has set the mask."""
         wp.capture_if(self._any.warp, self._launch_masked_reset)
 
     def _launch_masked_reset(self) -> None:
@@ -164,16 +170,14 @@ class World:
             kernel, inputs, outputs = self._pose_kernel
             self._launch(kernel, [*inputs, mask, self.stream.warp], outputs)
         self.sim.forward(mask) if self._begins_in_motion else self.sim.forward_at_rest(mask)
-        self._launch_outputs(mask)
+        self._launch_observation(mask)
 
     def _launch_refresh(self) -> None:
         """Computes the outputs after the state of the masked worlds was written."""
-        self.sim.forward(self.mask.warp)
-        self._launch_outputs(self.mask.warp)
-
-    def _launch_outputs(self, mask: wp.array) -> None:
+        mask, data = self.mask.warp, self.sim.data
+        self.sim.forward(mask)
         self._launch_observation(mask)
-        data, outputs = self.sim.data, [self.observation.warp, self.reward.warp, self.terms.warp]
+        outputs = [self.observation.warp, self.reward.warp, self.terms.warp]
         self._launch(zero_non_finite, [mask, data.qpos, data.qvel], [self.non_finite.warp, *outputs])
 
     def _launch_observation(self, mask: wp.array) -> None:
@@ -188,9 +192,8 @@ class World:
     def step(self, action: torch.Tensor) -> None:
         """Steps all worlds under actions of shape ``(nworld, nu)``."""
         self.action.torch.copy_(action.detach())  # else the buffer would keep every past policy's autograd graph
-        self._step_graph.replay()
-        for monitor in self._monitors:
-            monitor.poll()
+        self._run(self._step_graph, self._launch_step)
+        self.poll()
 
     def reset(self, mask: torch.Tensor | None, stagger: bool) -> None:
         """Begins the next episode in the worlds of ``mask`` ``(nworld,)``, in all for ``None``.
@@ -200,8 +203,29 @@ class World:
             stagger: whether they begin with a random number of elapsed steps.
         """
         self._set_mask(mask)
-        self._stagger.torch.fill_(stagger)
-        self._reset_graph.replay()
+        if stagger:
+            self._stagger.torch.fill_(True)
+        self._run(self._reset_graph, self._launch_masked_reset)
+        if stagger:
+            self._stagger.torch.fill_(False)
+
+    def reset_done(self) -> None:
+        """Begins the next episode in the worlds that are done, right after a step."""
+        self._run(self._reset_done_graph, self._launch_masked_reset)
+
+    def _run(self, graph: Graph, launch: Callable[[], None]) -> None:
+        """Replays a graph; while torch records one of its own, makes the launches without a condition instead."""
+        if torch_is_recording(self.sim.device):
+            with joined_to_torch(self.sim.device):
+                launch()
+        else:
+            graph.replay()
+
+    def poll(self, steps: int = 1) -> None:
+        """Lets the monitors report after so many control steps."""
+        if not torch_is_recording(self.sim.device):
+            for monitor in self._monitors:
+                monitor.poll(steps)
 
     def state(self) -> dict[str, torch.Tensor]:
         """Returns the buffers that make up the state of the worlds, by key of :class:`torchrl_loco.State`."""

@@ -22,3 +22,12 @@ class Buffer:
     def __init__(self, shape: int | tuple[int, ...], dtype: Any, device: wp.Device) -> None:
         self.warp: wp.array = wp.zeros(shape, dtype=dtype, device=device)
         self.torch: torch.Tensor = wp.to_torch(self.warp)
+
+    def rows(self) -> "list[Buffer]":
+        """Returns the rows as buffers that share this one's memory."""
+        rows = []
+        for i in range(len(self.torch)):
+            row = object.__new__(Buffer)
+            row.warp, row.torch = self.warp[i], self.torch[i]
+            rows.append(row)
+        return rows

@@ -4,7 +4,7 @@ import contextlib
 import os
 import threading
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import torch
 import warp as wp
@@ -22,6 +22,23 @@ def current_stream(device: wp.Device) -> wp.Stream | None:
     if not device.is_cuda:
         return None
     return wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(device)))
+
+
+def torch_is_recording(device: wp.Device) -> bool:
+    """Returns whether torch records a CUDA graph on its current stream."""
+    return device.is_cuda and torch.cuda.is_current_stream_capturing()
+
+
+@contextlib.contextmanager
+def joined_to_torch(device: wp.Device) -> Iterator[None]:
+    """Adds Warp's launches to the CUDA graph that torch records on its current stream."""
+    stream = current_stream(device)
+    with (
+        wp.ScopedDevice(device),
+        wp.ScopedStream(stream, sync_enter=False),
+        wp.ScopedCapture(stream=stream, external=True),
+    ):
+        yield
 
 
 class Graph:
@@ -51,6 +68,42 @@ class Graph:
         """Runs the recorded work on torch's current stream of the device, without waiting for it."""
         with contextlib.nullcontext() if self._device.is_cuda else EXCLUSIVE:
             wp.capture_launch(self._graph, stream=current_stream(self._device))
+
+
+class TorchGraph:
+    """Work on CUDA without arguments, recorded as a CUDA graph of torch after some warm-up calls.
+
+    ``tensordict.nn.CudaGraphModule`` waits for the device at every call; this does not.
+
+    Args:
+        work: reads and writes tensors that keep their addresses. Warp's launches need :func:`joined_to_torch`.
+        device: a CUDA device.
+        warmup: calls that run the work directly, before it is recorded.
+    """
+
+    def __init__(self, work: Callable[[], None], device: torch.device, warmup: int = 0) -> None:
+        self._work, self._device, self._warmup = work, device, warmup
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self) -> None:
+        """Runs the work, on torch's current stream."""
+        if self._warmup > 0:
+            self._warmup -= 1
+            side = torch.cuda.Stream(self._device)
+            side.wait_stream(torch.cuda.current_stream(self._device))
+            with torch.cuda.stream(side):
+                self._work()
+            torch.cuda.current_stream(self._device).wait_stream(side)
+            return
+        if self._graph is None:
+            torch.cuda.synchronize(self._device)
+            graph = torch.cuda.CUDAGraph()
+            side = torch.cuda.Stream(self._device)  # else torch takes one of its current device
+            recording = torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local")
+            with EXCLUSIVE, torch.cuda.device(self._device), recording:
+                self._work()
+            self._graph = graph
+        self._graph.replay()
 
 
 class ScratchPool:

@@ -2,7 +2,7 @@
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, ClassVar
 
 import torch
@@ -11,7 +11,11 @@ from torch import nn
 from torchrl.modules import ProbabilisticActor
 
 from torchrl_loco.policy import ObservationNorm
+from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training.config import TrainingConfig
+
+WARMUP = 3
+"""Gradient steps before one is recorded: optimizers and cuBLAS allocate at their first."""
 
 
 class Algorithm(ABC):
@@ -39,7 +43,7 @@ class Algorithm(ABC):
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
         self._data: TensorDictBase | None = None
         on_cuda = self.device.type == "cuda"
-        self._step = RecordedStep(self._minibatch_step, self.device) if on_cuda else self._minibatch_step
+        self._step = TorchGraph(self._minibatch_step, self.device, warmup=WARMUP) if on_cuda else self._minibatch_step
 
     @abstractmethod
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
@@ -120,43 +124,6 @@ class Algorithm(ABC):
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
         self.generator.set_state(state["generator"].cpu())
-
-
-class RecordedStep:
-    """Work on CUDA without arguments, recorded as a CUDA graph after some warm-up calls.
-
-    ``tensordict.nn.CudaGraphModule`` waits for the device at every call; this does not.
-
-    Args:
-        work: reads and writes tensors that keep their addresses.
-        device: a CUDA device.
-    """
-
-    WARMUP = 3  # optimizers and cuBLAS allocate at their first call
-
-    def __init__(self, work: Callable[[], None], device: torch.device) -> None:
-        self._work = work
-        self._device = device
-        self._calls = 0
-        self._graph: torch.cuda.CUDAGraph | None = None
-
-    def __call__(self) -> None:
-        """Runs the work directly in the first three calls, then replays its recording."""
-        if self._calls < self.WARMUP:
-            self._calls += 1
-            side = torch.cuda.Stream(self._device)
-            side.wait_stream(torch.cuda.current_stream(self._device))
-            with torch.cuda.stream(side):
-                self._work()
-            torch.cuda.current_stream(self._device).wait_stream(side)
-            return
-        if self._graph is None:
-            torch.cuda.synchronize(self._device)
-            self._graph = torch.cuda.CUDAGraph()
-            side = torch.cuda.Stream(self._device)  # else torch takes one of its current device
-            with torch.cuda.device(self._device), torch.cuda.graph(self._graph, stream=side):
-                self._work()
-        self._graph.replay()
 
 
 def clip_and_step(optimizer: torch.optim.Optimizer, max_norm: float) -> torch.Tensor:
