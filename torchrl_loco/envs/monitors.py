@@ -327,7 +327,8 @@ class NanGuard(Monitor):
             return
         self._reported = True
         names = ("action", "episode", "elapsed_steps", "qpos", "qvel", "qacc_warmstart", "act")
-        kept = {name: wp.to_torch(array)[world].clone() for name, array in zip(names, self._kept, strict=True)}
+        arrays = zip(names, self._kept, strict=True)
+        kept = {name: wp.to_torch(array)[world].clone() for name, array in arrays if array.size}  # act may be empty
         counters = {name: int(kept.pop(name)) for name in ("episode", "elapsed_steps")}
         settings = {**self._settings, "seed": int(self._seed.torch[0]), "world": world, **counters}
         try:

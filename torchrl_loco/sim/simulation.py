@@ -109,7 +109,7 @@ class Simulation:
         self.qvel = wp.to_torch(self.data.qvel)
         self.ctrl = wp.to_torch(self.data.ctrl)
         self.qacc_warmstart = wp.to_torch(self.data.qacc_warmstart)
-        self.act = wp.to_torch(self.data.act)
+        self.act = wp.to_torch(self.data.act) if mj_model.na else torch.empty((num_envs, 0), device=device)
         self.xpos = wp.to_torch(self.data.xpos)
         self.xmat = wp.to_torch(self.data.xmat)
         self.time = wp.to_torch(self.data.time)
