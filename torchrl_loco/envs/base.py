@@ -214,10 +214,7 @@ class LocoEnv(EnvBase):
         if action.shape != shape:
             raise ValueError(f"action must have shape {tuple(shape)}, got {tuple(action.shape)}")
         self.world.step(action.reshape(self.num_envs, -1))
-        result = self._outputs()
-        reward = self.world.reward.torch.clone()
-        result.set("reward", reward.view(*self.batch_size, 1))
-        return result
+        return self._outputs(with_reward=True)
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False) -> TensorDictBase:
         self._refuse_after_fork()
@@ -241,15 +238,18 @@ class LocoEnv(EnvBase):
             result.get("reward_terms").zero_()  # nothing was rewarded yet
         return result
 
-    def _outputs(self) -> TensorDict:
+    def _outputs(self, *, with_reward: bool = False) -> TensorDict:
         """Returns a copy of what the kernels wrote: the buffers themselves change at the next step."""
-        world, batch = self.world, self.batch_size
-        done, terminated, truncated = world.flags.torch.clone().view(3, *batch, 1).unbind()
-        observation = world.observation.torch.clone().view(*batch, self.observation_size)
-        entries = {"done": done, "terminated": terminated, "truncated": truncated, "observation": observation}
+        outputs, batch = self.world.outputs, self.batch_size
+        observation, reward, terms, flags = outputs.parts(outputs.memory.clone())
+        done, terminated, truncated = flags.view(3, *batch, 1).unbind()
+        entries = {"done": done, "terminated": terminated, "truncated": truncated}
+        entries["observation"] = observation.view(*batch, self.observation_size)
+        if with_reward:
+            entries["reward"] = reward.view(*batch, 1)
         result = TensorDict._new_unsafe(entries, batch_size=batch, device=self.device)  # they need no checks
         if self.reward_terms:
-            columns = world.terms.torch.clone().view(*batch, len(self.term_names)).split(1, dim=-1)
+            columns = terms.view(*batch, len(self.term_names)).split(1, dim=-1)
             result["reward_terms"] = dict(zip(self.term_names, columns, strict=True))
         return result
 

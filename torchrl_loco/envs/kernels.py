@@ -23,13 +23,18 @@ def apply_action(
     actuator_ctrlrange: wp.array2d[wp.vec2],
     # In:
     action_in: wp.array2d[float],
+    # Out:
+    action_out: wp.array2d[float],
     # Data out:
     ctrl_out: wp.array2d[float],
     # Out:
     non_finite_out: wp.array[bool],
     any_out: wp.array[int],
 ):
-    """Clips the action and scales it to ``ctrl``. A world whose action is NaN or infinite is marked, and gets zeros."""
+    """Keeps the action, clips it and scales it to ``ctrl``.
+
+    A world whose action is NaN or infinite is marked, and stepped with an action of zeros.
+    """
     world = wp.tid()
     if world == 0:
         any_out[0] = 0  # until finish_step finds a world that is done
@@ -38,9 +43,11 @@ def apply_action(
         count += wp.where(wp.isfinite(action_in[world, i]), 0, 1)
     non_finite = count > 0
     for i in range(action_in.shape[1]):
+        action = action_in[world, i]
+        action_out[world, i] = action
         limits = actuator_ctrlrange[0, i]
-        action = wp.where(non_finite, 0.0, wp.clamp(action_in[world, i], -1.0, 1.0))
-        ctrl_out[world, i] = 0.5 * (limits[0] + limits[1]) + 0.5 * (limits[1] - limits[0]) * action
+        used = wp.where(non_finite, 0.0, wp.clamp(action, -1.0, 1.0))
+        ctrl_out[world, i] = 0.5 * (limits[0] + limits[1]) + 0.5 * (limits[1] - limits[0]) * used
     non_finite_out[world] = non_finite
 
 

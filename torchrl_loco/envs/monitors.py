@@ -63,7 +63,7 @@ class Monitor(ABC):
         self._steps, self._pending = 0, False
 
     def launch_before_step(self) -> None:  # noqa: B027
-        """Launches the monitor's kernels at the start of the recorded control step."""
+        """Launches the monitor's kernels before the physics of the recorded control step."""
 
     def launch_after_step(self) -> None:  # noqa: B027
         """Launches the monitor's kernels at the end of the recorded control step."""
@@ -205,10 +205,21 @@ class Health(Monitor):
 # NaN guard: keeps the inputs of the last control step until a world becomes non-finite.
 
 
+KEEPERS = 32
+"""Threads that copy the numbers of a world: neighbours copy neighbours, in one access to memory."""
+
+
+@wp.func
+def copy_row(lane: int, row: wp.array[float], kept: wp.array[float]):
+    for i in range(lane, row.shape[0], KEEPERS):
+        kept[i] = row[i]
+
+
 @wp.kernel(enable_backward=False)
 def keep_worlds(
     # In:
-    found_in: wp.array[bool],
+    first_in: wp.array[int],
+    num_envs: int,
     action_in: wp.array2d[float],
     episode_in: wp.array[int],
     elapsed_steps_in: wp.array[int],
@@ -225,22 +236,23 @@ def keep_worlds(
     qvel_out: wp.array2d[float],
     qacc_warmstart_out: wp.array2d[float],
     act_out: wp.array2d[float],
+    found_out: wp.array[bool],
 ):
     """Copies what a control step begins with, until a world that is not finite was found."""
-    world = wp.tid()
-    if found_in[0]:
+    world, lane = wp.tid()
+    found = first_in[0] < num_envs
+    if world + lane == 0:
+        found_out[0] = found
+    if found:
         return
-    for i in range(action_in.shape[1]):
-        action_out[world, i] = action_in[world, i]
-    episode_out[world] = episode_in[world]
-    elapsed_steps_out[world] = elapsed_steps_in[world]
-    for i in range(qpos_in.shape[1]):
-        qpos_out[world, i] = qpos_in[world, i]
-    for i in range(qvel_in.shape[1]):
-        qvel_out[world, i] = qvel_in[world, i]
-        qacc_warmstart_out[world, i] = qacc_warmstart_in[world, i]
-    for i in range(act_in.shape[1]):
-        act_out[world, i] = act_in[world, i]
+    if lane == 0:
+        episode_out[world] = episode_in[world]
+        elapsed_steps_out[world] = elapsed_steps_in[world]
+    copy_row(lane, action_in[world], action_out[world])
+    copy_row(lane, qpos_in[world], qpos_out[world])
+    copy_row(lane, qvel_in[world], qvel_out[world])
+    copy_row(lane, qacc_warmstart_in[world], qacc_warmstart_out[world])
+    copy_row(lane, act_in[world], act_out[world])
 
 
 @wp.kernel(enable_backward=False)
@@ -251,20 +263,10 @@ def find_first(
     # Out:
     first_out: wp.array[int],
 ):
+    """Notes the first world that is not finite, unless an earlier step had one."""
     world = wp.tid()
     if non_finite_in[world] and not found_in[0]:
         wp.atomic_min(first_out, 0, world)
-
-
-@wp.kernel(enable_backward=False)
-def set_found(
-    # In:
-    first_in: wp.array[int],
-    num_envs: int,
-    # Out:
-    found_out: wp.array[bool],
-):
-    found_out[0] = first_in[0] < num_envs
 
 
 class NanGuard(Monitor):
@@ -300,15 +302,15 @@ class NanGuard(Monitor):
 
     def launch_before_step(self) -> None:
         """Launches the kernel that keeps what a control step begins with."""
-        self._launch(keep_worlds, self._sim.num_envs, [self._found.warp, *self._inputs], self._kept)
+        n, outputs = self._sim.num_envs, [*self._kept, self._found.warp]
+        self._launch(keep_worlds, (n, KEEPERS), [self._first.warp, n, *self._inputs], outputs)
 
     def launch_after_step(self) -> None:
-        """Launches the kernels that look for a non-finite world."""
-        found, first = self._found.warp, self._first.warp
-        self._launch(find_first, self._sim.num_envs, [found, self._non_finite.warp], [first])
-        self._launch(set_found, 1, [first, self._sim.num_envs], [found])
+        """Launches the kernel that looks for a non-finite world."""
+        inputs = [self._found.warp, self._non_finite.warp]
+        self._launch(find_first, self._sim.num_envs, inputs, [self._first.warp])
 
-    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._sim.device)
 
     def numbers(self) -> torch.Tensor:

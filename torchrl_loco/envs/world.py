@@ -5,7 +5,6 @@ import contextlib
 import os
 import warnings
 import weakref
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,7 +16,7 @@ from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.kernels import any_world, apply_action, begin_episode, finish_step, zero_non_finite
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.rendering import Renderer
-from torchrl_loco.sim import EXCLUSIVE, Buffer, Graph, Simulation, joined_to_torch, torch_is_recording
+from torchrl_loco.sim import BLOCK, EXCLUSIVE, Block, Buffer, Graph, Simulation, joined_to_torch, torch_is_recording
 
 
 class Task(Protocol):
@@ -56,6 +55,7 @@ class World:
     Attributes:
         sim: the physics.
         action: actions of the control step, ``(nworld, nu)``.
+        outputs: the memory of what a step returns: observation, reward, terms; done, terminated and truncated.
         observation: observations, ``(nworld, observation_size)``.
         reward: rewards, ``(nworld,)``.
         terms: factors of the rewards, ``(nworld, len(term_names))``.
@@ -64,7 +64,6 @@ class World:
         episode: episodes drawn so far, ``(nworld,)``.
         elapsed_steps: control steps since the world's reset, ``(nworld,)``.
         non_finite: whether the world is non-finite, ``(nworld,)``.
-        flags: the three flags that follow, ``(3, nworld)``.
         done: terminated or truncated, ``(nworld,)``.
         terminated: whether the episode ended because the world is not finite, ``(nworld,)``.
         truncated: whether the episode reached the time limit, ``(nworld,)``.
@@ -83,16 +82,17 @@ class World:
             self.sim = Simulation(task.mj_model, task.config, n, task.device)
             device = self.sim.device
             self.action = Buffer((n, nu), float, device)
-            self.observation = Buffer((n, task.observation_size), float, device)
-            self.reward = Buffer(n, float, device)
-            self.terms = Buffer((n, len(task.term_names)), float, device)
+            sizes = [task.observation_size, 1, len(task.term_names)]
+            self.outputs = Block([n * size for size in sizes], 3 * n, task.device)
+            observation, reward, terms, flags = self.outputs.parts(self.outputs.memory)
+            self.observation, self.terms = (Buffer.around(part.view(n, -1)) for part in (observation, terms))
+            self.reward = Buffer.around(reward)
+            self.done, self.terminated, self.truncated = map(Buffer.around, flags.view(3, n))
             self.mask = Buffer(n, bool, device)
             self.stream = Buffer(n, wp.uint32, device)
             self.episode = Buffer(n, int, device)
             self.elapsed_steps = Buffer(n, int, device)
             self.non_finite = Buffer(n, bool, device)
-            self.flags = Buffer((3, n), bool, device)
-            self.done, self.terminated, self.truncated = self.flags.rows()
             self.seed = Buffer(1, wp.uint32, device)
             self._stagger = Buffer(1, bool, device)
             self._any = Buffer(1, int, device)
@@ -127,10 +127,13 @@ class World:
 
     def _launch_step(self) -> None:
         """The control step."""
+        self._launch_step_under(self.action.warp)
+
+    def _launch_step_under(self, action: wp.array) -> None:
+        outputs = [self.action.warp, self.sim.data.ctrl, self.non_finite.warp, self._any.warp]
+        self._launch(apply_action, [self.sim.model.actuator_ctrlrange, action], outputs)
         for monitor in self._monitors:
             monitor.launch_before_step()
-        ranges, marks = self.sim.model.actuator_ctrlrange, [self.non_finite.warp, self._any.warp]
-        self._launch(apply_action, [ranges, self.action.warp], [self.sim.data.ctrl, *marks])
         self.sim.step()
         self._launch_observation(self._all)
         data, health = self.sim.data, self.health
@@ -185,14 +188,21 @@ class World:
         self._launch(kernel, [*inputs, mask], [self.observation.warp, self.reward.warp, self.terms.warp])
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=self.sim.num_envs, inputs=inputs, outputs=outputs, device=self.sim.device)
+        n, device = self.sim.num_envs, self.sim.device
+        wp.launch(kernel, dim=n, inputs=inputs, outputs=outputs, device=device, block_dim=BLOCK)
 
     # What the environment calls. Nothing waits for the device.
 
     def step(self, action: torch.Tensor) -> None:
         """Steps all worlds under actions of shape ``(nworld, nu)``."""
-        self.action.torch.copy_(action.detach())  # else the buffer would keep every past policy's autograd graph
-        self._run(self._step_graph, self._launch_step)
+        action = action.detach()  # else the buffer would keep every past policy's autograd graph
+        if torch_is_recording(self.sim.device):
+            action = action.float().contiguous()
+            with joined_to_torch(self.sim.device):
+                self._launch_step_under(wp.from_torch(action))
+            return
+        self.action.torch.copy_(action)
+        self._step_graph.replay()
         self.poll()
 
     def reset(self, mask: torch.Tensor | None, stagger: bool) -> None:
@@ -205,27 +215,26 @@ class World:
         self._set_mask(mask)
         if stagger:
             self._stagger.torch.fill_(True)
-        self._run(self._reset_graph, self._launch_masked_reset)
+        self._replay_reset(self._reset_graph)
         if stagger:
             self._stagger.torch.fill_(False)
 
     def reset_done(self) -> None:
         """Begins the next episode in the worlds that are done, right after a step."""
-        self._run(self._reset_done_graph, self._launch_masked_reset)
+        self._replay_reset(self._reset_done_graph)
 
-    def _run(self, graph: Graph, launch: Callable[[], None]) -> None:
-        """Replays a graph; while torch records one of its own, makes the launches without a condition instead."""
+    def _replay_reset(self, graph: Graph) -> None:
+        """Replays the graph of a reset; into a graph that torch records the reset goes without its condition."""
         if torch_is_recording(self.sim.device):
             with joined_to_torch(self.sim.device):
-                launch()
+                self._launch_masked_reset()
         else:
             graph.replay()
 
     def poll(self, steps: int = 1) -> None:
         """Lets the monitors report after so many control steps."""
-        if not torch_is_recording(self.sim.device):
-            for monitor in self._monitors:
-                monitor.poll(steps)
+        for monitor in self._monitors:
+            monitor.poll(steps)
 
     def state(self) -> dict[str, torch.Tensor]:
         """Returns the buffers that make up the state of the worlds, by key of :class:`torchrl_loco.State`."""

@@ -1,5 +1,6 @@
 """Memory that Warp kernels and torch share."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -23,11 +24,31 @@ class Buffer:
         self.warp: wp.array = wp.zeros(shape, dtype=dtype, device=device)
         self.torch: torch.Tensor = wp.to_torch(self.warp)
 
-    def rows(self) -> "list[Buffer]":
-        """Returns the rows as buffers that share this one's memory."""
-        rows = []
-        for i in range(len(self.torch)):
-            row = object.__new__(Buffer)
-            row.warp, row.torch = self.warp[i], self.torch[i]
-            rows.append(row)
-        return rows
+    @classmethod
+    def around(cls, tensor: torch.Tensor) -> "Buffer":
+        """Returns a buffer on the memory of a contiguous tensor."""
+        buffer = object.__new__(cls)
+        buffer.warp, buffer.torch = wp.from_torch(tensor), tensor
+        return buffer
+
+
+class Block:
+    """Arrays of float32 and flags in one piece of memory, which can be copied at once.
+
+    Args:
+        floats: number of floats of each array.
+        flags: number of flags.
+        device: where it lives.
+
+    Attributes:
+        memory: all of it, as bytes.
+    """
+
+    def __init__(self, floats: Sequence[int], flags: int, device: torch.device) -> None:
+        self._floats, self._end = list(floats), 4 * sum(floats)
+        self.memory = torch.zeros(self._end + flags, dtype=torch.uint8, device=device)
+
+    def parts(self, memory: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Returns the arrays, then the flags, in :attr:`memory` or in a copy of it; all of one dimension."""
+        floats = memory[: self._end].view(torch.float32).split(self._floats)
+        return *floats, memory[self._end :].view(torch.bool)

@@ -100,8 +100,15 @@ class TorchGraph:
             graph = torch.cuda.CUDAGraph()
             side = torch.cuda.Stream(self._device)  # else torch takes one of its current device
             recording = torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local")
-            with EXCLUSIVE, torch.cuda.device(self._device), recording:
-                self._work()
+            with EXCLUSIVE, torch.cuda.device(self._device):
+                try:
+                    with recording:
+                        self._work()
+                except BaseException:
+                    # torch's random numbers would wait for the end of the recording: let an empty one end.
+                    with torch.cuda.graph(torch.cuda.CUDAGraph(), stream=side):
+                        torch.zeros(1, device=self._device)
+                    raise
             self._graph = graph
         self._graph.replay()
 

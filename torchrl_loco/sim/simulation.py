@@ -23,6 +23,10 @@ DETERMINISTIC_SCRATCH = 11.0
 """The same with ``deterministic=True`` on CUDA (measured: 6 to 8 times the memory of a world)."""
 
 
+BLOCK = 64
+"""Threads of a block where a thread has a world: few, so that a thousand worlds keep all multiprocessors busy."""
+
+
 @wp.kernel(enable_backward=False)
 def reset_worlds(
     # Model:
@@ -128,6 +132,7 @@ class Simulation:
             inputs=[self.model.qpos0, mask],
             outputs=[d.qpos, d.qvel, d.qacc_warmstart, d.act, d.ctrl, d.time],
             device=self.device,
+            block_dim=BLOCK,
         )
         self.engine.reset(mask)
 

@@ -30,7 +30,7 @@ auto smooth = [&](float step) {
 #define ROW const float slope = D * v, curvature = slope * v, half = 0.5f * D, at_zero = wp::min(x, 0.0f);
 #define ADD_ROW(p) { \\
   const float y = wp::min(fmaf(p.step, v, x), 0.0f); \\
-  p.cost = fmaf(half * (y - at_zero), y + at_zero, p.cost); \\
+  p.cost = fmaf(half * y, y, p.cost - half * at_zero * at_zero); \\
   p.slope = fmaf(slope, y, p.slope); \\
   p.curvature += y < 0.0f ? curvature : 0.0f; }
 // A row of dry friction: quadratic up to the largest force, linear beyond.
