@@ -5,8 +5,9 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.cases import CASES, TASKS, VARIANTS
+from benchmarks.cases import CASES, VARIANTS
 from benchmarks.results import save, show
+from benchmarks.tasks import TASKS
 from torchrl_loco import list_envs
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"

@@ -14,11 +14,11 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 import torchrl_loco
+from benchmarks.tasks import TASKS
 from torchrl_loco import RolloutCollector, models
 from torchrl_loco.config import DEFAULTS, sim_config
 from torchrl_loco.sim import Simulation, current_stream
 
-TASKS = {"walker": "walker_walk", "humanoid": "humanoid_walk"}
 BATCH_STEPS = 20
 """Control steps in a batch of the collectors."""
 

@@ -12,9 +12,11 @@ import torch
 from tqdm import tqdm
 
 import torchrl_loco
-from benchmarks.cases import TASKS, bare_default, waiter
+from benchmarks.cases import bare_default, waiter
 from benchmarks.results import Row
+from benchmarks.tasks import TASKS
 from benchmarks.timing import milliseconds
+from torchrl_loco import models
 from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.sim.simulation import memory
 
@@ -22,6 +24,7 @@ COLUMNS = {
     "body": "",
     "protocol": "",
     "worlds": "d",
+    "engine": "",
     "mujoco_warp": ".3f",
     "C MuJoCo": ".3f",
     "compiled": ".3f",
@@ -47,7 +50,7 @@ def engines(bodies: Sequence[str], worlds: Sequence[int], device: torch.device, 
     rows: list[Row] = []
     runs = [(body, protocol, n) for body in bodies for protocol in PROTOCOLS for n in worlds]
     for body, protocol, n in tqdm(runs, desc="engines"):
-        row = {"body": body, "protocol": protocol, "worlds": n, **_compiled(body, protocol, n, device)}
+        row = {"body": body, "protocol": protocol, "worlds": n, **_environment(body, protocol, n, device)}
         if n <= base_up_to:
             row["mujoco_warp"] = _time(bare_default(body, n, device, protocol), n, device)
             row["ratio"] = row["mujoco_warp"] / row["with observation"]
@@ -59,8 +62,9 @@ def engines(bodies: Sequence[str], worlds: Sequence[int], device: torch.device, 
     return rows
 
 
-def _compiled(body: str, protocol: str, n: int, device: torch.device) -> Row:
-    env = torchrl_loco.make(TASKS[body], n, device, seed=0, protocol=protocol, stagger=True, engine="compiled")
+def _environment(body: str, protocol: str, n: int, device: torch.device) -> Row:
+    """Measures an environment under the compiled engine, or under MuJoCo-Warp if the body needs that."""
+    env = torchrl_loco.make(TASKS[body], n, device, seed=0, protocol=protocol, stagger=True)
     env.reset()
     world, physics = env.world, env.sim.capture(env.sim.step)
 
@@ -73,8 +77,10 @@ def _compiled(body: str, protocol: str, n: int, device: torch.device) -> Row:
 
     for _ in range(WARM_UP):
         control_step()
-    found = {"compiled": _time(step, n, device), "with observation": _time(control_step, n, device)}
-    found["bytes a world"] = memory("compiled", env.mj_model, env.config, n, device) // n
+    found = {"engine": env.engine, "with observation": _time(control_step, n, device)}
+    if env.engine == "compiled":
+        found["compiled"] = _time(step, n, device)
+    found["bytes a world"] = memory(env.engine, env.mj_model, env.config, n, device) // n
     return found
 
 
@@ -91,9 +97,10 @@ def _c_mujoco(body: str, protocol: str, n: int) -> float:
         _, td = env.step_and_maybe_reset(td.set("action", env.action_spec.rand()))
     states, data, spent = env.get_state(), mujoco.MjData(env.mj_model), 0.0
     for world in range(64):
-        for name in ("qpos", "qvel", "qacc_warmstart"):
-            getattr(data, name)[:] = states[name][world].numpy()
-        data.ctrl[:] = np.random.default_rng(world).uniform(-1, 1, env.mj_model.nu)
+        for name in ("qpos", "qvel", "qacc_warmstart", "act"):
+            if name in states:
+                getattr(data, name)[:] = states[name][world].numpy()
+        data.ctrl[:] = models.control(env.mj_model, np.random.default_rng(world).uniform(-1, 1, env.mj_model.nu))
         start = time.perf_counter()
         mujoco.mj_step(env.mj_model, data, env.config.substeps)
         spent += time.perf_counter() - start

@@ -10,8 +10,9 @@ from mujoco import rollout
 from tqdm import tqdm
 
 import torchrl_loco
-from benchmarks.cases import TASKS
 from benchmarks.results import Row
+from benchmarks.tasks import TASKS
+from torchrl_loco import models
 
 COLUMNS = {
     "body": "",
@@ -73,8 +74,9 @@ def compare(body: str, protocol: str, converged: bool, worlds: int, device: torc
     states = np.zeros((worlds, mujoco.mj_stateSize(model, spec)))
     for world in range(worlds):
         data.qpos[:], data.qvel[:] = start["qpos"][world], start["qvel"][world]
+        data.act[:] = start["act"][world] if model.na else 0.0
         mujoco.mj_getState(model, data, states[world], spec)
-    control = actions.transpose(0, 1).double().numpy().repeat(env.config.substeps, axis=1)
+    control = models.control(model, actions.transpose(0, 1).double().numpy()).repeat(env.config.substeps, axis=1)
     warmstart = start["qacc_warmstart"].double().numpy()
     trajectory, _ = rollout.rollout(model, [data], states, control, initial_warmstart=warmstart)
     theirs = trajectory[:, env.config.substeps - 1 :: env.config.substeps, 1 : 1 + model.nq]  # after the time

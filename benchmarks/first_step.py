@@ -14,7 +14,8 @@ import torch
 import warp as wp
 
 import torchrl_loco
-from benchmarks.cases import TASKS, waiter
+from benchmarks.cases import waiter
+from benchmarks.tasks import TASKS
 
 
 def used_bytes(device: torch.device) -> int:

@@ -13,8 +13,8 @@ from tensordict import TensorDictBase
 from tqdm import tqdm
 
 import torchrl_loco
-from benchmarks.cases import TASKS
 from benchmarks.results import Row
+from benchmarks.tasks import TASKS
 from torchrl_loco import State
 from torchrl_loco.envs import LocoEnv
 

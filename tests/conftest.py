@@ -53,6 +53,8 @@ def shared():
     made = {}
 
     def get(task="walker_run", num_envs=4, device="cpu", seed=0, *, copy=0, **options):
+        if options.get("engine") == "auto":
+            del options["engine"]  # the default
         key = (task, num_envs, device, copy, *sorted(options.items()))
         if key not in made:
             made[key] = torchrl_loco.make(task, num_envs, device, seed, **options)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from cases import COARSE
+from cases import coarse
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, FiniteTensorDictCheck, InitTracker, RewardSum
@@ -15,14 +15,14 @@ import torchrl_loco
 from torchrl_loco import RolloutCollector
 from torchrl_loco.collector import what_forbids_recording
 
-QUICK = {"episode_length": 7, "on_overflow": "ignore", **COARSE}
-"""Steps so coarse make a humanoid fly apart, with more contacts than there are places."""
+QUICK = {"episode_length": 7, "on_overflow": "ignore"}
+"""Coarse steps make a humanoid fly apart, with more contacts than there are places."""
 
 
 @pytest.fixture
 def make(shared):
     def make(task, wrap, device="cpu", num_envs=4, copy=0, **settings):
-        env = shared(task, num_envs, device, stagger=True, copy=copy, **{**QUICK, **settings})
+        env = shared(task, num_envs, device, stagger=True, copy=copy, **{**QUICK, **coarse(task), **settings})
         return torchrl_loco.TransformedEnv(env, Compose(InitTracker(), RewardSum())) if wrap else env
 
     return make

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torchrl_loco
-from torchrl_loco import cli, doctor
+from torchrl_loco import cli, doctor, models
 
 
 def test_healthy(capsys):
@@ -16,7 +16,7 @@ def test_healthy(capsys):
 
 
 def test_wrong_physics(capsys, monkeypatch):
-    """Of one body it is wrong, of the other not even finite."""
+    """Of one body it is wrong, of the others not even finite."""
     make = doctor.make
 
     def spoilt(*args, **kwargs):
@@ -29,7 +29,7 @@ def test_wrong_physics(capsys, monkeypatch):
     with pytest.raises(SystemExit, match="1"):
         cli.main(["doctor"])
     out = capsys.readouterr().out
-    assert out.count("WRONG: differs") == 2
+    assert out.count("WRONG: differs") == len(models.PATHS)
     assert "verdict: problems with walker on cpu, humanoid on cpu" in out
 
 

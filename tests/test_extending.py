@@ -1,4 +1,4 @@
-"""A body outside the package: the worked example against dm_control, and what is reported about broken plug-ins."""
+"""A body outside the package: the worked example against C MuJoCo, and what is reported about broken plug-ins."""
 
 import os
 import shutil
@@ -11,22 +11,21 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from oracle import DATA, tolerance
-from test_models import assert_figures_are_dm_controls
+from oracle import tolerance
 from torchrl.envs import check_env_specs
 
 import torchrl_loco
-from torchrl_loco import State, cli, doctor, models, nan_dump, registry
+from torchrl_loco import cli, doctor, nan_dump, registry
 
 ROOT = Path(__file__).parents[1]
-EXAMPLE = ROOT / "examples" / "cheetah"
+EXAMPLE = ROOT / "examples" / "inchworm"
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """A folder with the example as an installer leaves it, but for the time that this takes."""
     path = tmp_path_factory.mktemp("site")
-    shutil.copytree(EXAMPLE / "loco_cheetah", path / "loco_cheetah")
+    shutil.copytree(EXAMPLE / "loco_inchworm", path / "loco_inchworm")
     project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
     points = project["entry-points"][registry.GROUP]
     distribution(path, project["name"], "\n".join(f"{name} = {value}" for name, value in points.items()))
@@ -57,37 +56,23 @@ def discover(monkeypatch):
 
 
 @pytest.fixture
-def cheetah(site, discover, shared):
+def inchworm(site, discover, shared):
     """Makes the environment by its id."""
     discover(site)
-    return lambda *args, **kwargs: shared("cheetah_run", *args, **kwargs)
-
-
-def recorded(kind):
-    return dict(np.load(DATA / f"cheetah_{kind}_dm_control.npz"))
-
-
-def state(qpos, qvel, **more):
-    entries = {"qpos": qpos, "qvel": qvel, **more}
-    values = {key: torch.as_tensor(value, dtype=torch.float32) for key, value in entries.items()}
-    return State(values, batch_size=[len(qpos)])
+    return lambda *args, **kwargs: shared("inchworm_crawl", *args, **kwargs)
 
 
 # The example.
 
 
-def test_the_model_has_dm_controls_figures():
-    assert_figures_are_dm_controls(models.load(EXAMPLE / "loco_cheetah" / "cheetah.xml"), "cheetah")
-
-
-def test_contract(cheetah, site):
-    assert torchrl_loco.list_envs() == [*registry.OURS, "cheetah_run"]
-    assert registry.summary("cheetah_run") == "Run at 10 m/s or faster."
-    env = cheetah(64, reward_terms=True)
+def test_contract(inchworm, site):
+    assert torchrl_loco.list_envs() == [*registry.OURS, "inchworm_crawl"]
+    assert registry.summary("inchworm_crawl") == "Crawl at 0.5 m/s or faster."
+    env = inchworm(64, reward_terms=True)
     assert Path(sys.modules[type(env).__module__].__file__).is_relative_to(site)
-    assert (env.action_spec.shape, env.observation_spec["observation"].shape) == ((64, 6), (64, 17))
+    assert (env.action_spec.shape, env.observation_spec["observation"].shape) == ((64, 2), (64, 9))
     check_env_specs(env)
-    td = env.rollout(20)
+    td = env.rollout(40)
     reward = td["next", "reward"]
     assert ((reward >= 0) & (reward <= 1)).all()
     assert reward.max() > 0
@@ -96,79 +81,39 @@ def test_contract(cheetah, site):
     assert env.render(width=32, height=24).float().std() > 5
 
 
-def test_observation_physics_and_reward_agree_with_dm_control(cheetah):
-    record = recorded("run")
-    env = cheetah(len(record["qpos"]), protocol="dm_control")
-    td = env.reset(state(record["next_qpos"], record["next_qvel"]), set_state=True)
-    np.testing.assert_allclose(td["observation"], record["obs"], rtol=0, atol=1e-5)
-    before = state(record["qpos"], record["qvel"], qacc_warmstart=record["warmstart"])
-    td = env.reset(before, set_state=True)
-    td = env.step(td.set("action", torch.as_tensor(record["action"], dtype=torch.float32)))["next"]
-    error = np.abs(env.get_state()["qpos"].numpy() - record["next_qpos"]).max(axis=1)
-    assert np.median(error) < 1e-5
-    assert np.quantile(error, 0.95) < 1e-4
-    assert np.median(np.abs(td["reward"].squeeze(-1).numpy() - record["reward"])) < 1e-5
-
-
-def test_observation_and_reward_agree_with_c_mujoco(cheetah):
-    """At all speeds, beyond the target too: C MuJoCo in float64, at the state that follows."""
-    record, rng = recorded("run"), np.random.default_rng(0)
-    qvel = record["qvel"].copy()
-    qvel[:, 0] += rng.uniform(-2, 13, len(qvel))
-    env = cheetah(len(qvel), protocol="dm_control")
-    td = env.reset(state(record["qpos"], qvel), set_state=True)
-    td = env.step(td.set("action", torch.as_tensor(record["action"], dtype=torch.float32)))["next"]
-    after, model = env.get_state().numpy(), models.load(type(env).mjcf)
-    data, rewards = mujoco.MjData(model), []
+def test_physics_observation_and_reward_agree_with_c_mujoco(inchworm, actions):
+    """From states of a rollout, in the air and on the ground, at all speeds, beyond the target too."""
+    env = inchworm(64, protocol="dm_control")
+    td = env.rollout(60, break_when_any_done=False)[:, -1]["next"].exclude("reward")
+    start = env.get_state()
+    start["qvel"][:, 0] += torch.linspace(-0.5, 1.0, 64)
+    td = env.reset(start, set_state=True)
+    (action,) = actions(env, 1)
+    td = env.step(td.set("action", action))["next"]
+    after, model = env.get_state().numpy(), env.mj_model
+    data, rewards, errors = mujoco.MjData(model), [], []
     for world in range(env.num_envs):
+        for name in ("qpos", "qvel", "qacc_warmstart"):
+            getattr(data, name)[:] = start[name][world]
+        data.ctrl[:] = action[world]
+        mujoco.mj_step(model, data, env.config.substeps)
+        errors.append(np.abs(data.qpos - after["qpos"][world]).max())
         data.qpos[:], data.qvel[:] = after["qpos"][world], after["qvel"][world]
         mujoco.mj_forward(model, data)
         expected = np.concatenate([data.qpos[1:], data.qvel])
         np.testing.assert_allclose(td["observation"][world], expected, rtol=0, atol=1e-6)
-        rewards.append(tolerance(data.sensordata[0], 10, np.inf, 10, "linear", 0))
+        rewards.append(tolerance(data.sensordata[0], 0.5, np.inf, 0.5, "linear", 0))
+    assert np.quantile(errors, 0.95) < 1e-4
     np.testing.assert_allclose(td["reward"].squeeze(-1), rewards, rtol=0, atol=1e-5)
     assert min(rewards) == 0
     assert max(rewards) == 1
 
 
-@pytest.mark.slow
-def test_starts(cheetah):
-    """They are distributed as dm_control's, stand at rest on the floor, and a masked reset draws from them too."""
-    env = cheetah(64)
-    poses, theirs = env.initial_poses(), recorded("resets")["qpos"]
-    critical = np.sqrt(-0.5 * np.log(1e-6 / 2) * (1 / len(poses) + 1 / len(theirs)))  # Kolmogorov and Smirnov's
-    for a, b in zip(poses.T, theirs.T, strict=True):
-        both = np.concatenate([a, b])
-        share = [np.searchsorted(np.sort(x), both, side="right") / len(x) for x in (a, b)]
-        assert np.abs(share[0] - share[1]).max() < critical
-
-    td = env.reset()
-    first, data = env.get_state()["qpos"], mujoco.MjData(env.mj_model)
-    assert len(first.unique(dim=0)) > 32
-    for qpos in first.numpy():
-        data.qpos[:] = qpos
-        mujoco.mj_fwdPosition(env.mj_model, data)
-        assert data.ncon >= 2
-        assert data.contact.dist.min() > -0.02
-    for _ in range(20):
-        td = env.step(td.set("action", torch.zeros(64, 6)))["next"].exclude("reward")
-    assert (env.get_state()["qpos"] - first).abs().max() < 0.05  # random hinges swing through more than 1 rad
-
-    before, mask = env.get_state(), torch.arange(64) % 2 == 0
-    td = env.reset(td.set("_reset", mask.unsqueeze(-1)))
-    after = env.get_state()
-    assert torch.equal(after["qpos"][~mask], before["qpos"][~mask])
-    starts = torch.as_tensor(poses, dtype=torch.float32)
-    assert (after["qpos"][mask].unsqueeze(1) == starts).all(dim=-1).any(dim=-1).all()
-    assert torch.equal(td["observation"][mask, :8], after["qpos"][mask, 1:])
-    assert (after["qvel"][mask] == 0).all()
-
-
-def test_a_nan_dump_knows_its_class(cheetah, tmp_path):
+def test_a_nan_dump_knows_its_class(inchworm, tmp_path):
     file = tmp_path / "dump.safetensors"
-    env = registry.env_class("cheetah_run")(3, "cpu", seed=0, nan_dump=file)
-    action = torch.zeros(3, 6)
-    action[1, 2] = torch.nan
+    env = registry.env_class("inchworm_crawl")(3, "cpu", seed=0, nan_dump=file)
+    action = torch.zeros(3, 2)
+    action[1, 1] = torch.nan
     env.step(env.reset().set("action", action))
     with pytest.warns(torchrl_loco.NonFiniteWarning):
         env.close()
@@ -176,14 +121,14 @@ def test_a_nan_dump_knows_its_class(cheetah, tmp_path):
 
 
 @pytest.mark.slow
-def test_doctor(cheetah, monkeypatch):
-    _, error, engine = doctor.self_test("cheetah_run", "cpu")
+def test_doctor(inchworm, monkeypatch):
+    _, error, engine = doctor.self_test("inchworm_crawl", "cpu")
     assert error < doctor.TOLERANCE
     assert engine == "compiled"
     tested = []
     monkeypatch.setattr(doctor, "self_test", lambda *args: tested.append(args) or (0.0, 0.0, "compiled"))
-    assert "cheetah on cpu" in [finding.subject for finding in doctor.diagnose()]
-    assert ("cheetah_run", "cpu") in tested
+    assert "inchworm on cpu" in [finding.subject for finding in doctor.diagnose()]
+    assert ("inchworm_crawl", "cpu") in tested
 
 
 @pytest.mark.ci
@@ -202,63 +147,78 @@ def test_installed_trained_and_played(tmp_path):
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    assert command("list").splitlines()[-1].split(maxsplit=1) == ["cheetah_run", "Run at 10 m/s or faster."]
+    assert command("list").splitlines()[-1].split(maxsplit=1) == ["inchworm_crawl", "Crawl at 0.5 m/s or faster."]
     small = {
         **{"num_envs": 4, "num_steps": 8, "action_repeat": 4, "minibatch_size": 16, "epochs": 1, "total_frames": 256},
         **{"hidden": 16, "eval_episodes": 2, "video_seconds": 0.2},
     }
     settings = [text for name, value in small.items() for text in (f"--{name}", str(value))]
-    command("train", "cheetah_run", "--device", "cpu", *settings)
+    command("train", "inchworm_crawl", "--device", "cpu", *settings)
     (run,) = (tmp_path / "runs").iterdir()
     assert (run / "video.mp4").stat().st_size > 0
     policy = str(run / "policy.safetensors")
     options = ["--policy", policy, "--seconds", "0.2", "--device", "cpu", "--out", "x.mp4"]
-    command("play", "cheetah_run", *options)
+    command("play", "inchworm_crawl", *options)
     assert (tmp_path / "x.mp4").stat().st_size > 0
     with pytest.raises(SystemExit, match="2"):
         cli.main(["play", "walker_walk", "--policy", policy, "--device", "cpu"])
 
 
-# A table of initial poses.
+# A table of initial states.
 
 
 @pytest.fixture
-def posed(site, discover):
+def starting(site, discover):
     """Makes an environment of the example's body that has another table."""
     discover(site)
 
-    def make(table, num_envs=1):
-        cls = type("Posed", (registry.env_class("cheetah_run"),), {"initial_poses": lambda self: table})
-        return cls(num_envs, "cpu", seed=0)
+    def make(table, num_envs=1, **options):
+        cls = type("Starting", (registry.env_class("inchworm_crawl"),), {"initial_states": lambda self: table})
+        return cls(num_envs, "cpu", seed=0, **options)
 
     return make
 
 
-def test_each_reset_draws_a_row_uniformly(posed):
-    table = np.random.default_rng(0).uniform(0.5, 1.0, (3, 9)).astype(np.float32)
-    env, drawn = posed(table, num_envs=300), []
+@pytest.mark.parametrize("columns", [5, 10])
+def test_each_reset_draws_a_row_uniformly(starting, columns):
+    """Of poses at rest, or of poses with velocities."""
+    table = np.random.default_rng(0).uniform(0.5, 1.0, (3, columns)).astype(np.float32)
+    env, drawn = starting(table, num_envs=300), []
     for _ in range(2):
-        td = env.reset()
-        qpos = env.get_state()["qpos"].numpy()
-        np.testing.assert_array_equal(td["observation"][:, :8], qpos[:, 1:])
-        rows, counts = np.unique(qpos, axis=0, return_counts=True)
+        td, state = env.reset(), env.get_state()
+        start = torch.cat([state["qpos"], state["qvel"]], dim=1).numpy()
+        np.testing.assert_array_equal(td["observation"], start[:, 1:])
+        assert (start[:, columns:] == 0).all()
+        rows, counts = np.unique(start[:, :columns], axis=0, return_counts=True)
         np.testing.assert_array_equal(rows, np.unique(table, axis=0))
         assert counts.min() > 60  # of 100; the deviation is 8
-        drawn.append(qpos)
+        drawn.append(start)
     assert 150 < (drawn[0] != drawn[1]).any(axis=1).sum() < 250  # 200 of 300, if the draws are independent
     env.set_seed(0)
     env.reset()
-    np.testing.assert_array_equal(env.get_state()["qpos"], drawn[0])
+    np.testing.assert_array_equal(env.get_state()["qpos"], drawn[0][:, :5])
 
 
-def test_tables_that_are_none(posed):
+def test_what_is_observed_at_a_start_in_motion(starting, engine):
+    """Sensors belong to the velocities that were drawn."""
+    env = starting(np.full((1, 10), 0.3), num_envs=2, engine=engine)
+    env.reset()
+    data = mujoco.MjData(env.mj_model)
+    data.qpos[:], data.qvel[:] = 0.3, 0.3
+    mujoco.mj_forward(env.mj_model, data)
+    np.testing.assert_allclose(env.sim.data.sensordata.numpy(), np.tile(data.sensordata, (2, 1)), atol=1e-6)
+
+
+def test_tables_that_are_none(starting):
     """Without a table a world starts in the default pose; one of a wrong shape is refused."""
-    env = posed(None, num_envs=2)
+    env = starting(None, num_envs=2)
     env.reset()
     np.testing.assert_array_equal(env.get_state()["qpos"], np.tile(env.mj_model.qpos0, (2, 1)))
-    for shape in ((9,), (4, 8), (0, 9), (2, 2, 9)):
-        with pytest.raises(ValueError, match=r"initial_poses must return an array of shape \(count > 0, 9\), got"):
-            posed(np.zeros(shape))
+    for shape in ((5,), (4, 6), (0, 5), (2, 2, 5)):
+        with pytest.raises(ValueError, match=r"initial_states must return .* shape \(count > 0, 5\) or .* 10\), got"):
+            starting(np.zeros(shape))
+    with pytest.raises(ValueError, match="initial_states must return finite numbers"):
+        starting(np.full((3, 10), np.nan))
 
 
 # What plug-ins may get wrong.
@@ -291,8 +251,8 @@ def test_broken_plug_ins_are_named_and_harm_no_other(tmp_path, discover, capsys,
 
     assert cli.main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 6 + len(broken)
-    assert all("broken_loco 1.2" in line for line in lines[6:])
+    assert len(lines) == len(registry.OURS) + len(broken)
+    assert all("broken_loco 1.2" in line for line in lines[len(registry.OURS) :])
     with pytest.raises(SystemExit, match="2"):
         cli.main(["train", "ant_0", "--device", "cpu", "--out", str(tmp_path / "runs")])
     assert "'ant_0' of broken_loco 1.2" in capsys.readouterr().err

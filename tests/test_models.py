@@ -3,38 +3,66 @@
 import mujoco
 import numpy as np
 import pytest
+import torch
 from oracle import reference_model
 
 import torchrl_loco
 from torchrl_loco import models
 
-SECTIONS = ("names", "sizes", "option", "source")
+SECTIONS = {"names", "sizes", "option", "source"}
+INDICES = {"sensor_objid"}
+"""Fields that count what our models leave out, such as sites that no sensor uses."""
+LEGS = ("front_left", "front_right", "back_right", "back_left")
+SENSORS = {
+    **{body: ["torso_velocity"] for body in ("walker", "humanoid", "cheetah")},
+    "hopper": ["torso_velocity", "touch_toe", "touch_heel"],
+    "quadruped": [
+        *("imu_accel", "imu_gyro", "velocimeter"),
+        *(f"force_toe_{leg}" for leg in LEGS),
+        *(f"torque_toe_{leg}" for leg in LEGS),
+    ],
+}
+"""A sensor that nobody reads costs time."""
 
 
 def assert_figures_are_dm_controls(model, body):
     reference = reference_model(body)
-    for field in reference:
-        if field not in SECTIONS:
-            ours, theirs = np.asarray(getattr(model, field), dtype=float), np.ravel(reference[field])
-            np.testing.assert_allclose(ours.ravel(), theirs, rtol=0, atol=1e-6, err_msg=field)
-    assert {size: getattr(model, size) for size in reference["sizes"]} == reference["sizes"]
+    for field in set(reference) - SECTIONS - INDICES:
+        ours, theirs = np.asarray(getattr(model, field), dtype=float), np.asarray(reference[field], dtype=float)
+        kind = field.split("_")[0]
+        if kind == "site":  # those that our sensors use
+            theirs = theirs[[reference["names"]["site"].index(model.site(i).name) for i in range(model.nsite)]]
+        elif kind == "sensor":  # our sensors come first
+            theirs = theirs[: model.nsensor]
+        elif field == "geom_size":  # the size of the floor is that of its picture
+            ours, theirs = ours[1:], theirs[1:]
+        np.testing.assert_allclose(ours, theirs.reshape(ours.shape), rtol=0, atol=1e-6, err_msg=field)
+    sizes = reference["sizes"].keys() - {"nsite", "nsensor"}
+    assert {size: getattr(model, size) for size in sizes} == {size: reference["sizes"][size] for size in sizes}
     for option, value in reference["option"].items():
         np.testing.assert_allclose(getattr(model.opt, option), value, err_msg=option)
 
 
-@pytest.mark.parametrize("body", ["walker", "humanoid"])
+@pytest.mark.parametrize("body", models.PATHS)
 def test_figures_names_and_scene(body):
     model = models.load(models.PATHS[body])
     assert_figures_are_dm_controls(model, body)
-    for kind, names in reference_model(body)["names"].items():
-        assert [getattr(model, kind)(i).name for i in range(len(names))] == names
+    names = reference_model(body)["names"]
+    for kind in ("body", "joint", "actuator"):
+        assert [getattr(model, kind)(i).name for i in range(len(names[kind]))] == names[kind]
+    assert [model.geom(i).name for i in range(1, model.ngeom)] == names["geom"][1:]  # the floor has one name here
     assert {model.camera(i).name for i in range(model.ncam)} == {"side", "back", "egocentric"}
     assert model.geom("floor").type == mujoco.mjtGeom.mjGEOM_PLANE
     assert model.nlight == 1
     assert {model.material(i).name for i in range(model.nmat)} == {"floor", "skin", "skin_left"}
-    assert model.nsensor == 1  # a sensor that nobody reads costs time
-    assert model.sensor_type[0] == mujoco.mjtSensor.mjSENS_SUBTREELINVEL
-    assert model.sensor_objid[0] == model.body("torso").id
+    assert [model.sensor(i).name for i in range(model.nsensor)] == SENSORS[body]
+    if "torso_velocity" in SENSORS[body]:
+        assert model.sensor("torso_velocity").type[0] == mujoco.mjtSensor.mjSENS_SUBTREELINVEL
+        assert model.sensor("torso_velocity").objid[0] == model.body("torso").id
+    for i in range(model.nsensor):
+        if model.sensor_objtype[i] == mujoco.mjtObj.mjOBJ_SITE:
+            name = model.site(model.sensor_objid[i]).name
+            assert model.sensor(i).name.endswith(name) or name == "torso"
     assert models.check(model) is model
 
 
@@ -58,19 +86,18 @@ def test_a_model_that_would_go_wrong_in_silence_is_refused():
     from_camera = '<framelinvel name="seen" objtype="body" objname="ant" reftype="camera" refname="eye"/>'
     clampctrl = '<option><flag clampctrl="disable"/></option>'
     for options, message in [
-        ({"actuator": MOTOR.replace("-1 1", "-2 2")}, "every actuator needs ctrlrange -1 1"),
-        ({"actuator": '<motor name="a" joint="leg"/>'}, "every actuator needs ctrlrange -1 1"),
+        ({"actuator": '<motor name="a" joint="leg"/>'}, "every actuator needs a ctrlrange"),
         ({"actuator": MOTOR.replace("/>", ' ctrllimited="false"/>')}, "must be clipped"),
         ({"option": clampctrl}, "must be clipped"),
         ({"actuator": MOTOR.replace("/>", ' delay="0.1" nsample="4"/>')}, "delays"),
-        ({"actuator": '<intvelocity joint="leg" ctrlrange="-1 1" actrange="-1 1"/>'}, "activations"),
         ({"sensor": from_camera}, "sensor 'seen' is not evaluated"),
         ({"sensor": '<framepos name="place" objtype="body" objname="ant"/>'}, "sensor 'place' is not evaluated"),
         ({"sensor": '<actuatorfrc name="force" actuator="a"/>'}, "sensor 'force' is not evaluated"),
     ]:
         with pytest.raises(ValueError, match=message):
             models.check(ant(**options))
-    models.check(ant())
+    for actuator in (MOTOR.replace("-1 1", "-2 2"), '<intvelocity joint="leg" ctrlrange="-1 1" actrange="-1 1"/>'):
+        models.check(ant(actuator))
 
 
 def test_load(tmp_path):
@@ -85,9 +112,19 @@ def test_load(tmp_path):
 
 
 def test_an_environment_refuses_such_a_model(tmp_path):
-    unclipped = models.PATHS["walker"].read_text().replace('ctrlrange="-1 1"', 'ctrlrange="-2 2"')
+    unclipped = models.PATHS["walker"].read_text().replace('ctrlrange="-1 1" ctrllimited="true"', "")
     path = tmp_path / "walker.xml"
     path.write_text(unclipped)
     body = type("Strong", (torchrl_loco.WalkerWalk,), {"mjcf": path})
-    with pytest.raises(ValueError, match="every actuator needs ctrlrange -1 1"):
+    with pytest.raises(ValueError, match="every actuator needs a ctrlrange"):
         body(2, "cpu", seed=0)
+
+
+def test_actions_are_scaled_to_the_range_of_the_controls(shared):
+    env = shared("quadruped_run", 3)
+    action = torch.tensor([[-1.0], [0.5], [7.0]]).expand(3, 12)
+    env.step(env.reset().set("action", action))
+    low, high = env.mj_model.actuator_ctrlrange.T
+    expected = np.stack([low, low + 0.75 * (high - low), high])
+    np.testing.assert_allclose(env.sim.ctrl, expected, atol=1e-6)
+    np.testing.assert_allclose(models.control(env.mj_model, action.numpy()), expected, atol=1e-6)

@@ -74,6 +74,24 @@ def test_only_the_first_is_kept(file, actions):
     assert torch.equal(nan_dump.load(file).tensors["qvel"], state["qvel"][BAD])
 
 
+def test_of_a_body_with_activations(file, actions):
+    """They are kept, and both simulators step with them and with scaled actions."""
+    env = torchrl_loco.make("quadruped_run", 3, "cpu", 0, protocol="dm_control", nan_dump=file)
+    td = env.reset()
+    for action in actions(env, 5):
+        td = stepped(env, td, action)
+    state = env.get_state()
+    action[1, 2] = float("nan")
+    stepped(env, td, action)
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    dump = nan_dump.load(file)
+    assert torch.equal(dump.tensors["act"], state["act"][1])
+    assert dump.tensors["act"].abs().max() > 0.1
+    dump.tensors["action"][2] = 0.5
+    np.testing.assert_allclose(nan_dump.warp_trace(dump, "cpu"), nan_dump.mujoco_trace(dump), atol=1e-3)
+
+
 def test_of_two_in_one_step_the_lower_is_kept(file):
     env = made(file)
     action = env.action_spec.zero()
@@ -196,8 +214,8 @@ def test_files_that_are_no_nan_dump(file, tmp_path, capsys):
     with pytest.raises(SystemExit):
         cli.main(["inspect", str(file)])
     assert "its format is 'torchrl_loco policy 1'" in capsys.readouterr().err
-    storage.save(file, NAN_DUMP, {}, {"env": "Cheetah"})
-    with pytest.raises(ValueError, match=r"is of 'Cheetah'; installed are torchrl_loco\.envs\.walker\.WalkerStand"):
+    storage.save(file, NAN_DUMP, {}, {"env": "Ant"})
+    with pytest.raises(ValueError, match=r"is of 'Ant'; installed are torchrl_loco\.envs\.walker\.WalkerStand"):
         nan_dump.load(file)
     with pytest.raises(FileNotFoundError, match="there is no NaN dump"):
         nan_dump.load(tmp_path / "none")

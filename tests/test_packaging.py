@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 import torchrl_loco
+from torchrl_loco import models
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -65,7 +66,7 @@ def test_wheel_holds_the_package_and_nothing_else(built):
         entry_points = wheel.read(f"{info}/entry_points.txt").decode()
     inside = {name for name in names if not name.startswith(info)}
     assert inside == files_below(ROOT / "torchrl_loco")
-    assert {f"torchrl_loco/models/{name}.xml" for name in ("walker", "humanoid", "scene")} < inside
+    assert {f"torchrl_loco/models/{path.name}" for path in [*models.PATHS.values(), models.SCENE]} < inside
     assert {f"torchrl_loco/policies/walker_{goal}.safetensors" for goal in ("stand", "walk", "run")} < inside
     assert "torchrl_loco/py.typed" in inside
     assert {f"{info}/licenses/LICENSE", f"{info}/licenses/NOTICE"} < names

@@ -11,12 +11,23 @@ from torchrl_loco.config import DEFAULTS, sim_config
 EXPECTED = {
     "walker": {"nu": 6, "obs": 24, "ctrl_dt": 0.025, "sim_dt": 0.0025, "naconmax": 50_000, "njmax": 100},
     "humanoid": {"nu": 21, "obs": 67, "ctrl_dt": 0.025, "sim_dt": 0.005, "naconmax": 200_000, "njmax": 250},
+    "hopper": {"nu": 4, "obs": 15, "ctrl_dt": 0.02, "sim_dt": 0.005, "naconmax": 50_000, "njmax": 50},
+    "quadruped": {"nu": 12, "obs": 78, "ctrl_dt": 0.02, "sim_dt": 0.005, "naconmax": 50_000, "njmax": 100},
+    "cheetah": {"nu": 6, "obs": 17, "ctrl_dt": 0.01, "sim_dt": 0.01, "naconmax": 100_000, "njmax": 100},
+}
+GOALS = {
+    "walker": ("stand", "walk", "run"),
+    "humanoid": ("stand", "walk", "run"),
+    "cheetah": ("run",),
+    "hopper": ("stand", "hop"),
+    "quadruped": ("walk", "run"),
 }
 
 
-def test_six_environments():
-    assert list_envs()[:6] == [f"{body}_{goal}" for body in ("walker", "humanoid") for goal in ("stand", "walk", "run")]
-    for task in list_envs()[:6]:
+def test_our_environments():
+    tasks = [f"{body}_{goal}" for body, goals in GOALS.items() for goal in goals]
+    assert list_envs()[: len(tasks)] == tasks == list(registry.OURS)
+    for task in tasks:
         cls = registry.env_class(task)
         assert cls is registry.env_class(f"mjx/{task}-v0") is getattr(torchrl_loco, task.title().replace("_", ""))
         # The table has summaries of its own, so that they can be shown without importing the classes.
@@ -26,7 +37,7 @@ def test_six_environments():
 
 @pytest.mark.parametrize("body", EXPECTED)
 def test_an_alias_and_sizes(body):
-    env = make(f"mjx/{body}_run-v0", 2, "cpu")
+    env = make(f"mjx/{body}_{GOALS[body][-1]}-v0", 2, "cpu")
     assert env.action_spec.shape == (2, EXPECTED[body]["nu"])
     assert env.observation_spec["observation"].shape == (2, EXPECTED[body]["obs"])
     assert env.batch_size == (2,)
@@ -40,9 +51,10 @@ def test_defaults(body):
         for field in ("ctrl_dt", "sim_dt", "naconmax", "njmax"):
             assert getattr(config, field) == EXPECTED[body][field]
         assert config.episode_length == 1000
-    cut = {"walker": (2, 5), "humanoid": (4, 8)}[body]
+    cut = {"walker": (2, 5), "humanoid": (4, 8), "cheetah": (4, 8), "hopper": (4, 10), "quadruped": (4, 10)}[body]
     playground, dm_control = (sim_config(DEFAULTS[body], name, 2048, {}) for name in ("playground", "dm_control"))
-    assert (playground.iterations, playground.ls_iterations, playground.euler_damping) == (*cut, False)
+    damped = body == "quadruped"
+    assert (playground.iterations, playground.ls_iterations, playground.euler_damping) == (*cut, damped)
     assert (dm_control.iterations, dm_control.ls_iterations, dm_control.euler_damping) == (100, 50, True)
 
 

@@ -1,6 +1,8 @@
 """Pixels against where the bodies are, and rendering changes nothing but pixels."""
 
+import pytest
 import torch
+from cases import BODIES, COMPILED
 
 from torchrl_loco import State
 
@@ -11,8 +13,11 @@ def orange(pixels):
     return red > blue + 40
 
 
-def test_every_camera_sees_its_world_and_changes_nothing(shared, body_task, engine, device):
-    env = shared(body_task, 2, device, engine=engine)
+@pytest.mark.parametrize(
+    ("task", "engine"), [*((task, "auto") for task in BODIES), *((task, "mujoco_warp") for task in COMPILED)]
+)
+def test_every_camera_sees_its_world_and_changes_nothing(shared, task, engine, device):
+    env = shared(task, 2, device, engine=engine)
     env.rollout(2)
     before, pictures = env.get_state(), {}
     for camera in ("side", "back", "egocentric"):

@@ -12,6 +12,9 @@ from . import sim as sim
 from . import training as training
 from .collector import RolloutCollector as RolloutCollector
 from .config import SimConfig as SimConfig
+from .envs import CheetahRun as CheetahRun
+from .envs import HopperHop as HopperHop
+from .envs import HopperStand as HopperStand
 from .envs import HumanoidRun as HumanoidRun
 from .envs import HumanoidStand as HumanoidStand
 from .envs import HumanoidWalk as HumanoidWalk
@@ -19,6 +22,8 @@ from .envs import LocoEnv as LocoEnv
 from .envs import NonFiniteWarning as NonFiniteWarning
 from .envs import PhysicsOverflowError as PhysicsOverflowError
 from .envs import PhysicsOverflowWarning as PhysicsOverflowWarning
+from .envs import QuadrupedRun as QuadrupedRun
+from .envs import QuadrupedWalk as QuadrupedWalk
 from .envs import State as State
 from .envs import TransformedEnv as TransformedEnv
 from .envs import WalkerRun as WalkerRun

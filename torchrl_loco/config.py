@@ -68,6 +68,17 @@ class SimConfig:
 DEFAULTS = {
     "walker": SimConfig(ctrl_dt=0.025, sim_dt=0.0025, naconmax=50_000, njmax=100, iterations=2, ls_iterations=5),
     "humanoid": SimConfig(ctrl_dt=0.025, sim_dt=0.005, naconmax=200_000, njmax=250, iterations=4, ls_iterations=8),
+    "cheetah": SimConfig(ctrl_dt=0.01, sim_dt=0.01, naconmax=100_000, njmax=100, iterations=4, ls_iterations=8),
+    "hopper": SimConfig(ctrl_dt=0.02, sim_dt=0.005, naconmax=50_000, njmax=50, iterations=4, ls_iterations=10),
+    "quadruped": SimConfig(
+        ctrl_dt=0.02,
+        sim_dt=0.005,
+        naconmax=50_000,
+        njmax=100,
+        iterations=4,
+        ls_iterations=10,
+        euler_damping=True,  # its hinges are damped so strongly that without it a control step errs by 0.01 rad
+    ),
 }
 """By body, under the protocol ``playground``."""
 

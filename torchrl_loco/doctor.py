@@ -16,6 +16,7 @@ import warp as wp
 from tqdm.auto import trange
 
 import torchrl_loco
+from torchrl_loco import models
 from torchrl_loco.registry import env_class, list_envs, make
 from torchrl_loco.sim.mujoco_warp import with_margin
 from torchrl_loco.sim.simulation import free_memory
@@ -141,9 +142,9 @@ def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, st
         if td["terminated"].any():  # a world was not finite
             return seconds, float("nan"), engine
         for world in range(env.num_envs):
-            for name in ("qpos", "qvel", "qacc_warmstart"):
-                getattr(data, name)[:] = before[name][world]
-            data.ctrl[:] = action[world]
+            for name in ("qpos", "qvel", "qacc_warmstart", "act"):
+                getattr(data, name)[:] = before.get(name, {world: ()})[world]
+            data.ctrl[:] = models.control(env.mj_model, action[world].numpy())
             mujoco.mj_step(env.mj_model, data, env.config.substeps)
             errors.append(np.abs(data.qpos - after[world]).max())
     return seconds, float(np.median(errors)), engine

@@ -19,7 +19,7 @@ from torchrl_loco.envs.monitors import NAN_DUMP
 from torchrl_loco.registry import env_class, list_envs
 from torchrl_loco.sim.simulation import set_options
 
-STATE = ("qpos", "qvel", "qacc_warmstart")
+STATE = ("qpos", "qvel", "qacc_warmstart", "act")
 RESETS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 """Warnings at which C MuJoCo resets a world."""
 
@@ -29,8 +29,8 @@ class NanDump:
     """What led to a world that is not finite: its state and action before the control step, and its settings.
 
     Attributes:
-        tensors: ``qpos`` ``(nq,)``, ``qvel`` ``(nv,)``, ``qacc_warmstart`` ``(nv,)`` and ``action`` ``(nu,)``, before
-            the step.
+        tensors: ``qpos`` ``(nq,)``, ``qvel`` ``(nv,)``, ``qacc_warmstart`` ``(nv,)``, ``act`` ``(na,)`` if there are
+            activations, and ``action`` ``(nu,)``, before the step.
         settings: ``env`` (module and name of the class), ``protocol``, ``config``, ``seed``, ``device``, ``num_envs``,
             ``world_offset``, and ``world``, ``episode`` and ``elapsed_steps`` before the step.
     """
@@ -47,7 +47,7 @@ class NanDump:
     @property
     def state(self) -> State:
         """The state before the step, of one world."""
-        return State({name: self.tensors[name][None] for name in STATE}, batch_size=[1])
+        return State({name: self.tensors[name][None] for name in STATE if name in self.tensors}, batch_size=[1])
 
 
 def load(path: Path) -> NanDump:
@@ -96,10 +96,10 @@ def mujoco_trace(dump: NanDump) -> np.ndarray:
     model = models.load(_classes()[dump.settings["env"]].mjcf)
     set_options(model, config)
     data = mujoco.MjData(model)
-    for name in STATE:
-        getattr(data, name)[:] = dump.tensors[name].numpy()
+    for name, value in dump.state.items():
+        getattr(data, name)[:] = value[0].numpy()
     trace = [np.concatenate([data.qpos, data.qvel])]
-    data.ctrl[:] = dump.tensors["action"].numpy()
+    data.ctrl[:] = models.control(model, dump.tensors["action"].numpy())
     mujoco.set_mju_user_warning(lambda message: None)  # else it prints, and writes a log into the working directory
     try:
         for _ in range(config.substeps):
@@ -124,7 +124,7 @@ def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterato
         f"{settings['num_envs']} on {settings['device']}, episode {settings['episode']}, "
         f"after {settings['elapsed_steps']} steps"
     )
-    bad = {name: ~(dump.tensors[name].abs() < MAX_VALUE) for name in STATE}
+    bad = {name: ~(value[0].abs() < MAX_VALUE) for name, value in dump.state.items()}
     bad["action"] = ~dump.tensors["action"].isfinite()  # finite ones are clipped
     wrong = [name for name in bad if bad[name].any()]
     for name in wrong:

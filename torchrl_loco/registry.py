@@ -39,6 +39,11 @@ OURS = {
     "humanoid_stand": Entry("torchrl_loco.envs.humanoid:HumanoidStand", "Stand still and upright."),
     "humanoid_walk": Entry("torchrl_loco.envs.humanoid:HumanoidWalk", "Walk at 1 m/s or faster, in any direction."),
     "humanoid_run": Entry("torchrl_loco.envs.humanoid:HumanoidRun", "Run at 10 m/s or faster, in any direction."),
+    "cheetah_run": Entry("torchrl_loco.envs.cheetah:CheetahRun", "Run at 10 m/s or faster."),
+    "hopper_stand": Entry("torchrl_loco.envs.hopper:HopperStand", "Stand upright on one leg."),
+    "hopper_hop": Entry("torchrl_loco.envs.hopper:HopperHop", "Hop forward at 2 m/s or faster."),
+    "quadruped_walk": Entry("torchrl_loco.envs.quadruped:QuadrupedWalk", "Walk forward at 0.5 m/s or faster."),
+    "quadruped_run": Entry("torchrl_loco.envs.quadruped:QuadrupedRun", "Run forward at 5 m/s or faster."),
 }
 """The environments of this package by id."""
 

@@ -1,4 +1,4 @@
-"""dm_control's ``tolerance`` and its eight sigmoids as Warp functions, for use inside kernels."""
+"""dm_control's ``tolerance``, its eight sigmoids and what its rewards share, as Warp functions for use in kernels."""
 
 import enum
 
@@ -115,3 +115,16 @@ def tolerance(
     if x > upper:
         distance = x - upper
     return sigmoid(distance / margin, value_at_margin, kind)
+
+
+@wp.func
+def small_control(ctrl: wp.array[float]) -> float:
+    """Returns dm_control's factor for small controls: 1 where all are 0, 0.8 where all are -1 or 1.
+
+    Args:
+        ctrl: controls of a world, ``(nu,)``.
+    """
+    small = float(0.0)
+    for i in range(ctrl.shape[0]):
+        small += tolerance(ctrl[i], 0.0, 0.0, 1.0, Sigmoid.QUADRATIC, 0.0)
+    return (4.0 + small / float(ctrl.shape[0])) / 5.0

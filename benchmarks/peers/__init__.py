@@ -27,7 +27,7 @@ def peers(bodies: Sequence[str], worlds: Sequence[int], device: torch.device, pa
     """Measures the peers of a device and ours; a peer that cannot run gets a row with the error.
 
     Args:
-        bodies: "walker", "humanoid" or both.
+        bodies: names of bodies; a peer that lacks one has an error in its row.
         worlds: numbers of worlds.
         device: where ours runs; the peers are those of its kind.
         path: folder with the peers' packages, which take precedence there.

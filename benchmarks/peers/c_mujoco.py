@@ -30,7 +30,8 @@ def main(body: str, worlds: int, threads: int) -> None:
 
         def step() -> None:
             nonlocal state
-            control = generator.uniform(-1.0, 1.0, (worlds, CONTROL_STEPS, model.nu)).repeat(config.substeps, axis=1)
+            action = generator.uniform(-1.0, 1.0, (worlds, CONTROL_STEPS, model.nu))
+            control = models.control(model, action).repeat(config.substeps, axis=1)
             states, _ = pool.rollout(model, data, state, control)
             state = states[:, -1]
 

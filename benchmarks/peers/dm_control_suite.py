@@ -6,12 +6,13 @@ import sys
 import numpy as np
 from dm_control import suite
 
+from benchmarks.tasks import TASKS
 from benchmarks.timing import milliseconds
 
 
 def main(body: str, worlds: int) -> None:
     """Prints the time of a step of one world; ``beside`` says which row of ours it is compared with."""
-    env = suite.load(body, "walk", task_kwargs={"random": 0})
+    env = suite.load(*TASKS[body].split("_"), task_kwargs={"random": 0})
     spec, generator = env.action_spec(), np.random.default_rng(0)
     env.reset()
     ms = milliseconds(lambda: env.step(generator.uniform(spec.minimum, spec.maximum)), lambda: None, steps=200)

@@ -6,12 +6,13 @@ import sys
 import jax
 from mujoco_playground import dm_control_suite
 
+from benchmarks.tasks import playground_name
 from benchmarks.timing import milliseconds
 
 
 def main(body: str, worlds: int) -> None:
     """Prints the time of a step."""
-    env = dm_control_suite.load(f"{body.capitalize()}Walk")
+    env = dm_control_suite.load(playground_name(body))
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), worlds))
     key = jax.random.PRNGKey(1)
 

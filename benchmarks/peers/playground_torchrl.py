@@ -6,13 +6,14 @@ import sys
 import torch
 from torchrl.envs import MujocoPlaygroundEnv
 
+from benchmarks.tasks import playground_name
 from benchmarks.timing import milliseconds
 
 
 @torch.no_grad()
 def main(body: str, worlds: int) -> None:
     """Prints the time of a step."""
-    env = MujocoPlaygroundEnv(f"{body.capitalize()}Walk", device="cuda", batch_size=torch.Size([worlds]))
+    env = MujocoPlaygroundEnv(playground_name(body), device="cuda", batch_size=torch.Size([worlds]))
     carried = env.reset()
 
     def step() -> None:

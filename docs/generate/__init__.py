@@ -5,6 +5,7 @@ from pathlib import Path
 
 from generate import benchmarks, bodies, rewards, tasks
 from generate.markdown import write
+from torchrl_loco import models
 from torchrl_loco.registry import OURS
 
 DOCS = Path(__file__).parent.parent
@@ -21,7 +22,7 @@ def everything() -> None:
         write(fragments / f"{name}_reward.md", rewards.formula(name))
         write(fragments / f"{name}_policy.md", tasks.shipped_policy(name))
         tasks.picture(name, OUT / "pictures" / f"{name}.png")
-    for body in ("walker", "humanoid"):
+    for body in models.PATHS:
         write(fragments / f"{body}_observation.md", bodies.observation_table(body))
         write(fragments / f"{body}_action.md", bodies.action_table(body))
         write(fragments / f"{body}_protocols.md", tasks.protocols(body))

@@ -21,18 +21,18 @@ class Entry:
     Args:
         name: what it is, in Markdown.
         unit: its unit, empty for pure numbers.
-        value: computes it from a state of C MuJoCo.
+        value: computes it from a state of C MuJoCo; ``None`` for what does not follow from qpos and qvel: activations,
+            and forces of the last physics step.
     """
 
     name: str
     unit: str
-    value: Value
+    value: Value | None
 
 
 def observation(body: str, protocol: str) -> list[Entry]:
     """Returns the entries of a body's observation in order."""
-    model = models.load(models.PATHS[body])
-    return list(_walker(model, protocol) if body == "walker" else _humanoid(model))
+    return list(BODIES[body](models.load(models.PATHS[body]), protocol))
 
 
 def observation_table(body: str) -> str:
@@ -52,6 +52,8 @@ def observation_table(body: str) -> str:
 def action_table(body: str) -> str:
     """Returns the table of a body's actuators."""
     model = models.load(models.PATHS[body])
+    if model.na:
+        return _set_points(model)
     rows = []
     for index in range(model.nu):
         actuator = model.actuator(index)
@@ -60,6 +62,22 @@ def action_table(body: str) -> str:
         control = "[{:g}, {:g}]".format(*actuator.ctrlrange)
         rows.append((index, f"`{joint.name}`", control, f"{actuator.gear[0]:g}", f"{low:.0f} to {high:.0f}"))
     return table(("index", "joint", "action", "gear: torque at 1 (Nm)", "range of the joint (degrees)"), rows)
+
+
+def _set_points(model: mujoco.MjModel) -> str:
+    """Returns the table of actuators that pull joints and tendons to a set point."""
+    rows = []
+    for index in range(model.nu):
+        actuator = model.actuator(index)
+        moved = int(actuator.trnid[0])
+        if actuator.trntype[0] == mujoco.mjtTrn.mjTRN_JOINT:
+            what = f"`{model.joint(moved).name}`"
+        else:
+            parts = range(model.tendon_adr[moved], model.tendon_adr[moved] + model.tendon_num[moved])
+            what = " ".join(f"{model.wrap_prm[i]:+g} `{model.joint(model.wrap_objid[i]).name}`" for i in parts)
+        control = "[{:g}, {:g}]".format(*actuator.ctrlrange)
+        rows.append((index, f"`{actuator.name}`", what, control))
+    return table(("index", "actuator", "what it moves", "control at an action of -1 and 1 (rad)"), rows)
 
 
 def _walker(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
@@ -76,10 +94,8 @@ def _walker(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
     yield from _velocities(model)
 
 
-def _humanoid(model: mujoco.MjModel) -> Iterator[Entry]:
-    for i in range(1, model.njnt):
-        joint = model.joint(i)
-        yield Entry(f"angle of `{joint.name}`", "rad", lambda d, k=joint.qposadr[0]: d.qpos[k])
+def _humanoid(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
+    yield from _positions(model, 1)
     yield Entry("height of `head`", "m", lambda d: d.body("head").xpos[2])
     for name in humanoid.EXTREMITIES:
         for k, axis in enumerate("xyz"):
@@ -96,6 +112,49 @@ def _humanoid(model: mujoco.MjModel) -> Iterator[Entry]:
     yield from _velocities(model)
 
 
+def _cheetah(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
+    yield from _positions(model, 1)
+    yield from _velocities(model)
+
+
+def _hopper(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
+    yield from _positions(model, 1)
+    yield from _velocities(model)
+    for part in ("toe", "heel"):
+        yield Entry(f"touch of the {part}", "log(1 + N)", None)
+
+
+def _quadruped(model: mujoco.MjModel, protocol: str) -> Iterator[Entry]:
+    yield from _positions(model, 1)
+    yield from _velocities(model)
+    for i in range(model.na):
+        yield Entry(f"activation of `{model.actuator(i).name}`", "rad", None)
+    for k, axis in enumerate("xyz"):
+        yield Entry(
+            f"velocity of `torso` along its own {axis} axis", "m/s", lambda d, k=k: d.sensor("velocimeter").data[k]
+        )
+    yield Entry("z component of the z axis of `torso`", "", lambda d: d.body("torso").xmat[8])
+    for axis in "xyz":
+        yield Entry(f"acceleration of `torso` along its own {axis} axis", "m/s^2", None)
+    for k, axis in enumerate("xyz"):
+        name = f"angular velocity of `torso` about its own {axis} axis"
+        yield Entry(name, "rad/s", lambda d, k=k: d.sensor("imu_gyro").data[k])
+    toes = [model.site(i).name for i in range(model.nsite) if model.site(i).name.startswith("toe")]
+    for quantity, unit in (("force", "arcsinh(N)"), ("torque", "arcsinh(Nm)")):
+        for toe in toes:
+            for axis in "xyz":
+                yield Entry(f"{quantity} on `{toe}` along its {axis} axis", unit, None)
+
+
+def _positions(model: mujoco.MjModel, first: int) -> Iterator[Entry]:
+    """Yields the positions of slides and hinges, from a joint on."""
+    for i in range(first, model.njnt):
+        joint = model.joint(i)
+        slide = joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE
+        name = f"{'position' if slide else 'angle'} of `{joint.name}`"
+        yield Entry(name, "m" if slide else "rad", lambda d, k=joint.qposadr[0]: d.qpos[k])
+
+
 def _velocities(model: mujoco.MjModel) -> Iterator[Entry]:
     """Yields the velocities of slides and hinges."""
     for i in range(model.njnt):
@@ -109,3 +168,7 @@ def _seen(data: mujoco.MjData, name: str) -> np.ndarray:
     """Returns where a body is in the frame of the torso."""
     torso = data.body("torso")
     return torso.xmat.reshape(3, 3).T @ (data.body(name).xpos - torso.xpos)
+
+
+BODIES = {"walker": _walker, "humanoid": _humanoid, "cheetah": _cheetah, "hopper": _hopper, "quadruped": _quadruped}
+"""What yields the entries of a body's observation from its model and the protocol."""

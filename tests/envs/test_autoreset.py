@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cases import COARSE
+from cases import coarse
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
@@ -38,7 +38,8 @@ def play(env, moves, step_and_maybe_reset):
 @pytest.mark.parametrize("wrap", [False, True])
 def test_same_data_as_torchrl(shared, body_task, actions, wrap, at_once):
     """Worlds end at different times: at the environment's limit, at a transform's, and by a NaN action."""
-    options = {"protocol": "dm_control", "episode_length": 12, "stagger": True, "reward_terms": True, **COARSE}
+    options = {"protocol": "dm_control", "episode_length": 12, "stagger": True, "reward_terms": True}
+    options |= coarse(body_task)
     theirs, ours = (shared(body_task, 6, copy=copy, **options) for copy in (0, 1))
     if wrap:
         theirs = TorchRLTransformedEnv(theirs, transforms())

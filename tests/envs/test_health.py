@@ -9,6 +9,7 @@ import warnings
 
 import pytest
 import torch
+from cases import COMPILED
 from mujoco_warp import OverflowType
 from tensordict import TensorDict
 
@@ -144,7 +145,7 @@ def test_nothing_is_reported_if_nothing_was_dropped(shared, device, engine, prot
         assert found["total", "iteration_limit"] > 0
 
 
-@pytest.mark.parametrize(("body_task", "share"), [("walker_run", 0.0), ("humanoid_run", 1e-3)])
+@pytest.mark.parametrize(("body_task", "share"), [(task, 1e-3 if task == "humanoid_run" else 0.0) for task in COMPILED])
 def test_bodies_that_lie_on_the_floor_lose_hardly_a_contact(body_task, share):
     """Under ``compiled``, whose places are fixed: flat on their backs or faces, bodies touch the floor everywhere."""
     env = torchrl_loco.make(body_task, 48, "cpu", seed=0, protocol="dm_control", on_overflow="ignore")

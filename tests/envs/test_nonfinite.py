@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 import warp as wp
-from cases import COARSE
+from cases import COARSE, coarse
 from tensordict import TensorDict
 
 from torchrl_loco.envs.kernels import zero_non_finite
@@ -62,7 +62,7 @@ def test_a_bad_action_ends_only_its_world(shared, task, protocol, engine, device
 
 def test_a_bad_action_is_stepped_with_zeros(shared, body_task, actions):
     """All of it, so that the state stays finite."""
-    env, twin = (shared(body_task, copy=copy, **COARSE) for copy in (0, 1))
+    env, twin = (shared(body_task, copy=copy, **coarse(body_task)) for copy in (0, 1))
     bad, expected = actions(env, 1)[0], actions(env, 1)[0]
     bad[1, 2], expected[1] = torch.nan, 0.0
     step_all(env, env.reset(), bad)
@@ -72,7 +72,7 @@ def test_a_bad_action_is_stepped_with_zeros(shared, body_task, actions):
 
 
 def test_a_finite_action_of_any_size_is_clipped(shared, body_task, actions):
-    env, twin = (shared(body_task, copy=copy, **COARSE) for copy in (0, 1))
+    env, twin = (shared(body_task, copy=copy, **coarse(body_task)) for copy in (0, 1))
     good, huge = actions(env, 1)[0], actions(env, 1)[0]
     huge[0, 1], huge[1, 2], huge[2, 0], huge[3, 3] = 1e10, -3e38, 1.5, 2e11
     good[0, 1], good[1, 2], good[2, 0], good[3, 3] = 1.0, -1.0, 1.0, 1.0

@@ -4,15 +4,29 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from oracle import DATA
+from oracle import DATA, FORCES, Oracle
 from tensordict import TensorDict
 
 import torchrl_loco
-from torchrl_loco import State, models
+from torchrl_loco import models
 
 SIGNIFICANCE = 1e-4
 # Under playground the humanoid draws nothing.
-DRAWING = [("walker_run", "playground"), ("humanoid_run", "dm_control")]
+DRAWING = [
+    *(("walker_run", "playground"), ("humanoid_run", "dm_control"), ("hopper_hop", "playground")),
+    ("quadruped_run", "dm_control"),
+]
+
+
+def from_one_distribution(ours, theirs):
+    """Whether the columns of two samples do not differ by more than chance, by Kolmogorov's and Smirnov's test."""
+    critical = np.sqrt(-0.5 * np.log(SIGNIFICANCE / ours.shape[1] / 2) * (1 / len(ours) + 1 / len(theirs)))
+    for x, y in zip(ours.T, theirs.T, strict=True):
+        both = np.concatenate([x, y])
+        share = [np.searchsorted(np.sort(z), both, side="right") / len(z) for z in (x, y)]
+        if np.abs(share[0] - share[1]).max() >= critical:
+            return False
+    return True
 
 
 def kolmogorov_smirnov(x, cdf):
@@ -44,6 +58,11 @@ def draws(shared):
         ("humanoid_run", "dm_control", "compiled"),
         ("humanoid_run", "playground", "compiled"),
         ("humanoid_run", "dm_control", "mujoco_warp"),
+        ("cheetah_run", "playground", "compiled"),
+        ("cheetah_run", "dm_control", "mujoco_warp"),
+        ("hopper_hop", "dm_control", "compiled"),
+        ("hopper_hop", "playground", "mujoco_warp"),
+        ("quadruped_run", "dm_control", "mujoco_warp"),
     ],
 )
 def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol, engine, device, actions):
@@ -56,16 +75,17 @@ def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol
     after_td = env.reset(td.clone().set("_reset", mask))
     after = env.get_state()
     kept = ~mask.squeeze(-1)
-    for key in State.KEYS:
-        assert torch.equal(before[key][kept], after[key][kept]), key
+    for key, value in before.items():
+        assert torch.equal(value[kept], after[key][kept]), key
     assert (env.health() == health).all()
     assert torch.equal(after_td["observation"][kept], td["observation"][kept])
     assert (after["elapsed_steps"][~kept] == 0).all()
     assert (after["elapsed_steps"][kept] == 8).all()
     assert (after["episode"][~kept] == 2).all()
-    for name in ("qvel", "qacc_warmstart", "ctrl", "time"):
+    for name in ("qvel", "qacc_warmstart", "ctrl", "time", *(("act",) if "act" in before else ())):
         values = getattr(env.sim, name)
-        assert (values[~kept] == 0).all(), name
+        if (name, task) != ("qvel", "cheetah_run"):  # it begins in motion
+            assert (values[~kept] == 0).all(), name
         assert (values[kept] != 0).any(), name
 
     if device == "cpu" or engine == "compiled":  # and they go on as if nothing had happened
@@ -77,9 +97,11 @@ def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol
 
 
 @pytest.mark.slow
-def test_walker_starts_uniformly(draws, device):
-    qpos = draws("walker_walk", 4096, 1, seed=12, device=device)[0].numpy().astype(np.float64)
-    model = models.load(models.PATHS["walker"])
+@pytest.mark.parametrize("task", ["walker_walk", "hopper_stand"])
+def test_planar_bodies_start_uniformly(draws, task, device):
+    body = task.split("_")[0]
+    qpos = draws(task, 4096, 1, seed=12, device=device)[0].numpy().astype(np.float64)
+    model = models.load(models.PATHS[body])
     assert (qpos[:, :2] == 0).all()
     ranges = [(-np.pi, np.pi), *model.jnt_range[3:]]
     for angle, (low, high) in zip(qpos[:, 2:].T, ranges, strict=True):
@@ -87,8 +109,48 @@ def test_walker_starts_uniformly(draws, device):
         assert angle.max() <= high
         distance, critical = kolmogorov_smirnov(angle, lambda x, low=low, high=high: (x - low) / (high - low))
         assert distance < critical
-    correlation = np.corrcoef(qpos[:, 2:].T) - np.eye(7)
+    correlation = np.corrcoef(qpos[:, 2:].T) - np.eye(model.nq - 2)
     assert np.abs(correlation).max() < 5 / np.sqrt(len(qpos))
+    assert from_one_distribution(qpos[:, 2:], np.load(DATA / f"{body}_resets_dm_control.npz")["qpos"][:, 2:])
+
+
+@pytest.mark.parametrize("lowered", [0.0, 0.2])
+def test_a_hopper_feels_the_ground_before_its_first_step(shared, engine, lowered, device):
+    """What C MuJoCo finds without control, and not the forces of the episode before."""
+    env = shared("hopper_hop", 64, device, protocol="dm_control", engine=engine)
+    env.rollout(30, break_when_any_done=False)
+    td, state = env.reset(), env.get_state()
+    if lowered:
+        state["qpos"][:, 1] -= lowered
+        td = env.reset(state, set_state=True)
+    reference = Oracle("hopper_hop", env.mjcf)
+    rows = zip(*(state[key].cpu().double().numpy() for key in ("qpos", "qvel")), strict=True)
+    expected = np.array([reference.observation("dm_control", *row) for row in rows])
+    error = np.abs(td["observation"].cpu().numpy() - expected)[:, FORCES["hopper"]].max(axis=1)
+    assert (expected[:, FORCES["hopper"]] > 0).any() == (lowered > 0)
+    assert np.quantile(error, 0.95) < 1e-4
+
+
+@pytest.mark.slow
+def test_quadruped_starts_just_above_the_floor(draws, device):
+    """In any orientation, 1 cm above the highest place of a centimeter grid where C MuJoCo finds a contact."""
+    qpos = draws("quadruped_run", 2048, 1, seed=5, protocol="dm_control", device=device)[0].numpy().astype(np.float64)
+    model = models.load(models.PATHS["quadruped"])
+    assert (qpos[:, :2] == 0).all()
+    assert (qpos[:, 7:] == 0).all()
+    np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(qpos[:, 2], qpos[:, 2].round(2), atol=1e-6)
+    data, contacts = mujoco.MjData(model), []
+    for lowered in (0.0, 0.01):
+        for q in qpos[:512]:
+            data.qpos[:] = q
+            data.qpos[2] -= lowered
+            mujoco.mj_fwdPosition(model, data)
+            contacts.append(data.ncon)
+    free, touching = np.split(np.array(contacts), 2)
+    assert (free == 0).all()
+    assert (touching > 0).all()
+    assert from_one_distribution(qpos[:, 2:7], np.load(DATA / "quadruped_resets_dm_control.npz")["qpos"][:, 2:7])
 
 
 @pytest.mark.slow
@@ -104,11 +166,26 @@ def test_humanoid_starts_free_of_contact(draws, device):
     assert (qpos[:, :3] == [0, 0, 1.5]).all()
     np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1, atol=1e-6)
     recorded = np.load(DATA / "humanoid_resets_dm_control.npz")["qpos"]
-    for ours, theirs in zip(qpos.T[3:], recorded.T[3:], strict=True):
-        both = np.concatenate([ours, theirs])
-        share = [np.searchsorted(np.sort(x), both, side="right") / len(x) for x in (ours, theirs)]
-        critical = np.sqrt(-0.5 * np.log(SIGNIFICANCE / 2) * (1 / len(ours) + 1 / len(theirs)))
-        assert np.abs(share[0] - share[1]).max() < critical
+    assert from_one_distribution(qpos[:, 3:], recorded[:, 3:])
+
+
+@pytest.mark.slow
+def test_cheetah_starts_settled(shared, engine, device):
+    """It stands on the floor, nearly at rest, with the distribution that dm_control recorded."""
+    env = shared("cheetah_run", 64, device, protocol="dm_control", engine=engine)
+    states, record = env.initial_states(), np.load(DATA / "cheetah_resets_dm_control.npz")
+    assert from_one_distribution(states, np.concatenate([record["qpos"], record["qvel"]], axis=1))
+    observation, start = env.reset()["observation"].cpu(), env.get_state().cpu()
+    assert torch.equal(observation, torch.cat([start["qpos"][:, 1:], start["qvel"]], dim=1))
+    assert len(start["qpos"].unique(dim=0)) > 48
+    assert (start["qvel"] != 0).any()
+    data = mujoco.MjData(env.mj_model)
+    for qpos, qvel, velocity in zip(start["qpos"], start["qvel"], env.sim.data.sensordata.numpy(), strict=True):
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(env.mj_model, data)
+        assert data.ncon >= 2
+        assert data.contact.dist.min() > -0.02
+        np.testing.assert_allclose(velocity, data.sensordata, atol=1e-5)
 
 
 def test_humanoid_playground_start_is_the_default_pose(draws):

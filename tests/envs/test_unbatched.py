@@ -2,18 +2,18 @@
 
 import pytest
 import torch
-from cases import COARSE
+from cases import coarse
 from compare import assert_repeats
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, check_env_specs
 
 import torchrl_loco
-from torchrl_loco import RolloutCollector, State
+from torchrl_loco import RolloutCollector
 
 
 @pytest.fixture
 def env(shared, body_task, device):
-    return shared(body_task, None, device, episode_length=5, reward_terms=True, **COARSE)
+    return shared(body_task, None, device, episode_length=5, reward_terms=True, **coarse(body_task))
 
 
 def test_specs(env):
@@ -29,7 +29,7 @@ def play(moves):
 
 def test_same_data_as_one_world_in_a_batch(env, shared, body_task, device, actions):
     """To the bit, across the end of an episode, with rendering and health."""
-    one = shared(body_task, 1, device, episode_length=5, reward_terms=True, **COARSE)
+    one = shared(body_task, 1, device, episode_length=5, reward_terms=True, **coarse(body_task))
     moves, results = actions(env, 12), []
     for each, action in ((env, moves), (one, moves.unsqueeze(1))):
         steps = iter(action)
@@ -59,9 +59,9 @@ def test_state(env, shared, body_task, device):
     env.reset()
     env.reset(state, set_state=True)
     now = env.get_state()
-    assert all(torch.equal(now[key], state[key]) for key in State.KEYS)
+    assert all(torch.equal(now[key], value) for key, value in state.items())
     env.load_state_dict(env.state_dict())
-    many = shared(body_task, 3, device, **COARSE)
+    many = shared(body_task, 3, device, **coarse(body_task))
     many.reset(state.branch(0, 3), set_state=True)
     assert torch.equal(many.get_state()["qpos"], state["qpos"].expand(3, -1))
 

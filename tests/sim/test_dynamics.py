@@ -4,6 +4,7 @@ import hypothesis
 import mujoco
 import numpy as np
 import pytest
+from cases import COMPILED
 from random_models import models
 
 import torchrl_loco.models
@@ -56,6 +57,6 @@ def test_random_models(xml):
     assert_agrees(model, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("body", ["walker", "humanoid"])
+@pytest.mark.parametrize("body", [task.split("_")[0] for task in COMPILED])
 def test_our_bodies(body):
     assert_agrees(torchrl_loco.models.load(torchrl_loco.models.PATHS[body]), np.random.default_rng(0))

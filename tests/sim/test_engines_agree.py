@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from cases import BODIES, ENGINES
+from cases import COMPILED, ENGINES
 
 import torchrl_loco
 from torchrl_loco import State, models
@@ -15,7 +15,7 @@ from torchrl_loco.sim.simulation import set_options
 WORLDS, AGES = 80, (10, 30, 50, 80)
 
 
-@pytest.fixture(scope="module", params=BODIES)
+@pytest.fixture(scope="module", params=COMPILED)
 def states(request):
     """A task of each body, and states of worlds that begin, fall and lie, with an action for each."""
     env = torchrl_loco.make(request.param, WORLDS, "cpu", seed=0, protocol="dm_control", stagger=True)
@@ -31,7 +31,7 @@ def states(request):
 
 def after(env, state, action):
     """Returns the positions after one control step, ``(num_envs, nq)``."""
-    td = env.reset(State({key: state[key] for key in State.KEYS}, batch_size=len(state)), set_state=True)
+    td = env.reset(State(dict(state.items()), batch_size=len(state)), set_state=True)
     env.step(td.set("action", action))
     return env.get_state()["qpos"].double().numpy()
 

@@ -99,6 +99,8 @@ def test_what_was_not_tuned_is_said():
         ("walker_walk", "cuda", "reppo", False),
         ("humanoid_run", "cuda:1", "reppo", False),
     ]
+    for device in ("cpu", "cuda"):
+        assert "No settings were tuned for cheetah_run" in tuning_note(PPOConfig("cheetah_run", device=device))
     for task, device, algorithm, said in cases:
         note = tuning_note(dataclasses.replace(preset(task, "cpu", algorithm), device=device))
         assert (bool(note), "walker_stand and walker_walk by ppo" in note) == (said, said)

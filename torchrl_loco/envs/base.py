@@ -39,8 +39,8 @@ class LocoEnv(EnvBase):
 
     A subclass sets ``body``, ``mjcf`` (path of the model), ``defaults`` (settings under ``playground``),
     ``observation_size`` and ``term_names``, and names the kernel that writes observation and reward
-    (:meth:`observation_kernel`). Initial poses come from a table (:meth:`initial_poses`) or from a kernel of the
-    subclass (:meth:`pose_kernel`). docs/guides/extending.md shows it with a third body.
+    (:meth:`observation_kernel`). Initial states come from a table (:meth:`initial_states`) or from a kernel of the
+    subclass (:meth:`pose_kernel`). docs/guides/extending.md shows it with a body outside of the package.
 
     Args:
         num_envs: number of worlds, the batch size. ``None`` makes one world without a batch dimension.
@@ -149,8 +149,11 @@ class LocoEnv(EnvBase):
         """
         raise NotImplementedError
 
-    def initial_poses(self) -> np.ndarray | None:
-        """Returns a table of poses, ``(count, nq)``, of which each reset draws one; ``None`` for the default pose.
+    def initial_states(self) -> np.ndarray | None:
+        """Returns a table of which each reset draws a row; ``None`` for the default pose.
+
+        A row is a pose, in which the world is at rest (``(count, nq)``), or a pose and its velocities
+        (``(count, nq + nv)``: qpos, then qvel).
 
         It is called when the environment is made, and again when it opens after :meth:`close`, so it must return the
         same table every time.
@@ -158,11 +161,11 @@ class LocoEnv(EnvBase):
         return None
 
     def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list] | None:
-        """Returns the kernel that draws initial poses, its inputs and its outputs; by default it draws from the table.
+        """Returns the kernel that draws initial states, its inputs and its outputs; by default it draws from the table.
 
         Its parameters are the inputs, the mask of the worlds that begin an episode (bool, ``(num_envs,)``), the start
         of each world's random stream (uint32, ``(num_envs,)``), then the outputs. The worlds are at rest in the default
-        pose. The kernel writes ``qpos`` only.
+        pose. The kernel writes ``qpos``, and ``qvel`` if they begin in motion.
 
         Args:
             world: the worlds; the physics arrays are in ``world.sim.data``.
@@ -170,15 +173,19 @@ class LocoEnv(EnvBase):
         Raises:
             ValueError: the table has the wrong shape, or a number that is not finite.
         """
-        poses = self.initial_poses()
-        if poses is None:
+        states = self.initial_states()
+        if states is None:
             return None
-        table, nq = np.asarray(poses, dtype=np.float32), self.mj_model.nq
-        if table.ndim != 2 or table.shape[1] != nq or len(table) == 0:
-            raise ValueError(f"initial_poses must return an array of shape (count > 0, {nq}), got {table.shape}")
+        table, data = np.asarray(states, dtype=np.float32), world.sim.data
+        nq, nv = self.mj_model.nq, self.mj_model.nv
+        if table.ndim != 2 or table.shape[1] not in (nq, nq + nv) or len(table) == 0:
+            raise ValueError(
+                f"initial_states must return an array of shape (count > 0, {nq}) or (count > 0, {nq + nv}), "
+                f"got {table.shape}"
+            )
         if not np.isfinite(table).all():
-            raise ValueError("initial_poses must return finite numbers")
-        return draw_from_table, [wp.array(table, device=world.sim.device)], [world.sim.data.qpos]
+            raise ValueError("initial_states must return finite numbers")
+        return draw_from_table, [wp.array(table, device=world.sim.device)], [data.qpos, data.qvel]
 
     # TorchRL's side.
 

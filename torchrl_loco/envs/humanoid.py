@@ -6,7 +6,7 @@ from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.world import World
-from torchrl_loco.rewards import Sigmoid, tolerance
+from torchrl_loco.rewards import Sigmoid, small_control, tolerance
 from torchrl_loco.sim.sampling import draw_free_poses, make_skeleton
 
 STAND_HEIGHT = wp.constant(1.4)
@@ -23,14 +23,6 @@ ROOT_QPOS = wp.constant(7)
 
 
 @wp.func
-def mean_small_control(ctrl: wp.array[float]) -> float:
-    small = float(0.0)
-    for i in range(ctrl.shape[0]):
-        small += tolerance(ctrl[i], 0.0, 0.0, 1.0, Sigmoid.QUADRATIC, 0.0)
-    return small / float(ctrl.shape[0])
-
-
-@wp.func
 def humanoid_reward(
     head_height: float, torso_upright: float, ctrl: wp.array[float], velocity: wp.vec3, target_speed: float
 ):
@@ -40,13 +32,13 @@ def humanoid_reward(
     """
     standing = tolerance(head_height, STAND_HEIGHT, wp.inf, STAND_HEIGHT / 4.0)
     upright = tolerance(torso_upright, 0.9, wp.inf, 1.9, Sigmoid.LINEAR, 0.0)
-    small_control = (4.0 + mean_small_control(ctrl)) / 5.0
+    gentle = small_control(ctrl)
     if target_speed > 0.0:
         speed = wp.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
         move = (5.0 * tolerance(speed, target_speed, wp.inf, target_speed, Sigmoid.LINEAR, 0.0) + 1.0) / 6.0
     else:
         move = 0.5 * (tolerance(velocity[0], 0.0, 0.0, 2.0) + tolerance(velocity[1], 0.0, 0.0, 2.0))
-    return standing * upright * small_control * move, standing, upright, small_control, move
+    return standing * upright * gentle * move, standing, upright, gentle, move
 
 
 @wp.kernel(enable_backward=False)
@@ -98,13 +90,13 @@ def observe_and_reward_humanoid(
     for i in range(qvel_in.shape[1]):
         observation_out[world, k + i] = qvel_in[world, i]
 
-    reward, standing, upright, small_control, move = humanoid_reward(
+    reward, standing, upright, gentle, move = humanoid_reward(
         head_height, torso_mat[2, 2], ctrl_in[world], velocity, target_speed
     )
     reward_out[world] = reward
     terms_out[world, 0] = standing
     terms_out[world, 1] = upright
-    terms_out[world, 2] = small_control
+    terms_out[world, 2] = gentle
     terms_out[world, 3] = move
 
 

@@ -19,6 +19,8 @@ def count_non_finite(row: wp.array[float]) -> int:
 
 @wp.kernel(enable_backward=False)
 def apply_action(
+    # Model:
+    actuator_ctrlrange: wp.array2d[wp.vec2],
     # In:
     action_in: wp.array2d[float],
     # Out:
@@ -29,9 +31,9 @@ def apply_action(
     non_finite_out: wp.array[bool],
     any_out: wp.array[int],
 ):
-    """Keeps the action, and clips it into ``ctrl``.
+    """Keeps the action, clips it and scales it to ``ctrl``.
 
-    A world whose action is NaN or infinite is marked, and stepped with zeros.
+    A world whose action is NaN or infinite is marked, and stepped with an action of zeros.
     """
     world = wp.tid()
     if world == 0:
@@ -43,7 +45,9 @@ def apply_action(
     for i in range(action_in.shape[1]):
         action = action_in[world, i]
         action_out[world, i] = action
-        ctrl_out[world, i] = wp.where(non_finite, 0.0, wp.clamp(action, -1.0, 1.0))
+        limits = actuator_ctrlrange[0, i]
+        used = wp.where(non_finite, 0.0, wp.clamp(action, -1.0, 1.0))
+        ctrl_out[world, i] = 0.5 * (limits[0] + limits[1]) + 0.5 * (limits[1] - limits[0]) * used
     non_finite_out[world] = non_finite
 
 

@@ -227,6 +227,7 @@ def keep_worlds(
     qpos_in: wp.array2d[float],
     qvel_in: wp.array2d[float],
     qacc_warmstart_in: wp.array2d[float],
+    act_in: wp.array2d[float],
     # Out:
     action_out: wp.array2d[float],
     episode_out: wp.array[int],
@@ -234,6 +235,7 @@ def keep_worlds(
     qpos_out: wp.array2d[float],
     qvel_out: wp.array2d[float],
     qacc_warmstart_out: wp.array2d[float],
+    act_out: wp.array2d[float],
     found_out: wp.array[bool],
 ):
     """Copies what a control step begins with, until a world that is not finite was found."""
@@ -250,6 +252,7 @@ def keep_worlds(
     copy_row(lane, qpos_in[world], qpos_out[world])
     copy_row(lane, qvel_in[world], qvel_out[world])
     copy_row(lane, qacc_warmstart_in[world], qacc_warmstart_out[world])
+    copy_row(lane, act_in[world], act_out[world])
 
 
 @wp.kernel(enable_backward=False)
@@ -290,7 +293,7 @@ class NanGuard(Monitor):
         self._path, self._sim, self._seed, self._settings = path, sim, seed, settings
         self._non_finite = non_finite
         data = sim.data
-        self._inputs = [*(buffer.warp for buffer in inputs), data.qpos, data.qvel, data.qacc_warmstart]
+        self._inputs = [*(buffer.warp for buffer in inputs), data.qpos, data.qvel, data.qacc_warmstart, data.act]
         self._kept = [wp.zeros_like(array) for array in self._inputs]
         self._first = Buffer(1, int, sim.device)
         self._found = Buffer(1, bool, sim.device)
@@ -325,8 +328,9 @@ class NanGuard(Monitor):
         if self._reported or world == self._sim.num_envs:
             return
         self._reported = True
-        names = ("action", "episode", "elapsed_steps", "qpos", "qvel", "qacc_warmstart")
-        kept = {name: wp.to_torch(array)[world].clone() for name, array in zip(names, self._kept, strict=True)}
+        names = ("action", "episode", "elapsed_steps", "qpos", "qvel", "qacc_warmstart", "act")
+        arrays = zip(names, self._kept, strict=True)
+        kept = {name: wp.to_torch(array)[world].clone() for name, array in arrays if array.size}  # act may be empty
         counters = {name: int(kept.pop(name)) for name in ("episode", "elapsed_steps")}
         settings = {**self._settings, "seed": int(self._seed.torch[0]), "world": world, **counters}
         try:

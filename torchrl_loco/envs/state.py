@@ -18,6 +18,7 @@ class State(TensorDict):
     ``qpos``            ``(N, nq)``  positions (m, rad, unit quaternions)
     ``qvel``            ``(N, nv)``  velocities (m/s, rad/s)
     ``qacc_warmstart``  ``(N, nv)``  initial guess of the constraint solver
+    ``act``             ``(N, na)``  activations of the actuators, if the model has any
     ``elapsed_steps``   ``(N,)``     control steps since the world's reset
     ``episode``         ``(N,)``     episodes begun: index of the next random stream
     ==================  ===========  =====================================================
@@ -29,7 +30,7 @@ class State(TensorDict):
     TensorDict that it was given, with the state in it: exclude ``State.KEYS`` before you pass that on as a state again.
     """
 
-    KEYS = ("qpos", "qvel", "qacc_warmstart", "elapsed_steps", "episode")
+    KEYS = ("qpos", "qvel", "qacc_warmstart", "act", "elapsed_steps", "episode")
 
     def branch(self, world: int, num_envs: int | None = None) -> "State":
         """Returns a state in which every world is a copy of one, to try different futures from the same moment.

@@ -7,6 +7,7 @@ from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
+from torchrl_loco.sim.sampling import draw_pitch_and_hinges
 
 STAND_HEIGHT = wp.constant(1.2)
 """Height of the torso from which the walker counts as standing (m)."""
@@ -73,27 +74,6 @@ def observe_and_reward_walker(
         terms_out[world, 1] = move
 
 
-@wp.kernel(enable_backward=False)
-def pose_walker(
-    # Model:
-    jnt_range: wp.array2d[wp.vec2],
-    pitch: int,
-    # In:
-    mask_in: wp.array[bool],
-    stream_in: wp.array[wp.uint32],
-    # Data out:
-    qpos_out: wp.array2d[float],
-):
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    stream = stream_in[world]
-    qpos_out[world, pitch] = wp.randf(stream, -wp.pi, wp.pi)
-    for i in range(pitch + 1, qpos_out.shape[1]):  # the hinges, all with limits
-        limits = jnt_range[0, i]
-        qpos_out[world, i] = wp.randf(stream, limits[0], limits[1])
-
-
 class Walker(LocoEnv):
     """What the walker's three tasks share; they differ in ``target_speed`` (m/s, 0 to stand)."""
 
@@ -113,7 +93,7 @@ class Walker(LocoEnv):
     def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list]:
         """Returns the kernel that draws pitch and hinges, its inputs and its outputs."""
         pitch = int(self.mj_model.joint("rooty").qposadr[0])
-        return pose_walker, [world.sim.model.jnt_range, pitch], [world.sim.data.qpos]
+        return draw_pitch_and_hinges, [world.sim.model.jnt_range, pitch], [world.sim.data.qpos]
 
 
 class WalkerStand(Walker):

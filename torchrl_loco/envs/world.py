@@ -37,7 +37,7 @@ class Task(Protocol):
         """Returns the kernel that writes observation and reward, and its inputs."""
 
     def pose_kernel(self, world: "World") -> tuple[wp.Kernel, list, list] | None:
-        """Returns the kernel that draws initial poses, its inputs and its outputs, if there is one."""
+        """Returns the kernel that draws initial states, its inputs and its outputs, if there is one."""
 
     def settings(self) -> dict[str, Any]:
         """Returns what a NaN dump records of the environment."""
@@ -108,6 +108,8 @@ class World:
 
             self._observation_kernel = task.observation_kernel(self)
             self._pose_kernel = task.pose_kernel(self)
+            outputs = [] if self._pose_kernel is None else self._pose_kernel[2]
+            self._begins_in_motion = any(array is self.sim.data.qvel for array in outputs)
             self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
             self._step_graph = self.sim.capture(self._launch_step)
             self._reset_graph = self.sim.capture(self._launch_reset)
@@ -129,7 +131,7 @@ class World:
 
     def _launch_step_under(self, action: wp.array) -> None:
         outputs = [self.action.warp, self.sim.data.ctrl, self.non_finite.warp, self._any.warp]
-        self._launch(apply_action, [action], outputs)
+        self._launch(apply_action, [self.sim.model.actuator_ctrlrange, action], outputs)
         for monitor in self._monitors:
             monitor.launch_before_step()
         self.sim.step()
@@ -170,7 +172,7 @@ class World:
         if self._pose_kernel is not None:
             kernel, inputs, outputs = self._pose_kernel
             self._launch(kernel, [*inputs, mask, self.stream.warp], outputs)
-        self.sim.forward_at_rest(mask)
+        self.sim.forward(mask) if self._begins_in_motion else self.sim.forward_at_rest(mask)
         self._launch_observation(mask)
 
     def _launch_refresh(self) -> None:
@@ -238,6 +240,8 @@ class World:
         """Returns the buffers that make up the state of the worlds, by key of :class:`torchrl_loco.State`."""
         sim = self.sim
         physics = {"qpos": sim.qpos, "qvel": sim.qvel, "qacc_warmstart": sim.qacc_warmstart}
+        if sim.mj_model.na:
+            physics["act"] = sim.act
         return {**physics, "elapsed_steps": self.elapsed_steps.torch, "episode": self.episode.torch}
 
     def refresh(self, mask: torch.Tensor) -> None:

@@ -11,6 +11,7 @@ import mujoco_warp as mjw
 import warp as wp
 
 from torchrl_loco.config import SimConfig
+from torchrl_loco.models import FORCE_SENSORS
 from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.row_order import RowOrder
 
@@ -56,6 +57,25 @@ def rest(
         cvel_out[world, i] = wp.spatial_vector()
     for i in range(sensordata_out.shape[1]):
         sensordata_out[world, i] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def restore_others(
+    # In:
+    mask_in: wp.array[bool],
+    sensordata_in: wp.array2d[float],
+    overflow_in: wp.array[int],
+    # Data out:
+    sensordata_out: wp.array2d[float],
+    overflow_out: wp.array[int],
+):
+    """Restores the sensors of the worlds where the mask is not set, and the overflow of all."""
+    world = wp.tid()
+    overflow_out[world] = overflow_in[world]
+    if mask_in[world]:
+        return
+    for i in range(sensordata_out.shape[1]):
+        sensordata_out[world, i] = sensordata_in[world, i]
 
 
 @wp.kernel(enable_backward=False)
@@ -120,6 +140,9 @@ class MujocoWarpEngine:
         # Threads per small matrix of a world: measured in benchmarks/README.md.
         self.model.block_dim.update_gradient_cholesky = 32
         self.model.block_dim.update_gradient_JTDAJ_dense = 64
+        self._before: tuple[wp.array, wp.array] | None = None
+        if not FORCE_SENSORS.isdisjoint(mj_model.sensor_type):
+            self._before = wp.clone(self.data.sensordata), wp.clone(self.data.overflow)
         self._row_order = RowOrder(self.model, self.data) if config.deterministic else None
         self.peak_constraints = Buffer(num_envs, int, device)
         self.peak_contacts = Buffer(1, int, device)
@@ -138,10 +161,11 @@ class MujocoWarpEngine:
 
         Afterwards poses, velocities and sensors belong to the new state, as in dm_control. dm_control reaches this by
         running the first half of the next step. Here only what an observation can read is computed, so a reset has
-        nothing else to update. Forces, contacts and constraints are those of the last substep.
+        nothing else to update. Forces, contacts and constraints are those of the last substep, and so are the sensors
+        of forces.
         """
-        with self._without_sensors():
-            for _ in range(self._substeps):
+        for i in range(self._substeps):
+            with self._substep_only(sensors=self._before is not None and i == self._substeps - 1):
                 self._substep()
                 self._record_peaks()
         self._evaluate()
@@ -168,12 +192,13 @@ class MujocoWarpEngine:
         )
 
     @contextlib.contextmanager
-    def _without_sensors(self) -> Iterator[None]:
-        """Skips sensors, cameras and lights in substeps: they are evaluated when they are needed."""
+    def _substep_only(self, *, sensors: bool) -> Iterator[None]:
+        """Skips cameras and lights in a substep, and sensors unless asked for: most are evaluated after it."""
         model = self.model
         kept = model.opt.disableflags, model.ncam, model.nlight
         model.ncam = model.nlight = 0
-        model.opt.disableflags |= mjw.DisableBit.SENSOR
+        if not sensors:
+            model.opt.disableflags |= mjw.DisableBit.SENSOR
         try:
             yield
         finally:
@@ -182,10 +207,16 @@ class MujocoWarpEngine:
     def forward(self, mask: wp.array) -> None:
         """Updates poses and sensors after ``qpos`` and ``qvel`` were changed where ``mask`` ``(nworld,)`` is set."""
         self._clear_constraints(mask)
-        self._evaluate()
+        if self._before is None:
+            self._evaluate()
+        else:
+            self._evaluate_forces(mask, *self._before)
 
     def forward_at_rest(self, mask: wp.array) -> None:
         """As :meth:`forward`, for less: the worlds that changed are at rest."""
+        if self._before is not None:
+            self.forward(mask)  # forces act at rest too
+            return
         self._clear_constraints(mask)
         mjw.kinematics(self.model, self.data)
 
@@ -195,6 +226,31 @@ class MujocoWarpEngine:
         mjw.com_pos(self.model, self.data)
         mjw.com_vel(self.model, self.data)
         mjw.sensor_vel(self.model, self.data)
+
+    def _evaluate_forces(self, mask: wp.array, sensordata: wp.array, overflow: wp.array) -> None:
+        """Evaluates all sensors, those of forces without control, where ``mask`` ``(nworld,)`` is set.
+
+        That takes the first half of a physics step of all worlds.
+
+        Args:
+            mask: the worlds.
+            sensordata: room for the sensors of the others.
+            overflow: room for the overflow of all.
+        """
+        model, data = self.model, self.data
+        wp.copy(sensordata, data.sensordata)
+        wp.copy(overflow, data.overflow)
+        flags = model.opt.disableflags
+        model.opt.disableflags |= mjw.DisableBit.ACTUATION
+        mjw.forward(model, data)
+        model.opt.disableflags = flags
+        wp.launch(
+            restore_others,
+            dim=self._num_envs,
+            inputs=[mask, sensordata, overflow],
+            outputs=[data.sensordata, data.overflow],
+            device=self._device,
+        )
 
     def _clear_constraints(self, mask: wp.array) -> None:
         """Removes the constraints of the worlds where ``mask`` ``(nworld,)`` is set."""

@@ -1,4 +1,4 @@
-"""What a world draws at its reset: a random stream of its own, a pose from a table, or a pose free of contact."""
+"""What a world draws at its reset: a random stream of its own, a state of a table, or a pose free of contact."""
 
 from typing import Any
 
@@ -22,20 +22,46 @@ def world_stream(seed: wp.uint32, world: int, episode: int) -> wp.uint32:
 @wp.kernel(enable_backward=False)
 def draw_from_table(
     # In:
-    poses_in: wp.array2d[float],
+    states_in: wp.array2d[float],
+    mask_in: wp.array[bool],
+    stream_in: wp.array[wp.uint32],
+    # Data out:
+    qpos_out: wp.array2d[float],
+    qvel_out: wp.array2d[float],
+):
+    """Draws a row of a table uniformly: ``qpos``, then ``qvel`` if the table has columns for it."""
+    world = wp.tid()
+    if not mask_in[world]:
+        return
+    stream = stream_in[world]
+    row = wp.randi(stream, 0, states_in.shape[0])
+    nq = qpos_out.shape[1]
+    for i in range(nq):
+        qpos_out[world, i] = states_in[row, i]
+    for i in range(states_in.shape[1] - nq):
+        qvel_out[world, i] = states_in[row, nq + i]
+
+
+@wp.kernel(enable_backward=False)
+def draw_pitch_and_hinges(
+    # Model:
+    jnt_range: wp.array2d[wp.vec2],
+    pitch: int,
+    # In:
     mask_in: wp.array[bool],
     stream_in: wp.array[wp.uint32],
     # Data out:
     qpos_out: wp.array2d[float],
 ):
-    """Draws ``qpos`` uniformly from the rows of a table."""
+    """Draws the pitch of a planar body in (-pi, pi), and the hinges that follow it uniformly in their ranges."""
     world = wp.tid()
     if not mask_in[world]:
         return
     stream = stream_in[world]
-    row = wp.randi(stream, 0, poses_in.shape[0])
-    for i in range(qpos_out.shape[1]):
-        qpos_out[world, i] = poses_in[row, i]
+    qpos_out[world, pitch] = wp.randf(stream, -wp.pi, wp.pi)
+    for i in range(pitch + 1, qpos_out.shape[1]):  # the hinges, all with limits
+        limits = jnt_range[0, i]
+        qpos_out[world, i] = wp.randf(stream, limits[0], limits[1])
 
 
 @wp.func
@@ -188,6 +214,101 @@ def draw_free_poses(
         pose_bodies(skeleton, qpos_out[world], xpos_out[world], xquat_out[world])
         if not in_contact(skeleton, xpos_out[world], xquat_out[world]):
             return
+
+
+@wp.struct
+class Outline:
+    """How far a rigid body reaches in any direction: a sum of sphere, segment and ellipsoid for each geom.
+
+    Attributes:
+        center: center of the geom in the body's frame (m), ``(ngeom,)``.
+        radius: radius of the sphere (m), ``(ngeom,)``.
+        segment: half of the segment (m), ``(ngeom,)``.
+        axes: semi-axes of the ellipsoid as columns (m), ``(ngeom,)``.
+    """
+
+    center: wp.array[wp.vec3]
+    radius: wp.array[float]
+    segment: wp.array[wp.vec3]
+    axes: wp.array[wp.mat33]
+
+
+@wp.func
+def depth_below(outline: Outline, down: wp.vec3) -> float:
+    """How far the body reaches beyond its origin in the direction ``down`` of its frame (m)."""
+    depth = float(-wp.inf)
+    for i in range(outline.radius.shape[0]):
+        reach = wp.length(wp.transpose(outline.axes[i]) * down) + wp.abs(wp.dot(outline.segment[i], down))
+        depth = wp.max(depth, wp.dot(outline.center[i], down) + outline.radius[i] + reach)
+    return depth
+
+
+@wp.kernel(enable_backward=False)
+def draw_orientation_above_floor(
+    # In:
+    outline: Outline,
+    increment: float,
+    mask_in: wp.array[bool],
+    stream_in: wp.array[wp.uint32],
+    # Data out:
+    qpos_out: wp.array2d[float],
+):
+    """Draws the orientation of a free root uniformly, and raises it in increments (m) until it is off the floor."""
+    world = wp.tid()
+    if not mask_in[world]:
+        return
+    stream = stream_in[world]
+    w = wp.randn(stream)
+    x = wp.randn(stream)
+    y = wp.randn(stream)
+    z = wp.randn(stream)
+    quat = wp.normalize(wp.quat(x, y, z, w))
+    down = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
+    qpos_out[world, 0] = 0.0
+    qpos_out[world, 1] = 0.0
+    qpos_out[world, 2] = wp.ceil(depth_below(outline, down) / increment) * increment
+    qpos_out[world, 3] = quat[3]
+    for i in range(3):
+        qpos_out[world, 4 + i] = quat[i]
+
+
+def make_outline(mj_model: mujoco.MjModel, device: wp.Device) -> Outline:
+    """Gathers the :class:`Outline` of a model in its default pose.
+
+    Args:
+        mj_model: a model of one tree on a free joint, above a floor, which is geom 0.
+        device: where the arrays live.
+
+    Returns:
+        The outline, in the frame of the root.
+
+    Raises:
+        ValueError: the model has another kind of geom.
+    """
+    m, data = mj_model, mujoco.MjData(mj_model)
+    mujoco.mj_kinematics(m, data)
+    root, count = data.xmat[1].reshape(3, 3), m.ngeom - 1
+    center = (data.geom_xpos[1:] - data.xpos[1]) @ root
+    radius, segment, axes = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    for i in range(count):
+        kind, size = mujoco.mjtGeom(int(m.geom_type[i + 1])), m.geom_size[i + 1]
+        frame = root.T @ data.geom_xmat[i + 1].reshape(3, 3)
+        if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
+            radius[i] = size[0]
+        elif kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+            axes[i] = frame * size
+        elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            axes[i] = frame * (size[0], size[0], 0.0)
+        else:
+            raise ValueError("an outline consists of spheres, capsules, cylinders and ellipsoids")
+        if kind in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER):
+            segment[i] = frame[:, 2] * size[1]
+    outline = Outline()
+    outline.center = wp.array(center, dtype=wp.vec3, device=device)
+    outline.radius = wp.array(radius, dtype=float, device=device)
+    outline.segment = wp.array(segment, dtype=wp.vec3, device=device)
+    outline.axes = wp.array(axes, dtype=wp.mat33, device=device)
+    return outline
 
 
 def make_skeleton(mj_model: mujoco.MjModel, pairs: np.ndarray, device: wp.Device) -> Skeleton:

@@ -37,6 +37,7 @@ def reset_worlds(
     qpos_out: wp.array2d[float],
     qvel_out: wp.array2d[float],
     qacc_warmstart_out: wp.array2d[float],
+    act_out: wp.array2d[float],
     ctrl_out: wp.array2d[float],
     time_out: wp.array[float],
 ):
@@ -49,6 +50,8 @@ def reset_worlds(
     for i in range(qvel_out.shape[1]):
         qvel_out[world, i] = 0.0
         qacc_warmstart_out[world, i] = 0.0
+    for i in range(act_out.shape[1]):
+        act_out[world, i] = 0.0
     for i in range(ctrl_out.shape[1]):
         ctrl_out[world, i] = 0.0
     time_out[world] = 0.0
@@ -68,6 +71,7 @@ class Simulation:
     ``qvel``            ``(nworld, nv)``           velocities (m/s, rad/s)
     ``ctrl``            ``(nworld, nu)``           controls
     ``qacc_warmstart``  ``(nworld, nv)``           initial guess of the constraint solver
+    ``act``             ``(nworld, na)``           activations of the actuators
     ``xpos``            ``(nworld, nbody, 3)``     positions of the bodies (m)
     ``xmat``            ``(nworld, nbody, 3, 3)``  orientations of the bodies
     ``time``            ``(nworld,)``              time since the world's reset (s)
@@ -109,6 +113,7 @@ class Simulation:
         self.qvel = wp.to_torch(self.data.qvel)
         self.ctrl = wp.to_torch(self.data.ctrl)
         self.qacc_warmstart = wp.to_torch(self.data.qacc_warmstart)
+        self.act = wp.to_torch(self.data.act) if mj_model.na else torch.empty((num_envs, 0), device=device)
         self.xpos = wp.to_torch(self.data.xpos)
         self.xmat = wp.to_torch(self.data.xmat)
         self.time = wp.to_torch(self.data.time)
@@ -125,7 +130,7 @@ class Simulation:
             reset_worlds,
             dim=self.num_envs,
             inputs=[self.model.qpos0, mask],
-            outputs=[d.qpos, d.qvel, d.qacc_warmstart, d.ctrl, d.time],
+            outputs=[d.qpos, d.qvel, d.qacc_warmstart, d.act, d.ctrl, d.time],
             device=self.device,
             block_dim=BLOCK,
         )

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from torchrl_loco.checks import check_choice, check_device
-from torchrl_loco.registry import OURS, canonical_id
+from torchrl_loco.registry import canonical_id
 from torchrl_loco.training.config import CONFIGS, TrainingConfig
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def preset(
 ) -> TrainingConfig:
     """Returns the settings for ``task`` on ``device``, with ``overrides`` on top.
 
-    The task of a plug-in takes the general settings of algorithm and device, tuned on the walker and the humanoid.
+    A task that was not tuned takes the general settings of algorithm and device, tuned on the walker and the humanoid.
 
     Args:
         task: id of the environment.
@@ -117,7 +117,7 @@ def preset(
 
 def tuning_note(config: TrainingConfig) -> str:
     """Returns a note if ``config.task`` was not tuned on its device, else an empty string."""
-    if config.task not in OURS:
+    if not any(config.task == task for _, task in TASKS):
         return f"No settings were tuned for {config.task}: these were tuned on the walker and the humanoid."
     algorithm, tasks = TUNED_ON_CPU
     if config.device == "cpu" and (config.algorithm != algorithm or config.task not in tasks):

@@ -47,6 +47,7 @@ class Data:
         xmat: orientations of the bodies, ``(nworld, nbody)`` mat33.
         sensordata: sensors, ``(nworld, nsensordata)``.
         overflow: :class:`mujoco_warp.OverflowType` bits, ``(nworld,)``.
+        act: activations of the actuators, ``(nworld, 0)``: a supported model has none.
     """
 
     qpos: wp.array
@@ -58,11 +59,13 @@ class Data:
     xmat: wp.array
     sensordata: wp.array
     overflow: wp.array
+    act: wp.array
 
     def __init__(self, m: mujoco.MjModel, nworld: int, device: wp.Device) -> None:
         def make(name: str) -> wp.array:
             return wp.zeros(_shape(m, nworld, name), dtype=ROWS[name][1], device=device)
 
+        self.act = wp.zeros((nworld, 0), dtype=float, device=device)
         self._make: Callable[[str], wp.array] | None = make
         self._cvel: wp.array | None = None
         for name in ROWS:

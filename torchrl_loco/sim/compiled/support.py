@@ -12,6 +12,13 @@ IGNORED_FLAGS = ("EULERDAMP", "FILTERPARENT", "REFSAFE", "MIDPHASE", "NATIVECCD"
 """Flags that may be set: the compiled step follows them, or they change nothing in it."""
 
 
+SHOWN = 3
+"""Names of elements that a line shows."""
+
+Found = dict[str, list[str]]
+"""Names of the elements that need something, by what it is."""
+
+
 def unsupported(m: mujoco.MjModel) -> list[str]:
     """Returns what a model needs that the compiled step does not have, in words; an empty list if nothing."""
     found = [*_options(m), *_elements(m), *_joints(m), *_actuators(m), *_contacts(m), *_sensors(m)]
@@ -71,46 +78,56 @@ def _elements(m: mujoco.MjModel) -> list[str]:
 
 
 def _joints(m: mujoco.MjModel) -> list[str]:
-    found = []
+    found: Found = {}
     for j in range(m.njnt):
-        title = f"joint {m.joint(j).name!r}"
+        name = m.joint(j).name
         if m.jnt_type[j] in (FREE, BALL) and m.jnt_stiffness[j]:
-            found.append(f"{title}: stiffness of a free or ball joint")
+            found.setdefault("stiffness of a free or ball joint", []).append(name)
         if m.jnt_actfrclimited[j]:
-            found.append(f"{title}: limits of actuator forces at a joint")
+            found.setdefault("limits of actuator forces at a joint", []).append(name)
         if m.jnt_stiffnesspoly[j].any():
-            found.append(f"{title}: springs that are not linear")
-    if m.dof_dampingpoly.any():
-        found.append("dampers that are not linear")
-    return found
+            found.setdefault("springs that are not linear", []).append(name)
+    dampers = ["dampers that are not linear"] if m.dof_dampingpoly.any() else []
+    return _lines("joint", found) + dampers
 
 
 def _actuators(m: mujoco.MjModel) -> list[str]:
-    found = []
+    found: Found = {}
     for i in range(m.nu):
-        title = f"actuator {m.actuator(i).name!r}"
-        joint = m.actuator_trnid[i, 0]
+        name, joint = m.actuator(i).name, m.actuator_trnid[i, 0]
         if m.actuator_trntype[i] != int(mujoco.mjtTrn.mjTRN_JOINT) or m.jnt_type[joint] in (FREE, BALL):
-            found.append(f"{title}: a transmission other than a hinge or slide")
+            found.setdefault("a transmission other than a hinge or slide", []).append(name)
         if m.actuator_dyntype[i] != int(mujoco.mjtDyn.mjDYN_NONE):
-            found.append(f"{title}: activation dynamics")
+            found.setdefault("activation dynamics", []).append(name)
         biases = [int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)]
         if m.actuator_gaintype[i] != int(mujoco.mjtGain.mjGAIN_FIXED) or m.actuator_biastype[i] not in biases:
-            found.append(f"{title}: a gain that is not fixed or a bias that is not affine")
+            found.setdefault("a gain that is not fixed or a bias that is not affine", []).append(name)
         if m.actuator_delay[i] or m.actuator_damping[i] or m.actuator_armature[i] or m.actuator_dampingpoly[i].any():
-            found.append(f"{title}: delay, damping or armature of an actuator")
-    return found
+            found.setdefault("delay, damping or armature of an actuator", []).append(name)
+    return _lines("actuator", found)
+
+
+def _lines(kind: str, found: Found) -> list[str]:
+    """Returns a line for each thing that was found, with the names of the first elements that need it."""
+    lines = []
+    for what, names in found.items():
+        others = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+        lines.append(f"{kind} {', '.join(map(repr, names[:SHOWN]))}{others}: {what}")
+    return lines
 
 
 def _contacts(m: mujoco.MjModel) -> list[str]:
-    found = set()
+    kinds, dimensions = set(), set()
     for pair in pairs(m):
         if not _collides(m, pair):
-            kinds = [mujoco.mjtGeom(int(m.geom_type[geom])).name.removeprefix("mjGEOM_").lower() for geom in pair.geoms]
-            found.add(f"contacts of {kinds[0]} and {kinds[1]}, unless the first is a plane of the world")
+            names = [mujoco.mjtGeom(int(m.geom_type[geom])).name.removeprefix("mjGEOM_").lower() for geom in pair.geoms]
+            kinds.add(" and ".join(names))
         if pair.condim not in (1, 3):
-            found.add(f"contacts with condim {pair.condim}")
-    return sorted(found)
+            dimensions.add(f"contacts with condim {pair.condim}")
+    found = sorted(dimensions)
+    if kinds:
+        found.insert(0, f"contacts of {', '.join(sorted(kinds))}: only spheres, capsules and planes of the world")
+    return found
 
 
 def _collides(m: mujoco.MjModel, pair: Pair) -> bool:
@@ -121,11 +138,12 @@ def _collides(m: mujoco.MjModel, pair: Pair) -> bool:
 
 
 def _sensors(m: mujoco.MjModel) -> list[str]:
-    return [
-        f"sensor {m.sensor(i).name!r}: anything but touch and the velocity of a subtree, as they are"
+    names = [
+        m.sensor(i).name
         for i in range(m.nsensor)
         if m.sensor_type[i] not in (SUBTREE_VELOCITY, TOUCH)
         or m.sensor_cutoff[i]
         or m.sensor_interval[i].any()
         or m.sensor_delay[i]
     ]
+    return _lines("sensor", {"anything but touch and the velocity of a subtree, as they are": names} if names else {})

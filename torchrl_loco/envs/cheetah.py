@@ -1,0 +1,111 @@
+"""Cheetah: a planar body on a back and a front leg that learns to run."""
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from torchrl_loco import models
+from torchrl_loco.config import DEFAULTS
+from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.envs.world import World
+from torchrl_loco.rewards import Sigmoid, tolerance
+
+RUN_SPEED = 10.0
+"""Horizontal speed that counts as running (m/s)."""
+
+SETTLED_STATES = 512
+"""States in the table from which episodes start."""
+SETTLING_TIME = 2.0
+"""Time for which a random pose settles (s): 200 physics steps of 0.01 s."""
+
+
+@wp.func
+def cheetah_reward(horizontal_velocity: float, target_speed: float) -> float:
+    return tolerance(horizontal_velocity, target_speed, wp.inf, target_speed, Sigmoid.LINEAR, 0.0)
+
+
+@wp.kernel(enable_backward=False)
+def observe_and_reward_cheetah(
+    # Model:
+    torso_velocity: int,
+    # Data in:
+    qpos_in: wp.array2d[float],
+    qvel_in: wp.array2d[float],
+    sensordata_in: wp.array2d[float],
+    # In:
+    target_speed: float,
+    mask_in: wp.array[bool],
+    # Out:
+    observation_out: wp.array2d[float],
+    reward_out: wp.array[float],
+    terms_out: wp.array2d[float],
+):
+    world = wp.tid()
+    if not mask_in[world]:
+        return
+    k = int(0)
+    for i in range(1, qpos_in.shape[1]):  # without the position along x
+        observation_out[world, k] = qpos_in[world, i]
+        k += 1
+    for i in range(qvel_in.shape[1]):
+        observation_out[world, k + i] = qvel_in[world, i]
+
+    move = cheetah_reward(sensordata_in[world, torso_velocity], target_speed)  # along x
+    reward_out[world] = move
+    terms_out[world, 0] = move
+
+
+class CheetahRun(LocoEnv):
+    """Run at 10 m/s or faster.
+
+    Arguments as in :class:`~torchrl_loco.LocoEnv`.
+
+    Observation:
+        17 numbers: height and pitch of the torso and the hinges, qpos[1:] (8, m and rad); qvel (9, m/s and rad/s).
+
+    Action:
+        6 numbers: torques of the hinges as a share of their gear, in [-1, 1]; clipped beyond.
+
+    Reward:
+        ``move = tolerance(speed, [10 m/s, inf), margin 10 m/s, linear, value_at_margin 0)``, the speed being the center
+        of mass's along x. It is the only term.
+
+    Start:
+        One of 512 states, in each of which random hinges have settled for 2 s without action.
+
+    Termination:
+        None by falling; truncation after 1000 steps; a non-finite world is terminated with reward 0 and a
+        zero observation.
+
+    Source:
+        dm_control ``suite/cheetah.py``.
+    """
+
+    body = "cheetah"
+    mjcf = models.PATHS["cheetah"]
+    defaults = DEFAULTS["cheetah"]
+    observation_size = 17
+    term_names = ("move",)
+    target_speed = RUN_SPEED
+
+    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
+        """Returns the kernel that writes observation and reward, and its inputs."""
+        torso_velocity, data = int(self.mj_model.sensor("torso_velocity").adr[0]), world.sim.data
+        arrays = [data.qpos, data.qvel, data.sensordata]
+        return observe_and_reward_cheetah, [torso_velocity, *arrays, self.target_speed]
+
+    def initial_states(self) -> np.ndarray:
+        """Returns states into which random poses have settled, ``(512, nq + nv)``.
+
+        dm_control lets a random pose settle at each reset. Here worlds begin their episodes at different times, and
+        those that settle would keep all others waiting for 200 physics steps.
+        """
+        model, rng = self.mj_model, np.random.default_rng(0)
+        hinges = model.jnt_limited.astype(bool)
+        states = np.empty((SETTLED_STATES, model.nq + model.nv))
+        for state in states:
+            data = mujoco.MjData(model)
+            data.qpos[hinges] = rng.uniform(*model.jnt_range[hinges].T)
+            mujoco.mj_step(model, data, round(SETTLING_TIME / model.opt.timestep))
+            state[:] = *data.qpos, *data.qvel
+        return states
