@@ -7,6 +7,7 @@ import warp as wp
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.envs.kernels import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
 
@@ -43,12 +44,8 @@ def observe_and_reward_cheetah(
     world = wp.tid()
     if not mask_in[world]:
         return
-    k = int(0)
-    for i in range(1, qpos_in.shape[1]):  # without the position along x
-        observation_out[world, k] = qpos_in[world, i]
-        k += 1
-    for i in range(qvel_in.shape[1]):
-        observation_out[world, k + i] = qvel_in[world, i]
+    k = observe_row(qpos_in[world], 1, observation_out[world], 0)  # without the position along x
+    k = observe_row(qvel_in[world], 0, observation_out[world], k)
 
     move = cheetah_reward(sensordata_in[world, torso_velocity], target_speed)  # along x
     reward_out[world] = move

@@ -5,6 +5,7 @@ import warp as wp
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.envs.kernels import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, small_control, tolerance
 from torchrl_loco.sim.sampling import draw_pitch_and_hinges
@@ -58,13 +59,8 @@ def observe_and_reward_hopper(
     torso_center = xpos_in[world, torso] + xmat_in[world, torso] * torso_com
     foot_center = xpos_in[world, foot] + xmat_in[world, foot] * foot_com
 
-    k = int(0)
-    for i in range(1, qpos_in.shape[1]):  # without the position along x
-        observation_out[world, k] = qpos_in[world, i]
-        k += 1
-    for i in range(qvel_in.shape[1]):
-        observation_out[world, k] = qvel_in[world, i]
-        k += 1
+    k = observe_row(qpos_in[world], 1, observation_out[world], 0)  # without the position along x
+    k = observe_row(qvel_in[world], 0, observation_out[world], k)
     for i in range(2):
         observation_out[world, k + i] = wp.log(1.0 + sensordata_in[world, touch[i]])
 

@@ -5,6 +5,7 @@ import warp as wp
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.envs.kernels import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, small_control, tolerance
 from torchrl_loco.sim.sampling import draw_free_poses, make_skeleton
@@ -72,10 +73,7 @@ def observe_and_reward_humanoid(
     v = torso_velocity
     velocity = wp.vec3(sensordata_in[world, v], sensordata_in[world, v + 1], sensordata_in[world, v + 2])
 
-    k = int(0)
-    for i in range(ROOT_QPOS, qpos_in.shape[1]):
-        observation_out[world, k] = qpos_in[world, i]
-        k += 1
+    k = observe_row(qpos_in[world], ROOT_QPOS, observation_out[world], 0)
     observation_out[world, k] = head_height
     k += 1
     for i in range(extremities.shape[0]):
@@ -87,8 +85,7 @@ def observe_and_reward_humanoid(
         observation_out[world, k + j] = torso_mat[2, j]
         observation_out[world, k + 3 + j] = velocity[j]
     k += 6
-    for i in range(qvel_in.shape[1]):
-        observation_out[world, k + i] = qvel_in[world, i]
+    k = observe_row(qvel_in[world], 0, observation_out[world], k)
 
     reward, standing, upright, gentle, move = humanoid_reward(
         head_height, torso_mat[2, 2], ctrl_in[world], velocity, target_speed

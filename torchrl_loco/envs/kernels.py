@@ -3,9 +3,34 @@
 import warp as wp
 
 from torchrl_loco.sim.sampling import world_stream
+from torchrl_loco.sim.simulation import put_at_rest
 
 MAX_VALUE = 1.0e10
 """Magnitude from which a number counts as not finite: MuJoCo's mjMAXVAL."""
+
+Eight = wp.types.vector(length=8, dtype=wp.float32)
+
+
+@wp.func
+def observe_row(row: wp.array[float], first: int, observation: wp.array[float], k: int) -> int:
+    """Copies the numbers of a row from ``first`` on into an observation at ``k``; returns where they end.
+
+    Eight are read before any is written: a read that follows a write waits for it, as both may be the same number.
+    """
+    i = int(first)
+    while i + 8 <= row.shape[0]:
+        some = Eight()
+        for j in range(8):
+            some[j] = row[i + j]
+        for j in range(8):
+            observation[k + j] = some[j]
+        i += 8
+        k += 8
+    while i < row.shape[0]:
+        observation[k] = row[i]
+        i += 1
+        k += 1
+    return k
 
 
 @wp.func
@@ -173,6 +198,8 @@ def any_world(
 
 @wp.kernel(enable_backward=False)
 def begin_episode(
+    # Model:
+    qpos0: wp.array2d[float],
     # In:
     mask_in: wp.array[bool],
     stagger_in: wp.array[bool],
@@ -187,8 +214,15 @@ def begin_episode(
     done_out: wp.array[bool],
     terminated_out: wp.array[bool],
     truncated_out: wp.array[bool],
+    # Data out:
+    qpos_out: wp.array2d[float],
+    qvel_out: wp.array2d[float],
+    qacc_warmstart_out: wp.array2d[float],
+    act_out: wp.array2d[float],
+    ctrl_out: wp.array2d[float],
+    time_out: wp.array[float],
 ):
-    """Starts the next episode: its random stream, its clock, its flags."""
+    """Starts the next episode: its random stream, its clock, its flags, and the world at rest."""
     world = wp.tid()
     if not mask_in[world]:
         return
@@ -205,3 +239,4 @@ def begin_episode(
     done_out[world] = False
     terminated_out[world] = False
     truncated_out[world] = False
+    put_at_rest(world, qpos0, qpos_out, qvel_out, qacc_warmstart_out, act_out, ctrl_out, time_out)

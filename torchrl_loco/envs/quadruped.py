@@ -5,6 +5,7 @@ import warp as wp
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.envs.kernels import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
 from torchrl_loco.sim.sampling import draw_orientation_above_floor, make_outline
@@ -65,16 +66,9 @@ def observe_and_reward_quadruped(
         return
     torso_upright = xmat_in[world, torso][2, 2]
 
-    k = int(0)
-    for i in range(ROOT_QPOS, qpos_in.shape[1]):
-        observation_out[world, k] = qpos_in[world, i]
-        k += 1
-    for i in range(ROOT_QVEL, qvel_in.shape[1]):
-        observation_out[world, k] = qvel_in[world, i]
-        k += 1
-    for i in range(act_in.shape[1]):
-        observation_out[world, k] = act_in[world, i]
-        k += 1
+    k = observe_row(qpos_in[world], ROOT_QPOS, observation_out[world], 0)
+    k = observe_row(qvel_in[world], ROOT_QVEL, observation_out[world], k)
+    k = observe_row(act_in[world], 0, observation_out[world], k)
     for i in range(3):
         observation_out[world, k + i] = sensordata_in[world, velocimeter + i]
     k += 3

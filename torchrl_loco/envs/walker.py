@@ -5,6 +5,7 @@ import warp as wp
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.envs.kernels import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
 from torchrl_loco.sim.sampling import draw_pitch_and_hinges
@@ -15,6 +16,10 @@ WALK_SPEED = 1.0
 """Horizontal speed that counts as walking (m/s)."""
 RUN_SPEED = 8.0
 """Horizontal speed that counts as running (m/s)."""
+
+BODIES = wp.constant(7)
+Rows = wp.types.matrix(shape=(7, 3), dtype=wp.float32)
+"""First rows of the bodies' orientations."""
 
 
 @wp.func
@@ -55,16 +60,16 @@ def observe_and_reward_walker(
     torso_height = xpos_in[world, torso][2]
     torso_upright = xmat_in[world, torso][2, 2]
 
+    rows = Rows()  # all are read before the first is written, as in observe_row
+    for i in range(BODIES):
+        rows[i] = xmat_in[world, 1 + i][0]  # body 0 is the world
     k = int(0)
-    for body in range(1, xmat_in.shape[1]):  # body 0 is the world
-        xmat = xmat_in[world, body]
-        observation_out[world, k] = xmat[0, 0]
-        observation_out[world, k + 1] = xmat[0, 2]
+    for i in range(BODIES):
+        observation_out[world, k] = rows[i, 0]
+        observation_out[world, k + 1] = rows[i, 2]
         k += 2
     observation_out[world, k] = wp.where(observe_height, torso_height, torso_upright)
-    k += 1
-    for i in range(qvel_in.shape[1]):
-        observation_out[world, k + i] = qvel_in[world, i]
+    k = observe_row(qvel_in[world], 0, observation_out[world], k + 1)
 
     horizontal_velocity = sensordata_in[world, torso_velocity]  # along x
     reward, stand, move = walker_reward(torso_height, torso_upright, horizontal_velocity, target_speed)

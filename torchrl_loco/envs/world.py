@@ -163,12 +163,13 @@ class World:
     def _launch_masked_reset(self) -> None:
         mask = self.mask.warp
         flags = [self.non_finite.warp, self.done.warp, self.terminated.warp, self.truncated.warp]
+        inputs = [mask, self._stagger.warp, self.seed.warp, self._world_offset, self._episode_length]
         self._launch(
             begin_episode,
-            [mask, self._stagger.warp, self.seed.warp, self._world_offset, self._episode_length],
-            [self.episode.warp, self.stream.warp, self.elapsed_steps.warp, *flags],
+            [self.sim.model.qpos0, *inputs],
+            [self.episode.warp, self.stream.warp, self.elapsed_steps.warp, *flags, *self.sim.rest_state()],
         )
-        self.sim.reset(mask)
+        self.sim.engine.reset(mask)
         if self._pose_kernel is not None:
             kernel, inputs, outputs = self._pose_kernel
             self._launch(kernel, [*inputs, mask, self.stream.warp], outputs)

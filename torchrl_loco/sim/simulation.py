@@ -27,6 +27,32 @@ BLOCK = 64
 """Threads of a block where a thread has a world: few, so that a thousand worlds keep all multiprocessors busy."""
 
 
+@wp.func
+def put_at_rest(
+    world: int,
+    # Model:
+    qpos0: wp.array2d[float],
+    # Data out:
+    qpos_out: wp.array2d[float],
+    qvel_out: wp.array2d[float],
+    qacc_warmstart_out: wp.array2d[float],
+    act_out: wp.array2d[float],
+    ctrl_out: wp.array2d[float],
+    time_out: wp.array[float],
+):
+    """Puts a world at rest in the default pose."""
+    for i in range(qpos_out.shape[1]):
+        qpos_out[world, i] = qpos0[0, i]
+    for i in range(qvel_out.shape[1]):
+        qvel_out[world, i] = 0.0
+        qacc_warmstart_out[world, i] = 0.0
+    for i in range(act_out.shape[1]):
+        act_out[world, i] = 0.0
+    for i in range(ctrl_out.shape[1]):
+        ctrl_out[world, i] = 0.0
+    time_out[world] = 0.0
+
+
 @wp.kernel(enable_backward=False)
 def reset_worlds(
     # Model:
@@ -41,20 +67,9 @@ def reset_worlds(
     ctrl_out: wp.array2d[float],
     time_out: wp.array[float],
 ):
-    """Puts worlds at rest in the default pose."""
     world = wp.tid()
-    if not mask_in[world]:
-        return
-    for i in range(qpos_out.shape[1]):
-        qpos_out[world, i] = qpos0[0, i]
-    for i in range(qvel_out.shape[1]):
-        qvel_out[world, i] = 0.0
-        qacc_warmstart_out[world, i] = 0.0
-    for i in range(act_out.shape[1]):
-        act_out[world, i] = 0.0
-    for i in range(ctrl_out.shape[1]):
-        ctrl_out[world, i] = 0.0
-    time_out[world] = 0.0
+    if mask_in[world]:
+        put_at_rest(world, qpos0, qpos_out, qvel_out, qacc_warmstart_out, act_out, ctrl_out, time_out)
 
 
 class Simulation:
@@ -125,16 +140,14 @@ class Simulation:
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds where ``mask`` (bool, ``(nworld,)``) is set at rest in the default pose; others stay."""
-        d = self.data
-        wp.launch(
-            reset_worlds,
-            dim=self.num_envs,
-            inputs=[self.model.qpos0, mask],
-            outputs=[d.qpos, d.qvel, d.qacc_warmstart, d.act, d.ctrl, d.time],
-            device=self.device,
-            block_dim=BLOCK,
-        )
+        inputs, outputs = [self.model.qpos0, mask], self.rest_state()
+        wp.launch(reset_worlds, dim=self.num_envs, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
         self.engine.reset(mask)
+
+    def rest_state(self) -> list[wp.array]:
+        """Returns what :func:`put_at_rest` writes, for kernels that call it; ``engine.reset(mask)`` comes after."""
+        d = self.data
+        return [d.qpos, d.qvel, d.qacc_warmstart, d.act, d.ctrl, d.time]
 
     def forward(self, mask: wp.array) -> None:
         """Updates poses and sensors after ``qpos`` and ``qvel`` were changed where ``mask`` ``(nworld,)`` is set."""
