@@ -133,5 +133,5 @@ def test_close_frees_device_memory(engine, num_envs):
         env.close()
         left.append(used() - before)
     assert taken > 300  # MiB
-    assert left[0] < 0.15 * taken  # Warp's pool keeps some
+    assert left[0] < 200  # MiB that Warp's pool keeps
     assert left[2] <= left[0]
