@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -132,3 +133,10 @@ def test_runs(tmp_path):
         checks.check_run(tmp_path)
     (tmp_path / "config.json").touch()
     assert checks.check_run(str(tmp_path)) == tmp_path
+
+
+def test_packages(monkeypatch):
+    checks.check_packages("anything", ["torch", "numpy"], "train")
+    monkeypatch.setitem(sys.modules, "numpy", None)
+    with pytest.raises(ImportError, match=r"^the dashboard needs numpy, nopy: pip install 'torchrl-loco\[dash\]', or"):
+        checks.check_packages("the dashboard", ["torch", "numpy", "nopy"], "dash")

@@ -40,7 +40,7 @@ def test_help_and_wrong_options_wait_for_nothing():
     """Importing torch, TorchRL and MuJoCo-Warp takes seconds, and the extra need not be installed."""
     helpful = ["--help", "list", "train --help", "play --help"]
     wrong = ["fly", "train", "train walker_wlak", "train --seed 1", "play", "play walker_wlak", "eval x --episode many"]
-    wrong += [f"{command} no/such/run" for command in ("eval", "resume", "record", "plot")]
+    wrong += [f"{command} no/such/run" for command in ("eval", "resume", "record", "plot", "export")]
     said, exits, imported = in_fresh_process(*helpful, *wrong)
     assert exits == ["exit 0"] * len(helpful) + ["exit 2"] * len(wrong), said
     assert imported[-1] == "imported []"

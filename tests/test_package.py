@@ -17,6 +17,7 @@ LAYERS = [  # a module imports from its own layer or from those before it
     {"envs"},
     {"registry", "collector"},
     {"policy", "nan_dump", "doctor"},
+    {"export"},
     {"training"},
     {"cli", "__main__"},
 ]

@@ -2,6 +2,7 @@ from . import checks as checks
 from . import collector as collector
 from . import config as config
 from . import envs as envs
+from . import export as export
 from . import models as models
 from . import policy as policy
 from . import registry as registry
@@ -23,6 +24,7 @@ from .envs import TransformedEnv as TransformedEnv
 from .envs import WalkerRun as WalkerRun
 from .envs import WalkerStand as WalkerStand
 from .envs import WalkerWalk as WalkerWalk
+from .export import export_policy as export_policy
 from .policy import Policy as Policy
 from .policy import load_policy as load_policy
 from .registry import list_envs as list_envs

@@ -5,6 +5,7 @@ A message says what is wrong and what is valid. Intervals are written as in math
 
 import dataclasses
 import difflib
+import importlib.util
 import math
 import numbers
 import operator
@@ -178,12 +179,39 @@ def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> 
     return path
 
 
-def check_run(path: Path) -> Path:
-    """Returns ``path`` as that of a run folder.
+def check_run(path: Path, or_group: bool = False) -> Path:
+    """Returns ``path`` as that of a run folder, or of a folder with the runs of several seeds if that will do.
 
     Raises:
         FileNotFoundError: it is no folder with a ``config.json``.
     """
+    if is_run_group(path):
+        if or_group:
+            return Path(path)
+        raise FileNotFoundError(f"{path} holds the runs of several seeds: name the folder of one of them, in it")
     if not (Path(path) / "config.json").is_file():
         raise FileNotFoundError(f"{path} is not a run folder: it has no config.json")
     return Path(path)
+
+
+def is_run_group(path: Path) -> bool:
+    """Returns whether ``path`` is a folder with the runs of several seeds."""
+    return (Path(path) / "group.json").is_file()
+
+
+def check_packages(purpose: str, packages: Collection[str], extra: str) -> None:
+    """Checks that packages are installed, without importing them.
+
+    Args:
+        purpose: what needs them.
+        packages: names by which they are imported.
+        extra: the extra of this package that installs them.
+
+    Raises:
+        ImportError: one is not installed; the message says how to install it.
+    """
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ImportError(
+            f"{purpose} needs {', '.join(missing)}: pip install 'torchrl-loco[{extra}]', or pip install '.[{extra}]'"
+        )

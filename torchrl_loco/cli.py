@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 import tyro
 
 import torchrl_loco
-from torchrl_loco.checks import SEED, check_choice, check_device, check_float, check_int, check_output_file, check_run
+from torchrl_loco.checks import (
+    SEED,
+    check_choice,
+    check_device,
+    check_float,
+    check_int,
+    check_output_file,
+    check_run,
+    is_run_group,
+)
 
 if TYPE_CHECKING:
     from torchrl_loco import training
@@ -122,7 +131,7 @@ def evaluate(
         check_run(run)
         folder = training.RunFolder(run)
         summary = training.evaluate_run(folder, episodes, seed, device)
-        note = training.poor_return(folder.load_config(), summary)
+        note = training.poor_return(folder.load_config(), summary, folder.seeds)
     print(training.describe(summary))
     if note:
         print(note)
@@ -132,14 +141,21 @@ def resume(run: tyro.conf.Positional[Path], /) -> None:
     """Continue a run that was stopped, from its last checkpoint, as if it had not been stopped.
 
     Args:
-        run: folder of the run.
+        run: folder of the run, or of the runs of several seeds, of which all that is missing is trained.
     """
     with _user_errors():
+        check_run(run, or_group=True)
         from torchrl_loco import training
 
-        check_run(run)
-        trainer = training.Trainer(training.RunFolder(run), resume=True)
-    _train(trainer)
+        if is_run_group(run):
+            group = training.RunGroup(run)
+            group.check()
+        else:
+            trainer = training.Trainer(training.RunFolder(run), resume=True)
+    if is_run_group(run):
+        _train_group(group)
+    else:
+        _train(trainer)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,6 +248,49 @@ def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: 
             video.make(trained, Path(f"{trained.info['task']}.mp4"))
 
 
+def export(
+    run_or_task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN_OR_TASK")],
+    /,
+    format: Literal["onnx", "torch"] = "onnx",
+    out: Path | None = None,
+) -> None:
+    """Write a policy as a file for programs without this package, and compare it with the policy.
+
+    Args:
+        run_or_task: a run folder, a policy file, or the id of an environment for the policy shipped with the package.
+        format: onnx, or torch for a program of torch.export (.pt2).
+        out: the file, a new one; default: a new file beside the policy, or TASK.onnx for a shipped one.
+    """
+    with _user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
+        source = Path(run_or_task)
+        task = None if source.exists() else _shipped_task(run_or_task)
+        from torchrl_loco import training
+        from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy
+
+        suffix = SUFFIXES[format]
+        if out is not None:
+            check_output_file("out", out, (suffix,))
+        if task is not None:
+            policy, default = torchrl_loco.load_policy(task, "cpu"), Path(f"{task}{suffix}")
+        else:
+            file = training.RunFolder(source).policy if source.is_dir() else source
+            policy, default = torchrl_loco.Policy.load(file, "cpu"), file.with_suffix(suffix)
+        out = training.unused_path(default) if out is None else out
+        error = export_policy(policy, out)
+    print(f"largest difference from the policy, on random observations: {error:.1e} (at most {TOLERANCE:.0e})")
+    print(out)
+
+
+def _shipped_task(name: str) -> str:
+    """Returns the id of the environment that was named instead of a file or a folder."""
+    from torchrl_loco.registry import canonical_id
+
+    try:
+        return canonical_id(name)
+    except ValueError as error:
+        raise ValueError(f"there is no run folder or policy file {name!r}, and {error}") from None
+
+
 def inspect(file: tyro.conf.Positional[Path], /, device: str | None = None) -> None:
     """Inspect a NaN dump: step its world again, substep by substep, in Warp and in C MuJoCo.
 
@@ -251,15 +310,17 @@ def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("lear
     """Plot the learning curves of runs; runs that differ only in their seed become a mean and a band.
 
     Args:
-        runs: folders of the runs.
+        runs: folders of the runs, or of the runs of several seeds.
         out: the picture; an existing one is replaced.
     """
     with _user_errors():
         from torchrl_loco import training
 
+        folders: list[training.RunFolder] = []
         for run in runs:
-            check_run(run)
-        training.plot_runs([training.RunFolder(run) for run in runs], out)
+            check_run(run, or_group=True)
+            folders += training.RunGroup(run).plotted if is_run_group(run) else [training.RunFolder(run)]
+        training.plot_runs(folders, out)
     print(out)
 
 
@@ -280,8 +341,17 @@ def _run(args: list[str]) -> None:
     def train(config: Annotated[task_config, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]
         """Train a policy: evaluation, learning curve and video included. All settings: train TASK --help."""
         with _user_errors():
-            trainer = _begin(config)
-        _train(trainer)
+            if {"--seed", "--seeds"} <= {arg.partition("=")[0] for arg in args}:
+                raise ValueError("--seed trains one seed, --seeds several: pass one of them")
+            plain, seeds = _settings(config)
+            if seeds:
+                group = _begin_group(plain, seeds)
+            else:
+                trainer = _begin(plain)
+        if seeds:
+            _train_group(group)
+        else:
+            _train(trainer)
 
     commands: dict[str, Callable[..., None]] = {
         "train": train,
@@ -290,6 +360,7 @@ def _run(args: list[str]) -> None:
         "record": record,
         "play": play,
         "plot": plot,
+        "export": export,
         "inspect": inspect,
         "list": list_tasks,
         "doctor": diagnose,
@@ -319,7 +390,7 @@ def _task_config(args: list[str]) -> Any:
     if len(args) > 1 and not args[1].startswith("-"):
         with _user_errors():
             task = args[1] = canonical_id(args[1])
-            config = _fixed_task(preset(task, device, algorithm))
+            config = _options(preset(task, device, algorithm))
         about[task] += f" {tuning_note(config)}\n\n--algorithm, {' or '.join(CONFIGS)} (here {config.algorithm}), and"
         about[task] += " --device choose the\nsettings and their defaults."
         configs = {task: config}
@@ -328,12 +399,22 @@ def _task_config(args: list[str]) -> Any:
     return tyro.extras.subcommand_type_from_defaults(configs, about, prefix_names=False)
 
 
-def _fixed_task(config: "training.TrainingConfig") -> "training.TrainingConfig":
-    """Returns the settings with their task fixed: a preset belongs to one task."""
+SEEDS = Annotated[tuple[int, ...], tyro.conf.arg(help="Train these seeds one after the other, into one folder.")]
+
+
+def _options(config: "training.TrainingConfig") -> "training.TrainingConfig":
+    """Returns the settings as options: with their task fixed, as a preset belongs to one, and with several seeds."""
     hidden = Annotated[str, tyro.conf.Suppress, tyro.conf.Fixed]
     kind = type(config)
-    cls = dataclasses.make_dataclass(kind.__name__, [("task", hidden, config.task)], bases=(kind,), frozen=True)
+    fields = [("task", hidden, config.task), ("seeds", SEEDS, ())]
+    cls = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=True)
     return cls(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
+
+
+def _settings(options: Any) -> tuple["training.TrainingConfig", tuple[int, ...]]:
+    """Returns the settings and the seeds of what :func:`_options` returned."""
+    (kind,) = type(options).__bases__
+    return kind(**{field.name: getattr(options, field.name) for field in dataclasses.fields(kind)}), options.seeds
 
 
 def _begin(config: "training.TrainingConfig") -> "training.Trainer":
@@ -350,6 +431,32 @@ def _begin(config: "training.TrainingConfig") -> "training.Trainer":
     except BaseException:  # an empty run folder is of no use
         shutil.rmtree(run.path)
         raise
+
+
+def _begin_group(config: "training.TrainingConfig", seeds: tuple[int, ...]) -> "training.RunGroup":
+    """Makes the folder for the runs of several seeds."""
+    from torchrl_loco import training
+
+    group = training.RunGroup.create(config, seeds)
+    if note := training.tuning_note(config):
+        print(note)
+    print(f"folder of the runs: {group.path}")
+    return group
+
+
+def _train_group(group: "training.RunGroup") -> None:
+    """Trains the seeds that are missing and prints where the results are; exits with 1 if some failed."""
+    way = f"to continue: torchrl-loco resume {group.path}"
+    try:
+        with _user_errors(OSError):  # as of a run
+            failed = group.train()
+    except (KeyboardInterrupt, SystemExit):
+        print(way, file=sys.stderr)
+        raise
+    if failed:
+        print(way, file=sys.stderr)
+        raise SystemExit(1)
+    print(f"policies, curves, videos and logs: {group.path}")
 
 
 def _train(trainer: "training.Trainer") -> None:

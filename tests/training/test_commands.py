@@ -5,9 +5,11 @@ from pathlib import Path
 
 import imageio.v3 as imageio
 import pytest
+import torch
 from small_runs import SMALL, made
 
 from torchrl_loco import cli, training
+from torchrl_loco.policy import Policy
 from torchrl_loco.training import RunFolder
 from torchrl_loco.training.algorithm import Algorithm
 
@@ -51,6 +53,16 @@ def test_from_training_to_a_video(tmp_path, capsys, monkeypatch):
         assert Path(out).exists()
 
 
+def test_a_run_is_exported_into_its_folder(ppo_run, tmp_path, capsys):
+    path = shutil.copytree(ppo_run.path, tmp_path / "run")
+    (path / "policy.pt2").write_text("mine")
+    assert cli.main(["export", str(path), "--format", "torch"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(path / "policy-2.pt2")
+    assert (path / "policy.pt2").read_text() == "mine"
+    action = torch.export.load(path / "policy-2.pt2").module()(torch.ones(3, 24))
+    torch.testing.assert_close(action, Policy.load(ppo_run.policy, "cpu")(observation=torch.ones(3, 24)))
+
+
 def test_errors_of_the_user(ppo_run, tmp_path, capsys):
     (tmp_path / "file.mp4").write_text("")
     broken = shutil.copytree(ppo_run.path, tmp_path / "broken")
@@ -72,6 +84,7 @@ def test_errors_of_the_user(ppo_run, tmp_path, capsys):
         "record {run} --seconds 0": "seconds must lie in (0, inf)",
         "record {run} --device cpu --out {file}": "already exists",
         "play walker_walk --policy {run} --device cpu": "is a policy for walker_stand",
+        "export {run} --out {file}": "out must end in one of .onnx",
         "plot": "no runs",
         "plot {broken}": "{broken}/config.json is damaged",
         "fly": "train, resume, eval",

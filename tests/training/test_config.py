@@ -41,6 +41,11 @@ def test_wrong_settings():
         ({"device": "tpu"}, ValueError, "choose one of cpu"),
         ({"task": "walker_stnd"}, ValueError, "did you mean 'walker_stand'"),
         ({"protocol": "brax"}, ValueError, "choose one of playground, dm_control"),
+        (
+            {"logger": ("csv", "wanb")},
+            ValueError,
+            "did you mean 'wandb'?: choose one of csv, tensorboard, wandb, mlflow",
+        ),
     ]
     for overrides, error, message in cases:
         with pytest.raises(error, match=re.escape(message)):

@@ -33,18 +33,40 @@ def test_runs_share_a_curve_unless_they_learn_differently(tmp_path, monkeypatch)
     drawn, plot = [], Axes.plot
 
     def note(self, x, y, **options):
-        drawn.append((list(y), options["label"]))
+        drawn.append((list(y), options.get("label")))
         return plot(self, x, y, **options)
 
     monkeypatch.setattr(Axes, "plot", note)
     same = [{}, {"seed": 1, "batches": 3}, {"device": "cuda:7"}]
-    same += [{"eval_interval": 128}, {"eval_episodes": 9}, {"video_seconds": 3.0}, {"checkpoint_seconds": 5.0}]
+    same += [
+        {"eval_interval": 128},
+        {"eval_episodes": 9},
+        {"video_seconds": 3.0},
+        {"checkpoint_seconds": 5.0},
+        {"logger": "csv"},
+    ]
     other = [{"lr": 1e-4}, {"algorithm": "reppo"}]
     runs = [measured(tmp_path / str(i), **settings) for i, settings in enumerate([*same, *other])]
     plot_runs(runs, tmp_path / "curves.png")
+    faint = [curve for curve, label in drawn if label is None]
+    assert faint == [[100.0, 200.0], [200.0, 300.0, 400.0], *[[100.0, 200.0]] * 6]  # each seed in full
+    drawn = [(curve, label) for curve, label in drawn if label is not None]
     curves = [curve for curve, _ in drawn]
-    assert curves == [[100.0 + 100 / 7, 200.0 + 100 / 7], [100.0, 200.0], [100.0, 200.0]]
-    assert ["7 seeds" in label for _, label in drawn] == [True, False, False]
+    assert curves == [[100.0 + 100 / 8, 200.0 + 100 / 8], [100.0, 200.0], [100.0, 200.0]]
+    assert ["8 seeds" in label for _, label in drawn] == [True, False, False]
+
+
+def test_a_run_that_was_stopped_early_does_not_cut_the_mean_of_the_others(tmp_path, monkeypatch):
+    drawn, plot = [], Axes.plot
+    monkeypatch.setattr(Axes, "plot", lambda *args, **options: drawn.append((args, options)) or plot(*args, **options))
+    runs = [measured(tmp_path, seed=seed, total_frames=256) for seed in (0, 2, 5)]
+    for run in runs[:2]:
+        run.append_metrics({"frames": 256, "seconds": 1.0, "return": 900.0})
+    plot_runs(runs, tmp_path / "curves.png")
+    ((_, _, mean), options), *faint = drawn
+    assert list(mean) == [200.0, 300.0, 900.0]
+    assert ", 2 of 3 seeds" in options["label"]
+    assert [list(args[2]) for args, _ in faint][2] == [600.0, 700.0]
 
 
 def test_nothing_to_plot(tmp_path):

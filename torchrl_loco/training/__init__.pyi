@@ -11,5 +11,6 @@ from .presets import preset as preset
 from .presets import tuning_note as tuning_note
 from .run_folder import RunFolder as RunFolder
 from .run_folder import unused_path as unused_path
+from .run_group import RunGroup as RunGroup
 from .trainer import Trainer as Trainer
 from .trainer import evaluate_run as evaluate_run

@@ -61,6 +61,8 @@ def deterministic_policy(actor: ProbabilisticActor, config: TrainingConfig, info
     # The mean's rows of the last layer; initialising it would draw from the generator that training draws from.
     head = nn.utils.skip_init(nn.Linear, config.hidden[-1], config.action_size)
     head.load_state_dict({name: value[: config.action_size] for name, value in last.state_dict().items()})
-    settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "device")}
+    settings = {
+        name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "device", "logger")
+    }
     network = nn.Sequential(*layers, head.to(config.device), nn.Tanh())
     return Policy(network, {"algorithm": config.algorithm, **settings, **info})

@@ -4,12 +4,13 @@ import dataclasses
 import math
 import re
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 from torchrl_loco.checks import SEED, check_choice, check_fields, check_int
 from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.registry import canonical_id, env_class
 
+LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow"]
 INTERVALS = {
     "seed": SEED,
     "eval_interval": "[0, 2**31)",
@@ -90,11 +91,17 @@ class TrainingConfig:
     """Length of the video of the trained policy (s); 0 makes none."""
     checkpoint_seconds: float = 60.0
     """Time between two checkpoints (s)."""
+    logger: tuple[LoggerName, ...] = ("tensorboard",)
+    """Where metrics go besides the run's CSV files, which are always written; csv adds nothing to them."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "task", canonical_id(self.task))
         check_choice("protocol", self.protocol, PROTOCOLS)
         check_fields(self, INTERVALS)
+        loggers = (self.logger,) if isinstance(self.logger, str) else tuple(self.logger)
+        for name in loggers:
+            check_choice("logger", name, get_args(LoggerName))
+        object.__setattr__(self, "logger", tuple(dict.fromkeys(loggers)))
         if not re.fullmatch(
             r"cpu|cuda(:\d+)?", str(self.device)
         ):  # whether the machine has it is checked when the run starts
@@ -114,6 +121,11 @@ class TrainingConfig:
                 f"total_frames ({self.total_frames}) must be at least one batch of num_envs * num_steps * "
                 f"action_repeat ({self.frames_per_batch})"
             )
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns the settings as values that JSON can hold, from which ``config_from_json`` makes them again."""
+        words = {"device": str(self.device), "out": str(self.out)}
+        return {"algorithm": self.algorithm, **dataclasses.asdict(self), **words}
 
     @property
     def batch_size(self) -> int:
@@ -189,3 +201,16 @@ class REPPOConfig(TrainingConfig):
 
 
 CONFIGS: dict[str, type[TrainingConfig]] = {config.algorithm: config for config in (PPOConfig, REPPOConfig)}
+
+
+def config_from_json(values: dict[str, Any]) -> TrainingConfig:
+    """Returns the settings that :meth:`TrainingConfig.to_json` has turned into ``values``.
+
+    Raises:
+        ValueError: a field is out of range, or there is no such algorithm.
+        TypeError: a field is unknown, or has the wrong type.
+        LookupError: a field is missing.
+    """
+    algorithm = check_choice("algorithm", values.get("algorithm"), CONFIGS)
+    fields = {name: value for name, value in values.items() if name != "algorithm"}
+    return CONFIGS[algorithm](**{**fields, "out": Path(values["out"]), "hidden": tuple(values["hidden"])})

@@ -4,7 +4,7 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -77,7 +77,7 @@ POOR = 0.8
 """Fraction of the shipped policy's return below which a return is called poor."""
 
 
-def poor_return(config: TrainingConfig, summary: dict[str, float]) -> str:
+def poor_return(config: TrainingConfig, summary: dict[str, float], seeds: Collection[int] = ()) -> str:
     """Returns a note if the return of a run is poor, with what to try, else an empty string.
 
     It is compared with the policy that is shipped for the same task, if there is one.
@@ -85,6 +85,7 @@ def poor_return(config: TrainingConfig, summary: dict[str, float]) -> str:
     Args:
         config: settings of the run.
         summary: what :func:`summarize` returned.
+        seeds: further seeds that were tried.
     """
     if not (SHIPPED / f"{config.task}.safetensors").is_file():
         return ""
@@ -94,7 +95,7 @@ def poor_return(config: TrainingConfig, summary: dict[str, float]) -> str:
         return ""
     return (
         f"This return is poor: the policy shipped for {config.task} earns {reference:.0f}. Returns vary with seeds and "
-        f"processors. Try another seed (--seed {config.seed + 1}) or twice the frames "
+        f"processors. Try another seed (--seed {max(config.seed, *seeds, -1) + 1}) or twice the frames "
         f"(--total_frames {2 * config.total_frames}); the learning curve shows whether it was still rising"
     )
 

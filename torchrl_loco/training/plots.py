@@ -13,7 +13,7 @@ from torchrl_loco.training.run_folder import RunFolder
 
 IRRELEVANT: dict[str, Any] = {
     **{"seed": 0, "out": Path(), "device": "cpu"},
-    **{"eval_interval": 0, "eval_episodes": 1, "video_seconds": 0.0, "checkpoint_seconds": 0.0},
+    **{"eval_interval": 0, "eval_episodes": 1, "video_seconds": 0.0, "checkpoint_seconds": 0.0, "logger": ()},
 }
 """Settings that do not affect learning, each with a fixed value, so that runs can be grouped without them."""
 
@@ -22,7 +22,8 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     """Plots return against frames of ``runs`` into ``picture``.
 
     Runs that differ only in their seed, or in settings that do not change learning, share a line, their mean, and a
-    band from least to greatest. Evaluations are dots: the mean over episodes, with their standard deviation as a bar.
+    band from least to greatest; each of them is a faint line. Runs that were stopped early count in neither if others
+    were not. Evaluations are dots: the mean over episodes, with their standard deviation as a bar.
 
     Raises:
         ValueError: there are no runs, or one has no metrics yet.
@@ -37,13 +38,17 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     for config, group in groups.items():
         label = f"{config.task}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds"
         metrics = [run.read_metrics() for run in group]
-        length = min(len(m["frames"]) for m in metrics)
-        returns = np.array([m["return"][:length] for m in metrics])
-        millions = np.array(metrics[0]["frames"][:length]) / 1e6
-        seconds = np.mean([m["seconds"][-1] for m in metrics])
-        seeds = "" if len(group) == 1 else f", {len(group)} seeds"
+        whole = [m for m in metrics if m["frames"][-1] + config.frames_per_batch > config.total_frames] or metrics
+        length = min(len(m["frames"]) for m in whole)
+        returns = np.array([m["return"][:length] for m in whole])
+        millions = np.array(whole[0]["frames"][:length]) / 1e6
+        seconds = np.mean([m["seconds"][-1] for m in whole])
+        count = f"{len(group)}" if len(whole) == len(group) else f"{len(whole)} of {len(group)}"
+        seeds = "" if len(group) == 1 else f", {count} seeds"
         (line,) = axes.plot(millions, returns.mean(0), label=f"{label}{seeds}, {seconds:.0f} s")
         axes.fill_between(millions, returns.min(0), returns.max(0), color=line.get_color(), alpha=0.2, linewidth=0)
+        for one in metrics if len(group) > 1 else ():
+            axes.plot(np.array(one["frames"]) / 1e6, one["return"], color=line.get_color(), alpha=0.35, linewidth=0.7)
         for run in group:
             rows = run.read_evaluations()
             axes.errorbar(

@@ -17,10 +17,11 @@ from typing import Any
 import torch
 
 from torchrl_loco import storage
-from torchrl_loco.checks import check_choice, check_device, check_run
+from torchrl_loco.checks import check_device, check_run, is_run_group
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import env_class
-from torchrl_loco.training.config import CONFIGS, TrainingConfig
+from torchrl_loco.training.config import TrainingConfig, config_from_json
+from torchrl_loco.training.loggers import check_loggers
 
 CHECKPOINT_VERSION = 3
 ROOM_NEEDED = 200 * 2**20
@@ -40,12 +41,41 @@ def unused_path(path: Path) -> Path:
     return next(candidate for candidate in itertools.chain([path], numbered) if not candidate.exists())
 
 
+def new_folder(config: TrainingConfig, ending: str) -> Path:
+    """Makes a new folder in ``config.out``, named after task and time, if runs with these settings can begin here.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ValueError: this machine does not have the device.
+        ImportError: the package of a logger is missing, or the environment is a plug-in, which is broken.
+        OSError: the folder cannot be made, or the disk has no room for a run.
+    """
+    check_device(config.device)
+    env_class(config.task)
+    check_loggers(config.logger)
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    try:
+        Path(config.out).mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise OSError(f"out must be a folder for runs, but {config.out} is a file or lies below one") from None
+    free = shutil.disk_usage(config.out).free
+    if free < ROOM_NEEDED:
+        raise OSError(f"{config.out} has {free / 2**20:.0f} MiB left, a run may need {ROOM_NEEDED / 2**20:.0f} MiB")
+    while True:  # runs may start within the same second
+        path = unused_path(Path(config.out) / f"{config.task}-{stamp}-{ending}")
+        with contextlib.suppress(FileExistsError):
+            path.mkdir()
+            return path
+
+
 class RunFolder:
     """A run on disk.
 
-    It holds ``config.json``, ``metrics.csv``, ``tensorboard/``, ``evaluations.csv``, ``checkpoint.pt``,
-    ``policy.safetensors``, ``learning_curve.png``, ``video.mp4``, and ``nan_dump.safetensors`` if a world became
-    non-finite.
+    It holds ``config.json``, ``metrics.csv``, ``evaluations.csv``, ``checkpoint.pt``, ``policy.safetensors``,
+    ``learning_curve.png``, ``video.mp4``, what its loggers write (``tensorboard/``, ``wandb/``, ``mlflow.db``), and
+    ``nan_dump.safetensors`` if a world became non-finite.
 
     Args:
         path: an existing run folder.
@@ -66,27 +96,11 @@ class RunFolder:
 
         Raises:
             ValueError: this machine does not have the device.
-            ImportError: the environment is a plug-in, which is broken.
+            ImportError: the package of a logger is missing, or the environment is a plug-in, which is broken.
             OSError: the folder cannot be made, or the disk has no room for a run.
         """
-        check_device(config.device)
-        env_class(config.task)
-        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        name = f"{config.task}-{stamp}-seed{config.seed}"
-        try:
-            Path(config.out).mkdir(parents=True, exist_ok=True)
-        except (FileExistsError, NotADirectoryError):
-            raise OSError(f"out must be a folder for runs, but {config.out} is a file or lies below one") from None
-        free = shutil.disk_usage(config.out).free
-        if free < ROOM_NEEDED:
-            raise OSError(f"{config.out} has {free / 2**20:.0f} MiB left, a run may need {ROOM_NEEDED / 2**20:.0f} MiB")
-        while True:  # runs may start within the same second
-            path = unused_path(Path(config.out) / name)
-            with contextlib.suppress(FileExistsError):
-                path.mkdir()
-                break
-        values = {"algorithm": config.algorithm, **dataclasses.asdict(config)}
-        (path / "config.json").write_text(json.dumps(values, default=str, indent=2) + "\n")
+        path = new_folder(config, f"seed{config.seed}")
+        (path / "config.json").write_text(json.dumps(config.to_json(), indent=2) + "\n")
         return cls(path)
 
     def load_config(self, **overrides: Any) -> TrainingConfig:
@@ -97,10 +111,7 @@ class RunFolder:
         """
         path = self.path / "config.json"
         try:
-            values = json.loads(path.read_text())
-            values.update(out=Path(values["out"]), hidden=tuple(values["hidden"]))
-            algorithm = check_choice("algorithm", values.pop("algorithm", None), CONFIGS)
-            config = CONFIGS[algorithm](**values)
+            config = config_from_json(json.loads(path.read_text()))
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             raise ValueError(f"{path} is damaged or from another release: {error}") from error
         return dataclasses.replace(config, **overrides)
@@ -124,6 +135,19 @@ class RunFolder:
     def nan_dump(self) -> Path:
         """State and action from which a world first became non-finite, if any."""
         return self.path / "nan_dump.safetensors"
+
+    @property
+    def has_metrics(self) -> bool:
+        """Whether a batch was collected."""
+        return bool(self._read("metrics.csv"))
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seeds of the group that the run belongs to; its own if it belongs to none."""
+        folder = self.path.parent
+        if is_run_group(folder):
+            return tuple(json.loads((folder / "group.json").read_text())["seeds"])
+        return (self.load_config().seed,)
 
     @property
     def is_finished(self) -> bool:
@@ -152,6 +176,16 @@ class RunFolder:
     def read_evaluations(self) -> list[dict[str, float]]:
         """Returns the lines of ``evaluations.csv``, none if there was no evaluation yet."""
         return self._read("evaluations.csv")
+
+    def read_logger_ids(self) -> dict[str, str]:
+        """Returns the ids under which W&B and MLflow know the run, by logger."""
+        path = self.path / "loggers.json"
+        return json.loads(path.read_text()) if path.exists() else {}
+
+    def write_logger_ids(self, ids: dict[str, str]) -> None:
+        """Keeps the ids that :meth:`read_logger_ids` returns."""
+        if ids:
+            storage.replace_file(self.path / "loggers.json", f"{json.dumps(ids)}\n".encode())
 
     def forget_after(self, frames: int) -> None:
         """Removes the lines of metrics and evaluations after ``frames`` frames: a resumed run writes them again."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.utils.tensorboard import SummaryWriter
 from torchrl.envs import EnvBase, FrameSkipTransform
 from tqdm.auto import tqdm
 
@@ -23,6 +22,7 @@ from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.evaluation import Evaluator, describe, poor_return, record, summarize
+from torchrl_loco.training.loggers import Loggers, check_loggers
 from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.ppo import PPO
 from torchrl_loco.training.reppo import REPPO
@@ -42,12 +42,14 @@ class Trainer:
     Raises:
         FileNotFoundError: there is no checkpoint to resume from.
         ValueError: the checkpoint cannot be read, or the run is complete.
+        ImportError: the package of a logger is missing.
     """
 
     def __init__(self, run: RunFolder, resume: bool = False) -> None:
         self.run = run
         self.config = config = run.load_config()
         check_device(config.device)
+        check_loggers(config.logger)
         checkpoint = run.load_checkpoint(config.device) if resume else None
         torch.manual_seed(config.seed)
         self.env = make_env(config, run.nan_dump)
@@ -67,6 +69,7 @@ class Trainer:
 
         Raises:
             KeyboardInterrupt: Ctrl-C or SIGTERM.
+            OSError: a logger cannot be opened.
         """
         with settings_for_small_networks():
             self._train()
@@ -76,18 +79,19 @@ class Trainer:
     def _train(self) -> None:
         config = self.config
         saved = time.perf_counter()
-        board = SummaryWriter(str(self.run.path / "tensorboard"), purge_step=self.frames + 1)
-        bar = tqdm(total=self.last_frame, initial=self.frames, unit="frame", unit_scale=True, desc=config.task)
-        with board, bar, interruptible() as interrupted:
+        with (
+            Loggers(self.run, self.frames) as loggers,
+            tqdm(total=self.last_frame, initial=self.frames, unit="frame", unit_scale=True, desc=config.task) as bar,
+            interruptible() as interrupted,
+        ):
             while self.frames < self.last_frame:
                 row = self._iterate()
                 self.run.append_metrics(row)
-                for key, value in row.items():
-                    board.add_scalar(key, value, self.frames)
+                loggers.log(row, self.frames)
                 bar.set_postfix({"return": f"{row['return']:.0f}"}, refresh=False)
                 bar.update(config.frames_per_batch)
                 if self.frames >= self.last_frame or self._evaluation_is_due():
-                    board.add_scalar("evaluation", self._evaluate()["mean"], self.frames)
+                    loggers.log({"evaluation": self._evaluate()["mean"]}, self.frames)
                 if interrupted() or time.perf_counter() - saved > config.checkpoint_seconds:
                     self.save()
                     saved = time.perf_counter()
@@ -156,7 +160,7 @@ class Trainer:
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
         print(f"best policy, in new episodes: {describe(summary)}")
-        if note := poor_return(config, summary):
+        if note := poor_return(config, summary, self.run.seeds):
             print(note)
 
     def save(self) -> None:

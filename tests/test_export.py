@@ -1,0 +1,127 @@
+"""Exported policies do what the policies do, without this package, and say what they are."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import torchrl_loco
+from torchrl_loco import cli
+from torchrl_loco.export import TOLERANCE, export_policy
+from torchrl_loco.policy import ObservationNorm, Policy
+
+INFO = {"task": "walker_stand", "protocol": "dm_control", "action_repeat": 2, "mean": 12.5}
+
+
+def policy(bias=0.0):
+    """Returns a policy with a normalisation that matters: without it, the layers would saturate."""
+    norm = ObservationNorm(24)
+    norm.update(torch.randn(1000, 24, generator=torch.Generator().manual_seed(0)) * 100 + 700)
+    network = nn.Sequential(norm, nn.Linear(24, 32), nn.LayerNorm(32), nn.SiLU(), nn.Linear(32, 6), nn.Tanh())
+    nn.init.constant_(network[1].bias, bias)
+    return Policy(network, INFO)
+
+
+def read_onnx(path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    facts = session.get_modelmeta().custom_metadata_map
+    words = {
+        name: fact if name in {"task", "protocol", "torchrl_loco"} else json.loads(fact) for name, fact in facts.items()
+    }
+    return lambda seen: session.run(["action"], {"observation": seen.numpy()})[0], words
+
+
+def read_program(path):
+    files = {"metadata.json": ""}
+    program = torch.export.load(path, extra_files=files).module()
+    return lambda seen: program(seen).numpy(), json.loads(files["metadata.json"])
+
+
+FORMATS = [("policy.onnx", read_onnx), ("policy.pt2", read_program)]
+
+
+@pytest.mark.parametrize(("name", "read"), FORMATS)
+def test_exported_policies_do_the_same(name, read, tmp_path):
+    """For any batch; with observations that are clipped; and they say what a robot's program has to know."""
+    if name.endswith("onnx"):
+        pytest.importorskip("onnxscript")
+    original = policy()
+    error = export_policy(original, tmp_path / name)
+    assert 0 <= error <= TOLERANCE
+    play, facts = read(tmp_path / name)
+    for batch in (1, 3, 50):
+        seen = torch.randn(batch, 24) * 500 + 700
+        expected = original(observation=seen)
+        assert expected.std() > 1e-2
+        np.testing.assert_allclose(play(seen), expected.detach().numpy(), rtol=0, atol=TOLERANCE)
+    assert facts.pop("info") == INFO
+    assert facts == {
+        **{"task": "walker_stand", "protocol": "dm_control", "torchrl_loco": torchrl_loco.__version__},
+        **{"observation_size": 24, "action_size": 6, "action_low": -1.0, "action_high": 1.0},
+        **{"control_timestep": 0.025, "action_repeat": 2},
+    }
+
+
+def test_what_differs_is_not_written(tmp_path, monkeypatch):
+    """Here because what is read back is a policy with another bias."""
+    load, wrong = torch.export.load, tmp_path / "wrong.pt2"
+    export_policy(policy(bias=0.5), wrong)
+    monkeypatch.setattr("torch.export.load", lambda file: load(wrong))
+    with pytest.raises(
+        RuntimeError, match=r"differs by .* own rounding in float32 is \d.\de-0[78]; .* nothing was written"
+    ):
+        export_policy(policy(), tmp_path / "policy.pt2")
+    assert list(tmp_path.iterdir()) == [wrong]
+
+
+def test_what_cannot_be_exported(tmp_path, monkeypatch):
+    (tmp_path / "taken.pt2").touch()
+    for name, message in {"x.tflite": "must end in one of .onnx, .pt2", "taken.pt2": "already exists"}.items():
+        with pytest.raises(ValueError, match=message):
+            export_policy(policy(), tmp_path / name)
+    with pytest.raises(TypeError, match="must begin with an ObservationNorm"):
+        export_policy(Policy(nn.Sequential(nn.Linear(24, 6)), INFO), tmp_path / "x.pt2")
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ImportError, match=r"needs onnx: pip install 'torchrl-loco\[onnx\]'"):
+        export_policy(policy(), tmp_path / "x.onnx")
+    assert [path.name for path in tmp_path.iterdir()] == ["taken.pt2"]
+
+
+def test_the_command(tmp_path, monkeypatch, capsys):
+    """From a shipped policy or a file; nothing is overwritten."""
+    monkeypatch.chdir(tmp_path)
+    policy().save(tmp_path / "mine.safetensors")
+    commands = {
+        "export mjx/walker_walk-v0 --format torch": "walker_walk.pt2",
+        "export walker_walk --format torch": "walker_walk-2.pt2",
+        "export mine.safetensors --format torch": "mine.pt2",
+        "export mine.safetensors --format torch --out other.pt2": "other.pt2",
+    }
+    for command, name in commands.items():
+        assert cli.main(command.split()) == 0
+        said, written = capsys.readouterr().out.splitlines()
+        assert said.startswith("largest difference from the policy, on random observations: ")
+        assert written == name
+        assert read_program(name)[1]["task"] == ("walker_walk" if "walk" in command else "walker_stand")
+
+
+def test_errors_of_the_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken.onnx").touch()
+    cases = {
+        "export walker_wlak": "did you mean 'walker_walk'",
+        "export walker_walk --format tflite": "onnx",
+        "export walker_walk --format torch --out x.onnx": "out must end in one of .pt2",
+        "export walker_walk --out taken.onnx": "already exists",
+        "export .": "is not a run folder",
+    }
+    for command, message in cases.items():
+        with pytest.raises(SystemExit, match="2"):
+            cli.main(command.split())
+        said = capsys.readouterr()
+        assert message in said.out + said.err, command
+    assert [path.name for path in tmp_path.iterdir()] == ["taken.onnx"]

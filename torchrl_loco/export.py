@@ -1,0 +1,163 @@
+"""Policies for programs without this package: as ONNX, or as a program of torch.export."""
+
+import copy
+import io
+import json
+import logging
+import math
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+import torchrl_loco
+from torchrl_loco import storage
+from torchrl_loco.checks import check_output_file, check_packages
+from torchrl_loco.policy import ObservationNorm, Policy
+from torchrl_loco.registry import env_class
+
+SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
+"""Formats and the suffixes of their files."""
+
+TOLERANCE = 1e-5
+"""Largest difference of an action from the policy's own that an exported policy may have."""
+
+BATCH_SIZES = (1, 2, 1000)
+"""Batches of random observations on which they are compared."""
+
+
+def export_policy(policy: Policy, path: Path) -> float:
+    """Writes a policy, with its normalisation of observations, as a file that needs none of this package.
+
+    What is written takes ``observation``, float32 of shape ``(batch, n)`` for any batch, and gives ``action``, float32
+    of shape ``(batch, m)`` in [-1, 1]. Before the file is written, it is compared with the policy, on the CPU and on
+    random observations that reach beyond those of the training. Information travels with it: task, protocol, sizes,
+    bounds of an action, the time between two control steps (s), for how many of them an action is held, and all of
+    ``policy.info``; as ``metadata_props`` in ONNX, in the extra file ``metadata.json`` with torch.export.
+
+    Args:
+        policy: the policy, on any device.
+        path: a new file; ``.onnx`` or ``.pt2`` chooses the format.
+
+    Returns:
+        The largest difference of an entry of an action from the policy's own.
+
+    Raises:
+        ValueError: the file exists, its folder does not, or its suffix is none of the valid ones.
+        TypeError: the policy does not begin by normalising observations.
+        ImportError: a package of the extra "onnx" is missing; the message says how to install it.
+        RuntimeError: the difference is larger than 1e-5; nothing is written.
+    """
+    path = check_output_file("path", path, tuple(SUFFIXES.values()))
+    if path.suffix == ".onnx":
+        check_packages("exporting as ONNX", ("onnx", "onnxscript", "onnxruntime"), "onnx")
+    original = _Network(policy)
+    observations = _random_observations(original)
+    expected = original(observations)
+    facts = _facts(policy, n=observations.shape[-1], m=expected.shape[-1])
+    content, play = (_as_onnx if path.suffix == ".onnx" else _as_program)(original, observations[:2], facts)
+    error = max(_difference(play(observations[:size]), expected[:size]) for size in BATCH_SIZES)
+    if not error <= TOLERANCE:  # true for NaN too
+        rounding = _difference(copy.deepcopy(original).double()(observations.double()), expected)
+        raise RuntimeError(
+            f"the exported policy differs by {error:.1e} from the original, whose own rounding in float32 is "
+            f"{rounding:.1e}; more than {TOLERANCE:.0e} is refused, and nothing was written"
+        )
+    storage.replace_file(path, content)
+    return error
+
+
+class _Network(nn.Module):
+    """The network of a policy, copied to the CPU; gives its argument the name that exported policies have for it."""
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__()
+        self.layers = copy.deepcopy(policy.module).cpu().requires_grad_(False).eval()
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Returns the actions, shape ``(batch, m)``, for observations of shape ``(batch, n)``."""
+        return self.layers(observation)
+
+
+def _random_observations(network: _Network) -> torch.Tensor:
+    """Returns random observations, of which some are so far from those of the training that they are clipped.
+
+    Raises:
+        TypeError: the network does not begin by normalising observations.
+    """
+    norm = network.layers[0]
+    if not isinstance(norm, ObservationNorm):
+        raise TypeError(f"a policy must begin with an ObservationNorm, this one begins with {type(norm).__name__}")
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(max(BATCH_SIZES), len(norm.mean), generator=generator)
+    return norm.mean + 4 * noise * (norm.var + 1e-6).sqrt()
+
+
+def _facts(policy: Policy, n: int, m: int) -> dict[str, Any]:
+    info = policy.info
+    return {
+        "task": info["task"],
+        "protocol": info["protocol"],
+        "observation_size": n,
+        "action_size": m,
+        "action_low": -1.0,
+        "action_high": 1.0,
+        "control_timestep": env_class(info["task"]).defaults.ctrl_dt,
+        "action_repeat": info["action_repeat"],
+        "torchrl_loco": torchrl_loco.__version__,
+        "info": info,
+    }
+
+
+def _difference(actions: torch.Tensor, expected: torch.Tensor) -> float:
+    """Returns the largest difference, infinity if the shapes differ."""
+    return (actions - expected).abs().max().item() if actions.shape == expected.shape else math.inf
+
+
+Exported = tuple[bytes, Callable[[torch.Tensor], torch.Tensor]]
+"""A file's content, and what it computes when it is loaded."""
+
+
+def _as_program(network: _Network, example: torch.Tensor, facts: dict[str, Any]) -> Exported:
+    shapes = {"observation": {0: torch.export.Dim("batch")}}
+    program = torch.export.export(network, (example,), dynamic_shapes=shapes)
+    file = io.BytesIO()
+    torch.export.save(program, file, extra_files={"metadata.json": json.dumps(facts, indent=2)})
+    content = file.getvalue()
+    return content, torch.export.load(io.BytesIO(content)).module()
+
+
+def _as_onnx(network: _Network, example: torch.Tensor, facts: dict[str, Any]) -> Exported:
+    import onnxruntime
+
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)  # it warns of operators of packages that are not there
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch's own deprecations
+            program = torch.onnx.export(
+                network,
+                (example,),
+                input_names=["observation"],
+                output_names=["action"],
+                dynamic_shapes={"observation": {0: "batch"}},
+                dynamo=True,
+                verbose=False,
+            )
+    finally:
+        log.setLevel(level)
+    assert program is not None
+    words = {name: fact if isinstance(fact, str) else json.dumps(fact) for name, fact in facts.items()}
+    program.model.metadata_props.update(words)
+    content = program.model_proto.SerializeToString()
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+
+    def play(observations: torch.Tensor) -> torch.Tensor:
+        (actions,) = session.run(["action"], {"observation": observations.numpy()})
+        return torch.from_numpy(actions)
+
+    return content, play
