@@ -5,6 +5,7 @@ Modules that take seconds to import are imported where they are used, so that he
 
 import contextlib
 import dataclasses
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -137,25 +138,34 @@ def evaluate(
         print(note)
 
 
-def resume(run: tyro.conf.Positional[Path], /) -> None:
+def resume(run: tyro.conf.Positional[Path], /, gpus: int | None = None) -> None:
     """Continue a run that was stopped, from its last checkpoint, as if it had not been stopped.
 
     Args:
         run: folder of the run, or of the runs of several seeds, of which all that is missing is trained.
+        gpus: as in train: pass the same number to continue exactly.
     """
     with _user_errors():
         check_run(run, or_group=True)
         from torchrl_loco import training
 
         if is_run_group(run):
+            _refuse_seeds_of_ranks(gpus)
             group = training.RunGroup(run)
             group.check()
         else:
-            trainer = training.Trainer(training.RunFolder(run), resume=True)
+            folder = training.RunFolder(run)
+            device = folder.load_config().device
+            missing = _missing_processes(gpus, device)
     if is_run_group(run):
         _train_group(group)
+    elif missing:
+        training.distributed.launch(missing, ["resume", str(run), f"--gpus={gpus}"])
     else:
-        _train(trainer)
+        with _joined(device):
+            with _user_errors():
+                trainer = training.Trainer(folder, resume=True)
+            _train(trainer)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -329,13 +339,14 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         _run(sys.argv[1:] if args is None else list(args))
     except KeyboardInterrupt:
-        print("torchrl-loco: interrupted", file=sys.stderr)
+        print(f"{_name()}: interrupted", file=sys.stderr)
         return 130
     return 0
 
 
 def _run(args: list[str]) -> None:
     """Runs one command."""
+    complete = list(args)
     task_config = _task_config(args) if args[:1] == ["train"] else None
 
     def train(config: Annotated[task_config, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]
@@ -343,15 +354,22 @@ def _run(args: list[str]) -> None:
         with _user_errors():
             if {"--seed", "--seeds"} <= {arg.partition("=")[0] for arg in args}:
                 raise ValueError("--seed trains one seed, --seeds several: pass one of them")
-            plain, seeds = _settings(config)
+            plain, seeds, gpus = _settings(config)
             if seeds:
+                _refuse_seeds_of_ranks(gpus)
                 group = _begin_group(plain, seeds)
-            else:
-                trainer = _begin(plain)
+            missing = _missing_processes(gpus, plain.device)
         if seeds:
             _train_group(group)
+        elif missing:
+            from torchrl_loco.training import distributed
+
+            distributed.launch(missing, complete)
         else:
-            _train(trainer)
+            with _joined(plain.device):
+                with _user_errors():
+                    trainer = _begin(plain)
+                _train(trainer)
 
     commands: dict[str, Callable[..., None]] = {
         "train": train,
@@ -399,38 +417,91 @@ def _task_config(args: list[str]) -> Any:
     return tyro.extras.subcommand_type_from_defaults(configs, about, prefix_names=False)
 
 
+GPUS = Annotated[
+    int | None,
+    tyro.conf.arg(
+        help="Train on so many GPUs of this machine, each with num_envs worlds; on a CPU, in so many processes."
+    ),
+]
 SEEDS = Annotated[tuple[int, ...], tyro.conf.arg(help="Train these seeds one after the other, into one folder.")]
 
 
 def _options(config: "training.TrainingConfig") -> "training.TrainingConfig":
-    """Returns the settings as options: with their task fixed, as a preset belongs to one, and with several seeds."""
+    """Returns the settings as options: with their task fixed, as a preset belongs to one, several seeds and GPUs."""
     hidden = Annotated[str, tyro.conf.Suppress, tyro.conf.Fixed]
     kind = type(config)
-    fields = [("task", hidden, config.task), ("seeds", SEEDS, ())]
+    fields = [("task", hidden, config.task), ("seeds", SEEDS, ()), ("gpus", GPUS, None)]
     cls = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=True)
     return cls(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
 
 
-def _settings(options: Any) -> tuple["training.TrainingConfig", tuple[int, ...]]:
-    """Returns the settings and the seeds of what :func:`_options` returned."""
+def _settings(options: Any) -> tuple["training.TrainingConfig", tuple[int, ...], int | None]:
+    """Returns the settings, the seeds and the number of GPUs of what :func:`_options` returned."""
     (kind,) = type(options).__bases__
-    return kind(**{field.name: getattr(options, field.name) for field in dataclasses.fields(kind)}), options.seeds
+    settings = kind(**{field.name: getattr(options, field.name) for field in dataclasses.fields(kind)})
+    return settings, options.seeds, options.gpus
 
 
 def _begin(config: "training.TrainingConfig") -> "training.Trainer":
-    """Makes the run folder and the trainer of a run."""
+    """Makes the run folder and the trainer of a run; in place of a process that died, those of its run."""
     from torchrl_loco import training
 
-    trainer = training.Trainer  # imports the extra: if it is missing, no folder is made
-    run = training.RunFolder.create(config)
-    if note := training.tuning_note(config):
-        print(note)
-    print(f"run folder: {run.path}")
+    trainer, distributed = training.Trainer, training.distributed  # imports the extra: else no folder is made
+    path = Path()
+    if distributed.is_first():
+        began = training.RunFolder.of_launch(config) if distributed.is_restart() else None
+        if began is None and (note := training.tuning_note(config)):
+            print(note)
+        path = (began or training.RunFolder.create(config)).path
+        print(f"run folder: {path}{', which torchrun continues after a failure' if began else ''}", flush=True)
+    run = training.RunFolder(distributed.from_first(path))
+    had_checkpoint = run.has_checkpoint
     try:
-        return trainer(run)
-    except BaseException:  # an empty run folder is of no use
-        shutil.rmtree(run.path)
+        return trainer(run, resume=had_checkpoint)
+    except BaseException:
+        if distributed.ranks() == 1 and not had_checkpoint:  # an empty run folder is of no use
+            shutil.rmtree(run.path)
         raise
+
+
+def _refuse_seeds_of_ranks(gpus: int | None) -> None:
+    """Checks that several seeds are trained by one process.
+
+    A seed that fails must not end the others, but ranks that wait for a failed one cannot go on.
+    """
+    if (gpus or 1) > 1 or int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise ValueError("several seeds are trained one after the other by one process: pass --seed with several GPUs")
+
+
+def _missing_processes(gpus: int | None, device: str) -> int:
+    """Checks the number of processes that is asked for. Returns how many are still to be started."""
+    if gpus is None:
+        return 0
+    check_int("gpus", gpus)
+    if "RANK" in os.environ:  # of torchrun
+        if gpus != int(os.environ["WORLD_SIZE"]):
+            raise ValueError(f"torchrun has started {os.environ['WORLD_SIZE']} processes: leave --gpus {gpus} out")
+        return 0
+    if gpus > 1 and device != "cpu":
+        import torch
+
+        if gpus > (count := torch.cuda.device_count()):
+            raise ValueError(f"gpus must be at most the {count} GPUs of this machine, got {gpus}")
+    return gpus if gpus > 1 else 0
+
+
+@contextlib.contextmanager
+def _joined(device: str) -> Iterator[None]:
+    """Connects the ranks of torchrun, if there are several, while the block lasts."""
+    from torchrl_loco.training import distributed
+
+    with _user_errors(OSError), distributed.joined(device):
+        yield
+
+
+def _name() -> str:
+    """Returns what the lines of this process begin with."""
+    return f"torchrl-loco, rank {os.environ['RANK']}" if "RANK" in os.environ else "torchrl-loco"
 
 
 def _begin_group(config: "training.TrainingConfig", seeds: tuple[int, ...]) -> "training.RunGroup":
@@ -461,14 +532,19 @@ def _train_group(group: "training.RunGroup") -> None:
 
 def _train(trainer: "training.Trainer") -> None:
     """Trains to the last frame and prints where the results are."""
+    from torchrl_loco.training import distributed
+
+    ranks, first = distributed.ranks(), distributed.is_first()
     try:
         with _user_errors(OSError):  # such as a full disk; other errors are bugs and keep their traceback
             trainer.train()
     except (KeyboardInterrupt, SystemExit):
-        if trainer.run.has_checkpoint:
-            print(f"to continue: torchrl-loco resume {trainer.run.path}", file=sys.stderr)
+        if first and trainer.run.has_checkpoint:
+            ending = f" --gpus {ranks}" if ranks > 1 else ""
+            print(f"to continue: torchrl-loco resume {trainer.run.path}{ending}", file=sys.stderr)
         raise
-    print(f"policy, curve, video and logs: {trainer.run.path}")
+    if first:
+        print(f"policy, curve, video and logs: {trainer.run.path}")
 
 
 @contextlib.contextmanager
@@ -478,7 +554,7 @@ def _user_errors(*kinds: type[Exception]) -> Iterator[None]:
     try:
         yield
     except kinds as error:
-        print(f"torchrl-loco: {error}", file=sys.stderr)
+        print(f"{_name()}: {error}", file=sys.stderr)
         if isinstance(error, ModuleNotFoundError) and error.name in EXTRA:
             print("install it with: pip install 'torchrl-loco[train]', or pip install '.[train]'", file=sys.stderr)
         raise SystemExit(2) from None

@@ -46,17 +46,33 @@ class ObservationNorm(nn.Module):
             )
         return ((observation - self.mean) * torch.rsqrt(self.var + 1e-6)).clamp(-self.limit, self.limit)
 
-    @torch.no_grad()
     def update(self, observation: torch.Tensor) -> None:
-        """Updates mean and variance with observations of shape ``(..., size)`` (Chan's parallel formula)."""
-        batch = observation.flatten(0, -2)
-        var, mean = torch.var_mean(batch, dim=0, correction=0)
-        total = self.count + len(batch)
-        share = len(batch) / total
+        """Updates mean and variance with observations of shape ``(..., size)``."""
+        self.merge(*moments(observation))
+
+    @torch.no_grad()
+    def merge(self, count: float | torch.Tensor, mean: torch.Tensor, var: torch.Tensor) -> None:
+        """Updates mean and variance with those of further observations (Chan's parallel formula).
+
+        Args:
+            count: number of the observations.
+            mean: their mean, shape ``(size,)``.
+            var: their variance, without Bessel's correction, shape ``(size,)``.
+        """
+        total = self.count + count
+        share = count / total
         delta = mean - self.mean
         self.var.lerp_(var, share).add_(delta.square() * share * (1 - share))
         self.mean.add_(delta * share)
         self.count.copy_(total)
+
+
+@torch.no_grad()
+def moments(observation: torch.Tensor) -> tuple[int, torch.Tensor, torch.Tensor]:
+    """Returns the number of observations of shape ``(..., size)``, their mean and variance, each ``(size,)``."""
+    batch = observation.flatten(0, -2)
+    var, mean = torch.var_mean(batch, dim=0, correction=0)
+    return len(batch), mean, var
 
 
 class Policy(TensorDictModule):

@@ -6,6 +6,7 @@ import os
 import re
 import resource
 import shutil
+import zipfile
 
 import pytest
 import torch
@@ -73,8 +74,10 @@ def test_a_run_needs_an_undamaged_checkpoint_of_this_version(ppo_run, tmp_path):
         with pytest.raises(error, match=message):
             Trainer(run, resume=True)
 
+    with zipfile.ZipFile(path) as archive:
+        largest = archive.read(max(archive.infolist(), key=lambda info: info.file_size))
     changed = bytearray(good)
-    changed[len(good) // 2] ^= 1
+    changed[good.index(largest) + len(largest) // 2] ^= 1
     for bad in (b"no checkpoint at all", good[: len(good) // 2], bytes(changed)):
         path.write_bytes(bad)
         refused(ValueError, "checkpoint.pt cannot be read as a checkpoint")

@@ -1,3 +1,4 @@
+from . import distributed as distributed
 from .config import PPOConfig as PPOConfig
 from .config import REPPOConfig as REPPOConfig
 from .config import TrainingConfig as TrainingConfig

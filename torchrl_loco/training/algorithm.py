@@ -10,8 +10,9 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
-from torchrl_loco.policy import ObservationNorm
+from torchrl_loco.policy import ObservationNorm, moments
 from torchrl_loco.sim import TorchGraph
+from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig
 
 WARMUP = 3
@@ -38,7 +39,7 @@ class Algorithm(ABC):
         self.config = config
         self.device = torch.device(config.device)
         self.optimizers: dict[str, torch.optim.Adam] = {}
-        self.generator = torch.Generator(config.device).manual_seed(config.seed)
+        self.generator = torch.Generator(config.device).manual_seed(distributed.own_seed(config.seed))
         self._indices = torch.zeros(config.minibatch_size, dtype=torch.long, device=config.device)
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
         self._data: TensorDictBase | None = None
@@ -76,7 +77,7 @@ class Algorithm(ABC):
         """Updates on one batch, without synchronising with the device.
 
         Args:
-            batch: experience of shape ``(num_envs, num_steps)``.
+            batch: experience of shape ``(num_envs, num_steps)``; each rank passes its own.
             progress: fraction of the run that is done, in [0, 1], which sets the learning rate.
 
         Returns:
@@ -101,9 +102,8 @@ class Algorithm(ABC):
             for indices in order[: minibatches * config.minibatch_size].split(config.minibatch_size):
                 self._indices.copy_(indices)
                 self._step()
-        self.norm.update(
-            batch["observation"]
-        )  # after the update: the losses need the normalisation used while collecting
+        # After the update: the losses need the normalisation used while collecting.
+        self.norm.merge(*distributed.merged_moments(*moments(batch["observation"])))
         return self._totals / (config.epochs * minibatches)
 
     def _minibatch_step(self) -> None:
@@ -127,12 +127,13 @@ class Algorithm(ABC):
 
 
 def clip_and_step(optimizer: torch.optim.Optimizer, max_norm: float) -> torch.Tensor:
-    """Clips the gradients of an optimizer's parameters to a norm and makes its step.
+    """Averages the gradients of an optimizer's parameters over the ranks, clips them to a norm and makes its step.
 
     Returns:
         The norm before, a scalar.
     """
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    distributed.average_gradients(parameters)
     norm = nn.utils.clip_grad_norm_(parameters, max_norm)
     optimizer.step()
     return norm

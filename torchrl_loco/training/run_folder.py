@@ -20,6 +20,7 @@ from torchrl_loco import storage
 from torchrl_loco.checks import check_device, check_run, is_run_group
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import env_class
+from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig, config_from_json
 from torchrl_loco.training.loggers import check_loggers
 
@@ -75,7 +76,7 @@ class RunFolder:
 
     It holds ``config.json``, ``metrics.csv``, ``evaluations.csv``, ``checkpoint.pt``, ``policy.safetensors``,
     ``learning_curve.png``, ``video.mp4``, what its loggers write (``tensorboard/``, ``wandb/``, ``mlflow.db``), and
-    ``nan_dump.safetensors`` if a world became non-finite.
+    ``nan_dump.safetensors`` if a world became non-finite. ``launch.txt`` names the launch by torchrun that began it.
 
     Args:
         path: an existing run folder.
@@ -101,7 +102,15 @@ class RunFolder:
         """
         path = new_folder(config, f"seed{config.seed}")
         (path / "config.json").write_text(json.dumps(config.to_json(), indent=2) + "\n")
+        if launch := distributed.launch_id():
+            (path / "launch.txt").write_text(launch)
         return cls(path)
+
+    @classmethod
+    def of_launch(cls, config: TrainingConfig) -> "RunFolder | None":
+        """Returns the run in ``config.out`` that this launch by torchrun has begun, if any; the newest of several."""
+        files = [file for file in Path(config.out).glob("*/launch.txt") if file.read_text() == distributed.launch_id()]
+        return cls(max(files, key=lambda file: file.stat().st_mtime).parent) if files else None
 
     def load_config(self, **overrides: Any) -> TrainingConfig:
         """Returns the settings of the run, with ``overrides`` on top, such as ``device="cpu"`` for a run from CUDA.

@@ -1,8 +1,10 @@
 """The training loop: collect, update, log; evaluate and save now and then; plot and record at the end."""
 
 import contextlib
+import dataclasses
 import math
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +20,7 @@ from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs.autoreset import TransformedEnv
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import env_class, make
+from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.config import TrainingConfig
@@ -34,30 +37,47 @@ ALGORITHMS: dict[str, Callable[[Any], Algorithm]] = {"ppo": PPO, "reppo": REPPO}
 class Trainer:
     """A training run: environment, algorithm, collector and counters.
 
+    Within :func:`torchrl_loco.training.distributed.joined` each rank makes a trainer of the same run, steps worlds of
+    its own, and learns from those of all ranks; rank 0 alone writes into the folder. ``num_envs`` and
+    ``minibatch_size`` are those of a rank; frames count all ranks'.
+
     Args:
         run: the folder from which settings are read and into which everything is written.
         resume: whether to continue from the run's checkpoint. On the CPU, a run that was stopped and resumed equals one
-            that was not, bit for bit.
+            that was not, bit for bit. With another number of ranks, parameters and counters continue, the worlds start
+            anew, and what that changes is printed.
 
     Raises:
         FileNotFoundError: there is no checkpoint to resume from.
-        ValueError: the checkpoint cannot be read, or the run is complete.
+        ValueError: the checkpoint cannot be read, the run is complete, or too short for so many ranks.
         ImportError: the package of a logger is missing.
     """
 
     def __init__(self, run: RunFolder, resume: bool = False) -> None:
         self.run = run
-        self.config = config = run.load_config()
+        config = run.load_config()
+        self.config = config = dataclasses.replace(config, device=distributed.own_device(config.device))
         check_device(config.device)
         check_loggers(config.logger)
         checkpoint = run.load_checkpoint(config.device) if resume else None
+        if checkpoint is None and config.total_frames < self.frames_per_iteration:
+            raise ValueError(
+                f"total_frames ({config.total_frames}) must be at least {self.frames_per_iteration}: one batch of "
+                f"{config.frames_per_batch} on each of {distributed.ranks()} ranks"
+            )
         torch.manual_seed(config.seed)
-        self.env = make_env(config, run.nan_dump)
+        first, rank = distributed.is_first(), distributed.rank()
+        self.env = make_env(config, run.nan_dump if first else run.nan_dump.with_stem(f"nan_dump_rank{rank}"))
         self.algorithm = ALGORITHMS[config.algorithm](config)
         self.collector = RolloutCollector(self.env, self.algorithm.actor, frames_per_batch=config.batch_size)
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
+        if not first:  # the networks began alike, from here on each rank draws actions of its own
+            torch.manual_seed(distributed.own_seed(config.seed))
         if checkpoint is not None:
             self._load(checkpoint)
+        elif first:
+            run.forget_after(0)  # what a process wrote that torchrun has restarted before its first checkpoint
+        distributed.copy_from_first(self.algorithm.networks.state_dict().values())
         self._evaluator: Evaluator | None = None
 
     def train(self) -> None:
@@ -74,41 +94,59 @@ class Trainer:
         with settings_for_small_networks():
             self._train()
             self.save()
-            self._finish()
+            if distributed.is_first():
+                self._finish()
+            distributed.wait_for_all()
 
     def _train(self) -> None:
-        config = self.config
+        config, first = self.config, distributed.is_first()
         saved = time.perf_counter()
         with (
-            Loggers(self.run, self.frames) as loggers,
-            tqdm(total=self.last_frame, initial=self.frames, unit="frame", unit_scale=True, desc=config.task) as bar,
+            Loggers(self.run, self.frames) if first else contextlib.nullcontext() as loggers,
+            tqdm(
+                **{"total": self.last_frame, "initial": self.frames, "desc": config.task},
+                **{"unit": "frame", "unit_scale": True, "disable": not first},
+            ) as bar,
             interruptible() as interrupted,
         ):
             while self.frames < self.last_frame:
                 row = self._iterate()
-                self.run.append_metrics(row)
-                loggers.log(row, self.frames)
+                if loggers is not None:
+                    self.run.append_metrics(row)
+                    loggers.log(row, self.frames)
                 bar.set_postfix({"return": f"{row['return']:.0f}"}, refresh=False)
-                bar.update(config.frames_per_batch)
+                bar.update(self.frames_per_iteration)
                 if self.frames >= self.last_frame or self._evaluation_is_due():
-                    loggers.log({"evaluation": self._evaluate()["mean"]}, self.frames)
-                if interrupted() or time.perf_counter() - saved > config.checkpoint_seconds:
+                    if loggers is not None:
+                        loggers.log({"evaluation": self._evaluate()["mean"]}, self.frames)
+                    distributed.wait_for_all()
+                is_late = time.perf_counter() - saved > config.checkpoint_seconds
+                stop, is_late = distributed.any_rank(interrupted(), is_late)
+                if stop or is_late:
                     self.save()
                     saved = time.perf_counter()
-                if interrupted():
-                    plot_runs([self.run], self.run.path / "learning_curve.png")
+                if stop:
+                    if first:
+                        plot_runs([self.run], self.run.path / "learning_curve.png")
                     raise KeyboardInterrupt
 
     @property
     def device_name(self) -> str:
-        """Name of the device."""
+        """Name of the device, with the number of ranks if there are several."""
         device = self.algorithm.device
-        return torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+        name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+        return name if distributed.ranks() == 1 else f"{distributed.ranks()} x {name}"
+
+    @property
+    def frames_per_iteration(self) -> int:
+        """Frames between two updates, over all ranks."""
+        return self.config.frames_per_batch * distributed.ranks()
 
     @property
     def last_frame(self) -> int:
-        """Frames of a complete run, in whole batches."""
-        return self.config.total_frames // self.config.frames_per_batch * self.config.frames_per_batch
+        """Frames of a complete run, in whole batches from here on."""
+        batches = (self.config.total_frames - self.frames) // self.frames_per_iteration
+        return self.frames + batches * self.frames_per_iteration
 
     def _iterate(self) -> dict[str, float]:
         """Returns the metrics of collecting a batch and updating on it; reads from the device once."""
@@ -117,8 +155,8 @@ class Trainer:
         batch = self.collector.rollout()
         reward = batch["next", "reward"].mean() / config.action_repeat
         metrics = algorithm.update(batch, progress=self.frames / config.total_frames)
-        mean_reward, *means = torch.cat([reward.view(1), metrics]).tolist()
-        self.frames += config.frames_per_batch
+        mean_reward, *means = distributed.mean_of_ranks(torch.cat([reward.view(1), metrics])).tolist()
+        self.frames += self.frames_per_iteration
         self.iteration += 1
         seconds = time.perf_counter() - start
         self.seconds += seconds
@@ -126,14 +164,14 @@ class Trainer:
             "iteration": self.iteration,
             "frames": self.frames,
             "seconds": round(self.seconds, 3),
-            "frames_per_second": round(config.frames_per_batch / seconds, 1),
+            "frames_per_second": round(self.frames_per_iteration / seconds, 1),
             "return": round(mean_reward * full_length, 3),
             **{name: round(value, 6) for name, value in zip(algorithm.metric_names, means, strict=True)},
         }
 
     def _evaluation_is_due(self) -> bool:
         interval = self.config.eval_interval
-        return interval > 0 and self.frames % interval < self.config.frames_per_batch
+        return interval > 0 and self.frames % interval < self.frames_per_iteration
 
     def _evaluate(self) -> dict[str, float]:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""
@@ -164,19 +202,21 @@ class Trainer:
             print(note)
 
     def save(self) -> None:
-        """Writes the checkpoint, from which a run continues exactly."""
+        """Writes the checkpoint, from which a run continues exactly; all ranks must call it."""
         on_cuda = self.algorithm.device.type == "cuda"
-        self.run.save_checkpoint(
-            {
-                "frames": self.frames,
-                "iteration": self.iteration,
-                "seconds": self.seconds,
-                "algorithm": self.algorithm.state_dict(),
-                "collector": self.collector.state_dict(),
-                "rng": torch.get_rng_state(),
-                "cuda_rng": torch.cuda.get_rng_state(self.algorithm.device) if on_cuda else None,
-            }
-        )
+        own = {
+            "collector": self.collector.state_dict(),
+            "rng": torch.get_rng_state(),
+            "cuda_rng": torch.cuda.get_rng_state(self.algorithm.device) if on_cuda else None,
+        }
+        if not distributed.is_first():  # that of rank 0 is the algorithm's
+            own["generator"] = self.algorithm.generator.get_state()
+        ranks = distributed.gathered(own)
+        if distributed.is_first():
+            counters = {"frames": self.frames, "iteration": self.iteration, "seconds": self.seconds}
+            algorithm = {"algorithm": self.algorithm.state_dict()}
+            self.run.save_checkpoint({**counters, **algorithm, **ranks[0], "further_ranks": ranks[1:]})
+        distributed.wait_for_all()
 
     def _load(self, checkpoint: dict[str, Any]) -> None:
         self.frames, self.iteration, self.seconds = (checkpoint[key] for key in ("frames", "iteration", "seconds"))
@@ -184,16 +224,50 @@ class Trainer:
             raise ValueError(
                 f"{self.run.path} is complete: it has all of its {self.frames} frames. Train a new run for more"
             )
+        rank = distributed.rank()
+        generator = self.algorithm.generator.get_state()
         self.algorithm.load_state_dict(checkpoint["algorithm"])
-        self.collector.load_state_dict(checkpoint["collector"])
-        self.run.forget_after(self.frames)
-        torch.set_rng_state(checkpoint["rng"].cpu())
-        if checkpoint["cuda_rng"] is not None and self.algorithm.device.type == "cuda":
-            torch.cuda.set_rng_state(checkpoint["cuda_rng"].cpu(), self.algorithm.device)
+        if distributed.is_first():
+            self.run.forget_after(self.frames)
+        before = 1 + len(checkpoint.get("further_ranks", ()))  # a checkpoint without is of one process
+        if before != distributed.ranks():
+            self.algorithm.generator.set_state(generator)
+            self._say_what_changes(before)
+            return
+        own = checkpoint if rank == 0 else checkpoint["further_ranks"][rank - 1]
+        self.collector.load_state_dict(own["collector"])
+        torch.set_rng_state(own["rng"].cpu())
+        if own["cuda_rng"] is not None and self.algorithm.device.type == "cuda":
+            torch.cuda.set_rng_state(own["cuda_rng"].cpu(), self.algorithm.device)
+        if rank > 0:
+            self.algorithm.generator.set_state(own["generator"].cpu())
+
+    def _say_what_changes(self, ranks_before: int) -> None:
+        """Prints what a run gets that was trained by another number of ranks.
+
+        Raises:
+            ValueError: what remains is less than a batch of so many ranks.
+        """
+        if self.frames >= self.last_frame:
+            raise ValueError(
+                f"only {self.config.total_frames - self.frames} frames remain, less than a batch of "
+                f"{distributed.ranks()} ranks ({self.frames_per_iteration}): continue with {ranks_before}, as before"
+            )
+        if distributed.is_first():
+            config, now = self.config, distributed.ranks()
+            print(
+                f"ranks: {ranks_before} so far, {now} from here on. A batch has {now * config.num_envs} worlds instead "
+                f"of {ranks_before * config.num_envs}, a gradient step {now * config.minibatch_size} steps instead of "
+                f"{ranks_before * config.minibatch_size}. All worlds start anew; networks, optimizers and counters "
+                "continue",
+                file=sys.stderr,
+            )
 
 
 def make_env(config: TrainingConfig, nan_dump: Path) -> EnvBase:
     """Returns the environment of a run: each action is held for ``config.action_repeat`` frames, rewards are summed.
+
+    Its worlds are those of this rank: world k of rank r is world ``r * num_envs + k`` of the whole.
 
     If a world becomes non-finite, a NaN dump is written to ``nan_dump``, unless one is already there.
     """
@@ -203,7 +277,7 @@ def make_env(config: TrainingConfig, nan_dump: Path) -> EnvBase:
         config.device,
         config.seed,
         config.protocol,
-        world_offset=0,
+        world_offset=distributed.rank() * config.num_envs,
         stagger=True,
         episode_length=config.episode_length,
         nan_dump=None if nan_dump.exists() else nan_dump,

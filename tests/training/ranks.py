@@ -1,0 +1,104 @@
+"""Ranks for tests: processes connected by gloo, and what they do."""
+
+import itertools
+import signal
+import uuid
+
+import torch
+from small_runs import SMALL, made, small_walker
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
+from torchrl_loco.training import RunFolder, Trainer, distributed
+from torchrl_loco.training.algorithm import Algorithm
+
+BATCH = SMALL["num_envs"] * SMALL["num_steps"] * SMALL["action_repeat"]
+"""Frames in a batch of one rank."""
+
+
+def in_ranks(function, *args, count=2):
+    """Runs a function of this module in several ranks; returns what each has returned, in their order."""
+    config = LaunchConfig(
+        *(1, 1, count),
+        run_id=str(uuid.uuid4()),
+        rdzv_backend="c10d",
+        rdzv_endpoint="localhost:0",
+        max_restarts=0,
+    )
+    results = elastic_launch(config, _connected)(function, *args)
+    return [results[rank] for rank in range(count)]
+
+
+def _connected(function, *args):
+    torch.set_num_threads(1)
+    with distributed.joined("cpu"), small_walker():
+        return function(*args)
+
+
+def messages():
+    """Returns what the functions of the module give this rank."""
+    rank = distributed.rank()
+    samples = torch.randn(10, 3, generator=torch.Generator().manual_seed(rank)) * 3 + 100 * rank
+    var, mean = torch.var_mean(samples, dim=0, correction=0)
+    parameters = [torch.nn.Parameter(torch.zeros(shape)) for shape in ((2, 3), (), (4,))]
+    parameters[0].grad, parameters[1].grad = torch.full((2, 3), 1.0 + rank), torch.tensor(4.0 * rank)
+    distributed.average_gradients(parameters)
+    copied = torch.full((2,), float(rank))
+    distributed.copy_from_first([copied])
+    return {
+        "gradients": [parameter.grad for parameter in parameters],
+        "samples": samples,
+        "moments": distributed.merged_moments(len(samples), mean, var),
+        "mean": distributed.mean_of_ranks(torch.tensor([rank, 3.0])),
+        "any": distributed.any_rank(rank == 1, False),
+        "copied": copied,
+        "from_first": distributed.from_first(f"of {rank}"),
+        "gathered": [state["rank"] for state in distributed.gathered({"rank": rank})],
+    }
+
+
+def whole_and_resumed(out, algorithm):
+    """Trains a run at once, and another that rank 1 is asked to end in its second update, after which it is resumed.
+
+    Returns the folders of both, and of each update of the first one the batch, and the parameters afterwards.
+    """
+    settings = {"total_frames": 4 * 2 * BATCH, "episode_length": 23, "logger": ("csv",)}
+    update, updates = Algorithm.update, []
+
+    def noted(self, batch, progress):
+        metrics = update(self, batch, progress)
+        updates.append((batch.clone().to_dict(), [tensor.clone() for tensor in self.networks.state_dict().values()]))
+        return metrics
+
+    def new_run(name):
+        return RunFolder(distributed.from_first(made(out / name, algorithm, **settings).path if is_first else None))
+
+    is_first = distributed.is_first()
+    try:
+        Algorithm.update = noted
+        whole = new_run("whole")
+        Trainer(whole).train()
+
+        calls = itertools.count(1)
+
+        def asked_to_end(self, batch, progress):
+            if next(calls) == 2 and not is_first:
+                signal.raise_signal(signal.SIGTERM)
+            return update(self, batch, progress)
+
+        Algorithm.update = asked_to_end
+        stopped = new_run("stopped")
+        try:
+            Trainer(stopped).train()
+        except KeyboardInterrupt:
+            iteration = stopped.load_checkpoint("cpu")["iteration"]
+    finally:
+        Algorithm.update = update
+    distributed.wait_for_all()
+    Trainer(stopped, resume=True).train()
+    return {"whole": whole.path, "stopped": stopped.path, "stopped_at": iteration, "updates": updates}
+
+
+def of_both_algorithms(out):
+    """Returns all of the above."""
+    runs = {algorithm: whole_and_resumed(out / algorithm, algorithm) for algorithm in ("ppo", "reppo")}
+    return {"messages": messages(), **runs}

@@ -1,0 +1,296 @@
+"""Data parallel training: one process a GPU, each with worlds of its own and all with the same parameters.
+
+``torchrun`` starts the processes, the ranks; :func:`joined` connects them, by NCCL on CUDA and by gloo on the CPU. In a
+process of its own every function here returns what it was given, so that the rest of the training need not ask.
+"""
+
+import contextlib
+import datetime
+import io
+import os
+import socket
+import sys
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import nn
+
+T = TypeVar("T")
+
+TIMEOUT = datetime.timedelta(hours=2)
+"""For how long a rank waits for another. Rank 0 evaluates and records alone; a rank that dies is noticed at once."""
+
+GRACE = 5.0
+"""Seconds for which a rank that lost another one stays alive, so that torchrun sees first which one died."""
+
+
+class RankLostError(ConnectionError):
+    """Another rank ended while this one needed it."""
+
+
+# Who is who.
+
+
+def rank() -> int:
+    """Returns the number of this process among all; 0 if it is the only one."""
+    return dist.get_rank() if _connected() else 0
+
+
+def ranks() -> int:
+    """Returns the number of processes; 1 if this is the only one."""
+    return dist.get_world_size() if _connected() else 1
+
+
+def is_first() -> bool:
+    """Returns whether this rank writes the run folder, evaluates and talks."""
+    return rank() == 0
+
+
+def _connected() -> bool:
+    return dist.is_available() and dist.is_initialized()
+
+
+def was_launched() -> bool:
+    """Returns whether torchrun, or a launcher with the same environment variables, started this as one of several."""
+    return "RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
+
+
+def launch_id() -> str | None:
+    """Returns a name of the launch by torchrun that stays the same when it restarts its processes, if there is one."""
+    of = os.environ.get("TORCHELASTIC_RUN_ID")
+    if of == "none":  # torchrun's default; the process that starts and restarts this one is unique on its machine
+        return f"{socket.gethostname()} {os.getppid()}"
+    return of
+
+
+def is_restart() -> bool:
+    """Returns whether torchrun started this process in place of one that failed."""
+    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+
+
+def own_device(device: str) -> str:
+    """Returns the device of this rank: on CUDA, the GPU that has the number of the rank on its machine.
+
+    Raises:
+        ValueError: ``device`` names another GPU than the first for several ranks.
+    """
+    if ranks() == 1 or device == "cpu":
+        return device
+    if device not in ("cuda", "cuda:0"):
+        raise ValueError(
+            f"device {device!r} is one GPU, but there are {ranks()} ranks, each with a GPU of its own: pass "
+            "device='cuda', and choose GPUs by CUDA_VISIBLE_DEVICES"
+        )
+    return f"cuda:{torch.cuda.current_device()}"
+
+
+def own_seed(seed: int) -> int:
+    """Returns the seed from which this rank draws actions and minibatches; rank 0 draws from ``seed`` itself.
+
+    It has 32 bits: on the CPU, torch ignores further ones.
+    """
+    return (seed + rank() * 0x9E3779B9) % 2**32
+
+
+# Start and end.
+
+
+@contextlib.contextmanager
+def joined(device: str) -> Iterator[None]:
+    """Connects the ranks that torchrun started, while the block lasts, and gives each its GPU.
+
+    Args:
+        device: what the run computes on; its kind chooses NCCL or gloo.
+
+    Yields:
+        Nothing.
+
+    Raises:
+        ValueError: this machine has no GPU for this rank.
+    """
+    if not was_launched() or _connected():
+        yield
+        return
+    on_cuda = torch.device(device).type == "cuda"
+    own = None
+    if on_cuda:
+        index, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
+        if index >= count:
+            raise ValueError(f"no GPU for local rank {index}, this machine has {count}: start one process a GPU")
+        own = torch.device("cuda", index)
+        torch.cuda.set_device(own)
+    dist.init_process_group("nccl" if on_cuda else "gloo", timeout=TIMEOUT, device_id=own)
+    yield
+    # After an error the group is left to the end of the process: closing it could wait for ranks that are gone.
+    dist.destroy_process_group()
+
+
+def launch(count: int, args: Sequence[str]) -> None:
+    """Runs the command line in several processes of this machine, as ``torchrun --standalone`` does.
+
+    Args:
+        count: number of processes.
+        args: the arguments of ``torchrl-loco``.
+
+    Raises:
+        SystemExit: a rank failed; its number is printed.
+        KeyboardInterrupt: Ctrl-C or SIGTERM, after which all ranks have ended.
+    """
+    from torch.distributed.elastic.multiprocessing.api import SignalException
+    from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+    from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
+    config = LaunchConfig(
+        min_nodes=1,
+        max_nodes=1,
+        nproc_per_node=count,
+        run_id=str(uuid.uuid4()),
+        rdzv_backend="c10d",
+        rdzv_endpoint="localhost:0",
+        max_restarts=0,
+    )
+    try:
+        elastic_launch(config, sys.executable)("-m", "torchrl_loco", *args)
+    except ChildFailedError as error:
+        number, failure = error.get_first_failure()
+        if failure.exitcode == 130:
+            raise KeyboardInterrupt from None
+        how = f"status {failure.exitcode}" if failure.exitcode > 0 else f"signal {failure.signal_name()}"
+        print(f"torchrl-loco: rank {number} (process {failure.pid}) ended with {how}", file=sys.stderr)
+        raise SystemExit(max(failure.exitcode, 1)) from None
+    except SignalException:
+        raise KeyboardInterrupt from None
+
+
+# What ranks tell each other. All ranks must make the same calls in the same order.
+
+
+def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
+    """Replaces gradients by their mean over the ranks, in one message; CUDA can record it.
+
+    Args:
+        parameters: parameters of any shape ``(...)``; those without a gradient must be the same on all ranks.
+    """
+    if ranks() == 1:
+        return
+    with_gradient = [(parameter, parameter.grad) for parameter in parameters if parameter.grad is not None]
+    bucket = torch.cat([gradient.flatten() for _, gradient in with_gradient])
+    _sum(bucket)
+    bucket /= ranks()
+    parts = bucket.split([gradient.numel() for _, gradient in with_gradient])
+    for (parameter, gradient), part in zip(with_gradient, parts, strict=True):
+        parameter.grad = part.view_as(gradient)
+
+
+def merged_moments(
+    count: float | torch.Tensor, mean: torch.Tensor, var: torch.Tensor
+) -> tuple[float | torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Returns number, mean and variance of the samples of all ranks, exactly (Chan's formula).
+
+    Args:
+        count: number of samples of this rank.
+        mean: their mean, shape ``(n,)``.
+        var: their variance, without Bessel's correction, shape ``(n,)``.
+    """
+    if ranks() == 1:
+        return count, mean, var
+    own = torch.cat([torch.as_tensor(count, dtype=mean.dtype, device=mean.device).view(1), mean, var])
+    rows = own.new_empty(ranks(), len(own))
+    with _peers():
+        dist.all_gather(list(rows.unbind()), own)
+    counts, means, variances = rows.split([1, len(mean), len(var)], dim=1)
+    total = counts.sum()
+    shares = counts / total
+    merged = (shares * means).sum(0)
+    return total, merged, (shares * (variances + (means - merged).square())).sum(0)
+
+
+def mean_of_ranks(values: torch.Tensor) -> torch.Tensor:
+    """Returns the mean over the ranks of ``values``, of any shape ``(...)``."""
+    if ranks() == 1:
+        return values
+    values = values.clone()
+    _sum(values)
+    return values / ranks()
+
+
+def any_rank(*flags: bool) -> list[bool]:
+    """Returns for each flag whether it is set on some rank."""
+    if ranks() == 1:
+        return list(flags)
+    counts = torch.tensor(flags, dtype=torch.float32, device=_device())
+    _sum(counts)
+    return [count > 0 for count in counts.tolist()]
+
+
+def copy_from_first(tensors: Iterable[torch.Tensor]) -> None:
+    """Overwrites ``tensors``, each of any shape ``(...)``, with those of rank 0."""
+    if ranks() > 1:
+        for tensor in tensors:
+            with _peers():
+                dist.broadcast(tensor, src=0)
+
+
+def from_first(value: T) -> T:
+    """Returns the value of rank 0, which pickle must be able to copy."""
+    if ranks() == 1:
+        return value
+    values = [value]
+    with _peers():
+        dist.broadcast_object_list(values, src=0, device=_device())
+    return values[0]
+
+
+def gathered(state: dict[str, Any]) -> list[dict[str, Any]]:
+    """Collects a state from each rank.
+
+    Args:
+        state: tensors and numbers, in dictionaries.
+
+    Returns:
+        On rank 0 those of all ranks in their order, with tensors on the CPU; nothing elsewhere.
+    """
+    if ranks() == 1:
+        return [state]
+    buffer = io.BytesIO()  # a pickled tensor of CUDA would be put on its rank's GPU again
+    torch.save(state, buffer)
+    parts: list[Any] | None = [None] * ranks() if is_first() else None
+    with _peers():
+        dist.gather_object(buffer.getvalue(), parts)
+    return [torch.load(io.BytesIO(part), map_location="cpu", weights_only=True) for part in parts or ()]
+
+
+def wait_for_all() -> None:
+    """Waits until every rank has come here."""
+    if ranks() > 1:
+        with _peers():
+            dist.barrier()
+
+
+def _sum(tensor: torch.Tensor) -> None:
+    with _peers():
+        dist.all_reduce(tensor)
+
+
+def _device() -> torch.device:
+    """Returns where the messages of this rank lie."""
+    return torch.device("cuda", torch.cuda.current_device()) if dist.get_backend() == "nccl" else torch.device("cpu")
+
+
+@contextlib.contextmanager
+def _peers() -> Iterator[None]:
+    """Names a failed message as what it mostly is.
+
+    Raises:
+        RankLostError: it failed.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        time.sleep(GRACE)
+        reason = str(error).splitlines()[0]
+        raise RankLostError(f"the other ranks cannot be reached, one of them probably ended: {reason}") from error
