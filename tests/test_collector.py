@@ -122,7 +122,12 @@ def on_cuda(task, wrap=False, num_envs=64, **settings):
     return torchrl_loco.TransformedEnv(env, Compose(InitTracker(), RewardSum())) if wrap else env
 
 
+compiled_bodies = pytest.mark.parametrize("body_task", ["walker_run", "humanoid_run", "cheetah_run", "hopper_hop"])
+still_bodies = pytest.mark.parametrize("body_task", ["walker_run", "humanoid_run"])  # they begin at rest
+
+
 @pytest.mark.gpu
+@compiled_bodies
 @pytest.mark.parametrize("exploration", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
 @pytest.mark.parametrize("wrap", [False, True])
 def test_recorded_batches_equal_steps_taken_one_by_one(body_task, protocol, wrap, exploration):
@@ -168,6 +173,7 @@ def test_no_synchronisation(task, wrap):
 
 
 @pytest.mark.gpu
+@compiled_bodies
 def test_recorded_batches_share_no_memory_and_need_no_more_of_it(body_task):
     env = on_cuda(body_task)
     collector = RolloutCollector(env, policy(env), frames_per_batch=64 * 5)
@@ -186,6 +192,7 @@ def test_recorded_batches_share_no_memory_and_need_no_more_of_it(body_task):
 
 
 @pytest.mark.gpu
+@still_bodies
 def test_a_recording_goes_on_from_a_state_and_from_a_closed_environment(body_task):
     env, other = on_cuda(body_task), on_cuda(body_task)
     collector, second = (RolloutCollector(made, policy(made), frames_per_batch=64 * 5) for made in (env, other))

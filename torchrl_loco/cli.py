@@ -495,7 +495,9 @@ def _joined(device: str) -> Iterator[None]:
     """Connects the ranks of torchrun, if there are several, while the block lasts."""
     from torchrl_loco.training import distributed
 
-    with _user_errors(OSError), distributed.joined(device):
+    with contextlib.ExitStack() as ranks:
+        with _user_errors():
+            ranks.enter_context(distributed.joined(device))
         yield
 
 

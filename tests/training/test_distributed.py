@@ -6,7 +6,7 @@ import pytest
 import torch
 from compare import assert_same
 from ranks import BATCH, in_ranks, of_both_algorithms
-from small_runs import SMALL, small_walker
+from small_runs import SMALL, made, small_walker
 
 import torchrl_loco
 from torchrl_loco import cli
@@ -60,7 +60,9 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(ranks, algorithm):
     first, second = whole.load_checkpoint("cpu"), stopped.load_checkpoint("cpu")
     for name in ("frames", "iteration", "algorithm", "collector", "rng", "further_ranks"):
         assert_same({name: first[name]}, {name: second[name]})
-    assert len(first["further_ranks"]) == 1
+    (further,) = first["further_ranks"]
+    assert not torch.equal(first["rng"], further["rng"])  # each rank draws actions and minibatches of its own
+    assert not torch.equal(first["algorithm"]["generator"], further["generator"])
     assert first["frames"] == 4 * 2 * BATCH
     assert whole.read_metrics()["return"] == stopped.read_metrics()["return"]
     assert whole.is_finished
@@ -114,6 +116,20 @@ def test_one_process_is_all_there_is():
     assert distributed.own_device("cuda:3") == "cuda:3"
     with distributed.joined("cpu"):
         assert not torch.distributed.is_initialized()
+
+
+def test_what_several_ranks_cannot_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(distributed, "ranks", lambda: 2)
+    with pytest.raises(ValueError, match="device 'cuda:3' is one GPU, but there are 2 ranks"):
+        distributed.own_device("cuda:3")
+    run = made(tmp_path, total_frames=2 * BATCH - 1)
+    with pytest.raises(ValueError, match=rf"total_frames \({2 * BATCH - 1}\) must be at least {2 * BATCH}"):
+        Trainer(run)
+    for name, value in {"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(ValueError, match="no GPU for local rank 1, this machine has 1"), distributed.joined("cuda"):
+        pass
 
 
 def test_wrong_numbers_of_gpus(tmp_path, monkeypatch, capsys):

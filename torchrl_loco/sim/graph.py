@@ -112,6 +112,13 @@ class TorchGraph:
             self._graph = graph
         self._graph.replay()
 
+    def release(self) -> None:
+        """Forgets the recording; the next call records anew."""
+        if self._graph is not None:
+            torch.cuda.synchronize(self._device)
+            self._graph.reset()
+            self._graph = None
+
 
 class ScratchPool:
     """A Warp allocator for launches that will be recorded. It reuses freed blocks and never returns them to the device.

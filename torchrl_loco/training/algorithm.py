@@ -110,6 +110,11 @@ class Algorithm(ABC):
         assert self._data is not None
         self._totals += torch.stack([metric.detach() for metric in self.gradient_step(self._data[self._indices])])
 
+    def release(self) -> None:
+        """Forgets the recorded gradient step: NCCL's communicators wait at their end for graphs that contain them."""
+        if isinstance(self._step, TorchGraph):
+            self._step.release()
+
     def state_dict(self) -> dict[str, Any]:
         """Returns all that an exact continuation needs."""
         return {

@@ -79,10 +79,10 @@ FAR_SIGHTED: Settings = {"gamma": 0.995, "max_value": 250.0, "minibatch_size": 4
 TASKS: dict[tuple[str, str], Settings] = {
     ("reppo", "walker_stand"): {**WALKER, **GETTING_UP, **FAR_SIGHTED},
     ("reppo", "walker_walk"): {**WALKER, **GETTING_UP, **FAR_SIGHTED},
-    ("reppo", "walker_run"): {**WALKER, "total_frames": 80_000_000},
+    ("reppo", "walker_run"): {**WALKER, "total_frames": 100_000_000},
     ("reppo", "humanoid_stand"): {"total_frames": 80_000_000, **NO_FLOOR},
     ("reppo", "humanoid_walk"): {"total_frames": 120_000_000, **NO_FLOOR},
-    ("reppo", "humanoid_run"): {"total_frames": 200_000_000},
+    ("reppo", "humanoid_run"): {"total_frames": 100_000_000},
 }
 """Further settings of a task on CUDA, by algorithm and task."""
 

@@ -92,7 +92,10 @@ class Trainer:
             OSError: a logger cannot be opened.
         """
         with settings_for_small_networks():
-            self._train()
+            try:
+                self._train()
+            finally:
+                self.algorithm.release()
             self.save()
             if distributed.is_first():
                 self._finish()
