@@ -542,11 +542,17 @@ def _train(trainer: "training.Trainer") -> None:
             trainer.train()
     except (KeyboardInterrupt, SystemExit):
         if first and trainer.run.has_checkpoint:
-            ending = f" --gpus {ranks}" if ranks > 1 else ""
-            print(f"to continue: torchrl-loco resume {trainer.run.path}{ending}", file=sys.stderr)
+            print(f"to continue: {_way_to_resume(trainer.run.path, ranks)}", file=sys.stderr)
         raise
     if first:
         print(f"policy, curve, video and logs: {trainer.run.path}")
+
+
+def _way_to_resume(run: Path, ranks: int) -> str:
+    """Returns the command that continues a run with the same number of ranks."""
+    if ranks > 1 and os.environ.get("LOCAL_WORLD_SIZE") != str(ranks):
+        return f"torchrun, with the options of this launch, -m torchrl_loco resume {run}"
+    return f"torchrl-loco resume {run}" + (f" --gpus {ranks}" if ranks > 1 else "")
 
 
 @contextlib.contextmanager

@@ -132,6 +132,13 @@ def test_what_several_ranks_cannot_do(tmp_path, monkeypatch):
         pass
 
 
+def test_the_way_to_resume_keeps_the_number_of_ranks(monkeypatch):
+    assert cli._way_to_resume("runs/a", 1) == "torchrl-loco resume runs/a"
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    assert cli._way_to_resume("runs/a", 2) == "torchrl-loco resume runs/a --gpus 2"
+    assert cli._way_to_resume("runs/a", 4).startswith("torchrun, with the options of this launch")  # several machines
+
+
 def test_wrong_numbers_of_gpus(tmp_path, monkeypatch, capsys):
     command = ["train", "walker_stand", "--device=cpu", f"--out={tmp_path}"]
     cases = {

@@ -13,13 +13,11 @@ import sys
 import time
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 import torch.distributed as dist
 from torch import nn
-
-T = TypeVar("T")
 
 TIMEOUT = datetime.timedelta(hours=2)
 """For how long a rank waits for another. Rank 0 evaluates and records alone; a rank that dies is noticed at once."""
@@ -235,7 +233,7 @@ def copy_from_first(tensors: Iterable[torch.Tensor]) -> None:
                 dist.broadcast(tensor, src=0)
 
 
-def from_first(value: T) -> T:
+def from_first(value: Any) -> Any:
     """Returns the value of rank 0, which pickle must be able to copy."""
     if ranks() == 1:
         return value

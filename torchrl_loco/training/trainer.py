@@ -103,13 +103,10 @@ class Trainer:
 
     def _train(self) -> None:
         config, first = self.config, distributed.is_first()
-        saved = time.perf_counter()
+        saved, frames = time.perf_counter(), {"total": self.last_frame, "initial": self.frames}
         with (
             Loggers(self.run, self.frames) if first else contextlib.nullcontext() as loggers,
-            tqdm(
-                **{"total": self.last_frame, "initial": self.frames, "desc": config.task},
-                **{"unit": "frame", "unit_scale": True, "disable": not first},
-            ) as bar,
+            tqdm(**frames, unit="frame", unit_scale=True, desc=config.task, disable=not first) as bar,
             interruptible() as interrupted,
         ):
             while self.frames < self.last_frame:
