@@ -72,7 +72,8 @@ def test_a_rank_that_dies_is_named(tmp_path):
 @pytest.mark.slow
 def test_torchrun_restarts_a_run_from_its_checkpoint(tmp_path):
     """In the same folder, without a frame lost or counted twice."""
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2", "--max-restarts=1"]
+    own_port = ["--rdzv-backend=c10d", "--rdzv-endpoint=localhost:0"]  # tests may run side by side
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2", "--max-restarts=1", *own_port]
     frames = 256 * 60
     process = started(torchrun, tmp_path, total_frames=frames)
     kill_rank_1(process, tmp_path)
