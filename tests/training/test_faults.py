@@ -69,7 +69,7 @@ def test_a_rank_that_dies_is_named(tmp_path):
     assert len(RunFolder(path).load_checkpoint("cpu")["further_ranks"]) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_torchrun_restarts_a_run_from_its_checkpoint(tmp_path):
     """In the same folder, without a frame lost or counted twice."""
     own_port = ["--rdzv-backend=c10d", "--rdzv-endpoint=localhost:0"]  # tests may run side by side

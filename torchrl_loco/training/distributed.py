@@ -18,6 +18,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from torch import nn
+from torch.distributed.rendezvous import rendezvous
 
 TIMEOUT = datetime.timedelta(hours=2)
 """For how long a rank waits for another. Rank 0 evaluates and records alone; a rank that dies is noticed at once."""
@@ -121,7 +122,11 @@ def joined(device: str) -> Iterator[None]:
             raise ValueError(f"no GPU for local rank {index}, this machine has {count}: start one process a GPU")
         own = torch.device("cuda", index)
         torch.cuda.set_device(own)
-    dist.init_process_group("nccl" if on_cuda else "gloo", timeout=TIMEOUT, device_id=own)
+    store, number, count = next(rendezvous("env://", timeout=TIMEOUT))
+    # torchrun keeps its store when it restarts the ranks: they must not find the addresses of those that are gone.
+    attempt = dist.PrefixStore(f"attempt {os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
+    backend = "nccl" if on_cuda else "gloo"
+    dist.init_process_group(backend, store=attempt, rank=number, world_size=count, timeout=TIMEOUT, device_id=own)
     yield
     # After an error the group is left to the end of the process: closing it could wait for ranks that are gone.
     dist.destroy_process_group()
