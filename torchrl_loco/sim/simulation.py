@@ -145,7 +145,7 @@ class Simulation:
         self.engine.reset(mask)
 
     def rest_state(self) -> list[wp.array]:
-        """Returns what :func:`put_at_rest` writes, for kernels that call it; ``engine.reset(mask)`` comes after."""
+        """Returns what ``put_at_rest`` writes, for kernels that call it; ``engine.reset(mask)`` comes after."""
         d = self.data
         return [d.qpos, d.qvel, d.qacc_warmstart, d.act, d.ctrl, d.time]
 
