@@ -45,14 +45,14 @@ def step_and_reset(env: "LocoEnv", tensordict: TensorDictBase) -> tuple[TensorDi
         begin.get("reward_terms").apply_(lambda terms: terms.masked_fill_(done, 0))  # nothing was rewarded yet
     for key, value in tensordict.items():
         if key not in begin:  # as in TorchRL, the policy's outputs are zero where a world was reset
-            begin._set_str(key, _zeroed(value, done), inplace=False, validated=True)
+            begin._set_str(key, value.masked_fill(_rows(done, value), 0), inplace=False, validated=True)
     tensordict.set("next", after)
     return tensordict, begin
 
 
-def _zeroed(value: torch.Tensor, done: torch.Tensor) -> torch.Tensor:
-    """Returns a copy of an entry, ``(*batch, ...)``, that is zero in the worlds that are ``done``, ``(*batch, 1)``."""
-    return value.masked_fill(done.view(*done.shape[:-1], *[1] * (value.ndim - done.ndim + 1)), 0)
+def _rows(mask: torch.Tensor, entry: torch.Tensor) -> torch.Tensor:
+    """Returns a mask of worlds, ``(*batch, 1)``, in a shape that broadcasts with an entry, ``(*batch, ...)``."""
+    return mask.view(*mask.shape[:-1], *[1] * (entry.ndim - mask.ndim + 1))
 
 
 def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:
@@ -74,7 +74,7 @@ def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBas
     fresh = env._reset(request, set_state=False)
 
     def merge(old: torch.Tensor, new: torch.Tensor | None) -> torch.Tensor:
-        rows = mask.view(*batch, *[1] * (old.ndim - len(batch)))
+        rows = _rows(mask, old)
         return old.masked_fill(rows, 0) if new is None else torch.where(rows, new, old)
 
     # As in TorchRL, entries that a reset does not return (a policy's other outputs) are zero where a world was reset.

@@ -16,7 +16,16 @@ from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.kernels import any_world, apply_action, begin_episode, finish_step, zero_non_finite
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.rendering import Renderer
-from torchrl_loco.sim import BLOCK, EXCLUSIVE, Block, Buffer, Graph, Simulation, joined_to_torch, torch_is_recording
+from torchrl_loco.sim import (
+    BLOCK_DIM,
+    EXCLUSIVE,
+    Buffer,
+    Graph,
+    PackedBuffers,
+    Simulation,
+    joined_to_torch,
+    torch_is_recording,
+)
 
 
 class Task(Protocol):
@@ -83,7 +92,7 @@ class World:
             device = self.sim.device
             self.action = Buffer((n, nu), float, device)
             sizes = [task.observation_size, 1, len(task.term_names)]
-            self.outputs = Block([n * size for size in sizes], 3 * n, task.device)
+            self.outputs = PackedBuffers([n * size for size in sizes], 3 * n, task.device)
             observation, reward, terms, flags = self.outputs.parts(self.outputs.memory)
             self.observation, self.terms = (Buffer.around(part.view(n, -1)) for part in (observation, terms))
             self.reward = Buffer.around(reward)
@@ -125,11 +134,9 @@ class World:
 
     # What the graphs record.
 
-    def _launch_step(self) -> None:
-        """The control step."""
-        self._launch_step_under(self.action.warp)
-
-    def _launch_step_under(self, action: wp.array) -> None:
+    def _launch_step(self, action: wp.array | None = None) -> None:
+        """The control step, under actions ``(nworld, nu)`` or those in the buffer."""
+        action = self.action.warp if action is None else action
         outputs = [self.action.warp, self.sim.data.ctrl, self.non_finite.warp, self._any.warp]
         self._launch(apply_action, [self.sim.model.actuator_ctrlrange, action], outputs)
         for monitor in self._monitors:
@@ -190,7 +197,7 @@ class World:
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         n, device = self.sim.num_envs, self.sim.device
-        wp.launch(kernel, dim=n, inputs=inputs, outputs=outputs, device=device, block_dim=BLOCK)
+        wp.launch(kernel, dim=n, inputs=inputs, outputs=outputs, device=device, block_dim=BLOCK_DIM)
 
     # What the environment calls. Nothing waits for the device.
 
@@ -200,7 +207,7 @@ class World:
         if torch_is_recording(self.sim.device):
             action = action.float().contiguous()
             with joined_to_torch(self.sim.device):
-                self._launch_step_under(wp.from_torch(action))
+                self._launch_step(wp.from_torch(action))
             return
         self.action.torch.copy_(action)
         self._step_graph.replay()

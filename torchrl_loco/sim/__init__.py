@@ -2,15 +2,15 @@
 
 import warp as wp
 
-from torchrl_loco.sim.buffer import Block as Block
 from torchrl_loco.sim.buffer import Buffer as Buffer
+from torchrl_loco.sim.buffer import PackedBuffers as PackedBuffers
 from torchrl_loco.sim.graph import EXCLUSIVE as EXCLUSIVE
 from torchrl_loco.sim.graph import Graph as Graph
 from torchrl_loco.sim.graph import TorchGraph as TorchGraph
 from torchrl_loco.sim.graph import current_stream as current_stream
 from torchrl_loco.sim.graph import joined_to_torch as joined_to_torch
 from torchrl_loco.sim.graph import torch_is_recording as torch_is_recording
-from torchrl_loco.sim.simulation import BLOCK as BLOCK
+from torchrl_loco.sim.simulation import BLOCK_DIM as BLOCK_DIM
 from torchrl_loco.sim.simulation import Simulation as Simulation
 
 # At its default level Warp prints a line for each of a hundred kernels that it loads. Set another level to see them.

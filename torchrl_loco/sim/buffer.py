@@ -32,7 +32,7 @@ class Buffer:
         return buffer
 
 
-class Block:
+class PackedBuffers:
     """Arrays of float32 and flags in one piece of memory, which can be copied at once.
 
     Args:

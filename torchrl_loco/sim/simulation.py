@@ -22,8 +22,7 @@ SCRATCH = 1.4
 DETERMINISTIC_SCRATCH = 11.0
 """The same with ``deterministic=True`` on CUDA (measured: 6 to 8 times the memory of a world)."""
 
-
-BLOCK = 64
+BLOCK_DIM = 64
 """Threads of a block where a thread has a world: few, so that a thousand worlds keep all multiprocessors busy."""
 
 
@@ -141,7 +140,9 @@ class Simulation:
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds where ``mask`` (bool, ``(nworld,)``) is set at rest in the default pose; others stay."""
         inputs, outputs = [self.model.qpos0, mask], self.rest_state()
-        wp.launch(reset_worlds, dim=self.num_envs, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
+        wp.launch(
+            reset_worlds, dim=self.num_envs, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK_DIM
+        )
         self.engine.reset(mask)
 
     def rest_state(self) -> list[wp.array]:
