@@ -34,11 +34,12 @@ def play(env, moves, step_and_maybe_reset):
     return torch.stack(trace)
 
 
+@pytest.mark.parametrize("reward_terms", [False, True])
 @pytest.mark.parametrize("at_once", [False, True])
 @pytest.mark.parametrize("wrap", [False, True])
-def test_same_data_as_torchrl(shared, body_task, actions, wrap, at_once):
+def test_same_data_as_torchrl(shared, body_task, actions, wrap, at_once, reward_terms):
     """Worlds end at different times: at the environment's limit, at a transform's, and by a NaN action."""
-    options = {"protocol": "dm_control", "episode_length": 12, "stagger": True, "reward_terms": True}
+    options = {"protocol": "dm_control", "episode_length": 12, "stagger": True, "reward_terms": reward_terms}
     options |= coarse(body_task)
     theirs, ours = (shared(body_task, 6, copy=copy, **options) for copy in (0, 1))
     if wrap:

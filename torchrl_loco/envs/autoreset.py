@@ -14,12 +14,13 @@ if TYPE_CHECKING:
 def is_plain(env: "LocoEnv", tensordict: TensorDictBase) -> bool:
     """Returns whether :func:`step_and_reset` does what TorchRL would do with ``tensordict``.
 
-    TorchRL has further features: partial steps, results given in advance, checks of types, hooks.
+    TorchRL has further features: partial steps, results given in advance, nested entries, checks of types, hooks.
     """
     return (
         type(tensordict) is TensorDict
         and tensordict.batch_size == env.batch_size
         and tensordict.device == env.device
+        and not env.reward_terms  # which are nested
         and not env.run_type_checks
         and env._post_step_mdp_hooks is None
         and all(isinstance(value, torch.Tensor) for value in tensordict.values())
@@ -41,8 +42,6 @@ def step_and_reset(env: "LocoEnv", tensordict: TensorDictBase) -> tuple[TensorDi
     env.world.reset_done()
     begin = env._outputs()  # in the worlds that go on, nothing has changed
     done = after.get("done")
-    if env.reward_terms:
-        begin.get("reward_terms").apply_(lambda terms: terms.masked_fill_(done, 0))  # nothing was rewarded yet
     for key, value in tensordict.items():
         if key not in begin:  # as in TorchRL, the policy's outputs are zero where a world was reset
             begin._set_str(key, value.masked_fill(_rows(done, value), 0), inplace=False, validated=True)
