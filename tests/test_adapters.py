@@ -227,7 +227,6 @@ def sum_of_rewards():
 
 @pytest.mark.parametrize("planner_class", [CEMPlanner, MPPIPlanner])
 def test_plans_beat_random_actions(planning_env, planner_class):
-    torch.manual_seed(0)
     horizon = LENGTH - 1
     size = {"planning_horizon": horizon, "optim_steps": 3, "num_candidates": 32, "top_k": 4}
     if planner_class is MPPIPlanner:

@@ -5,7 +5,7 @@ import dataclasses
 import os
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -98,13 +98,13 @@ def _describe_cache() -> str:
 def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) -> dict[str, tuple[int, int]]:
     """Measures the ``njmax`` and ``naconmax`` that a task needs under MuJoCo-Warp, with limits far above the need.
 
-    Actions are random.
+    Actions are random, the same in every call. Other actions, a trained policy's for one, may need more.
 
     Args:
         task: id of the environment.
         num_envs: number of worlds.
         device: where to measure; ``None`` takes CUDA if there is any.
-        steps: control steps; a trained policy may need more than random actions do.
+        steps: control steps.
 
     Returns:
         For each setting the most that was needed and the advised value.
@@ -113,12 +113,19 @@ def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) 
     env = make(task, num_envs, device, seed=0, world_offset=0, on_overflow="raise", engine="mujoco_warp", **limits)
     with torch.no_grad():
         td = env.reset()
-        for _ in trange(steps, desc=f"{task}, {num_envs} worlds", leave=False):
-            _, td = env.step_and_maybe_reset(td.set("action", env.action_spec.rand()))
+        for action in random_actions(env, trange(steps, desc=f"{task}, {num_envs} worlds", leave=False)):
+            _, td = env.step_and_maybe_reset(td.set("action", action.to(env.device)))
     env.world.health.check()
     peak = env.health()["peak"]
     needed = {"njmax": int(peak["constraints"]), "naconmax": int(peak["contacts"])}
     return {name: (value, with_margin(value)) for name, value in needed.items()}
+
+
+def random_actions(env: torchrl_loco.LocoEnv, steps: Iterable[int]) -> Iterator[torch.Tensor]:
+    """Yields an action on the CPU for each step, ``(num_envs, nu)``, the same in every call."""
+    generator = torch.Generator().manual_seed(0)
+    for _ in steps:
+        yield torch.rand(env.action_spec.shape, generator=generator) * 2 - 1
 
 
 def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, str]:
@@ -131,11 +138,9 @@ def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, st
     env = make(task, 4, device, seed=0, protocol="dm_control", world_offset=0)
     seconds = time.perf_counter() - start
     engine = env.engine if env.engine == "compiled" else f"{env.engine}: {env.engine_reason}"
-    generator = torch.Generator().manual_seed(0)
     errors, data = [], mujoco.MjData(env.mj_model)
     td = env.reset()
-    for _ in range(steps):
-        action = torch.rand(env.action_spec.shape, generator=generator) * 2 - 1
+    for action in random_actions(env, range(steps)):
         before = env.get_state().cpu().numpy()
         td = env.step(td.set("action", action.to(env.device)))["next"]
         after = env.get_state()["qpos"].cpu().numpy()
