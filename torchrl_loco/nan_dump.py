@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torchrl_loco import models, storage
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs import LocoEnv, State
-from torchrl_loco.envs.kernels import MAX_VALUE
+from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.monitors import NAN_DUMP
 from torchrl_loco.registry import env_class, list_envs
 from torchrl_loco.sim.simulation import set_options

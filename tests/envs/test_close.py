@@ -67,7 +67,7 @@ def test_a_failed_opening_leaves_nothing_behind(actions, monkeypatch):
         played(other, moves)
     env.close()
     with monkeypatch.context() as broken:
-        broken.setattr(type(env), "pose_kernel", lambda self, world: 1 / 0)
+        broken.setattr(type(env), "pose_func", lambda self, world: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             env.reset()
     env.close()

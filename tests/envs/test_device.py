@@ -11,14 +11,29 @@ def test_each_graph_is_recorded_once(body_task, device, actions, monkeypatch):
     captures, capture = [], wp.ScopedCapture
     monkeypatch.setattr(wp, "ScopedCapture", lambda **options: captures.append(options) or capture(**options))
     env = torchrl_loco.make(body_task, 3, device, seed=0, episode_length=4)
-    assert len(env.sim.graphs) == len(captures) == 4  # step, reset, reset after a step, and refresh after set_state
+    assert len(env.sim.graphs) == len(captures) == 3  # step, reset, and refresh after set_state
     td = env.reset()
     for action in actions(env, 10):
         _, td = env.step_and_maybe_reset(td.set("action", action))
     env.reset(env.get_state(), set_state=True)
     env.set_seed(3)
     env.reset()
-    assert len(env.sim.graphs) == len(captures) == 4
+    assert len(env.sim.graphs) == len(captures) == 3
+
+
+def test_the_compiled_engine_launches_two_kernels(monkeypatch):
+    """One for a control step, with observation, reward, time limit and counters; one for the resets after it."""
+    launches, launch = [], wp.launch
+    monkeypatch.setattr(
+        wp, "launch", lambda kernel, *args, **options: launches.append(kernel) or launch(kernel, *args, **options)
+    )
+    env = torchrl_loco.make("walker_run", 3, "cpu", seed=0, engine="compiled", episode_length=1)
+    assert len(set(launches)) == 3  # the third updates what the others return, after set_state
+    launches.clear()
+    env.world._launch_step()
+    env.world._launch_reset()
+    assert len(launches) == 2
+    assert (env.world.elapsed_steps.torch == 0).all()  # they were reset
 
 
 @pytest.mark.gpu

@@ -8,7 +8,9 @@ import warp as wp
 from cases import COARSE, coarse
 from tensordict import TensorDict
 
-from torchrl_loco.envs.kernels import zero_non_finite
+from torchrl_loco.envs.episode import Outputs, Screen, zero_non_finite
+from torchrl_loco.sim import WorldFunc, fill
+from torchrl_loco.sim.world_func import launch_each
 
 BAD = [math.nan, math.inf, -math.inf]
 CASES = [
@@ -150,11 +152,13 @@ def test_everything_that_can_be_not_finite_is_looked_at():
         if spoilt is not None:
             arrays[spoilt].view(3, -1)[1:, -1] = 2e10
         mask, bad, terms = torch.tensor([True, True, False]), torch.zeros(3, dtype=torch.bool), torch.ones(3, 1)
-        outputs = [bad, arrays["observation"], arrays["reward"], terms]
-        views = [wp.from_torch(array) for array in [mask, arrays["qpos"], arrays["qvel"], *outputs]]
-        wp.launch(zero_non_finite, dim=3, inputs=views[:3], outputs=views[3:], device="cpu")
+        views = {name: wp.from_torch(array) for name, array in arrays.items()}
+        state = {name: views.pop(name) for name in ("qpos", "qvel")}
+        outputs = fill(Outputs, **views, terms=wp.from_torch(terms))
+        screen = fill(Screen, **state, outputs=outputs, non_finite=wp.from_torch(bad))
+        launch_each([WorldFunc(zero_non_finite, screen)], wp.from_torch(mask))
         assert bad.tolist() == [False, spoilt is not None, False]
-        for array in outputs[1:]:
+        for array in (arrays["observation"], arrays["reward"], terms):
             assert (array[0] == 1).all()
             assert (array[1] == (spoilt is None)).all()
             assert (array[2] != 0).all()  # beyond the mask

@@ -7,7 +7,10 @@ import pytest
 import warp as wp
 
 from torchrl_loco import models
-from torchrl_loco.sim.sampling import draw_free_poses, make_skeleton, segment_distance
+from torchrl_loco.envs.episode import poser
+from torchrl_loco.sim import fill
+from torchrl_loco.sim.sampling import FreePoses, draw_free_pose, make_skeleton, segment_distance
+from torchrl_loco.sim.world_func import launch_each
 
 
 @wp.kernel
@@ -57,13 +60,10 @@ def test_poses_near_the_floor_do_not_touch_it():
         start = np.tile(model.qpos0, (n, 1))
         start[:, 2] = 0.9
         qpos = wp.array(start, dtype=float)
-        inputs = [
-            make_skeleton(model, pairs, device),
-            wp.ones(n, dtype=bool),
-            wp.array(np.arange(n), dtype=wp.uint32),  # where the streams start
-        ]
-        bodies = [wp.zeros((n, model.nbody), dtype=dtype) for dtype in (wp.vec3, wp.quat)]
-        wp.launch(draw_free_poses, n, inputs, [qpos, *bodies])
+        skeleton, stream = make_skeleton(model, pairs, device), wp.array(np.arange(n), dtype=wp.uint32)
+        xpos, xquat = (wp.zeros((n, model.nbody), dtype=dtype) for dtype in (wp.vec3, wp.quat))
+        inputs = fill(FreePoses, skeleton=skeleton, qpos=qpos, xpos=xpos, xquat=xquat)
+        launch_each([poser(draw_free_pose, inputs, stream)], wp.ones(n, dtype=bool))
         drawn = qpos.numpy().astype(np.float64)
     data = mujoco.MjData(model)
     for q in drawn:

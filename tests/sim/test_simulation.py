@@ -73,7 +73,7 @@ def test_derived_quantities_belong_to_the_new_state(body, device, engine):
 def test_forward_at_rest_is_forward_for_worlds_at_rest(body, device, engine):
     """What it leaves out is zero after a reset, and the worlds beside keep what they have."""
     states = []
-    for forward in (Simulation.forward, Simulation.forward_at_rest):
+    for at_rest in (False, True):
         sim, mask = simulation(body, device, engine=engine)
         d = sim.data
         arrays = [d.xpos, d.xmat, d.cvel, d.sensordata]
@@ -87,7 +87,7 @@ def test_forward_at_rest_is_forward_for_worlds_at_rest(body, device, engine):
         wp.to_torch(mask)[1:] = False
         sim.reset(mask)
         sim.qpos[0, -5:].uniform_(-1, 1, generator=generator)
-        forward(sim, mask)
+        sim.engine.forward(mask, at_rest=at_rest)
         states.append([wp.to_torch(x).clone() for x in arrays])
     for full, less in zip(*states, strict=True):
         torch.testing.assert_close(less, full, rtol=0, atol=0)

@@ -30,17 +30,17 @@ from torchrl_loco.envs.autoreset import is_plain, reset_done_worlds, step_and_re
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.state import State, write_state
 from torchrl_loco.envs.world import World
-from torchrl_loco.sim import Simulation
-from torchrl_loco.sim.sampling import draw_from_table
+from torchrl_loco.sim import Simulation, fill
+from torchrl_loco.sim.sampling import Table, draw_from_table
 
 
 class LocoEnv(EnvBase):
     """Base of the locomotion environments: batched worlds of one body on one device.
 
     A subclass sets ``body``, ``mjcf`` (path of the model), ``defaults`` (settings under ``playground``),
-    ``observation_size`` and ``term_names``, and names the kernel that writes observation and reward
-    (:meth:`observation_kernel`). Initial states come from a table (:meth:`initial_states`) or from a kernel of the
-    subclass (:meth:`pose_kernel`). docs/guides/extending.md shows it with a body outside of the package.
+    ``observation_size`` and ``term_names``, and names the function that writes observation and reward
+    (:meth:`observation_func`). Initial states come from a table (:meth:`initial_states`) or from a function of the
+    subclass (:meth:`pose_func`). docs/guides/extending.md shows it with a body outside of the package.
 
     Args:
         num_envs: number of worlds, the batch size. ``None`` makes one world without a batch dimension.
@@ -137,15 +137,17 @@ class LocoEnv(EnvBase):
 
     # What a body adds.
 
-    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
-        """Returns the kernel that writes observation and reward, and its inputs.
+    def observation_func(self, world: World) -> tuple[wp.Function, Any]:
+        """Returns the function that writes observation and reward of one world, and its inputs.
 
-        Its parameters are these inputs, then the mask of the worlds to write (bool, ``(num_envs,)``; all after a step,
-        those that begin an episode after a reset), then what it writes: ``observation`` ``(num_envs,
-        observation_size)``, ``reward`` ``(num_envs,)`` and ``terms`` ``(num_envs, len(term_names))``.
+        It is a ``wp.func`` of the index of the world, the inputs, the world's row of the observation, float
+        ``(observation_size,)``, and that of the terms, float ``(len(term_names),)``; it returns the reward.
 
         Args:
             world: the worlds; the physics arrays are in ``world.sim.data``.
+
+        Returns:
+            The function and its inputs. These are an instance of a ``wp.struct``; see :func:`torchrl_loco.sim.fill`.
         """
         raise NotImplementedError
 
@@ -160,15 +162,18 @@ class LocoEnv(EnvBase):
         """
         return None
 
-    def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list] | None:
-        """Returns the kernel that draws initial states, its inputs and its outputs; by default it draws from the table.
+    def pose_func(self, world: World) -> tuple[wp.Function, Any] | None:
+        """Returns the function that draws an initial state, and its inputs; by default it draws from the table.
 
-        Its parameters are the inputs, the mask of the worlds that begin an episode (bool, ``(num_envs,)``), the start
-        of each world's random stream (uint32, ``(num_envs,)``), then the outputs. The worlds are at rest in the default
-        pose. The kernel writes ``qpos``, and ``qvel`` if they begin in motion.
+        It is a ``wp.func`` of the index of the world, the inputs, and the start of the world's random stream (uint32).
+        The world is at rest in the default pose. The function writes ``qpos``, and ``qvel`` if it begins in motion.
 
         Args:
             world: the worlds; the physics arrays are in ``world.sim.data``.
+
+        Returns:
+            The function and its inputs. These are an instance of a ``wp.struct`` with ``world.sim.data.qvel`` among its
+            fields if worlds begin in motion; ``None`` for the default pose.
 
         Raises:
             ValueError: the table has the wrong shape, or a number that is not finite.
@@ -185,7 +190,7 @@ class LocoEnv(EnvBase):
             )
         if not np.isfinite(table).all():
             raise ValueError("initial_states must return finite numbers")
-        return draw_from_table, [wp.array(table, device=world.sim.device)], [data.qpos, data.qvel]
+        return draw_from_table, fill(Table, data, states=wp.array(table, device=world.sim.device))
 
     # TorchRL's side.
 

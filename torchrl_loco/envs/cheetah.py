@@ -1,5 +1,7 @@
 """Cheetah: a planar body on a back and a front leg that learns to run."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import warp as wp
@@ -7,9 +9,10 @@ import warp as wp
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
-from torchrl_loco.envs.kernels import observe_row
+from torchrl_loco.envs.episode import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
+from torchrl_loco.sim import fill
 
 RUN_SPEED = 10.0
 """Horizontal speed that counts as running (m/s)."""
@@ -25,31 +28,25 @@ def cheetah_reward(horizontal_velocity: float, target_speed: float) -> float:
     return tolerance(horizontal_velocity, target_speed, wp.inf, target_speed, Sigmoid.LINEAR, 0.0)
 
 
-@wp.kernel(enable_backward=False)
-def observe_and_reward_cheetah(
-    # Model:
-    torso_velocity: int,
-    # Data in:
-    qpos_in: wp.array2d[float],
-    qvel_in: wp.array2d[float],
-    sensordata_in: wp.array2d[float],
-    # In:
-    target_speed: float,
-    mask_in: wp.array[bool],
-    # Out:
-    observation_out: wp.array2d[float],
-    reward_out: wp.array[float],
-    terms_out: wp.array2d[float],
-):
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    k = observe_row(qpos_in[world], 1, observation_out[world], 0)  # without the position along x
-    k = observe_row(qvel_in[world], 0, observation_out[world], k)
+@wp.struct
+class CheetahInputs:
+    """What observation and reward are computed from."""
 
-    move = cheetah_reward(sensordata_in[world, torso_velocity], target_speed)  # along x
-    reward_out[world] = move
-    terms_out[world, 0] = move
+    torso_velocity: int
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    sensordata: wp.array2d[float]
+    target_speed: float
+
+
+@wp.func
+def observe_cheetah(world: int, inputs: CheetahInputs, observation: wp.array[float], terms: wp.array[float]) -> float:
+    k = observe_row(inputs.qpos[world], 1, observation, 0)  # without the position along x
+    k = observe_row(inputs.qvel[world], 0, observation, k)
+
+    move = cheetah_reward(inputs.sensordata[world, inputs.torso_velocity], inputs.target_speed)  # along x
+    terms[0] = move
+    return move
 
 
 class CheetahRun(LocoEnv):
@@ -85,11 +82,16 @@ class CheetahRun(LocoEnv):
     term_names = ("move",)
     target_speed = RUN_SPEED
 
-    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
-        """Returns the kernel that writes observation and reward, and its inputs."""
-        torso_velocity, data = int(self.mj_model.sensor("torso_velocity").adr[0]), world.sim.data
-        arrays = [data.qpos, data.qvel, data.sensordata]
-        return observe_and_reward_cheetah, [torso_velocity, *arrays, self.target_speed]
+    def observation_func(self, world: World) -> tuple[wp.Function, Any]:
+        """Returns the function that writes observation and reward, and its inputs."""
+        data = world.sim.data
+        inputs = fill(
+            CheetahInputs,
+            data,
+            torso_velocity=int(self.mj_model.sensor("torso_velocity").adr[0]),
+            target_speed=self.target_speed,
+        )
+        return observe_cheetah, inputs
 
     def initial_states(self) -> np.ndarray:
         """Returns states into which random poses have settled, ``(512, nq + nv)``.

@@ -1,14 +1,17 @@
 """Hopper: a planar body on one leg that learns to stand and to hop."""
 
+from typing import Any
+
 import warp as wp
 
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
-from torchrl_loco.envs.kernels import observe_row
+from torchrl_loco.envs.episode import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, small_control, tolerance
-from torchrl_loco.sim.sampling import draw_pitch_and_hinges
+from torchrl_loco.sim import fill
+from torchrl_loco.sim.sampling import PlanarBody, draw_pitch_and_hinges
 
 STAND_HEIGHT = wp.constant(0.6)
 """Height of the torso above the foot from which the hopper counts as standing (m)."""
@@ -29,47 +32,42 @@ def hopper_reward(height: float, ctrl: wp.array[float], horizontal_velocity: flo
     return standing * factor, standing, factor
 
 
-@wp.kernel(enable_backward=False)
-def observe_and_reward_hopper(
-    # Model:
-    torso: int,
-    torso_com: wp.vec3,
-    foot: int,
-    foot_com: wp.vec3,
-    torso_velocity: int,
-    touch: wp.vec2i,
-    # Data in:
-    qpos_in: wp.array2d[float],
-    qvel_in: wp.array2d[float],
-    ctrl_in: wp.array2d[float],
-    xpos_in: wp.array2d[wp.vec3],
-    xmat_in: wp.array2d[wp.mat33],
-    sensordata_in: wp.array2d[float],
-    # In:
-    target_speed: float,
-    mask_in: wp.array[bool],
-    # Out:
-    observation_out: wp.array2d[float],
-    reward_out: wp.array[float],
-    terms_out: wp.array2d[float],
-):
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    torso_center = xpos_in[world, torso] + xmat_in[world, torso] * torso_com
-    foot_center = xpos_in[world, foot] + xmat_in[world, foot] * foot_com
+@wp.struct
+class HopperInputs:
+    """What observation and reward are computed from; a ``com`` is a center of mass in the frame of its body (m)."""
 
-    k = observe_row(qpos_in[world], 1, observation_out[world], 0)  # without the position along x
-    k = observe_row(qvel_in[world], 0, observation_out[world], k)
-    for i in range(2):
-        observation_out[world, k + i] = wp.log(1.0 + sensordata_in[world, touch[i]])
+    torso: int
+    torso_com: wp.vec3
+    foot: int
+    foot_com: wp.vec3
+    torso_velocity: int
+    touch_toe: int
+    touch_heel: int
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    ctrl: wp.array2d[float]
+    xpos: wp.array2d[wp.vec3]
+    xmat: wp.array2d[wp.mat33]
+    sensordata: wp.array2d[float]
+    target_speed: float
+
+
+@wp.func
+def observe_hopper(world: int, inputs: HopperInputs, observation: wp.array[float], terms: wp.array[float]) -> float:
+    torso_center = inputs.xpos[world, inputs.torso] + inputs.xmat[world, inputs.torso] * inputs.torso_com
+    foot_center = inputs.xpos[world, inputs.foot] + inputs.xmat[world, inputs.foot] * inputs.foot_com
+
+    k = observe_row(inputs.qpos[world], 1, observation, 0)  # without the position along x
+    k = observe_row(inputs.qvel[world], 0, observation, k)
+    observation[k] = wp.log(1.0 + inputs.sensordata[world, inputs.touch_toe])
+    observation[k + 1] = wp.log(1.0 + inputs.sensordata[world, inputs.touch_heel])
 
     height = torso_center[2] - foot_center[2]
-    horizontal_velocity = sensordata_in[world, torso_velocity]  # along x
-    reward, standing, factor = hopper_reward(height, ctrl_in[world], horizontal_velocity, target_speed)
-    reward_out[world] = reward
-    terms_out[world, 0] = standing
-    terms_out[world, 1] = factor
+    horizontal_velocity = inputs.sensordata[world, inputs.torso_velocity]  # along x
+    reward, standing, factor = hopper_reward(height, inputs.ctrl[world], horizontal_velocity, inputs.target_speed)
+    terms[0] = standing
+    terms[1] = factor
+    return reward
 
 
 class Hopper(LocoEnv):
@@ -81,21 +79,27 @@ class Hopper(LocoEnv):
     observation_size = 15
     target_speed = 0.0
 
-    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
-        """Returns the kernel that writes observation and reward, and its inputs."""
+    def observation_func(self, world: World) -> tuple[wp.Function, Any]:
+        """Returns the function that writes observation and reward, and its inputs."""
         model, data = self.mj_model, world.sim.data
-        bodies = []
-        for name in ("torso", "foot"):
-            body = model.body(name).id
-            bodies += [body, wp.vec3(*model.body_ipos[body])]
-        velocity, *touch = (int(model.sensor(name).adr[0]) for name in ("torso_velocity", "touch_toe", "touch_heel"))
-        arrays = [data.qpos, data.qvel, data.ctrl, data.xpos, data.xmat, data.sensordata]
-        return observe_and_reward_hopper, [*bodies, velocity, wp.vec2i(*touch), *arrays, self.target_speed]
+        torso, foot = model.body("torso").id, model.body("foot").id
+        sensors = {name: int(model.sensor(name).adr[0]) for name in ("torso_velocity", "touch_toe", "touch_heel")}
+        inputs = fill(
+            HopperInputs,
+            data,
+            torso=torso,
+            torso_com=wp.vec3(*model.body_ipos[torso]),
+            foot=foot,
+            foot_com=wp.vec3(*model.body_ipos[foot]),
+            target_speed=self.target_speed,
+            **sensors,
+        )
+        return observe_hopper, inputs
 
-    def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list]:
-        """Returns the kernel that draws pitch and hinges, its inputs and its outputs."""
-        pitch = int(self.mj_model.joint("rooty").qposadr[0])
-        return draw_pitch_and_hinges, [world.sim.model.jnt_range, pitch], [world.sim.data.qpos]
+    def pose_func(self, world: World) -> tuple[wp.Function, Any]:
+        """Returns the function that draws pitch and hinges, and its inputs."""
+        sim, pitch = world.sim, int(self.mj_model.joint("rooty").qposadr[0])
+        return draw_pitch_and_hinges, fill(PlanarBody, sim.data, jnt_range=sim.model.jnt_range, pitch=pitch)
 
 
 class HopperStand(Hopper):

@@ -1,14 +1,17 @@
 """Humanoid: 21 hinges on a free root, learning to stand, walk and run."""
 
+from typing import Any
+
 import warp as wp
 
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
-from torchrl_loco.envs.kernels import observe_row
+from torchrl_loco.envs.episode import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, small_control, tolerance
-from torchrl_loco.sim.sampling import draw_free_poses, make_skeleton
+from torchrl_loco.sim import fill
+from torchrl_loco.sim.sampling import FreePoses, draw_free_pose, make_skeleton
 
 STAND_HEIGHT = wp.constant(1.4)
 """Height of the head from which the humanoid counts as standing (m)."""
@@ -42,59 +45,54 @@ def humanoid_reward(
     return standing * upright * gentle * move, standing, upright, gentle, move
 
 
-@wp.kernel(enable_backward=False)
-def observe_and_reward_humanoid(
-    # Model:
-    torso: int,
-    head: int,
-    extremities: wp.array[int],
-    torso_velocity: int,
-    # Data in:
-    qpos_in: wp.array2d[float],
-    qvel_in: wp.array2d[float],
-    ctrl_in: wp.array2d[float],
-    xpos_in: wp.array2d[wp.vec3],
-    xmat_in: wp.array2d[wp.mat33],
-    sensordata_in: wp.array2d[float],
-    # In:
-    target_speed: float,
-    mask_in: wp.array[bool],
-    # Out:
-    observation_out: wp.array2d[float],
-    reward_out: wp.array[float],
-    terms_out: wp.array2d[float],
-):
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    head_height = xpos_in[world, head][2]
-    torso_pos = xpos_in[world, torso]
-    torso_mat = xmat_in[world, torso]
-    v = torso_velocity
-    velocity = wp.vec3(sensordata_in[world, v], sensordata_in[world, v + 1], sensordata_in[world, v + 2])
+@wp.struct
+class HumanoidInputs:
+    """What observation and reward are computed from."""
 
-    k = observe_row(qpos_in[world], ROOT_QPOS, observation_out[world], 0)
-    observation_out[world, k] = head_height
+    torso: int
+    head: int
+    extremities: wp.array[int]
+    torso_velocity: int
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    ctrl: wp.array2d[float]
+    xpos: wp.array2d[wp.vec3]
+    xmat: wp.array2d[wp.mat33]
+    sensordata: wp.array2d[float]
+    target_speed: float
+
+
+@wp.func
+def observe_humanoid(world: int, inputs: HumanoidInputs, observation: wp.array[float], terms: wp.array[float]) -> float:
+    head_height = inputs.xpos[world, inputs.head][2]
+    torso_pos = inputs.xpos[world, inputs.torso]
+    torso_mat = inputs.xmat[world, inputs.torso]
+    sensors = inputs.sensordata[world]
+    v = inputs.torso_velocity
+    velocity = wp.vec3(sensors[v], sensors[v + 1], sensors[v + 2])
+
+    k = observe_row(inputs.qpos[world], ROOT_QPOS, observation, 0)
+    observation[k] = head_height
     k += 1
-    for i in range(extremities.shape[0]):
-        limb = wp.transpose(torso_mat) * (xpos_in[world, extremities[i]] - torso_pos)
+    for i in range(inputs.extremities.shape[0]):
+        limb = wp.transpose(torso_mat) * (inputs.xpos[world, inputs.extremities[i]] - torso_pos)
         for j in range(3):
-            observation_out[world, k + j] = limb[j]
+            observation[k + j] = limb[j]
         k += 3
     for j in range(3):
-        observation_out[world, k + j] = torso_mat[2, j]
-        observation_out[world, k + 3 + j] = velocity[j]
+        observation[k + j] = torso_mat[2, j]
+        observation[k + 3 + j] = velocity[j]
     k += 6
-    k = observe_row(qvel_in[world], 0, observation_out[world], k)
+    k = observe_row(inputs.qvel[world], 0, observation, k)
 
     reward, standing, upright, gentle, move = humanoid_reward(
-        head_height, torso_mat[2, 2], ctrl_in[world], velocity, target_speed
+        head_height, torso_mat[2, 2], inputs.ctrl[world], velocity, inputs.target_speed
     )
-    reward_out[world] = reward
-    terms_out[world, 0] = standing
-    terms_out[world, 1] = upright
-    terms_out[world, 2] = gentle
-    terms_out[world, 3] = move
+    terms[0] = standing
+    terms[1] = upright
+    terms[2] = gentle
+    terms[3] = move
+    return reward
 
 
 class Humanoid(LocoEnv):
@@ -107,23 +105,29 @@ class Humanoid(LocoEnv):
     term_names = ("standing", "upright", "small_control", "move")
     target_speed = 0.0
 
-    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
-        """Returns the kernel that writes observation and reward, and its inputs."""
+    def observation_func(self, world: World) -> tuple[wp.Function, Any]:
+        """Returns the function that writes observation and reward, and its inputs."""
         model, data = self.mj_model, world.sim.data
-        extremities = wp.array([model.body(name).id for name in EXTREMITIES], dtype=int, device=world.sim.device)
-        velocity = int(model.sensor("torso_velocity").adr[0])
-        ids = [model.body("torso").id, model.body("head").id, extremities, velocity]
-        arrays = [data.qpos, data.qvel, data.ctrl, data.xpos, data.xmat, data.sensordata]
-        return observe_and_reward_humanoid, [*ids, *arrays, self.target_speed]
+        extremities = [model.body(name).id for name in EXTREMITIES]
+        inputs = fill(
+            HumanoidInputs,
+            data,
+            torso=model.body("torso").id,
+            head=model.body("head").id,
+            extremities=wp.array(extremities, dtype=int, device=world.sim.device),
+            torso_velocity=int(model.sensor("torso_velocity").adr[0]),
+            target_speed=self.target_speed,
+        )
+        return observe_humanoid, inputs
 
-    def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list] | None:
-        """Returns the kernel that draws a pose free of contact under ``dm_control``, else the default pose."""
+    def pose_func(self, world: World) -> tuple[wp.Function, Any] | None:
+        """Returns the function that draws a pose free of contact under ``dm_control``, else the default pose."""
         if self.protocol != "dm_control":
             return None
         sim = world.sim
         skeleton = make_skeleton(self.mj_model, sim.model.nxn_geom_pair_filtered.numpy(), sim.device)
         xquat = wp.empty(sim.data.xpos.shape, dtype=wp.quat, device=sim.device)
-        return draw_free_poses, [skeleton], [sim.data.qpos, sim.data.xpos, xquat]
+        return draw_free_pose, fill(FreePoses, sim.data, skeleton=skeleton, xquat=xquat)
 
 
 class HumanoidStand(Humanoid):

@@ -62,8 +62,8 @@ class Monitor(ABC):
         self._copied = torch.cuda.Event() if on_cuda else None
         self._steps, self._pending = 0, False
 
-    def launch_before_step(self) -> None:  # noqa: B027
-        """Launches the monitor's kernels before the physics of the recorded control step."""
+    def launch_before_step(self, action: wp.array) -> None:  # noqa: B027
+        """Launches the monitor's kernels before the recorded control step under ``action`` ``(nworld, nu)``."""
 
     def launch_after_step(self) -> None:  # noqa: B027
         """Launches the monitor's kernels at the end of the recorded control step."""
@@ -129,7 +129,7 @@ DROPPED = ("constraints", "contacts")
 class Health(Monitor):
     """Counts, for each world, the control steps in which something went wrong in the physics.
 
-    The kernel that ends a control step counts (:func:`torchrl_loco.envs.kernels.finish_step`).
+    What ends a control step counts (:func:`torchrl_loco.envs.episode.finish_step`).
 
     Args:
         sim: the simulation.
@@ -275,7 +275,7 @@ class NanGuard(Monitor):
     Args:
         path: the file; never overwritten.
         sim: the simulation.
-        inputs: actions ``(nworld, nu)``, episodes and elapsed steps ``(nworld,)`` of all worlds.
+        inputs: episodes and elapsed steps of all worlds, each ``(nworld,)``.
         non_finite: flags of non-finite worlds, ``(nworld,)``.
         seed: seed of the environment, ``(1,)``.
         settings: further settings from which the environment can be made again.
@@ -285,7 +285,7 @@ class NanGuard(Monitor):
         self,
         path: Path,
         sim: Simulation,
-        inputs: tuple[Buffer, Buffer, Buffer],
+        inputs: tuple[Buffer, Buffer],
         non_finite: Buffer,
         seed: Buffer,
         settings: dict[str, Any],
@@ -294,16 +294,17 @@ class NanGuard(Monitor):
         self._non_finite = non_finite
         data = sim.data
         self._inputs = [*(buffer.warp for buffer in inputs), data.qpos, data.qvel, data.qacc_warmstart, data.act]
-        self._kept = [wp.zeros_like(array) for array in self._inputs]
+        action = wp.zeros(sim.data.ctrl.shape, dtype=float, device=sim.device)
+        self._kept = [action, *(wp.zeros_like(array) for array in self._inputs)]
         self._first = Buffer(1, int, sim.device)
         self._found = Buffer(1, bool, sim.device)
         super().__init__(1, self._first.torch.device)
         self._reported = False
 
-    def launch_before_step(self) -> None:
-        """Launches the kernel that keeps what a control step begins with."""
+    def launch_before_step(self, action: wp.array) -> None:
+        """Launches the kernel that keeps what a control step under ``action`` ``(nworld, nu)`` begins with."""
         n, outputs = self._sim.num_envs, [*self._kept, self._found.warp]
-        self._launch(keep_worlds, (n, KEEPERS), [self._first.warp, n, *self._inputs], outputs)
+        self._launch(keep_worlds, (n, KEEPERS), [self._first.warp, n, action, *self._inputs], outputs)
 
     def launch_after_step(self) -> None:
         """Launches the kernel that looks for a non-finite world."""

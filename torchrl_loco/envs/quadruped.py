@@ -1,14 +1,17 @@
 """Quadruped: four legs on a free torso, learning to walk and run."""
 
+from typing import Any
+
 import warp as wp
 
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
-from torchrl_loco.envs.kernels import observe_row
+from torchrl_loco.envs.episode import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
-from torchrl_loco.sim.sampling import draw_orientation_above_floor, make_outline
+from torchrl_loco.sim import fill
+from torchrl_loco.sim.sampling import Drop, draw_orientation_above_floor, make_outline
 
 WALK_SPEED = 0.5
 """Forward speed that counts as walking (m/s)."""
@@ -40,51 +43,48 @@ def quadruped_reward(torso_upright: float, forward_velocity: float, target_speed
     return upright * move, upright, move
 
 
-@wp.kernel(enable_backward=False)
-def observe_and_reward_quadruped(
-    # Model:
-    torso: int,
-    imu: int,
-    velocimeter: int,
-    force_torque: int,
-    # Data in:
-    qpos_in: wp.array2d[float],
-    qvel_in: wp.array2d[float],
-    act_in: wp.array2d[float],
-    xmat_in: wp.array2d[wp.mat33],
-    sensordata_in: wp.array2d[float],
-    # In:
-    target_speed: float,
-    mask_in: wp.array[bool],
-    # Out:
-    observation_out: wp.array2d[float],
-    reward_out: wp.array[float],
-    terms_out: wp.array2d[float],
-):
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    torso_upright = xmat_in[world, torso][2, 2]
+@wp.struct
+class QuadrupedInputs:
+    """What observation and reward are computed from."""
 
-    k = observe_row(qpos_in[world], ROOT_QPOS, observation_out[world], 0)
-    k = observe_row(qvel_in[world], ROOT_QVEL, observation_out[world], k)
-    k = observe_row(act_in[world], 0, observation_out[world], k)
+    torso: int
+    imu: int
+    velocimeter: int
+    force_torque: int
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    act: wp.array2d[float]
+    xmat: wp.array2d[wp.mat33]
+    sensordata: wp.array2d[float]
+    target_speed: float
+
+
+@wp.func
+def observe_quadruped(
+    world: int, inputs: QuadrupedInputs, observation: wp.array[float], terms: wp.array[float]
+) -> float:
+    torso_upright = inputs.xmat[world, inputs.torso][2, 2]
+    sensors = inputs.sensordata[world]
+
+    k = observe_row(inputs.qpos[world], ROOT_QPOS, observation, 0)
+    k = observe_row(inputs.qvel[world], ROOT_QVEL, observation, k)
+    k = observe_row(inputs.act[world], 0, observation, k)
     for i in range(3):
-        observation_out[world, k + i] = sensordata_in[world, velocimeter + i]
+        observation[k + i] = sensors[inputs.velocimeter + i]
     k += 3
-    observation_out[world, k] = torso_upright
+    observation[k] = torso_upright
     k += 1
     for i in range(IMU):
-        observation_out[world, k + i] = sensordata_in[world, imu + i]
+        observation[k + i] = sensors[inputs.imu + i]
     k += IMU
     for i in range(FORCES):
-        observation_out[world, k + i] = arcsinh(sensordata_in[world, force_torque + i])
+        observation[k + i] = arcsinh(sensors[inputs.force_torque + i])
 
-    forward_velocity = sensordata_in[world, velocimeter]  # along the torso's own x axis
-    reward, upright, move = quadruped_reward(torso_upright, forward_velocity, target_speed)
-    reward_out[world] = reward
-    terms_out[world, 0] = upright
-    terms_out[world, 1] = move
+    forward_velocity = sensors[inputs.velocimeter]  # along the torso's own x axis
+    reward, upright, move = quadruped_reward(torso_upright, forward_velocity, inputs.target_speed)
+    terms[0] = upright
+    terms[1] = move
+    return reward
 
 
 class Quadruped(LocoEnv):
@@ -97,17 +97,24 @@ class Quadruped(LocoEnv):
     term_names = ("upright", "move")
     target_speed = WALK_SPEED
 
-    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
-        """Returns the kernel that writes observation and reward, and its inputs."""
+    def observation_func(self, world: World) -> tuple[wp.Function, Any]:
+        """Returns the function that writes observation and reward, and its inputs."""
         model, data = self.mj_model, world.sim.data
-        first = (int(model.sensor(name).adr[0]) for name in ("imu_accel", "velocimeter", "force_toe_front_left"))
-        arrays = [data.qpos, data.qvel, data.act, data.xmat, data.sensordata]
-        return observe_and_reward_quadruped, [model.body("torso").id, *first, *arrays, self.target_speed]
+        inputs = fill(
+            QuadrupedInputs,
+            data,
+            torso=model.body("torso").id,
+            imu=int(model.sensor("imu_accel").adr[0]),
+            velocimeter=int(model.sensor("velocimeter").adr[0]),
+            force_torque=int(model.sensor("force_toe_front_left").adr[0]),
+            target_speed=self.target_speed,
+        )
+        return observe_quadruped, inputs
 
-    def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list]:
-        """Returns the kernel that draws the orientation and raises the torso, its inputs and its outputs."""
+    def pose_func(self, world: World) -> tuple[wp.Function, Any]:
+        """Returns the function that draws the orientation and raises the torso, and its inputs."""
         outline = make_outline(self.mj_model, world.sim.device)
-        return draw_orientation_above_floor, [outline, INCREMENT], [world.sim.data.qpos]
+        return draw_orientation_above_floor, fill(Drop, world.sim.data, outline=outline, increment=INCREMENT)
 
 
 class QuadrupedWalk(Quadruped):

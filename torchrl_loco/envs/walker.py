@@ -1,14 +1,17 @@
 """Walker: a planar body that learns to stand, walk and run."""
 
+from typing import Any
+
 import warp as wp
 
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS
 from torchrl_loco.envs.base import LocoEnv
-from torchrl_loco.envs.kernels import observe_row
+from torchrl_loco.envs.episode import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
-from torchrl_loco.sim.sampling import draw_pitch_and_hinges
+from torchrl_loco.sim import fill
+from torchrl_loco.sim.sampling import PlanarBody, draw_pitch_and_hinges
 
 STAND_HEIGHT = wp.constant(1.2)
 """Height of the torso from which the walker counts as standing (m)."""
@@ -35,48 +38,42 @@ def walker_reward(torso_height: float, torso_upright: float, horizontal_velocity
     return stand * move, stand, move
 
 
-@wp.kernel(enable_backward=False)
-def observe_and_reward_walker(
-    # Model:
-    torso: int,
-    torso_velocity: int,
-    # Data in:
-    qvel_in: wp.array2d[float],
-    xpos_in: wp.array2d[wp.vec3],
-    xmat_in: wp.array2d[wp.mat33],
-    sensordata_in: wp.array2d[float],
-    # In:
-    target_speed: float,
-    observe_height: bool,
-    mask_in: wp.array[bool],
-    # Out:
-    observation_out: wp.array2d[float],
-    reward_out: wp.array[float],
-    terms_out: wp.array2d[float],
-):
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    torso_height = xpos_in[world, torso][2]
-    torso_upright = xmat_in[world, torso][2, 2]
+@wp.struct
+class WalkerInputs:
+    """What observation and reward are computed from."""
+
+    torso: int
+    torso_velocity: int
+    qvel: wp.array2d[float]
+    xpos: wp.array2d[wp.vec3]
+    xmat: wp.array2d[wp.mat33]
+    sensordata: wp.array2d[float]
+    target_speed: float
+    observe_height: bool
+
+
+@wp.func
+def observe_walker(world: int, inputs: WalkerInputs, observation: wp.array[float], terms: wp.array[float]) -> float:
+    torso_height = inputs.xpos[world, inputs.torso][2]
+    torso_upright = inputs.xmat[world, inputs.torso][2, 2]
 
     rows = Rows()  # all are read before the first is written, as in observe_row
     for i in range(BODIES):
-        rows[i] = xmat_in[world, 1 + i][0]  # body 0 is the world
+        rows[i] = inputs.xmat[world, 1 + i][0]  # body 0 is the world
     k = int(0)
     for i in range(BODIES):
-        observation_out[world, k] = rows[i, 0]
-        observation_out[world, k + 1] = rows[i, 2]
+        observation[k] = rows[i, 0]
+        observation[k + 1] = rows[i, 2]
         k += 2
-    observation_out[world, k] = wp.where(observe_height, torso_height, torso_upright)
-    k = observe_row(qvel_in[world], 0, observation_out[world], k + 1)
+    observation[k] = wp.where(inputs.observe_height, torso_height, torso_upright)
+    k = observe_row(inputs.qvel[world], 0, observation, k + 1)
 
-    horizontal_velocity = sensordata_in[world, torso_velocity]  # along x
-    reward, stand, move = walker_reward(torso_height, torso_upright, horizontal_velocity, target_speed)
-    reward_out[world] = reward
-    terms_out[world, 0] = stand
-    if terms_out.shape[1] > 1:
-        terms_out[world, 1] = move
+    horizontal_velocity = inputs.sensordata[world, inputs.torso_velocity]  # along x
+    reward, stand, move = walker_reward(torso_height, torso_upright, horizontal_velocity, inputs.target_speed)
+    terms[0] = stand
+    if terms.shape[0] > 1:
+        terms[1] = move
+    return reward
 
 
 class Walker(LocoEnv):
@@ -88,17 +85,23 @@ class Walker(LocoEnv):
     observation_size = 24
     target_speed = 0.0
 
-    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
-        """Returns the kernel that writes observation and reward, and its inputs."""
+    def observation_func(self, world: World) -> tuple[wp.Function, Any]:
+        """Returns the function that writes observation and reward, and its inputs."""
         model, data = self.mj_model, world.sim.data
-        ids = [model.body("torso").id, int(model.sensor("torso_velocity").adr[0])]
-        arrays = [data.qvel, data.xpos, data.xmat, data.sensordata]
-        return observe_and_reward_walker, [*ids, *arrays, self.target_speed, self.protocol == "dm_control"]
+        inputs = fill(
+            WalkerInputs,
+            data,
+            torso=model.body("torso").id,
+            torso_velocity=int(model.sensor("torso_velocity").adr[0]),
+            target_speed=self.target_speed,
+            observe_height=self.protocol == "dm_control",
+        )
+        return observe_walker, inputs
 
-    def pose_kernel(self, world: World) -> tuple[wp.Kernel, list, list]:
-        """Returns the kernel that draws pitch and hinges, its inputs and its outputs."""
-        pitch = int(self.mj_model.joint("rooty").qposadr[0])
-        return draw_pitch_and_hinges, [world.sim.model.jnt_range, pitch], [world.sim.data.qpos]
+    def pose_func(self, world: World) -> tuple[wp.Function, Any]:
+        """Returns the function that draws pitch and hinges, and its inputs."""
+        sim, pitch = world.sim, int(self.mj_model.joint("rooty").qposadr[0])
+        return draw_pitch_and_hinges, fill(PlanarBody, sim.data, jnt_range=sim.model.jnt_range, pitch=pitch)
 
 
 class WalkerStand(Walker):

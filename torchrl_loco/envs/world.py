@@ -6,6 +6,7 @@ import os
 import warnings
 import weakref
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import mujoco
@@ -13,23 +14,36 @@ import torch
 import warp as wp
 
 from torchrl_loco.config import SimConfig
-from torchrl_loco.envs.kernels import any_world, apply_action, begin_episode, finish_step, zero_non_finite
+from torchrl_loco.envs.episode import (
+    Beginning,
+    Control,
+    End,
+    Flags,
+    Outputs,
+    Screen,
+    apply_action,
+    begin_episode,
+    finish_step,
+    observer,
+    poser,
+    zero_non_finite,
+)
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import (
-    BLOCK_DIM,
     EXCLUSIVE,
     Buffer,
-    Graph,
     PackedBuffers,
     Simulation,
+    WorldFunc,
+    fill,
     joined_to_torch,
     torch_is_recording,
 )
 
 
 class Task(Protocol):
-    """What :class:`World` needs of an environment: its model, its settings and its kernels."""
+    """What :class:`World` needs of an environment: its model, its settings and its functions."""
 
     mj_model: mujoco.MjModel
     config: SimConfig
@@ -42,11 +56,11 @@ class Task(Protocol):
     on_overflow: str
     nan_dump: Path | None
 
-    def observation_kernel(self, world: "World") -> tuple[wp.Kernel, list]:
-        """Returns the kernel that writes observation and reward, and its inputs."""
+    def observation_func(self, world: "World") -> tuple[wp.Function, Any]:
+        """Returns the function that writes observation and reward, and its inputs."""
 
-    def pose_kernel(self, world: "World") -> tuple[wp.Kernel, list, list] | None:
-        """Returns the kernel that draws initial states, its inputs and its outputs, if there is one."""
+    def pose_func(self, world: "World") -> tuple[wp.Function, Any] | None:
+        """Returns the function that draws initial states, and its inputs, if there is one."""
 
     def settings(self) -> dict[str, Any]:
         """Returns what a NaN dump records of the environment."""
@@ -104,25 +118,19 @@ class World:
             self.non_finite = Buffer(n, bool, device)
             self.seed = Buffer(1, wp.uint32, device)
             self._stagger = Buffer(1, bool, device)
-            self._any = Buffer(1, int, device)
-            self._all = wp.ones(n, dtype=bool, device=device)
             self.mask.warp.fill_(True)
 
             self.health = Health(self.sim, task.on_overflow)
             self._monitors: list[Monitor] = [self.health]
             if task.nan_dump is not None:
-                inputs = self.action, self.episode, self.elapsed_steps
+                inputs = self.episode, self.elapsed_steps
                 guard = NanGuard(task.nan_dump, self.sim, inputs, self.non_finite, self.seed, task.settings())
                 self._monitors.append(guard)
 
-            self._observation_kernel = task.observation_kernel(self)
-            self._pose_kernel = task.pose_kernel(self)
-            outputs = [] if self._pose_kernel is None else self._pose_kernel[2]
-            self._begins_in_motion = any(array is self.sim.data.qvel for array in outputs)
+            self._make_funcs(task)
             self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
             self._step_graph = self.sim.capture(self._launch_step)
             self._reset_graph = self.sim.capture(self._launch_reset)
-            self._reset_done_graph = self.sim.capture(self._launch_reset_done)
             self._refresh_graph = self.sim.capture(self._launch_refresh)
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
@@ -132,72 +140,45 @@ class World:
         self._pid, self._closed = os.getpid(), False
         _WORLDS.add(self)
 
+    # What each world does besides the physics.
+
+    def _make_funcs(self, task: Task) -> None:
+        data = self.sim.data
+        buffers = {name: value.warp for name, value in vars(self).items() if isinstance(value, Buffer)}
+        mine = SimpleNamespace(**buffers, episode_length=self._episode_length, world_offset=self._world_offset)
+        mine.outputs, mine.flags = fill(Outputs, mine), fill(Flags, mine)
+        counters = {"counter_bits": self.health.counter_bits, "counts": self.health.counts.warp}
+        self._observe = observer(*task.observation_func(self), mine.outputs)
+        self._screen = WorldFunc(zero_non_finite, fill(Screen, mine, qpos=data.qpos, qvel=data.qvel))
+        self._finish = WorldFunc(finish_step, fill(End, mine, overflow=data.overflow, **counters))
+        self._begin = [WorldFunc(begin_episode, fill(Beginning, mine, stagger=self._stagger.warp))]
+        self._begins_in_motion = False
+        pose = task.pose_func(self)
+        if pose is not None:
+            func, inputs = pose
+            self._begin.append(poser(func, inputs, self.stream.warp))
+            self._begins_in_motion = any(getattr(inputs, name) is data.qvel for name in inputs._cls.vars)
+
     # What the graphs record.
 
     def _launch_step(self, action: wp.array | None = None) -> None:
         """The control step, under actions ``(nworld, nu)`` or those in the buffer."""
-        action = self.action.warp if action is None else action
-        outputs = [self.action.warp, self.sim.data.ctrl, self.non_finite.warp, self._any.warp]
-        self._launch(apply_action, [self.sim.model.actuator_ctrlrange, action], outputs)
+        sim, action = self.sim, self.action.warp if action is None else action
+        control = {"ctrlrange": sim.model.actuator_ctrlrange, "ctrl": sim.data.ctrl, "non_finite": self.non_finite.warp}
         for monitor in self._monitors:
-            monitor.launch_before_step()
-        self.sim.step()
-        self._launch_observation(self._all)
-        data, health = self.sim.data, self.health
-        self._launch(
-            finish_step,
-            [self._episode_length, health.counter_bits, data.qpos, data.qvel],
-            [
-                *(data.overflow, self.non_finite.warp),
-                *(self.observation.warp, self.reward.warp, self.terms.warp),
-                *(self.elapsed_steps.warp, self.done.warp, self.terminated.warp, self.truncated.warp),
-                *(self.mask.warp, self._any.warp, health.counts.warp),
-            ],
-        )
+            monitor.launch_before_step(action)
+        apply = WorldFunc(apply_action, fill(Control, action=action, **control))
+        sim.step(before=[apply], after=[self._observe, self._screen, self._finish])
         for monitor in self._monitors:
             monitor.launch_after_step()
 
     def _launch_reset(self) -> None:
-        """A new episode in the worlds of the mask. It costs almost nothing if the mask is empty."""
-        self._any.warp.zero_()
-        self._launch(any_world, [self.mask.warp], [self._any.warp])
-        self._launch_reset_done()
-
-    def _launch_reset_done(self) -> None:
-        """The same after a step, which has set the mask."""
-        wp.capture_if(self._any.warp, self._launch_masked_reset)
-
-    def _launch_masked_reset(self) -> None:
-        mask = self.mask.warp
-        flags = [self.non_finite.warp, self.done.warp, self.terminated.warp, self.truncated.warp]
-        inputs = [mask, self._stagger.warp, self.seed.warp, self._world_offset, self._episode_length]
-        self._launch(
-            begin_episode,
-            [self.sim.model.qpos0, *inputs],
-            [self.episode.warp, self.stream.warp, self.elapsed_steps.warp, *flags, *self.sim.rest_state()],
-        )
-        self.sim.engine.reset(mask)
-        if self._pose_kernel is not None:
-            kernel, inputs, outputs = self._pose_kernel
-            self._launch(kernel, [*inputs, mask, self.stream.warp], outputs)
-        self.sim.forward(mask) if self._begins_in_motion else self.sim.forward_at_rest(mask)
-        self._launch_observation(mask)
+        """A new episode in the worlds of the mask."""
+        self.sim.reset(self.mask.warp, before=self._begin, after=[self._observe], in_motion=self._begins_in_motion)
 
     def _launch_refresh(self) -> None:
-        """Computes the outputs after the state of the masked worlds was written."""
-        mask, data = self.mask.warp, self.sim.data
-        self.sim.forward(mask)
-        self._launch_observation(mask)
-        outputs = [self.observation.warp, self.reward.warp, self.terms.warp]
-        self._launch(zero_non_finite, [mask, data.qpos, data.qvel], [self.non_finite.warp, *outputs])
-
-    def _launch_observation(self, mask: wp.array) -> None:
-        kernel, inputs = self._observation_kernel
-        self._launch(kernel, [*inputs, mask], [self.observation.warp, self.reward.warp, self.terms.warp])
-
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        n, device = self.sim.num_envs, self.sim.device
-        wp.launch(kernel, dim=n, inputs=inputs, outputs=outputs, device=device, block_dim=BLOCK_DIM)
+        """The outputs after the state of the masked worlds was written."""
+        self.sim.forward(self.mask.warp, after=[self._observe, self._screen])
 
     # What the environment calls. Nothing waits for the device.
 
@@ -223,21 +204,17 @@ class World:
         self._set_mask(mask)
         if stagger:
             self._stagger.torch.fill_(True)
-        self._replay_reset(self._reset_graph)
+        self.reset_done()
         if stagger:
             self._stagger.torch.fill_(False)
 
     def reset_done(self) -> None:
-        """Begins the next episode in the worlds that are done, right after a step."""
-        self._replay_reset(self._reset_done_graph)
-
-    def _replay_reset(self, graph: Graph) -> None:
-        """Replays the graph of a reset; into a graph that torch records the reset goes without its condition."""
+        """Begins the next episode in the worlds of the mask: after a step, those that are done."""
         if torch_is_recording(self.sim.device):
             with joined_to_torch(self.sim.device):
-                self._launch_masked_reset()
+                self._launch_reset()
         else:
-            graph.replay()
+            self._reset_graph.replay()
 
     def poll(self, steps: int = 1) -> None:
         """Lets the monitors report after so many control steps."""

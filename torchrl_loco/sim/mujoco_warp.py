@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import mujoco
@@ -13,7 +13,9 @@ import warp as wp
 from torchrl_loco.config import SimConfig
 from torchrl_loco.models import FORCE_SENSORS
 from torchrl_loco.sim.buffer import Buffer
+from torchrl_loco.sim.graph import torch_is_recording
 from torchrl_loco.sim.row_order import RowOrder
+from torchrl_loco.sim.world_func import WorldFunc, launch_each
 
 UNROLLED_ITERATIONS = 10
 """Up to this many solver iterations, the recorded step contains all of them, without an early exit."""
@@ -49,7 +51,7 @@ def rest(
     cvel_out: wp.array2d[wp.spatial_vector],
     sensordata_out: wp.array2d[float],
 ):
-    """Zeroes what is not evaluated after a reset."""
+    """Zeroes what is not evaluated in a world at rest."""
     world = wp.tid()
     if not mask_in[world]:
         return
@@ -57,6 +59,17 @@ def rest(
         cvel_out[world, i] = wp.spatial_vector()
     for i in range(sensordata_out.shape[1]):
         sensordata_out[world, i] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def any_world(
+    # In:
+    mask_in: wp.array[bool],
+    # Out:
+    any_out: wp.array[int],
+):
+    if mask_in[wp.tid()]:
+        any_out[0] = 1
 
 
 @wp.kernel(enable_backward=False)
@@ -144,6 +157,8 @@ class MujocoWarpEngine:
         if not FORCE_SENSORS.isdisjoint(mj_model.sensor_type):
             self._before = wp.clone(self.data.sensordata), wp.clone(self.data.overflow)
         self._row_order = RowOrder(self.model, self.data) if config.deterministic else None
+        self._all = wp.ones(num_envs, dtype=bool, device=device)
+        self._any = wp.zeros(1, dtype=int, device=device)
         self.peak_constraints = Buffer(num_envs, int, device)
         self.peak_contacts = Buffer(1, int, device)
 
@@ -151,24 +166,25 @@ class MujocoWarpEngine:
         """Returns what prevents that something is dropped, if a substep needed so many."""
         return f"a physics step needed up to {most}: pass {ROOM[dropped]}={with_margin(most)}"
 
-    def reset(self, mask: wp.array) -> None:
-        """Puts velocities and sensors to rest where ``mask`` ``(nworld,)`` is set."""
-        d = self.data
-        wp.launch(rest, dim=self._num_envs, inputs=[mask], outputs=[d.cvel, d.sensordata], device=self._device)
-
-    def step(self) -> None:
+    def step(self, before: Sequence[WorldFunc] = (), after: Sequence[WorldFunc] = ()) -> None:
         """Advances every world by one control step under ``ctrl``.
 
         Afterwards poses, velocities and sensors belong to the new state, as in dm_control. dm_control reaches this by
         running the first half of the next step. Here only what an observation can read is computed, so a reset has
         nothing else to update. Forces, contacts and constraints are those of the last substep, and so are the sensors
         of forces.
+
+        Args:
+            before: what each world does first.
+            after: what it does at the end.
         """
+        launch_each(before, self._all)
         for i in range(self._substeps):
             with self._substep_only(sensors=self._before is not None and i == self._substeps - 1):
                 self._substep()
                 self._record_peaks()
         self._evaluate()
+        launch_each(after, self._all)
 
     def _substep(self) -> None:
         if self._row_order is None:
@@ -204,21 +220,41 @@ class MujocoWarpEngine:
         finally:
             model.opt.disableflags, model.ncam, model.nlight = kept
 
-    def forward(self, mask: wp.array) -> None:
-        """Updates poses and sensors after ``qpos`` and ``qvel`` were changed where ``mask`` ``(nworld,)`` is set."""
-        self._clear_constraints(mask)
-        if self._before is None:
-            self._evaluate()
-        else:
-            self._evaluate_forces(mask, *self._before)
+    def forward(
+        self,
+        mask: wp.array,
+        before: Sequence[WorldFunc] = (),
+        after: Sequence[WorldFunc] = (),
+        *,
+        at_rest: bool = False,
+    ) -> None:
+        """Updates poses and sensors where ``mask`` ``(nworld,)`` is set. It costs almost nothing if none is.
 
-    def forward_at_rest(self, mask: wp.array) -> None:
-        """As :meth:`forward`, for less: the worlds that changed are at rest."""
-        if self._before is not None:
-            self.forward(mask)  # forces act at rest too
+        Args:
+            mask: the worlds.
+            before: what each of them does first.
+            after: what it does at the end.
+            at_rest: whether they are at rest, which costs less.
+        """
+
+        def update() -> None:
+            launch_each(before, mask)
+            self._clear_constraints(mask)
+            if self._before is not None:  # forces act at rest too
+                self._evaluate_forces(mask, *self._before)
+            elif at_rest:
+                self._rest(mask)
+                mjw.kinematics(self.model, self.data)
+            else:
+                self._evaluate()
+            launch_each(after, mask)
+
+        if torch_is_recording(self._device):
+            update()
             return
-        self._clear_constraints(mask)
-        mjw.kinematics(self.model, self.data)
+        self._any.zero_()
+        wp.launch(any_world, dim=self._num_envs, inputs=[mask], outputs=[self._any], device=self._device)
+        wp.capture_if(self._any, update)
 
     def _evaluate(self) -> None:
         """Evaluates what an observation can read: poses and velocities of bodies, and velocity sensors."""
@@ -251,6 +287,11 @@ class MujocoWarpEngine:
             outputs=[data.sensordata, data.overflow],
             device=self._device,
         )
+
+    def _rest(self, mask: wp.array) -> None:
+        """Zeroes velocities of bodies and sensors where ``mask`` ``(nworld,)`` is set."""
+        d = self.data
+        wp.launch(rest, dim=self._num_envs, inputs=[mask], outputs=[d.cvel, d.sensordata], device=self._device)
 
     def _clear_constraints(self, mask: wp.array) -> None:
         """Removes the constraints of the worlds where ``mask`` ``(nworld,)`` is set."""

@@ -19,49 +19,42 @@ def world_stream(seed: wp.uint32, world: int, episode: int) -> wp.uint32:
     return wp.rand_init(int(wp.rand_init(int(seed), world)), episode)
 
 
-@wp.kernel(enable_backward=False)
-def draw_from_table(
-    # In:
-    states_in: wp.array2d[float],
-    mask_in: wp.array[bool],
-    stream_in: wp.array[wp.uint32],
-    # Data out:
-    qpos_out: wp.array2d[float],
-    qvel_out: wp.array2d[float],
-):
+@wp.struct
+class Table:
+    """States, ``(count, nq)`` or ``(count, nq + nv)``, and what one of them is written to."""
+
+    states: wp.array2d[float]
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+
+
+@wp.func
+def draw_from_table(world: int, table: Table, stream: wp.uint32):
     """Draws a row of a table uniformly: ``qpos``, then ``qvel`` if the table has columns for it."""
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    stream = stream_in[world]
-    row = wp.randi(stream, 0, states_in.shape[0])
-    nq = qpos_out.shape[1]
+    row = wp.randi(stream, 0, table.states.shape[0])
+    nq = table.qpos.shape[1]
     for i in range(nq):
-        qpos_out[world, i] = states_in[row, i]
-    for i in range(states_in.shape[1] - nq):
-        qvel_out[world, i] = states_in[row, nq + i]
+        table.qpos[world, i] = table.states[row, i]
+    for i in range(table.states.shape[1] - nq):
+        table.qvel[world, i] = table.states[row, nq + i]
 
 
-@wp.kernel(enable_backward=False)
-def draw_pitch_and_hinges(
-    # Model:
-    jnt_range: wp.array2d[wp.vec2],
-    pitch: int,
-    # In:
-    mask_in: wp.array[bool],
-    stream_in: wp.array[wp.uint32],
-    # Data out:
-    qpos_out: wp.array2d[float],
-):
+@wp.struct
+class PlanarBody:
+    """The joints of a planar body: their ranges ``(1, njnt)``, and which of qpos is the pitch."""
+
+    jnt_range: wp.array2d[wp.vec2]
+    pitch: int
+    qpos: wp.array2d[float]
+
+
+@wp.func
+def draw_pitch_and_hinges(world: int, body: PlanarBody, stream: wp.uint32):
     """Draws the pitch of a planar body in (-pi, pi), and the hinges that follow it uniformly in their ranges."""
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    stream = stream_in[world]
-    qpos_out[world, pitch] = wp.randf(stream, -wp.pi, wp.pi)
-    for i in range(pitch + 1, qpos_out.shape[1]):  # the hinges, all with limits
-        limits = jnt_range[0, i]
-        qpos_out[world, i] = wp.randf(stream, limits[0], limits[1])
+    body.qpos[world, body.pitch] = wp.randf(stream, -wp.pi, wp.pi)
+    for i in range(body.pitch + 1, body.qpos.shape[1]):  # the hinges, all with limits
+        limits = body.jnt_range[0, i]
+        body.qpos[world, i] = wp.randf(stream, limits[0], limits[1])
 
 
 @wp.func
@@ -194,26 +187,26 @@ def in_contact(skeleton: Skeleton, xpos: wp.array[wp.vec3], xquat: wp.array[wp.q
     return False
 
 
-@wp.kernel(enable_backward=False)
-def draw_free_poses(
-    # In:
-    skeleton: Skeleton,
-    mask_in: wp.array[bool],
-    stream_in: wp.array[wp.uint32],
-    # Data out:
-    qpos_out: wp.array2d[float],
-    xpos_out: wp.array2d[wp.vec3],
-    xquat_out: wp.array2d[wp.quat],
-):
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    stream = stream_in[world]
-    for _ in range(MAX_TRIES):
-        stream = draw_joints(skeleton, stream, qpos_out[world])
-        pose_bodies(skeleton, qpos_out[world], xpos_out[world], xquat_out[world])
-        if not in_contact(skeleton, xpos_out[world], xquat_out[world]):
-            return
+@wp.struct
+class FreePoses:
+    """A skeleton, what its pose is written to, and room for the poses of its bodies."""
+
+    skeleton: Skeleton
+    qpos: wp.array2d[float]
+    xpos: wp.array2d[wp.vec3]
+    xquat: wp.array2d[wp.quat]
+
+
+@wp.func
+def draw_free_pose(world: int, args: FreePoses, stream: wp.uint32):
+    """Draws orientations of free joints and hinges until no geoms touch."""
+    touching = bool(True)
+    tries = int(0)
+    while touching and tries < MAX_TRIES:
+        stream = draw_joints(args.skeleton, stream, args.qpos[world])
+        pose_bodies(args.skeleton, args.qpos[world], args.xpos[world], args.xquat[world])
+        touching = in_contact(args.skeleton, args.xpos[world], args.xquat[world])
+        tries += 1
 
 
 @wp.struct
@@ -243,33 +236,30 @@ def depth_below(outline: Outline, down: wp.vec3) -> float:
     return depth
 
 
-@wp.kernel(enable_backward=False)
-def draw_orientation_above_floor(
-    # In:
-    outline: Outline,
-    increment: float,
-    mask_in: wp.array[bool],
-    stream_in: wp.array[wp.uint32],
-    # Data out:
-    qpos_out: wp.array2d[float],
-):
-    """Draws the orientation of a free root uniformly, and raises it in increments (m) until it is off the floor."""
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    stream = stream_in[world]
+@wp.struct
+class Drop:
+    """A rigid body on a free joint, the height of an increment (m), and what its pose is written to."""
+
+    outline: Outline
+    increment: float
+    qpos: wp.array2d[float]
+
+
+@wp.func
+def draw_orientation_above_floor(world: int, args: Drop, stream: wp.uint32):
+    """Draws the orientation of a free root uniformly, and raises it in increments until it is off the floor."""
     w = wp.randn(stream)
     x = wp.randn(stream)
     y = wp.randn(stream)
     z = wp.randn(stream)
     quat = wp.normalize(wp.quat(x, y, z, w))
     down = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
-    qpos_out[world, 0] = 0.0
-    qpos_out[world, 1] = 0.0
-    qpos_out[world, 2] = wp.ceil(depth_below(outline, down) / increment) * increment
-    qpos_out[world, 3] = quat[3]
+    args.qpos[world, 0] = 0.0
+    args.qpos[world, 1] = 0.0
+    args.qpos[world, 2] = wp.ceil(depth_below(args.outline, down) / args.increment) * args.increment
+    args.qpos[world, 3] = quat[3]
     for i in range(3):
-        qpos_out[world, 4 + i] = quat[i]
+        args.qpos[world, 4 + i] = quat[i]
 
 
 def make_outline(mj_model: mujoco.MjModel, device: wp.Device) -> Outline:

@@ -3,7 +3,7 @@
 import gc
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mujoco
@@ -15,6 +15,7 @@ from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import compiled, mujoco_warp
 from torchrl_loco.sim.compilation import compile_kernels
 from torchrl_loco.sim.graph import Graph, ScratchPool
+from torchrl_loco.sim.world_func import WorldFunc, fill
 
 SCRATCH = 1.4
 """Memory of a simulation as a multiple of its ``mjData``; the rest is scratch memory (measured: 1.3 to 1.4)."""
@@ -22,60 +23,41 @@ SCRATCH = 1.4
 DETERMINISTIC_SCRATCH = 11.0
 """The same with ``deterministic=True`` on CUDA (measured: 6 to 8 times the memory of a world)."""
 
-BLOCK_DIM = 64
-"""Threads of a block where a thread has a world: few, so that a thousand worlds keep all multiprocessors busy."""
+
+@wp.struct
+class Rest:
+    """The default pose ``(1, nq)``, and what it is written to."""
+
+    qpos0: wp.array2d[float]
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    qacc_warmstart: wp.array2d[float]
+    act: wp.array2d[float]
+    ctrl: wp.array2d[float]
+    time: wp.array[float]
 
 
 @wp.func
-def put_at_rest(
-    world: int,
-    # Model:
-    qpos0: wp.array2d[float],
-    # Data out:
-    qpos_out: wp.array2d[float],
-    qvel_out: wp.array2d[float],
-    qacc_warmstart_out: wp.array2d[float],
-    act_out: wp.array2d[float],
-    ctrl_out: wp.array2d[float],
-    time_out: wp.array[float],
-):
+def put_at_rest(world: int, args: Rest):
     """Puts a world at rest in the default pose."""
-    for i in range(qpos_out.shape[1]):
-        qpos_out[world, i] = qpos0[0, i]
-    for i in range(qvel_out.shape[1]):
-        qvel_out[world, i] = 0.0
-        qacc_warmstart_out[world, i] = 0.0
-    for i in range(act_out.shape[1]):
-        act_out[world, i] = 0.0
-    for i in range(ctrl_out.shape[1]):
-        ctrl_out[world, i] = 0.0
-    time_out[world] = 0.0
-
-
-@wp.kernel(enable_backward=False)
-def reset_worlds(
-    # Model:
-    qpos0: wp.array2d[float],
-    # In:
-    mask_in: wp.array[bool],
-    # Data out:
-    qpos_out: wp.array2d[float],
-    qvel_out: wp.array2d[float],
-    qacc_warmstart_out: wp.array2d[float],
-    act_out: wp.array2d[float],
-    ctrl_out: wp.array2d[float],
-    time_out: wp.array[float],
-):
-    world = wp.tid()
-    if mask_in[world]:
-        put_at_rest(world, qpos0, qpos_out, qvel_out, qacc_warmstart_out, act_out, ctrl_out, time_out)
+    for i in range(args.qpos.shape[1]):
+        args.qpos[world, i] = args.qpos0[0, i]
+    for i in range(args.qvel.shape[1]):
+        args.qvel[world, i] = 0.0
+        args.qacc_warmstart[world, i] = 0.0
+    for i in range(args.act.shape[1]):
+        args.act[world, i] = 0.0
+    for i in range(args.ctrl.shape[1]):
+        args.ctrl[world, i] = 0.0
+    args.time[world] = 0.0
 
 
 class Simulation:
     """Owns the model, the state of all worlds and the engine that advances it.
 
-    ``step``, ``reset``, ``forward`` and ``forward_at_rest`` launch kernels on Warp's current stream and return at once;
-    :meth:`capture` records any sequence of them, with the caller's own kernels in between, to be replayed.
+    ``step``, ``reset`` and ``forward`` launch kernels on Warp's current stream and return at once; :meth:`capture`
+    records any sequence of them to be replayed. Each takes what the caller does in each world before and after the
+    physics; under the engine ``compiled`` all of it is one kernel.
 
     The torch views share memory with the Warp arrays of ``data`` and never change their address. They always hold the
     current state: clone what you want to keep.
@@ -133,30 +115,42 @@ class Simulation:
         self.time = wp.to_torch(self.data.time)
         self.overflow = wp.to_torch(self.data.overflow)
 
-    def step(self) -> None:
-        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state."""
-        self.engine.step()
+    def step(self, before: Sequence[WorldFunc] = (), after: Sequence[WorldFunc] = ()) -> None:
+        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state.
 
-    def reset(self, mask: wp.array) -> None:
-        """Puts the worlds where ``mask`` (bool, ``(nworld,)``) is set at rest in the default pose; others stay."""
-        inputs, outputs = [self.model.qpos0, mask], self.rest_state()
-        wp.launch(
-            reset_worlds, dim=self.num_envs, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK_DIM
-        )
-        self.engine.reset(mask)
+        Args:
+            before: what each world does first.
+            after: what it does at the end.
+        """
+        self.engine.step(before, after)
 
-    def rest_state(self) -> list[wp.array]:
-        """Returns what ``put_at_rest`` writes, for kernels that call it; ``engine.reset(mask)`` comes after."""
-        d = self.data
-        return [d.qpos, d.qvel, d.qacc_warmstart, d.act, d.ctrl, d.time]
+    def reset(
+        self,
+        mask: wp.array,
+        before: Sequence[WorldFunc] = (),
+        after: Sequence[WorldFunc] = (),
+        *,
+        in_motion: bool = False,
+    ) -> None:
+        """Puts worlds at rest in the default pose, and updates their poses and sensors; the others stay.
 
-    def forward(self, mask: wp.array) -> None:
-        """Updates poses and sensors after ``qpos`` and ``qvel`` were changed where ``mask`` ``(nworld,)`` is set."""
-        self.engine.forward(mask)
+        Args:
+            mask: the worlds, bool ``(nworld,)``.
+            before: what each of them does once it is at rest; it may write ``qpos``.
+            after: what it does at the end.
+            in_motion: whether ``before`` may write ``qvel`` too.
+        """
+        rest = WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0))
+        self.engine.forward(mask, [rest, *before], after, at_rest=not in_motion)
 
-    def forward_at_rest(self, mask: wp.array) -> None:
-        """As :meth:`forward`, but cheaper; valid after :meth:`reset` if only ``qpos`` changed since."""
-        self.engine.forward_at_rest(mask)
+    def forward(self, mask: wp.array, after: Sequence[WorldFunc] = ()) -> None:
+        """Updates poses and sensors after ``qpos`` and ``qvel`` were changed.
+
+        Args:
+            mask: the worlds, bool ``(nworld,)``.
+            after: what each of them does at the end.
+        """
+        self.engine.forward(mask, after=after)
 
     def mujoco_data(self, *, contacts: bool = False) -> mjw.Data:
         """Returns the present state as ``mjData`` of MuJoCo-Warp, with poses of geoms, sites and cameras.

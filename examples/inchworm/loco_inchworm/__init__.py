@@ -1,13 +1,16 @@
 """Inchworm: three links that learn to crawl. A body for torchrl_loco that lives outside of it."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from torchrl_loco import LocoEnv, SimConfig
+from torchrl_loco.envs.episode import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
+from torchrl_loco.sim import fill
 
 CRAWL_SPEED = wp.constant(0.5)
 """Horizontal speed that earns the full reward (m/s)."""
@@ -18,33 +21,24 @@ def inchworm_reward(horizontal_velocity: float) -> float:
     return tolerance(horizontal_velocity, CRAWL_SPEED, wp.inf, CRAWL_SPEED, Sigmoid.LINEAR, 0.0)
 
 
-@wp.kernel(enable_backward=False)
-def observe_inchworm(
-    # Model:
-    velocity: int,
-    # Data in:
-    qpos_in: wp.array2d[float],
-    qvel_in: wp.array2d[float],
-    sensordata_in: wp.array2d[float],
-    # In:
-    mask_in: wp.array[bool],
-    # Out:
-    observation_out: wp.array2d[float],
-    reward_out: wp.array[float],
-    terms_out: wp.array2d[float],
-):
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    nq = qpos_in.shape[1]
-    for i in range(1, nq):  # without the position along x
-        observation_out[world, i - 1] = qpos_in[world, i]
-    for i in range(qvel_in.shape[1]):
-        observation_out[world, nq - 1 + i] = qvel_in[world, i]
+@wp.struct
+class InchwormInputs:
+    """What observation and reward are computed from."""
 
-    move = inchworm_reward(sensordata_in[world, velocity])  # along x
-    terms_out[world, 0] = move
-    reward_out[world] = move
+    velocity: int
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    sensordata: wp.array2d[float]
+
+
+@wp.func
+def observe_inchworm(world: int, inputs: InchwormInputs, observation: wp.array[float], terms: wp.array[float]) -> float:
+    k = observe_row(inputs.qpos[world], 1, observation, 0)  # without the position along x
+    observe_row(inputs.qvel[world], 0, observation, k)
+
+    move = inchworm_reward(inputs.sensordata[world, inputs.velocity])  # along x
+    terms[0] = move
+    return move
 
 
 class InchwormCrawl(LocoEnv):
@@ -62,10 +56,10 @@ class InchwormCrawl(LocoEnv):
     observation_size = 9
     term_names = ("move",)
 
-    def observation_kernel(self, world: World) -> tuple[wp.Kernel, list]:
-        """Returns the kernel that writes observation and reward, and its inputs."""
-        velocity, data = int(self.mj_model.sensor("velocity").adr[0]), world.sim.data
-        return observe_inchworm, [velocity, data.qpos, data.qvel, data.sensordata]
+    def observation_func(self, world: World) -> tuple[wp.Function, Any]:
+        """Returns the function that writes observation and reward, and its inputs."""
+        velocity = int(self.mj_model.sensor("velocity").adr[0])
+        return observe_inchworm, fill(InchwormInputs, world.sim.data, velocity=velocity)
 
     def initial_states(self) -> np.ndarray:
         """Returns poses with random bends."""

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -12,7 +12,8 @@ import warp as wp
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.buffer import Buffer
-from torchrl_loco.sim.compiled.step import launch_size, source
+from torchrl_loco.sim.compiled.step import WARP, launch_size, source
+from torchrl_loco.sim.world_func import WorldFunc, chain
 
 ROWS = {
     "qpos": ("nq", wp.float32),
@@ -80,7 +81,7 @@ class Data:
     def cvel(self) -> wp.array:
         """Velocities of the bodies about the center of mass of their tree (rad/s, m/s), ``(nworld, nbody)``.
 
-        They are computed if they were asked for before the first step, as an environment's ``observation_kernel`` does.
+        They are computed if they were asked for before the first step, as an environment's ``observation_func`` does.
 
         Raises:
             RuntimeError: it is too late.
@@ -142,7 +143,7 @@ class CompiledEngine:
         with wp.ScopedDevice(device):
             self.model = mjw.put_model(mj_model)
         self.data = Data(mj_model, num_envs, device)
-        self._kernels: dict[int, wp.Kernel] = {}
+        self._texts: dict[int, str] = {}
         self._launch_size = launch_size(mj_model, num_envs, device)
         self._all = wp.ones(num_envs, dtype=bool, device=device)
         self.peak_constraints = Buffer(num_envs, int, device)
@@ -152,46 +153,61 @@ class CompiledEngine:
         """Returns what prevents that something is dropped."""
         return f"a world of the compiled engine has no more places for {dropped}: pass engine='mujoco_warp'"
 
-    def reset(self, mask: wp.array) -> None:
-        """Does nothing: the state is all that a world has."""
+    def step(self, before: Sequence[WorldFunc] = (), after: Sequence[WorldFunc] = ()) -> None:
+        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state.
 
-    def step(self) -> None:
-        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state."""
-        self._launch(self._substeps, self._all)
+        Args:
+            before: what each world does first, in the same kernel.
+            after: what it does at the end, likewise.
+        """
+        self._launch(self._substeps, self._all, before, after)
 
-    def forward(self, mask: wp.array) -> None:
-        """Updates poses and sensors where ``mask`` ``(nworld,)`` is set."""
-        self._launch(0, mask)
+    def forward(
+        self,
+        mask: wp.array,
+        before: Sequence[WorldFunc] = (),
+        after: Sequence[WorldFunc] = (),
+        *,
+        at_rest: bool = False,
+    ) -> None:
+        """Updates poses and sensors where ``mask`` ``(nworld,)`` is set; ``at_rest`` makes no difference.
 
-    forward_at_rest = forward
+        Args:
+            mask: the worlds.
+            before: what each of them does first, in the same kernel.
+            after: what it does at the end, likewise.
+            at_rest: whether they are at rest.
+        """
+        self._launch(0, mask, before, after)
 
-    def _launch(self, substeps: int, mask: wp.array) -> None:
+    def _launch(self, substeps: int, mask: wp.array, before: Sequence[WorldFunc], after: Sequence[WorldFunc]) -> None:
         outputs = self.data.outputs()
-        threads, block, worlds_per_warp = self._launch_size
+        text = self._text(substeps, outputs["cvel"] is not None)
+        first, last, size = chain(before), chain(after), self._launch_size
         wp.launch(
-            self._kernel(substeps, outputs["cvel"] is not None),
-            dim=threads,
-            inputs=[worlds_per_warp, mask, self.data.ctrl],
+            _kernel(text, first.func, first.args._cls, last.func, last.args._cls),
+            dim=size.threads,
+            inputs=[size.worlds_per_warp, size.lanes, mask, first.args, last.args, self.data.ctrl],
             outputs=list(outputs.values()),
             device=self._device,
-            block_dim=block,
+            block_dim=size.block,
         )
 
-    def _kernel(self, substeps: int, with_cvel: bool) -> wp.Kernel:
-        if substeps not in self._kernels:
-            self._kernels[substeps] = _kernel(source(self._mj_model, substeps, with_cvel=with_cvel))
-        return self._kernels[substeps]
+    def _text(self, substeps: int, with_cvel: bool) -> str:
+        if substeps not in self._texts:
+            self._texts[substeps] = source(self._mj_model, substeps, with_cvel=with_cvel)
+        return self._texts[substeps]
 
 
-@functools.cache
-def _kernel(text: str) -> wp.Kernel:
+@functools.cache  # else each environment would make the kernel again
+def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, After: Any) -> wp.Kernel:  # noqa: N803
     """Returns a kernel around the C++ of :func:`~torchrl_loco.sim.compiled.step.source`."""
 
     @wp.func_native(text)
     def advance(
-        thread: int,
-        worlds_per_warp: int,
-        mask_in: wp.array[bool],
+        world: int,
+        lane: int,
+        live: bool,
         ctrl_in: wp.array2d[float],
         qpos_out: wp.array2d[float],
         qvel_out: wp.array2d[float],
@@ -209,7 +225,10 @@ def _kernel(text: str) -> wp.Kernel:
     def compiled_step(
         # In:
         worlds_per_warp: int,
+        lanes: int,
         mask_in: wp.array[bool],
+        before_args: Before,
+        after_args: After,
         # Data in:
         ctrl_in: wp.array2d[float],
         # Data out:
@@ -223,10 +242,18 @@ def _kernel(text: str) -> wp.Kernel:
         sensordata_out: wp.array2d[float],
         overflow_out: wp.array[int],
     ):
+        place = wp.tid() % WARP // lanes  # of the world in its warp
+        lane = wp.tid() % lanes  # of the thread in its world
+        world = wp.tid() // WARP * worlds_per_warp + place
+        live = place < worlds_per_warp and world < mask_in.shape[0]
+        if live:
+            live = mask_in[world]
+        if live and lane == 0:
+            before(world, before_args)
         advance(
-            wp.tid(),
-            worlds_per_warp,
-            mask_in,
+            world,
+            lane,
+            live,  # lanes of a block may wait for those that are not
             ctrl_in,
             qpos_out,
             qvel_out,
@@ -238,5 +265,7 @@ def _kernel(text: str) -> wp.Kernel:
             sensordata_out,
             overflow_out,
         )
+        if live and lane == 0:
+            after(world, after_args)
 
     return compiled_step

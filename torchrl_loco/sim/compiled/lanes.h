@@ -1329,19 +1329,17 @@ struct Step : Math {
 static_assert(sizeof(World) == Model::WORLD_BYTES, "lanes.py counts on this size");
 static __shared__ World worlds[Model::WORLDS_PER_BLOCK];
 World& w = worlds[threadIdx.x / LANES];
-const int world = thread / LANES, lane = threadIdx.x % LANES;
 // Warps that run in step share what they fetch of the text. Lanes without a world keep to the step but do nothing else.
 #define LOCKSTEP() if (Model::LOCKSTEP) __syncthreads()
 #else
 World storage;
 World& w = storage;
-const int world = thread, lane = 0;
 #define LOCKSTEP()
 #endif
-const bool live = world < mask_in.shape[0] && mask_in.data[world < mask_in.shape[0] ? world : 0];
 float* const sensors = sensordata_out.data + (live ? world : 0) * Model::SENSOR_VALUES;
 Step step(w, lane, ctrl_in.data, overflow_out.data, world);
 if (live) {
+  step.sync();  // the first lane may have written the state
   SHARED_LOOP(i, Model::POSITIONS) w.qpos[i] = qpos_out.data[world * Model::POSITIONS + i];
   SHARED_LOOP(i, STRIDE) {
     w.qvel[i] = i < DOFS ? qvel_out.data[world * DOFS + i] : 0.0f;
@@ -1382,6 +1380,7 @@ if (live) {
     }
     if (lane == 0) time_out.data[world] += Model::SUBSTEPS * Model::timestep();
   }
+  step.sync();  // the first lane may read it
 }
 #undef INLINE
 #undef ROLLED

@@ -1,6 +1,7 @@
 """A control step of one model as one function of C++: all substeps of a world, then what an observation reads."""
 
 import math
+from typing import NamedTuple
 
 import mujoco
 import warp as wp
@@ -11,7 +12,7 @@ TRACED_DOFS = 16
 """Most degrees of freedom of a body that is traced. A thread holds its state; for the humanoid that would be 12 KiB and
 340 KB of code, which takes twice as long on a GPU as a warp of lanes. For the walker lanes take 3 times as long."""
 
-WARP = 32
+WARP = wp.constant(32)
 """Threads of a CUDA warp, which wait for each other wherever they diverge."""
 WARPS = 2
 """Warps that each multiprocessor gets before warps are filled with worlds: a warp takes as long as its slowest world,
@@ -34,15 +35,29 @@ def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
     return traced.source(m, substeps, with_cvel=with_cvel) if is_traced(m) else lanes.source(m, substeps)
 
 
-def launch_size(m: mujoco.MjModel, num_envs: int, device: wp.Device) -> tuple[int, int, int]:
-    """Returns the threads of a launch, those of a block, and how many worlds share a warp."""
-    if is_traced(m):
-        worlds = WARP
-        if device.is_cuda:
-            share = num_envs / (WARPS * device.sm_count)
-            worlds = min(WARP, 2 ** math.ceil(math.log2(max(share, 1))))
-        return WARP * math.ceil(num_envs / worlds), WARP, worlds
-    if not device.is_cuda:
-        return num_envs, 1, 1
-    block = lanes.worlds_per_block(m)
-    return WARP * block * math.ceil(num_envs / block), WARP * block, 1
+class LaunchSize(NamedTuple):
+    """The threads of a launch.
+
+    Attributes:
+        threads: all of them.
+        block: those of a block.
+        worlds_per_warp: worlds that share a warp.
+        lanes: threads that share a world.
+    """
+
+    threads: int
+    block: int
+    worlds_per_warp: int
+    lanes: int
+
+
+def launch_size(m: mujoco.MjModel, num_envs: int, device: wp.Device) -> LaunchSize:
+    """Returns how the worlds are spread over threads."""
+    if device.is_cuda and not is_traced(m):
+        block = lanes.worlds_per_block(m)
+        return LaunchSize(WARP * block * math.ceil(num_envs / block), WARP * block, 1, WARP)
+    worlds = WARP
+    if device.is_cuda:
+        share = num_envs / (WARPS * device.sm_count)
+        worlds = min(WARP, 2 ** math.ceil(math.log2(max(share, 1))))
+    return LaunchSize(WARP * math.ceil(num_envs / worlds), WARP, worlds, 1)

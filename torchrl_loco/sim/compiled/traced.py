@@ -63,9 +63,7 @@ def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
         with_cvel: whether the velocities of the bodies are written.
     """
     world = Block()
-    world("// Threads of a warp beyond its worlds, and worlds that are not masked, do nothing.")
-    world("const int lane = thread % 32, world = thread / 32 * worlds_per_warp + lane;")
-    world("if (lane >= worlds_per_warp || world >= mask_in.shape[0] || !mask_in.data[world]) return;")
+    world("if (!live) return;")
     for title, size in INPUTS.items():
         argument = {"qacc": "qacc_warmstart_out", "ctrl": "ctrl_in"}.get(title, f"{title}_out")
         count = getattr(m, size)

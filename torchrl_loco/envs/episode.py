@@ -1,0 +1,236 @@
+"""What happens in each world beside the physics: actions, observations, the time limit, counters, new episodes."""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from torchrl_loco.sim import WorldFunc, fill
+from torchrl_loco.sim.sampling import world_stream
+
+MAX_VALUE = 1.0e10
+"""Magnitude from which a number counts as not finite: MuJoCo's mjMAXVAL."""
+
+Eight = wp.types.vector(length=8, dtype=wp.float32)
+
+
+@wp.struct
+class Outputs:
+    """Observations ``(nworld, size)``, rewards ``(nworld,)`` and their factors ``(nworld, count)``."""
+
+    observation: wp.array2d[float]
+    reward: wp.array[float]
+    terms: wp.array2d[float]
+
+
+@wp.struct
+class Flags:
+    """How the episodes are: each ``(nworld,)``."""
+
+    non_finite: wp.array[bool]
+    done: wp.array[bool]
+    terminated: wp.array[bool]
+    truncated: wp.array[bool]
+
+
+# Before the physics.
+
+
+@wp.struct
+class Control:
+    """Actions in [-1, 1] ``(nworld, nu)``, and the controls that they are scaled to."""
+
+    ctrlrange: wp.array2d[wp.vec2]
+    action: wp.array2d[float]
+    ctrl: wp.array2d[float]
+    non_finite: wp.array[bool]
+
+
+@wp.func
+def apply_action(world: int, args: Control):
+    """Clips the action and scales it to ``ctrl``.
+
+    A world whose action is NaN or infinite is marked, and stepped with an action of zeros.
+    """
+    count = int(0)
+    for i in range(args.action.shape[1]):
+        count += wp.where(wp.isfinite(args.action[world, i]), 0, 1)
+    non_finite = count > 0
+    for i in range(args.action.shape[1]):
+        limits = args.ctrlrange[0, i]
+        used = wp.where(non_finite, 0.0, wp.clamp(args.action[world, i], -1.0, 1.0))
+        args.ctrl[world, i] = 0.5 * (limits[0] + limits[1]) + 0.5 * (limits[1] - limits[0]) * used
+    args.non_finite[world] = non_finite
+
+
+# After it.
+
+
+def observer(func: wp.Function, inputs: Any, outputs: Any) -> WorldFunc:
+    """Returns what writes observation, reward and terms, from what a body names in its ``observation_func``."""
+    write, struct = _observer(func, inputs._cls)
+    return WorldFunc(write, fill(struct, inputs=inputs, outputs=outputs))
+
+
+@functools.cache
+def _observer(observe: wp.Function, Inputs: Any) -> tuple[wp.Function, Any]:  # noqa: N803
+    @wp.struct
+    class Observer:
+        inputs: Inputs
+        outputs: Outputs
+
+    @wp.func
+    def write_observation(world: int, args: Observer):
+        out = args.outputs
+        out.reward[world] = observe(world, args.inputs, out.observation[world], out.terms[world])
+
+    return write_observation, Observer
+
+
+@wp.func
+def observe_row(row: wp.array[float], first: int, observation: wp.array[float], k: int) -> int:
+    """Copies the numbers of a row from ``first`` on into an observation at ``k``; returns where they end.
+
+    Eight are read before any is written: a read that follows a write waits for it, as both may be the same number.
+    """
+    i = int(first)
+    while i + 8 <= row.shape[0]:
+        some = Eight()
+        for j in range(8):
+            some[j] = row[i + j]
+        for j in range(8):
+            observation[k + j] = some[j]
+        i += 8
+        k += 8
+    while i < row.shape[0]:
+        observation[k] = row[i]
+        i += 1
+        k += 1
+    return k
+
+
+@wp.func
+def count_non_finite(row: wp.array[float]) -> int:
+    """Counts without a branch: else a thread would wait for each number before it asks for the next."""
+    count = int(0)
+    for i in range(row.shape[0]):
+        count += wp.where(wp.abs(row[i]) < MAX_VALUE, 0, 1)  # counts NaN too
+    return count
+
+
+@wp.struct
+class Screen:
+    """Where a number that is not finite is looked for, and what is zeroed then."""
+
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    outputs: Outputs
+    non_finite: wp.array[bool]
+
+
+@wp.func
+def zero_non_finite(world: int, args: Screen):
+    """Marks a world that is non-finite, and zeroes observation, reward and terms of one that is marked."""
+    out = args.outputs
+    observation = out.observation[world]
+    found = count_non_finite(args.qpos[world]) + count_non_finite(args.qvel[world]) + count_non_finite(observation)
+    if args.non_finite[world] or found > 0 or not (wp.abs(out.reward[world]) < MAX_VALUE):
+        args.non_finite[world] = True
+        for i in range(observation.shape[0]):
+            observation[i] = 0.0
+        for i in range(out.terms.shape[1]):
+            out.terms[world, i] = 0.0
+        out.reward[world] = 0.0
+
+
+@wp.struct
+class End:
+    """What ends a control step. ``counts`` ``(nworld, counters)`` has a last column for steps that end non-finite."""
+
+    episode_length: int
+    counter_bits: wp.array[int]
+    overflow: wp.array[int]
+    flags: Flags
+    elapsed_steps: wp.array[int]
+    mask: wp.array[bool]
+    counts: wp.array2d[int]
+
+
+@wp.func
+def finish_step(world: int, args: End):
+    """Ends a control step: applies the time limit, and counts what went wrong.
+
+    A world is truncated at the time limit, and terminated if it is not finite; what is done is masked for the reset
+    that may follow. The bits of ``overflow`` are cleared.
+    """
+    non_finite = args.flags.non_finite[world]
+    elapsed_steps = args.elapsed_steps[world] + 1
+    truncated = elapsed_steps >= args.episode_length
+    args.elapsed_steps[world] = elapsed_steps
+    args.flags.terminated[world] = non_finite
+    args.flags.truncated[world] = truncated
+    args.flags.done[world] = truncated or non_finite
+    args.mask[world] = truncated or non_finite
+
+    bits = args.overflow[world]
+    for i in range(args.counter_bits.shape[0]):
+        if bits & args.counter_bits[i] != 0:
+            args.counts[world, i] += 1
+    if non_finite:
+        args.counts[world, args.counter_bits.shape[0]] += 1
+    args.overflow[world] = 0
+
+
+# At a reset.
+
+
+@wp.struct
+class Beginning:
+    """What begins an episode; ``stream`` ``(nworld,)`` is where its random numbers start."""
+
+    stagger: wp.array[bool]
+    seed: wp.array[wp.uint32]
+    world_offset: int
+    episode_length: int
+    episode: wp.array[int]
+    stream: wp.array[wp.uint32]
+    elapsed_steps: wp.array[int]
+    flags: Flags
+
+
+@wp.func
+def begin_episode(world: int, args: Beginning):
+    """Starts the next episode: its random stream, its clock and its flags."""
+    episode = args.episode[world]
+    elapsed_steps = int(0)
+    if args.stagger[0]:
+        # The complement of the episode separates this stream from the one that draws the pose.
+        stream = world_stream(args.seed[0], args.world_offset + world, -1 - episode)
+        elapsed_steps = wp.randi(stream, 0, args.episode_length)
+    args.stream[world] = world_stream(args.seed[0], args.world_offset + world, episode)
+    args.episode[world] = episode + 1
+    args.elapsed_steps[world] = elapsed_steps
+    args.flags.non_finite[world] = False
+    args.flags.done[world] = False
+    args.flags.terminated[world] = False
+    args.flags.truncated[world] = False
+
+
+def poser(func: wp.Function, inputs: Any, stream: wp.array) -> WorldFunc:
+    """Returns what draws initial states from ``stream`` ``(nworld,)``, from what a body names in its ``pose_func``."""
+    draw, struct = _poser(func, inputs._cls)
+    return WorldFunc(draw, fill(struct, inputs=inputs, stream=stream))
+
+
+@functools.cache
+def _poser(pose: wp.Function, Inputs: Any) -> tuple[wp.Function, Any]:  # noqa: N803
+    @wp.struct
+    class Poser:
+        inputs: Inputs
+        stream: wp.array[wp.uint32]
+
+    @wp.func
+    def draw_pose(world: int, args: Poser):
+        pose(world, args.inputs, args.stream[world])
+
+    return draw_pose, Poser
