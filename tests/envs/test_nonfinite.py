@@ -100,6 +100,17 @@ def test_a_state_that_is_not_finite_ends_only_its_world(shared, task, protocol, 
         assert_goes_on_as(env, twin, after, expected, more, exact)
 
 
+def test_a_restored_state_beyond_all_bounds_is_not_observed(shared, engine):
+    env = shared("walker_run", 2, engine=engine, **COARSE)
+    env.reset()
+    state = env.get_state()
+    state["qvel"][0, 0] = 2e10  # NaN is refused
+    td = env.reset(state, set_state=True)
+    assert (td["observation"][0] == 0).all()
+    assert (td["observation"][1] != 0).any()
+    assert env.world.non_finite.torch.tolist() == [True, False]
+
+
 def test_a_reset_clears_constraints_that_are_not_finite(shared, protocol):
     """The solver multiplies unused rows by zero: a NaN would remain."""
     options = {"protocol": protocol, "engine": "mujoco_warp", **COARSE}
