@@ -47,6 +47,11 @@ train.add_argument("--peer", action="store_true", help="train Brax's PPO too")
 train.add_argument("--path", type=Path, help="folder that the peer's packages were installed in")
 train.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 train.add_argument("--out", type=Path, help="file for the results as JSON")
+spread = commands.add_parser("scaling", help="several GPUs beside one, with the same worlds on each")
+spread.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_walk"])
+spread.add_argument("--gpus", type=int, nargs="+", default=[1, 2], help="numbers of GPUs, or of processes on the CPU")
+spread.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
+spread.add_argument("--out", type=Path, help="file for the results as JSON")
 draw = commands.add_parser("plot", help="draw throughput against worlds, or return against time, from the JSON")
 draw.add_argument("results", type=Path)
 draw.add_argument("picture", type=Path)
@@ -84,6 +89,10 @@ elif args.command == "soak":
     from benchmarks.soak import COLUMNS, soak
 
     rows = soak(args.bodies, args.worlds[0], int(args.frames), args.device)
+elif args.command == "scaling":
+    from benchmarks.scaling import COLUMNS, scaling
+
+    rows = scaling(args.tasks, args.gpus, args.device)
 elif args.command == "training":
     from benchmarks.training import COLUMNS, training
 

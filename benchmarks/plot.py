@@ -1,4 +1,4 @@
-"""Pictures of results: throughput against the number of worlds, or return against the time that training took."""
+"""Pictures of results: throughput against worlds or GPUs, return against the time that training took."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -16,7 +16,7 @@ from benchmarks.results import Row
 def plot(results: Path, picture: Path) -> None:
     """Draws the rows of a results file, a panel for each body or task and a line for each case or trainer."""
     data = json.loads(results.read_text())
-    panel, draw = ("task", draw_returns) if "trainer" in data["rows"][0] else ("body", draw_throughput)
+    panel, draw = next((panel, draw) for key, panel, draw in KINDS if key in data["rows"][0])
     names = distinct(data["rows"], panel)
     figure, panels = plt.subplots(1, len(names), figsize=(5.5 * len(names), 4.2), squeeze=False, layout="constrained")
     for axes, name in zip(panels[0], names, strict=True):
@@ -45,6 +45,27 @@ def draw_returns(axes: Axes, rows: Sequence[Row]) -> None:
         found = [row for row in rows if row["trainer"] == trainer and "mean" in row]
         seconds, means = [row["seconds"] for row in found], [row["mean"] for row in found]
         axes.plot(seconds, means, "o-", markersize=3, label=trainer)
+
+
+def draw_scaling(axes: Axes, rows: Sequence[Row]) -> None:
+    """Draws frames per second against GPUs as multiples of the first row's, and what the cost model predicts."""
+    axes.set(xlabel="GPUs", ylabel="frames per second, times those of one GPU")
+    measured = [row for row in rows if "error" not in row]
+    gpus = sorted({row["gpus"] for row in measured})
+    axes.plot(gpus, [count / gpus[0] for count in gpus], ":", color="gray", label="as many times as GPUs")
+    for color, algorithm in enumerate(distinct(measured, "algorithm")):
+        found = [row for row in measured if row["algorithm"] == algorithm]
+        lines = {"collection": "o--", "training": "o-"}
+        for what, line in lines.items():
+            ratios = [row[f"{what}, ratio"] for row in found]
+            axes.plot([row["gpus"] for row in found], ratios, line, color=f"C{color}", label=f"{algorithm}, {what}")
+        predicted = [row["predicted"] for row in found]
+        axes.plot([row["gpus"] for row in found], predicted, "x", color=f"C{color}", label=f"{algorithm}, predicted")
+    axes.set_xticks(gpus)
+
+
+KINDS = (("gpus", "task", draw_scaling), ("trainer", "task", draw_returns), ("worlds", "body", draw_throughput))
+"""A key of the rows of each kind of results, what makes a panel, and what draws it."""
 
 
 def distinct(rows: Iterable[Row], key: str) -> list[str]:

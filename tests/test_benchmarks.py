@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import fidelity, plot, soak, timing
+from benchmarks import fidelity, plot, scaling, soak, timing
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
 from benchmarks.throughput import phases
@@ -90,3 +90,24 @@ def test_soak_compares_the_counters_with_what_happened(monkeypatch):
     monkeypatch.setattr(soak.LocoEnv, "health", lambda env: {"total": {"non_finite": torch.tensor(3)}})
     with pytest.raises(AssertionError):
         soak.soak(["walker"], 32, 40 * 32, torch.device("cpu"))
+
+
+@pytest.mark.slow
+def test_ranks_are_measured_beside_one_process(tmp_path):
+    settings = {"num_envs": 8, "num_steps": 4, "minibatch_size": 16, "epochs": 1, "hidden": [16]}
+    found = scaling.scaling(["walker_walk"], [1, 2], torch.device("cpu"), settings)
+    assert [(row["algorithm"], row["gpus"]) for row in found] == [("ppo", 1), ("reppo", 1), ("ppo", 2), ("reppo", 2)]
+    for row in found:
+        assert row["gradient_steps"] == 2
+        assert min(row["collection"], row["training"]) > 0
+        assert (row["exchange"] > 0) == (row["gpus"] == 2)  # one process exchanges nothing
+    save(found, tmp_path / "scaling.json", torch.device("cpu"))
+    plot.plot(tmp_path / "scaling.json", tmp_path / "scaling.png")
+    assert (tmp_path / "scaling.png").stat().st_size > 10_000
+
+
+def test_the_cost_model_adds_the_exchanges_to_an_iteration():
+    first = {"gpus": 1, "collection": 10.0, "training": 5.0, "iteration": 30.0}
+    row = {"gpus": 4, "collection": 39.0, "training": 15.0, "gradient_steps": 5, "exchange, recorded": 2.0}
+    found = scaling.compared(row, first)
+    assert found == {"collection, ratio": 3.9, "training, ratio": 3.0, "predicted": 3.0}  # 30 of 30 + 5 * 2 ms
