@@ -13,6 +13,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
+from generate import benchmarks as page
 
 from benchmarks import campaign, marks, pack, plot
 from benchmarks.campaign_folder import TABLES, CampaignFolder, Job
@@ -353,6 +354,19 @@ def test_results_beside_marks(results):
     assert marks.threshold("humanoid_run", "playground") == 900
     with pytest.raises(FileNotFoundError, match=r"is not the folder of a campaign: it has no results\.csv"):
         marks.learning(results.parent)
+
+
+def test_a_campaign_on_the_page(results, tmp_path):
+    text = page.all_results(results.parents[1], tmp_path / "docs" / "pictures")
+    row = "| walker_walk | playground | 3 | 980.3 | 984 | 976.0 | 980 | 32 | 30 | 950 | 8 | 18 | 982.9 | FastTD3 |"
+    assert row in text
+    assert "| snail_crawl | dm_control | 1 | 12.5 |  |" in text
+    assert "`python -m benchmarks campaign`: 2 x toaster, 2027-01-02" in text
+    picture = "pictures/2027-01-02-toaster-campaign.png"
+    assert f"]({picture})" in text
+    assert (tmp_path / "docs" / picture).stat().st_size > 10_000
+    assert "### campaign, results" not in text  # linked, without a table of their own
+    assert "[results.csv](../benchmarks/results/2027-01-02-toaster/campaign/results.csv)" in text
 
 
 def test_archives_in_parts(tmp_path, monkeypatch):
