@@ -1,6 +1,7 @@
 """Pictures of results: throughput against worlds or GPUs, return against the time that training took."""
 
 import json
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -10,11 +11,21 @@ matplotlib.use("agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
+from benchmarks.marks import MARKS, read
 from benchmarks.results import Row
+
+COLORS = {"playground": "C0", "dm_control": "C1"}
+"""Of the protocols."""
 
 
 def plot(results: Path, picture: Path) -> None:
-    """Draws the rows of a results file, a panel for each body or task and a line for each case or trainer."""
+    """Draws the rows of a results file, a panel for each body or task and a line for each case or trainer.
+
+    Of a campaign's folder it draws the returns, a panel for each task and a line for each seed.
+    """
+    if results.is_dir():
+        plot_campaign(results, picture)
+        return
     data = json.loads(results.read_text())
     panel, draw = next((panel, draw) for key, panel, draw in KINDS if key in data["rows"][0])
     names = distinct(data["rows"], panel)
@@ -66,6 +77,41 @@ def draw_scaling(axes: Axes, rows: Sequence[Row]) -> None:
 
 KINDS = (("gpus", "task", draw_scaling), ("trainer", "task", draw_returns), ("worlds", "body", draw_throughput))
 """A key of the rows of each kind of results, what makes a panel, and what draws it."""
+
+
+def plot_campaign(folder: Path, picture: Path) -> None:
+    """Draws the return of every job's evaluations against training time, and published returns as dashed lines."""
+    rows = read(folder, "evaluations.csv")
+    found = distinct(rows, "task")
+    if not rows:
+        raise ValueError(f"there are no evaluations in {folder} yet")
+    tasks = [task for task in dict.fromkeys([*(task for task, _ in MARKS), *found]) if task in found]
+    columns = min(3, len(tasks))
+    shape = (math.ceil(len(tasks) / columns), columns)
+    figure, panels = plt.subplots(*shape, figsize=(4.5 * columns, 3.4 * shape[0]), squeeze=False, layout="constrained")
+    for axes, task in zip(panels.flat, tasks, strict=False):
+        draw_task(axes, task, [row for row in rows if row["task"] == task])
+    for axes in panels.flat[len(tasks) :]:
+        axes.remove()
+    figure.savefig(picture, dpi=150)
+
+
+def draw_task(axes: Axes, task: str, rows: Sequence[Row]) -> None:
+    """Draws the return of each seed of a task in each protocol against training time."""
+    axes.set(title=task, xlabel="seconds of training", ylabel="return of 1000 steps", ylim=(0, 1020))
+    axes.grid(alpha=0.3)
+    for protocol in distinct(rows, "protocol"):
+        of_protocol = [row for row in rows if row["protocol"] == protocol]
+        color, seeds = COLORS[protocol], distinct(of_protocol, "seed")
+        for seed in seeds:
+            found = [(float(row["seconds"]), float(row["mean"])) for row in of_protocol if row["seed"] == seed]
+            label = f"{protocol}, seed {', '.join(seeds)}" if seed == seeds[0] else None
+            axes.plot(*zip(*found, strict=True), "o-", markersize=2, linewidth=1, color=color, label=label)
+        mark = MARKS.get((task, protocol))
+        if mark is not None and mark.published is not None:
+            axes.axhline(mark.published, color=color, linestyle="--", linewidth=1, label=f"{mark.by} {mark.published}")
+    axes.set_xlim(left=0)
+    axes.legend(loc="lower right", fontsize="small")
 
 
 def distinct(rows: Iterable[Row], key: str) -> list[str]:

@@ -3,6 +3,7 @@
 import datetime
 import json
 import platform
+import shlex
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -32,19 +33,23 @@ def show(rows: Sequence[Row], columns: dict[str, str]) -> None:
 
 def save(rows: Sequence[Row], path: Path, device: torch.device) -> None:
     """Writes the rows and what a reader needs to judge them by as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({**circumstances(device), "rows": list(rows)}, indent=1) + "\n")
+
+
+def circumstances(device: torch.device) -> dict[str, Any]:
+    """Returns the command, without folders of this machine, the date, the revision, the device and the versions."""
     git = subprocess.run(
         ["git", "describe", "--always", "--abbrev=40", "--dirty"], capture_output=True, text=True, check=False
     )
-    results = {
-        "command": " ".join(["python -m benchmarks", *sys.argv[1:]]),
+    words = [Path(word).name if word.startswith("/") else word for word in sys.argv[1:]]
+    return {
+        "command": f"python -m benchmarks {shlex.join(words)}",
         "date": datetime.date.today().isoformat(),
         "revision": git.stdout.strip() if git.returncode == 0 else "unknown",
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name(),
         "versions": {name: metadata.version(name) for name in PACKAGES},
-        "rows": list(rows),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(results, indent=1) + "\n")
 
 
 def cpu_name() -> str:

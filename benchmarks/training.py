@@ -5,7 +5,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -47,16 +47,28 @@ def ours(task: str, device: torch.device, frames: int) -> list[Row]:
     """Runs our command and notes when each evaluation is written."""
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as out:
-        options = {"total_frames": frames, "eval_interval": frames // EVALUATIONS, "video_seconds": 0, "out": out}
-        command = [sys.executable, "-m", "torchrl_loco", "train", task, f"--device={device}"]
+        settings = {"device": device, "total_frames": frames, "eval_interval": frames // EVALUATIONS}
         started = time.time()
-        process = subprocess.Popen([*command, *(f"--{key}={value}" for key, value in options.items())], env=os.environ)
+        process = subprocess.Popen(train_command(task, {**settings, "video_seconds": 0, "out": out}), env=os.environ)
         while process.poll() is None:
             time.sleep(0.05)
-            for folder in Path(out).glob("*/evaluations.csv"):
-                for row in RunFolder(folder.parent).read_evaluations()[len(rows) :]:
-                    seconds = time.time() - started
-                    rows.append({"frames": int(row["frames"]), "seconds": seconds, "mean": row["mean"]})
+            for row in evaluations(Path(out))[len(rows) :]:
+                seconds = time.time() - started
+                rows.append({"frames": int(row["frames"]), "seconds": seconds, "mean": row["mean"]})
         if process.returncode:
             raise MeasurementError(f"training {task} ended with status {process.returncode}")
     return rows
+
+
+def train_command(task: str, settings: Mapping[str, object]) -> list[str]:
+    """Returns the command that trains a task with these settings; blanks separate several values of one."""
+    command = [sys.executable, "-m", "torchrl_loco", "train", task]
+    for name, value in settings.items():
+        words = str(value).split()
+        command += [f"--{name}", *words] if len(words) > 1 else [f"--{name}={value}"]
+    return command
+
+
+def evaluations(out: Path) -> list[Row]:
+    """Returns the evaluations so far of the run in a folder of runs, none before the first."""
+    return [row for file in out.glob("*/evaluations.csv") for row in RunFolder(file.parent).read_evaluations()]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -48,13 +49,14 @@ def test_a_failed_process_raises_its_error(tmp_path):
         run_json(["bad"], environment)
 
 
-def test_results_say_how_they_were_measured(tmp_path, capsys):
+def test_results_say_how_they_were_measured(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["-m", "throughput", "--out", "/root/out/throughput.json"])
     measured = rows(env_step=5.5)
     save(measured, tmp_path / "new" / "results.json", torch.device("cpu"))
     results = json.loads((tmp_path / "new" / "results.json").read_text())
     assert results["rows"] == measured
     assert results["versions"]["torch"] == torch.__version__
-    assert results["command"].startswith("python -m benchmarks")
+    assert results["command"] == "python -m benchmarks throughput --out throughput.json"
     assert results["device"]
     show(measured, {"case": "", "ms": ".2f", "error": ""})
     assert capsys.readouterr().out.splitlines()[1].split() == ["env_step", "5.50"]

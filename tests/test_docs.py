@@ -140,7 +140,7 @@ def test_new_results_appear_by_themselves(tmp_path):
     folder = tmp_path / "benchmarks" / "results" / "2027-01-02-toaster"
     folder.mkdir(parents=True)
     (folder / "new.csv").write_text("task,mean\nwalker_walk,12.5\n")
-    text = benchmarks.all_results(folder.parent)
+    text = benchmarks.all_results(folder.parent, tmp_path / "docs")
     assert "## toaster, 2027-01-02" in text
     assert "| walker_walk | 12.5 |" in text
 

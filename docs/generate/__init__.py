@@ -27,7 +27,7 @@ def everything() -> None:
         write(fragments / f"{body}_action.md", bodies.action_table(body))
         write(fragments / f"{body}_protocols.md", tasks.protocols(body))
     write(fragments / "tasks.md", tasks.overview())
-    write(fragments / "benchmarks.md", benchmarks.all_results(RESULTS))
+    write(fragments / "benchmarks.md", benchmarks.all_results(RESULTS, OUT / "pictures"))
     write(fragments / "notebooks.md", notebooks(NOTEBOOKS, OUT / "notebooks"))
 
 

@@ -1,10 +1,12 @@
-"""All of benchmarks/results as tables: a new folder or file there appears by itself."""
+"""All of benchmarks/results as tables and pictures: a new folder or file there appears by itself."""
 
 import csv
 import json
 from pathlib import Path
 from typing import Any
 
+from benchmarks.marks import COLUMNS, learning
+from benchmarks.plot import plot
 from generate.markdown import table
 
 Row = dict[str, Any]
@@ -12,16 +14,24 @@ FOLDED = 12
 """Rows from which on a table is folded up."""
 
 
-def all_results(results: Path) -> str:
-    """Returns a section for each folder of results, newest first; paths are relative to docs/."""
+def all_results(results: Path, pictures: Path) -> str:
+    """Returns a section for each folder of results, newest first; paths are relative to docs/.
+
+    Args:
+        results: the folder benchmarks/results.
+        pictures: a folder below docs/, into which the pictures of campaigns are drawn.
+    """
     folders = sorted((path for path in results.iterdir() if path.is_dir()), reverse=True)
-    return "\n".join(_folder(folder, results.parent.parent) for folder in folders)
+    return "\n".join(_folder(folder, results.parent.parent, pictures) for folder in folders)
 
 
-def _folder(folder: Path, root: Path) -> str:
+def _folder(folder: Path, root: Path, pictures: Path) -> str:
     date, device = folder.name[:10], folder.name[11:]
     parts = [f"## {device}, {date}\n"]
-    for path in sorted(folder.rglob("*")):
+    campaign = folder / "campaign"
+    if campaign.is_dir():
+        parts.append(_campaign(campaign, root, pictures / f"{folder.name}-campaign.png"))
+    for path in sorted(path for path in folder.rglob("*") if campaign not in path.parents):
         link = f"../{path.relative_to(root).as_posix()}"
         heading = f"### {path.relative_to(folder).with_suffix('').as_posix().replace('/', ', ')}\n"
         if path.suffix == ".json":
@@ -35,6 +45,26 @@ def _folder(folder: Path, root: Path) -> str:
         elif path.suffix == ".txt":
             parts += [heading, f"[{path.name}]({link})\n"]
     return "\n".join(parts)
+
+
+def _campaign(folder: Path, root: Path, picture: Path) -> str:
+    """Returns table and picture of a campaign, and draws the picture."""
+    calls = json.loads((folder / "about.json").read_text())
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    plot(folder, picture)
+    lines = (
+        ["" if row[name] is None else f"{row[name]:{spec}}" for name, spec in COLUMNS.items()]
+        for row in learning(folder)
+    )
+    files = sorted(path for path in folder.iterdir() if path.is_file())
+    links = ", ".join(f"[{path.name}](../{path.relative_to(root).as_posix()})" for path in files)
+    how = "".join(f"`{call['command']}`: {call['devices']} x {call['device']}, {call['date']}\n\n" for call in calls)
+    return (
+        "### campaign\n\nThe best policy of each seed in new episodes, beside marks and published returns:\n\n"
+        f"{table(tuple(COLUMNS), lines)}\n"
+        f"![Return against training time]({picture.relative_to(root / 'docs').as_posix()})\n\n"
+        f"{how}All numbers: {links}.\n"
+    )
 
 
 def _json(results: dict[str, Any], link: str) -> str:
