@@ -94,7 +94,7 @@ def test_soak_compares_the_counters_with_what_happened(monkeypatch):
         soak.soak(["walker"], 32, 40 * 32, torch.device("cpu"))
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_ranks_are_measured_beside_one_process(tmp_path):
     settings = {"num_envs": 8, "num_steps": 4, "minibatch_size": 16, "epochs": 1, "hidden": [16]}
     found = scaling.scaling(["walker_walk"], [1, 2], torch.device("cpu"), settings)

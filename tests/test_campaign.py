@@ -199,7 +199,7 @@ def unpacked(archive, target):
     return target
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_stopped_campaign_is_continued(tmp_path):
     folder, archive = tmp_path / "first", tmp_path / "out" / "all.tgz"
     process = subprocess.Popen(arguments(folder, pack=[archive]), stdout=subprocess.PIPE, text=True)
@@ -279,7 +279,7 @@ def test_a_stopped_campaign_is_continued(tmp_path):
         assert read(place, "evaluations.csv") == evaluations
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_job_that_fails_stops_no_other(tmp_path):
     """It is tried again, here with settings that are valid."""
     short = {"total_frames": "128", "eval_interval": "0"}
@@ -298,7 +298,7 @@ def test_a_job_that_fails_stops_no_other(tmp_path):
     assert statuses(tmp_path / "set") == {0: "finished", 1: "finished"}
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_minutes_end_a_campaign(tmp_path):
     done = call(tmp_path, minutes=[0.7], settings={"total_frames": "1e6"})
     assert done.returncode == 0, done.stderr
