@@ -24,7 +24,8 @@ def in_ranks(function, *args, count=2):
         rdzv_endpoint="localhost:0",
         max_restarts=0,
     )
-    results = elastic_launch(config, _connected)(function, *args)
+    with distributed.handlers_restored():
+        results = elastic_launch(config, _connected)(function, *args)
     return [results[rank] for rank in range(count)]
 
 

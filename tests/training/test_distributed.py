@@ -1,6 +1,7 @@
 """Several ranks that train one run: what they share, what is their own, and how the run goes on."""
 
 import shutil
+import signal
 
 import pytest
 import torch
@@ -104,6 +105,10 @@ def test_messages(ranks):
         assert count == 20
         torch.testing.assert_close((var, mean), expected)
     assert (first["gathered"], second["gathered"]) == ([0, 1], [])
+
+
+def test_the_launcher_leaves_no_handlers_behind(ranks):
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_one_process_is_all_there_is():

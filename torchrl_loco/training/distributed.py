@@ -8,6 +8,7 @@ import contextlib
 import datetime
 import io
 import os
+import signal
 import socket
 import sys
 import time
@@ -157,7 +158,8 @@ def launch(count: int, args: Sequence[str]) -> None:
         max_restarts=0,
     )
     try:
-        elastic_launch(config, sys.executable)("-m", "torchrl_loco", *args)
+        with handlers_restored():
+            elastic_launch(config, sys.executable)("-m", "torchrl_loco", *args)
     except ChildFailedError as error:
         number, failure = error.get_first_failure()
         if failure.exitcode == 130:
@@ -167,6 +169,18 @@ def launch(count: int, args: Sequence[str]) -> None:
         raise SystemExit(max(failure.exitcode, 1)) from None
     except SignalException:
         raise KeyboardInterrupt from None
+
+
+@contextlib.contextmanager
+def handlers_restored() -> Iterator[None]:
+    """Restores the handlers of the signals that torch's launcher handles, which leaves its own behind."""
+    kinds = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
+    before = {kind: signal.getsignal(kind) for kind in kinds}
+    try:
+        yield
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
 
 
 # What ranks tell each other. All ranks must make the same calls in the same order.
