@@ -11,11 +11,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from oracle import tolerance
 from torchrl.envs import check_env_specs
 
 import torchrl_loco
-from torchrl_loco import cli, doctor, nan_dump, registry
+from torchrl_loco import WalkerStand, cli, doctor, nan_dump, registry
+from torchrl_loco.sim import fill
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "inchworm"
@@ -219,6 +221,67 @@ def test_tables_that_are_none(starting):
             starting(np.zeros(shape))
     with pytest.raises(ValueError, match="initial_states must return finite numbers"):
         starting(np.full((3, 10), np.nan))
+
+
+# What is observed, of a body that is written here.
+
+
+@wp.func
+def pay() -> float:
+    return 0.25
+
+
+@wp.func
+def pay_more() -> float:
+    return 0.5
+
+
+@wp.struct
+class PaidInputs:
+    bonus: float
+    qvel: wp.array2d[float]
+
+
+@wp.func
+def observe_paid(world: int, inputs: PaidInputs, observation: wp.array[float], terms: wp.array[float]) -> float:
+    observation[0] = inputs.qvel[world, 0]
+    terms[0] = inputs.bonus
+    return pay() + inputs.bonus
+
+
+class Paid(WalkerStand):
+    observation_size = 1
+    answer = staticmethod(lambda data: (observe_paid, fill(PaidInputs, data, bonus=0.125)))
+
+    def observation_func(self, world):
+        return self.answer(world.sim.data)
+
+
+def test_a_function_that_was_written_anew_is_used(engine, monkeypatch):
+    """As in a notebook, where a cell with the reward alone is run again."""
+    for func, expected in ((pay, 0.25), (pay_more, 0.5)):
+        monkeypatch.setitem(globals(), "pay", func)
+        env = Paid(2, "cpu", seed=0, engine=engine)
+        td = env.rollout(1)
+        assert (td["next", "reward"] == expected + 0.125).all()
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda data: (len, fill(PaidInputs, data, bonus=0.0)), "observation_func must return a wp.func"),
+        (lambda data: (observe_paid, [data.qvel]), r"inputs of observe_paid must be an instance of a wp\.struct"),
+        (
+            lambda data: (observe_paid, fill(PaidInputs, data)),
+            "PaidInputs has the fields bonus, qvel: bonus is missing",
+        ),
+        (lambda data: (observe_paid, fill(PaidInputs, data, bonus=0.0, bonos=1.0)), "there is no bonos"),
+    ],
+)
+def test_wrong_inputs_are_named(answer, message, monkeypatch):
+    monkeypatch.setattr(Paid, "answer", staticmethod(answer))
+    with pytest.raises(TypeError, match=message):
+        Paid(2, "cpu", seed=0)
 
 
 # What plug-ins may get wrong.

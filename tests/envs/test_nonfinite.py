@@ -8,7 +8,7 @@ import warp as wp
 from cases import COARSE, coarse
 from tensordict import TensorDict
 
-from torchrl_loco.envs.episode import Outputs, Screen, zero_non_finite
+from torchrl_loco.envs.episode import FiniteCheck, Outputs, zero_non_finite
 from torchrl_loco.sim import WorldFunc, fill
 from torchrl_loco.sim.world_func import launch_each
 
@@ -166,8 +166,8 @@ def test_everything_that_can_be_not_finite_is_looked_at():
         views = {name: wp.from_torch(array) for name, array in arrays.items()}
         state = {name: views.pop(name) for name in ("qpos", "qvel")}
         outputs = fill(Outputs, **views, terms=wp.from_torch(terms))
-        screen = fill(Screen, **state, outputs=outputs, non_finite=wp.from_torch(bad))
-        launch_each([WorldFunc(zero_non_finite, screen)], wp.from_torch(mask))
+        check = fill(FiniteCheck, **state, outputs=outputs, non_finite=wp.from_torch(bad))
+        launch_each([WorldFunc(zero_non_finite, check)], wp.from_torch(mask))
         assert bad.tolist() == [False, spoilt is not None, False]
         for array in (arrays["observation"], arrays["reward"], terms):
             assert (array[0] == 1).all()

@@ -27,7 +27,7 @@ def body(request):
 def test_views_are_zero_copy_and_never_rebound(body, device, engine):
     sim, mask = simulation(body, device, engine=engine)
     pointers = {name: getattr(sim, name).data_ptr() for name in VIEWS}
-    graph = sim.capture(lambda: (sim.reset(mask), sim.forward(mask), sim.step()))
+    graph = sim.capture(lambda: (sim.reset(mask), sim.step()))
     for _ in range(3):
         graph.replay()
     for name in VIEWS:
@@ -42,7 +42,7 @@ def test_replay_equals_eager(body, engine):
     for captured in (True, False):
         sim, mask = simulation(body, "cpu", engine=engine)
         step = sim.capture(sim.step).replay if captured else sim.step
-        start = sim.capture(lambda s=sim, m=mask: (s.reset(m), s.forward(m))).replay
+        start = sim.capture(lambda s=sim, m=mask: s.reset(m)).replay
         start()
         generator, trace = torch.Generator().manual_seed(0), []
         for _ in range(10):
@@ -57,7 +57,6 @@ def test_derived_quantities_belong_to_the_new_state(body, device, engine):
     """dm_control's order: after a step, xpos, xmat and sensors are those of the qpos and qvel at hand."""
     sim, mask = simulation(body, device, engine=engine)
     sim.reset(mask)
-    sim.forward(mask)
     for _ in range(8):
         sim.ctrl.uniform_(-1, 1)
         sim.step()
@@ -81,7 +80,6 @@ def test_forward_at_rest_is_forward_for_worlds_at_rest(body, device, engine):
             arrays += [d.geom_xpos, d.efc.J]
         generator = torch.Generator(device).manual_seed(0)
         sim.reset(mask)
-        sim.forward(mask)
         sim.ctrl.uniform_(-1, 1, generator=generator)
         sim.step()
         wp.to_torch(mask)[1:] = False
@@ -122,7 +120,6 @@ def test_mujoco_data_shows_the_present_state(body, engine):
 def test_time_and_substeps(engine):
     sim, mask = simulation("walker", "cpu", ctrl_dt=0.05, engine=engine)
     sim.reset(mask)
-    sim.forward(mask)
     sim.step()
     torch.testing.assert_close(sim.time, torch.full((4,), 0.05))
 

@@ -149,7 +149,7 @@ class LocoEnv(EnvBase):
         Returns:
             The function and its inputs. These are an instance of a ``wp.struct``; see :func:`torchrl_loco.sim.fill`.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must have a method observation_func")
 
     def initial_states(self) -> np.ndarray | None:
         """Returns a table of which each reset draws a row; ``None`` for the default pose.

@@ -1,6 +1,5 @@
 """What happens in each world beside the physics: actions, observations, the time limit, counters, new episodes."""
 
-import functools
 from typing import Any
 
 import warp as wp
@@ -38,7 +37,7 @@ class Flags:
 
 @wp.struct
 class Control:
-    """Actions in [-1, 1] ``(nworld, nu)``, and the controls that they are scaled to."""
+    """Actions in [-1, 1] ``(nworld, nu)``; ``ctrl`` and ``non_finite`` are written."""
 
     ctrlrange: wp.array2d[wp.vec2]
     action: wp.array2d[float]
@@ -68,11 +67,10 @@ def apply_action(world: int, args: Control):
 
 def observer(func: wp.Function, inputs: Any, outputs: Any) -> WorldFunc:
     """Returns what writes observation, reward and terms, from what a body names in its ``observation_func``."""
-    write, struct = _observer(func, inputs._cls)
+    write, struct = _observer(func, struct_of("observation_func", func, inputs))
     return WorldFunc(write, fill(struct, inputs=inputs, outputs=outputs))
 
 
-@functools.cache
 def _observer(observe: wp.Function, Inputs: Any) -> tuple[wp.Function, Any]:  # noqa: N803
     @wp.struct
     class Observer:
@@ -85,6 +83,19 @@ def _observer(observe: wp.Function, Inputs: Any) -> tuple[wp.Function, Any]:  # 
         out.reward[world] = observe(world, args.inputs, out.observation[world], out.terms[world])
 
     return write_observation, Observer
+
+
+def struct_of(method: str, func: Any, inputs: Any) -> Any:
+    """Returns the struct of the inputs that a method of a body returned with a function.
+
+    Raises:
+        TypeError: they are not what the method must return.
+    """
+    if not isinstance(func, wp.Function):
+        raise TypeError(f"{method} must return a wp.func and its inputs, got {func!r} as the function")
+    if not hasattr(inputs, "_cls"):
+        raise TypeError(f"the inputs of {func.key} must be an instance of a wp.struct, got {inputs!r}")
+    return inputs._cls
 
 
 @wp.func
@@ -119,8 +130,8 @@ def count_non_finite(row: wp.array[float]) -> int:
 
 
 @wp.struct
-class Screen:
-    """Where a number that is not finite is looked for, and what is zeroed then."""
+class FiniteCheck:
+    """Where a number that is not finite is looked for; ``outputs`` are zeroed and ``non_finite`` is set then."""
 
     qpos: wp.array2d[float]
     qvel: wp.array2d[float]
@@ -129,7 +140,7 @@ class Screen:
 
 
 @wp.func
-def zero_non_finite(world: int, args: Screen):
+def zero_non_finite(world: int, args: FiniteCheck):
     """Marks a world that is non-finite, and zeroes observation, reward and terms of one that is marked."""
     out = args.outputs
     observation = out.observation[world]
@@ -144,8 +155,11 @@ def zero_non_finite(world: int, args: Screen):
 
 
 @wp.struct
-class End:
-    """What ends a control step. ``counts`` ``(nworld, counters)`` has a last column for steps that end non-finite."""
+class StepEnd:
+    """What ends a control step: all but the length and the bits is written.
+
+    ``counts`` ``(nworld, counters)`` has a last column for steps that end non-finite.
+    """
 
     episode_length: int
     counter_bits: wp.array[int]
@@ -157,7 +171,7 @@ class End:
 
 
 @wp.func
-def finish_step(world: int, args: End):
+def finish_step(world: int, args: StepEnd):
     """Ends a control step: applies the time limit, and counts what went wrong.
 
     A world is truncated at the time limit, and terminated if it is not finite; what is done is masked for the reset
@@ -185,8 +199,11 @@ def finish_step(world: int, args: End):
 
 
 @wp.struct
-class Beginning:
-    """What begins an episode; ``stream`` ``(nworld,)`` is where its random numbers start."""
+class EpisodeStart:
+    """What begins an episode: from ``episode`` on all is written.
+
+    ``stream`` ``(nworld,)`` is where its random numbers start.
+    """
 
     stagger: wp.array[bool]
     seed: wp.array[wp.uint32]
@@ -199,7 +216,7 @@ class Beginning:
 
 
 @wp.func
-def begin_episode(world: int, args: Beginning):
+def begin_episode(world: int, args: EpisodeStart):
     """Starts the next episode: its random stream, its clock and its flags."""
     episode = args.episode[world]
     elapsed_steps = int(0)
@@ -218,11 +235,10 @@ def begin_episode(world: int, args: Beginning):
 
 def poser(func: wp.Function, inputs: Any, stream: wp.array) -> WorldFunc:
     """Returns what draws initial states from ``stream`` ``(nworld,)``, from what a body names in its ``pose_func``."""
-    draw, struct = _poser(func, inputs._cls)
+    draw, struct = _poser(func, struct_of("pose_func", func, inputs))
     return WorldFunc(draw, fill(struct, inputs=inputs, stream=stream))
 
 
-@functools.cache
 def _poser(pose: wp.Function, Inputs: Any) -> tuple[wp.Function, Any]:  # noqa: N803
     @wp.struct
     class Poser:

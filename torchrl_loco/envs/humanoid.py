@@ -11,7 +11,7 @@ from torchrl_loco.envs.episode import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, small_control, tolerance
 from torchrl_loco.sim import fill
-from torchrl_loco.sim.sampling import FreePoses, draw_free_pose, make_skeleton
+from torchrl_loco.sim.sampling import FreePose, draw_free_pose, make_skeleton
 
 STAND_HEIGHT = wp.constant(1.4)
 """Height of the head from which the humanoid counts as standing (m)."""
@@ -127,7 +127,7 @@ class Humanoid(LocoEnv):
         sim = world.sim
         skeleton = make_skeleton(self.mj_model, sim.model.nxn_geom_pair_filtered.numpy(), sim.device)
         xquat = wp.empty(sim.data.xpos.shape, dtype=wp.quat, device=sim.device)
-        return draw_free_pose, fill(FreePoses, sim.data, skeleton=skeleton, xquat=xquat)
+        return draw_free_pose, fill(FreePose, sim.data, skeleton=skeleton, xquat=xquat)
 
 
 class HumanoidStand(Humanoid):

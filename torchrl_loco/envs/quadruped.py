@@ -11,7 +11,7 @@ from torchrl_loco.envs.episode import observe_row
 from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
 from torchrl_loco.sim import fill
-from torchrl_loco.sim.sampling import Drop, draw_orientation_above_floor, make_outline
+from torchrl_loco.sim.sampling import RootAboveFloor, draw_orientation_above_floor, make_outline
 
 WALK_SPEED = 0.5
 """Forward speed that counts as walking (m/s)."""
@@ -114,7 +114,7 @@ class Quadruped(LocoEnv):
     def pose_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that draws the orientation and raises the torso, and its inputs."""
         outline = make_outline(self.mj_model, world.sim.device)
-        return draw_orientation_above_floor, fill(Drop, world.sim.data, outline=outline, increment=INCREMENT)
+        return draw_orientation_above_floor, fill(RootAboveFloor, world.sim.data, outline=outline, increment=INCREMENT)
 
 
 class QuadrupedWalk(Quadruped):

@@ -15,12 +15,12 @@ import warp as wp
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.episode import (
-    Beginning,
     Control,
-    End,
+    EpisodeStart,
+    FiniteCheck,
     Flags,
     Outputs,
-    Screen,
+    StepEnd,
     apply_action,
     begin_episode,
     finish_step,
@@ -37,6 +37,7 @@ from torchrl_loco.sim import (
     Simulation,
     WorldFunc,
     fill,
+    holds,
     joined_to_torch,
     torch_is_recording,
 )
@@ -77,7 +78,8 @@ class World:
 
     Attributes:
         sim: the physics.
-        action: actions of the control step, ``(nworld, nu)``.
+        action: actions of the last control step, ``(nworld, nu)``, unless torch recorded it; ``sim.ctrl`` holds the
+            controls that they became.
         outputs: the memory of what a step returns: observation, reward, terms; done, terminated and truncated.
         observation: observations, ``(nworld, observation_size)``.
         reward: rewards, ``(nworld,)``.
@@ -149,15 +151,15 @@ class World:
         mine.outputs, mine.flags = fill(Outputs, mine), fill(Flags, mine)
         counters = {"counter_bits": self.health.counter_bits, "counts": self.health.counts.warp}
         self._observe = observer(*task.observation_func(self), mine.outputs)
-        self._screen = WorldFunc(zero_non_finite, fill(Screen, mine, qpos=data.qpos, qvel=data.qvel))
-        self._finish = WorldFunc(finish_step, fill(End, mine, overflow=data.overflow, **counters))
-        self._begin = [WorldFunc(begin_episode, fill(Beginning, mine, stagger=self._stagger.warp))]
-        self._begins_in_motion = False
+        self._check_finite = WorldFunc(zero_non_finite, fill(FiniteCheck, mine, qpos=data.qpos, qvel=data.qvel))
+        self._finish = WorldFunc(finish_step, fill(StepEnd, mine, overflow=data.overflow, **counters))
+        self._begin = [WorldFunc(begin_episode, fill(EpisodeStart, mine, stagger=self._stagger.warp))]
+        self._begins_at_rest = True
         pose = task.pose_func(self)
         if pose is not None:
             func, inputs = pose
             self._begin.append(poser(func, inputs, self.stream.warp))
-            self._begins_in_motion = any(getattr(inputs, name) is data.qvel for name in inputs._cls.vars)
+            self._begins_at_rest = not holds(inputs, data.qvel)
 
     # What the graphs record.
 
@@ -168,17 +170,17 @@ class World:
         for monitor in self._monitors:
             monitor.launch_before_step(action)
         apply = WorldFunc(apply_action, fill(Control, action=action, **control))
-        sim.step(before=[apply], after=[self._observe, self._screen, self._finish])
+        sim.step(before=[apply], after=[self._observe, self._check_finite, self._finish])
         for monitor in self._monitors:
             monitor.launch_after_step()
 
     def _launch_reset(self) -> None:
         """A new episode in the worlds of the mask."""
-        self.sim.reset(self.mask.warp, before=self._begin, after=[self._observe], in_motion=self._begins_in_motion)
+        self.sim.reset(self.mask.warp, before=self._begin, after=[self._observe], at_rest=self._begins_at_rest)
 
     def _launch_refresh(self) -> None:
         """The outputs after the state of the masked worlds was written."""
-        self.sim.forward(self.mask.warp, after=[self._observe, self._screen])
+        self.sim.forward(self.mask.warp, after=[self._observe, self._check_finite])
 
     # What the environment calls. Nothing waits for the device.
 

@@ -153,9 +153,9 @@ class MujocoWarpEngine:
         # Threads per small matrix of a world: measured in benchmarks/README.md.
         self.model.block_dim.update_gradient_cholesky = 32
         self.model.block_dim.update_gradient_JTDAJ_dense = 64
-        self._before: tuple[wp.array, wp.array] | None = None
+        self._kept_sensors: tuple[wp.array, wp.array] | None = None
         if not FORCE_SENSORS.isdisjoint(mj_model.sensor_type):
-            self._before = wp.clone(self.data.sensordata), wp.clone(self.data.overflow)
+            self._kept_sensors = wp.clone(self.data.sensordata), wp.clone(self.data.overflow)
         self._row_order = RowOrder(self.model, self.data) if config.deterministic else None
         self._all = wp.ones(num_envs, dtype=bool, device=device)
         self._any = wp.zeros(1, dtype=int, device=device)
@@ -180,7 +180,7 @@ class MujocoWarpEngine:
         """
         launch_each(before, self._all)
         for i in range(self._substeps):
-            with self._substep_only(sensors=self._before is not None and i == self._substeps - 1):
+            with self._substep_only(sensors=self._kept_sensors is not None and i == self._substeps - 1):
                 self._substep()
                 self._record_peaks()
         self._evaluate()
@@ -240,8 +240,8 @@ class MujocoWarpEngine:
         def update() -> None:
             launch_each(before, mask)
             self._clear_constraints(mask)
-            if self._before is not None:  # forces act at rest too
-                self._evaluate_forces(mask, *self._before)
+            if self._kept_sensors is not None:  # forces act at rest too
+                self._evaluate_forces(mask, *self._kept_sensors)
             elif at_rest:
                 self._rest(mask)
                 mjw.kinematics(self.model, self.data)

@@ -188,7 +188,7 @@ def in_contact(skeleton: Skeleton, xpos: wp.array[wp.vec3], xquat: wp.array[wp.q
 
 
 @wp.struct
-class FreePoses:
+class FreePose:
     """A skeleton, what its pose is written to, and room for the poses of its bodies."""
 
     skeleton: Skeleton
@@ -198,7 +198,7 @@ class FreePoses:
 
 
 @wp.func
-def draw_free_pose(world: int, args: FreePoses, stream: wp.uint32):
+def draw_free_pose(world: int, args: FreePose, stream: wp.uint32):
     """Draws orientations of free joints and hinges until no geoms touch."""
     touching = bool(True)
     tries = int(0)
@@ -237,7 +237,7 @@ def depth_below(outline: Outline, down: wp.vec3) -> float:
 
 
 @wp.struct
-class Drop:
+class RootAboveFloor:
     """A rigid body on a free joint, the height of an increment (m), and what its pose is written to."""
 
     outline: Outline
@@ -246,7 +246,7 @@ class Drop:
 
 
 @wp.func
-def draw_orientation_above_floor(world: int, args: Drop, stream: wp.uint32):
+def draw_orientation_above_floor(world: int, args: RootAboveFloor, stream: wp.uint32):
     """Draws the orientation of a free root uniformly, and raises it in increments until it is off the floor."""
     w = wp.randn(stream)
     x = wp.randn(stream)

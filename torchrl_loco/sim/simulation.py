@@ -55,9 +55,9 @@ def put_at_rest(world: int, args: Rest):
 class Simulation:
     """Owns the model, the state of all worlds and the engine that advances it.
 
-    ``step``, ``reset`` and ``forward`` launch kernels on Warp's current stream and return at once; :meth:`capture`
-    records any sequence of them to be replayed. Each takes what the caller does in each world before and after the
-    physics; under the engine ``compiled`` all of it is one kernel.
+    ``step``, ``reset`` and ``forward`` launch kernels on Warp's current stream; MuJoCo-Warp's ``reset`` and ``forward``
+    wait for CUDA unless they are recorded. :meth:`capture` records any sequence of them to be replayed. Each takes what
+    the caller does in each world before and after the physics; under the engine ``compiled`` all of it is one kernel.
 
     The torch views share memory with the Warp arrays of ``data`` and never change their address. They always hold the
     current state: clone what you want to keep.
@@ -130,7 +130,7 @@ class Simulation:
         before: Sequence[WorldFunc] = (),
         after: Sequence[WorldFunc] = (),
         *,
-        in_motion: bool = False,
+        at_rest: bool = True,
     ) -> None:
         """Puts worlds at rest in the default pose, and updates their poses and sensors; the others stay.
 
@@ -138,10 +138,10 @@ class Simulation:
             mask: the worlds, bool ``(nworld,)``.
             before: what each of them does once it is at rest; it may write ``qpos``.
             after: what it does at the end.
-            in_motion: whether ``before`` may write ``qvel`` too.
+            at_rest: whether they still are then; ``before`` may write ``qvel`` too if not.
         """
         rest = WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0))
-        self.engine.forward(mask, [rest, *before], after, at_rest=not in_motion)
+        self.engine.forward(mask, [rest, *before], after, at_rest=at_rest)
 
     def forward(self, mask: wp.array, after: Sequence[WorldFunc] = ()) -> None:
         """Updates poses and sensors after ``qpos`` and ``qvel`` were changed.

@@ -1,6 +1,6 @@
 """Functions of one world, which an engine runs before and after the physics: in the same kernel, if it can."""
 
-import functools
+import contextlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -32,25 +32,61 @@ def fill(struct: Any, source: Any = None, /, **fields: Any) -> Any:
 
     Raises:
         TypeError: a field is missing, or there is no such field; the message names them.
+        ValueError: arrays lie on several devices.
     """
-    if source is not None:
-        fields |= {name: getattr(source, name) for name in struct.vars if name not in fields}
-    missing, unknown = struct.vars.keys() - fields.keys(), fields.keys() - struct.vars.keys()
+    given = dict(fields)
+    for name in struct.vars:
+        if name not in given and source is not None:
+            with contextlib.suppress(AttributeError):
+                given[name] = getattr(source, name)
+    missing, unknown = sorted(struct.vars.keys() - given.keys()), sorted(given.keys() - struct.vars.keys())
     if missing or unknown:
-        wrong = [f"no {name}" for name in sorted(missing)] + [f"unknown {name}" for name in sorted(unknown)]
-        raise TypeError(f"{struct.key} has the fields {', '.join(struct.vars)}; got {', '.join(wrong)}")
+        wrong = [f"{name} is missing" for name in missing] + [f"there is no {name}" for name in unknown]
+        raise TypeError(f"{struct.key} has the fields {', '.join(struct.vars)}: {', '.join(wrong)}")
+    devices = {name: str(value.device) for name, value in given.items() if isinstance(value, wp.array)}
+    if len(set(devices.values())) > 1:
+        raise ValueError(f"the arrays of {struct.key} must lie on one device, got {devices}")
     instance = struct()
-    for name, value in fields.items():
+    for name, value in given.items():
         setattr(instance, name, value)
     return instance
 
 
-def chain(funcs: Sequence[WorldFunc]) -> WorldFunc:
-    """Returns one that does what ``funcs`` do, in their order."""
-    whole = NOTHING
-    for one in funcs:
-        whole = one if whole is NOTHING else _both(whole, one)
-    return whole
+def holds(args: Any, array: wp.array) -> bool:
+    """Returns whether an instance of a ``wp.struct`` has an array among its fields, or among those of its structs."""
+    fields = [getattr(args, name) for name in args._cls.vars]
+    return any(field is array or (hasattr(field, "_cls") and holds(field, array)) for field in fields)
+
+
+class Chain:
+    """Functions of a world as one, which calls them in their order.
+
+    Args:
+        funcs: the functions.
+
+    Attributes:
+        func: the function that calls them.
+        struct: the ``wp.struct`` that it takes.
+    """
+
+    def __init__(self, funcs: Sequence[WorldFunc]) -> None:
+        self.func, self.struct = do_nothing, Nothing
+        self._pairs = []
+        for index, (func, args) in enumerate(funcs):
+            if index == 0:
+                self.func, self.struct = func, args._cls
+            else:
+                self.func, self.struct = _both(self.func, self.struct, func, args._cls)
+                self._pairs.append(self.struct)
+
+    def args(self, funcs: Sequence[WorldFunc]) -> Any:
+        """Returns the arguments of such functions as one instance of :attr:`struct`."""
+        if not funcs:
+            return Nothing()
+        whole = funcs[0].args
+        for pair, (_, args) in zip(self._pairs, funcs[1:], strict=True):
+            whole = fill(pair, first=whole, second=args)
+        return whole
 
 
 def launch_each(funcs: Sequence[WorldFunc], mask: wp.array) -> None:
@@ -71,16 +107,7 @@ def do_nothing(world: int, args: Nothing):
     pass
 
 
-NOTHING = WorldFunc(do_nothing, Nothing())
-
-
-def _both(first: WorldFunc, second: WorldFunc) -> WorldFunc:
-    func, struct = _both_funcs(first.func, first.args._cls, second.func, second.args._cls)
-    return WorldFunc(func, fill(struct, first=first.args, second=second.args))
-
-
-@functools.cache  # else the same functions would make a new kernel for each environment
-def _both_funcs(first: wp.Function, First: Any, second: wp.Function, Second: Any) -> tuple[wp.Function, Any]:  # noqa: N803
+def _both(first: wp.Function, First: Any, second: wp.Function, Second: Any) -> tuple[wp.Function, Any]:  # noqa: N803
     @wp.struct
     class Both:
         first: First
@@ -94,8 +121,8 @@ def _both_funcs(first: wp.Function, First: Any, second: wp.Function, Second: Any
     return both, Both
 
 
-@functools.cache
 def _kernel(func: wp.Function, Args: Any) -> wp.Kernel:  # noqa: N803
+    # Made anew at each call: Warp compiles none that it has compiled before, and sees what the function calls.
     @wp.kernel(enable_backward=False, module="unique")
     def each_world(mask_in: wp.array[bool], args: Args):
         world = wp.tid()

@@ -1,6 +1,5 @@
 """The engine that steps all worlds with the compiled step."""
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,7 +12,7 @@ import warp as wp
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.compiled.step import WARP, launch_size, source
-from torchrl_loco.sim.world_func import WorldFunc, chain
+from torchrl_loco.sim.world_func import Chain, WorldFunc
 
 ROWS = {
     "qpos": ("nq", wp.float32),
@@ -143,7 +142,7 @@ class CompiledEngine:
         with wp.ScopedDevice(device):
             self.model = mjw.put_model(mj_model)
         self.data = Data(mj_model, num_envs, device)
-        self._texts: dict[int, str] = {}
+        self._kernels: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
         self._launch_size = launch_size(mj_model, num_envs, device)
         self._all = wp.ones(num_envs, dtype=bool, device=device)
         self.peak_constraints = Buffer(num_envs, int, device)
@@ -182,26 +181,25 @@ class CompiledEngine:
 
     def _launch(self, substeps: int, mask: wp.array, before: Sequence[WorldFunc], after: Sequence[WorldFunc]) -> None:
         outputs = self.data.outputs()
-        text = self._text(substeps, outputs["cvel"] is not None)
-        first, last, size = chain(before), chain(after), self._launch_size
+        key = substeps, *(func for func, _ in before), None, *(func for func, _ in after)
+        if key not in self._kernels:
+            text = source(self._mj_model, substeps, with_cvel=outputs["cvel"] is not None)
+            first, last = Chain(before), Chain(after)
+            self._kernels[key] = _kernel(text, first.func, first.struct, last.func, last.struct), first, last
+        kernel, first, last = self._kernels[key]
+        size = self._launch_size
         wp.launch(
-            _kernel(text, first.func, first.args._cls, last.func, last.args._cls),
+            kernel,
             dim=size.threads,
-            inputs=[size.worlds_per_warp, size.lanes, mask, first.args, last.args, self.data.ctrl],
+            inputs=[size.worlds_per_warp, size.lanes, mask, first.args(before), last.args(after), self.data.ctrl],
             outputs=list(outputs.values()),
             device=self._device,
             block_dim=size.block,
         )
 
-    def _text(self, substeps: int, with_cvel: bool) -> str:
-        if substeps not in self._texts:
-            self._texts[substeps] = source(self._mj_model, substeps, with_cvel=with_cvel)
-        return self._texts[substeps]
 
-
-@functools.cache  # else each environment would make the kernel again
 def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, After: Any) -> wp.Kernel:  # noqa: N803
-    """Returns a kernel around the C++ of :func:`~torchrl_loco.sim.compiled.step.source`."""
+    """Returns a kernel around the C++ of :func:`~torchrl_loco.sim.compiled.step.source`, and what is done around it."""
 
     @wp.func_native(text)
     def advance(
@@ -220,8 +218,7 @@ def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, Aft
         overflow_out: wp.array[int],
     ): ...
 
-    # fast_math flushes denormals and approximates divisions and roots: 1 to 3 % faster on CUDA; the CPU ignores it.
-    @wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": True})
+    @wp.kernel(enable_backward=False, module="unique")
     def compiled_step(
         # In:
         worlds_per_warp: int,

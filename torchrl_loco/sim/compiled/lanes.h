@@ -29,8 +29,17 @@ struct Math {
   static INLINE float larger(float a, float b) { return a > b ? a : b; }
   static INLINE float clamp(float x, float low, float high) { return smaller(larger(x, low), high); }
 #ifdef __CUDA_ARCH__
-  static INLINE float divide(float a, float b) { return __fdividef(a, b); }
-  static INLINE float root(float x) { return x * rsqrtf(larger(x, 1e-30f)); }
+  // Approximate, and with denormals as zero: quicker, and near enough.
+  static INLINE float divide(float a, float b) {
+    float x;
+    asm("div.approx.ftz.f32 %0, %1, %2;" : "=f"(x) : "f"(a), "f"(b));
+    return x;
+  }
+  static INLINE float root(float x) {
+    float y;
+    asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(larger(x, 1e-30f)));
+    return x * y;
+  }
   static INLINE int bits(unsigned x) { return __popc(x); }
   static INLINE int lowest_bit(unsigned x) { return __ffs(x) - 1; }
   static INLINE int lowest_bit(unsigned long long x) { return __ffsll(x) - 1; }

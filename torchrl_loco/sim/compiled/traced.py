@@ -24,8 +24,21 @@ from torchrl_loco.sim.compiled.symbols import (
 
 PRELUDE = """
 #ifdef __CUDA_ARCH__
-#define DIV(a, b) __fdividef(a, b)
-#define SQRT(a) ((a) * rsqrtf(wp::max(a, 1e-30f)))
+// Approximate, and with denormals as zero: quicker, and near enough.
+struct Quick {
+  static __device__ __forceinline__ float divide(float a, float b) {
+    float x;
+    asm("div.approx.ftz.f32 %0, %1, %2;" : "=f"(x) : "f"(a), "f"(b));
+    return x;
+  }
+  static __device__ __forceinline__ float root(float a) {
+    float x;
+    asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(x) : "f"(wp::max(a, 1e-30f)));
+    return a * x;
+  }
+};
+#define DIV(a, b) Quick::divide(a, b)
+#define SQRT(a) Quick::root(a)
 #else
 #define DIV(a, b) ((a) / (b))
 #define SQRT(a) sqrtf(a)
