@@ -131,7 +131,8 @@ def main(
         seed: decides every random draw.
         address: of a running cluster; without, one is started on this machine.
     """
-    ray.init(address=address, num_cpus=actors if address is None else None, log_to_driver=False)
+    # "local": else Ray would join a cluster that it finds on this machine.
+    ray.init(address=address or "local", num_cpus=actors if address is None else None, log_to_driver=False)
     torch.manual_seed(seed)
     # A function for each actor: with one for all of them, they would step the same worlds.
     environments = [functools.partial(make_env, task, num_envs, device, seed, k) for k in range(actors)]
