@@ -199,7 +199,15 @@ class CompiledEngine:
 
 
 def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, After: Any) -> wp.Kernel:  # noqa: N803
-    """Returns a kernel around the C++ of :func:`~torchrl_loco.sim.compiled.step.source`, and what is done around it."""
+    """Returns a kernel that calls ``before``, the C++ of a control step and ``after`` in each world.
+
+    Args:
+        text: the C++, of :func:`~torchrl_loco.sim.compiled.step.source`.
+        before: the function that is called first, of the world and of a ``Before``.
+        Before: a ``wp.struct``.
+        after: the function that is called last, of the world and of an ``After``.
+        After: a ``wp.struct``.
+    """
 
     @wp.func_native(text)
     def advance(
