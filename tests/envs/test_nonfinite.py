@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from torchrl_loco.envs.episode import FiniteCheck, Outputs, zero_non_finite
 from torchrl_loco.sim import WorldFunc, fill
-from torchrl_loco.sim.world_func import launch_each
+from torchrl_loco.sim.world_func import launch_together
 
 BAD = [math.nan, math.inf, -math.inf]
 CASES = [
@@ -167,7 +167,7 @@ def test_everything_that_can_be_not_finite_is_looked_at():
         state = {name: views.pop(name) for name in ("qpos", "qvel")}
         outputs = fill(Outputs, **views, terms=wp.from_torch(terms))
         check = fill(FiniteCheck, **state, outputs=outputs, non_finite=wp.from_torch(bad))
-        launch_each([WorldFunc(zero_non_finite, check)], wp.from_torch(mask))
+        launch_together([WorldFunc(zero_non_finite, check)], wp.from_torch(mask))
         assert bad.tolist() == [False, spoilt is not None, False]
         for array in (arrays["observation"], arrays["reward"], terms):
             assert (array[0] == 1).all()

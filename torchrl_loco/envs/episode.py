@@ -46,19 +46,40 @@ class Control:
 
 
 @wp.func
+def read_eight(row: wp.array[float], first: int):
+    """Returns eight numbers of a row from ``first`` on; beyond its end, the last one.
+
+    Numbers are read by eights before any is written: a read that follows a write waits for it, as both may be the same
+    number.
+    """
+    some = Eight()
+    for j in range(8):
+        some[j] = row[wp.min(first + j, row.shape[0] - 1)]
+    return some
+
+
+@wp.func
 def apply_action(world: int, args: Control):
     """Clips the action and scales it to ``ctrl``.
 
     A world whose action is NaN or infinite is marked, and stepped with an action of zeros.
     """
+    action, ctrl = args.action[world], args.ctrl[world]
     count = int(0)
-    for i in range(args.action.shape[1]):
-        count += wp.where(wp.isfinite(args.action[world, i]), 0, 1)
+    for i in range(0, action.shape[0], 8):
+        some = read_eight(action, i)
+        for j in range(8):
+            count += wp.where(wp.isfinite(some[j]), 0, 1)
     non_finite = count > 0
-    for i in range(args.action.shape[1]):
-        limits = args.ctrlrange[0, i]
-        used = wp.where(non_finite, 0.0, wp.clamp(args.action[world, i], -1.0, 1.0))
-        args.ctrl[world, i] = 0.5 * (limits[0] + limits[1]) + 0.5 * (limits[1] - limits[0]) * used
+    for i in range(0, action.shape[0], 8):
+        some = read_eight(action, i)
+        for j in range(8):
+            limits = args.ctrlrange[0, wp.min(i + j, action.shape[0] - 1)]
+            used = wp.where(non_finite, 0.0, wp.clamp(some[j], -1.0, 1.0))
+            some[j] = 0.5 * (limits[0] + limits[1]) + 0.5 * (limits[1] - limits[0]) * used
+        for j in range(8):
+            if i + j < action.shape[0]:
+                ctrl[i + j] = some[j]
     args.non_finite[world] = non_finite
 
 
@@ -100,32 +121,24 @@ def struct_of(method: str, func: Any, inputs: Any) -> Any:
 
 @wp.func
 def observe_row(row: wp.array[float], first: int, observation: wp.array[float], k: int) -> int:
-    """Copies the numbers of a row from ``first`` on into an observation at ``k``; returns where they end.
-
-    Eight are read before any is written: a read that follows a write waits for it, as both may be the same number.
-    """
-    i = int(first)
-    while i + 8 <= row.shape[0]:
-        some = Eight()
+    """Copies the numbers of a row from ``first`` on into an observation at ``k``; returns where they end."""
+    for i in range(first, row.shape[0], 8):
+        some = read_eight(row, i)
         for j in range(8):
-            some[j] = row[i + j]
-        for j in range(8):
-            observation[k + j] = some[j]
-        i += 8
-        k += 8
-    while i < row.shape[0]:
-        observation[k] = row[i]
-        i += 1
-        k += 1
+            if i + j < row.shape[0]:
+                observation[k + j] = some[j]
+        k += wp.min(8, row.shape[0] - i)
     return k
 
 
 @wp.func
 def count_non_finite(row: wp.array[float]) -> int:
-    """Counts without a branch: else a thread would wait for each number before it asks for the next."""
+    """Counts in eights, the last number perhaps more than once, and without a branch."""
     count = int(0)
-    for i in range(row.shape[0]):
-        count += wp.where(wp.abs(row[i]) < MAX_VALUE, 0, 1)  # counts NaN too
+    for i in range(0, row.shape[0], 8):
+        some = read_eight(row, i)
+        for j in range(8):
+            count += wp.where(wp.abs(some[j]) < MAX_VALUE, 0, 1)  # counts NaN too
     return count
 
 

@@ -25,19 +25,22 @@ def current_stream(device: wp.Device) -> wp.Stream | None:
 
 
 def torch_is_recording(device: wp.Device) -> bool:
-    """Returns whether torch records a CUDA graph on its current stream."""
-    return device.is_cuda and torch.cuda.is_current_stream_capturing()
+    """Returns whether torch records a CUDA graph on its current stream.
+
+    CUDA's default stream cannot be recorded, nor asked while Warp records on a stream of its own.
+    """
+    if not device.is_cuda:
+        return False
+    with torch.cuda.device(wp.device_to_torch(device)):
+        return torch.cuda.current_stream() != torch.cuda.default_stream() and torch.cuda.is_current_stream_capturing()
 
 
 @contextlib.contextmanager
 def joined_to_torch(device: wp.Device) -> Iterator[None]:
-    """Adds Warp's launches to the CUDA graph that torch records on its current stream."""
+    """Lets Warp launch on torch's current stream; while torch records a CUDA graph there, the launches are added."""
     stream = current_stream(device)
-    with (
-        wp.ScopedDevice(device),
-        wp.ScopedStream(stream, sync_enter=False),
-        wp.ScopedCapture(stream=stream, external=True),
-    ):
+    joins = wp.ScopedCapture(stream=stream, external=True) if torch_is_recording(device) else contextlib.nullcontext()
+    with wp.ScopedDevice(device), wp.ScopedStream(stream, sync_enter=False), joins:
         yield
 
 

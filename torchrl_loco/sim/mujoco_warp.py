@@ -15,7 +15,7 @@ from torchrl_loco.models import FORCE_SENSORS
 from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.graph import torch_is_recording
 from torchrl_loco.sim.row_order import RowOrder
-from torchrl_loco.sim.world_func import WorldFunc, launch_each
+from torchrl_loco.sim.world_func import WorldFunc, launch_together
 
 UNROLLED_ITERATIONS = 10
 """Up to this many solver iterations, the recorded step contains all of them, without an early exit."""
@@ -178,13 +178,13 @@ class MujocoWarpEngine:
             before: what each world does first.
             after: what it does at the end.
         """
-        launch_each(before, self._all)
+        launch_together(before, self._all)
         for i in range(self._substeps):
             with self._substep_only(sensors=self._kept_sensors is not None and i == self._substeps - 1):
                 self._substep()
                 self._record_peaks()
         self._evaluate()
-        launch_each(after, self._all)
+        launch_together(after, self._all)
 
     def _substep(self) -> None:
         if self._row_order is None:
@@ -238,7 +238,7 @@ class MujocoWarpEngine:
         """
 
         def update() -> None:
-            launch_each(before, mask)
+            launch_together(before, mask)
             self._clear_constraints(mask)
             if self._kept_sensors is not None:  # forces act at rest too
                 self._evaluate_forces(mask, *self._kept_sensors)
@@ -247,7 +247,7 @@ class MujocoWarpEngine:
                 mjw.kinematics(self.model, self.data)
             else:
                 self._evaluate()
-            launch_each(after, mask)
+            launch_together(after, mask)
 
         if torch_is_recording(self._device):
             update()

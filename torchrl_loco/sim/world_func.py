@@ -89,10 +89,27 @@ class Chain:
         return whole
 
 
-def launch_each(funcs: Sequence[WorldFunc], mask: wp.array) -> None:
-    """Launches each function as a kernel of its own; worlds that are not in ``mask`` ``(nworld,)`` do nothing."""
-    for func, args in funcs:
-        wp.launch(_kernel(func, args._cls), mask.size, [mask, args], device=mask.device, block_dim=BLOCK_DIM)
+class WorldKernel:
+    """Functions of a world as a kernel of their own, where the physics cannot call them or would wait for them.
+
+    Args:
+        funcs: the functions.
+    """
+
+    def __init__(self, funcs: Sequence[WorldFunc]) -> None:
+        self._chain = Chain(funcs)
+        self._kernel = _kernel(self._chain.func, self._chain.struct) if funcs else None
+
+    def launch(self, funcs: Sequence[WorldFunc], mask: wp.array) -> None:
+        """Launches such functions; worlds that are not in ``mask`` ``(nworld,)`` do nothing."""
+        if self._kernel is not None:
+            inputs = [mask, self._chain.args(funcs)]
+            wp.launch(self._kernel, mask.size, inputs, device=mask.device, block_dim=BLOCK_DIM)
+
+
+def launch_together(funcs: Sequence[WorldFunc], mask: wp.array) -> None:
+    """Launches functions as one kernel; worlds that are not in ``mask`` ``(nworld,)`` do nothing."""
+    WorldKernel(funcs).launch(funcs, mask)
 
 
 @wp.struct

@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from torch import nn
 
-from torchrl_loco.sim.graph import joined_to_torch, torch_is_recording
+from torchrl_loco.sim import joined_to_torch
 
 WARP = 32
 """Threads that share a row on CUDA; they hold it in registers. On the CPU one does."""
@@ -155,15 +155,13 @@ def _launch(kind: str, groups: int, inputs: tuple[Any, ...], outputs: tuple[torc
     device = wp.get_device(str(x.device))
     lanes = WARP if device.is_cuda else 1
     arrays = [wp.from_torch(value.detach()) if isinstance(value, torch.Tensor) else value for value in inputs]
-    joined = joined_to_torch if torch_is_recording(device) else wp.ScopedDevice
-    with joined(device):
+    with joined_to_torch(device):
         wp.launch(
             _kernels(x.shape[-1])[kind],
             dim=groups * lanes,
             inputs=[lanes, *arrays],
             outputs=[wp.from_torch(value) for value in outputs],
             device=device,
-            stream=wp.stream_from_torch(torch.cuda.current_stream(x.device)) if device.is_cuda else None,
             block_dim=BLOCK,
         )
 
