@@ -5,9 +5,8 @@ things keep that gradient reliable: the critic is a distribution over returns, i
 actor minimises the KL divergence from the policy that collected the data wherever it exceeds a bound.
 """
 
-import contextlib
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import torch
 from tensordict import TensorDictBase
@@ -21,7 +20,6 @@ from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training.actor import make_actor
 from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import REPPOConfig
-from torchrl_loco.training.norm_silu import NormSiLU
 
 
 class REPPO(Algorithm):
@@ -39,6 +37,7 @@ class REPPO(Algorithm):
         self.distribution = self.actor[0].module  # from observations to means and standard deviations
         self.dual = DualVariables(config).to(self.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "dual": self.dual})
+        self._actor_parameters = [*self.actor.parameters(), *self.dual.parameters()]
         self.critic_optimizer = self.make_optimizer("critic", self.critic.parameters())
         # The gradient of a dual variable's logarithm shrinks with the variable: an eps of 1e-5 would keep it small.
         groups = [{"params": list(self.actor.parameters())}, {"params": list(self.dual.parameters()), "eps": 1e-8}]
@@ -91,8 +90,7 @@ class REPPO(Algorithm):
         config, dual = self.config, self.dual
         loc, scale = self.distribution(minibatch["observation"])
         action, log_prob = sample(loc, scale)
-        with frozen(self.critic):
-            value, _ = self.critic.value_and_features(minibatch["observation"], action)
+        value, _ = self.critic.value_and_features(minibatch["observation"], action)
         divergence = kl(minibatch["loc"], minibatch["scale"], loc, scale)
         exceeded = divergence >= config.kl_bound
         objective = dual.temperature.detach() * log_prob - value
@@ -102,23 +100,13 @@ class REPPO(Algorithm):
         excess_kl = (divergence.detach() - config.kl_bound).mean()
         dual_loss = dual.temperature * excess_entropy - dual.kl_weight * excess_kl
         self.actor_optimizer.zero_grad()
-        (loss + dual_loss).backward()
+        (loss + dual_loss).backward(inputs=self._actor_parameters)  # and leave the critic's gradients alone
         grad_norm = clip_and_step(self.actor_optimizer, config.max_grad_norm)
         dual.clamp_()
         return [
             *(loss, divergence.mean(), exceeded.float().mean(), -log_prob.mean()),
             *(dual.temperature, dual.kl_weight, grad_norm),
         ]
-
-
-@contextlib.contextmanager
-def frozen(module: nn.Module) -> Iterator[None]:
-    """Lets what is computed with a module pass gradients on to its inputs, but not to its parameters."""
-    module.requires_grad_(False)
-    try:
-        yield
-    finally:
-        module.requires_grad_(True)
 
 
 class DualVariables(nn.Module):
@@ -229,8 +217,10 @@ class DistributionalQ(nn.Module):
         last = nn.Linear(width, len(bins.centers))
         with torch.no_grad():  # the initial prediction is a return of zero
             last.bias.add_(40.0 * bins.encode(torch.zeros(())))
-        self.value_head = nn.Sequential(NormSiLU(width), *normed_layers(width, (width,)), last)
-        self.predictor = nn.Sequential(NormSiLU(width), *normed_layers(width, (width,)), nn.Linear(width, width))
+        self.value_head = nn.Sequential(nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), last)
+        self.predictor = nn.Sequential(
+            nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), nn.Linear(width, width)
+        )
 
     def forward(self, observation: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns logits of shape ``(..., count)`` and the predicted next features of shape ``(..., hidden[-1])``."""
@@ -247,7 +237,7 @@ def normed_layers(inputs: int, hidden: tuple[int, ...]) -> list[nn.Module]:
     """Returns layers of the given widths, each with layer norm and SiLU."""
     layers: list[nn.Module] = []
     for width in hidden:
-        layers += [nn.Linear(inputs, width), NormSiLU(width)]
+        layers += [nn.Linear(inputs, width), nn.LayerNorm(width), nn.SiLU()]
         inputs = width
     return layers
 
