@@ -109,12 +109,11 @@ class RolloutCollector:
         """Returns the steps of a batch that begins with ``td``, and what the next one begins with."""
         steps = []
         # What the policy writes anew at every step need not be zeroed where a world is reset.
-        rewritten = set(getattr(self._policy, "out_keys", ())) - set(getattr(self._policy, "in_keys", ())) - {"action"}
+        rewritten = frozenset(getattr(self._policy, "out_keys", ())) - set(getattr(self._policy, "in_keys", ()))
         for _ in range(self._steps):
             current = self._policy(td)
-            if rewritten and self._env is self._base:
-                kept, td = self._env.step_and_maybe_reset(current.exclude(*rewritten))
-                current.set("next", kept.get("next"))
+            if self._env is self._base:
+                current, td = self._base._step_and_maybe_reset(current, rewritten)
             else:
                 current, td = self._env.step_and_maybe_reset(current)
             steps.append(current)

@@ -28,12 +28,15 @@ def is_plain(env: "LocoEnv", tensordict: TensorDictBase) -> bool:
     )
 
 
-def step_and_reset(env: "LocoEnv", tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+def step_and_reset(
+    env: "LocoEnv", tensordict: TensorDictBase, rewritten: frozenset[str]
+) -> tuple[TensorDictBase, TensorDictBase]:
     """Steps an environment and begins new episodes in the worlds that are done.
 
     Args:
         env: the environment.
         tensordict: has an ``action``, batch ``(num_envs,)``; ``next`` is added to it.
+        rewritten: entries that the next step need not begin with.
 
     Returns:
         It, and what the next step begins with, as TorchRL's ``step_and_maybe_reset``.
@@ -43,7 +46,9 @@ def step_and_reset(env: "LocoEnv", tensordict: TensorDictBase) -> tuple[TensorDi
     begin = env._outputs()  # in the worlds that go on, nothing has changed
     done = after.get("done")
     for key, value in tensordict.items():
-        if key not in begin:  # as in TorchRL, the policy's outputs are zero where a world was reset
+        if (
+            key not in begin and key not in rewritten
+        ):  # as in TorchRL, the policy's outputs are zero where a world was reset
             begin._set_str(key, value.masked_fill(_rows(done, value), 0), inplace=False, validated=True)
     tensordict.set("next", after)
     return tensordict, begin

@@ -262,11 +262,18 @@ class LocoEnv(EnvBase):
         """Returns a copy of an array with one row per world, in the environment's batch size."""
         return rows.clone() if self.batch_size else rows[0].clone()
 
-    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """Returns what TorchRL's returns, after a third of its work on the host where nothing special is asked for."""
+    def _step_and_maybe_reset(
+        self, tensordict: TensorDictBase, rewritten: frozenset[str] = frozenset()
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """Returns what TorchRL's returns, after a third of its work on the host where nothing special is asked for.
+
+        Args:
+            tensordict: has an ``action``, batch ``(num_envs,)``.
+            rewritten: entries that the next step need not begin with.
+        """
         own = (getattr(type(self), name) is getattr(LocoEnv, name) for name in ("step", "_reset", "maybe_reset"))
         if all(own) and is_plain(self, tensordict):
-            return step_and_reset(self, tensordict)
+            return step_and_reset(self, tensordict, rewritten)
         return super()._step_and_maybe_reset(tensordict)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -10,7 +10,10 @@ from torchrl_loco.sim.sampling import world_stream
 MAX_VALUE = 1.0e10
 """Magnitude from which a number counts as not finite: MuJoCo's mjMAXVAL."""
 
-Eight = wp.types.vector(length=8, dtype=wp.float32)
+AT_ONCE = 16
+"""Numbers of a row that are read before any is written."""
+
+Numbers = wp.types.vector(length=AT_ONCE, dtype=wp.float32)
 
 
 @wp.struct
@@ -46,14 +49,13 @@ class Control:
 
 
 @wp.func
-def read_eight(row: wp.array[float], first: int):
-    """Returns eight numbers of a row from ``first`` on; beyond its end, the last one.
+def read_some(row: wp.array[float], first: int):
+    """Returns numbers of a row from ``first`` on; beyond its end, the last one.
 
-    Numbers are read by eights before any is written: a read that follows a write waits for it, as both may be the same
-    number.
+    Several are read before any is written: a read that follows a write waits for it, as both may be the same number.
     """
-    some = Eight()
-    for j in range(8):
+    some = Numbers()
+    for j in range(AT_ONCE):
         some[j] = row[wp.min(first + j, row.shape[0] - 1)]
     return some
 
@@ -66,18 +68,18 @@ def apply_action(world: int, args: Control):
     """
     action, ctrl = args.action[world], args.ctrl[world]
     count = int(0)
-    for i in range(0, action.shape[0], 8):
-        some = read_eight(action, i)
-        for j in range(8):
+    for i in range(0, action.shape[0], AT_ONCE):
+        some = read_some(action, i)
+        for j in range(AT_ONCE):
             count += wp.where(wp.isfinite(some[j]), 0, 1)
     non_finite = count > 0
-    for i in range(0, action.shape[0], 8):
-        some = read_eight(action, i)
-        for j in range(8):
+    for i in range(0, action.shape[0], AT_ONCE):
+        some = read_some(action, i)
+        for j in range(AT_ONCE):
             limits = args.ctrlrange[0, wp.min(i + j, action.shape[0] - 1)]
             used = wp.where(non_finite, 0.0, wp.clamp(some[j], -1.0, 1.0))
             some[j] = 0.5 * (limits[0] + limits[1]) + 0.5 * (limits[1] - limits[0]) * used
-        for j in range(8):
+        for j in range(AT_ONCE):
             if i + j < action.shape[0]:
                 ctrl[i + j] = some[j]
     args.non_finite[world] = non_finite
@@ -122,22 +124,22 @@ def struct_of(method: str, func: Any, inputs: Any) -> Any:
 @wp.func
 def observe_row(row: wp.array[float], first: int, observation: wp.array[float], k: int) -> int:
     """Copies the numbers of a row from ``first`` on into an observation at ``k``; returns where they end."""
-    for i in range(first, row.shape[0], 8):
-        some = read_eight(row, i)
-        for j in range(8):
+    for i in range(first, row.shape[0], AT_ONCE):
+        some = read_some(row, i)
+        for j in range(AT_ONCE):
             if i + j < row.shape[0]:
                 observation[k + j] = some[j]
-        k += wp.min(8, row.shape[0] - i)
+        k += wp.min(AT_ONCE, row.shape[0] - i)
     return k
 
 
 @wp.func
 def count_non_finite(row: wp.array[float]) -> int:
-    """Counts in eights, the last number perhaps more than once, and without a branch."""
+    """Counts, the last number perhaps more than once; without a branch, which would wait for each."""
     count = int(0)
-    for i in range(0, row.shape[0], 8):
-        some = read_eight(row, i)
-        for j in range(8):
+    for i in range(0, row.shape[0], AT_ONCE):
+        some = read_some(row, i)
+        for j in range(AT_ONCE):
             count += wp.where(wp.abs(some[j]) < MAX_VALUE, 0, 1)  # counts NaN too
     return count
 

@@ -160,10 +160,9 @@ class CompiledEngine:
             before: what each world does first.
             after: what it does at the end.
         """
-        if self._launch_size.lanes == 1:
+        if self._launch_size.one_kernel:
             self._launch(self._substeps, self._all, before, after)
             return
-        # In the same kernel one lane would do it while 31 wait (humanoid: 7 to 10 % of a step).
         self._launch_apart(before)
         self._launch(self._substeps, self._all, (), ())
         self._launch_apart(after)

@@ -18,6 +18,10 @@ WARPS = 2
 """Warps that each multiprocessor gets before warps are filled with worlds: a warp takes as long as its slowest world,
 and more warps wait for each other's instructions (measured)."""
 
+MANY = 2
+"""With more than so many times the worlds that fill those warps, what is not physics has kernels of its own. It waits for
+memory, and few warps have room beside each other with all the registers that the physics takes."""
+
 
 def is_traced(m: mujoco.MjModel) -> bool:
     """Returns whether one thread steps a world, in straight-line code; else a group of lanes does, in loops."""
@@ -43,21 +47,25 @@ class LaunchSize(NamedTuple):
         block: those of a block.
         worlds_per_warp: worlds that share a warp.
         lanes: threads that share a world.
+        one_kernel: whether the functions of a world run in the kernel of the physics, and not as kernels of their own.
     """
 
     threads: int
     block: int
     worlds_per_warp: int
     lanes: int
+    one_kernel: bool
 
 
 def launch_size(m: mujoco.MjModel, num_envs: int, device: wp.Device) -> LaunchSize:
     """Returns how the worlds are spread over threads."""
     if device.is_cuda and not is_traced(m):
         block = lanes.worlds_per_block(m)
-        return LaunchSize(WARP * block * math.ceil(num_envs / block), WARP * block, 1, WARP)
-    worlds = WARP
+        # One lane would do what is not physics, while 31 wait.
+        return LaunchSize(WARP * block * math.ceil(num_envs / block), WARP * block, 1, WARP, one_kernel=False)
+    worlds, one_kernel = WARP, True
     if device.is_cuda:
         share = num_envs / (WARPS * device.sm_count)
         worlds = min(WARP, 2 ** math.ceil(math.log2(max(share, 1))))
-    return LaunchSize(WARP * math.ceil(num_envs / worlds), WARP, worlds, 1)
+        one_kernel = share <= MANY * WARP
+    return LaunchSize(WARP * math.ceil(num_envs / worlds), WARP, worlds, 1, one_kernel)
