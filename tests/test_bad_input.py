@@ -13,7 +13,7 @@ from tensordict import TensorDict
 import torchrl_loco
 from torchrl_loco import LocoEnv, SimConfig, nan_dump
 from torchrl_loco.envs import base
-from torchrl_loco.policy import SHIPPED, Policy
+from torchrl_loco.policy import Policy, shipped_policies
 
 BAD = {
     "num_envs": (2.5, TypeError),
@@ -138,7 +138,7 @@ def assert_damage_is_noticed(path, load, kind, times=100):
 
 def test_damaged_policies(tmp_path):
     path = tmp_path / "policy.safetensors"
-    path.write_bytes((SHIPPED / "walker_walk.safetensors").read_bytes())
+    path.write_bytes(shipped_policies("playground")["walker_walk"].read_bytes())
     assert_damage_is_noticed(path, lambda: Policy.load(path, "cpu"), "policy")
 
 

@@ -67,7 +67,7 @@ def test_wheel_holds_the_package_and_nothing_else(built):
     inside = {name for name in names if not name.startswith(info)}
     assert inside == files_below(ROOT / "torchrl_loco")
     assert {f"torchrl_loco/models/{path.name}" for path in [*models.PATHS.values(), models.SCENE]} < inside
-    assert {f"torchrl_loco/policies/walker_{goal}.safetensors" for goal in ("stand", "walk", "run")} < inside
+    assert {f"torchrl_loco/policies/playground/walker_{goal}.safetensors" for goal in ("stand", "walk", "run")} < inside
     assert "torchrl_loco/py.typed" in inside
     assert {f"{info}/licenses/LICENSE", f"{info}/licenses/NOTICE"} < names
     assert f"\nVersion: {torchrl_loco.__version__}\n" in metadata

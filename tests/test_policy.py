@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from cases import PROTOCOLS
 from safetensors.torch import save_file
 from torch import nn
 
 import torchrl_loco
 from torchrl_loco import storage
-from torchrl_loco.policy import SHIPPED, ObservationNorm, Policy
+from torchrl_loco.policy import ObservationNorm, Policy, shipped_policies
 
 INFO = {"task": "walker_stand", "protocol": "playground", "action_repeat": 2, "mean": 12.5}
 
@@ -93,33 +94,36 @@ def test_files_that_are_no_policy(policy, tmp_path):
             Policy.load(path, "cpu")
 
 
-SHIPPED_TASKS = [path.stem for path in sorted(SHIPPED.glob("*.safetensors"))]
+SHIPPED = [(name, protocol) for protocol in PROTOCOLS for name in shipped_policies(protocol)]
 
 
-def test_shipped_policies_are_small_and_belong_to_their_task():
-    assert SHIPPED_TASKS
-    for name in SHIPPED_TASKS:
-        assert (SHIPPED / f"{name}.safetensors").stat().st_size < 1e6
-        policy = torchrl_loco.load_policy(name, "cpu")
-        assert policy.info["task"] == name
+def test_shipped_policies_are_small_and_belong_to_their_task_and_protocol():
+    assert {protocol for _, protocol in SHIPPED} == set(PROTOCOLS)
+    for name, protocol in SHIPPED:
+        assert shipped_policies(protocol)[name].stat().st_size < 1e6
+        policy = torchrl_loco.load_policy(name, "cpu", protocol)
+        assert (policy.info["task"], policy.info["protocol"]) == (name, protocol)
         zeros = torch.zeros(2, torchrl_loco.registry.env_class(name).observation_size)
         assert policy(observation=zeros).shape == (2, 6 if name.startswith("walker") else 21)
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("name", SHIPPED_TASKS)
-def test_shipped_policies_reach_the_return_that_they_state(name):
-    policy = torchrl_loco.load_policy(name, "cpu")
-    env = torchrl_loco.make(name, 4, "cpu", seed=1, protocol=policy.info["protocol"])
+@pytest.mark.parametrize(("name", "protocol"), SHIPPED)
+def test_shipped_policies_reach_the_return_that_they_state(name, protocol):
+    policy = torchrl_loco.load_policy(name, "cpu", protocol)
+    env = torchrl_loco.make(name, 4, "cpu", seed=1, protocol=protocol)
     returns = env.rollout(1000, policy)["next", "reward"].sum(dim=1)
     assert returns.mean() > policy.info["mean"] - 3 * policy.info["std"] - 20
 
 
 def test_a_policy_that_was_not_shipped(monkeypatch, tmp_path):
-    (tmp_path / "walker_run.safetensors").touch()
+    (tmp_path / "dm_control").mkdir()
+    (tmp_path / "dm_control/walker_run.safetensors").touch()
     monkeypatch.setattr("torchrl_loco.policy.SHIPPED", tmp_path)
-    with pytest.raises(ValueError, match=r"no policy for 'walker_walk' .* choose one of walker_run, or train one"):
-        torchrl_loco.load_policy("walker_walk", "cpu")
+    with pytest.raises(ValueError, match=r"no policy for 'walker_walk' under .* choose one of walker_run, or train"):
+        torchrl_loco.load_policy("walker_walk", "cpu", protocol="dm_control")
+    with pytest.raises(ValueError, match="choose one of playground, dm_control"):
+        torchrl_loco.load_policy("walker_walk", "cpu", protocol="mjx")
 
 
 def test_another_bodys_observations_are_refused(policy, shared):

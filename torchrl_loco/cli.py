@@ -226,12 +226,19 @@ def record(run: tyro.conf.Positional[Path], /, video: VideoOptions = Video()) ->
         video.make(torchrl_loco.Policy.load(folder.policy, video.device), folder.video)
 
 
-def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: VideoOptions = Video()) -> None:
+def play(
+    task: tyro.conf.Positional[str],
+    /,
+    policy: Path | None = None,
+    protocol: Literal["playground", "dm_control"] = "playground",
+    video: VideoOptions = Video(),
+) -> None:
     """Show a trained policy: in a window if there is a display, else as a video.
 
     Args:
         task: id of the environment.
         policy: a run folder or a policy file; default: the policy shipped with the package.
+        protocol: which shipped policy, by what it was trained under; others are played under their own.
         video: which part of an episode is shown, and how; --out always records a video.
     """
     with _user_errors():
@@ -243,7 +250,7 @@ def play(task: tyro.conf.Positional[str], /, policy: Path | None = None, video: 
             policy = training.RunFolder(check_run(policy)).policy
         video.check()
         if policy is None:
-            trained = torchrl_loco.load_policy(task, video.device)
+            trained = torchrl_loco.load_policy(task, video.device, protocol)
         else:
             trained = torchrl_loco.Policy.load(policy, video.device)
             if trained.info["task"] != name:

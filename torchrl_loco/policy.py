@@ -8,10 +8,12 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from torchrl_loco import storage
-from torchrl_loco.checks import check_device
+from torchrl_loco.checks import check_choice, check_device
+from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.registry import canonical_id
 
 SHIPPED = Path(__file__).parent / "policies"
+"""Has a folder for each protocol."""
 
 
 class ObservationNorm(nn.Module):
@@ -156,27 +158,32 @@ def _make_layer(name: str, sized: torch.Tensor | None) -> nn.Module:
     raise ValueError(f"unknown layer {name!r}")
 
 
-def load_policy(task: str, device: torch.device | str | None = None) -> Policy:
+def load_policy(task: str, device: torch.device | str | None = None, protocol: str = "playground") -> Policy:
     """Loads the trained policy of a task that is shipped with the package.
 
     Args:
         task: id of the environment.
         device: where it computes; ``None`` takes CUDA if there is any.
+        protocol: what it was trained under, "playground" or "dm_control".
 
     Returns:
         The policy. ``policy.info`` holds its return, protocol, frames, wall time, seed and settings. Hold each of
         its actions for ``policy.info["action_repeat"]`` control steps.
 
     Raises:
-        ValueError: there is no such task, or no policy for it.
+        ValueError: there is no such task or protocol, or no policy for them.
     """
     if str(task).endswith(".safetensors"):
         raise ValueError(f"load_policy takes the id of a task; load a file with torchrl_loco.Policy.load({task!r})")
-    name = canonical_id(task)
-    path = SHIPPED / f"{name}.safetensors"
-    if not path.is_file():
-        shipped = sorted(p.stem for p in SHIPPED.glob("*.safetensors"))
+    name, shipped = canonical_id(task), shipped_policies(check_choice("protocol", protocol, PROTOCOLS))
+    if name not in shipped:
         raise ValueError(
-            f"no policy for {name!r} is shipped with this release: choose one of {', '.join(shipped)}, or train one"
+            f"no policy for {name!r} under protocol {protocol!r} is shipped with this release: choose one of "
+            f"{', '.join(shipped)}, or train one"
         )
-    return Policy.load(path, device)
+    return Policy.load(shipped[name], device)
+
+
+def shipped_policies(protocol: str) -> dict[str, Path]:
+    """Returns the files of the policies that are shipped for a protocol, by task."""
+    return {path.stem: path for path in sorted((SHIPPED / protocol).glob("*.safetensors"))}

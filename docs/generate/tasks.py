@@ -12,7 +12,7 @@ import torchrl_loco
 from generate.markdown import table
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS, NACONMAX_FLOOR, NACONMAX_WORLDS, PROTOCOLS, sim_config
-from torchrl_loco.policy import SHIPPED
+from torchrl_loco.policy import shipped_policies
 from torchrl_loco.registry import ALIASES, OURS, env_class
 
 MOMENTS = (0, 20, 40, 160)
@@ -79,23 +79,28 @@ def protocols(body: str) -> str:
     return table(("setting", *(f"`{protocol}`" for protocol in PROTOCOLS)), rows) + note
 
 
-def _info(name: str) -> dict[str, Any] | None:
+def _info(name: str, protocol: str = "playground") -> dict[str, Any] | None:
     """Returns the info of the shipped policy, None if there is none."""
-    if not (SHIPPED / f"{name}.safetensors").is_file():
+    if name not in shipped_policies(protocol):
         return None
-    return torchrl_loco.load_policy(name, device="cpu").info
+    return torchrl_loco.load_policy(name, "cpu", protocol).info
 
 
 def shipped_policy(name: str) -> str:
-    """Returns how well the shipped policy of a task does, if there is one."""
-    info = _info(name)
-    if info is None:
+    """Returns how well the shipped policies of a task do, if there are any."""
+    found = {protocol: info for protocol in PROTOCOLS if (info := _info(name, protocol))}
+    if not found:
         return "No policy is shipped for this task. The [benchmarks](/benchmarks.md) list its training runs.\n"
+    return "\n".join(_about_policy(name, protocol, info) for protocol, info in found.items())
+
+
+def _about_policy(name: str, protocol: str, info: dict[str, Any]) -> str:
+    chosen = "" if protocol == "playground" else f', protocol="{protocol}"'
     return (
-        f'`torchrl_loco.load_policy("{name}")` returns **{info["mean"]:.1f} ± {info["std"]:.1f}** (mean and standard '
-        f"deviation over {info['episodes']} episodes of {env_class(name).defaults.episode_length} "
-        f"steps that were not used to select it; worst {info['min']:.1f}, best {info['max']:.1f}; protocol "
-        f"`{info['protocol']}`). It was trained by {info['algorithm'].upper()} for "
+        f'`torchrl_loco.load_policy("{name}"{chosen})` returns **{info["mean"]:.1f} ± {info["std"]:.1f}** under '
+        f"protocol `{protocol}` (mean and standard deviation over {info['episodes']} episodes of "
+        f"{env_class(name).defaults.episode_length} steps that were not used to select it; worst {info['min']:.1f}, "
+        f"best {info['max']:.1f}). It was trained by {info['algorithm'].upper()} for "
         f"{info['frames'] / 1e6:.0f} million frames, {info['seconds']:.0f} s on one {info['trained_on']}, with "
         f"{info['num_envs']} worlds and seed {info['seed']}.\n"
     )

@@ -51,6 +51,8 @@ def test_from_training_to_a_video(tmp_path, capsys, monkeypatch):
         head, returns, out = capsys.readouterr().out.splitlines()
         assert (head.split(",")[0], returns.split()[0], Path(out).name) == ("walker_walk", "return", name)
         assert Path(out).exists()
+    assert cli.main(["play", "walker_walk", "--protocol", "dm_control", *video]) == 0
+    assert "protocol dm_control" in capsys.readouterr().out
 
 
 def test_a_run_is_exported_into_its_folder(ppo_run, tmp_path, capsys):

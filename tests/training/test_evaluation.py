@@ -93,5 +93,5 @@ def test_a_poor_return_is_said(monkeypatch):
     assert "--seed 8" in note
     assert "--total_frames 200000" in note
     assert poor_return(config, {"mean": 0.81 * shipped}) == ""
-    monkeypatch.setattr("torchrl_loco.training.evaluation.SHIPPED", config.out / "none")
+    monkeypatch.setattr("torchrl_loco.policy.SHIPPED", config.out / "none")
     assert poor_return(config, {"mean": 0.0}) == ""

@@ -15,7 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import trange
 
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.policy import SHIPPED, load_policy
+from torchrl_loco.policy import load_policy, shipped_policies
 from torchrl_loco.registry import make
 from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.config import TrainingConfig
@@ -80,18 +80,17 @@ POOR = 0.8
 def poor_return(config: TrainingConfig, summary: dict[str, float], seeds: Collection[int] = ()) -> str:
     """Returns a note if the return of a run is poor, with what to try, else an empty string.
 
-    It is compared with the policy that is shipped for the same task, if there is one.
+    It is compared with the policy that is shipped for the same task and protocol, if there is one.
 
     Args:
         config: settings of the run.
         summary: what :func:`summarize` returned.
         seeds: further seeds that were tried.
     """
-    if not (SHIPPED / f"{config.task}.safetensors").is_file():
+    if config.task not in shipped_policies(config.protocol):
         return ""
-    info = load_policy(config.task, "cpu").info
-    reference = info["mean"]
-    if config.protocol != info["protocol"] or summary["mean"] >= POOR * reference:
+    reference = load_policy(config.task, "cpu", config.protocol).info["mean"]
+    if summary["mean"] >= POOR * reference:
         return ""
     return (
         f"This return is poor: the policy shipped for {config.task} earns {reference:.0f}. Returns vary with seeds and "
