@@ -1,8 +1,8 @@
 """What is measured: each case makes a function that advances all worlds by one control step."""
 
 import itertools
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import mujoco_warp as mjw
 import torch
@@ -12,15 +12,32 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
+from tqdm import tqdm
 
 import torchrl_loco
 from benchmarks.tasks import TASKS
 from torchrl_loco import RolloutCollector, models
 from torchrl_loco.config import DEFAULTS, sim_config
 from torchrl_loco.sim import Simulation, current_stream
+from torchrl_loco.training.trainer import interruptible
+
+Run = TypeVar("Run")
 
 BATCH_STEPS = 20
 """Control steps in a batch of the collectors."""
+
+
+def until_interrupted(runs: Sequence[Run], name: str) -> Iterator[Run]:
+    """Yields what is to be measured, under a progress bar.
+
+    Ctrl-C or SIGTERM ends it after the present one: what was measured until then is shown and kept. A second signal
+    stops at once.
+    """
+    with interruptible() as interrupted:
+        for run in tqdm(runs, desc=name):
+            yield run
+            if interrupted():
+                return
 
 
 def waiter(device: torch.device) -> Callable[[], None]:

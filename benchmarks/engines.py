@@ -9,10 +9,9 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 import torch
-from tqdm import tqdm
 
 import torchrl_loco
-from benchmarks.cases import bare_default, waiter
+from benchmarks.cases import bare_default, until_interrupted, waiter
 from benchmarks.results import Row
 from benchmarks.tasks import TASKS
 from benchmarks.timing import milliseconds
@@ -49,7 +48,7 @@ def engines(bodies: Sequence[str], worlds: Sequence[int], device: torch.device, 
     """
     rows: list[Row] = []
     runs = [(body, protocol, n) for body in bodies for protocol in PROTOCOLS for n in worlds]
-    for body, protocol, n in tqdm(runs, desc="engines"):
+    for body, protocol, n in until_interrupted(runs, "engines"):
         row = {"body": body, "protocol": protocol, "worlds": n, **_environment(body, protocol, n, device)}
         if n <= base_up_to:
             row["mujoco_warp"] = _time(bare_default(body, n, device, protocol), n, device)

@@ -6,9 +6,8 @@ Times are of one control step of all worlds. Ratios are to the bare loop with mu
 from collections.abc import Sequence
 
 import torch
-from tqdm import tqdm
 
-from benchmarks.cases import CASES, VARIANTS, waiter
+from benchmarks.cases import CASES, VARIANTS, until_interrupted, waiter
 from benchmarks.results import Row
 from benchmarks.timing import milliseconds
 
@@ -27,7 +26,7 @@ def throughput(bodies: Sequence[str], worlds: Sequence[int], cases: Sequence[str
     """Measures each case for each body and number of worlds; returns a row for each."""
     rows: list[Row] = []
     runs = [(body, n, case) for body in bodies for n in worlds for case in cases]
-    for body, n, case in tqdm(runs, desc="throughput"):
+    for body, n, case in until_interrupted(runs, "throughput"):
         ms = milliseconds({**CASES, **VARIANTS}[case](body, n, device), waiter(device))
         rows.append({"body": body, "worlds": n, "case": case, "ms": ms, "million steps/s": n / ms / 1e3})
     for row in rows:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 
 from benchmarks import fidelity, plot, scaling, soak, timing
+from benchmarks.cases import until_interrupted
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
 from benchmarks.throughput import phases
@@ -38,6 +40,16 @@ def test_time_is_the_median_of_blocks_after_the_first(monkeypatch):
         clock[0] += next(cost)
 
     assert timing.milliseconds(step, lambda: None, blocks=3, steps=2) == 2000.0
+
+
+def test_what_was_measured_before_a_signal_is_kept():
+    measured = []
+    for run in until_interrupted(range(5), "runs"):
+        measured.append(run)
+        if run == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+    assert measured == [0, 1]
+    assert list(until_interrupted("abc", "runs")) == ["a", "b", "c"]
 
 
 def test_a_failed_process_raises_its_error(tmp_path):
