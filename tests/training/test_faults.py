@@ -56,7 +56,7 @@ def kill_rank_1(process, out):
     return pid
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_rank_that_dies_is_named(tmp_path):
     """The other ranks end too, and the run can be continued."""
     process = started([sys.executable], tmp_path, "--gpus=2", total_frames=10_000_000)

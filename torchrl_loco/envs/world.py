@@ -33,6 +33,7 @@ from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import (
     EXCLUSIVE,
     Buffer,
+    Graph,
     PackedBuffers,
     Simulation,
     WorldFunc,
@@ -130,10 +131,10 @@ class World:
                 self._monitors.append(guard)
 
             self._make_funcs(task)
-            self.sim.compile(self._launch_step, self._launch_reset, self._launch_refresh)
+            self.sim.compile(self._launch_step, self._launch_reset)
             self._step_graph = self.sim.capture(self._launch_step)
             self._reset_graph = self.sim.capture(self._launch_reset)
-            self._refresh_graph = self.sim.capture(self._launch_refresh)
+            self._refresh_graph: Graph | None = None  # most environments never need it
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
             for monitor in self._monitors:
@@ -238,7 +239,18 @@ class World:
             flag.torch.masked_fill_(mask, False)
         time = self.sim.time
         time.copy_(torch.where(mask, self.elapsed_steps.torch * self._ctrl_dt, time))
+        if self._refresh_graph is None:
+            self._refresh_graph = self._record_refresh()
         self._refresh_graph.replay()
+
+    def _record_refresh(self) -> Graph:
+        device = self.sim.device
+        with torch.inference_mode(False), EXCLUSIVE, self.sim.qpos.device:
+            self.sim.compile(self._launch_refresh)
+            wp.synchronize_device(device)  # written on torch's stream, used on Warp's, which runs it too
+            graph = self.sim.capture(self._launch_refresh)
+            wp.synchronize_device(device)
+        return graph
 
     def _set_mask(self, mask: torch.Tensor | None) -> None:
         if mask is None:
