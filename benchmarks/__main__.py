@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.cases import CASES, VARIANTS
+from benchmarks.cases import CASES, INTERRUPTED, VARIANTS
 from benchmarks.results import save, show
 from benchmarks.tasks import TASKS
 from torchrl_loco import list_envs
@@ -141,4 +141,5 @@ else:
     rows = profile(args.bodies, args.worlds[0], args.cases, args.device)
 show(rows, COLUMNS)
 if args.out:
-    save(rows, args.out, args.device)
+    save(rows, args.out, args.device, {"interrupted": True} if INTERRUPTED.is_set() else {})
+raise SystemExit(130 if INTERRUPTED.is_set() else 0)

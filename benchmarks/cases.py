@@ -1,6 +1,7 @@
 """What is measured: each case makes a function that advances all worlds by one control step."""
 
 import itertools
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -22,6 +23,8 @@ from torchrl_loco.sim import Simulation, current_stream
 from torchrl_loco.training.trainer import interruptible
 
 Run = TypeVar("Run")
+INTERRUPTED = threading.Event()
+"""Whether only a part was measured."""
 
 BATCH_STEPS = 20
 """Control steps in a batch of the collectors."""
@@ -30,13 +33,14 @@ BATCH_STEPS = 20
 def until_interrupted(runs: Sequence[Run], name: str) -> Iterator[Run]:
     """Yields what is to be measured, under a progress bar.
 
-    Ctrl-C or SIGTERM ends it after the present one: what was measured until then is shown and kept. A second signal
-    stops at once.
+    Ctrl-C or SIGTERM ends it after the present one, and sets ``INTERRUPTED``: what was measured until then is shown and
+    kept. A second signal stops at once.
     """
     with interruptible() as interrupted:
         for run in tqdm(runs, desc=name):
             yield run
             if interrupted():
+                INTERRUPTED.set()
                 return
 
 

@@ -6,7 +6,7 @@ import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,10 @@ def show(rows: Sequence[Row], columns: dict[str, str]) -> None:
         print("  ".join([first.ljust(widths[0]), *map(str.rjust, others, widths[1:])]))
 
 
-def save(rows: Sequence[Row], path: Path, device: torch.device) -> None:
-    """Writes the rows and what a reader needs to judge them by as JSON."""
+def save(rows: Sequence[Row], path: Path, device: torch.device, notes: Mapping[str, Any] | None = None) -> None:
+    """Writes the rows and what a reader needs to judge them by as JSON, ``notes`` included."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({**circumstances(device), "rows": list(rows)}, indent=1) + "\n")
+    path.write_text(json.dumps({**circumstances(device), **(notes or {}), "rows": list(rows)}, indent=1) + "\n")
 
 
 def circumstances(device: torch.device) -> dict[str, Any]:

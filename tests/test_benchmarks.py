@@ -4,12 +4,13 @@ import json
 import os
 import signal
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 import torch
 
-from benchmarks import fidelity, plot, scaling, soak, timing
+from benchmarks import cases, fidelity, plot, scaling, soak, timing
 from benchmarks.cases import until_interrupted
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
@@ -42,13 +43,15 @@ def test_time_is_the_median_of_blocks_after_the_first(monkeypatch):
     assert timing.milliseconds(step, lambda: None, blocks=3, steps=2) == 2000.0
 
 
-def test_what_was_measured_before_a_signal_is_kept():
+def test_what_was_measured_before_a_signal_is_kept(monkeypatch):
+    monkeypatch.setattr(cases, "INTERRUPTED", threading.Event())
     measured = []
     for run in until_interrupted(range(5), "runs"):
         measured.append(run)
         if run == 1:
             os.kill(os.getpid(), signal.SIGTERM)
     assert measured == [0, 1]
+    assert cases.INTERRUPTED.is_set()
     assert list(until_interrupted("abc", "runs")) == ["a", "b", "c"]
 
 

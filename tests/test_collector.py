@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 import torchrl_loco
 from torchrl_loco import RolloutCollector
 from torchrl_loco.collector import what_forbids_recording
+from torchrl_loco.envs import WalkerRun
 
 QUICK = {"episode_length": 7, "on_overflow": "ignore"}
 """Coarse steps make a humanoid fly apart, with more contacts than there are places."""
@@ -52,6 +53,19 @@ def test_exchangeable_with_torchrls_collector(make, body_task, wrap):
         for key in theirs_batch.keys(True, True):
             assert torch.equal(ours_batch[key], theirs_batch[key]), key
     assert not got[0].requires_grad
+
+
+@pytest.mark.parametrize("name", ["step_and_maybe_reset", "_step_and_maybe_reset"])
+def test_a_step_that_a_subclass_overrides_is_called(name):
+    calls = []
+
+    def override(self, tensordict):
+        calls.append(name)
+        return getattr(WalkerRun, name)(self, tensordict)
+
+    counted = type("Counted", (WalkerRun,), {name: override})(2, "cpu", 0, **QUICK)
+    RolloutCollector(counted, policy(counted), frames_per_batch=6).rollout()
+    assert calls == [name] * 3
 
 
 def test_endless_and_wrong_sizes(make):

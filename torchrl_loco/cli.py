@@ -270,6 +270,7 @@ def export(
     /,
     format: Literal["onnx", "torch"] = "onnx",
     out: Path | None = None,
+    protocol: Literal["playground", "dm_control"] = "playground",
 ) -> None:
     """Write a policy as a file for programs without this package, and compare it with the policy.
 
@@ -277,6 +278,7 @@ def export(
         run_or_task: a run folder, a policy file, or the id of an environment for the policy shipped with the package.
         format: onnx, or torch for a program of torch.export (.pt2).
         out: the file, a new one; default: a new file beside the policy, or TASK.onnx for a shipped one.
+        protocol: which shipped policy, by what it was trained under.
     """
     with _user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
         source = Path(run_or_task)
@@ -288,7 +290,7 @@ def export(
         if out is not None:
             check_output_file("out", out, (suffix,))
         if task is not None:
-            policy, default = torchrl_loco.load_policy(task, "cpu"), Path(f"{task}{suffix}")
+            policy, default = torchrl_loco.load_policy(task, "cpu", protocol), Path(f"{task}{suffix}")
         else:
             file = training.RunFolder(source).policy if source.is_dir() else source
             policy, default = torchrl_loco.Policy.load(file, "cpu"), file.with_suffix(suffix)

@@ -112,7 +112,7 @@ class RolloutCollector:
         rewritten = frozenset(getattr(self._policy, "out_keys", ())) - set(getattr(self._policy, "in_keys", ()))
         for _ in range(self._steps):
             current = self._policy(td)
-            if self._env is self._base:
+            if steps_as_ours(self._env):
                 current, td = self._base._step_and_maybe_reset(current, rewritten)
             else:
                 current, td = self._env.step_and_maybe_reset(current)
@@ -183,6 +183,13 @@ class RolloutCollector:
 
     def shutdown(self) -> None:
         """Does nothing: TorchRL's ``Collector`` has this method."""
+
+
+def steps_as_ours(env: EnvBase) -> bool:
+    """Returns whether an environment's ``step_and_maybe_reset`` is this package's, neither overridden nor compiled."""
+    names = "step_and_maybe_reset", "_step_and_maybe_reset"
+    own = all(getattr(type(env), name) is getattr(LocoEnv, name) for name in names)
+    return own and "_compiled_step_and_maybe_reset" not in vars(env)
 
 
 class Recording:

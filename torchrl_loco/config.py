@@ -35,7 +35,7 @@ class SimConfig:
             engine ``compiled``, they always do, at no cost. Under ``mujoco_warp`` a step then takes three to four times
             as long, and which constraints are dropped when ``njmax`` or ``naconmax`` is too small still varies, see
             :meth:`torchrl_loco.LocoEnv.health`.
-        engine: what steps the physics. ``compiled`` is one kernel made for the model, 5 to 40 times as fast on an
+        engine: what steps the physics. ``compiled`` is one kernel made for the model, 6 to 50 times as fast on an
             H200; ``mujoco_warp`` is MuJoCo-Warp; ``auto`` takes ``compiled`` where it can do the model.
 
     Raises:

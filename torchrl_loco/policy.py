@@ -177,9 +177,10 @@ def load_policy(task: str, device: torch.device | str | None = None, protocol: s
         raise ValueError(f"load_policy takes the id of a task; load a file with torchrl_loco.Policy.load({task!r})")
     name, shipped = canonical_id(task), shipped_policies(check_choice("protocol", protocol, PROTOCOLS))
     if name not in shipped:
+        others = [f"protocol={other!r}" for other in PROTOCOLS if name in shipped_policies(other)]
         raise ValueError(
             f"no policy for {name!r} under protocol {protocol!r} is shipped with this release: choose one of "
-            f"{', '.join(shipped)}, or train one"
+            f"{', '.join([*shipped, *others])}, or train one"
         )
     return Policy.load(shipped[name], device)
 

@@ -49,10 +49,17 @@ def test_the_cpu_always_repeats(shared, task, protocol, engine, actions):
         assert (current == expected).all()
 
 
-@pytest.mark.parametrize(("task", "protocol"), [("walker_run", "playground"), ("humanoid_run", "dm_control")])
-def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protocol, device, actions):
+@pytest.mark.parametrize(
+    ("task", "protocol", "count"),
+    [
+        ("walker_run", "playground", 131),
+        ("humanoid_run", "dm_control", 131),
+        pytest.param("walker_run", "playground", 20_000, marks=pytest.mark.gpu),  # in three kernels instead of one
+    ],
+)
+def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protocol, count, device, actions):
     """Under ``compiled``, bit for bit, whatever their number, its place, and what happens in the others."""
-    many, few = (shared(task, n, device, protocol=protocol, episode_length=500) for n in (131, 3))
+    many, few = (shared(task, n, device, protocol=protocol, episode_length=500) for n in (count, 3))
     td, moves = many.reset(), actions(many, 70)
     for action in moves[:60]:  # until most lie on the ground
         td = many.step(td.set("action", action))["next"].exclude("reward")
@@ -60,9 +67,10 @@ def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protoc
     picked = State({key: value[places.to(device)] for key, value in state.items()}, batch_size=[3])
     alone = few.reset(picked, set_state=True)
     beside = many.reset(state, set_state=True)
-    others = torch.ones(131, dtype=torch.bool)
+    others = torch.ones(count, dtype=torch.bool)
     others[places] = False
-    many.sim.qvel[others.to(device)] = many.sim.qvel.new_tensor([torch.nan, 1e9]).repeat(64).unsqueeze(-1)
+    bad = many.sim.qvel.new_tensor([torch.nan, 1e9]).repeat(count)
+    many.sim.qvel[others.to(device)] = bad[: count - 3].unsqueeze(-1)
     for action in moves[60:]:
         spoilt = action.clone()
         spoilt[others.to(device)] *= torch.inf

@@ -45,10 +45,9 @@ def step_and_reset(
     env.world.reset_done()
     begin = env._outputs()  # in the worlds that go on, nothing has changed
     done = after.get("done")
+    # As in TorchRL, the policy's outputs are zero where a world was reset.
     for key, value in tensordict.items():
-        if (
-            key not in begin and key not in rewritten
-        ):  # as in TorchRL, the policy's outputs are zero where a world was reset
+        if key not in begin and key not in rewritten:
             begin._set_str(key, value.masked_fill(_rows(done, value), 0), inplace=False, validated=True)
     tensordict.set("next", after)
     return tensordict, begin

@@ -1,5 +1,6 @@
 """Cheetah: a planar body on a back and a front leg that learns to run."""
 
+import hashlib
 from typing import Any
 
 import mujoco
@@ -99,15 +100,16 @@ class CheetahRun(LocoEnv):
         dm_control lets a random pose settle at each reset. Here worlds begin their episodes at different times, and
         those that settle would keep all others waiting for 200 physics steps.
         """
-        key = np.empty(mujoco.mj_sizeModel(self.mj_model), np.uint8)
-        mujoco.mj_saveModel(self.mj_model, None, key)
-        if (found := _SETTLED.get(key.tobytes())) is None:
-            found = _SETTLED[key.tobytes()] = settled_states(self.mj_model)
-        return found.copy()
+        saved = np.empty(mujoco.mj_sizeModel(self.mj_model), np.uint8)
+        mujoco.mj_saveModel(self.mj_model, None, saved)
+        key = hashlib.sha256(saved.tobytes()).digest()
+        if key not in _SETTLED:
+            _SETTLED[key] = settled_states(self.mj_model)
+        return _SETTLED[key].copy()
 
 
 _SETTLED: dict[bytes, np.ndarray] = {}
-"""What was computed before, by the bytes of the model: it takes a second."""
+"""What was computed before, by a digest of the model: it takes a second."""
 
 
 def settled_states(model: mujoco.MjModel) -> np.ndarray:

@@ -135,7 +135,10 @@ def observe_row(row: wp.array[float], first: int, observation: wp.array[float], 
 
 @wp.func
 def count_non_finite(row: wp.array[float]) -> int:
-    """Counts, the last number perhaps more than once; without a branch, which would wait for each."""
+    """Returns zero if all numbers are finite, else how many are not, the last perhaps more than once.
+
+    It has no branch, which would wait for each number.
+    """
     count = int(0)
     for i in range(0, row.shape[0], AT_ONCE):
         some = read_some(row, i)

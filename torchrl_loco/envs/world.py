@@ -183,7 +183,7 @@ class World:
         """The outputs after the state of the masked worlds was written."""
         self.sim.forward(self.mask.warp, after=[self._observe, self._check_finite])
 
-    # What the environment calls. Nothing waits for the device.
+    # What the environment calls. Nothing waits for the device but the first refresh, which is recorded then.
 
     def step(self, action: torch.Tensor) -> None:
         """Steps all worlds under actions of shape ``(nworld, nu)``."""
@@ -239,6 +239,10 @@ class World:
             flag.torch.masked_fill_(mask, False)
         time = self.sim.time
         time.copy_(torch.where(mask, self.elapsed_steps.torch * self._ctrl_dt, time))
+        if torch_is_recording(self.sim.device):
+            with joined_to_torch(self.sim.device):
+                self._launch_refresh()
+            return
         if self._refresh_graph is None:
             self._refresh_graph = self._record_refresh()
         self._refresh_graph.replay()
@@ -246,8 +250,8 @@ class World:
     def _record_refresh(self) -> Graph:
         device = self.sim.device
         with torch.inference_mode(False), EXCLUSIVE, self.sim.qpos.device:
+            wp.synchronize_device(device)  # the state was written on torch's stream; Warp's reads it while recording
             self.sim.compile(self._launch_refresh)
-            wp.synchronize_device(device)  # written on torch's stream, used on Warp's, which runs it too
             graph = self.sim.capture(self._launch_refresh)
             wp.synchronize_device(device)
         return graph

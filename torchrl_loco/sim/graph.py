@@ -27,7 +27,7 @@ def current_stream(device: wp.Device) -> wp.Stream | None:
 def torch_is_recording(device: wp.Device) -> bool:
     """Returns whether torch records a CUDA graph on its current stream.
 
-    CUDA's default stream cannot be recorded, nor asked while Warp records on a stream of its own.
+    CUDA's default stream cannot be recorded, and asking about it while Warp records on another one is an error.
     """
     if not device.is_cuda:
         return False
@@ -37,10 +37,13 @@ def torch_is_recording(device: wp.Device) -> bool:
 
 @contextlib.contextmanager
 def joined_to_torch(device: wp.Device) -> Iterator[None]:
-    """Lets Warp launch on torch's current stream; while torch records a CUDA graph there, the launches are added."""
+    """Adds Warp's launches to the CUDA graph that torch records on its current stream."""
     stream = current_stream(device)
-    joins = wp.ScopedCapture(stream=stream, external=True) if torch_is_recording(device) else contextlib.nullcontext()
-    with wp.ScopedDevice(device), wp.ScopedStream(stream, sync_enter=False), joins:
+    with (
+        wp.ScopedDevice(device),
+        wp.ScopedStream(stream, sync_enter=False),
+        wp.ScopedCapture(stream=stream, external=True),
+    ):
         yield
 
 

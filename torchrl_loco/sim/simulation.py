@@ -57,7 +57,7 @@ class Simulation:
 
     ``step``, ``reset`` and ``forward`` launch kernels on Warp's current stream; MuJoCo-Warp's ``reset`` and ``forward``
     wait for CUDA unless they are recorded. :meth:`capture` records any sequence of them to be replayed. Each takes what
-    the caller does in each world before and after the physics; under the engine ``compiled`` all of it is one kernel.
+    the caller does in each world before and after the physics; under ``compiled`` that is one kernel, or three.
 
     The torch views share memory with the Warp arrays of ``data`` and never change their address. They always hold the
     current state: clone what you want to keep.

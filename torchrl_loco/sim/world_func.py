@@ -1,4 +1,4 @@
-"""Functions of one world, which an engine runs before and after the physics: in the same kernel, if it can."""
+"""Functions of one world, which an engine runs before and after the physics: in the same kernel, if that is faster."""
 
 import contextlib
 from collections.abc import Sequence

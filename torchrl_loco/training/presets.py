@@ -73,8 +73,12 @@ NO_FLOOR: Settings = {"min_temperature": 1e-9}
 """No effective lower bound of the temperature: these tasks train well without one."""
 WALKER: Settings = {"lr": 1e-3, **NO_FLOOR}
 GETTING_UP: Settings = {
-    **{"total_frames": 17_000_000, "episode_length": 100},
-    **{"gamma": 0.98, "max_value": 75.0, "minibatch_size": 4096},
+    "total_frames": 17_000_000,
+    "episode_length": 100,
+    "gamma": 0.98,
+    "max_value": 75.0,
+    "minibatch_size": 4096,
+    "eval_interval": 2_000_000,
 }
 """For tasks whose remaining return is in getting up sooner: that is half of a short episode."""
 TASKS: dict[tuple[str, str], Settings] = {

@@ -19,8 +19,8 @@ WARPS = 2
 and more warps wait for each other's instructions (measured)."""
 
 MANY = 2
-"""With more than so many times the worlds that fill those warps, what is not physics has kernels of its own. It waits
-for memory, and few warps have room beside each other with all the registers that the physics takes."""
+"""Above this many times the worlds that fill those warps, the rest of a control step has kernels of its own: it waits
+for memory, and the registers of the physics leave room for few warps."""
 
 
 def is_traced(m: mujoco.MjModel) -> bool:
