@@ -72,5 +72,13 @@ from torchrl_loco import *
 env = make("walker_walk", 1, "cpu")
 assert RolloutCollector and training.PPOConfig("walker_walk")
 assert env.rollout(2, load_policy("walker_walk", "cpu")).shape == (1, 2)
+for name in ("tensorboard", "imageio", "av"):
+    del sys.modules[name]
+try:
+    training.Trainer
+except ImportError as error:
+    assert "matplotlib" in str(error) and "[train]" in str(error)
+else:
+    raise AssertionError("a trainer without matplotlib would fail at the end of its run")
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

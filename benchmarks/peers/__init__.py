@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from tqdm import tqdm
 
+from benchmarks.cases import INTERRUPTED, until_interrupted
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import Row
 from benchmarks.throughput import throughput, time_of
@@ -33,16 +33,16 @@ def peers(bodies: Sequence[str], worlds: Sequence[int], device: torch.device, pa
         path: folder with the peers' packages, which take precedence there.
     """
     names = ON_CUDA if device.type == "cuda" else ON_CPU
-    rows: list[Row] = []
-    for body, n, name in tqdm([(b, n, name) for b in bodies for n in worlds for name in names], desc="peers"):
-        row = {"body": body, "worlds": n, "case": name}
+    rows = throughput(bodies, worlds, OURS, device)
+    runs = [(body, n, name) for name in names for body in bodies for n in worlds if not INTERRUPTED.is_set()]
+    for body, n, name in until_interrupted(runs, "peers"):
+        row: Row = {"body": body, "worlds": n, "case": name}
         try:
             environment = environment_with(path if name in OTHER_MUJOCO else None)
             row |= run_json([f"benchmarks.peers.{name}", body, n], environment)
         except MeasurementError as error:
             row["error"] = str(error)
         rows.append(row)
-    rows += throughput(bodies, worlds, OURS, device)
     for row in rows:
         if "ms" in row:
             row["thousand steps/s"] = row["worlds"] / row["ms"]

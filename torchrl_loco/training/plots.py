@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
+from torchrl_loco.checks import check_packages
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
+
+check_packages("a plot", ["matplotlib"], "train")  # told before a run, which imports it at its end: that takes a second
 
 IRRELEVANT: dict[str, Any] = {
     **{"seed": 0, "out": Path(), "device": "cpu"},
@@ -33,6 +35,8 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     groups: dict[TrainingConfig, list[RunFolder]] = {}
     for run in runs:
         groups.setdefault(dataclasses.replace(run.load_config(), **IRRELEVANT), []).append(run)
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(7, 4.2), layout="constrained")  # without pyplot: a caller's backend stays as it is
     axes = figure.subplots()
     for config, group in groups.items():
