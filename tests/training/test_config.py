@@ -96,11 +96,14 @@ def test_what_was_not_tuned_is_said():
         ("walker_stand", "cpu", "reppo", True),
         ("walker_walk", "cpu", "ppo", False),
         ("walker_run", "cpu", "ppo", True),
+        ("cheetah_run", "cpu", "ppo", True),
         ("walker_walk", "cuda", "reppo", False),
         ("humanoid_run", "cuda:1", "reppo", False),
+        ("humanoid_run", "cuda", "ppo", False),
+        ("quadruped_run", "cuda", "reppo", False),
     ]
-    for device in ("cpu", "cuda"):
-        assert "No settings were tuned for cheetah_run" in tuning_note(PPOConfig("cheetah_run", device=device))
+    note = tuning_note(PPOConfig("cheetah_run", device="cuda"))
+    assert "No settings of ppo were tuned for cheetah_run" in note
     for task, device, algorithm, said in cases:
         note = tuning_note(dataclasses.replace(preset(task, "cpu", algorithm), device=device))
         assert (bool(note), "walker_stand and walker_walk by ppo" in note) == (said, said)
