@@ -94,7 +94,7 @@ TASKS: dict[tuple[str, str], Settings] = {
     ("reppo", "humanoid_walk"): {"total_frames": 120_000_000, **NO_FLOOR},
     ("reppo", "humanoid_run"): {"total_frames": 100_000_000},
     ("reppo", "cheetah_run"): {**MORE_STEPS, "total_frames": 30_000_000},
-    ("reppo", "hopper_stand"): {**HOPPER, "total_frames": 60_000_000},
+    ("reppo", "hopper_stand"): {**HOPPER, "total_frames": 60_000_000, "episode_length": 100},
     ("reppo", "hopper_hop"): {**HOPPER, "total_frames": 160_000_000},
     ("reppo", "quadruped_walk"): {**MORE_STEPS, "total_frames": 30_000_000},
     ("reppo", "quadruped_run"): {**MORE_STEPS, "total_frames": 50_000_000},
