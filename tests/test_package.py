@@ -72,6 +72,8 @@ from torchrl_loco import *
 env = make("walker_walk", 1, "cpu")
 assert RolloutCollector and training.PPOConfig("walker_walk")
 assert env.rollout(2, load_policy("walker_walk", "cpu")).shape == (1, 2)
+assert "mujoco_warp" not in sys.modules
+assert env.sim.model.opt.timestep.numpy() == env.config.sim_dt and "mujoco_warp" in sys.modules
 for name in ("tensorboard", "imageio", "av"):
     del sys.modules[name]
 try:

@@ -1,10 +1,9 @@
 """Pixels from Warp's ray tracer: all worlds at once, on the CPU or CUDA, without OpenGL."""
 
-import mujoco_warp as mjw
 import torch
 import warp as wp
 
-from torchrl_loco.sim import EXCLUSIVE, Simulation, current_stream
+from torchrl_loco.sim import EXCLUSIVE, Simulation, current_stream, mjw
 
 
 class Renderer:

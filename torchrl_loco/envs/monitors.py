@@ -12,11 +12,10 @@ from typing import Any
 
 import torch
 import warp as wp
-from mujoco_warp import OverflowType
 from tensordict import TensorDict
 
 from torchrl_loco import storage
-from torchrl_loco.sim import Buffer, Simulation
+from torchrl_loco.sim import Buffer, Overflow, Simulation
 
 INTERVAL = 100
 """Control steps between two reads."""
@@ -116,10 +115,10 @@ class Monitor(ABC):
 # Health: how often the physics dropped something, used up its iterations, or was not finite.
 
 COUNTERS = {
-    "constraint_overflow": OverflowType.NEFC | OverflowType.NJMAX_NNZ,
-    "contact_overflow": OverflowType.BROADPHASE | OverflowType.NARROWPHASE | OverflowType.CCD,
-    "iteration_limit": OverflowType.ITERATIONS,
-    "line_search_limit": OverflowType.LS_ITERATIONS,
+    "constraint_overflow": Overflow.NEFC | Overflow.NJMAX_NNZ,
+    "contact_overflow": Overflow.BROADPHASE | Overflow.NARROWPHASE | Overflow.CCD,
+    "iteration_limit": Overflow.ITERATIONS,
+    "line_search_limit": Overflow.LS_ITERATIONS,
 }
 """Name of a counter and the bits of ``Data.overflow`` that it counts."""
 DROPPED = ("constraints", "contacts")

@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import mujoco
-import mujoco_warp as mjw
 import warp as wp
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.models import FORCE_SENSORS
+from torchrl_loco.sim import mjw
 from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.graph import torch_is_recording
 from torchrl_loco.sim.row_order import RowOrder

@@ -7,8 +7,9 @@ which decides the rounding. Its own mode, ``opt.deterministic``, makes sums dete
 from typing import Any
 
 import mujoco
-import mujoco_warp as mjw
 import warp as wp
+
+from torchrl_loco.sim import mjw
 
 ROW_FIELDS = ("type", "id", "pos", "margin", "D", "vel", "aref", "frictionloss")
 """Fields of a constraint row, which move with its Jacobian."""
@@ -133,7 +134,7 @@ class RowOrder:
         ValueError: the model has something else whose order varies.
     """
 
-    def __init__(self, model: mjw.Model, data: mjw.Data) -> None:
+    def __init__(self, model: "mjw.Model", data: "mjw.Data") -> None:
         check_order(model)
         self._data = data
         self._rank = wp.zeros((data.nworld, data.njmax), dtype=int, device=data.qpos.device)
@@ -157,7 +158,7 @@ class RowOrder:
         )
 
 
-def check_order(model: mjw.Model) -> None:
+def check_order(model: "mjw.Model") -> None:
     """Checks that constraint rows are all that varies in order before the solver starts.
 
     Raises:

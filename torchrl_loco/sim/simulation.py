@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mujoco
-import mujoco_warp as mjw
 import torch
 import warp as wp
 
 from torchrl_loco.config import SimConfig
-from torchrl_loco.sim import compiled, mujoco_warp
+from torchrl_loco.sim import compiled, mjw, mujoco_warp
 from torchrl_loco.sim.compilation import compile_kernels
 from torchrl_loco.sim.graph import Graph, ScratchPool
 from torchrl_loco.sim.world_func import WorldFunc, fill
@@ -71,7 +70,7 @@ class Simulation:
     ``xpos``            ``(nworld, nbody, 3)``     positions of the bodies (m)
     ``xmat``            ``(nworld, nbody, 3, 3)``  orientations of the bodies
     ``time``            ``(nworld,)``              time since the world's reset (s)
-    ``overflow``        ``(nworld,)``              :class:`mujoco_warp.OverflowType` bits, kept until you zero them
+    ``overflow``        ``(nworld,)``              :class:`Overflow` bits, kept until you zero them
     ==================  =========================  ========================================================
 
     Args:
@@ -152,7 +151,7 @@ class Simulation:
         """
         self.engine.forward(mask, after=after)
 
-    def mujoco_data(self, *, contacts: bool = False) -> mjw.Data:
+    def mujoco_data(self, *, contacts: bool = False) -> "mjw.Data":
         """Returns the present state as ``mjData`` of MuJoCo-Warp, with poses of geoms, sites and cameras.
 
         Under the engine ``compiled`` it is made at the first call, and takes the memory of the other engine: several

@@ -1,15 +1,16 @@
 """The engine that steps all worlds with the compiled step."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
-import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
 from torchrl_loco.config import SimConfig
+from torchrl_loco.sim import mjw
 from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.compiled.step import WARP, launch_size, source
 from torchrl_loco.sim.world_func import Chain, WorldFunc, WorldKernel
@@ -46,7 +47,7 @@ class Data:
         xpos: positions of the bodies (m), ``(nworld, nbody)`` vec3.
         xmat: orientations of the bodies, ``(nworld, nbody)`` mat33.
         sensordata: sensors, ``(nworld, nsensordata)``.
-        overflow: :class:`mujoco_warp.OverflowType` bits, ``(nworld,)``.
+        overflow: :class:`Overflow` bits, ``(nworld,)``.
         act: activations of the actuators, ``(nworld, 0)``: a supported model has none.
     """
 
@@ -118,6 +119,34 @@ def data_bytes(m: mujoco.MjModel, num_envs: int) -> int:
     return sum(sizes.values()) - sizes["cvel"]
 
 
+class Model:
+    """The model on the device: what ``mujoco_warp.Model`` has, under the same names.
+
+    Only what environments read when they are made is copied here. Anything else makes the model of MuJoCo-Warp, which
+    imports it and takes a second or two.
+
+    Args:
+        m: the model.
+        device: where it lives.
+    """
+
+    def __init__(self, m: mujoco.MjModel, device: wp.Device) -> None:
+        self._mj_model, self._device = m, device
+        self.qpos0 = wp.array(m.qpos0.reshape(1, m.nq), dtype=wp.float32, device=device)
+        self.jnt_range = wp.array(m.jnt_range.reshape(1, m.njnt, 2), dtype=wp.vec2, device=device)
+        self.actuator_ctrlrange = wp.array(m.actuator_ctrlrange.reshape(1, m.nu, 2), dtype=wp.vec2, device=device)
+
+    @functools.cached_property
+    def _complete(self) -> "mjw.Model":
+        with wp.ScopedDevice(self._device):
+            return mjw.put_model(self._mj_model)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._complete, name)
+
+
 class CompiledEngine:
     """Steps all worlds with one kernel, made for the model.
 
@@ -139,8 +168,7 @@ class CompiledEngine:
 
     def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
         self._mj_model, self._substeps, self._device = mj_model, config.substeps, device
-        with wp.ScopedDevice(device):
-            self.model = mjw.put_model(mj_model)
+        self.model = Model(mj_model, device)
         self.data = Data(mj_model, num_envs, device)
         self._kernels: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
         self._kernels_apart: dict[tuple, WorldKernel] = {}

@@ -13,7 +13,6 @@ from typing import ClassVar
 
 import mujoco
 import numpy as np
-from mujoco_warp import OverflowType
 from numpy.typing import ArrayLike
 
 from torchrl_loco.sim.compiled import collision
@@ -21,6 +20,7 @@ from torchrl_loco.sim.compiled.collision import CAPSULE, MINVAL, PLANE, Pair, pa
 from torchrl_loco.sim.compiled.constraints import Softness, tolerance
 from torchrl_loco.sim.compiled.contacts import contact_weight
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, SLIDE
+from torchrl_loco.sim.overflow import Overflow
 
 TEMPLATE = pathlib.Path(__file__).with_name("lanes.h")
 TRANSLATION, ROTATION = 0, 1
@@ -361,8 +361,8 @@ class Description:
             SUBSTEPS=substeps,
             ITERATIONS=m.opt.iterations,
             LS_ITERATIONS=m.opt.ls_iterations,
-            NO_PLACE=int(OverflowType.NARROWPHASE),
-            LIMIT_REACHED=int(OverflowType.ITERATIONS),
+            NO_PLACE=int(Overflow.NARROWPHASE),
+            LIMIT_REACHED=int(Overflow.ITERATIONS),
             WORLD_BYTES=layout.bytes,
             WORLDS_PER_BLOCK=self.worlds_per_block(),
             LOCKSTEP=LOCKSTEP,

@@ -1,7 +1,6 @@
 """The schedule of one thread a world: a control step of one model, traced to straight-line C++."""
 
 import mujoco
-from mujoco_warp import OverflowType
 
 from torchrl_loco.sim.compiled import sensors
 from torchrl_loco.sim.compiled.collision import pairs
@@ -21,6 +20,7 @@ from torchrl_loco.sim.compiled.symbols import (
     sqrt,
     zeros,
 )
+from torchrl_loco.sim.overflow import Overflow
 
 PRELUDE = """
 #ifdef __CUDA_ARCH__
@@ -105,7 +105,7 @@ def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
         world(f"time_out.data[world] += {literal(substeps * m.opt.timestep)};")
         world("overflow_out.data[world] |= overflow;")
     _outputs(world, m, with_cvel)
-    bits = f"#define NO_PLACE {int(OverflowType.NARROWPHASE)}\n#define LIMIT_REACHED {int(OverflowType.ITERATIONS)}\n"
+    bits = f"#define NO_PLACE {int(Overflow.NARROWPHASE)}\n#define LIMIT_REACHED {int(Overflow.ITERATIONS)}\n"
     return PRELUDE + bits + world.text() + "\n"
 
 

@@ -1,0 +1,22 @@
+"""What an engine dropped or cut short in a control step."""
+
+import enum
+
+
+class Overflow(enum.IntFlag):
+    """Bits of ``overflow``: those of :class:`mujoco_warp.OverflowType` that are counted."""
+
+    NEFC = 1
+    """No room for a row of constraints."""
+    NJMAX_NNZ = 2
+    """No room for an entry of the constraints' Jacobian."""
+    BROADPHASE = 4
+    """No room for a pair of geoms that may touch."""
+    NARROWPHASE = 8
+    """No room for a contact."""
+    CCD = 16
+    """No room for a pair whose contacts are searched iteratively."""
+    ITERATIONS = 512
+    """The solver used up its iterations."""
+    LS_ITERATIONS = 1024
+    """A line search used up its iterations."""
