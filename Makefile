@@ -27,7 +27,7 @@ test-all: lint tests tests-ci  ## the same as test, then site, notebooks, wheel 
 tests: $(VENV)/installed
 	$(PYTEST) -m "not ci"
 
-tests-ci: $(VENV)/installed
+tests-ci: $(VENV)/installed-ray
 	$(PYTEST) -m ci
 
 lint: $(VENV)/installed
@@ -55,6 +55,10 @@ $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --editable ".[dev]"
+	touch $@
+
+$(VENV)/installed-ray: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --editable ".[ray]"
 	touch $@
 
 clean:

@@ -12,7 +12,7 @@ from torchrl_loco import State, models
 from torchrl_loco.sim.compiled import collision
 from torchrl_loco.sim.simulation import set_options
 
-WORLDS, AGES = 80, (10, 30, 50, 80)
+WORLDS, AGES = 128, (10, 30, 50, 80)
 
 
 @pytest.fixture(scope="module", params=COMPILED)
