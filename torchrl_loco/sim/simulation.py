@@ -70,7 +70,7 @@ class Simulation:
     ``xpos``            ``(nworld, nbody, 3)``     positions of the bodies (m)
     ``xmat``            ``(nworld, nbody, 3, 3)``  orientations of the bodies
     ``time``            ``(nworld,)``              time since the world's reset (s)
-    ``overflow``        ``(nworld,)``              :class:`Overflow` bits, kept until you zero them
+    ``overflow``        ``(nworld,)``              ``Overflow`` bits, kept until you zero them
     ==================  =========================  ========================================================
 
     Args:

@@ -47,7 +47,7 @@ class Data:
         xpos: positions of the bodies (m), ``(nworld, nbody)`` vec3.
         xmat: orientations of the bodies, ``(nworld, nbody)`` mat33.
         sensordata: sensors, ``(nworld, nsensordata)``.
-        overflow: :class:`Overflow` bits, ``(nworld,)``.
+        overflow: ``Overflow`` bits, ``(nworld,)``.
         act: activations of the actuators, ``(nworld, 0)``: a supported model has none.
     """
 
