@@ -34,8 +34,8 @@ def peers(bodies: Sequence[str], worlds: Sequence[int], device: torch.device, pa
     """
     names = ON_CUDA if device.type == "cuda" else ON_CPU
     rows = throughput(bodies, worlds, OURS, device)
-    runs = [(body, n, name) for name in names for body in bodies for n in worlds if not INTERRUPTED.is_set()]
-    for body, n, name in until_interrupted(runs, "peers"):
+    runs = [(body, n, name) for name in names for body in bodies for n in worlds]
+    for body, n, name in until_interrupted([] if INTERRUPTED.is_set() else runs, "peers"):
         row: Row = {"body": body, "worlds": n, "case": name}
         try:
             environment = environment_with(path if name in OTHER_MUJOCO else None)

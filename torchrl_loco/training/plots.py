@@ -11,7 +11,7 @@ from torchrl_loco.checks import check_packages
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
 
-check_packages("a plot", ["matplotlib"], "train")  # told before a run, which imports it at its end: that takes a second
+check_packages("a plot", ["matplotlib"], "train")  # so that a run fails at its start, though it imports it at its end
 
 IRRELEVANT: dict[str, Any] = {
     **{"seed": 0, "out": Path(), "device": "cpu"},
@@ -35,7 +35,7 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     groups: dict[TrainingConfig, list[RunFolder]] = {}
     for run in runs:
         groups.setdefault(dataclasses.replace(run.load_config(), **IRRELEVANT), []).append(run)
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # takes a second
 
     figure = Figure(figsize=(7, 4.2), layout="constrained")  # without pyplot: a caller's backend stays as it is
     axes = figure.subplots()
