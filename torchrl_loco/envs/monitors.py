@@ -15,7 +15,7 @@ import warp as wp
 from tensordict import TensorDict
 
 from torchrl_loco import storage
-from torchrl_loco.sim import Buffer, Overflow, Simulation
+from torchrl_loco.sim import Buffer, Overflow, Simulation, WorldFunc, fill
 
 INTERVAL = 100
 """Control steps between two reads."""
@@ -61,11 +61,13 @@ class Monitor(ABC):
         self._copied = torch.cuda.Event() if on_cuda else None
         self._steps, self._pending = 0, False
 
-    def launch_before_step(self, action: wp.array) -> None:  # noqa: B027
-        """Launches the monitor's kernels before the recorded control step under ``action`` ``(nworld, nu)``."""
+    def first_of_step(self, action: wp.array) -> list[WorldFunc]:
+        """Returns what each world does before any of them is stepped under ``action`` ``(nworld, nu)``."""
+        return []
 
-    def launch_after_step(self) -> None:  # noqa: B027
-        """Launches the monitor's kernels at the end of the recorded control step."""
+    def last_of_step(self) -> list[WorldFunc]:
+        """Returns what each world does after all of them were stepped."""
+        return []
 
     @abstractmethod
     def numbers(self) -> torch.Tensor:
@@ -204,68 +206,66 @@ class Health(Monitor):
 # NaN guard: keeps the inputs of the last control step until a world becomes non-finite.
 
 
-KEEPERS = 32
-"""Threads that copy the numbers of a world: neighbours copy neighbours, in one access to memory."""
+@wp.struct
+class StepInputs:
+    """What a control step begins with, or where it is kept."""
+
+    action: wp.array2d[float]
+    episode: wp.array[int]
+    elapsed_steps: wp.array[int]
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    qacc_warmstart: wp.array2d[float]
+    act: wp.array2d[float]
+
+
+@wp.struct
+class Keeper:
+    """What :func:`keep_inputs` copies, until a world was found that is not finite."""
+
+    first: wp.array[int]
+    found: wp.array[bool]
+    present: StepInputs
+    kept: StepInputs
+
+
+@wp.struct
+class Finder:
+    """What :func:`find_first` reads, and where it notes the world."""
+
+    found: wp.array[bool]
+    non_finite: wp.array[bool]
+    first: wp.array[int]
 
 
 @wp.func
-def copy_row(lane: int, row: wp.array[float], kept: wp.array[float]):
-    for i in range(lane, row.shape[0], KEEPERS):
+def copy_row(row: wp.array[float], kept: wp.array[float]):
+    for i in range(row.shape[0]):
         kept[i] = row[i]
 
 
-@wp.kernel(enable_backward=False)
-def keep_worlds(
-    # In:
-    first_in: wp.array[int],
-    num_envs: int,
-    action_in: wp.array2d[float],
-    episode_in: wp.array[int],
-    elapsed_steps_in: wp.array[int],
-    # Data in:
-    qpos_in: wp.array2d[float],
-    qvel_in: wp.array2d[float],
-    qacc_warmstart_in: wp.array2d[float],
-    act_in: wp.array2d[float],
-    # Out:
-    action_out: wp.array2d[float],
-    episode_out: wp.array[int],
-    elapsed_steps_out: wp.array[int],
-    qpos_out: wp.array2d[float],
-    qvel_out: wp.array2d[float],
-    qacc_warmstart_out: wp.array2d[float],
-    act_out: wp.array2d[float],
-    found_out: wp.array[bool],
-):
+@wp.func
+def keep_inputs(world: int, args: Keeper):
     """Copies what a control step begins with, until a world that is not finite was found."""
-    world, lane = wp.tid()
-    found = first_in[0] < num_envs
-    if world + lane == 0:
-        found_out[0] = found
+    found = args.first[0] < args.present.episode.shape[0]
+    if world == 0:
+        args.found[0] = found
     if found:
         return
-    if lane == 0:
-        episode_out[world] = episode_in[world]
-        elapsed_steps_out[world] = elapsed_steps_in[world]
-    copy_row(lane, action_in[world], action_out[world])
-    copy_row(lane, qpos_in[world], qpos_out[world])
-    copy_row(lane, qvel_in[world], qvel_out[world])
-    copy_row(lane, qacc_warmstart_in[world], qacc_warmstart_out[world])
-    copy_row(lane, act_in[world], act_out[world])
+    args.kept.episode[world] = args.present.episode[world]
+    args.kept.elapsed_steps[world] = args.present.elapsed_steps[world]
+    copy_row(args.present.action[world], args.kept.action[world])
+    copy_row(args.present.qpos[world], args.kept.qpos[world])
+    copy_row(args.present.qvel[world], args.kept.qvel[world])
+    copy_row(args.present.qacc_warmstart[world], args.kept.qacc_warmstart[world])
+    copy_row(args.present.act[world], args.kept.act[world])
 
 
-@wp.kernel(enable_backward=False)
-def find_first(
-    # In:
-    found_in: wp.array[bool],
-    non_finite_in: wp.array[bool],
-    # Out:
-    first_out: wp.array[int],
-):
+@wp.func
+def find_first(world: int, args: Finder):
     """Notes the first world that is not finite, unless an earlier step had one."""
-    world = wp.tid()
-    if non_finite_in[world] and not found_in[0]:
-        wp.atomic_min(first_out, 0, world)
+    if args.non_finite[world] and not args.found[0]:
+        wp.atomic_min(args.first, 0, world)
 
 
 class NanGuard(Monitor):
@@ -290,28 +290,27 @@ class NanGuard(Monitor):
         settings: dict[str, Any],
     ) -> None:
         self._path, self._sim, self._seed, self._settings = path, sim, seed, settings
-        self._non_finite = non_finite
         data = sim.data
-        self._inputs = [*(buffer.warp for buffer in inputs), data.qpos, data.qvel, data.qacc_warmstart, data.act]
-        action = wp.zeros(sim.data.ctrl.shape, dtype=float, device=sim.device)
-        self._kept = [action, *(wp.zeros_like(array) for array in self._inputs)]
+        episode, elapsed_steps = (buffer.warp for buffer in inputs)
+        physics = {name: getattr(data, name) for name in ("qpos", "qvel", "qacc_warmstart", "act")}
+        self._inputs = {"episode": episode, "elapsed_steps": elapsed_steps, **physics}
+        self._kept = {name: wp.zeros_like(array) for name, array in {"action": data.ctrl, **self._inputs}.items()}
         self._first = Buffer(1, int, sim.device)
         self._found = Buffer(1, bool, sim.device)
+        found = {"first": self._first.warp, "found": self._found.warp}
+        self._keeper = {**found, "kept": fill(StepInputs, **self._kept)}
+        self._find = WorldFunc(find_first, fill(Finder, non_finite=non_finite.warp, **found))
         super().__init__(1, self._first.torch.device)
         self._reported = False
 
-    def launch_before_step(self, action: wp.array) -> None:
-        """Launches the kernel that keeps what a control step under ``action`` ``(nworld, nu)`` begins with."""
-        n, outputs = self._sim.num_envs, [*self._kept, self._found.warp]
-        self._launch(keep_worlds, (n, KEEPERS), [self._first.warp, n, action, *self._inputs], outputs)
+    def first_of_step(self, action: wp.array) -> list[WorldFunc]:
+        """Returns what keeps what a control step under ``action`` ``(nworld, nu)`` begins with."""
+        present = fill(StepInputs, action=action, **self._inputs)
+        return [WorldFunc(keep_inputs, fill(Keeper, present=present, **self._keeper))]
 
-    def launch_after_step(self) -> None:
-        """Launches the kernel that looks for a non-finite world."""
-        inputs = [self._found.warp, self._non_finite.warp]
-        self._launch(find_first, self._sim.num_envs, inputs, [self._first.warp])
-
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._sim.device)
+    def last_of_step(self) -> list[WorldFunc]:
+        """Returns what looks for a non-finite world."""
+        return [self._find]
 
     def numbers(self) -> torch.Tensor:
         """Returns the index of the world that was found, or the number of worlds if none was, shape ``(1,)``."""
@@ -328,8 +327,7 @@ class NanGuard(Monitor):
         if self._reported or world == self._sim.num_envs:
             return
         self._reported = True
-        names = ("action", "episode", "elapsed_steps", "qpos", "qvel", "qacc_warmstart", "act")
-        arrays = zip(names, self._kept, strict=True)
+        arrays = self._kept.items()
         kept = {name: wp.to_torch(array)[world].clone() for name, array in arrays if array.size}  # act may be empty
         counters = {name: int(kept.pop(name)) for name in ("episode", "elapsed_steps")}
         settings = {**self._settings, "seed": int(self._seed.torch[0]), "world": world, **counters}

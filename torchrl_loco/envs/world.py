@@ -168,12 +168,13 @@ class World:
         """The control step, under actions ``(nworld, nu)`` or those in the buffer."""
         sim, action = self.sim, self.action.warp if action is None else action
         control = {"ctrlrange": sim.model.actuator_ctrlrange, "ctrl": sim.data.ctrl, "non_finite": self.non_finite.warp}
-        for monitor in self._monitors:
-            monitor.launch_before_step(action)
         apply = WorldFunc(apply_action, fill(Control, action=action, **control))
-        sim.step(before=[apply], after=[self._observe, self._check_finite, self._finish])
-        for monitor in self._monitors:
-            monitor.launch_after_step()
+        sim.step(
+            before=[apply],
+            after=[self._observe, self._check_finite, self._finish],
+            first=[func for monitor in self._monitors for func in monitor.first_of_step(action)],
+            last=[func for monitor in self._monitors for func in monitor.last_of_step()],
+        )
 
     def _launch_reset(self) -> None:
         """A new episode in the worlds of the mask."""

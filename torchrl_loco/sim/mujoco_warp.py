@@ -166,7 +166,13 @@ class MujocoWarpEngine:
         """Returns what prevents that something is dropped, if a substep needed so many."""
         return f"a physics step needed up to {most}: pass {ROOM[dropped]}={with_margin(most)}"
 
-    def step(self, before: Sequence[WorldFunc] = (), after: Sequence[WorldFunc] = ()) -> None:
+    def step(
+        self,
+        before: Sequence[WorldFunc] = (),
+        after: Sequence[WorldFunc] = (),
+        first: Sequence[WorldFunc] = (),
+        last: Sequence[WorldFunc] = (),
+    ) -> None:
         """Advances every world by one control step under ``ctrl``.
 
         Afterwards poses, velocities and sensors belong to the new state, as in dm_control. dm_control reaches this by
@@ -177,14 +183,16 @@ class MujocoWarpEngine:
         Args:
             before: what each world does first.
             after: what it does at the end.
+            first: what each world does before any of them does anything else.
+            last: what each does after all have done the rest.
         """
-        launch_together(before, self._all)
+        launch_together([*first, *before], self._all)
         for i in range(self._substeps):
             with self._substep_only(sensors=self._kept_sensors is not None and i == self._substeps - 1):
                 self._substep()
                 self._record_peaks()
         self._evaluate()
-        launch_together(after, self._all)
+        launch_together([*after, *last], self._all)
 
     def _substep(self) -> None:
         if self._row_order is None:

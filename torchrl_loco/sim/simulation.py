@@ -114,14 +114,22 @@ class Simulation:
         self.time = wp.to_torch(self.data.time)
         self.overflow = wp.to_torch(self.data.overflow)
 
-    def step(self, before: Sequence[WorldFunc] = (), after: Sequence[WorldFunc] = ()) -> None:
+    def step(
+        self,
+        before: Sequence[WorldFunc] = (),
+        after: Sequence[WorldFunc] = (),
+        first: Sequence[WorldFunc] = (),
+        last: Sequence[WorldFunc] = (),
+    ) -> None:
         """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state.
 
         Args:
             before: what each world does first.
             after: what it does at the end.
+            first: what each world does before any of them does anything else.
+            last: what each does after all have done the rest.
         """
-        self.engine.step(before, after)
+        self.engine.step(before, after, first, last)
 
     def reset(
         self,

@@ -181,19 +181,29 @@ class CompiledEngine:
         """Returns what prevents that something is dropped."""
         return f"a world of the compiled engine has no more places for {dropped}: pass engine='mujoco_warp'"
 
-    def step(self, before: Sequence[WorldFunc] = (), after: Sequence[WorldFunc] = ()) -> None:
+    def step(
+        self,
+        before: Sequence[WorldFunc] = (),
+        after: Sequence[WorldFunc] = (),
+        first: Sequence[WorldFunc] = (),
+        last: Sequence[WorldFunc] = (),
+    ) -> None:
         """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state.
 
         Args:
             before: what each world does first.
             after: what it does at the end.
+            first: what each world does before any of them does anything else, in a kernel before the physics.
+            last: what each does after all have done the rest, in a kernel after it.
         """
         if self._launch_size.one_kernel:
+            self._launch_apart(first)
             self._launch(self._substeps, self._all, before, after)
-            return
-        self._launch_apart(before)
-        self._launch(self._substeps, self._all, (), ())
-        self._launch_apart(after)
+            self._launch_apart(last)
+        else:
+            self._launch_apart([*first, *before])
+            self._launch(self._substeps, self._all, (), ())
+            self._launch_apart([*after, *last])
 
     def forward(
         self,
