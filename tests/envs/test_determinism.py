@@ -5,9 +5,11 @@ Under ``mujoco_warp`` it is everything on the CPU; on CUDA the starts, and with 
 
 import pytest
 import torch
+import warp as wp
 
 import torchrl_loco
 from torchrl_loco import State
+from torchrl_loco.sim.compiled import engine as compiled_engine
 
 
 def rollouts(task, device, protocol, num_envs, steps, **settings):
@@ -80,6 +82,26 @@ def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protoc
         assert beside["terminated"].sum() == len(others) - 3
     now = few.get_state()
     assert all(torch.equal(value[places.to(device)], now[key]) for key, value in many.get_state().items())
+
+
+def test_the_order_of_the_memory_changes_no_bit(monkeypatch, actions):
+    """On CUDA, numbers of small bodies lie beside those of the next world; here on the CPU too."""
+    rows = torchrl_loco.make("cheetah_run", 5, "cpu", 0)
+    monkeypatch.setattr(compiled_engine, "neighbours_adjoin", lambda model, device: True)
+    columns = torchrl_loco.make("cheetah_run", 5, "cpu", 0)
+    assert rows.sim.qpos.is_contiguous()
+    assert columns.sim.qpos.stride() == (1, 5)
+    tds = [env.reset() for env in (rows, columns)]
+    for action in actions(rows, 30):
+        tds = [env.step(td.set("action", action))["next"] for env, td in zip((rows, columns), tds, strict=True)]
+        assert torch.equal(tds[0]["observation"], tds[1]["observation"])
+    states = [env.get_state() for env in (rows, columns)]
+    assert all(value.is_contiguous() and torch.equal(value, states[0][key]) for key, value in states[1].items())
+    columns.reset(states[0], set_state=True)
+    for name in ("qpos", "qvel", "xpos", "xmat"):
+        assert torch.equal(getattr(rows.sim, name), getattr(columns.sim, name)), name
+    poses = [wp.to_torch(env.sim.mujoco_data().xpos) for env in (rows, columns)]
+    assert torch.equal(*poses)
 
 
 def test_the_setting_leaves_the_physics_as_it_is(shared):

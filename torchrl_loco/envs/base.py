@@ -260,7 +260,7 @@ class LocoEnv(EnvBase):
 
     def _batched(self, rows: torch.Tensor) -> torch.Tensor:
         """Returns a copy of an array with one row per world, in the environment's batch size."""
-        return rows.clone() if self.batch_size else rows[0].clone()
+        return (rows if self.batch_size else rows[0]).clone(memory_format=torch.contiguous_format)
 
     def _step_and_maybe_reset(
         self, tensordict: TensorDictBase, rewritten: frozenset[str] = frozenset()

@@ -12,7 +12,7 @@ import warp as wp
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.buffer import Buffer
-from torchrl_loco.sim.compiled.step import WARP, launch_size, source
+from torchrl_loco.sim.compiled.step import WARP, launch_size, neighbours_adjoin, source
 from torchrl_loco.sim.world_func import Chain, WorldFunc, WorldKernel
 
 ROWS = {
@@ -64,7 +64,10 @@ class Data:
 
     def __init__(self, m: mujoco.MjModel, nworld: int, device: wp.Device) -> None:
         def make(name: str) -> wp.array:
-            return wp.zeros(_shape(m, nworld, name), dtype=ROWS[name][1], device=device)
+            shape, dtype = _shape(m, nworld, name), ROWS[name][1]
+            if neighbours_adjoin(m, device):
+                return wp.zeros(shape[::-1], dtype=dtype, device=device).transpose()
+            return wp.zeros(shape, dtype=dtype, device=device)
 
         self.act = wp.zeros((nworld, 0), dtype=float, device=device)
         self._make: Callable[[str], wp.array] | None = make

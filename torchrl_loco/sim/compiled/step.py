@@ -28,6 +28,14 @@ def is_traced(m: mujoco.MjModel) -> bool:
     return m.nv <= TRACED_DOFS
 
 
+def neighbours_adjoin(m: mujoco.MjModel, device: wp.Device) -> bool:
+    """Returns whether a number lies in memory beside that of the next world, and not beside the next of its world.
+
+    It should where the threads of a warp read it together, each for its world.
+    """
+    return device.is_cuda and is_traced(m)
+
+
 def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 

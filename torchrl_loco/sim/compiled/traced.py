@@ -1,5 +1,7 @@
 """The schedule of one thread a world: a control step of one model, traced to straight-line C++."""
 
+from collections.abc import Iterable, Sequence
+
 import mujoco
 
 from torchrl_loco.sim.compiled import sensors
@@ -78,11 +80,9 @@ def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
     world = Block()
     world("if (!live) return;")
     for title, size in INPUTS.items():
-        argument = {"qacc": "qacc_warmstart_out", "ctrl": "ctrl_in"}.get(title, f"{title}_out")
-        count = getattr(m, size)
-        world(f"float* {title}_global = {argument}.data + (size_t)world * {count};")
+        argument, count = _argument(title), getattr(m, size)
         world(f"float {title}[{max(count, 1)}];")
-        world(f"for (int i = 0; i < {count}; ++i) {title}[i] = {title}_global[i];")
+        world(f"for (int i = 0; i < {count}; ++i) {title}[i] = wp::index({argument}, world, i);")
     world("int overflow = 0;")
     if substeps or TOUCH in m.sensor_type:
         if not substeps:
@@ -101,12 +101,18 @@ def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
     if substeps:
         for title, size in INPUTS.items():
             if title != "ctrl":
-                world(f"for (int i = 0; i < {getattr(m, size)}; ++i) {title}_global[i] = {title}[i];")
+                row = f"wp::index({_argument(title)}, world, i)"
+                world(f"for (int i = 0; i < {getattr(m, size)}; ++i) {row} = {title}[i];")
         world(f"time_out.data[world] += {literal(substeps * m.opt.timestep)};")
         world("overflow_out.data[world] |= overflow;")
     _outputs(world, m, with_cvel)
     bits = f"#define NO_PLACE {int(Overflow.NARROWPHASE)}\n#define LIMIT_REACHED {int(Overflow.ITERATIONS)}\n"
     return PRELUDE + bits + world.text() + "\n"
+
+
+def _argument(title: str) -> str:
+    """Returns the array of all worlds that an input is read from."""
+    return {"qacc": "qacc_warmstart_out", "ctrl": "ctrl_in"}.get(title, f"{title}_out")
 
 
 def _substep(m: mujoco.MjModel, substeps: int) -> tuple[Block, dict[str, int]]:
@@ -177,15 +183,15 @@ def _outputs(world: Block, m: mujoco.MjModel, with_cvel: bool) -> None:
     Constants are left out: they are in the arrays from the start.
     """
     tree = Dynamics(m, names("qpos", m.nq), names("qvel", m.nv), names("ctrl", m.nu))
-    rows = {
-        "xpos": [x for position in tree.poses.xpos for x in position],
-        "xmat": [x for orientation in tree.poses.xmat for x in orientation.flat],
-        "sensordata": sensors.read(m, tree, TouchSensors(m, tree.poses)),
+    rows: dict[str, Sequence[Iterable[Scalar | None]]] = {
+        "xpos": tree.poses.xpos,
+        "xmat": [orientation.flat for orientation in tree.poses.xmat],
+        "sensordata": [[x] for x in sensors.read(m, tree, TouchSensors(m, tree.poses))],
     }
     if with_cvel:
-        rows["cvel"] = [x for twist in tree.cvel for x in twist]
+        rows["cvel"] = tree.cvel
     for title, row in rows.items():
-        world(f"float* {title}_global = (float*){title}_out.data + (size_t)world * {len(row)};")
-        for i, x in enumerate(row):
-            if x is not None and scalar(x).constant is None:
-                world.set(f"{title}_global[{i}]", x)
+        for i, element in enumerate(row):
+            for k, x in enumerate(element):
+                if x is not None and scalar(x).constant is None:
+                    world.set(f"((float*)&wp::index({title}_out, world, {i}))[{k}]", x)
