@@ -92,11 +92,14 @@ def test_nothing_holds_on_to_a_closed_environment(way, engine):
 
 
 def test_an_environment_that_is_dropped_reports_as_if_closed(tmp_path):
-    env = made(nan_dump=tmp_path / "dump")
-    env.step(env.reset().set("action", torch.full((WORLDS, 6), torch.nan)))
-    del env
-    with pytest.warns(torchrl_loco.NonFiniteWarning):
+    def step_and_drop():
+        env = made(nan_dump=tmp_path / "dump")
+        env.step(env.reset().set("action", torch.full((WORLDS, 6), torch.nan)))
+        del env
         gc.collect()
+
+    with pytest.warns(torchrl_loco.NonFiniteWarning):
+        step_and_drop()
     assert (tmp_path / "dump").exists()
 
 
