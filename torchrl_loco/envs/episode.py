@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from torchrl_loco.sim import WorldFunc, fill
+from torchrl_loco.sim import WorldFunc, fill, write_rows
 from torchrl_loco.sim.sampling import world_stream
 
 MAX_VALUE = 1.0e10
@@ -88,13 +88,21 @@ def apply_action(world: int, args: Control):
 # After it.
 
 
-def observer(func: wp.Function, inputs: Any, outputs: Any) -> WorldFunc:
-    """Returns what writes observation, reward and terms, from what a body names in its ``observation_func``."""
-    write, struct = _observer(func, struct_of("observation_func", func, inputs))
+def observer(func: wp.Function, inputs: Any, outputs: Any, size: int, *, together: bool) -> WorldFunc:
+    """Returns what writes observation, reward and terms, from what a body names in its ``observation_func``.
+
+    Args:
+        func: the body's function.
+        inputs: its inputs.
+        outputs: where they are written.
+        size: length of an observation.
+        together: whether the threads of a warp step neighbouring worlds, and write their observations together.
+    """
+    write, struct = _observer(func, struct_of("observation_func", func, inputs), size, together)
     return WorldFunc(write, fill(struct, inputs=inputs, outputs=outputs))
 
 
-def _observer(observe: wp.Function, Inputs: Any) -> tuple[wp.Function, Any]:  # noqa: N803
+def _observer(observe: wp.Function, Inputs: Any, size: int, together: bool) -> tuple[wp.Function, Any]:  # noqa: N803
     @wp.struct
     class Observer:
         inputs: Inputs
@@ -103,7 +111,12 @@ def _observer(observe: wp.Function, Inputs: Any) -> tuple[wp.Function, Any]:  # 
     @wp.func
     def write_observation(world: int, args: Observer):
         out = args.outputs
-        out.reward[world] = observe(world, args.inputs, out.observation[world], out.terms[world])
+        if wp.static(together):
+            observation = wp.zeros(shape=size, dtype=float)
+            out.reward[world] = observe(world, args.inputs, observation, out.terms[world])
+            write_rows(observation, out.observation[world])
+        else:
+            out.reward[world] = observe(world, args.inputs, out.observation[world], out.terms[world])
 
     return write_observation, Observer
 

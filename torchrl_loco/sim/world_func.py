@@ -112,6 +112,41 @@ def launch_together(funcs: Sequence[WorldFunc], mask: wp.array) -> None:
     WorldKernel(funcs).launch(funcs, mask)
 
 
+@wp.func_native("""
+int written = 0;
+#ifdef __CUDA_ARCH__
+const int PIECE = 8;  // numbers of a row that are written at once: 32 bytes, a sector of the memory
+const unsigned ALL = 0xffffffffu;
+const int lane = threadIdx.x % 32;
+if (__activemask() == ALL) {
+  float* const first = reinterpret_cast<float*>(__shfl_sync(ALL, reinterpret_cast<size_t>(out.data), 0));
+  if (__all_sync(ALL, out.data == first + lane * row.shape[0] && out.strides[0] == sizeof(float))) {
+    for (; written < row.shape[0]; written += PIECE) {
+      float piece[PIECE];
+      for (int i = 0; i < PIECE; ++i) piece[i] = written + i < row.shape[0] ? row.data[written + i] : 0.0f;
+      for (int world = lane / PIECE; world < 32; world += 32 / PIECE) {
+        float mine = 0.0f;
+        for (int i = 0; i < PIECE; ++i) {
+          const float other = __shfl_sync(ALL, piece[i], world);
+          if (i == lane % PIECE) mine = other;
+        }
+        const int place = written + lane % PIECE;
+        if (place < row.shape[0]) first[world * row.shape[0] + place] = mine;
+      }
+    }
+  }
+}
+#endif
+for (int i = written; i < row.shape[0]; ++i) wp::index(out, i) = row.data[i];
+""")
+def write_rows(row: wp.array[float], out: wp.array[float]):
+    """Writes the row of a world.
+
+    Threads of a warp write parts of each other's rows if these lie one after the other, so that an access reaches whole
+    pieces of memory instead of 32 single numbers.
+    """
+
+
 @wp.struct
 class Nothing:
     """A struct needs a field."""

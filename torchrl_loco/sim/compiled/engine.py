@@ -37,6 +37,7 @@ class Data:
         m: the model.
         nworld: number of worlds.
         device: where they live.
+        neighbours_adjoin: whether numbers of neighbouring worlds lie side by side.
 
     Attributes:
         qpos: positions, ``(nworld, nq)``.
@@ -62,10 +63,10 @@ class Data:
     overflow: wp.array
     act: wp.array
 
-    def __init__(self, m: mujoco.MjModel, nworld: int, device: wp.Device) -> None:
+    def __init__(self, m: mujoco.MjModel, nworld: int, device: wp.Device, *, neighbours_adjoin: bool) -> None:
         def make(name: str) -> wp.array:
             shape, dtype = _shape(m, nworld, name), ROWS[name][1]
-            if neighbours_adjoin(m, device):
+            if neighbours_adjoin:
                 return wp.zeros(shape[::-1], dtype=dtype, device=device).transpose()
             return wp.zeros(shape, dtype=dtype, device=device)
 
@@ -167,12 +168,14 @@ class CompiledEngine:
         data: the state of all worlds.
         peak_constraints: zero: no row of constraints needs room, ``(nworld,)``.
         peak_contacts: zero likewise, ``(1,)``.
+        neighbours_adjoin: whether the threads of a warp step neighbouring worlds, whose numbers then lie side by side.
     """
 
     def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
         self._mj_model, self._substeps, self._device = mj_model, config.substeps, device
         self.model = Model(mj_model, device)
-        self.data = Data(mj_model, num_envs, device)
+        self.neighbours_adjoin = neighbours_adjoin(mj_model, device)
+        self.data = Data(mj_model, num_envs, device, neighbours_adjoin=self.neighbours_adjoin)
         self._kernels: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
         self._kernels_apart: dict[tuple, WorldKernel] = {}
         self._launch_size = launch_size(mj_model, num_envs, device)

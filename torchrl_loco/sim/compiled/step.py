@@ -29,9 +29,10 @@ def is_traced(m: mujoco.MjModel) -> bool:
 
 
 def neighbours_adjoin(m: mujoco.MjModel, device: wp.Device) -> bool:
-    """Returns whether a number lies in memory beside that of the next world, and not beside the next of its world.
+    """Returns whether the threads of a warp step neighbouring worlds.
 
-    It should where the threads of a warp read it together, each for its world.
+    Each number then lies in memory beside that of the next world, and not beside the next of its own world: the threads
+    read and write it in one access.
     """
     return device.is_cuda and is_traced(m)
 
