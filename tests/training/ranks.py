@@ -8,7 +8,7 @@ import torch
 from small_runs import SMALL, made, small_walker
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
-from torchrl_loco.training import RunFolder, Trainer, distributed
+from torchrl_loco.training import RunFolder, Trainer, distributed, preset
 from torchrl_loco.training.algorithm import Algorithm
 
 BATCH = SMALL["num_envs"] * SMALL["num_steps"] * SMALL["action_repeat"]
@@ -31,7 +31,7 @@ def in_ranks(function, *args, count=2):
 
 def _connected(function, *args):
     torch.set_num_threads(1)
-    with distributed.joined("cpu"), small_walker():
+    with distributed.joined("cpu"):
         return function(*args)
 
 
@@ -99,7 +99,18 @@ def whole_and_resumed(out, algorithm):
     return {"whole": whole.path, "stopped": stopped.path, "stopped_at": iteration, "updates": updates}
 
 
-def of_both_algorithms(out):
+def learnt(out):
+    """Trains 16 batches with the total batch of the settings for one process; returns the return of the last."""
+    settings = {"num_envs": 128 // distributed.ranks(), "minibatch_size": 1024 // distributed.ranks()}
+    short = {"total_frames": 16 * 8192, "eval_episodes": 1, "video_seconds": 0.0, "logger": ("csv",)}
+    config = preset("walker_stand", "cpu", out=out, **settings, **short)
+    run = RunFolder(distributed.from_first(RunFolder.create(config).path if distributed.is_first() else None))
+    Trainer(run).train()
+    return run.read_metrics()["return"][-1]
+
+
+def of_ranks(out):
     """Returns all of the above."""
-    runs = {algorithm: whole_and_resumed(out / algorithm, algorithm) for algorithm in ("ppo", "reppo")}
-    return {"messages": messages(), **runs}
+    with small_walker():
+        runs = {algorithm: whole_and_resumed(out / algorithm, algorithm) for algorithm in ("ppo", "reppo")}
+    return {"messages": messages(), "learnt": learnt(out), **runs}
