@@ -17,8 +17,6 @@ from torchrl_loco.sim.compiled import collision, step, unsupported
 STATES = 16
 NOISE = 3e-7
 """Relative noise in a state: about what rounding to float32 makes."""
-FAR = 100.0
-"""Largest coordinate (rad, m) for which lanes are compared: their sine loses about 1e-8 of the angle."""
 KINDS = ("plane", "dense", "frictionless", "pyramid", "hinge limit", "slide limit", "ball limit", "dry friction")
 """Kinds of constraints that a state can have."""
 SETTINGS = {
@@ -162,8 +160,6 @@ def compare(xml, count=STATES):
         return found
     sim = compiled_step(model, starts)
     for world, state in enumerate(zip(*starts, strict=True)):
-        if np.abs(state[0]).max() > FAR and not step.is_traced(model):
-            continue
         if sim.overflow[world]:
             found["overflow"] += 1
             continue

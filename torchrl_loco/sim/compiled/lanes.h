@@ -51,10 +51,14 @@ struct Math {
   static INLINE int lowest_bit(unsigned long long x) { return __builtin_ctzll(x); }
 #endif
 
-  // Sine and cosine at once: x is reduced to a quarter turn about 0 (Cody and Waite), there both are polynomials.
+  // Sine and cosine at once: x is reduced to a quarter turn about 0 (Cody and Waite; the products must not be rounded), there
+  // both are polynomials.
   static INLINE void sincos(float x, float& sine, float& cosine) {
     const float quarters = rintf(x * 0.636619772f);
-    const float y = x - quarters * 1.57079601f - quarters * 3.13916473e-7f - quarters * 5.39030253e-15f, z = y * y;
+    float y = fmaf(quarters, -1.57079601f, x);
+    y = fmaf(quarters, -3.13916473e-7f, y);
+    y = fmaf(quarters, -5.39030253e-15f, y);
+    const float z = y * y;
     const float s = y + ((((2.86567956e-6f * z - 1.98559923e-4f) * z + 8.33338592e-3f) * z - 1.66666672e-1f) * z) * y;
     const float c = (((2.44677067e-5f * z - 1.38877297e-3f) * z + 4.16666567e-2f) * z - 0.5f) * z + 1.0f;
     const int quadrant = (int)quarters;
