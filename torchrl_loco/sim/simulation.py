@@ -59,7 +59,7 @@ class Simulation:
     the caller does in each world before and after the physics; under ``compiled`` that is one kernel, or three.
 
     The torch views share memory with the Warp arrays of ``data`` and never change their address. They always hold the
-    current state: clone what you want to keep.
+    current state: clone what you want to keep. Those of small bodies on CUDA are not contiguous.
 
     ==================  =========================  ========================================================
     ``qpos``            ``(nworld, nq)``           positions (m, rad, unit quaternions)
