@@ -92,14 +92,15 @@ def test_nothing_holds_on_to_a_closed_environment(way, engine):
 
 
 def test_an_environment_that_is_dropped_reports_as_if_closed(tmp_path):
-    def step_and_drop():
-        env = made(nan_dump=tmp_path / "dump")
-        env.step(env.reset().set("action", torch.full((WORLDS, 6), torch.nan)))
-        del env
+    held = [made(nan_dump=tmp_path / "dump")]
+    held[0].step(held[0].reset().set("action", torch.full((WORLDS, 6), torch.nan)))
+
+    def drop():
+        held.clear()
         gc.collect()
 
     with pytest.warns(torchrl_loco.NonFiniteWarning):
-        step_and_drop()
+        drop()
     assert (tmp_path / "dump").exists()
 
 

@@ -84,17 +84,47 @@ def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protoc
     assert all(torch.equal(value[places.to(device)], now[key]) for key, value in many.get_state().items())
 
 
+@pytest.mark.parametrize(
+    ("task", "device", "count"),
+    [
+        ("hopper_hop", "cpu", 100),
+        # Warps that are full, in one kernel and in three, and a last one that is not.
+        *(
+            pytest.param(task, "cuda", count, marks=pytest.mark.gpu)
+            for task in ("walker_run", "cheetah_run", "hopper_hop")
+            for count in (8203, 20_011)
+        ),
+    ],
+)
+def test_every_world_is_observed_as_among_few(task, device, count, actions):
+    many, few = (torchrl_loco.make(task, n, device, 0) for n in (count, 64))
+    td = many.reset()
+    for action in actions(many, 5):
+        state = many.get_state()
+        td = many.step(td.set("action", action))["next"]
+        reward = td.pop("reward")
+    for some in torch.arange(count, device=device).split(64):
+        places = some[torch.arange(64, device=device).clamp(max=len(some) - 1)]
+        begin = few.reset(State({key: value[places] for key, value in state.items()}, batch_size=[64]), set_state=True)
+        after = few.step(begin.set("action", action[places]))["next"]
+        assert torch.equal(after["observation"], td["observation"][places])
+        assert torch.equal(after["reward"], reward[places])
+
+
 def test_the_order_of_the_memory_changes_no_bit(monkeypatch, actions):
     """On CUDA, numbers of small bodies lie beside those of the next world; here on the CPU too."""
-    rows = torchrl_loco.make("cheetah_run", 5, "cpu", 0)
+    settings = {"episode_length": 20, "stagger": True}
+    rows = torchrl_loco.make("cheetah_run", 5, "cpu", 0, **settings)
     monkeypatch.setattr(compiled_engine, "neighbours_adjoin", lambda model, device: True)
-    columns = torchrl_loco.make("cheetah_run", 5, "cpu", 0)
+    columns = torchrl_loco.make("cheetah_run", 5, "cpu", 0, **settings)
     assert rows.sim.qpos.is_contiguous()
     assert columns.sim.qpos.stride() == (1, 5)
     tds = [env.reset() for env in (rows, columns)]
     for action in actions(rows, 30):
-        tds = [env.step(td.set("action", action))["next"] for env, td in zip((rows, columns), tds, strict=True)]
-        assert torch.equal(tds[0]["observation"], tds[1]["observation"])
+        pairs = zip((rows, columns), tds, strict=True)
+        (current, _), (other, _) = results = [env.step_and_maybe_reset(td.set("action", action)) for env, td in pairs]
+        assert (current == other).all()
+        tds = [td for _, td in results]
     states = [env.get_state() for env in (rows, columns)]
     assert all(value.is_contiguous() and torch.equal(value, states[0][key]) for key, value in states[1].items())
     columns.reset(states[0], set_state=True)

@@ -27,24 +27,25 @@ def test_each_graph_is_recorded_once(body_task, device, actions, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("task", "device", "guarded", "of_step"),
+    ("task", "device", "count", "guarded", "of_step"),
     [
-        ("walker_run", "cpu", False, 1),
-        ("walker_run", "cpu", True, 3),
-        pytest.param("walker_run", "cuda", False, 1, marks=pytest.mark.gpu),
-        pytest.param("walker_run", "cuda", True, 3, marks=pytest.mark.gpu),
-        pytest.param("humanoid_run", "cuda", False, 3, marks=pytest.mark.gpu),
-        pytest.param("humanoid_run", "cuda", True, 3, marks=pytest.mark.gpu),
+        ("walker_run", "cpu", 3, False, 1),
+        ("walker_run", "cpu", 3, True, 3),
+        pytest.param("walker_run", "cuda", 3, False, 1, marks=pytest.mark.gpu),
+        pytest.param("walker_run", "cuda", 3, True, 3, marks=pytest.mark.gpu),
+        pytest.param("walker_run", "cuda", 20_000, True, 3, marks=pytest.mark.gpu),
+        pytest.param("humanoid_run", "cuda", 3, False, 3, marks=pytest.mark.gpu),
+        pytest.param("humanoid_run", "cuda", 3, True, 3, marks=pytest.mark.gpu),
     ],
 )
-def test_launches_of_the_compiled_engine(monkeypatch, tmp_path, task, device, guarded, of_step):
+def test_launches_of_the_compiled_engine(monkeypatch, tmp_path, task, device, count, guarded, of_step):
     """A control step, with observation, reward, time limit, counters and NaN guard, and the resets after it."""
     launches, launch = [], wp.launch
     monkeypatch.setattr(
         wp, "launch", lambda kernel, *args, **options: launches.append(kernel) or launch(kernel, *args, **options)
     )
     nan_dump = tmp_path / "dump.safetensors" if guarded else None
-    env = torchrl_loco.make(task, 3, device, seed=0, engine="compiled", episode_length=1, nan_dump=nan_dump)
+    env = torchrl_loco.make(task, count, device, seed=0, engine="compiled", episode_length=1, nan_dump=nan_dump)
     assert len(set(launches)) == of_step + 1
     launches.clear()
     env.world._launch_step()

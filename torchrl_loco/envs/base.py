@@ -141,7 +141,8 @@ class LocoEnv(EnvBase):
         """Returns the function that writes observation and reward of one world, and its inputs.
 
         It is a ``wp.func`` of the index of the world, the inputs, the world's row of the observation, float
-        ``(observation_size,)``, and that of the terms, float ``(len(term_names),)``; it returns the reward.
+        ``(observation_size,)``, and that of the terms, float ``(len(term_names),)``; it writes every number of both,
+        without reading what they held, and returns the reward.
 
         Args:
             world: the worlds; the physics arrays are in ``world.sim.data``.

@@ -4,8 +4,9 @@ from typing import Any
 
 import warp as wp
 
-from torchrl_loco.sim import WorldFunc, fill, write_rows
+from torchrl_loco.sim import WorldFunc, fill
 from torchrl_loco.sim.sampling import world_stream
+from torchrl_loco.sim.world_func import write_rows
 
 MAX_VALUE = 1.0e10
 """Magnitude from which a number counts as not finite: MuJoCo's mjMAXVAL."""

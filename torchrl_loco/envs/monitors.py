@@ -47,7 +47,7 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
 
 
 class Monitor(ABC):
-    """Launches kernels around each control step, reads a few of their numbers every 100 steps, and reports.
+    """Adds functions to each control step, reads a few of their numbers every 100 steps, and reports.
 
     Args:
         count: how many numbers :meth:`numbers` returns.

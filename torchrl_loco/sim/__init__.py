@@ -15,7 +15,6 @@ from torchrl_loco.sim.simulation import Simulation as Simulation
 from torchrl_loco.sim.world_func import WorldFunc as WorldFunc
 from torchrl_loco.sim.world_func import fill as fill
 from torchrl_loco.sim.world_func import holds as holds
-from torchrl_loco.sim.world_func import write_rows as write_rows
 
 # At its default level Warp prints a line for each of a hundred kernels that it loads. Set another level to see them.
 if wp.config.log_level == wp.LOG_INFO:

@@ -185,8 +185,8 @@ class MujocoWarpEngine:
         Args:
             before: what each world does first.
             after: what it does at the end.
-            first: what each world does before any of them does anything else.
-            last: what each does after all have done the rest.
+            first: what it does before that, in a kernel before the physics.
+            last: what it does after that, in a kernel after the physics.
         """
         launch_together([*first, *before], self._all)
         for i in range(self._substeps):

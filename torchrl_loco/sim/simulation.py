@@ -59,7 +59,8 @@ class Simulation:
     the caller does in each world before and after the physics; under ``compiled`` that is one kernel, or three.
 
     The torch views share memory with the Warp arrays of ``data`` and never change their address. They always hold the
-    current state: clone what you want to keep. Those of small bodies on CUDA are not contiguous.
+    current state: clone what you want to keep. On CUDA, those of bodies with up to 16 degrees of freedom under
+    ``compiled`` are not contiguous.
 
     ==================  =========================  ========================================================
     ``qpos``            ``(nworld, nq)``           positions (m, rad, unit quaternions)
@@ -126,8 +127,8 @@ class Simulation:
         Args:
             before: what each world does first.
             after: what it does at the end.
-            first: what each world does before any of them does anything else.
-            last: what each does after all have done the rest.
+            first: what it does before that, in a kernel before the physics.
+            last: what it does after that, in a kernel after the physics.
         """
         self.engine.step(before, after, first, last)
 

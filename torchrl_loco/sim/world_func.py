@@ -134,6 +134,7 @@ if (__activemask() == ALL) {
         if (place < row.shape[0]) first[world * row.shape[0] + place] = mine;
       }
     }
+    __syncwarp();  // each thread may read its own row now
   }
 }
 #endif

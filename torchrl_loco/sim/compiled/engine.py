@@ -199,8 +199,8 @@ class CompiledEngine:
         Args:
             before: what each world does first.
             after: what it does at the end.
-            first: what each world does before any of them does anything else, in a kernel before the physics.
-            last: what each does after all have done the rest, in a kernel after it.
+            first: what it does before that, in a kernel before the physics.
+            last: what it does after that, in a kernel after the physics.
         """
         if self._launch_size.one_kernel:
             self._launch_apart(first)
@@ -240,14 +240,14 @@ class CompiledEngine:
         key = substeps, *(func for func, _ in before), None, *(func for func, _ in after)
         if key not in self._kernels:
             text = source(self._mj_model, substeps, with_cvel=outputs["cvel"] is not None)
-            first, last = Chain(before), Chain(after)
-            self._kernels[key] = _kernel(text, first.func, first.struct, last.func, last.struct), first, last
-        kernel, first, last = self._kernels[key]
+            start, end = Chain(before), Chain(after)
+            self._kernels[key] = _kernel(text, start.func, start.struct, end.func, end.struct), start, end
+        kernel, start, end = self._kernels[key]
         size = self._launch_size
         wp.launch(
             kernel,
             dim=size.threads,
-            inputs=[size.worlds_per_warp, size.lanes, mask, first.args(before), last.args(after), self.data.ctrl],
+            inputs=[size.worlds_per_warp, size.lanes, mask, start.args(before), end.args(after), self.data.ctrl],
             outputs=list(outputs.values()),
             device=self._device,
             block_dim=size.block,

@@ -51,7 +51,7 @@ struct Math {
   static INLINE int lowest_bit(unsigned long long x) { return __builtin_ctzll(x); }
 #endif
 
-  // Sine and cosine at once: x is reduced to a quarter turn about 0 (Cody and Waite; the products must not be rounded), there
+  // Sine and cosine at once, as in traced.py: x is reduced to a quarter turn about 0 (Cody and Waite, with fused products), there
   // both are polynomials.
   static INLINE void sincos(float x, float& sine, float& cosine) {
     const float quarters = rintf(x * 0.636619772f);

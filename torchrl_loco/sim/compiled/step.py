@@ -29,7 +29,7 @@ def is_traced(m: mujoco.MjModel) -> bool:
 
 
 def neighbours_adjoin(m: mujoco.MjModel, device: wp.Device) -> bool:
-    """Returns whether the threads of a warp step neighbouring worlds.
+    """Returns whether the threads of a warp step neighbouring worlds, if there are more worlds than warps.
 
     Each number then lies in memory beside that of the next world, and not beside the next of its own world: the threads
     read and write it in one access.
