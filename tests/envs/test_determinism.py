@@ -112,10 +112,10 @@ def test_every_world_is_observed_as_among_few(task, device, count, actions):
 
 
 def test_the_order_of_the_memory_changes_no_bit(monkeypatch, actions):
-    """On CUDA, numbers of small bodies lie beside those of the next world; here on the CPU too."""
+    """On CUDA the world is the fastest index of a small body's arrays; here on the CPU too."""
     settings = {"episode_length": 20, "stagger": True}
     rows = torchrl_loco.make("cheetah_run", 5, "cpu", 0, **settings)
-    monkeypatch.setattr(compiled_engine, "neighbours_adjoin", lambda model, device: True)
+    monkeypatch.setattr(compiled_engine, "structure_of_arrays", lambda model, device: True)
     columns = torchrl_loco.make("cheetah_run", 5, "cpu", 0, **settings)
     assert rows.sim.qpos.is_contiguous()
     assert columns.sim.qpos.stride() == (1, 5)

@@ -89,7 +89,7 @@ def apply_action(world: int, args: Control):
 # After it.
 
 
-def observer(func: wp.Function, inputs: Any, outputs: Any, size: int, *, together: bool) -> WorldFunc:
+def observer(func: wp.Function, inputs: Any, outputs: Any, size: int, *, coalesced: bool) -> WorldFunc:
     """Returns what writes observation, reward and terms, from what a body names in its ``observation_func``.
 
     Args:
@@ -97,13 +97,13 @@ def observer(func: wp.Function, inputs: Any, outputs: Any, size: int, *, togethe
         inputs: its inputs.
         outputs: where they are written.
         size: length of an observation.
-        together: whether the threads of a warp step neighbouring worlds, and write their observations together.
+        coalesced: whether the threads of a warp step neighbouring worlds, and coalesce their writes of observations.
     """
-    write, struct = _observer(func, struct_of("observation_func", func, inputs), size, together)
+    write, struct = _observer(func, struct_of("observation_func", func, inputs), size, coalesced)
     return WorldFunc(write, fill(struct, inputs=inputs, outputs=outputs))
 
 
-def _observer(observe: wp.Function, Inputs: Any, size: int, together: bool) -> tuple[wp.Function, Any]:  # noqa: N803
+def _observer(observe: wp.Function, Inputs: Any, size: int, coalesced: bool) -> tuple[wp.Function, Any]:  # noqa: N803
     @wp.struct
     class Observer:
         inputs: Inputs
@@ -112,7 +112,7 @@ def _observer(observe: wp.Function, Inputs: Any, size: int, together: bool) -> t
     @wp.func
     def write_observation(world: int, args: Observer):
         out = args.outputs
-        if wp.static(together):
+        if wp.static(coalesced):
             observation = wp.zeros(shape=size, dtype=float)
             out.reward[world] = observe(world, args.inputs, observation, out.terms[world])
             write_rows(observation, out.observation[world])

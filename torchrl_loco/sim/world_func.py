@@ -143,8 +143,8 @@ for (int i = written; i < row.shape[0]; ++i) wp::index(out, i) = row.data[i];
 def write_rows(row: wp.array[float], out: wp.array[float]):
     """Writes the row of a world.
 
-    Threads of a warp write parts of each other's rows if these lie one after the other, so that an access reaches whole
-    pieces of memory instead of 32 single numbers.
+    Threads of a warp write parts of each other's rows if these are contiguous, so that their accesses coalesce: one
+    reaches four whole sectors of memory, instead of a number in each of 32.
     """
 
 

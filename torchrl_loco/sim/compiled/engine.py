@@ -12,7 +12,7 @@ import warp as wp
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.buffer import Buffer
-from torchrl_loco.sim.compiled.step import WARP, launch_size, neighbours_adjoin, source
+from torchrl_loco.sim.compiled.step import WARP, launch_size, source, structure_of_arrays
 from torchrl_loco.sim.world_func import Chain, WorldFunc, WorldKernel
 
 ROWS = {
@@ -37,7 +37,7 @@ class Data:
         m: the model.
         nworld: number of worlds.
         device: where they live.
-        neighbours_adjoin: whether numbers of neighbouring worlds lie side by side.
+        structure_of_arrays: whether the world is the fastest index in memory.
 
     Attributes:
         qpos: positions, ``(nworld, nq)``.
@@ -63,10 +63,10 @@ class Data:
     overflow: wp.array
     act: wp.array
 
-    def __init__(self, m: mujoco.MjModel, nworld: int, device: wp.Device, *, neighbours_adjoin: bool) -> None:
+    def __init__(self, m: mujoco.MjModel, nworld: int, device: wp.Device, *, structure_of_arrays: bool) -> None:
         def make(name: str) -> wp.array:
             shape, dtype = _shape(m, nworld, name), ROWS[name][1]
-            if neighbours_adjoin:
+            if structure_of_arrays:
                 return wp.zeros(shape[::-1], dtype=dtype, device=device).transpose()
             return wp.zeros(shape, dtype=dtype, device=device)
 
@@ -168,14 +168,14 @@ class CompiledEngine:
         data: the state of all worlds.
         peak_constraints: zero: no row of constraints needs room, ``(nworld,)``.
         peak_contacts: zero likewise, ``(1,)``.
-        neighbours_adjoin: whether the threads of a warp step neighbouring worlds, whose numbers then lie side by side.
+        structure_of_arrays: whether the world is the fastest index in the memory of ``data``.
     """
 
     def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
         self._mj_model, self._substeps, self._device = mj_model, config.substeps, device
         self.model = Model(mj_model, device)
-        self.neighbours_adjoin = neighbours_adjoin(mj_model, device)
-        self.data = Data(mj_model, num_envs, device, neighbours_adjoin=self.neighbours_adjoin)
+        self.structure_of_arrays = structure_of_arrays(mj_model, device)
+        self.data = Data(mj_model, num_envs, device, structure_of_arrays=self.structure_of_arrays)
         self._kernels: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
         self._kernels_apart: dict[tuple, WorldKernel] = {}
         self._launch_size = launch_size(mj_model, num_envs, device)

@@ -28,11 +28,10 @@ def is_traced(m: mujoco.MjModel) -> bool:
     return m.nv <= TRACED_DOFS
 
 
-def neighbours_adjoin(m: mujoco.MjModel, device: wp.Device) -> bool:
-    """Returns whether the threads of a warp step neighbouring worlds, if there are more worlds than warps.
+def structure_of_arrays(m: mujoco.MjModel, device: wp.Device) -> bool:
+    """Returns whether the world is the fastest index of the arrays, instead of the slowest.
 
-    Each number then lies in memory beside that of the next world, and not beside the next of its own world: the threads
-    read and write it in one access.
+    The threads of a warp step neighbouring worlds, if there are more worlds than warps: this coalesces their accesses.
     """
     return device.is_cuda and is_traced(m)
 
