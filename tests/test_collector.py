@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from cases import coarse
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, FiniteTensorDictCheck, InitTracker, RewardSum
@@ -13,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 import torchrl_loco
 from torchrl_loco import RolloutCollector
-from torchrl_loco.collector import what_forbids_recording
+from torchrl_loco.collector import stack, what_forbids_recording
 from torchrl_loco.envs import WalkerRun
 
 QUICK = {"episode_length": 7, "on_overflow": "ignore"}
@@ -167,6 +168,24 @@ def test_recorded_batches_equal_steps_taken_one_by_one(body_task, protocol, wrap
     assert set(got.keys(True, True)) == set(expected.keys(True, True))
     for key in expected.keys(True, True):
         assert torch.equal(got[key], expected[key]), key
+
+
+@pytest.mark.gpu
+def test_steps_are_stacked_as_tensordict_does():
+    def a_step(**entries):
+        entries = {"action": torch.randn(5, 6), "note": "a text", **entries}
+        return TensorDict({**entries, "next": {"observation": torch.randn(5, 67)}}, batch_size=[5], device="cuda")
+
+    steps = [a_step() for _ in range(3)]
+    got, expected = stack(steps), TensorDict.stack(steps, dim=-1)
+    assert got.batch_size == expected.batch_size == (5, 3)
+    assert set(got.keys(True)) == set(expected.keys(True))
+    assert got["note"] == expected["note"]
+    for key in ("action", ("next", "observation")):
+        assert torch.equal(got[key], expected[key])
+        assert got[key].is_contiguous()
+    with pytest.raises(RuntimeError, match="sets of keys"):
+        stack([*steps, a_step(more=torch.zeros(5))])
 
 
 @pytest.mark.gpu

@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -103,7 +103,7 @@ class RolloutCollector:
             self._carried, self._recording, self._warm = self._env.reset(), None, False
         with set_exploration_type(self._exploration_type):
             steps = self._recorded_steps() if self._can_replay() else self._direct_steps()
-        return TensorDict.stack(steps, dim=-1).refine_names(..., "time")
+        return stack(steps).refine_names(..., "time")
 
     def _take_steps(self, td: TensorDictBase) -> tuple[list[TensorDictBase], TensorDictBase]:
         """Returns the steps of a batch that begins with ``td``, and what the next one begins with."""
@@ -190,6 +190,28 @@ def steps_as_ours(env: EnvBase) -> bool:
     names = "step_and_maybe_reset", "_step_and_maybe_reset"
     own = all(getattr(type(env), name) is getattr(LocoEnv, name) for name in names)
     return own and "_compiled_step_and_maybe_reset" not in vars(env)
+
+
+def stack(steps: Sequence[TensorDictBase]) -> TensorDictBase:
+    """Returns consecutive steps, each of batch ``(*batch,)``, as one TensorDict of batch ``(*batch, steps)``."""
+    first = steps[0]
+    apart = [key for key, entry in first.items(True, True) if stacks_slowly(entry, first.ndim)]
+    batch = TensorDict.stack([step.exclude(*apart) for step in steps] if apart else steps, dim=-1)
+    for key in apart:
+        batch.set(key, torch.stack([step[key] for step in steps]).movedim(0, first.ndim).contiguous())
+    return batch
+
+
+def stacks_slowly(entry: Any, dim: int) -> bool:
+    """Returns whether torch stacks such tensors faster along dimension 0, and moves that to ``dim``, than at ``dim``.
+
+    On CUDA it does if what stays together is between 16 and 128 bytes and no multiple of 16 (131072 actions of 6
+    numbers, 20 steps, H200: 0.08 instead of 0.29 ms).
+    """
+    if not isinstance(entry, torch.Tensor) or not entry.is_cuda:
+        return False
+    together = entry.shape[dim:].numel() * entry.element_size()
+    return 16 < together < 128 and together % 16 != 0
 
 
 class Recording:

@@ -8,7 +8,7 @@ import warp as wp
 from cases import COARSE, coarse
 from tensordict import TensorDict
 
-from torchrl_loco.envs.episode import FiniteCheck, Outputs, zero_non_finite
+from torchrl_loco.envs.episode import FiniteCheck, Outputs, observer, zero_non_finite
 from torchrl_loco.sim import WorldFunc, fill
 from torchrl_loco.sim.world_func import launch_together
 
@@ -152,27 +152,40 @@ def test_a_rollout_goes_on_past_a_bad_action(shared):
     assert not td["done"][2, 6]
 
 
-def test_everything_that_can_be_not_finite_is_looked_at():
+@wp.struct
+class Given:
+    observation: wp.array2d[float]
+    reward: wp.array[float]
+
+
+@wp.func
+def observe_given(world: int, given: Given, observation: wp.array[float], terms: wp.array[float]) -> float:
+    for i in range(observation.shape[0]):
+        observation[i] = given.observation[world, i]
+    terms[0] = 1.0
+    return given.reward[world]
+
+
+@pytest.mark.parametrize("coalesced", [False, True])
+def test_everything_that_can_be_not_finite_is_looked_at(coalesced):
     for spoilt in ("qpos", "qvel", "observation", "reward", None):
-        arrays = {
-            "qpos": torch.ones(3, 3),
-            "qvel": torch.ones(3, 3),
-            "observation": torch.ones(3, 4),
-            "reward": torch.ones(3),
-        }
+        given = {"qpos": (3, 3), "qvel": (3, 3), "observation": (3, 4), "reward": (3,)}
+        given = {name: torch.ones(shape) for name, shape in given.items()}
         if spoilt is not None:
-            arrays[spoilt].view(3, -1)[1:, -1] = 2e10
-        mask, bad, terms = torch.tensor([True, True, False]), torch.zeros(3, dtype=torch.bool), torch.ones(3, 1)
-        views = {name: wp.from_torch(array) for name, array in arrays.items()}
-        state = {name: views.pop(name) for name in ("qpos", "qvel")}
-        outputs = fill(Outputs, **views, terms=wp.from_torch(terms))
-        check = fill(FiniteCheck, **state, outputs=outputs, non_finite=wp.from_torch(bad))
-        launch_together([WorldFunc(zero_non_finite, check)], wp.from_torch(mask))
+            given[spoilt].view(3, -1)[1:, -1] = 2e10
+        given = {name: wp.from_torch(array) for name, array in given.items()}
+        written = {"observation": torch.zeros(3, 4), "reward": torch.zeros(3), "terms": torch.zeros(3, 1)}
+        outputs = fill(Outputs, **{name: wp.from_torch(array) for name, array in written.items()})
+        mask, bad = torch.tensor([True, True, False]), torch.zeros(3, dtype=torch.bool)
+        marked, state = wp.from_torch(bad), {name: given.pop(name) for name in ("qpos", "qvel")}
+        observe = observer(observe_given, fill(Given, **given), outputs, marked, 4, coalesced=coalesced)
+        check = WorldFunc(zero_non_finite, fill(FiniteCheck, **state, outputs=outputs, non_finite=marked))
+        launch_together([observe, check], wp.from_torch(mask))
         assert bad.tolist() == [False, spoilt is not None, False]
-        for array in (arrays["observation"], arrays["reward"], terms):
+        for array in written.values():
             assert (array[0] == 1).all()
             assert (array[1] == (spoilt is None)).all()
-            assert (array[2] != 0).all()  # beyond the mask
+            assert (array[2] == 0).all()  # beyond the mask
 
 
 def test_an_ended_world_is_well_again_after_its_state_is_restored(shared, actions):

@@ -89,18 +89,21 @@ def apply_action(world: int, args: Control):
 # After it.
 
 
-def observer(func: wp.Function, inputs: Any, outputs: Any, size: int, *, coalesced: bool) -> WorldFunc:
+def observer(
+    func: wp.Function, inputs: Any, outputs: Any, non_finite: wp.array, size: int, *, coalesced: bool
+) -> WorldFunc:
     """Returns what writes observation, reward and terms, from what a body names in its ``observation_func``.
 
     Args:
         func: the body's function.
         inputs: its inputs.
         outputs: where they are written.
+        non_finite: is set where an observation is not finite, ``(nworld,)``.
         size: length of an observation.
-        coalesced: whether the threads of a warp step neighbouring worlds, and coalesce their writes of observations.
+        coalesced: whether the threads of a warp take neighbouring worlds, and write observations together.
     """
     write, struct = _observer(func, struct_of("observation_func", func, inputs), size, coalesced)
-    return WorldFunc(write, fill(struct, inputs=inputs, outputs=outputs))
+    return WorldFunc(write, fill(struct, inputs=inputs, outputs=outputs, non_finite=non_finite))
 
 
 def _observer(observe: wp.Function, Inputs: Any, size: int, coalesced: bool) -> tuple[wp.Function, Any]:  # noqa: N803
@@ -108,6 +111,7 @@ def _observer(observe: wp.Function, Inputs: Any, size: int, coalesced: bool) -> 
     class Observer:
         inputs: Inputs
         outputs: Outputs
+        non_finite: wp.array[bool]
 
     @wp.func
     def write_observation(world: int, args: Observer):
@@ -116,8 +120,10 @@ def _observer(observe: wp.Function, Inputs: Any, size: int, coalesced: bool) -> 
             observation = wp.zeros(shape=size, dtype=float)
             out.reward[world] = observe(world, args.inputs, observation, out.terms[world])
             write_rows(observation, out.observation[world])
+            mark_non_finite(observation, world, args.non_finite)
         else:
             out.reward[world] = observe(world, args.inputs, out.observation[world], out.terms[world])
+            mark_non_finite(out.observation[world], world, args.non_finite)
 
     return write_observation, Observer
 
@@ -161,9 +167,16 @@ def count_non_finite(row: wp.array[float]) -> int:
     return count
 
 
+@wp.func
+def mark_non_finite(row: wp.array[float], world: int, non_finite: wp.array[bool]):
+    """Marks a world one of whose numbers in a row is not finite."""
+    if count_non_finite(row) > 0:
+        non_finite[world] = True
+
+
 @wp.struct
 class FiniteCheck:
-    """Where a number that is not finite is looked for; ``outputs`` are zeroed and ``non_finite`` is set then."""
+    """What is checked besides the observation; where a number is not finite, ``outputs`` are zeroed."""
 
     qpos: wp.array2d[float]
     qvel: wp.array2d[float]
@@ -173,14 +186,13 @@ class FiniteCheck:
 
 @wp.func
 def zero_non_finite(world: int, args: FiniteCheck):
-    """Marks a world that is non-finite, and zeroes observation, reward and terms of one that is marked."""
+    """Marks a world whose state or reward is not finite; zeroes observation, reward and terms of one that is marked."""
     out = args.outputs
-    observation = out.observation[world]
-    found = count_non_finite(args.qpos[world]) + count_non_finite(args.qvel[world]) + count_non_finite(observation)
+    found = count_non_finite(args.qpos[world]) + count_non_finite(args.qvel[world])
     if args.non_finite[world] or found > 0 or not (wp.abs(out.reward[world]) < MAX_VALUE):
         args.non_finite[world] = True
-        for i in range(observation.shape[0]):
-            observation[i] = 0.0
+        for i in range(out.observation.shape[1]):
+            out.observation[world, i] = 0.0
         for i in range(out.terms.shape[1]):
             out.terms[world, i] = 0.0
         out.reward[world] = 0.0

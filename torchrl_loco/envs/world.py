@@ -151,8 +151,8 @@ class World:
         mine = SimpleNamespace(**buffers, episode_length=self._episode_length, world_offset=self._world_offset)
         mine.outputs, mine.flags = fill(Outputs, mine), fill(Flags, mine)
         counters = {"counter_bits": self.health.counter_bits, "counts": self.health.counts.warp}
-        size, coalesced = task.observation_size, self.sim.engine.structure_of_arrays
-        self._observe = observer(*task.observation_func(self), mine.outputs, size, coalesced=coalesced)
+        size, coalesced = task.observation_size, self.sim.engine.coalesced
+        self._observe = observer(*task.observation_func(self), mine.outputs, mine.non_finite, size, coalesced=coalesced)
         self._check_finite = WorldFunc(zero_non_finite, fill(FiniteCheck, mine, qpos=data.qpos, qvel=data.qvel))
         self._finish = WorldFunc(finish_step, fill(StepEnd, mine, overflow=data.overflow, **counters))
         self._begin = [WorldFunc(begin_episode, fill(EpisodeStart, mine, stagger=self._stagger.warp))]

@@ -133,11 +133,11 @@ class MujocoWarpEngine:
         data: the state of all worlds.
         peak_constraints: most constraint rows that a substep needed, by world, ``(nworld,)``.
         peak_contacts: most contacts that a substep needed, over all worlds, ``(1,)``.
-        structure_of_arrays: false: the numbers of a world are contiguous.
+        coalesced: false: the numbers of a world are contiguous.
     """
 
     name = "mujoco_warp"
-    structure_of_arrays = False
+    coalesced = False
 
     def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
         self._num_envs, self._device = num_envs, device

@@ -117,21 +117,23 @@ int written = 0;
 #ifdef __CUDA_ARCH__
 const int PIECE = 8;  // numbers of a row that are written at once: 32 bytes, a sector of the memory
 const unsigned ALL = 0xffffffffu;
-const int lane = threadIdx.x % 32;
+const int lane = threadIdx.x % 32, place = lane % PIECE;
 if (__activemask() == ALL) {
   float* const first = reinterpret_cast<float*>(__shfl_sync(ALL, reinterpret_cast<size_t>(out.data), 0));
   if (__all_sync(ALL, out.data == first + lane * row.shape[0] && out.strides[0] == sizeof(float))) {
     for (; written < row.shape[0]; written += PIECE) {
       float piece[PIECE];
       for (int i = 0; i < PIECE; ++i) piece[i] = written + i < row.shape[0] ? row.data[written + i] : 0.0f;
-      for (int world = lane / PIECE; world < 32; world += 32 / PIECE) {
-        float mine = 0.0f;
+      for (int step = 1; step < PIECE; step *= 2) {  // transposes the pieces of each PIECE threads
         for (int i = 0; i < PIECE; ++i) {
-          const float other = __shfl_sync(ALL, piece[i], world);
-          if (i == lane % PIECE) mine = other;
+          if (i & step) continue;
+          const bool upper = place & step;
+          const float other = __shfl_xor_sync(ALL, upper ? piece[i] : piece[i + step], step);
+          (upper ? piece[i] : piece[i + step]) = other;
         }
-        const int place = written + lane % PIECE;
-        if (place < row.shape[0]) first[world * row.shape[0] + place] = mine;
+      }
+      for (int i = 0; i < PIECE; ++i) {
+        if (written + place < row.shape[0]) first[(lane - place + i) * row.shape[0] + written + place] = piece[i];
       }
     }
     __syncwarp();  // each thread may read its own row now

@@ -168,17 +168,19 @@ class CompiledEngine:
         data: the state of all worlds.
         peak_constraints: zero: no row of constraints needs room, ``(nworld,)``.
         peak_contacts: zero likewise, ``(1,)``.
-        structure_of_arrays: whether the world is the fastest index in the memory of ``data``.
+        coalesced: whether functions of a world have kernels of their own, in which the threads of a warp take
+            neighbouring worlds whose numbers are neighbours in memory.
     """
 
     def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
         self._mj_model, self._substeps, self._device = mj_model, config.substeps, device
         self.model = Model(mj_model, device)
-        self.structure_of_arrays = structure_of_arrays(mj_model, device)
-        self.data = Data(mj_model, num_envs, device, structure_of_arrays=self.structure_of_arrays)
+        self._launch_size = launch_size(mj_model, num_envs, device)
+        by_world = structure_of_arrays(mj_model, device)
+        self.data = Data(mj_model, num_envs, device, structure_of_arrays=by_world)
+        self.coalesced = by_world and not self._launch_size.one_kernel
         self._kernels: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
         self._kernels_apart: dict[tuple, WorldKernel] = {}
-        self._launch_size = launch_size(mj_model, num_envs, device)
         self._all = wp.ones(num_envs, dtype=bool, device=device)
         self.peak_constraints = Buffer(num_envs, int, device)
         self.peak_contacts = Buffer(1, int, device)
