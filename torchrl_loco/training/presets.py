@@ -75,7 +75,7 @@ LARGE_STEPS: Settings = {"lr": 1e-3, **NO_FLOOR}
 """For tasks that stay stable at a learning rate above the general one."""
 MORE_STEPS: Settings = {**LARGE_STEPS, "minibatch_size": 4096}
 """The same with twice the gradient steps for each batch."""
-HOPPER: Settings = {**MORE_STEPS, "action_repeat": 2, "reward_scale": 0.5, "episode_length": 200}
+HOPPER: Settings = {**MORE_STEPS, "action_repeat": 2, "reward_scale": 0.5, "episode_length": 100}
 """The reward is sparse: noise held for two frames explores further, and more of a short episode is the fall at its
 start, in which the hopper can still turn to a side from which it gets up."""
 GETTING_UP: Settings = {
@@ -94,7 +94,7 @@ TASKS: dict[tuple[str, str], Settings] = {
     ("reppo", "humanoid_walk"): {"total_frames": 120_000_000, **NO_FLOOR},
     ("reppo", "humanoid_run"): {"total_frames": 100_000_000},
     ("reppo", "cheetah_run"): {**MORE_STEPS, "total_frames": 30_000_000},
-    ("reppo", "hopper_stand"): {**HOPPER, "total_frames": 60_000_000, "episode_length": 100},
+    ("reppo", "hopper_stand"): {**HOPPER, "total_frames": 60_000_000},
     ("reppo", "hopper_hop"): {**HOPPER, "total_frames": 160_000_000},
     ("reppo", "quadruped_walk"): {**MORE_STEPS, "total_frames": 30_000_000},
     ("reppo", "quadruped_run"): {**MORE_STEPS, "total_frames": 50_000_000},
