@@ -174,14 +174,15 @@ def test_recorded_batches_equal_steps_taken_one_by_one(body_task, protocol, wrap
 def test_steps_are_stacked_as_tensordict_does():
     def a_step(**entries):
         entries = {"action": torch.randn(5, 6), "note": "a text", **entries}
-        return TensorDict({**entries, "next": {"observation": torch.randn(5, 67)}}, batch_size=[5], device="cuda")
+        after = {"observation": torch.randn(5, 67), "velocity": torch.randn(5, 9)}
+        return TensorDict({**entries, "next": after}, batch_size=[5], device="cuda")
 
     steps = [a_step() for _ in range(3)]
     got, expected = stack(steps), TensorDict.stack(steps, dim=-1)
     assert got.batch_size == expected.batch_size == (5, 3)
     assert set(got.keys(True)) == set(expected.keys(True))
     assert got["note"] == expected["note"]
-    for key in ("action", ("next", "observation")):
+    for key in ("action", ("next", "observation"), ("next", "velocity")):
         assert torch.equal(got[key], expected[key])
         assert got[key].is_contiguous()
     with pytest.raises(RuntimeError, match="sets of keys"):

@@ -136,7 +136,6 @@ class MujocoWarpEngine:
         coalesced: false: the numbers of a world are contiguous.
     """
 
-    name = "mujoco_warp"
     coalesced = False
 
     def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
