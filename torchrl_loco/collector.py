@@ -205,13 +205,13 @@ def stack(steps: Sequence[TensorDictBase]) -> TensorDictBase:
 def stacks_slowly(entry: Any, dim: int) -> bool:
     """Returns whether torch stacks such tensors faster along dimension 0, and moves that to ``dim``, than at ``dim``.
 
-    On CUDA it does if what stays together is between 16 and 128 bytes and no multiple of 16 (131072 actions of 6
+    On CUDA it does if the entry of one world takes between 16 and 128 bytes and no multiple of 16 (131072 actions of 6
     numbers, 20 steps, H200: 0.08 instead of 0.29 ms).
     """
     if not isinstance(entry, torch.Tensor) or not entry.is_cuda:
         return False
-    together = entry.shape[dim:].numel() * entry.element_size()
-    return 16 < together < 128 and together % 16 != 0
+    size = entry.shape[dim:].numel() * entry.element_size()
+    return 16 < size < 128 and size % 16 != 0
 
 
 class Recording:

@@ -174,7 +174,8 @@ def test_everything_that_can_be_not_finite_is_looked_at(coalesced):
         if spoilt is not None:
             given[spoilt].view(3, -1)[1:, -1] = 2e10
         given = {name: wp.from_torch(array) for name, array in given.items()}
-        written = {"observation": torch.zeros(3, 4), "reward": torch.zeros(3), "terms": torch.zeros(3, 1)}
+        written = {"observation": (3, 4), "reward": (3,), "terms": (3, 1)}
+        written = {name: torch.full(shape, 7.0) for name, shape in written.items()}
         outputs = fill(Outputs, **{name: wp.from_torch(array) for name, array in written.items()})
         mask, bad = torch.tensor([True, True, False]), torch.zeros(3, dtype=torch.bool)
         marked, state = wp.from_torch(bad), {name: given.pop(name) for name in ("qpos", "qvel")}
@@ -185,7 +186,7 @@ def test_everything_that_can_be_not_finite_is_looked_at(coalesced):
         for array in written.values():
             assert (array[0] == 1).all()
             assert (array[1] == (spoilt is None)).all()
-            assert (array[2] == 0).all()  # beyond the mask
+            assert (array[2] == 7).all()  # beyond the mask
 
 
 def test_an_ended_world_is_well_again_after_its_state_is_restored(shared, actions):
