@@ -5,8 +5,9 @@ things keep that gradient reliable: the critic is a distribution over returns, i
 actor minimises the KL divergence from the policy that collected the data wherever it exceeds a bound.
 """
 
+import contextlib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import torch
 from tensordict import TensorDictBase
@@ -20,6 +21,7 @@ from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training.actor import make_actor
 from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import REPPOConfig
+from torchrl_loco.training.norm_silu import Layers
 
 
 class REPPO(Algorithm):
@@ -37,7 +39,6 @@ class REPPO(Algorithm):
         self.distribution = self.actor[0].module  # from observations to means and standard deviations
         self.dual = DualVariables(config).to(self.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "dual": self.dual})
-        self._actor_parameters = [*self.actor.parameters(), *self.dual.parameters()]
         self.critic_optimizer = self.make_optimizer("critic", self.critic.parameters())
         # The gradient of a dual variable's logarithm shrinks with the variable: an eps of 1e-5 would keep it small.
         groups = [{"params": list(self.actor.parameters())}, {"params": list(self.dual.parameters()), "eps": 1e-8}]
@@ -90,7 +91,8 @@ class REPPO(Algorithm):
         config, dual = self.config, self.dual
         loc, scale = self.distribution(minibatch["observation"])
         action, log_prob = sample(loc, scale)
-        value, _ = self.critic.value_and_features(minibatch["observation"], action)
+        with frozen(self.critic):
+            value, _ = self.critic.value_and_features(minibatch["observation"], action)
         divergence = kl(minibatch["loc"], minibatch["scale"], loc, scale)
         exceeded = divergence >= config.kl_bound
         objective = dual.temperature.detach() * log_prob - value
@@ -100,13 +102,23 @@ class REPPO(Algorithm):
         excess_kl = (divergence.detach() - config.kl_bound).mean()
         dual_loss = dual.temperature * excess_entropy - dual.kl_weight * excess_kl
         self.actor_optimizer.zero_grad()
-        (loss + dual_loss).backward(inputs=self._actor_parameters)  # and leave the critic's gradients alone
+        (loss + dual_loss).backward()
         grad_norm = clip_and_step(self.actor_optimizer, config.max_grad_norm)
         dual.clamp_()
         return [
             *(loss, divergence.mean(), exceeded.float().mean(), -log_prob.mean()),
             *(dual.temperature, dual.kl_weight, grad_norm),
         ]
+
+
+@contextlib.contextmanager
+def frozen(module: nn.Module) -> Iterator[None]:
+    """Lets what is computed with a module pass gradients on to its inputs, but not to its parameters."""
+    module.requires_grad_(False)
+    try:
+        yield
+    finally:
+        module.requires_grad_(True)
 
 
 class DualVariables(nn.Module):
@@ -213,12 +225,12 @@ class DistributionalQ(nn.Module):
         super().__init__()
         self.norm, self.bins = norm, bins
         width = hidden[-1]
-        self.encoder = nn.Sequential(*normed_layers(sum(sizes), hidden), nn.Linear(width, width))
+        self.encoder = Layers(*normed_layers(sum(sizes), hidden), nn.Linear(width, width))
         last = nn.Linear(width, len(bins.centers))
         with torch.no_grad():  # the initial prediction is a return of zero
             last.bias.add_(40.0 * bins.encode(torch.zeros(())))
-        self.value_head = nn.Sequential(nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), last)
-        self.predictor = nn.Sequential(
+        self.value_head = Layers(nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), last)
+        self.predictor = Layers(
             nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), nn.Linear(width, width)
         )
 
@@ -247,7 +259,7 @@ def make_actor_q(config: REPPOConfig) -> tuple[ProbabilisticActor, Distributiona
     norm = ObservationNorm(config.observation_size)
     head = nn.Linear(config.hidden[-1], 2 * config.action_size)
     body = normed_layers(config.observation_size, config.hidden)
-    actor = make_actor(config, nn.Sequential(norm, *body, head, NormalParamExtractor("exp")), log_prob=False)
+    actor = make_actor(config, Layers(norm, *body, head, NormalParamExtractor("exp")), log_prob=False)
     bins = ValueBins(0.0, config.max_value, config.num_bins)
     critic = DistributionalQ(norm, (config.observation_size, config.action_size), config.hidden, bins)
     return actor, critic.to(config.device), norm
