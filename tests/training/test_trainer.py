@@ -187,6 +187,7 @@ def test_the_best_policy_is_kept(tmp_path, monkeypatch, capsys):
     assert seeds[0] != seeds[1]
     out = capsys.readouterr().out
     assert "best policy, in new episodes: return 25.0" in out
+    assert "The return fell from 30 after 512 frames to 20 at the end" in out
     assert "This return is poor: the policy shipped for walker_stand earns 9" in out
     assert "--seed 1" in out
 

@@ -4,7 +4,7 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -75,6 +75,8 @@ def describe(summary: dict[str, float]) -> str:
 
 POOR = 0.8
 """Fraction of the shipped policy's return below which a return is called poor."""
+FALLEN = 0.9
+"""Fraction of a run's best evaluation below which its last one is called fallen."""
 
 
 def poor_return(config: TrainingConfig, summary: dict[str, float], seeds: Collection[int] = ()) -> str:
@@ -96,6 +98,23 @@ def poor_return(config: TrainingConfig, summary: dict[str, float], seeds: Collec
         f"This return is poor: the policy shipped for {config.task} earns {reference:.0f}. Returns vary with seeds and "
         f"processors. Try another seed (--seed {max(config.seed, *seeds, -1) + 1}) or twice the frames "
         f"(--total_frames {2 * config.total_frames}); the learning curve shows whether it was still rising"
+    )
+
+
+def fallen_return(config: TrainingConfig, evaluations: Sequence[Mapping[str, float]]) -> str:
+    """Returns a note if the return of a run fell far below its best evaluation, else an empty string.
+
+    Args:
+        config: settings of the run.
+        evaluations: ``frames`` and ``mean`` of each, in their order.
+    """
+    best, last = max(evaluations, key=lambda row: row["mean"]), evaluations[-1]
+    if last["mean"] >= FALLEN * best["mean"]:
+        return ""
+    return (
+        f"The return fell from {best['mean']:.0f} after {best['frames']:.0f} frames to {last['mean']:.0f} at the end. "
+        f"The policy of the best evaluation was kept. Another seed (--seed {config.seed + 1}) or smaller steps "
+        f"(--lr {config.lr / 2:g}) may prevent it"
     )
 
 

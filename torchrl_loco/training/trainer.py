@@ -24,7 +24,7 @@ from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.config import TrainingConfig
-from torchrl_loco.training.evaluation import Evaluator, describe, poor_return, record, summarize
+from torchrl_loco.training.evaluation import Evaluator, describe, fallen_return, poor_return, record, summarize
 from torchrl_loco.training.loggers import Loggers, check_loggers
 from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.ppo import PPO
@@ -198,8 +198,9 @@ class Trainer:
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
         print(f"best policy, in new episodes: {describe(summary)}")
-        if note := poor_return(config, summary, self.run.seeds):
-            print(note)
+        for note in (fallen_return(config, self.run.read_evaluations()), poor_return(config, summary, self.run.seeds)):
+            if note:
+                print(note)
 
     def save(self) -> None:
         """Writes the checkpoint, from which a run continues exactly; all ranks must call it."""
