@@ -10,6 +10,7 @@ from benchmarks.results import save, show
 from benchmarks.tasks import TASKS
 from torchrl_loco import list_envs
 from torchrl_loco.config import PROTOCOLS
+from torchrl_loco.policy import shipped_policies
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
@@ -48,6 +49,13 @@ train.add_argument("--peer", action="store_true", help="train Brax's PPO too")
 train.add_argument("--path", type=Path, help="folder that the peer's packages were installed in")
 train.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 train.add_argument("--out", type=Path, help="file for the results as JSON")
+elsewhere = commands.add_parser("suite", help="what the policies of protocol dm_control earn in dm_control itself")
+shipped = sorted(shipped_policies("dm_control"))
+elsewhere.add_argument("--tasks", nargs="+", choices=shipped, default=shipped)
+elsewhere.add_argument("--episodes", type=int, default=32)
+elsewhere.add_argument("--path", type=Path, help="folder that dm_control and its MuJoCo were installed in")
+elsewhere.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
+elsewhere.add_argument("--out", type=Path, help="file for the results as JSON")
 spread = commands.add_parser("scaling", help="several GPUs beside one, with the same worlds on each")
 spread.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_walk"])
 spread.add_argument("--gpus", type=int, nargs="+", default=[1, 2], help="numbers of GPUs, or of processes on the CPU")
@@ -129,6 +137,10 @@ elif args.command == "scaling":
     from benchmarks.scaling import COLUMNS, scaling
 
     rows = scaling(args.tasks, args.gpus, args.device)
+elif args.command == "suite":
+    from benchmarks.suite import COLUMNS, suite
+
+    rows = suite(args.tasks, args.episodes, args.device, args.path)
 elif args.command == "training":
     from benchmarks.training import COLUMNS, training
 

@@ -1,5 +1,6 @@
 """The parts of the benchmarks that could be wrong: differences, ratios, and processes that fail."""
 
+import importlib.util
 import json
 import os
 import signal
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import cases, fidelity, plot, scaling, soak, timing
+from benchmarks import cases, fidelity, plot, scaling, soak, suite, timing
 from benchmarks.cases import until_interrupted
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
@@ -88,6 +89,16 @@ def test_fidelity_is_measured_on_real_worlds(tmp_path, monkeypatch):
     assert first["playground", "converged"] > 10 * first["dm_control", "same settings"]
     fidelity.plot_fidelity(found, tmp_path / "fidelity.png")
     assert (tmp_path / "fidelity.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_policies_are_played_here_and_in_dm_control():
+    theirs, ours = suite.suite(["walker_walk"], 4, torch.device("cpu"), None)
+    assert ours["mean"] > 960
+    if importlib.util.find_spec("dm_control"):
+        assert theirs["mean"] > 960
+    else:
+        assert theirs["error"] == "ModuleNotFoundError: No module named 'dm_control'"
 
 
 def test_pictures_are_drawn_of_recorded_results(tmp_path):
