@@ -44,7 +44,7 @@ def suite(tasks: Sequence[str], episodes: int, device: torch.device, path: Path 
                 )
             except MeasurementError as error:
                 theirs["error"] = str(error)
-            evaluator = Evaluator(task, episodes, device, SEED, PROTOCOL, held)
+            evaluator = Evaluator(task, episodes, str(device), SEED, PROTOCOL, held)
             ours = summarize(evaluator(load_policy(task, device, PROTOCOL)))
             rows += [theirs, {"task": task, "where": "torchrl_loco", **ours}]
     return rows

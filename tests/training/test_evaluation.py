@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 import torchrl_loco
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import RunFolder, evaluate_run, preset
-from torchrl_loco.training.evaluation import Evaluator, poor_return
+from torchrl_loco.training.evaluation import Evaluator, fallen_return, poor_return
 from torchrl_loco.training.trainer import evaluation_seed
 
 
@@ -95,3 +95,16 @@ def test_a_poor_return_is_said(monkeypatch):
     assert poor_return(config, {"mean": 0.81 * shipped}) == ""
     monkeypatch.setattr("torchrl_loco.policy.SHIPPED", config.out / "none")
     assert poor_return(config, {"mean": 0.0}) == ""
+
+
+@pytest.mark.parametrize(("last", "falls"), [(100.0, False), (91.0, False), (89.0, True), (-5.0, True)])
+def test_a_fall_below_the_best_evaluation_is_said(last, falls):
+    rows = [{"frames": 10 * i, "mean": mean} for i, mean in enumerate([20.0, 100.0, last])]
+    note = fallen_return(preset("walker_stand", "cpu", seed=7, episode_length=300), rows, seeds=[7, 9])
+    assert ("from 100.0 after 10 frames" in note) == falls
+    assert ("--seed 10" in note) == ("--episode_length 150" in note) == falls
+
+
+def test_returns_that_are_never_positive_do_not_fall():
+    rows = [{"frames": i, "mean": mean} for i, mean in enumerate([-10.0, -30.0])]
+    assert fallen_return(preset("walker_stand", "cpu"), rows) == ""

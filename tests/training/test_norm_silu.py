@@ -5,8 +5,10 @@ import torch
 from torch import nn
 from torch.nn.functional import layer_norm, silu
 
+from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training.norm_silu import BLOCKS, WIDEST, Layers, norm_silu
 
+SHAPES = [(5, 32), (8 * BLOCKS + 9, 64), (8 * BLOCKS + 9, 128), (2, 3, 512), (9, WIDEST), (0, 32)]
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 
@@ -21,7 +23,9 @@ def inputs(shape, device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("shape", [(5, 32), (8 * BLOCKS + 9, 64), (2, 3, 512), (0, 32)])
+@pytest.mark.parametrize(
+    "shape", [(5, 32), (8 * BLOCKS + 9, 64), (8 * BLOCKS + 9, 128), (2, 3, 512), (9, WIDEST), (0, 32)]
+)
 def test_values_and_gradients_are_those_of_torch(device, shape):
     given = inputs(shape, device)
     y = norm_silu(*given, 1e-5)
@@ -43,6 +47,32 @@ def test_rows_in_any_order_of_memory(device):
     (gradient,) = torch.autograd.grad(norm_silu(rows, weight, bias, 1e-5), x, grad_y)
     (expected,) = torch.autograd.grad(reference(rows, weight, bias), x, grad_y)
     torch.testing.assert_close(gradient, expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_tensors_with_gaps_and_at_any_address(device):
+    x, weight, bias = inputs((4, 128), device)
+    wide = torch.stack([weight, bias], dim=1)
+    moved = torch.cat([x.new_zeros(1), x.view(-1)])[1:].view(4, 128)
+    assert moved.data_ptr() % 16
+    expected = reference(x, weight, bias)
+    torch.testing.assert_close(norm_silu(moved, wide[:, 0], wide[:, 1], 1e-5), expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.gpu
+def test_recorded_gradients_are_those_of_a_direct_call():
+    given = inputs((33, 128), "cuda")
+    grad_y, found = torch.randn(33, 128, device="cuda"), []
+    graph = TorchGraph(
+        lambda: found.append(torch.autograd.grad(norm_silu(*given, 1e-5), given, grad_y)),
+        torch.device("cuda"),
+        warmup=1,
+    )
+    for _ in range(3):
+        graph()
+    assert len(found) == 2  # one direct call, one recording
+    for direct, recorded in zip(*found, strict=True):
+        assert direct.equal(recorded)
 
 
 def test_frozen_weights_get_no_gradient():

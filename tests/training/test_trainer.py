@@ -187,9 +187,8 @@ def test_the_best_policy_is_kept(tmp_path, monkeypatch, capsys):
     assert seeds[0] != seeds[1]
     out = capsys.readouterr().out
     assert "best policy, in new episodes: return 25.0" in out
-    assert "The return fell from 30 after 512 frames to 20 at the end" in out
+    assert "The return fell from 30.0 after 512 frames to 20.0 at the end" in out
     assert "This return is poor: the policy shipped for walker_stand earns 9" in out
-    assert "--seed 1" in out
 
 
 @pytest.mark.slow
@@ -255,7 +254,7 @@ def test_torchs_settings_are_restored(tmp_path, monkeypatch):
 @pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
 def test_a_run_on_cuda(algorithm, tmp_path):
     """Recorded gradient steps learn, the run can be stopped and resumed, and its policy plays on the CPU."""
-    config = preset("walker_stand", "cuda", algorithm, out=tmp_path, **{**SMALL, "total_frames": 640})
+    config = preset("walker_stand", "cuda", algorithm, out=tmp_path, **{**SMALL, "total_frames": 640, "hidden": (32,)})
     run = RunFolder.create(config)
     first = Trainer(run)
     before = {name: value.clone() for name, value in first.algorithm.networks.state_dict().items()}

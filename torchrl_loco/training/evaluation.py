@@ -96,26 +96,33 @@ def poor_return(config: TrainingConfig, summary: dict[str, float], seeds: Collec
         return ""
     return (
         f"This return is poor: the policy shipped for {config.task} earns {reference:.0f}. Returns vary with seeds and "
-        f"processors. Try another seed (--seed {max(config.seed, *seeds, -1) + 1}) or twice the frames "
+        f"processors. Try another seed (--seed {_next_seed(config, seeds)}) or twice the frames "
         f"(--total_frames {2 * config.total_frames}); the learning curve shows whether it was still rising"
     )
 
 
-def fallen_return(config: TrainingConfig, evaluations: Sequence[Mapping[str, float]]) -> str:
-    """Returns a note if the return of a run fell far below its best evaluation, else an empty string.
+def fallen_return(
+    config: TrainingConfig, evaluations: Sequence[Mapping[str, float]], seeds: Collection[int] = ()
+) -> str:
+    """Returns a note if the return of a run fell far below its best evaluation, with what to try, else an empty string.
 
     Args:
         config: settings of the run.
         evaluations: ``frames`` and ``mean`` of each, in their order.
+        seeds: further seeds that were tried.
     """
     best, last = max(evaluations, key=lambda row: row["mean"]), evaluations[-1]
-    if last["mean"] >= FALLEN * best["mean"]:
+    if best["mean"] <= 0 or last["mean"] >= FALLEN * best["mean"]:
         return ""
     return (
-        f"The return fell from {best['mean']:.0f} after {best['frames']:.0f} frames to {last['mean']:.0f} at the end. "
-        f"The policy of the best evaluation was kept. Another seed (--seed {config.seed + 1}) or smaller steps "
-        f"(--lr {config.lr / 2:g}) may prevent it"
+        f"The return fell from {best['mean']:.1f} after {best['frames']:.0f} frames to {last['mean']:.1f} at the end. "
+        f"The policy of the best evaluation was kept. Try another seed (--seed {_next_seed(config, seeds)}) or shorter "
+        f"episodes (--episode_length {max(config.episode_length // 2, 1)})"
     )
+
+
+def _next_seed(config: TrainingConfig, seeds: Collection[int]) -> int:
+    return max(config.seed, *seeds, -1) + 1
 
 
 def record(

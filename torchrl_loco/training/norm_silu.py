@@ -22,7 +22,7 @@ BLOCKS = 264
 """Blocks of the backward kernel, which add up the gradients of weight and bias over their rows: 2 for each of 132
 multiprocessors."""
 WIDEST = 1024
-"""The longest row that registers hold."""
+"""The longest row that was tried."""
 
 PREAMBLE = """
   enum { WIDTH = %(width)d };
@@ -170,8 +170,7 @@ class Layers(nn.Sequential):
         layers = collections.deque(self)
         while layers:
             layer = layers.popleft()
-            silu_follows = bool(layers) and isinstance(layers[0], nn.SiLU)
-            if silu_follows and isinstance(layer, nn.LayerNorm) and has_kernel(x):
+            if layers and isinstance(layers[0], nn.SiLU) and isinstance(layer, nn.LayerNorm) and has_kernel(layer, x):
                 layers.popleft()
                 x = norm_silu(x, layer.weight, layer.bias, layer.eps)
             else:
@@ -179,13 +178,15 @@ class Layers(nn.Sequential):
         return x
 
 
-def has_kernel(x: torch.Tensor) -> bool:
-    """Returns whether the kernel computes rows of a tensor ``(..., width)``."""
-    return x.is_cuda and x.dtype == torch.float32 and x.shape[-1] <= WIDEST and x.shape[-1] % LANES == 0
+def has_kernel(norm: nn.LayerNorm, x: torch.Tensor) -> bool:
+    """Returns whether the kernel computes a layer norm, and the SiLU that follows it, of rows ``(..., width)``."""
+    width = x.shape[-1]
+    fits = x.is_cuda and x.dtype == torch.float32 and width <= WIDEST and width % LANES == 0
+    return fits and norm.normalized_shape == (width,) and norm.bias is not None
 
 
 def norm_silu(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, eps: float) -> torch.Tensor:
-    """Returns ``silu(layer_norm(x) * weight + bias)`` in the shape of ``x``, differentiable once.
+    """Returns ``silu(layer_norm(x) * weight + bias)`` in the shape of ``x``. It has a first derivative only.
 
     Args:
         x: float32, shape ``(..., width)``; on CUDA the width is a multiple of 32, at most 1024.
@@ -199,17 +200,17 @@ def norm_silu(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, eps: fl
 class _NormSiLU(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, eps: float) -> torch.Tensor:
-        rows = x.contiguous().view(-1, x.shape[-1])
-        y, moments = torch.empty_like(rows), rows.new_empty(2 * len(rows))
-        _launch("forward", _lanes(rows) * len(rows), (rows, weight, bias, eps), (y, moments))
+        rows, weight, bias = _rows(x), weight.contiguous(), bias.contiguous()
+        y, moments = rows.new_empty(x.shape), rows.new_empty(2 * len(rows))
+        _launch("forward", _lanes(rows) * len(rows), (rows, weight, bias, eps), (y.view(rows.shape), moments))
         ctx.save_for_backward(rows, weight, bias, moments)
-        return y.view(x.shape)
+        return y
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_y: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None, None]:
         rows, weight, bias, moments = ctx.saved_tensors
-        grad_x, given = torch.empty_like(rows), grad_y.contiguous().view_as(rows)
+        grad_x, given = torch.empty_like(rows), _rows(grad_y)
         threads = BLOCK if rows.is_cuda else 1
         blocks = min(BLOCKS, -(-len(rows) * _lanes(rows) // threads))
         of_parameters = any(ctx.needs_input_grad[1:])
@@ -217,6 +218,12 @@ class _NormSiLU(torch.autograd.Function):
         _launch("backward", threads * blocks, (blocks, rows, weight, bias, moments, given), (grad_x, sums))
         grad_weight, grad_bias = sums.sum(0).chunk(2) if of_parameters else (None, None)
         return grad_x.view(grad_y.shape), grad_weight, grad_bias, None
+
+
+def _rows(x: torch.Tensor) -> torch.Tensor:
+    """Returns a tensor ``(..., width)`` as contiguous rows at an address that can be read 16 bytes at a time."""
+    rows = x.contiguous().view(-1, x.shape[-1])
+    return rows if rows.data_ptr() % 16 == 0 else rows.clone()
 
 
 def _lanes(rows: torch.Tensor) -> int:

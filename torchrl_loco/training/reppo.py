@@ -114,11 +114,14 @@ class REPPO(Algorithm):
 @contextlib.contextmanager
 def frozen(module: nn.Module) -> Iterator[None]:
     """Lets what is computed with a module pass gradients on to its inputs, but not to its parameters."""
-    module.requires_grad_(False)
+    trained = [parameter for parameter in module.parameters() if parameter.requires_grad]
+    for parameter in trained:
+        parameter.requires_grad_(False)
     try:
         yield
     finally:
-        module.requires_grad_(True)
+        for parameter in trained:
+            parameter.requires_grad_(True)
 
 
 class DualVariables(nn.Module):

@@ -198,9 +198,9 @@ class Trainer:
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
         print(f"best policy, in new episodes: {describe(summary)}")
-        for note in (fallen_return(config, self.run.read_evaluations()), poor_return(config, summary, self.run.seeds)):
-            if note:
-                print(note)
+        fallen = fallen_return(config, self.run.read_evaluations(), self.run.seeds)
+        for note in filter(None, (fallen, poor_return(config, summary, self.run.seeds))):
+            print(note)
 
     def save(self) -> None:
         """Writes the checkpoint, from which a run continues exactly; all ranks must call it."""
