@@ -79,7 +79,7 @@ HOPPER: Settings = {**MORE_STEPS, "action_repeat": 2, "reward_scale": 0.5, "epis
 """The reward is sparse: noise held for two frames explores further, and more of a short episode is the fall at its
 start, in which the hopper can still turn to a side from which it gets up."""
 GETTING_UP: Settings = {"episode_length": 100, "gamma": 0.98, "max_value": 75.0}
-"""For tasks whose remaining return is at the start: getting up, or to speed. That is much of a short episode."""
+"""For tasks that lose return mostly while the body gets up or gains speed, which is much of a short episode."""
 QUICK: Settings = {"total_frames": 17_000_000, "eval_interval": 2_000_000}
 """For tasks that are learned in half a minute."""
 TASKS: dict[tuple[str, str], Settings] = {
