@@ -52,11 +52,14 @@ def test_rows_in_any_order_of_memory(device):
 @pytest.mark.parametrize("device", DEVICES)
 def test_tensors_with_gaps_and_at_any_address(device):
     x, weight, bias = inputs((4, 128), device)
-    wide = torch.stack([weight, bias], dim=1)
-    moved = torch.cat([x.new_zeros(1), x.view(-1)])[1:].view(4, 128)
+    moved, moved_weight = (
+        torch.cat([given.new_zeros(1), given.view(-1)])[1:].view(given.shape) for given in (x, weight)
+    )
     assert moved.data_ptr() % 16
+    assert moved_weight.data_ptr() % 16
+    every_second = torch.stack([bias, weight], dim=1)[:, 0]
     expected = reference(x, weight, bias)
-    torch.testing.assert_close(norm_silu(moved, wide[:, 0], wide[:, 1], 1e-5), expected, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(norm_silu(moved, moved_weight, every_second, 1e-5), expected, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.gpu

@@ -200,7 +200,7 @@ def norm_silu(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, eps: fl
 class _NormSiLU(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, eps: float) -> torch.Tensor:
-        rows, weight, bias = _rows(x), weight.contiguous(), bias.contiguous()
+        rows, weight, bias = _aligned(x).view(-1, x.shape[-1]), _aligned(weight), _aligned(bias)
         y, moments = rows.new_empty(x.shape), rows.new_empty(2 * len(rows))
         _launch("forward", _lanes(rows) * len(rows), (rows, weight, bias, eps), (y.view(rows.shape), moments))
         ctx.save_for_backward(rows, weight, bias, moments)
@@ -210,7 +210,7 @@ class _NormSiLU(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_y: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None, None]:
         rows, weight, bias, moments = ctx.saved_tensors
-        grad_x, given = torch.empty_like(rows), _rows(grad_y)
+        grad_x, given = torch.empty_like(rows), _aligned(grad_y).view(rows.shape)
         threads = BLOCK if rows.is_cuda else 1
         blocks = min(BLOCKS, -(-len(rows) * _lanes(rows) // threads))
         of_parameters = any(ctx.needs_input_grad[1:])
@@ -220,10 +220,10 @@ class _NormSiLU(torch.autograd.Function):
         return grad_x.view(grad_y.shape), grad_weight, grad_bias, None
 
 
-def _rows(x: torch.Tensor) -> torch.Tensor:
-    """Returns a tensor ``(..., width)`` as contiguous rows at an address that can be read 16 bytes at a time."""
-    rows = x.contiguous().view(-1, x.shape[-1])
-    return rows if rows.data_ptr() % 16 == 0 else rows.clone()
+def _aligned(x: torch.Tensor) -> torch.Tensor:
+    """Returns a contiguous tensor at an address from which 16 bytes can be read at a time; a copy only if needed."""
+    x = x.contiguous()
+    return x if x.data_ptr() % 16 == 0 else x.clone()
 
 
 def _lanes(rows: torch.Tensor) -> int:
