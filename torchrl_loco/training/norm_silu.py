@@ -26,10 +26,13 @@ WIDEST = 1024
 
 PREAMBLE = """
   enum { WIDTH = %(width)d };
+#undef UNROLL
 #ifdef __CUDA_ARCH__
   enum { LANES = 32, WARPS = %(warps)d };
+#define UNROLL _Pragma("unroll")
 #else
   enum { LANES = 1, WARPS = 1 };
+#define UNROLL  // a row in one thread would take long to compile
 #endif
   enum { SLOTS = WIDTH / LANES, PACKED = LANES == 32 && WIDTH %% 128 == 0 };
   struct Lane {
@@ -40,34 +43,29 @@ PREAMBLE = """
     static CUDA_CALLABLE void read(const float* row, int lane, float* values) {
 #ifdef __CUDA_ARCH__
       if (PACKED) {
-#pragma unroll
-        for (int i = 0; i < SLOTS / 4; ++i) {
+        UNROLL for (int i = 0; i < SLOTS / 4; ++i) {
           const float4 four = reinterpret_cast<const float4*>(row)[i * 32 + lane];
           values[4 * i] = four.x, values[4 * i + 1] = four.y, values[4 * i + 2] = four.z, values[4 * i + 3] = four.w;
         }
         return;
       }
 #endif
-#pragma unroll
-      for (int slot = 0; slot < SLOTS; ++slot) values[slot] = row[column(lane, slot)];
+      UNROLL for (int slot = 0; slot < SLOTS; ++slot) values[slot] = row[column(lane, slot)];
     }
     static CUDA_CALLABLE void write(float* row, int lane, const float* values) {
 #ifdef __CUDA_ARCH__
       if (PACKED) {
-#pragma unroll
-        for (int i = 0; i < SLOTS / 4; ++i)
+        UNROLL for (int i = 0; i < SLOTS / 4; ++i)
           reinterpret_cast<float4*>(row)[i * 32 + lane] =
               make_float4(values[4 * i], values[4 * i + 1], values[4 * i + 2], values[4 * i + 3]);
         return;
       }
 #endif
-#pragma unroll
-      for (int slot = 0; slot < SLOTS; ++slot) row[column(lane, slot)] = values[slot];
+      UNROLL for (int slot = 0; slot < SLOTS; ++slot) row[column(lane, slot)] = values[slot];
     }
     static CUDA_CALLABLE float sum(float x) {
 #ifdef __CUDA_ARCH__
-#pragma unroll
-      for (int o = 16; o; o >>= 1) x += __shfl_xor_sync(~0u, x, o);
+      UNROLL for (int o = 16; o; o >>= 1) x += __shfl_xor_sync(~0u, x, o);
 #endif
       return x;
     }
@@ -87,14 +85,11 @@ FORWARD = """
   Lane::read(weight.data, lane, w);
   Lane::read(bias.data, lane, b);
   float mean = 0.0f, var = 0.0f;
-#pragma unroll
-  for (int slot = 0; slot < SLOTS; ++slot) mean += values[slot];
+  UNROLL for (int slot = 0; slot < SLOTS; ++slot) mean += values[slot];
   mean = Lane::sum(mean) / WIDTH;
-#pragma unroll
-  for (int slot = 0; slot < SLOTS; ++slot) var += (values[slot] - mean) * (values[slot] - mean);
+  UNROLL for (int slot = 0; slot < SLOTS; ++slot) var += (values[slot] - mean) * (values[slot] - mean);
   const float scale = 1.0f / sqrtf(Lane::sum(var) / WIDTH + eps);
-#pragma unroll
-  for (int slot = 0; slot < SLOTS; ++slot) {
+  UNROLL for (int slot = 0; slot < SLOTS; ++slot) {
     const float a = (values[slot] - mean) * scale * w[slot] + b[slot];
     values[slot] = a * Lane::sigmoid(a);
   }
@@ -107,8 +102,7 @@ FORWARD = """
 
 BACKWARD = """
   float weight_sum[SLOTS], bias_sum[SLOTS];
-#pragma unroll
-  for (int slot = 0; slot < SLOTS; ++slot) weight_sum[slot] = bias_sum[slot] = 0.0f;
+  UNROLL for (int slot = 0; slot < SLOTS; ++slot) weight_sum[slot] = bias_sum[slot] = 0.0f;
   const int rows = x.shape[0], lane = thread % LANES, group = thread / LANES;
   for (int row = group; row < rows; row += blocks * WARPS) {
     float normed[SLOTS], grad[SLOTS];
@@ -116,8 +110,7 @@ BACKWARD = """
     Lane::read(&grad_y.data[size_t(row) * WIDTH], lane, grad);
     const float shift = moments.data[2 * row], scale = moments.data[2 * row + 1];
     float mean = 0.0f, along = 0.0f;
-#pragma unroll
-    for (int slot = 0; slot < SLOTS; ++slot) {
+    UNROLL for (int slot = 0; slot < SLOTS; ++slot) {
       const int column = Lane::column(lane, slot);
       const float w = weight.data[column];
       normed[slot] = (normed[slot] - shift) * scale;
@@ -132,8 +125,7 @@ BACKWARD = """
     }
     mean = Lane::sum(mean) / WIDTH;
     along = Lane::sum(along) / WIDTH;
-#pragma unroll
-    for (int slot = 0; slot < SLOTS; ++slot) grad[slot] = scale * (grad[slot] - mean - normed[slot] * along);
+    UNROLL for (int slot = 0; slot < SLOTS; ++slot) grad[slot] = scale * (grad[slot] - mean - normed[slot] * along);
     Lane::write(&grad_x.data[size_t(row) * WIDTH], lane, grad);
   }
   if (sums.shape[0] == 0) return;  // they are not asked for
@@ -142,8 +134,7 @@ BACKWARD = """
   __shared__ float shared[2 * WIDTH];
   for (int warp = 0; warp < WARPS; ++warp) {  // one after the other, so that the sum has one order
     if (group % WARPS == warp) {
-#pragma unroll
-      for (int slot = 0; slot < SLOTS; ++slot) {
+      UNROLL for (int slot = 0; slot < SLOTS; ++slot) {
         const int column = Lane::column(lane, slot);
         shared[column] = weight_sum[slot] + (warp == 0 ? 0.0f : shared[column]);
         shared[WIDTH + column] = bias_sum[slot] + (warp == 0 ? 0.0f : shared[WIDTH + column]);
