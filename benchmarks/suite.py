@@ -34,7 +34,7 @@ def suite(tasks: Sequence[str], episodes: int, device: torch.device, path: Path 
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder, settings_for_small_networks():
         for task in until_interrupted(tasks, "suite"):
-            policy, program = load_policy(task, "cpu", PROTOCOL), Path(folder, f"{task}.pt2")
+            policy, program = load_policy(task, device, PROTOCOL), Path(folder, f"{task}.pt2")
             export_policy(policy, program)
             held = policy.info["action_repeat"]
             theirs: Row = {"task": task, "where": "dm_control", "episodes": episodes}
@@ -45,6 +45,5 @@ def suite(tasks: Sequence[str], episodes: int, device: torch.device, path: Path 
             except MeasurementError as error:
                 theirs["error"] = str(error)
             evaluator = Evaluator(task, episodes, str(device), SEED, PROTOCOL, held)
-            ours = summarize(evaluator(load_policy(task, device, PROTOCOL)))
-            rows += [theirs, {"task": task, "where": "torchrl_loco", **ours}]
+            rows += [theirs, {"task": task, "where": "torchrl_loco", **summarize(evaluator(policy))}]
     return rows

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 from torch import nn
 
-from torchrl_loco.sim.graph import current_stream, joined_to_torch, torch_is_recording
+from torchrl_loco.sim import current_stream, joined_to_torch, torch_is_recording
 
 LANES = 32
 """Threads that share a row on CUDA; they hold it in registers. On the CPU one does."""
@@ -80,6 +80,7 @@ PREAMBLE = """
 """
 
 FORWARD = """
+  const int lane = thread % LANES, row = thread / LANES;
   float values[SLOTS], w[SLOTS], b[SLOTS];
   Lane::read(&x.data[size_t(row) * WIDTH], lane, values);
   Lane::read(weight.data, lane, w);
@@ -244,7 +245,7 @@ def _kernels(width: int) -> dict[str, wp.Kernel]:
     """Returns the kernels for rows of a width."""
     preamble = PREAMBLE % {"width": width, "warps": BLOCK // LANES}
 
-    @wp.func_native(f"{preamble}const int lane = thread % LANES, row = thread / LANES;{FORWARD}")
+    @wp.func_native(preamble + FORWARD)
     def forward_row(
         thread: int,
         x: wp.array2d[float],
