@@ -56,6 +56,7 @@ def test_wrong_settings():
         ({"target_entropy": float("nan")}, "target_entropy must lie in"),
         ({"aux_coeff": -1.0}, "aux_coeff must lie in [0, inf)"),
         ({"init_temperature": 1e-5}, "must not be below min_temperature"),
+        ({"min_kl_weight": 0.02}, "init_kl_weight (0.01) must not be below min_kl_weight (0.02)"),
     ]
     for overrides, message in cases_of_reppo:
         with pytest.raises(ValueError, match=re.escape(message)):

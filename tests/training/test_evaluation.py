@@ -105,6 +105,15 @@ def test_a_fall_below_the_best_evaluation_is_said(last, falls):
     assert ("--seed 10" in note) == ("--episode_length 150" in note) == falls
 
 
+def test_a_run_of_reppo_that_fell_is_told_of_the_setting_that_steadies_it():
+    rows = [{"frames": 0, "mean": 900.0}, {"frames": 10, "mean": 300.0}]
+    note = fallen_return(preset("walker_stand", "cpu", "reppo"), rows)
+    assert "--init_kl_weight 0.02 --min_kl_weight 0.02" in note
+    assert "--episode_length" not in note
+    steady = preset("walker_stand", "cpu", "reppo", init_kl_weight=0.02, min_kl_weight=0.02)
+    assert "--episode_length 500" in fallen_return(steady, rows)
+
+
 def test_returns_that_are_never_positive_do_not_fall():
     rows = [{"frames": i, "mean": mean} for i, mean in enumerate([-10.0, -30.0])]
     assert fallen_return(preset("walker_stand", "cpu"), rows) == ""

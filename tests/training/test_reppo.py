@@ -174,8 +174,10 @@ def test_a_temperature_that_has_fallen_rises_again():
     assert reppo.dual.temperature > 1e-8 * math.exp(0.8 * 100 * 1e-2)
 
 
-def test_temperature_does_not_fall_below_its_minimum():
-    floor = {"init_temperature": 0.02, "min_temperature": 0.02}
-    reppo = made(num_envs=16, num_steps=8, minibatch_size=128, target_entropy=-50.0, **floor)
+def test_weights_do_not_fall_below_their_minima():
+    """Both would: there is more entropy than the target, and less divergence than the bound."""
+    floors = {"init_temperature": 0.02, "min_temperature": 0.02, "init_kl_weight": 0.03, "min_kl_weight": 0.03}
+    reppo = made(num_envs=16, num_steps=8, minibatch_size=128, target_entropy=-50.0, kl_bound=50.0, **floors)
     reppo.update(collected(reppo, 16), progress=0.0)
-    torch.testing.assert_close(reppo.dual.temperature.detach(), torch.tensor(0.02), rtol=1e-6, atol=0)
+    weights = torch.stack([reppo.dual.temperature, reppo.dual.kl_weight]).detach()
+    torch.testing.assert_close(weights, torch.tensor([0.02, 0.03]), rtol=1e-6, atol=0)

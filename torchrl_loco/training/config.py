@@ -179,6 +179,9 @@ class REPPOConfig(TrainingConfig):
     """Bound of the KL divergence from the policy that collected the batch, in one state (nats)."""
     init_kl_weight: float = 0.01
     """Weight of the divergence at the start (its Lagrange multiplier, which is learned)."""
+    min_kl_weight: float = 1e-9
+    """Lower bound of the divergence's weight, which falls with the slope of the value. A much smaller weight cannot
+    hold the policy when that slope suddenly grows."""
     target_entropy: float = -0.5
     """Target of the policy's entropy for each entry of an action (nats)."""
     init_temperature: float = 0.01
@@ -194,10 +197,10 @@ class REPPOConfig(TrainingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.init_temperature < self.min_temperature:
-            raise ValueError(
-                f"init_temperature ({self.init_temperature}) must not be below min_temperature ({self.min_temperature})"
-            )
+        for name in ("temperature", "kl_weight"):
+            first, least = getattr(self, f"init_{name}"), getattr(self, f"min_{name}")
+            if first < least:
+                raise ValueError(f"init_{name} ({first}) must not be below min_{name} ({least})")
 
 
 CONFIGS: dict[str, type[TrainingConfig]] = {config.algorithm: config for config in (PPOConfig, REPPOConfig)}

@@ -18,7 +18,8 @@ from torchrl_loco.envs import LocoEnv
 from torchrl_loco.policy import load_policy, shipped_policies
 from torchrl_loco.registry import make
 from torchrl_loco.training.algorithm import settings_for_small_networks
-from torchrl_loco.training.config import TrainingConfig
+from torchrl_loco.training.config import REPPOConfig, TrainingConfig
+from torchrl_loco.training.presets import STEADY
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -114,10 +115,14 @@ def fallen_return(
     best, last = max(evaluations, key=lambda row: row["mean"]), evaluations[-1]
     if best["mean"] <= 0 or last["mean"] >= FALLEN * best["mean"]:
         return ""
+    remedy = f"shorter episodes (--episode_length {max(config.episode_length // 2, 1)})"
+    if isinstance(config, REPPOConfig) and config.min_kl_weight < STEADY["min_kl_weight"]:
+        options = " ".join(f"--{name} {value}" for name, value in STEADY.items())
+        remedy = f"to hold the policy nearer to the one that collected the batch ({options})"
     return (
         f"The return fell from {best['mean']:.1f} after {best['frames']:.0f} frames to {last['mean']:.1f} at the end. "
-        f"The policy of the best evaluation was kept. Try another seed (--seed {_next_seed(config, seeds)}) or shorter "
-        f"episodes (--episode_length {max(config.episode_length // 2, 1)})"
+        "The policy of the best evaluation was kept. "
+        f"Try another seed (--seed {_next_seed(config, seeds)}), or {remedy}"
     )
 
 

@@ -132,11 +132,13 @@ class DualVariables(nn.Module):
         self.log_temperature = nn.Parameter(torch.tensor(math.log(config.init_temperature)))
         self.log_kl_weight = nn.Parameter(torch.tensor(math.log(config.init_kl_weight)))
         self._min_log_temperature = math.log(config.min_temperature)
+        self._min_log_kl_weight = math.log(config.min_kl_weight)
 
     @torch.no_grad()
     def clamp_(self) -> None:
-        """Keeps the temperature at or above its minimum."""
+        """Keeps the weights at or above their minima."""
         self.log_temperature.clamp_(min=self._min_log_temperature)
+        self.log_kl_weight.clamp_(min=self._min_log_kl_weight)
 
     @property
     def temperature(self) -> torch.Tensor:
