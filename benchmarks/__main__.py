@@ -68,7 +68,9 @@ several.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(P
 several.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
 several.add_argument("--minutes", type=float, help="time after which all must be written, from the process's start on")
 several.add_argument(
-    "--devices", nargs="+", help="cuda:0, cuda:1, ..., cpu: each trains a job at a time; default: all GPUs"
+    "--devices",
+    nargs="+",
+    help="cuda:0, cuda:1, ..., cpu: each trains a job at a time, one that is named twice two; default: all GPUs",
 )
 several.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of train, for all jobs")
 several.add_argument("--pack", type=Path, metavar="FILE.tgz", help="write the folder as an archive every minute, too")

@@ -61,7 +61,8 @@ def campaign(
         seeds: the seeds; every task is trained with the first one before any with the second.
         settings: settings of the jobs beside those of their presets, by name.
         devices: of :func:`available_devices`, one for each job that is trained at a time; ``None`` takes all GPUs, or
-            the CPU if there are none.
+            the CPU if there are none. A device that is named twice trains two jobs at a time: together they end sooner,
+            because one computes while the other starts, but their times are no longer those of a job alone.
         minutes: time from the start of the process until all is written; ``None`` for no limit.
         archive: where the folder is packed every minute and at the end.
 
@@ -84,7 +85,10 @@ def campaign(
     jobs = [Job(task, protocol, seed) for seed in seeds for protocol in protocols for task in tasks]
     with CampaignFolder(path) as folder:
         what_is_missing = Campaign(folder, jobs, settings)
-        folder.add_about({**circumstances(torch.device(devices[0])), "devices": len(devices)})
+        about = {**circumstances(torch.device(devices[0])), "devices": len(set(devices))}
+        if len(set(devices)) < len(devices):
+            about["note"] = "Jobs shared a device: their times are not those of a job alone."
+        folder.add_about(about)
         what_is_missing.run(devices, end, archive)
         counts = collections.Counter(folder.record(job).status for job in jobs)
     print(f"{len(jobs)} jobs: {', '.join(f'{count} {status}' for status, count in counts.items())}; in {path}")

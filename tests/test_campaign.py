@@ -98,9 +98,30 @@ def test_devices_work_side_by_side_on_one_job_each(tmp_path, process, monkeypatc
     for device in ("4", "9"):
         assert [what for at, what, *_ in lines if at == device] == ["begins", "ends"] * 2
     assert {line[3] for line in lines} == {"0", "1", "2", "3"}
+    assert json.loads((tmp_path / "about.json").read_text()) == [{"devices": 2}]
     assert campaign.child_environment("cpu")["CUDA_VISIBLE_DEVICES"] == ""
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     assert campaign.child_environment("cuda:3")["CUDA_VISIBLE_DEVICES"] == "3"
+
+
+MEET = """
+import pathlib, sys, time
+_, seed, out = sys.argv[1:]
+together = pathlib.Path(out).parents[1]
+(together / f"here-{seed}").touch()
+deadline = time.monotonic() + 30
+while len(list(together.glob("here-*"))) < 2 and time.monotonic() < deadline:
+    time.sleep(0.02)
+sys.exit(f"{len(list(together.glob('here-*')))} met")
+"""
+
+
+def test_a_device_that_is_named_twice_trains_two_jobs_at_a_time_and_that_is_noted(tmp_path, process):
+    process(MEET)
+    assert [row["error"] for row in run(tmp_path, seeds=[0, 1], devices=["cpu", "cpu"])] == ["2 met", "2 met"]
+    (about,) = json.loads((tmp_path / "about.json").read_text())
+    assert about["devices"] == 1
+    assert "shared a device" in about["note"]
 
 
 WAIT = """
@@ -335,7 +356,7 @@ def results(tmp_path):
     ]
     write(folder / "evaluations.csv", TABLES["evaluations.csv"], evaluations)
     about = {"command": "python -m benchmarks campaign", "date": "2027-01-02", "device": "toaster", "devices": 2}
-    (folder / "about.json").write_text(json.dumps([about]))
+    (folder / "about.json").write_text(json.dumps([about, {**about, "note": "Hot."}]))
     return folder
 
 
@@ -362,6 +383,7 @@ def test_a_campaign_on_the_page(results, tmp_path):
     assert row in text
     assert "| snail_crawl | dm_control | 1 | 12.5 |  |" in text
     assert "`python -m benchmarks campaign`: 2 x toaster, 2027-01-02" in text
+    assert text.count("Hot.") == 1
     picture = "pictures/2027-01-02-toaster-campaign.png"
     assert f"]({picture})" in text
     assert (tmp_path / "docs" / picture).stat().st_size > 10_000

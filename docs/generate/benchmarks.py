@@ -59,9 +59,10 @@ def _campaign(folder: Path, root: Path, picture: Path) -> str:
     files = sorted(path for path in folder.iterdir() if path.is_file())
     links = ", ".join(f"[{path.name}](../{path.relative_to(root).as_posix()})" for path in files)
     how = "".join(f"`{call['command']}`: {call['devices']} x {call['device']}, {call['date']}\n\n" for call in calls)
+    notes = "".join(f"{note}\n\n" for note in dict.fromkeys(call["note"] for call in calls if "note" in call))
     return (
         "### campaign\n\nThe best policy of each seed in new episodes, beside marks and published returns:\n\n"
-        f"{table(tuple(COLUMNS), lines)}\n"
+        f"{notes}{table(tuple(COLUMNS), lines)}\n"
         f"![Return against training time]({picture.relative_to(root / 'docs').as_posix()})\n\n"
         f"{how}All numbers: {links}.\n"
     )

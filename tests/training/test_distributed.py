@@ -13,6 +13,8 @@ import torchrl_loco
 from torchrl_loco import cli
 from torchrl_loco.training import RunFolder, Trainer, distributed
 
+pytestmark = pytest.mark.slow  # several processes train
+
 
 @pytest.fixture(scope="module")
 def ranks(tmp_path_factory):
