@@ -101,8 +101,8 @@ def _about_policy(name: str, protocol: str, info: dict[str, Any]) -> str:
         f"protocol `{protocol}` (mean and standard deviation over {info['episodes']} episodes of "
         f"{env_class(name).defaults.episode_length} steps that were not used to select it; worst {info['min']:.1f}, "
         f"best {info['max']:.1f}). It was trained by {info['algorithm'].upper()} for "
-        f"{info['frames'] / 1e6:.0f} million frames, {info['seconds']:.0f} s on one {info['trained_on']}, with "
-        f"{info['num_envs']} worlds and seed {info['seed']}.\n"
+        f"{info['frames'] / 1e6:.0f} million frames on one {info['trained_on']}, with {info['num_envs']} worlds and "
+        f"seed {info['seed']}.\n"
     )
 
 

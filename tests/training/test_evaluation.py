@@ -110,6 +110,8 @@ def test_a_run_of_reppo_that_fell_is_told_of_the_setting_that_steadies_it():
     note = fallen_return(preset("walker_stand", "cpu", "reppo"), rows)
     assert "--init_kl_weight 0.02 --min_kl_weight 0.02" in note
     assert "--episode_length" not in note
+    heavy = preset("walker_stand", "cpu", "reppo", init_kl_weight=0.05)
+    assert "(--min_kl_weight 0.02)" in fallen_return(heavy, rows)
     steady = preset("walker_stand", "cpu", "reppo", init_kl_weight=0.02, min_kl_weight=0.02)
     assert "--episode_length 500" in fallen_return(steady, rows)
 

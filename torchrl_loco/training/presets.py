@@ -81,8 +81,8 @@ start, in which the hopper can still turn to a side from which it gets up."""
 GETTING_UP: Settings = {"episode_length": 100, "gamma": 0.98, "max_value": 75.0}
 """For tasks that lose return mostly while the body gets up or gains speed, which is much of a short episode."""
 STEADY: Settings = {"init_kl_weight": 0.02, "min_kl_weight": 0.02}
-"""For tasks whose return comes so near the maximum that the divergence's weight falls far: runs of humanoid_walk broke
-down without this lower bound."""
+"""A lower bound of the divergence's weight, which falls far near the best return: without one, three of six runs of
+humanoid_walk broke down."""
 TASKS: dict[tuple[str, str], Settings] = {
     ("reppo", "walker_stand"): {**MORE_STEPS, **GETTING_UP, "total_frames": 34_000_000, "epochs": 2},
     ("reppo", "walker_walk"): {**MORE_STEPS, **GETTING_UP, "total_frames": 19_000_000, "eval_interval": 2_000_000},
