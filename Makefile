@@ -8,7 +8,7 @@ PYTEST_ARGS ?= --numprocesses auto --dist loadfile
 NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
 PYTEST := $(BIN)/python -m pytest $(PYTEST_ARGS)
 
-.PHONY: help train test test-fast test-all tests tests-ci lint format docs notebooks dist clean
+.PHONY: help train test test-fast test-all tests tests-ci lint format docs runners notebooks dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*##/\t/' | expand -t 12
@@ -46,6 +46,9 @@ dist: $(VENV)/installed  ## wheel and sdist, checked and tried out, into dist/
 
 docs: $(VENV)/installed  ## the site, into docs/_build/html; warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
+
+runners: $(VENV)/installed  ## draw the picture of the README anew, with the shipped policies
+	PYTHONPATH=docs $(BIN)/python -m generate.runners
 
 notebooks: $(VENV)/installed  ## run the notebooks and store their output; NOTEBOOKS=notebooks/rewards.ipynb for one
 	$(BIN)/python notebooks/execute.py $(NOTEBOOKS)

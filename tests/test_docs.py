@@ -8,10 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import imageio.v3 as imageio
 import mujoco
 import numpy as np
 import pytest
-from generate import benchmarks, bodies, rewards
+from generate import benchmarks, bodies, rewards, runners
 from oracle import tolerance
 from sybil import Example, Sybil
 from sybil.evaluators.python import PythonEvaluator
@@ -143,6 +144,19 @@ def test_new_results_appear_by_themselves(tmp_path):
     text = benchmarks.all_results(folder.parent, tmp_path / "docs")
     assert "## toaster, 2027-01-02" in text
     assert "| walker_walk | 12.5 |" in text
+
+
+def test_the_picture_of_the_readme_shows_moments_of_tasks_in_rows(tmp_path):
+    runners.draw(tmp_path / "rows.png", (("walker_stand", "walker_walk"), ("cheetah_run", "walker_stand")))
+    seen = imageio.imread(tmp_path / "rows.png").astype(int)
+    height, width = runners.HEIGHT, runners.WIDTH
+    strip = 4 * width + 3 * 4
+    assert seen.shape == (height + 12 + height, strip + 12 + strip, 3)
+    top, white, bottom = np.split(seen, [height, height + 12])
+    assert (white == 255).all()
+    assert (top[:, :strip] == bottom[:, strip + 12 :]).all()  # the same task
+    frames = [top[:, start : start + width] for start in range(0, strip, width + 4)]
+    assert all((frame != frames[0]).any() for frame in frames[1:])  # it moves
 
 
 # The site.

@@ -106,20 +106,40 @@ def _about_policy(name: str, protocol: str, info: dict[str, Any]) -> str:
     )
 
 
-@torch.no_grad()
 def picture(name: str, path: Path) -> None:
-    """Renders a few moments of an episode under the task's policy, or the start alone if there is none."""
+    """Draws a few moments of an episode under the task's policy, or the start alone if there is none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    imageio.imwrite(path, moments(name, WIDTH, HEIGHT).numpy())
+
+
+@torch.no_grad()
+def moments(name: str, width: int, height: int) -> torch.Tensor:
+    """Returns what :func:`picture` draws, uint8, ``(height, all frames' widths and gaps, 3)``.
+
+    Args:
+        name: id of the task.
+        width: width of a frame in pixels.
+        height: height of a frame in pixels.
+    """
     env = torchrl_loco.make(name, num_envs=1, device="cpu", seed=2)
-    info = _info(name)
+    policy = torchrl_loco.load_policy(name, device="cpu") if _info(name) else None
     td, frames = env.reset(), []
-    policy = torchrl_loco.load_policy(name, device="cpu") if info else None
     for step in range(MOMENTS[-1] + 1 if policy else 1):
         if step in MOMENTS:
-            pixels = env.render("side", 2 * WIDTH, 2 * HEIGHT)[0].float()
-            frames.append(pixels.view(HEIGHT, 2, WIDTH, 2, 3).mean(dim=(1, 3)))  # smooth edges
+            pixels = env.render("side", 2 * width, 2 * height)[0].float()
+            frames.append(pixels.view(height, 2, width, 2, 3).mean(dim=(1, 3)))  # smooth edges
         if policy:
             td = step_mdp(env.step(policy(td)))
-    gap = torch.full((HEIGHT, 4, 3), 255.0)
-    strip = torch.cat([piece for frame in frames for piece in (gap, frame)][1:], dim=1)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    imageio.imwrite(path, strip.round().to(torch.uint8).numpy())
+    return joined(frames, dim=1, gap=4)
+
+
+def joined(pieces: list[torch.Tensor], dim: int, gap: int) -> torch.Tensor:
+    """Returns pictures of shape ``(height, width, 3)`` side by side (dim 1) or one above the other (dim 0), in uint8.
+
+    Between two of them lies a white gap of as many pixels.
+    """
+    size = list(pieces[0].shape)
+    size[dim] = gap
+    white = torch.full(size, 255.0)
+    all_pieces = [part for piece in pieces for part in (white, piece.float())][1:]
+    return torch.cat(all_pieces, dim=dim).round().to(torch.uint8)
