@@ -183,7 +183,7 @@ def compare(xml, count=STATES):
 
 
 @pytest.mark.parametrize("traced_dofs", [31, 0], ids=["traced", "lanes"])
-@pytest.mark.parametrize("count", [10, pytest.param(200, marks=pytest.mark.ci)])
+@pytest.mark.parametrize("count", [pytest.param(10, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.ci)])
 def test_a_step_agrees_with_c_mujoco(traced_dofs, count, monkeypatch):
     """Both forms of the compiled step, which one takes small bodies and the other large ones, step any model."""
     monkeypatch.setattr(step, "TRACED_DOFS", traced_dofs)

@@ -40,6 +40,7 @@ def bug():
     raise ArithmeticError("a bug")
 
 
+@pytest.mark.slow
 def test_each_seed_is_as_if_it_were_alone(tmp_path, capsys):
     group = group_of(tmp_path / "group", 3, 1)
     assert group.train() == {}
@@ -112,6 +113,7 @@ def test_a_seed_that_fails_loses_no_other(tmp_path, monkeypatch, capsys):
     assert "is complete" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_ctrl_c_stops_all_seeds_and_resume_continues_them(tmp_path, monkeypatch, capsys):
     """The seed that was stopped continues from its checkpoint, in its own folder."""
     group = group_of(tmp_path, 0, 1, 2)
@@ -130,6 +132,7 @@ def test_ctrl_c_stops_all_seeds_and_resume_continues_them(tmp_path, monkeypatch,
     assert content(runs[0]) == first
 
 
+@pytest.mark.slow
 def test_poor_seeds_are_named(tmp_path, monkeypatch, capsys):
     """And no seed is suggested that is one of them."""
     means = iter([5.0, 950.0, 5.0, 10.0, 5.0, 970.0])
