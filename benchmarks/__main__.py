@@ -70,7 +70,7 @@ several.add_argument("--minutes", type=float, help="time after which all must be
 several.add_argument(
     "--devices",
     nargs="+",
-    help="cuda:0, cuda:1, ..., cpu: each trains a job at a time, one that is named twice two; default: all GPUs",
+    help="cuda:0, cuda:1, ..., cpu: each trains one job at a time; name it twice for two; default: all GPUs",
 )
 several.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of train, for all jobs")
 several.add_argument("--pack", type=Path, metavar="FILE.tgz", help="write the folder as an archive every minute, too")
