@@ -85,8 +85,9 @@ def campaign(
     jobs = [Job(task, protocol, seed) for seed in seeds for protocol in protocols for task in tasks]
     with CampaignFolder(path) as folder:
         what_is_missing = Campaign(folder, jobs, settings)
-        about = {**circumstances(torch.device(devices[0])), "devices": len(set(devices))}
-        if len(set(devices)) < len(devices):
+        distinct = len(set(devices))
+        about = {**circumstances(torch.device(devices[0])), "devices": distinct}
+        if distinct < len(devices):
             about["note"] = "Jobs shared a device: their times are not those of a job alone."
         folder.add_about(about)
         what_is_missing.run(devices, end, archive)

@@ -114,12 +114,12 @@ def picture(name: str, path: Path) -> None:
 
 @torch.no_grad()
 def moments(name: str, width: int, height: int) -> torch.Tensor:
-    """Returns what :func:`picture` draws, uint8, ``(height, all frames' widths and gaps, 3)``.
+    """Returns frames of a task side by side, in uint8; how many depends on whether it has a policy.
 
     Args:
         name: id of the task.
         width: width of a frame in pixels.
-        height: height of a frame in pixels.
+        height: height of the frames, and so of the picture, in pixels.
     """
     env = torchrl_loco.make(name, num_envs=1, device="cpu", seed=2)
     policy = torchrl_loco.load_policy(name, device="cpu") if _info(name) else None

@@ -189,6 +189,7 @@ def test_the_best_policy_is_kept(tmp_path, monkeypatch, capsys):
     assert "best policy, in new episodes: return 25.0" in out
     assert "The return fell from 30.0 after 512 frames to 20.0 at the end" in out
     assert "This return is poor: the policy shipped for walker_stand earns 9" in out
+    assert "--seed 1" in out
 
 
 @pytest.mark.slow
