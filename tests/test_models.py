@@ -89,6 +89,7 @@ def test_a_model_that_would_go_wrong_in_silence_is_refused():
         ({"actuator": '<motor name="a" joint="leg"/>'}, "every actuator needs a ctrlrange"),
         ({"actuator": MOTOR.replace("/>", ' ctrllimited="false"/>')}, "must be clipped"),
         ({"option": clampctrl}, "must be clipped"),
+        ({"option": '<option actuatorgroupdisable="3"/>', "actuator": MOTOR.replace("/>", ' group="3"/>')}, "disabled"),
         ({"actuator": MOTOR.replace("/>", ' delay="0.1" nsample="4"/>')}, "delays"),
         ({"sensor": from_camera}, "sensor 'seen' is not evaluated"),
         ({"sensor": '<framepos name="place" objtype="body" objname="ant"/>'}, "sensor 'place' is not evaluated"),

@@ -18,10 +18,13 @@ BODY = '<body name="arm"><joint name="elbow" damping="1"/><geom name="hand" type
 BALL = '<body name="ball" pos="1 0 1"><freejoint name="loose"/><geom name="marble" size="0.1"/></body>'
 MOTOR = '<motor name="pull" joint="elbow"/>'
 SENSOR = '<subtreelinvel name="speed" body="arm"/>'
+HILLS = '<geom type="hfield" hfield="hills"/>'
+TOUCH = "".join(f'<touch name="touch{i}" site="sole"/>' for i in range(36))
 MODEL = f"""
 <mujoco>
   <option/>
-  <worldbody><geom type="plane" size="5 5 0.1"/>{BODY}{BALL}</worldbody>
+  <asset><hfield name="hills" nrow="2" ncol="2" size="1 1 1 1"/></asset>
+  <worldbody><geom type="plane" size="5 5 0.1"/><site name="sole"/>{BODY}{BALL}</worldbody>
   <actuator>{MOTOR}</actuator>
   <sensor>{SENSOR}</sensor>
 </mujoco>
@@ -34,6 +37,9 @@ OTHERS = [
     ("<option/>", '<option noslip_iterations="2"/>', "noslip iterations"),
     ("<option/>", '<option viscosity="1"/>', "forces of a fluid"),
     ("<option/>", '<option><flag gravity="disable"/></option>', "disabled gravity"),
+    ("<option/>", '<option><flag warmstart="disable"/></option>', "disabled warmstart"),
+    ('<geom type="plane" size="5 5 0.1"/>', HILLS, "contacts of hfield and capsule, hfield and sphere"),
+    (SENSOR, f"{SENSOR}{TOUCH}", "'touch31', 'touch32', 'touch33' and 2 more: more than 31 sensors of touch"),
     ("<option/>", '<option><flag energy="enable"/></option>', "enabled energy"),
     ("</worldbody>", '</worldbody><tendon><fixed><joint joint="elbow" coef="1"/></fixed></tendon>', "tendons"),
     ("</worldbody>", '</worldbody><equality><weld body1="arm"/></equality>', "equality constraints"),
@@ -97,7 +103,7 @@ def test_a_model_needs_a_joint():
 def test_what_changes_nothing_is_supported():
     for old, new in [
         ("", ""),
-        ("<option/>", '<option><flag eulerdamp="disable" filterparent="disable" warmstart="disable"/></option>'),
+        ("<option/>", '<option><flag eulerdamp="disable" filterparent="disable"/></option>'),
         ('type="capsule" size="0.1 0.2"', 'type="box" size="0.1 0.1 0.1" contype="0" conaffinity="0"'),
     ]:
         assert unsupported(mujoco.MjModel.from_xml_string(MODEL.replace(old, new))) == []
@@ -234,6 +240,27 @@ def test_a_free_body_keeps_its_momentum(form):
     np.testing.assert_allclose(end.subtree_linvel[1], start.subtree_linvel[1], atol=1e-3)
     np.testing.assert_allclose(end.subtree_angmom[1], start.subtree_angmom[1], atol=1e-3)
     np.testing.assert_allclose(sim.data.sensordata.numpy()[0], end.subtree_linvel[1], atol=1e-5)
+
+
+def test_more_pairs_of_geoms_than_a_byte_counts(form):
+    """Of 4 rows of 8 balls the last two collide."""
+    balls = "".join(f'<geom size="0.04" pos="{0.1 * i} 0 0"/>' for i in range(8))
+    rows = [
+        f'<body name="{name}" pos="0 {2 * i} 2"><joint type="slide" axis="0 1 0"/>{balls}</body>'
+        for i, name in enumerate(("root", "b", "c", "d"))
+    ]
+    model = scene(*rows, gravity="0 0 0")
+    assert len(collision.pairs(model)) == 6 * 64
+    sim = simulated(model, ctrl_dt=0.005, sim_dt=0.005)
+    sim.qpos[0, 3] = -1.93
+    data = mujoco.MjData(model)
+    data.qpos[3] = -1.93
+    model.opt.timestep = 0.005
+    for _ in range(3):
+        sim.step()
+        mujoco.mj_step(model, data)
+    assert data.qvel[3] > 0.05
+    np.testing.assert_allclose(sim.qvel[0], data.qvel, atol=1e-4)
 
 
 def test_contacts_whose_damping_differs_by_rounding_are_all_damped_once(form):

@@ -25,13 +25,13 @@ FORCE_SENSORS = {
 """Sensors of forces and accelerations: those of the last physics step, or without control if none was taken yet."""
 
 
-def load(path: Path) -> mujoco.MjModel:
+def load(path: Path | str) -> mujoco.MjModel:
     """Returns the model of an MJCF file. It may include ``scene.xml``, which is ours unless one lies beside it.
 
     Raises:
         ValueError: there is no such file, or it is no valid MJCF.
     """
-    own = path.with_name(SCENE.name).exists()
+    own = Path(path).with_name(SCENE.name).exists()
     return mujoco.MjModel.from_xml_path(str(path), {} if own else {SCENE.name: SCENE.read_bytes()})
 
 
@@ -61,6 +61,9 @@ def check(mj_model: mujoco.MjModel) -> mujoco.MjModel:
         wrong.append("actions beyond [-1, 1] must be clipped: leave ctrllimited and the flag clampctrl on")
     if mj_model.actuator_delay.any():
         wrong.append("delays of actuators are not supported: they are not part of the state that is reset")
+    groups = np.clip(mj_model.actuator_group, 0, 30)
+    if ((mj_model.opt.disableactuator >> groups) & 1).any():
+        wrong.append("groups of actuators cannot be disabled (actuatorgroupdisable): leave the actuators out")
     for i in range(mj_model.nsensor):
         camera = int(mujoco.mjtObj.mjOBJ_CAMERA)
         of_camera = camera in (mj_model.sensor_objtype[i], mj_model.sensor_reftype[i])

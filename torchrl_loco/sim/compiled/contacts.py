@@ -415,7 +415,8 @@ class DenseContacts:
             for component in range(3):
                 block.set(f"geom_center[{3 * i + component}]", center[component] - origin[component])
                 block.set(f"geom_half[{3 * i + component}]", axis[component] * half[g])
-        block(f"int candidates = 0; unsigned char candidate[{len(self.pairs)}];")
+        index = "char" if len(self.pairs) <= 256 else "short"
+        block(f"int candidates = 0; unsigned {index} candidate[{len(self.pairs)}];")
         for i, pair in enumerate(self.pairs):
             a, b = pair.geoms
             offset = (poses[b][0] - origin) - (poses[a][0] - origin)

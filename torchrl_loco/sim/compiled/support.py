@@ -1,4 +1,4 @@
-"""Which models the compiled step can do. What is not listed here, it does."""
+"""Lists what a model needs that the compiled step does not support. Everything else is supported."""
 
 import mujoco
 
@@ -8,9 +8,11 @@ from torchrl_loco.sim.compiled.dynamics import BALL, FREE
 from torchrl_loco.sim.compiled.sensors import SUBTREE_VELOCITY, TOUCH
 from torchrl_loco.sim.compiled.step import is_traced
 
-IGNORED_FLAGS = ("EULERDAMP", "FILTERPARENT", "REFSAFE", "MIDPHASE", "NATIVECCD", "ISLAND", "AUTORESET", "WARMSTART")
+IGNORED_FLAGS = ("EULERDAMP", "FILTERPARENT", "REFSAFE", "MIDPHASE", "NATIVECCD", "ISLAND", "AUTORESET")
 """Flags that may be set: the compiled step follows them, or they change nothing in it."""
 
+MAX_TOUCH = 31
+"""Touch sensors that fit into the bits of an int."""
 
 SHOWN = 3
 """Names of elements that a line shows."""
@@ -132,7 +134,7 @@ def _contacts(m: mujoco.MjModel) -> list[str]:
 
 def _collides(m: mujoco.MjModel, pair: Pair) -> bool:
     first, second = (m.geom_type[geom] for geom in pair.geoms)
-    if second not in (SPHERE, CAPSULE):
+    if first not in (PLANE, SPHERE, CAPSULE) or second not in (SPHERE, CAPSULE):
         return False
     return bool(m.body_weldid[m.geom_bodyid[pair.geoms[0]]] == 0) if first == PLANE else True
 
@@ -146,4 +148,8 @@ def _sensors(m: mujoco.MjModel) -> list[str]:
         or m.sensor_interval[i].any()
         or m.sensor_delay[i]
     ]
-    return _lines("sensor", {"anything but touch and the velocity of a subtree, as they are": names} if names else {})
+    found = {"anything but touch and the velocity of a subtree, as they are": names} if names else {}
+    touch = [m.sensor(i).name for i in range(m.nsensor) if m.sensor_type[i] == TOUCH]
+    if len(touch) > MAX_TOUCH:
+        found[f"more than {MAX_TOUCH} sensors of touch"] = touch[MAX_TOUCH:]
+    return _lines("sensor", found)

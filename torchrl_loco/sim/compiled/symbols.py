@@ -352,7 +352,8 @@ def literal(x: float) -> str:
     """Returns a float32 literal of C++."""
     number = np.float32(x)
     plain = number == 0 or 1e-4 <= abs(number) < 1e7
-    return (np.format_float_positional(number, trim="0") if plain else f"{number:.9g}") + "f"
+    text = np.format_float_positional(number, trim="0") if plain else f"{number:.9g}"
+    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
 
 
 FUNCTIONS: dict[str, Callable[..., float]] = {
