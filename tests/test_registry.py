@@ -80,6 +80,12 @@ def test_every_field_can_be_overridden():
     assert env.rollout(20).shape == (2, 11)
 
 
+def test_what_torchrl_would_take_from_the_arguments_is_refused():
+    """Its ``auto_reset`` is for environments that reset themselves within a step."""
+    with pytest.raises(ValueError, match="auto_reset is no argument: step_and_maybe_reset"):
+        make("walker_walk", 2, "cpu", auto_reset=True)
+
+
 def test_naconmax_grows_with_the_worlds():
     for num_envs, expected in ((1, 1024), (2048, 50_000), (4096, 100_000)):
         assert sim_config(DEFAULTS["walker"], "playground", num_envs, {}).naconmax == expected

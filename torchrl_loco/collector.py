@@ -26,6 +26,7 @@ from torchrl.envs import (
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_loco.checks import check_int
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.state import State
 from torchrl_loco.sim import TorchGraph
@@ -60,7 +61,9 @@ class RolloutCollector:
         step_by_step: why batches are collected step by step; ``None`` if they are recorded, or will be.
 
     Raises:
-        ValueError: ``frames_per_batch`` is not a positive multiple of the number of worlds.
+        ValueError: ``frames_per_batch`` is not a positive multiple of the number of worlds, or ``total_frames`` is
+            below -1.
+        TypeError: one of them is no integer.
     """
 
     def __init__(
@@ -73,7 +76,8 @@ class RolloutCollector:
         exploration_type: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
         worlds = env.batch_size.numel()
-        if frames_per_batch < 1 or frames_per_batch % worlds:
+        check_int("total_frames", total_frames, "[-1, inf)")
+        if check_int("frames_per_batch", frames_per_batch, "(-inf, inf)") < 1 or frames_per_batch % worlds:
             raise ValueError(
                 f"frames_per_batch must be a positive multiple of the {worlds} worlds, got {frames_per_batch}"
             )

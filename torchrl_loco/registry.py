@@ -118,8 +118,10 @@ def summary(id: str) -> str:
     """Returns what a task asks for, in a sentence.
 
     Raises:
+        ValueError: there is no such task.
         ImportError: the plug-in that it comes from is broken.
     """
+    id = canonical_id(id)
     return registered()[id].summary or (env_class(id).__doc__ or "").strip().split("\n")[0]
 
 
@@ -146,4 +148,7 @@ def make(id: str, *args: Any, **kwargs: Any) -> "LocoEnv":
         >>> env.rollout(100)["next", "reward"].shape
         torch.Size([16, 100, 1])
     """
+    for name in ("auto_reset", "policy"):  # TorchRL takes them from every environment's arguments
+        if kwargs.get(name):
+            raise ValueError(f"{name} is no argument: step_and_maybe_reset, rollout and collectors reset by themselves")
     return env_class(id)(*args, **kwargs)

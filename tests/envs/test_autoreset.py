@@ -57,6 +57,14 @@ def test_same_data_as_torchrl(shared, body_task, actions, wrap, at_once, reward_
     assert not ended.all(dim=1).any()
 
 
+def test_a_step_begins_without_the_last_reward(shared):
+    """A loop may go on with what is under ``next``, where a reward is."""
+    env = shared("walker_run", 3)
+    td, after = env.step_and_maybe_reset(env.rand_action(env.reset()).set("reward", torch.ones(3, 1)))
+    assert "reward" not in after
+    assert "reward" in td["next"]
+
+
 def test_rollouts_reset_by_it(shared):
     env = torchrl_loco.TransformedEnv(shared("walker_run", 3, episode_length=5), transforms())
     td = env.rollout(12, break_when_any_done=False)

@@ -107,7 +107,7 @@ def test_a_wrong_state_is_refused_and_changes_nothing(shared):
         "qvel": [torch.zeros(3, 10), torch.full((3, 9), torch.inf), torch.full((3, 9), 1e39, dtype=torch.double)],
         "qacc_warmstart": [torch.zeros(3, 8), torch.full((3, 9), -torch.inf)],
         "elapsed_steps": [torch.zeros(3, 1), torch.tensor([2**32, 0, 0]), torch.tensor([0, -1, 0])],
-        "episode": [torch.zeros(3, 1), torch.tensor([0, -5, 0]), torch.tensor([0, 0, 2**31])],
+        "episode": [torch.zeros(3, 1), torch.tensor([0, -5, 0]), torch.tensor([0, 0, 2**31 - 1])],
     }
     for key, values in wrong.items():
         for value in values:

@@ -6,7 +6,16 @@ import pytest
 import torch
 from cases import COARSE
 from torchrl.collectors import Collector, MultiSyncCollector
-from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv, VecNormV2
+from torchrl.envs import (
+    Compose,
+    ConditionalSkip,
+    InitTracker,
+    MultiAction,
+    RewardSum,
+    StepCounter,
+    TransformedEnv,
+    VecNormV2,
+)
 from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 
 import torchrl_loco
@@ -22,6 +31,38 @@ def test_transforms_count_and_sum_by_world(shared):
     sums = td["next", "reward"][:, :6].sum(dim=1)
     torch.testing.assert_close(td["next", "episode_reward"][:, 5], sums)
     assert td["next", "observation"].isfinite().all()
+
+
+@pytest.mark.parametrize("reward_terms", [False, True])
+def test_worlds_that_a_transform_skips_stay_as_they_are(shared, actions, reward_terms):
+    options = {"episode_length": 8, "stagger": True, "reward_terms": reward_terms, **COARSE}
+    env, twin = (shared("walker_run", 3, copy=copy, **options) for copy in (0, 1))
+    skips = TransformedEnv(env, ConditionalSkip(lambda _: torch.tensor([True, False, False])))
+    start, before = skips.reset(), env.get_state()
+    action = actions(env, 1)[0]
+    expected = twin.step(twin.reset().set("action", action))["next"]
+    action[0] = torch.nan  # of the world that is skipped
+    after = skips.step(start.clone().set("action", action))["next"]
+    assert torch.equal(after["observation"][0], start["observation"][0])
+    assert after["reward"][0] == 0.0
+    assert not after["done"][0]
+    for key in expected.keys(True, True):
+        assert torch.equal(after[key][1:], expected[key][1:]), key
+    for key, value in env.get_state().items():
+        assert torch.equal(value[0], before[key][0]), key
+        assert torch.equal(value[1:], twin.get_state()[key][1:]), key
+    assert env.health()["total", "non_finite"] == 0
+
+
+def test_worlds_that_are_done_wait_for_the_end_of_a_chunk_of_actions(shared):
+    env = shared("walker_run", 3, episode_length=4, stagger=True, **COARSE)
+    chunks = TransformedEnv(env, MultiAction())
+    td = chunks.reset()
+    left = 4 - env.get_state()["elapsed_steps"]
+    after = chunks.step(td.set("action", torch.zeros(3, 4, 6)))["next"]
+    assert env.get_state()["elapsed_steps"].tolist() == [4, 4, 4]
+    assert left.min() < 4
+    assert after["truncated"].all()
 
 
 @pytest.mark.filterwarnings("ignore:The default value of `auto_register_policy_transforms`")

@@ -47,7 +47,7 @@ def step_and_reset(
     done = after.get("done")
     # As in TorchRL, the policy's outputs are zero where a world was reset.
     for key, value in tensordict.items():
-        if key not in begin and key not in rewritten:
+        if key not in begin and key not in rewritten and key != "reward":
             begin._set_str(key, value.masked_fill(_rows(done, value), 0), inplace=False, validated=True)
     tensordict.set("next", after)
     return tensordict, begin

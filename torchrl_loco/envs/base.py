@@ -26,7 +26,7 @@ from torchrl_loco.checks import (
     check_output_file,
 )
 from torchrl_loco.config import SimConfig, sim_config
-from torchrl_loco.envs.autoreset import is_plain, reset_done_worlds, step_and_reset
+from torchrl_loco.envs.autoreset import _rows, is_plain, reset_done_worlds, step_and_reset
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.state import State, write_state
 from torchrl_loco.envs.world import World
@@ -52,9 +52,9 @@ class LocoEnv(EnvBase):
         reward_terms: whether to return each factor of the reward under ``("next", "reward_terms", name)``.
         stagger: whether a full ``reset()`` starts each world at a random point of its time limit, so that the worlds
             are not truncated together.
-        on_overflow: what to do when contacts or constraints are dropped because ``naconmax`` or ``njmax`` is too small:
-            ``"warn"``, ``"raise"`` or ``"ignore"``. It is reported within about 100 steps, without waiting for the
-            device; see :meth:`health`.
+        on_overflow: what to do when the physics dropped contacts or constraints for want of room: ``"warn"``,
+            ``"raise"`` or ``"ignore"``. It is reported within about 100 steps, without waiting for the device; see
+            :meth:`health`.
         nan_dump: a file that does not exist yet. The state and action before the first step that made a world
             non-finite are written to it, within about 100 steps or at :meth:`close`; see ``torchrl-loco inspect``.
         config: fields of :class:`torchrl_loco.SimConfig` to override.
@@ -219,8 +219,26 @@ class LocoEnv(EnvBase):
             raise KeyError(f"step needs an 'action' of shape {tuple(shape)} in its TensorDict")
         if action.shape != shape:
             raise ValueError(f"action must have shape {tuple(shape)}, got {tuple(action.shape)}")
-        self.world.step(action.reshape(self.num_envs, -1))
+        action, part = action.reshape(self.num_envs, -1), tensordict.get("_step", None)
+        if part is not None:
+            return self._step_part(tensordict, action, part.reshape(self.num_envs))
+        self.world.step(action)
         return self._outputs(with_reward=True)
+
+    def _step_part(self, tensordict: TensorDictBase, action: torch.Tensor, part: torch.Tensor) -> TensorDictBase:
+        """Steps the worlds of a mask ``(num_envs,)``.
+
+        The worlds cannot be stepped apart: the others are stepped too, without control, and put back.
+
+        Returns:
+            The results of the step, of the other worlds what they began with and no reward.
+        """
+        before, held = self.get_state(), ~part.to(self.device)
+        self.world.step(action.masked_fill(held.unsqueeze(-1), 0.0))
+        after = self._outputs(with_reward=True)
+        self._set_state(before, held)
+        stay = self._skip_tensordict(tensordict.select(*self.full_done_spec, *self.full_observation_spec, strict=False))
+        return after.apply(lambda new, old: torch.where(_rows(held.view(*self.batch_size, 1), new), old, new), stay)
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False) -> TensorDictBase:
         self._refuse_after_fork()
@@ -402,8 +420,8 @@ class LocoEnv(EnvBase):
 
         ``"worlds"`` (batch ``(num_envs,)``) and ``"total"`` count control steps in which
 
-        - ``constraint_overflow``, ``contact_overflow``: constraints or contacts were dropped. Contacts share one
-          pool: if some are dropped, that counts in every world.
+        - ``constraint_overflow``, ``contact_overflow``: constraints or contacts were dropped. Under ``mujoco_warp``
+          contacts share one pool: if some are dropped, that counts in every world.
         - ``iteration_limit``, ``line_search_limit``: the solver or its line search used up its iterations, as is usual
           under ``protocol="playground"``.
         - ``non_finite``: the world became non-finite, and terminated.

@@ -88,8 +88,8 @@ def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor
         if targets[key].dtype.is_floating_point:
             if not value[mask].to(targets[key].dtype).isfinite().all():
                 raise ValueError(f"{key} must be finite")
-        elif not ((value[mask].long() >= 0) & (value[mask].long() < 2**31)).all():
-            raise ValueError(f"{key} must lie in [0, 2**31)")
+        elif not ((value[mask].long() >= 0) & (value[mask].long() < 2**31 - 1)).all():  # it will be counted up
+            raise ValueError(f"{key} must lie in [0, 2**31 - 1)")
     for key, target in targets.items():
         if key == "episode" and key not in new:
             continue  # the world's random stream goes on
