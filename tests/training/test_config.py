@@ -110,9 +110,16 @@ def test_what_was_not_tuned_is_said():
         assert (bool(note), "walker_stand and walker_walk by ppo" in note) == (said, said)
 
 
+def test_returns_that_the_critic_cannot_represent_are_reported():
+    for device in ("cpu", "cuda"):
+        config = dataclasses.replace(preset("walker_walk", "cpu", "reppo"), device=device, action_repeat=4)
+        assert "Returns of up to 100 may occur" in tuning_note(config)
+        assert "Returns of" not in tuning_note(dataclasses.replace(config, reward_scale=0.25))
+
+
 def test_a_device_may_be_torchs_own():
     config, device = preset("walker_stand", "cpu", "ppo"), torch.device("cuda", 1)
-    assert dataclasses.replace(config, device=device).device == device
+    assert dataclasses.replace(config, device=device).device == "cuda:1"
     for wrong in ("cpu:1", 3):
         with pytest.raises(ValueError, match="choose one of cpu, cuda, cuda:0"):
             dataclasses.replace(config, device=wrong)

@@ -82,6 +82,9 @@ def test_a_logger_that_fails_does_not_end_the_run(tmp_path, monkeypatch):
                 raise ConnectionError("the server is away")
             super().log_metrics(metrics, step)
 
+        def close(self):
+            failures.append("closed")
+
     class FailsToClose(CSVLogger):
         def close(self):
             raise ConnectionError("no answer")
@@ -96,7 +99,7 @@ def test_a_logger_that_fails_does_not_end_the_run(tmp_path, monkeypatch):
     ):
         run = trained(tmp_path, logger=("wandb", "mlflow"))
     assert run.is_finished
-    assert failures == [256]
+    assert failures == [256, "closed"]
     logged = {
         name: (run.path / name / "scalars" / "return.csv").read_text().splitlines()
         for name in files(run)
@@ -145,6 +148,36 @@ def test_seeds_share_a_group_in_wandb(tmp_path, monkeypatch):
     assert [options["group"] for _, options in given] == [group.path.name, group.path.name, None, group.path.name]
     assert [options["id"] for _, options in given] == [None, None, None, "id1"]
     assert {options["project"] for _, options in given} == {"torchrl_loco"}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("fails", ["log_metrics", "log_hparams"])
+@pytest.mark.parametrize("name", ["wandb", "mlflow"])
+def test_a_failure_of_one_seed_leaves_the_others_alone(tmp_path, monkeypatch, name, fails):
+    """The process must not keep the failed run open: the next one would be written into it, or be refused."""
+    module = pytest.importorskip(name)
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    owner, method = {"wandb": loggers.WandbLogger, "mlflow": loggers._MLflow}[name], fails
+    if (name, fails) == ("mlflow", "log_hparams"):
+        owner, method = module, "log_params"
+    works, calls = getattr(owner, method), []
+
+    def once(*arguments, **options):
+        calls.append(method)
+        if len(calls) == 1:
+            raise ConnectionError("away for a moment")
+        return works(*arguments, **options)
+
+    monkeypatch.setattr(owner, method, once)
+    group = RunGroup.create(made(tmp_path / "template", logger=name).load_config(out=tmp_path), [0, 1])
+    failed = group.train()
+    assert list(failed) == ([0] if fails == "log_hparams" else [])
+    ids = [run.read_logger_ids().get(name) for run in group.runs.values()]
+    assert len(set(ids)) == 2
+    assert ids[1] is not None
 
 
 @pytest.mark.slow

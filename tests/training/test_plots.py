@@ -69,6 +69,20 @@ def test_a_run_that_was_stopped_early_does_not_cut_the_mean_of_the_others(tmp_pa
     assert [list(args[2]) for args, _ in faint][2] == [600.0, 700.0]
 
 
+def test_runs_of_several_ranks_are_averaged_where_they_have_as_many_frames(tmp_path, monkeypatch):
+    """A run on two GPUs collects twice the frames in an iteration, so it ends with fewer rows."""
+    drawn, plot = [], Axes.plot
+    monkeypatch.setattr(Axes, "plot", lambda *args, **options: drawn.append((args, options)) or plot(*args, **options))
+    runs = [made(tmp_path / str(ranks), total_frames=7 * 128) for ranks in (1, 2)]
+    for run, step, end in zip(runs, (128, 256), (7 * 128, 6 * 128), strict=True):
+        for frames in range(step, end + 1, step):
+            run.append_metrics({"frames": frames, "seconds": 1.0, "return": float(frames)})
+    plot_runs(runs, tmp_path / "curves.png")
+    (_, millions, mean), options = drawn[0]
+    assert list(millions * 1e6) == list(mean) == [256.0, 512.0, 768.0]
+    assert ", 2 seeds" in options["label"]
+
+
 def test_nothing_to_plot(tmp_path):
     with pytest.raises(ValueError, match="no runs"):
         plot_runs([], tmp_path / "none.png")

@@ -61,8 +61,15 @@ def test_a_torn_line_does_not_keep_a_run_from_continuing(tmp_path):
         run.append_metrics({"iteration": frames // 128, "frames": frames, "return": 1.5})
     path = run.path / "metrics.csv"
     path.write_text(path.read_text() + "4,5")
+    assert run.read_metrics()["frames"] == [128, 256, 384]
+    path.write_text(path.read_text() + "12,1.2")
+    assert run.read_metrics()["frames"] == [128, 256, 384]
     run.forget_after(256)
     assert path.read_text() == "iteration,frames,return\n1,128,1.5\n2,256,1.5\n"
+    (run.path / "evaluations.csv").touch()  # the disk was full when its first line was written
+    run.forget_after(256)
+    run.append_evaluation({"frames": 256, "mean": 3.0})
+    assert run.read_evaluations() == [{"frames": 256, "mean": 3.0}]
 
 
 def test_a_run_needs_an_undamaged_checkpoint_of_this_version(ppo_run, tmp_path):

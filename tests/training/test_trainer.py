@@ -192,6 +192,24 @@ def test_the_best_policy_is_kept(tmp_path, monkeypatch, capsys):
     assert "--seed 1" in out
 
 
+def test_a_resumed_run_keeps_the_policy_of_a_better_evaluation_after_the_checkpoint(tmp_path, monkeypatch):
+    """The evaluation is repeated, and on CUDA not exactly."""
+    means = iter([10.0, 30.0, 20.0])
+    monkeypatch.setattr(trainer, "make_evaluator", lambda *_, **__: lambda policy: torch.full((3,), next(means)))
+    run = made(tmp_path, total_frames=768, eval_interval=256)
+    first = Trainer(run)
+    for save in (True, False):
+        first._iterate()
+        first._evaluate()
+        if save:
+            first.save()
+    again = Trainer(run, resume=True)
+    again._iterate()
+    again._evaluate()
+    assert [row["mean"] for row in run.read_evaluations()] == [10.0, 20.0]
+    assert Policy.load(run.policy, "cpu").info["selected_by"] == 30.0
+
+
 @pytest.mark.slow
 def test_evaluating_draws_nothing_that_training_draws(tmp_path):
     often = trained(tmp_path / "often", "reppo", eval_interval=128)

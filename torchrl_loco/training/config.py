@@ -102,9 +102,11 @@ class TrainingConfig:
         for name in loggers:
             check_choice("logger", name, get_args(LoggerName))
         object.__setattr__(self, "logger", tuple(dict.fromkeys(loggers)))
-        if not re.fullmatch(
-            r"cpu|cuda(:\d+)?", str(self.device)
-        ):  # whether the machine has it is checked when the run starts
+        object.__setattr__(self, "device", str(self.device))
+        object.__setattr__(self, "out", Path(self.out))
+        object.__setattr__(self, "hidden", tuple(self.hidden))
+        # Whether the machine has the device is checked when the run starts.
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
             raise ValueError(f"no device {self.device!r}: choose one of cpu, cuda, cuda:0, ...")
         if not self.hidden:
             raise ValueError("hidden must name the width of at least one layer")
@@ -124,8 +126,7 @@ class TrainingConfig:
 
     def to_json(self) -> dict[str, Any]:
         """Returns the settings as values that JSON can hold, from which ``config_from_json`` makes them again."""
-        words = {"device": str(self.device), "out": str(self.out)}
-        return {"algorithm": self.algorithm, **dataclasses.asdict(self), **words}
+        return {"algorithm": self.algorithm, **dataclasses.asdict(self), "out": str(self.out)}
 
     @property
     def batch_size(self) -> int:
@@ -192,7 +193,8 @@ class REPPOConfig(TrainingConfig):
     num_bins: int = 151
     """Bins of the critic's distribution over returns."""
     max_value: float = 150.0
-    """Return at the center of the last bin; the first is at 0."""
+    """Return at the center of the last bin; the first is at 0. Rewards in [0, 1] give returns of up to reward_scale *
+    action_repeat / (1 - gamma): the critic cannot tell those above max_value apart."""
     aux_coeff: float = 1.0
     """Weight of the critic's auxiliary loss, the prediction of its own features at the next step."""
 
@@ -217,4 +219,4 @@ def config_from_json(values: dict[str, Any]) -> TrainingConfig:
     """
     algorithm = check_choice("algorithm", values.get("algorithm"), CONFIGS)
     fields = {name: value for name, value in values.items() if name != "algorithm"}
-    return CONFIGS[algorithm](**{**fields, "out": Path(values["out"]), "hidden": tuple(values["hidden"])})
+    return CONFIGS[algorithm](**fields)

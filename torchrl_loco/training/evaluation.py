@@ -118,7 +118,7 @@ def fallen_return(
     remedy = f"shorter episodes (--episode_length {max(config.episode_length // 2, 1)})"
     if isinstance(config, REPPOConfig) and config.min_kl_weight < STEADY["min_kl_weight"]:
         options = " ".join(f"--{name} {value}" for name, value in STEADY.items() if getattr(config, name) < value)
-        remedy = f"a larger least weight of the divergence ({options}), which holds the policy near that of the batch"
+        remedy = f"a higher minimum of the KL weight ({options}), which holds the policy near that of the batch"
     return (
         f"The return fell from {best['mean']:.1f} after {best['frames']:.0f} frames to {last['mean']:.1f} at the end. "
         "The policy of the best evaluation was kept. "

@@ -1,8 +1,9 @@
 """Where the metrics of a run go besides its CSV files: TorchRL's loggers."""
 
+import contextlib
 import os
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -84,6 +85,8 @@ class Loggers:
             except Exception as error:
                 _report(name, error)
                 del self._open[name]
+                with contextlib.suppress(Exception):
+                    _close(logger, type(error))  # else the next run of this process would be written into this one
 
 
 def _report(name: str, error: Exception) -> None:
@@ -119,8 +122,9 @@ def _open_wandb(folder: Path, _: int, of: str | None, settings: dict[str, Any]) 
     project = os.environ.get("WANDB_PROJECT", PROJECT)
     group = folder.absolute().parent.name if is_run_group(folder.parent) else None
     logger = WandbLogger(folder.name, save_dir=str(folder), project=project, id=of, group=group)
-    logger.log_hparams(settings)
-    return logger, logger.experiment.id
+    with _closed_at_errors(logger):
+        logger.log_hparams(settings)
+        return logger, logger.experiment.id
 
 
 class _MLflow(MLFlowLogger):
@@ -129,21 +133,37 @@ class _MLflow(MLFlowLogger):
     def __init__(self, folder: Path, of: str | None) -> None:
         import mlflow
 
-        self._name, self._of = folder.name, of
+        self._name, self._of, self._begun = folder.name, of, False
         self.tracking_before = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else None
         local = f"sqlite:///{folder.absolute() / 'mlflow.db'}"
         artifacts = None if self.tracking_before else (folder.absolute() / "mlflow").as_uri()
         name = os.environ.get("MLFLOW_EXPERIMENT_NAME", PROJECT)
-        super().__init__(name, self.tracking_before or local, artifact_location=artifacts)
+        try:
+            super().__init__(name, self.tracking_before or local, artifact_location=artifacts)
+        except Exception:
+            self.end("FAILED")
+            raise
+
+    def end(self, status: str) -> None:
+        """Ends the run, if it has begun, and gives the process back the server that it had before."""
+        import mlflow
+
+        try:
+            if self._begun:  # else the active run, if there is one, is not ours
+                mlflow.end_run(status)
+        finally:
+            mlflow.set_tracking_uri(self.tracking_before)  # which TorchRL has set for the whole process
 
     def _create_experiment(self) -> Any:
         import mlflow
 
         if self._of is None:
             run = super()._create_experiment()
+            self._begun = True
             mlflow.set_tag("mlflow.runName", self._name)
             return run
         run = mlflow.start_run(run_id=self._of)
+        self._begun = True
         self.id = run.info.experiment_id
         return run
 
@@ -152,22 +172,31 @@ def _open_mlflow(folder: Path, _: int, of: str | None, settings: dict[str, Any])
     import mlflow
 
     logger = _MLflow(folder, of)
-    mlflow.log_params(settings)  # TorchRL's log_hparams needs omegaconf
-    return logger, logger.experiment.info.run_id
+    with _closed_at_errors(logger):
+        mlflow.log_params(settings)  # TorchRL's log_hparams needs omegaconf
+        return logger, logger.experiment.info.run_id
 
 
 _OPEN = {"tensorboard": _open_tensorboard, "wandb": _open_wandb, "mlflow": _open_mlflow}
 
 
-def _close(logger: Logger, kind: type[BaseException] | None) -> None:
-    if isinstance(logger, WandbLogger) and kind is not None:
-        logger.experiment.finish(exit_code=1)
-    logger.close()
-    if isinstance(logger, _MLflow):
-        import mlflow
+@contextlib.contextmanager
+def _closed_at_errors(logger: Logger) -> Iterator[None]:
+    """Closes a logger if what is done with it fails."""
+    try:
+        yield
+    except Exception as error:
+        with contextlib.suppress(Exception):
+            _close(logger, type(error))
+        raise
 
-        try:
+
+def _close(logger: Logger, kind: type[BaseException] | None) -> None:
+    try:
+        if isinstance(logger, WandbLogger) and kind is not None:
+            logger.experiment.finish(exit_code=1)
+        logger.close()
+    finally:
+        if isinstance(logger, _MLflow):
             stopped = "KILLED" if kind is KeyboardInterrupt else "FAILED"
-            mlflow.end_run("FINISHED" if kind is None else stopped)
-        finally:
-            mlflow.set_tracking_uri(logger.tracking_before)  # which TorchRL has set for the whole process
+            logger.end("FINISHED" if kind is None else stopped)

@@ -42,10 +42,11 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     for config, group in groups.items():
         label = f"{config.task}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds"
         metrics = [run.read_metrics() for run in group]
-        whole = [m for m in metrics if m["frames"][-1] + config.frames_per_batch > config.total_frames] or metrics
-        length = min(len(m["frames"]) for m in whole)
-        returns = np.array([m["return"][:length] for m in whole])
-        millions = np.array(whole[0]["frames"][:length]) / 1e6
+        whole = [m for m in metrics if _is_whole(m["frames"], config.total_frames)] or metrics
+        curves = [dict(zip(m["frames"], m["return"], strict=True)) for m in whole]
+        shared = sorted(set.intersection(*map(set, curves)))  # runs on several GPUs have fewer and larger batches
+        returns = np.array([[curve[frames] for frames in shared] for curve in curves])
+        millions = np.array(shared) / 1e6
         seconds = np.mean([m["seconds"][-1] for m in whole])
         count = f"{len(group)}" if len(whole) == len(group) else f"{len(whole)} of {len(group)}"
         seeds = "" if len(group) == 1 else f", {count} seeds"
@@ -74,3 +75,9 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize="small")
     figure.savefig(picture, dpi=150)
+
+
+def _is_whole(frames: Sequence[float], total: int) -> bool:
+    """Returns whether a run with rows at these frames had no room for a further batch as large as its last."""
+    before, last = [0.0, *frames][-2:]
+    return 2 * last - before > total

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_loco.checks import check_choice, check_device
 from torchrl_loco.registry import canonical_id, env_class
-from torchrl_loco.training.config import CONFIGS, TrainingConfig
+from torchrl_loco.training.config import CONFIGS, REPPOConfig, TrainingConfig
 
 if TYPE_CHECKING:
     import torch
@@ -134,7 +134,11 @@ def preset(
 
 
 def tuning_note(config: TrainingConfig) -> str:
-    """Returns a note if ``config.task`` was not tuned on its device, else an empty string."""
+    """Returns a note if ``config.task`` was not tuned on its device, or settings do not fit each other, else ``""``."""
+    return " ".join(note for note in (_untuned(config), _values_cut_off(config)) if note)
+
+
+def _untuned(config: TrainingConfig) -> str:
     if config.device == "cpu":
         algorithm, tasks = TUNED_ON_CPU
         if config.algorithm == algorithm and config.task in tasks:
@@ -145,3 +149,15 @@ def tuning_note(config: TrainingConfig) -> str:
         return ""
     tuned = " and the ".join(TUNED_IN_GENERAL)
     return f"No settings of {config.algorithm} were tuned for {config.task}: these were tuned on the {tuned}."
+
+
+def _values_cut_off(config: TrainingConfig) -> str:
+    """Returns a note if returns may be larger than the critic of REPPO can represent, else an empty string."""
+    largest = config.reward_scale * config.action_repeat / max(1.0 - config.gamma, 1e-9)
+    if not isinstance(config, REPPOConfig) or largest <= config.max_value * (1.0 + 1e-9):
+        return ""
+    scale = config.reward_scale * config.max_value / largest
+    return (
+        f"Returns of up to {largest:.4g} may occur, but the critic cannot tell those above --max_value "
+        f"{config.max_value:g} apart: raise it, or pass --reward_scale {scale:.3g}."
+    )

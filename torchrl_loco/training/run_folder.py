@@ -58,17 +58,23 @@ def new_folder(config: TrainingConfig, ending: str) -> Path:
     check_loggers(config.logger)
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     try:
-        Path(config.out).mkdir(parents=True, exist_ok=True)
+        config.out.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise OSError(f"out must be a folder for runs, but {config.out} is a file or lies below one") from None
     free = shutil.disk_usage(config.out).free
     if free < ROOM_NEEDED:
         raise OSError(f"{config.out} has {free / 2**20:.0f} MiB left, a run may need {ROOM_NEEDED / 2**20:.0f} MiB")
     while True:  # runs may start within the same second
-        path = unused_path(Path(config.out) / f"{config.task}-{stamp}-{ending}")
+        path = unused_path(config.out / f"{config.task}-{stamp}-{ending}")
         with contextlib.suppress(FileExistsError):
             path.mkdir()
             return path
+
+
+def _whole_lines(path: Path) -> list[str]:
+    """Returns the lines of a CSV file, its head first, without those that a crash or a full disk has cut."""
+    *lines, _ = path.read_text().split("\n")
+    return [line for line in lines if line.count(",") == lines[0].count(",")]
 
 
 class RunFolder:
@@ -109,7 +115,7 @@ class RunFolder:
     @classmethod
     def of_launch(cls, config: TrainingConfig) -> "RunFolder | None":
         """Returns the run in ``config.out`` that this launch by torchrun has begun, if any; the newest of several."""
-        files = [file for file in Path(config.out).glob("*/launch.txt") if file.read_text() == distributed.launch_id()]
+        files = [file for file in config.out.glob("*/launch.txt") if file.read_text() == distributed.launch_id()]
         return cls(max(files, key=lambda file: file.stat().st_mtime).parent) if files else None
 
     def load_config(self, **overrides: Any) -> TrainingConfig:
@@ -202,10 +208,12 @@ class RunFolder:
             path = self.path / name
             if not path.exists():
                 continue
-            head, *lines = path.read_text().splitlines()
-            at, count = head.split(",").index("frames"), head.count(",")
-            whole = [line for line in lines if line.count(",") == count]  # a crash may have cut the last one
-            kept = [head, *(line for line in whole if float(line.split(",")[at]) <= frames)]
+            if not (whole := _whole_lines(path)):
+                path.unlink()  # the disk was full when its first line was written
+                continue
+            head, *lines = whole
+            at = head.split(",").index("frames")
+            kept = [head, *(line for line in lines if float(line.split(",")[at]) <= frames)]
             storage.replace_file(path, "".join(f"{line}\n" for line in kept).encode())
 
     def _append(self, name: str, row: dict[str, Any]) -> None:
@@ -219,10 +227,8 @@ class RunFolder:
 
     def _read(self, name: str) -> list[dict[str, float]]:
         path = self.path / name
-        if not path.exists():
-            return []
-        with path.open(newline="") as file:
-            return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+        lines = _whole_lines(path) if path.exists() else []
+        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(lines)]
 
     def save_checkpoint(self, entries: dict[str, Any]) -> None:
         """Writes ``entries`` as the checkpoint; a crash while writing leaves the previous one.

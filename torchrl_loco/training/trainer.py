@@ -71,6 +71,7 @@ class Trainer:
         self.algorithm = ALGORITHMS[config.algorithm](config)
         self.collector = RolloutCollector(self.env, self.algorithm.actor, frames_per_batch=config.batch_size)
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
+        self._best = -math.inf  # the evaluation that selected the policy
         if not first:  # the networks began alike, from here on each rank draws actions of its own
             torch.manual_seed(distributed.own_seed(config.seed))
         if checkpoint is not None:
@@ -180,9 +181,9 @@ class Trainer:
         when = {"frames": self.frames, "seconds": round(self.seconds, 3)}
         policy = deterministic_policy(self.algorithm.actor, self.config, {**when, "trained_on": self.device_name})
         summary = summarize(self._evaluator(policy))
-        best = max((row["mean"] for row in self.run.read_evaluations()), default=-math.inf)
         self.run.append_evaluation({**when, **summary})
-        if summary["mean"] >= best:
+        if summary["mean"] >= self._best:
+            self._best = policy.info["selected_by"] = summary["mean"]
             policy.save(self.run.policy)
         return summary
 
@@ -230,6 +231,10 @@ class Trainer:
         self.algorithm.load_state_dict(checkpoint["algorithm"])
         if distributed.is_first():
             self.run.forget_after(self.frames)
+            means = [row["mean"] for row in self.run.read_evaluations()]
+            if self.run.policy.is_file():  # maybe of an evaluation after the checkpoint, which is repeated inexactly
+                means.append(Policy.load(self.run.policy, "cpu").info.get("selected_by", -math.inf))
+            self._best = max(means, default=-math.inf)
         before = 1 + len(checkpoint.get("further_ranks", ()))  # a checkpoint without is of one process
         if before != distributed.ranks():
             self.algorithm.generator.set_state(generator)
