@@ -9,6 +9,7 @@ import importlib.util
 import math
 import numbers
 import operator
+import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -167,7 +168,8 @@ def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> 
 
     Raises:
         TypeError: it is no path.
-        ValueError: its folder does not exist, a file is already there, or the suffix is none of the valid ones.
+        ValueError: its folder does not exist or cannot be written to, a file is already there, or the suffix is none
+            of the valid ones.
     """
     path = Path(value).absolute()  # the working directory may change
     if suffixes and path.suffix not in suffixes:
@@ -176,6 +178,8 @@ def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> 
         raise ValueError(f"{name} {path} cannot be written: the folder {path.parent} does not exist")
     if path.exists():
         raise ValueError(f"{name} {path} already exists: move it away, or choose another name")
+    if not os.access(path.parent, os.W_OK):
+        raise ValueError(f"{name} {path} cannot be written: no permission in the folder {path.parent}")
     return path
 
 

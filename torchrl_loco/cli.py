@@ -111,45 +111,84 @@ def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None =
     print("verdict: everything works")
 
 
+RunOrTask = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(
+        metavar="RUN_OR_TASK", help="a run folder, a policy file, or the id of a task for the policy of the package."
+    ),
+]
+Protocol = Annotated[
+    Literal["playground", "dm_control"],
+    tyro.conf.arg(help="which policy of the package, by what it was trained under; any is played under its own."),
+]
+
+
+def _policy(run_or_task: str, protocol: str, device: str | None) -> tuple["torchrl_loco.Policy", Path]:
+    """Returns the policy that was named, and the file beside which what is made of it goes."""
+    if task := _shipped_task(run_or_task):
+        return torchrl_loco.load_policy(task, device, protocol), Path(task)
+    source = Path(run_or_task)
+    if not source.is_dir():
+        return torchrl_loco.Policy.load(source, device), source
+    from torchrl_loco import training
+
+    run = training.RunFolder(source)
+    return run.load_policy(device), run.policy
+
+
+def _shipped_task(name: str) -> str:
+    """Returns the id of the task that was named instead of a file or a folder, or an empty string."""
+    if Path(name).exists():
+        return ""
+    from torchrl_loco.registry import canonical_id
+
+    try:
+        return canonical_id(name)
+    except ValueError as error:
+        raise ValueError(f"there is no run folder or policy file {name!r}, and {error}") from None
+
+
 def evaluate(
-    run: tyro.conf.Positional[Path],
+    run_or_task: RunOrTask,
     /,
     episodes: int | None = None,
     seed: int | None = None,
+    protocol: Protocol = "playground",
     device: str | None = None,
 ) -> None:
-    """Evaluate the policy of a run over full episodes, without exploration.
+    """Evaluate a trained policy over full episodes, without exploration.
 
     Args:
-        run: folder of the run.
-        episodes: number of episodes; default: as the run was evaluated.
-        seed: seed of the episodes; default: the episodes of the run's own evaluation.
-        device: where to play them; default: the device on which the run was trained.
+        run_or_task: what to evaluate.
+        episodes: number of episodes; default: as the policy was evaluated after its training.
+        seed: seed of the episodes; default: those of that evaluation.
+        protocol: which policy of the package.
+        device: where to play them; default: CUDA if there is any.
     """
     with _user_errors():
+        policy, _ = _policy(run_or_task, protocol, device)
         from torchrl_loco import training
 
-        check_run(run)
-        folder = training.RunFolder(run)
-        summary = training.evaluate_run(folder, episodes, seed, device)
-        note = training.poor_return(folder.load_config(), summary, folder.seeds)
+        summary = training.evaluate_policy(policy, episodes, seed)
     print(training.describe(summary))
-    if note:
-        print(note)
 
 
-def resume(run: tyro.conf.Positional[Path], /, gpus: int | None = None) -> None:
+def resume(run: tyro.conf.Positional[Path], /, gpus: int | None = None, total_frames: int | None = None) -> None:
     """Continue a run that was stopped, from its last checkpoint, as if it had not been stopped.
 
     Args:
         run: folder of the run, or of the runs of several seeds, of which all that is missing is trained.
         gpus: as in train: pass the same number to continue exactly.
+        total_frames: train one run to another number of frames, also if it is complete. The learning rate follows the
+            new number from here on.
     """
     with _user_errors():
         check_run(run, or_group=True)
         from torchrl_loco import training
 
         if is_run_group(run):
+            if total_frames is not None:
+                raise ValueError(f"{run} holds the runs of several seeds: total_frames is for one of them")
             _refuse_seeds_of_ranks(gpus)
             group = training.RunGroup(run)
             group.check()
@@ -160,10 +199,15 @@ def resume(run: tyro.conf.Positional[Path], /, gpus: int | None = None) -> None:
     if is_run_group(run):
         _train_group(group)
     elif missing:
-        training.distributed.launch(missing, ["resume", str(run), f"--gpus={gpus}"])
+        more = [] if total_frames is None else [f"--total_frames={total_frames}"]
+        training.distributed.launch(missing, ["resume", str(run), f"--gpus={gpus}", *more])
     else:
         with _joined(device):
             with _user_errors():
+                if total_frames is not None:
+                    if training.distributed.is_first():
+                        folder.extend(total_frames)
+                    training.distributed.wait_for_all()
                 trainer = training.Trainer(folder, resume=True)
             _train(trainer)
 
@@ -181,7 +225,7 @@ class Video:
     device: str | None = None
     """Where to play; default: CUDA if there is any."""
     out: Path | None = None
-    """The video, a new file; default: a new file in the run folder (record), or TASK.mp4 without a display (play)."""
+    """The video, a new file; default: a new file in the run folder, or TASK.mp4."""
 
     def check(self) -> None:
         """Checks all options before anything is printed or made."""
@@ -196,7 +240,7 @@ class Video:
         """Records the policy into ``out``, or into ``default`` or a numbered sibling of it, and prints the path."""
         from torchrl_loco import training
 
-        out = training.unused_path(default) if self.out is None else self.out
+        out = check_output_file("out", training.unused_path(default) if self.out is None else self.out)
         print(f"recording {self.seconds:g} s; on a CPU this takes a while", file=sys.stderr)  # logs have no bar
         training.record(policy, self.env(policy), out, self.seconds, policy.info["action_repeat"], self.camera)
         print(out)
@@ -210,104 +254,77 @@ class Video:
 VideoOptions = Annotated[Video, tyro.conf.arg(name="")]
 
 
-def record(run: tyro.conf.Positional[Path], /, video: VideoOptions = Video()) -> None:
-    """Record a video of the trained policy of a run.
+def record(run_or_task: RunOrTask, /, protocol: Protocol = "playground", video: VideoOptions = Video()) -> None:
+    """Record a video of a trained policy.
 
     Args:
-        run: folder of the run.
+        run_or_task: what to record.
+        protocol: which policy of the package.
         video: which part of an episode is shown, and how.
     """
     with _user_errors():
-        from torchrl_loco import training
-
         video.check()
-        check_run(run)
-        folder = training.RunFolder(run)
-        video.make(torchrl_loco.Policy.load(folder.policy, video.device), folder.video)
+        policy, beside = _policy(run_or_task, protocol, video.device)
+        video.make(policy, _video_file(policy, beside))
 
 
-def play(
-    task: tyro.conf.Positional[str],
-    /,
-    policy: Path | None = None,
-    protocol: Literal["playground", "dm_control"] = "playground",
-    video: VideoOptions = Video(),
-) -> None:
+def play(run_or_task: RunOrTask, /, protocol: Protocol = "playground", video: VideoOptions = Video()) -> None:
     """Show a trained policy: in a window if there is a display, else as a video.
 
     Args:
-        task: id of the environment.
-        policy: a run folder or a policy file; default: the policy shipped with the package.
-        protocol: which shipped policy, by what it was trained under; others are played under their own.
+        run_or_task: what to play.
+        protocol: which policy of the package.
         video: which part of an episode is shown, and how; --out always records a video.
     """
     with _user_errors():
         from torchrl_loco import training
-        from torchrl_loco.registry import canonical_id
 
-        name = canonical_id(task)
-        if policy is not None and policy.is_dir():
-            policy = training.RunFolder(check_run(policy)).policy
         video.check()
-        if policy is None:
-            trained = torchrl_loco.load_policy(task, video.device, protocol)
-        else:
-            trained = torchrl_loco.Policy.load(policy, video.device)
-            if trained.info["task"] != name:
-                raise ValueError(f"{policy} is a policy for {trained.info['task']}, not for {task}")
-        shown = ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
-        print(task, *(f"{key} {trained.info[key]}" for key in shown if key in trained.info), sep=", ")
-        if "mean" in trained.info:
-            print(training.describe(trained.info))
+        policy, beside = _policy(run_or_task, protocol, video.device)
+        info, shown = policy.info, ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
+        print(info["task"], *(f"{key} {info[key]}" for key in shown if key in info), sep=", ")
+        if "mean" in info:
+            print(training.describe(info))
         if video.out is None and training.has_display():
-            training.view(trained, video.env(trained), trained.info["action_repeat"])
+            training.view(policy, video.env(policy), info["action_repeat"])
         else:
-            video.make(trained, Path(f"{trained.info['task']}.mp4"))
+            video.make(policy, _video_file(policy, beside))
+
+
+def _video_file(policy: "torchrl_loco.Policy", beside: Path) -> Path:
+    """Returns the video of a run folder or of a policy elsewhere, which is named after its task."""
+    name = "video" if (beside.parent / "config.json").is_file() else policy.info["task"]
+    return beside.with_name(f"{name}.mp4")
 
 
 def export(
-    run_or_task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN_OR_TASK")],
+    run_or_task: RunOrTask,
     /,
     format: Literal["onnx", "torch"] = "onnx",
     out: Path | None = None,
-    protocol: Literal["playground", "dm_control"] = "playground",
+    protocol: Protocol = "playground",
 ) -> None:
     """Write a policy as a file for programs without this package, and compare it with the policy.
 
     Args:
-        run_or_task: a run folder, a policy file, or the id of an environment for the policy shipped with the package.
+        run_or_task: what to export.
         format: onnx, or torch for a program of torch.export (.pt2).
-        out: the file, a new one; default: a new file beside the policy, or TASK.onnx for a shipped one.
-        protocol: which shipped policy, by what it was trained under.
+        out: the file, a new one; default: a new file beside the policy, or TASK.onnx for a policy of the package.
+        protocol: which policy of the package.
     """
     with _user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
-        source = Path(run_or_task)
-        task = None if source.exists() else _shipped_task(run_or_task)
+        _shipped_task(run_or_task)  # before imports that take seconds
         from torchrl_loco import training
         from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy
 
         suffix = SUFFIXES[format]
         if out is not None:
             check_output_file("out", out, (suffix,))
-        if task is not None:
-            policy, default = torchrl_loco.load_policy(task, "cpu", protocol), Path(f"{task}{suffix}")
-        else:
-            file = training.RunFolder(source).policy if source.is_dir() else source
-            policy, default = torchrl_loco.Policy.load(file, "cpu"), file.with_suffix(suffix)
-        out = training.unused_path(default) if out is None else out
+        policy, beside = _policy(run_or_task, protocol, "cpu")
+        out = training.unused_path(beside.with_suffix(suffix)) if out is None else out
         error = export_policy(policy, out)
     print(f"largest difference from the policy, on random observations: {error:.1e} (at most {TOLERANCE:.0e})")
     print(out)
-
-
-def _shipped_task(name: str) -> str:
-    """Returns the id of the environment that was named instead of a file or a folder."""
-    from torchrl_loco.registry import canonical_id
-
-    try:
-        return canonical_id(name)
-    except ValueError as error:
-        raise ValueError(f"there is no run folder or policy file {name!r}, and {error}") from None
 
 
 def inspect(file: tyro.conf.Positional[Path], /, device: str | None = None) -> None:

@@ -57,7 +57,11 @@ def diagnose() -> Iterator[Finding]:
     if len(devices) == 1:
         why = "this torch is built without CUDA" if torch.version.cuda is None else "torch finds no driver or no device"
         yield Finding("cuda", f"none: {why}")
-    yield Finding("kernel cache", _describe_cache())
+    try:
+        yield Finding("kernel cache", _describe_cache())
+    except OSError as error:
+        yield Finding("kernel cache", f"{error}: name a writable folder in WARP_CACHE_PATH", problem=True)
+        return
     tasks: dict[str, str] = {}
     for task in list_envs():
         try:

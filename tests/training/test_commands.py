@@ -9,7 +9,7 @@ import torch
 from small_runs import SMALL, made
 
 from torchrl_loco import cli, training
-from torchrl_loco.policy import Policy
+from torchrl_loco.policy import Policy, load_policy
 from torchrl_loco.training import RunFolder
 from torchrl_loco.training.algorithm import Algorithm
 
@@ -45,14 +45,33 @@ def test_from_training_to_a_video(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(training, "has_display", lambda: False)
     monkeypatch.setattr(training, "record", lambda policy, env, path, *rest: path.touch(exist_ok=False))
-    play = ["play", "walker_walk", "--policy", str(path), *video]
-    for options, name in (([], "walker_walk.mp4"), ([], "walker_walk-2.mp4"), (["--out", "x.mp4"], "x.mp4")):
-        assert cli.main([*play, *options]) == 0
+    for what, options, name in (
+        ([str(path)], [], "video-3.mp4"),
+        (["walker_walk"], [], "walker_walk.mp4"),
+        (["walker_walk"], [], "walker_walk-2.mp4"),
+        ([str(path / "policy.safetensors")], ["--out", "x.mp4"], "x.mp4"),
+    ):
+        assert cli.main(["play", *what, *video, *options]) == 0
         head, returns, out = capsys.readouterr().out.splitlines()
         assert (head.split(",")[0], returns.split()[0], Path(out).name) == ("walker_walk", "return", name)
         assert Path(out).exists()
     assert cli.main(["play", "walker_walk", "--protocol", "dm_control", *video]) == 0
     assert "protocol dm_control" in capsys.readouterr().out
+
+
+def test_a_finished_run_is_trained_on(ppo_run, tmp_path):
+    run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
+    assert cli.main(["resume", str(run.path), "--total_frames", "512"]) == 0
+    assert run.load_config().total_frames == 512
+    assert run.read_metrics()["frames"] == [128, 256, 384, 512]
+    assert run.is_finished
+
+
+def test_the_policy_of_the_package_is_evaluated(capsys):
+    expected = training.evaluate_policy(load_policy("walker_walk", "cpu", "dm_control"), episodes=2)
+    assert expected["mean"] != training.evaluate_policy(load_policy("walker_walk", "cpu"), episodes=2)["mean"]
+    assert cli.main(["eval", "walker_walk", "--protocol", "dm_control", "--episodes", "2", "--device", "cpu"]) == 0
+    assert capsys.readouterr().out == f"{training.describe(expected)}\n"
 
 
 def test_a_run_is_exported_into_its_folder(ppo_run, tmp_path, capsys):
@@ -77,7 +96,7 @@ def test_errors_of_the_user(ppo_run, tmp_path, capsys):
         "train walker_walk --task walker_run": "Unrecognized options: --task",
         "train walker_walk --algorithm pppo": "did you mean 'ppo'",
         "train walker_walk --device cpu --out {file}": "out must be a folder",
-        "eval no/such/run": "is not a run folder",
+        "eval no/such/run": "there is no run folder or policy file 'no/such/run', and unknown environment",
         "eval {run} --episodes 0": "episodes must lie in [1, 2**31)",
         "eval {broken}": "{broken}/config.json is damaged",
         "resume no/such/run": "is not a run folder",
@@ -85,13 +104,24 @@ def test_errors_of_the_user(ppo_run, tmp_path, capsys):
         "resume {broken}": "{broken}/config.json is damaged",
         "record {run} --seconds 0": "seconds must lie in (0, inf)",
         "record {run} --device cpu --out {file}": "already exists",
-        "play walker_walk --policy {run} --device cpu": "is a policy for walker_stand",
+        "play {swapped} --device cpu": "is a policy for walker_walk, but the run is of walker_stand",
+        "resume {renamed} --total_frames 512": "is of a run with task='walker_stand', but its config.json has task",
         "export {run} --out {file}": "out must end in one of .onnx",
         "plot": "no runs",
         "plot {broken}": "{broken}/config.json is damaged",
         "fly": "train, resume, eval",
     }
-    names = {"run": ppo_run.path, "broken": broken, "file": tmp_path / "file.mp4"}
+    swapped, renamed = (shutil.copytree(ppo_run.path, tmp_path / name) for name in ("swapped", "renamed"))
+    load_policy("walker_walk", "cpu").save(swapped / "policy.safetensors")
+    text = (renamed / "config.json").read_text()
+    (renamed / "config.json").write_text(text.replace('"walker_stand"', '"walker_walk"'))
+    names = {
+        "swapped": swapped,
+        "renamed": renamed,
+        "run": ppo_run.path,
+        "broken": broken,
+        "file": tmp_path / "file.mp4",
+    }
     for arguments, message in cases.items():
         with pytest.raises(SystemExit) as ended:
             cli.main(arguments.format(**names).split())

@@ -1,5 +1,6 @@
 """Evaluations: full episodes, the same ones again, apart from those of training."""
 
+import dataclasses
 import itertools
 import json
 import math
@@ -13,8 +14,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 import torchrl_loco
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import RunFolder, evaluate_run, preset
-from torchrl_loco.training.evaluation import Evaluator, fallen_return, poor_return
-from torchrl_loco.training.trainer import evaluation_seed
+from torchrl_loco.training.evaluation import Evaluator, evaluation_seed, fallen_return, poor_return
 
 
 def test_evaluation_can_be_repeated(ppo_run):
@@ -32,8 +32,7 @@ def test_evaluation_can_be_repeated(ppo_run):
 def test_evaluation_is_apart_from_training(ppo_run, shared):
     """No evaluated episode begins as one of the training's did, not even for the largest seed."""
     for seed in (0, 2**32 - 1):
-        config = ppo_run.load_config(seed=seed)
-        seeds = (config.seed, evaluation_seed(config, 0), evaluation_seed(config, 1))
+        seeds = (seed, evaluation_seed(seed, final=False), evaluation_seed(seed, final=True))
         starts = [shared("walker_stand", 4, "cpu", s).reset()["observation"] for s in seeds]
         for one, other in itertools.combinations(starts, 2):
             assert (one != other).any(dim=1).all()
@@ -78,7 +77,7 @@ def test_a_run_from_another_device(ppo_run, tmp_path):
 
 def test_a_run_without_a_policy(tmp_path):
     run = made(tmp_path)
-    for way in ("it has no checkpoint: start a new run", "continue it with torchrl-loco resume"):
+    for way in ("start a new run", "continue it with torchrl-loco resume"):
         with pytest.raises(FileNotFoundError, match=f"has no policy yet: {way}"):
             evaluate_run(run)
         run.save_checkpoint({})
@@ -86,12 +85,15 @@ def test_a_run_without_a_policy(tmp_path):
 
 def test_a_poor_return_is_said(monkeypatch):
     """Poor is less than 0.8 of what the shipped policy earns; without a shipped policy nothing can be said."""
-    config = preset("walker_stand", "cpu", seed=7, total_frames=100_000)
+    config = preset("walker_stand", "cpu", seed=7)
     shipped = torchrl_loco.load_policy("walker_stand", "cpu").info["mean"]
     note = poor_return(config, {"mean": 0.79 * shipped})
     assert f"poor: the policy shipped for walker_stand earns {shipped:.0f}" in note
     assert "--seed 8" in note
-    assert "--total_frames 200000" in note
+    assert "--seed 10" in poor_return(config, {"mean": 0.0}, seeds=(9, 3))
+    assert "--total_frames 6000000" in note
+    short = poor_return(dataclasses.replace(config, total_frames=100_000), {"mean": 0.0})
+    assert "100,000 frames, and the settings for the task take 3,000,000" in short
     assert poor_return(config, {"mean": 0.81 * shipped}) == ""
     monkeypatch.setattr("torchrl_loco.policy.SHIPPED", config.out / "none")
     assert poor_return(config, {"mean": 0.0}) == ""

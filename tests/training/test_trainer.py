@@ -19,7 +19,8 @@ from torchrl_loco.envs.walker import Walker
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import RunFolder, Trainer, evaluate_run, preset, trainer
 from torchrl_loco.training.algorithm import Algorithm
-from torchrl_loco.training.trainer import ALGORITHMS, evaluation_seed, interruptible
+from torchrl_loco.training.evaluation import Evaluator
+from torchrl_loco.training.trainer import ALGORITHMS, interruptible
 
 FILES = {
     *("config.json", "metrics.csv", "evaluations.csv", "checkpoint.pt", "policy.safetensors"),
@@ -175,16 +176,16 @@ def test_the_best_policy_is_kept(tmp_path, monkeypatch, capsys):
     """Of three evaluations the second is the best: its policy is what the run leaves, evaluated in new episodes."""
     means, seeds = iter([10.0, 30.0, 20.0, 25.0]), []
 
-    def fake(config, episodes=None, seed=None):
-        seeds.append(evaluation_seed(config, 1) if seed is None else seed)
-        return lambda policy: torch.full((3,), next(means))
+    def fake(self, policy):
+        seeds.append(self._seed)
+        return torch.full((3,), next(means))
 
-    monkeypatch.setattr(trainer, "make_evaluator", fake)
+    monkeypatch.setattr(Evaluator, "__call__", fake)
     run = trained(tmp_path, total_frames=768, eval_interval=256)
     assert [row["frames"] for row in run.read_evaluations()] == [256, 512, 768]
     info = Policy.load(run.policy, "cpu").info
     assert (info["frames"], info["mean"]) == (512, 25.0)
-    assert seeds[0] != seeds[1]
+    assert seeds[0] == seeds[1] == seeds[2] != seeds[3]
     out = capsys.readouterr().out
     assert "best policy, in new episodes: return 25.0" in out
     assert "The return fell from 30.0 after 512 frames to 20.0 at the end" in out
@@ -195,7 +196,7 @@ def test_the_best_policy_is_kept(tmp_path, monkeypatch, capsys):
 def test_a_resumed_run_keeps_the_policy_of_a_better_evaluation_after_the_checkpoint(tmp_path, monkeypatch):
     """The evaluation is repeated, and on CUDA not exactly."""
     means = iter([10.0, 30.0, 20.0])
-    monkeypatch.setattr(trainer, "make_evaluator", lambda *_, **__: lambda policy: torch.full((3,), next(means)))
+    monkeypatch.setattr(Evaluator, "__call__", lambda self, policy: torch.full((3,), next(means)))
     run = made(tmp_path, total_frames=768, eval_interval=256)
     first = Trainer(run)
     for save in (True, False):

@@ -222,9 +222,11 @@ def choose_engine(mj_model: mujoco.MjModel, config: SimConfig) -> tuple[str, str
         return "compiled", "it has all that the model needs"
     if config.engine == "compiled":
         raise ValueError(f"engine='compiled' does not have: {'; '.join(missing)}. Pass engine='auto' or 'mujoco_warp'")
-    why = f"engine 'compiled' does not have: {'; '.join(missing)}"
-    logging.getLogger("torchrl_loco").warning("stepping with MuJoCo-Warp: %s", why)
-    return "mujoco_warp", why
+    more = f" and {len(missing) - 1} more: see env.engine_reason" if len(missing) > 1 else ""
+    logging.getLogger("torchrl_loco").warning(
+        "stepping with MuJoCo-Warp: engine 'compiled' does not have: %s%s", missing[0], more
+    )
+    return "mujoco_warp", f"engine 'compiled' does not have: {'; '.join(missing)}"
 
 
 def memory(engine: str, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: torch.device) -> int:

@@ -3,8 +3,9 @@ from .config import PPOConfig as PPOConfig
 from .config import REPPOConfig as REPPOConfig
 from .config import TrainingConfig as TrainingConfig
 from .evaluation import describe as describe
+from .evaluation import evaluate_policy as evaluate_policy
+from .evaluation import evaluate_run as evaluate_run
 from .evaluation import has_display as has_display
-from .evaluation import poor_return as poor_return
 from .evaluation import record as record
 from .evaluation import view as view
 from .plots import plot_runs as plot_runs
@@ -14,4 +15,3 @@ from .run_folder import RunFolder as RunFolder
 from .run_folder import unused_path as unused_path
 from .run_group import RunGroup as RunGroup
 from .trainer import Trainer as Trainer
-from .trainer import evaluate_run as evaluate_run

@@ -55,7 +55,7 @@ class TrainingConfig:
     num_envs: int = 64
     """Worlds stepped together."""
     total_frames: int = 1_228_800
-    """Frames to collect, over all worlds."""
+    """Frames to collect, over all worlds, rounded down to whole batches."""
     action_repeat: int = 4
     """Frames for which an action is held."""
     episode_length: int = 400

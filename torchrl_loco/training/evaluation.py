@@ -14,14 +14,17 @@ from torchrl.envs import step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import trange
 
+from torchrl_loco.checks import SEED, check_int
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.policy import load_policy, shipped_policies
+from torchrl_loco.policy import Policy, load_policy, shipped_policies
 from torchrl_loco.registry import make
 from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.config import REPPOConfig, TrainingConfig
-from torchrl_loco.training.presets import STEADY
+from torchrl_loco.training.presets import STEADY, tuned_settings
+from torchrl_loco.training.run_folder import RunFolder
 
-Policy = Callable[[TensorDictBase], TensorDictBase]
+PolicyFunc = Callable[[TensorDictBase], TensorDictBase]
+"""Reads ``observation`` and writes ``action``."""
 
 
 class Evaluator:
@@ -43,7 +46,7 @@ class Evaluator:
         self._seed = seed
         self._action_repeat = action_repeat
 
-    def __call__(self, policy: Policy) -> torch.Tensor:
+    def __call__(self, policy: PolicyFunc) -> torch.Tensor:
         """Returns the return of each episode, shape ``(episodes,)``."""
         env = self._env
         env.set_seed(self._seed)
@@ -74,6 +77,59 @@ def describe(summary: dict[str, float]) -> str:
     )
 
 
+def evaluation_seed(seed: int, final: bool) -> int:
+    """Returns the seed of the episodes that select the best policy of a run, or of those that evaluate it at the end.
+
+    Both differ from ``seed``, that of the training, and from each other.
+    """
+    return (seed + (1 + final) * 1_000_003) % 2**32
+
+
+def evaluate_policy(policy: Policy, episodes: int | None = None, seed: int | None = None) -> dict[str, float]:
+    """Evaluates a trained policy under the protocol that it was trained under, on the device on which it computes.
+
+    Args:
+        policy: a shipped policy, or one that a run has written.
+        episodes: number of episodes; ``None`` takes that of the run.
+        seed: seed of the episodes; ``None`` repeats those of the run's last evaluation.
+
+    Returns:
+        Number, mean, standard deviation and extremes of the returns.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+    info = policy.info
+    episodes = check_int("episodes", info["eval_episodes"] if episodes is None else episodes)
+    seed = evaluation_seed(info["seed"], final=True) if seed is None else check_int("seed", seed, SEED)
+    device = str(next(policy.parameters()).device)
+    with settings_for_small_networks():
+        evaluator = Evaluator(info["task"], episodes, device, seed, info["protocol"], info["action_repeat"])
+        return summarize(evaluator(policy))
+
+
+def evaluate_run(
+    run: RunFolder, episodes: int | None = None, seed: int | None = None, device: str | None = None
+) -> dict[str, float]:
+    """Evaluates the policy of a run, as :func:`evaluate_policy` does.
+
+    Args:
+        run: the run.
+        episodes: number of episodes; ``None`` takes the run's own setting.
+        seed: seed of the episodes; ``None`` repeats those of the run's last evaluation.
+        device: where to play them; ``None`` takes the device on which the run was trained.
+
+    Returns:
+        Number, mean, standard deviation and extremes of the returns.
+
+    Raises:
+        FileNotFoundError: the run has no policy yet.
+        ValueError: an argument is out of range, or the policy cannot be read.
+    """
+    config = run.load_config() if device is None else run.load_config(device=device)
+    return evaluate_policy(run.load_policy(config.device), episodes, seed)
+
+
 POOR = 0.8
 """Fraction of the shipped policy's return below which a return is called poor."""
 FALLEN = 0.9
@@ -95,10 +151,14 @@ def poor_return(config: TrainingConfig, summary: dict[str, float], seeds: Collec
     reference = load_policy(config.task, "cpu", config.protocol).info["mean"]
     if summary["mean"] >= POOR * reference:
         return ""
+    poor = f"This return is poor: the policy shipped for {config.task} earns {reference:.0f}."
+    tuned = tuned_settings(config.task, config.device.partition(":")[0], config.algorithm)["total_frames"]
+    if config.total_frames < tuned:
+        return f"{poor} The run had {config.total_frames:,} frames, and the settings for the task take {tuned:,}"
     return (
-        f"This return is poor: the policy shipped for {config.task} earns {reference:.0f}. Returns vary with seeds and "
-        f"processors. Try another seed (--seed {_next_seed(config, seeds)}) or twice the frames "
-        f"(--total_frames {2 * config.total_frames}); the learning curve shows whether it was still rising"
+        f"{poor} Returns vary with seeds and processors. Try another seed (--seed {_next_seed(config, seeds)}) or "
+        f"twice the frames (--total_frames {2 * config.total_frames}); the learning curve shows whether it was still "
+        "rising"
     )
 
 
@@ -131,7 +191,7 @@ def _next_seed(config: TrainingConfig, seeds: Collection[int]) -> int:
 
 
 def record(
-    policy: Policy, env: LocoEnv, path: Path, seconds: float, action_repeat: int = 1, camera: str = "side"
+    policy: PolicyFunc, env: LocoEnv, path: Path, seconds: float, action_repeat: int = 1, camera: str = "side"
 ) -> None:
     """Records the first world of an environment from its reset on, in real time.
 
@@ -161,7 +221,7 @@ def has_display() -> bool:
         return bool(glfw.init())
 
 
-def view(policy: Policy, env: LocoEnv, action_repeat: int = 1) -> None:
+def view(policy: PolicyFunc, env: LocoEnv, action_repeat: int = 1) -> None:
     """Shows the first world of an environment in MuJoCo's viewer, in real time, until its window is closed.
 
     Args:
@@ -186,7 +246,7 @@ def view(policy: Policy, env: LocoEnv, action_repeat: int = 1) -> None:
 
 
 @torch.no_grad()
-def _play(policy: Policy, env: LocoEnv, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
+def _play(policy: PolicyFunc, env: LocoEnv, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
     """Yields the result of each frame from a reset on, holding each action for ``action_repeat`` frames."""
     td = env.reset()
     for frame in trange(frames, desc=label, leave=False, disable=None):  # no bar in logs

@@ -1,5 +1,6 @@
 """Which settings are used for which task on which device, as data."""
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from torchrl_loco.checks import check_choice, check_device
@@ -126,11 +127,15 @@ def preset(
     task = canonical_id(task)
     device = check_device(device)
     algorithm = DEFAULT_ALGORITHM[device.type] if algorithm is None else algorithm
-    check_choice("algorithm", algorithm, CONFIGS)
-    values = {"device": str(device), **SETTINGS[algorithm, device.type]}
-    if device.type == "cuda":
-        values |= TASKS.get((algorithm, task), {})
-    return CONFIGS[algorithm](task, **{**values, **overrides})
+    kind = CONFIGS[check_choice("algorithm", algorithm, CONFIGS)]
+    for name in overrides:
+        check_choice("setting", name, [field.name for field in dataclasses.fields(kind)])
+    return kind(task, **{"device": str(device), **tuned_settings(task, device.type, algorithm), **overrides})
+
+
+def tuned_settings(task: str, device: str, algorithm: str) -> Settings:
+    """Returns the settings of a preset that differ from the defaults, for a kind of device, "cpu" or "cuda"."""
+    return {**SETTINGS[algorithm, device], **(TASKS.get((algorithm, task), {}) if device == "cuda" else {})}
 
 
 def tuning_note(config: TrainingConfig) -> str:

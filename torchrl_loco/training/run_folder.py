@@ -24,7 +24,7 @@ from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig, config_from_json
 from torchrl_loco.training.loggers import check_loggers
 
-CHECKPOINT_VERSION = 3
+CHECKPOINT_VERSION = 4
 ROOM_NEEDED = 200 * 2**20
 """Bytes that a run may need: checkpoints, video, metrics."""
 
@@ -71,6 +71,10 @@ def new_folder(config: TrainingConfig, ending: str) -> Path:
             return path
 
 
+def _as_json(config: TrainingConfig) -> bytes:
+    return f"{json.dumps(config.to_json(), indent=2)}\n".encode()
+
+
 def _whole_lines(path: Path) -> list[str]:
     """Returns the lines of a CSV file, its head first, without those that a crash or a full disk has cut."""
     *lines, _ = path.read_text().split("\n")
@@ -107,7 +111,7 @@ class RunFolder:
             OSError: the folder cannot be made, or the disk has no room for a run.
         """
         path = new_folder(config, f"seed{config.seed}")
-        (path / "config.json").write_text(json.dumps(config.to_json(), indent=2) + "\n")
+        (path / "config.json").write_bytes(_as_json(config))
         if launch := distributed.launch_id():
             (path / "launch.txt").write_text(launch)
         return cls(path)
@@ -128,8 +132,17 @@ class RunFolder:
         try:
             config = config_from_json(json.loads(path.read_text()))
         except (ValueError, TypeError, LookupError, AttributeError) as error:
-            raise ValueError(f"{path} is damaged or from another release: {error}") from error
+            why = "is damaged, from another release, or of a task that is not installed"
+            raise ValueError(f"{path} {why}: {error}") from error
         return dataclasses.replace(config, **overrides)
+
+    def extend(self, total_frames: int) -> None:
+        """Gives the run more frames, or fewer: the next process that resumes it trains to that number.
+
+        Raises:
+            ValueError: ``total_frames`` is less than a batch.
+        """
+        storage.replace_file(self.path / "config.json", _as_json(self.load_config(total_frames=total_frames)))
 
     @property
     def video(self) -> Path:
@@ -140,6 +153,21 @@ class RunFolder:
     def policy(self) -> Path:
         """The trained policy, without the parts that only training needs."""
         return self.path / "policy.safetensors"
+
+    def load_policy(self, device: str | None = None) -> Policy:
+        """Returns the trained policy on ``device``; ``None`` takes CUDA if there is any.
+
+        Raises:
+            FileNotFoundError: the run has none yet; the message says how to get one.
+            ValueError: it cannot be read, or is of another task.
+        """
+        if not self.policy.is_file():
+            way = "continue it with torchrl-loco resume" if self.has_checkpoint else "start a new run"
+            raise FileNotFoundError(f"{self.path} has no policy yet: {way}")
+        policy, task = Policy.load(self.policy, device), self.load_config().task
+        if policy.info["task"] != task:
+            raise ValueError(f"{self.policy} is a policy for {policy.info['task']}, but the run is of {task}")
+        return policy
 
     @property
     def has_checkpoint(self) -> bool:

@@ -163,9 +163,7 @@ class RunGroup:
             count = f"{len(means)} of {len(self.seeds)} seeds" if failed else f"{len(means)} seeds"
             lines.append(f"mean of {count}: {mean:.1f}, from {min(means):.1f} to {max(means):.1f}")
         if poor := [seed for seed, note in notes.items() if note]:
-            worst = min(poor, key=lambda seed: summaries[seed]["mean"])
-            names = ", ".join(map(str, poor))
-            lines.append(f"{len(poor)} of {len(means)} seeds stayed poor: {names}. Seed {worst}: {notes[worst]}")
+            lines.append(f"{len(poor)} of {len(means)} seeds stayed poor: {', '.join(map(str, poor))}")
         return "\n".join(lines)
 
 

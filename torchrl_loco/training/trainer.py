@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import math
+import os
 import signal
 import sys
 import threading
@@ -15,7 +16,7 @@ import torch
 from torchrl.envs import EnvBase, FrameSkipTransform
 from tqdm.auto import tqdm
 
-from torchrl_loco.checks import SEED, check_device, check_int
+from torchrl_loco.checks import check_device
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs.autoreset import TransformedEnv
 from torchrl_loco.policy import Policy
@@ -24,7 +25,16 @@ from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.config import TrainingConfig
-from torchrl_loco.training.evaluation import Evaluator, describe, fallen_return, poor_return, record, summarize
+from torchrl_loco.training.evaluation import (
+    Evaluator,
+    describe,
+    evaluate_run,
+    evaluation_seed,
+    fallen_return,
+    poor_return,
+    record,
+    summarize,
+)
 from torchrl_loco.training.loggers import Loggers, check_loggers
 from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.ppo import PPO
@@ -108,7 +118,9 @@ class Trainer:
         with (
             Loggers(self.run, self.frames) if first else contextlib.nullcontext() as loggers,
             tqdm(**frames, unit="frame", unit_scale=True, desc=config.task, disable=not first) as bar,
-            interruptible() as interrupted,
+            interruptible(
+                "the update is finished and a checkpoint written; Ctrl-C again stops at once" if first else ""
+            ) as interrupted,
         ):
             while self.frames < self.last_frame:
                 row = self._iterate()
@@ -177,7 +189,10 @@ class Trainer:
     def _evaluate(self) -> dict[str, float]:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""
         if self._evaluator is None:
-            self._evaluator = make_evaluator(self.config, seed=evaluation_seed(self.config, 0))
+            config, seed = self.config, evaluation_seed(self.config.seed, final=False)
+            self._evaluator = Evaluator(
+                config.task, config.eval_episodes, config.device, seed, config.protocol, config.action_repeat
+            )
         when = {"frames": self.frames, "seconds": round(self.seconds, 3)}
         policy = deterministic_policy(self.algorithm.actor, self.config, {**when, "trained_on": self.device_name})
         summary = summarize(self._evaluator(policy))
@@ -194,7 +209,9 @@ class Trainer:
         summary = evaluate_run(self.run)
         plot_runs([self.run], self.run.path / "learning_curve.png")
         if config.video_seconds > 0:
-            env = make(config.task, 1, config.device, evaluation_seed(config, 1), config.protocol, world_offset=0)
+            env = make(
+                config.task, 1, config.device, evaluation_seed(config.seed, final=True), config.protocol, world_offset=0
+            )
             record(policy, env, self.run.video, config.video_seconds, config.action_repeat)
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
@@ -216,15 +233,25 @@ class Trainer:
         ranks = distributed.gathered(own)
         if distributed.is_first():
             counters = {"frames": self.frames, "iteration": self.iteration, "seconds": self.seconds}
-            algorithm = {"algorithm": self.algorithm.state_dict()}
-            self.run.save_checkpoint({**counters, **algorithm, **ranks[0], "further_ranks": ranks[1:]})
+            of = {"settings": self._identity(), "algorithm": self.algorithm.state_dict()}
+            self.run.save_checkpoint({**counters, **of, **ranks[0], "further_ranks": ranks[1:]})
         distributed.wait_for_all()
 
+    def _identity(self) -> dict[str, Any]:
+        """Returns the settings that must not change while a run is stopped."""
+        return {name: getattr(self.config, name) for name in ("algorithm", "task", "protocol", "num_envs", "hidden")}
+
     def _load(self, checkpoint: dict[str, Any]) -> None:
+        for name, value in self._identity().items():
+            if checkpoint["settings"][name] != value:
+                raise ValueError(
+                    f"the checkpoint in {self.run.path} is of a run with {name}={checkpoint['settings'][name]!r}, but "
+                    f"its config.json has {name}={value!r}"
+                )
         self.frames, self.iteration, self.seconds = (checkpoint[key] for key in ("frames", "iteration", "seconds"))
         if self.frames >= self.last_frame and self.run.is_finished:
             raise ValueError(
-                f"{self.run.path} is complete: it has all of its {self.frames} frames. Train a new run for more"
+                f"{self.run.path} is complete: it has all of its {self.frames} frames. Pass --total_frames to train on"
             )
         rank = distributed.rank()
         generator = self.algorithm.generator.get_state()
@@ -291,51 +318,11 @@ def make_env(config: TrainingConfig, nan_dump: Path) -> EnvBase:
     return env if config.action_repeat == 1 else TransformedEnv(env, FrameSkipTransform(config.action_repeat))
 
 
-def make_evaluator(config: TrainingConfig, episodes: int | None = None, seed: int | None = None) -> Evaluator:
-    """Returns the evaluator of a run; ``None`` takes its number of episodes and the seed of its last evaluation."""
-    episodes = check_int("episodes", config.eval_episodes if episodes is None else episodes)
-    seed = evaluation_seed(config, 1) if seed is None else check_int("seed", seed, SEED)
-    return Evaluator(config.task, episodes, config.device, seed, config.protocol, config.action_repeat)
-
-
-def evaluation_seed(config: TrainingConfig, which: int) -> int:
-    """Returns the seed of the episodes that select the best policy (0) or evaluate it at the end (1).
-
-    Both differ from the seed of training and from each other.
-    """
-    return (config.seed + (1 + which) * 1_000_003) % 2**32
-
-
-def evaluate_run(
-    run: RunFolder, episodes: int | None = None, seed: int | None = None, device: str | None = None
-) -> dict[str, float]:
-    """Evaluates the policy of a run.
-
-    Args:
-        run: the run.
-        episodes: number of episodes; ``None`` takes the run's own setting.
-        seed: seed of the episodes; ``None`` repeats those of the run's last evaluation.
-        device: where to play them; ``None`` takes the device on which the run was trained.
-
-    Returns:
-        Number, mean, standard deviation and extremes of the returns.
-
-    Raises:
-        FileNotFoundError: the run has no policy yet.
-        ValueError: an argument is out of range, or the policy cannot be read.
-    """
-    config = run.load_config() if device is None else run.load_config(device=device)
-    if not run.policy.is_file():
-        way = "continue it with torchrl-loco resume" if run.has_checkpoint else "it has no checkpoint: start a new run"
-        raise FileNotFoundError(f"{run.path} has no policy yet: {way}")
-    policy = Policy.load(run.policy, config.device)
-    with settings_for_small_networks():
-        return summarize(make_evaluator(config, episodes, seed)(policy))
-
-
 @contextlib.contextmanager
-def interruptible() -> Iterator[Callable[[], bool]]:
+def interruptible(notice: str = "") -> Iterator[Callable[[], bool]]:
     """Yields a function that tells whether SIGINT or SIGTERM has arrived. The first one does not stop the process.
+
+    It prints ``notice`` on the standard error.
 
     Outside the main thread, and for signals that are ignored (as SIGINT is under ``nohup``), nothing is changed.
     """
@@ -351,6 +338,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
     def press(*_: object) -> None:
         pressed.set()
         restore()
+        os.write(2, f"\n{notice}\n".encode() if notice else b"")  # print may be interrupted while it prints
 
     for kind in handlers:
         signal.signal(kind, press)
