@@ -14,10 +14,13 @@ from types import SimpleNamespace
 
 import pytest
 from generate import benchmarks as page
+from torch import nn
 
 from benchmarks import campaign, marks, pack, plot
 from benchmarks.campaign_folder import TABLES, CampaignFolder, Job
 from benchmarks.marks import read
+from torchrl_loco.policy import ObservationNorm, Policy
+from torchrl_loco.training import RunFolder, preset
 
 SMALL = {
     **{"num_envs": "8", "num_steps": "8", "minibatch_size": "32", "epochs": "1", "hidden": "16 16"},
@@ -168,6 +171,51 @@ def test_the_archive_is_written_while_jobs_run(tmp_path, process, monkeypatch):
     process(LOOK)
     (job,) = run(tmp_path / "folder", archive=tmp_path / "all.tgz")
     assert job["error"] == "it is there"
+
+
+def test_a_job_that_is_stopped_before_it_listens_has_not_failed(tmp_path):
+    with CampaignFolder(tmp_path) as folder:
+        campaigning = campaign.Campaign(folder, [FIRST], {})
+        campaigning._stop.set()  # before its process has imported anything
+        campaigning._train(FIRST, "cpu")
+        assert folder.record(FIRST).status == "stopped"
+
+
+def test_a_process_that_sees_one_gpu_is_told_of_no_other(tmp_path, monkeypatch):
+    seen, command = [], [sys.executable, "-c", ""]
+    monkeypatch.setattr(campaign, "train_command", lambda task, settings: seen.append(settings["device"]) or command)
+    with CampaignFolder(tmp_path) as folder:
+        campaign.Campaign(folder, [FIRST], {})._train(FIRST, "cuda:1")
+    assert seen == ["cuda"]
+
+
+def test_the_result_of_a_finished_run(tmp_path):
+    with CampaignFolder(tmp_path) as folder:
+        folder.update(FIRST, status="running")
+        run = RunFolder.create(preset("walker_stand", "cpu", out=folder.home(FIRST)))
+        run.append_metrics({"iteration": 1, "frames": 3000, "seconds": 10.0, "return": 1.0})
+        for frames, seconds, mean in ((1000, 4.0, 949.0), (2000, 7.0, 951.0), (3000, 10.0, 970.0)):
+            run.append_evaluation({"frames": frames, "seconds": seconds, "mean": mean})
+            folder.note_evaluations(FIRST, wall=2 * seconds)
+        info = {"episodes": 2, "mean": 960.0, "std": 1.0, "min": 959.0, "max": 961.0, "trained_on": "CPU"}
+        Policy(nn.Sequential(ObservationNorm(24), nn.Linear(24, 6), nn.Tanh()), info).save(run.policy)
+        assert folder.finish(FIRST, wall=25.0)
+    (row,) = read(tmp_path, "results.csv")
+    expected = {"frames": 3000, "seconds": 10, "wall": 25, "frames_per_second": 300, "threshold": 950}
+    expected |= {"seconds_to_threshold": 7, "wall_to_threshold": 14, "mean": 960}
+    assert {name: float(row[name]) for name in expected} == expected
+
+
+def test_of_what_is_packed_the_longest_training_comes_first(tmp_path):
+    with CampaignFolder(tmp_path) as folder:
+        for job, wall in ((FIRST, 5.0), (SECOND, 9.0)):
+            folder.update(job, status="stopped", wall=wall)
+            (folder.home(job) / "run").mkdir()
+            for name in ("checkpoint.pt", "checkpoint.pt.part"):
+                (folder.home(job) / "run" / name).write_bytes(b"x")
+        files, checkpoints = folder.contents()
+    assert list(checkpoints) == [f"jobs/{job}/run/checkpoint.pt" for job in (SECOND, FIRST)]
+    assert not any(name.endswith((".pt", ".part")) for name in files)
 
 
 def test_no_two_campaigns_in_a_folder(tmp_path):

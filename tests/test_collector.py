@@ -69,6 +69,18 @@ def test_a_step_that_a_subclass_overrides_is_called(name):
     assert calls == [name] * 3
 
 
+@pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+def test_a_policy_explores_as_was_asked_for(make, kind):
+    made, seen = make("walker_run", False, num_envs=2), []
+
+    def choose(td):
+        seen.append(exploration_type())
+        return td.set("action", torch.zeros(2, 6))
+
+    RolloutCollector(made, choose, frames_per_batch=4, exploration_type=kind).rollout()
+    assert seen == [kind] * 2
+
+
 def test_endless_and_wrong_sizes(make):
     made = make("walker_run", False)
     batches = iter(RolloutCollector(made, policy(made), frames_per_batch=8))

@@ -49,8 +49,10 @@ def test_exported_policies_do_the_same(name, read, tmp_path):
     """For any batch; with observations that are clipped; and they say what a robot's program has to know."""
     if name.endswith("onnx"):
         pytest.importorskip("onnxscript")
-    original = policy()
+    original = policy().train()
     error = export_policy(original, tmp_path / name)
+    assert original.module.training
+    assert all(parameter.requires_grad for parameter in original.parameters())
     assert 0 <= error <= TOLERANCE
     play, facts = read(tmp_path / name)
     for batch in (1, 3, 50):

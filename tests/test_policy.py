@@ -33,6 +33,7 @@ def test_observations_are_normalised_by_all_that_were_seen():
     seen = torch.cat(batches).flatten(0, 1)
     torch.testing.assert_close(norm.mean, seen.mean(0))
     torch.testing.assert_close(norm.var, seen.var(0, correction=0))
+    assert norm.count == len(seen)
     expected = ((seen - norm.mean) / norm.var.sqrt()).clamp(-2, 2)
     torch.testing.assert_close(norm(seen), expected, rtol=1e-4, atol=1e-4)
     assert norm(seen).max() == 2.0
@@ -47,6 +48,17 @@ def test_round_trip(policy, shared, tmp_path):
     td = env.reset()
     torch.testing.assert_close(again(td.clone())["action"], policy(td.clone())["action"], atol=1e-3, rtol=0)
     assert env.rollout(3, again)["action"].abs().max() <= 1
+
+
+def test_large_observations_survive_a_file(tmp_path):
+    """Half precision ends at 65504, and a variance may be larger."""
+    norm, center = ObservationNorm(2), torch.tensor([1e5, 3000.0])
+    norm.update(torch.randn(1000, 2) * 1000 + center)
+    policy = Policy(nn.Sequential(norm, nn.Linear(2, 1), nn.Tanh()), {})
+    policy.save(tmp_path / "policy.safetensors")
+    seen = torch.randn(50, 2) * 1000 + center
+    again = Policy.load(tmp_path / "policy.safetensors", "cpu")
+    torch.testing.assert_close(again(observation=seen), policy(observation=seen), atol=2e-3, rtol=0)
 
 
 def test_a_saved_file_has_the_permissions_of_any_file(policy, tmp_path):

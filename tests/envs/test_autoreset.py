@@ -57,6 +57,22 @@ def test_same_data_as_torchrl(shared, body_task, actions, wrap, at_once, reward_
     assert not ended.all(dim=1).any()
 
 
+def test_hooks_of_torchrl_are_called():
+    env, called = torchrl_loco.make("walker_run", 2, "cpu", 0, **coarse("walker_run")), []
+    env._post_step_mdp_hooks = lambda td, after: called.append(1) or (td, after)
+    env.step_and_maybe_reset(env.rand_action(env.reset()))
+    assert called == [1]
+
+
+def test_a_step_of_no_world_changes_nothing(shared):
+    env = shared("walker_run", 2, **coarse("walker_run"))
+    td = env.rand_action(env.reset()).set("_step", torch.zeros(2, dtype=torch.bool))
+    before = env.get_state()
+    current, _ = env.step_and_maybe_reset(td)
+    assert (env.get_state() == before).all()
+    assert torch.equal(current["next", "observation"], td["observation"])
+
+
 def test_a_step_begins_without_the_last_reward(shared):
     """A loop may go on with what is under ``next``, where a reward is."""
     env = shared("walker_run", 3)

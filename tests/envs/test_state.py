@@ -93,6 +93,17 @@ def test_time_follows_the_elapsed_steps(shared):
     torch.testing.assert_close(env.sim.time, torch.full((4,), 4 * 0.025))
 
 
+def test_a_restored_world_is_not_done(shared):
+    env = shared("walker_run", 2, episode_length=2)
+    td = env.reset()
+    state = env.get_state()
+    for _ in range(2):
+        td = env.step(td.set("action", env.action_spec.zero()))["next"].exclude("reward")
+    assert td["truncated"].all()
+    td = env.reset(state, set_state=True)
+    assert not any(td[name].any() for name in ("done", "terminated", "truncated"))
+
+
 def test_a_wrong_state_is_refused_and_changes_nothing(shared):
     env = shared("walker_run", 3)
     env.reset()

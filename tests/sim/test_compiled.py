@@ -36,6 +36,7 @@ OTHERS = [
     ("<option/>", '<option integrator="implicitfast"/>', "an integrator other than Euler"),
     ("<option/>", '<option noslip_iterations="2"/>', "noslip iterations"),
     ("<option/>", '<option viscosity="1"/>', "forces of a fluid"),
+    ("<option/>", '<option density="1"/>', "forces of a fluid"),
     ("<option/>", '<option><flag gravity="disable"/></option>', "disabled gravity"),
     ("<option/>", '<option><flag warmstart="disable"/></option>', "disabled warmstart"),
     ('<geom type="plane" size="5 5 0.1"/>', HILLS, "contacts of hfield and capsule, hfield and sphere"),
@@ -59,6 +60,8 @@ OTHERS = [
     (MOTOR, '<general name="pull" joint="elbow" dyntype="filter" dynprm="1"/>', "'pull': activation dynamics"),
     (MOTOR, '<general name="pull" joint="elbow" gaintype="affine" gainprm="1 1"/>', "'pull': a gain that is not fixed"),
     (MOTOR, MOTOR.replace("/>", ' damping="1"/>'), "'pull': delay, damping or armature"),
+    (MOTOR, MOTOR.replace("/>", ' armature="1"/>'), "'pull': delay, damping or armature"),
+    (MOTOR, MOTOR.replace("/>", ' delay="0.01" nsample="2"/>'), "'pull': delay, damping or armature"),
     (SENSOR, '<jointpos name="angle" joint="elbow"/>', "sensor 'angle'"),
     (SENSOR, SENSOR.replace("/>", ' cutoff="1"/>'), "sensor 'speed'"),
     ('<joint name="elbow"', '<joint name="elbow" type="ball"', "'pull': a transmission other than a hinge or slide"),
@@ -240,6 +243,28 @@ def test_a_free_body_keeps_its_momentum(form):
     np.testing.assert_allclose(end.subtree_linvel[1], start.subtree_linvel[1], atol=1e-3)
     np.testing.assert_allclose(end.subtree_angmom[1], start.subtree_angmom[1], atol=1e-3)
     np.testing.assert_allclose(sim.data.sensordata.numpy()[0], end.subtree_linvel[1], atol=1e-5)
+
+
+def test_constraints_are_no_stiffer_than_the_time_step_allows(form):
+    """MuJoCo's flag refsafe: a time constant of less than two steps counts as two."""
+    joint = '<joint type="slide" axis="0 0 1" range="-1 0.5" limited="true"/>'
+    body = f'<body name="root" pos="0 0 0.099">{joint}<geom size="0.1"/></body>'
+    model = scene(PLANE.format(euler="0 0 0"), body, f'<body pos="3 0 1">{joint}<geom size="0.1"/></body>')
+    sim, data = simulated(model, sim_dt=0.02), mujoco.MjData(model)
+    data.qpos[1], data.qvel[:] = 0.51, (-0.5, 0.5)  # one in contact, one beyond its limit
+    sim.qpos[0], sim.qvel[0] = torch.as_tensor(data.qpos), torch.as_tensor(data.qvel)
+    sim.step()
+    mujoco.mj_step(model, data)
+    np.testing.assert_allclose(sim.qvel[0], data.qvel, rtol=1e-4)
+
+
+def test_bodies_that_are_excluded_do_not_touch():
+    bodies = "".join(f'<body name="{name}"><freejoint/><geom size="0.1"/></body>' for name in "abc")
+    exclude = '<contact><exclude body1="c" body2="a"/></contact>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody>{exclude}</mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert {pair.geoms for pair in collision.pairs(model)} == {tuple(geoms) for geoms in data.contact.geom.tolist()}
 
 
 def test_more_pairs_of_geoms_than_a_byte_counts(form):

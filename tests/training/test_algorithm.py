@@ -1,4 +1,4 @@
-"""What CUDA graphs and an asynchronous host need of the algorithms, checked on the CPU."""
+"""What all algorithms have in common; also what CUDA graphs and an asynchronous host need, checked on the CPU."""
 
 import traceback
 
@@ -47,6 +47,38 @@ def test_training_waits_for_nothing(trainer):
         torch.tensor(1.0)
         bool(torch.ones(()) > 0)
     assert len(traffic.found) >= 2
+
+
+def test_actor_and_critic_see_the_same_normalised_observations(trainer):
+    algorithm, seen = trainer.algorithm, torch.randn(50, 24)
+    critic = algorithm.critic
+
+    @torch.no_grad()
+    def now():
+        value = critic.module(seen) if hasattr(critic, "module") else critic(seen, torch.zeros(50, 6))[0]
+        return value, algorithm.actor[0].module(seen)[0]
+
+    before = now()
+    algorithm.norm.update(torch.randn(100, 24) * 5 + 3)
+    assert all((new != old).any() for new, old in zip(now(), before, strict=True))
+
+
+def test_gradients_of_one_minibatch_do_not_reach_the_next(trainer):
+    algorithm, norms = trainer.algorithm, []
+    for optimizer in algorithm.optimizers.values():
+        optimizer.param_groups[0]["lr"].fill_(1e-12)
+    for _ in range(2):
+        torch.manual_seed(0)
+        metrics = dict(zip(algorithm.metric_names, algorithm.gradient_step(algorithm._data), strict=True))
+        norms.append([value.item() for name, value in metrics.items() if name.startswith("grad_norm")])
+    assert norms[1] == pytest.approx(norms[0], rel=1e-2)
+
+
+def test_learning_rate_falls_while_a_run_goes_on(tmp_path):
+    trainer = Trainer(made(tmp_path, lr=1e-3, final_lr_fraction=0.2))
+    for lr in (1e-3, 6e-4):  # two batches in all
+        trainer._iterate()
+        torch.testing.assert_close(trainer.algorithm.optimizer.param_groups[0]["lr"], torch.tensor(lr))
 
 
 def test_squashed_normal_is_a_normal_under_tanh():

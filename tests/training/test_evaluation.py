@@ -14,7 +14,14 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 import torchrl_loco
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import RunFolder, evaluate_run, preset
-from torchrl_loco.training.evaluation import Evaluator, evaluation_seed, fallen_return, poor_return
+from torchrl_loco.training.evaluation import (
+    Evaluator,
+    evaluation_seed,
+    fallen_return,
+    poor_return,
+    record,
+    summarize,
+)
 
 
 def test_evaluation_can_be_repeated(ppo_run):
@@ -60,6 +67,25 @@ def test_evaluation_plays_full_episodes():
     returns = evaluator(policy)
     assert returns[0] == 0.0
     torch.testing.assert_close(returns[1], expected[1, 0], rtol=1e-4, atol=0)
+
+
+def test_actions_are_held_in_evaluations_and_videos(tmp_path):
+    calls = []
+
+    def policy(td):
+        calls.append(1)
+        return td.set("action", torch.zeros(1, 6))
+
+    Evaluator("walker_stand", 1, "cpu", 0, action_repeat=7)(policy)
+    assert len(calls) == 6  # of 40 frames
+    calls.clear()
+    record(policy, torchrl_loco.make("walker_stand", 1, "cpu", 0), tmp_path / "video.mp4", 0.1, action_repeat=2)
+    assert len(calls) == 2  # of 4
+
+
+def test_a_spread_is_that_of_the_episodes_themselves():
+    assert summarize(torch.tensor([1.0, 3.0]))["std"] == 1.0
+    assert summarize(torch.tensor([2.0]))["std"] == 0.0
 
 
 def test_a_run_from_another_device(ppo_run, tmp_path):

@@ -1,11 +1,9 @@
 """Advantages and normalisation against values computed by hand, and what an update does."""
 
-import pytest
 import torch
 from small_runs import collected
 from tensordict import TensorDict
 
-from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training import preset
 from torchrl_loco.training.algorithm import clip_and_step
 from torchrl_loco.training.ppo import PPO
@@ -55,22 +53,6 @@ def test_truncation_bootstraps_and_termination_does_not():
     torch.testing.assert_close(data["value_target"].flatten(), expected + value)
 
 
-def test_observation_norm_is_the_mean_and_variance_of_all_it_saw():
-    norm = ObservationNorm(3)
-    chunks = [torch.randn(5, 7, 3) * 4 + 2, torch.randn(1, 3), torch.randn(50, 3) - 6]
-    for chunk in chunks:
-        norm.update(chunk)
-    seen = torch.cat([chunk.reshape(-1, 3) for chunk in chunks])
-    torch.testing.assert_close(norm.mean, seen.mean(0))
-    torch.testing.assert_close(norm.var, seen.var(0, correction=0))
-    assert norm.count == len(seen)
-    normalised = norm(seen)
-    torch.testing.assert_close(normalised.mean(0), torch.zeros(3), atol=1e-4, rtol=0)
-    torch.testing.assert_close(normalised.std(0, correction=0), torch.ones(3), atol=1e-4, rtol=0)
-    assert norm(torch.full((1, 3), 1e9)).max() == norm.limit
-
-
-@pytest.mark.slow
 def test_updates_raise_what_is_rewarded():
     """Rewarded for the first joint alone, the actor moves that joint and leaves the others."""
     ppo, means = made(num_envs=64, num_steps=8, minibatch_size=128, epochs=4, lr=1e-3), []
@@ -104,6 +86,37 @@ def test_entropy_is_rewarded():
     for _ in range(5):
         ppo.update(batch, progress=0.0)
     assert ppo.actor.get_dist(batch).base_dist.stddev.mean() > 1.02 * before
+
+
+def test_the_critic_learns_the_returns():
+    ppo = made(num_envs=8, num_steps=8, minibatch_size=64, lr=3e-3)
+    with torch.no_grad():
+        data = ppo.prepare(collected(ppo, 8)).reshape(-1)
+    first = ppo.loss(data)["loss_critic"].item()
+    for _ in range(30):
+        ppo.gradient_step(data)
+    assert ppo.loss(data)["loss_critic"].item() < first / 2
+
+
+def test_the_ratio_is_clipped_where_the_settings_say():
+    objectives = []
+    for epsilon in (0.05, 0.2):
+        ppo = made(num_envs=8, num_steps=8, minibatch_size=64, clip_epsilon=epsilon)
+        with torch.no_grad():
+            data = ppo.prepare(collected(ppo, 8)).reshape(-1)
+        data["action_log_prob"] -= 1.0  # as if every action had become e times as likely
+        objectives.append(ppo.loss(data)["loss_objective"].item())
+    assert objectives[0] != objectives[1]
+
+
+def test_an_untrained_actor_hardly_looks_at_the_observation():
+    assert made().actor[0].module(torch.randn(200, 24))[0].std(dim=0).mean() < 0.02
+
+
+def test_metrics_are_means_over_all_gradient_steps():
+    ppo = made(num_envs=8, num_steps=8, minibatch_size=16, epochs=3)
+    ppo.gradient_step = lambda minibatch: [torch.tensor(2.5)] * len(ppo.metric_names)
+    torch.testing.assert_close(ppo.update(collected(ppo, 8), 0.0), torch.full((6,), 2.5))
 
 
 def test_a_remainder_smaller_than_a_minibatch_is_left_out():

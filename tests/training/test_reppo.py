@@ -130,6 +130,38 @@ def test_the_actor_returns_where_the_kl_bound_is_exceeded():
     assert after < before / 2
 
 
+@pytest.mark.parametrize(("slope", "temperature"), [(1.0, 1e-6), (0.0, 1.0)])
+def test_the_actor_ascends_value_and_entropy(slope, temperature):
+    """Within the bound: towards larger actions if the critic prefers them; if it prefers none, towards any action."""
+    settings = {"kl_bound": 1e6, "init_temperature": temperature, "min_temperature": 1e-9}
+    reppo = made(num_envs=8, num_steps=8, minibatch_size=64, lr=1e-2, **settings)
+    batch = collected(reppo, 8)
+    with torch.no_grad():
+        data = reppo.prepare(batch).reshape(-1)
+    reppo.critic.value_and_features = lambda observation, action: (slope * action.sum(-1), None)
+
+    def now():
+        torch.manual_seed(1)
+        loc, scale = reppo.distribution(batch["observation"])
+        return loc.mean().item() if slope else -sample(loc, scale)[1].mean().item()
+
+    before = now()
+    for _ in range(10):
+        reppo._actor_step(data)
+    assert now() > before + 0.1
+
+
+def test_the_critic_learns_to_predict_features_as_much_as_asked():
+    fallen = []
+    for coeff in (0.0, 100.0):
+        reppo = made(num_envs=8, num_steps=8, minibatch_size=64, lr=1e-3, aux_coeff=coeff)
+        with torch.no_grad():
+            data = reppo.prepare(collected(reppo, 8)).reshape(-1)
+        losses = [reppo._critic_step(data)[1].item() for _ in range(20)]
+        fallen.append(losses[-1] / losses[0])
+    assert fallen[1] < 0.7 * fallen[0]
+
+
 def test_dual_variables_rise_while_their_constraint_is_violated():
     """Too little entropy raises the temperature, too much divergence the weight of the divergence, and the reverse."""
     for target_entropy, kl_bound, rises in ((5.0, 1e-12, True), (-50.0, 100.0, False)):

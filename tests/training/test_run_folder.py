@@ -66,7 +66,11 @@ def test_a_torn_line_does_not_keep_a_run_from_continuing(tmp_path):
     assert run.read_metrics()["frames"] == [128, 256, 384]
     run.forget_after(256)
     assert path.read_text() == "iteration,frames,return\n1,128,1.5\n2,256,1.5\n"
-    (run.path / "evaluations.csv").touch()  # the disk was full when its first line was written
+    for frames in (256, 384):
+        run.append_evaluation({"frames": frames, "mean": 1.5})
+    run.forget_after(256)
+    assert run.read_evaluations() == [{"frames": 256, "mean": 1.5}]
+    (run.path / "evaluations.csv").write_text("")  # the disk was full when its first line was written
     run.forget_after(256)
     run.append_evaluation({"frames": 256, "mean": 3.0})
     assert run.read_evaluations() == [{"frames": 256, "mean": 3.0}]

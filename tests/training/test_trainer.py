@@ -205,6 +205,8 @@ def test_a_resumed_run_keeps_the_policy_of_a_better_evaluation_after_the_checkpo
         if save:
             first.save()
     again = Trainer(run, resume=True)
+    assert (again.frames, again.iteration) == (128, 1)
+    assert 0.0 < again.seconds < first.seconds
     again._iterate()
     again._evaluate()
     assert [row["mean"] for row in run.read_evaluations()] == [10.0, 20.0]
