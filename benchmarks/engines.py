@@ -17,6 +17,7 @@ from benchmarks.tasks import TASKS
 from benchmarks.timing import milliseconds
 from torchrl_loco import models
 from torchrl_loco.config import PROTOCOLS
+from torchrl_loco.envs import State
 from torchrl_loco.sim.simulation import memory
 
 COLUMNS = {
@@ -96,7 +97,7 @@ def _c_mujoco(body: str, protocol: str, n: int) -> float:
         _, td = env.step_and_maybe_reset(td.set("action", env.action_spec.rand()))
     states, data, spent = env.get_state(), mujoco.MjData(env.mj_model), 0.0
     for world in range(64):
-        for name in ("qpos", "qvel", "qacc_warmstart", "act"):
+        for name in State.PHYSICS:
             if name in states:
                 getattr(data, name)[:] = states[name][world].numpy()
         data.ctrl[:] = models.control(env.mj_model, np.random.default_rng(world).uniform(-1, 1, env.mj_model.nu))

@@ -48,7 +48,7 @@ def too_fast(state, action):
 
 @pytest.mark.parametrize("spoil", [bad_action, too_fast])
 def test_the_file_holds_what_the_step_began_with(device, engine, file, actions, spoil):
-    env = made(file, device, engine=engine, njmax=90)
+    env = made(file, device, engine=engine, iterations=3)
     state, action, _ = drive(env, actions, spoil)
     with pytest.warns(NonFiniteWarning, match=rf"world {BAD} became non-finite in step 4 .*dump\.safe.*inspect"):
         env.close()
@@ -59,7 +59,7 @@ def test_the_file_holds_what_the_step_began_with(device, engine, file, actions, 
     settings = dump.settings
     assert (settings["world"], settings["episode"], settings["elapsed_steps"], settings["seed"]) == (BAD, 1, 3, 7)
     assert (settings["env"], settings["protocol"]) == ("torchrl_loco.envs.walker.WalkerWalk", "playground")
-    assert (settings["config"]["njmax"], settings["config"]["engine"]) == (90, engine)
+    assert (settings["config"]["iterations"], settings["config"]["engine"]) == (3, engine)
 
 
 def test_only_the_first_is_kept(file, actions):

@@ -86,6 +86,11 @@ def test_what_torchrl_would_take_from_the_arguments_is_refused():
         make("walker_walk", 2, "cpu", auto_reset=True)
 
 
+def test_limits_without_effect_are_said():
+    with pytest.warns(UserWarning, match="njmax and naconmax have no effect: the compiled step"):
+        make("walker_walk", 2, "cpu", njmax=50, naconmax=100)
+
+
 def test_naconmax_grows_with_the_worlds():
     for num_envs, expected in ((1, 1024), (2048, 50_000), (4096, 100_000)):
         assert sim_config(DEFAULTS["walker"], "playground", num_envs, {}).naconmax == expected

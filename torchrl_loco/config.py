@@ -36,7 +36,8 @@ class SimConfig:
             as long, and which constraints are dropped when ``njmax`` or ``naconmax`` is too small still varies, see
             :meth:`torchrl_loco.LocoEnv.health`.
         engine: what steps the physics. ``compiled`` is one kernel made for the model, 6 to 50 times as fast on an
-            H200; ``mujoco_warp`` is MuJoCo-Warp; ``auto`` takes ``compiled`` where it can do the model.
+            H200; ``mujoco_warp`` is MuJoCo-Warp; ``auto`` takes ``compiled`` if it supports the model,
+            else ``mujoco_warp``.
 
     Raises:
         TypeError: a value has the wrong type.

@@ -17,6 +17,7 @@ from tqdm.auto import trange
 
 import torchrl_loco
 from torchrl_loco import models
+from torchrl_loco.envs import State
 from torchrl_loco.registry import env_class, list_envs, make
 from torchrl_loco.sim.mujoco_warp import with_margin
 from torchrl_loco.sim.simulation import free_memory
@@ -151,7 +152,7 @@ def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, st
         if td["terminated"].any():  # a world was not finite
             return seconds, float("nan"), engine
         for world in range(env.num_envs):
-            for name in ("qpos", "qvel", "qacc_warmstart", "act"):
+            for name in State.PHYSICS:
                 getattr(data, name)[:] = before.get(name, {world: ()})[world]
             data.ctrl[:] = models.control(env.mj_model, action[world].numpy())
             mujoco.mj_step(env.mj_model, data, env.config.substeps)

@@ -19,7 +19,6 @@ from torchrl_loco.envs.monitors import NAN_DUMP
 from torchrl_loco.registry import env_class, list_envs
 from torchrl_loco.sim.simulation import set_options
 
-STATE = ("qpos", "qvel", "qacc_warmstart", "act")
 RESETS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 """Warnings at which C MuJoCo resets a world."""
 
@@ -47,7 +46,7 @@ class NanDump:
     @property
     def state(self) -> State:
         """The state before the step, of one world."""
-        return State({name: self.tensors[name][None] for name in STATE if name in self.tensors}, batch_size=[1])
+        return State({name: self.tensors[name][None] for name in State.PHYSICS if name in self.tensors}, batch_size=[1])
 
 
 def load(path: Path) -> NanDump:
@@ -132,7 +131,7 @@ def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterato
         yield f"{name} is not finite before the step: entry {entries}"
     if "action" in wrong:
         yield "an action that is not finite terminates its world, which is stepped with zeros instead"
-    if any(name in STATE for name in wrong):
+    if any(name in State.PHYSICS for name in wrong):
         yield "the state was already non-finite before the step: there is nothing to step"
         return
     warp, c = warp_trace(dump, device), mujoco_trace(dump)

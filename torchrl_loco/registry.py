@@ -151,4 +151,8 @@ def make(id: str, *args: Any, **kwargs: Any) -> "LocoEnv":
     for name in ("auto_reset", "policy"):  # TorchRL takes them from every environment's arguments
         if kwargs.get(name):
             raise ValueError(f"{name} is no argument: step_and_maybe_reset, rollout and collectors reset by themselves")
-    return env_class(id)(*args, **kwargs)
+    env = env_class(id)(*args, **kwargs)
+    if env.engine == "compiled" and (ignored := [name for name in ("njmax", "naconmax") if name in kwargs]):
+        why = "the compiled step has no such limits, engine='mujoco_warp' has"
+        warnings.warn(f"{' and '.join(ignored)} have no effect: {why}", stacklevel=2)
+    return env

@@ -6,6 +6,7 @@ import re
 import hypothesis
 import numpy as np
 import pytest
+from evaluate import evaluate
 from hypothesis import strategies as st
 
 from torchrl_loco import models
@@ -17,7 +18,6 @@ from torchrl_loco.sim.compiled.symbols import (
     array,
     cell,
     cross,
-    evaluate,
     literal,
     maximum,
     minimum,

@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torchrl.record.loggers import CSVLogger
 
 from torchrl_loco import cli
-from torchrl_loco.training import RunFolder, RunGroup, Trainer, loggers
+from torchrl_loco.training import RunFolder, RunGroup, Trainer, config, loggers
 from torchrl_loco.training.algorithm import Algorithm
 
 
@@ -92,7 +92,7 @@ def test_a_logger_that_fails_does_not_end_the_run(tmp_path, monkeypatch):
     opened = {"wandb": Fails, "mlflow": FailsToClose}
     openers = {name: lambda folder, *_, of=of: (of(of.__name__, str(folder)), "id") for name, of in opened.items()}
     monkeypatch.setattr(loggers, "_OPEN", openers)
-    monkeypatch.setattr(loggers, "check_packages", lambda *_: None)
+    monkeypatch.setattr(config, "check_packages", lambda *_: None)
     with (
         pytest.warns(RuntimeWarning, match="wandb failed and is left out .*: the server is away"),
         pytest.warns(RuntimeWarning, match="mlflow failed .*: no answer"),
@@ -121,7 +121,7 @@ def test_a_logger_that_cannot_be_opened_is_said_in_a_line(tmp_path, monkeypatch,
 
     openers = {"wandb": lambda folder, *_: (Closes("first", str(folder)), None), "mlflow": no_login}
     monkeypatch.setattr(loggers, "_OPEN", openers)
-    monkeypatch.setattr(loggers, "check_packages", lambda *_: None)
+    monkeypatch.setattr(config, "check_packages", lambda *_: None)
     with pytest.raises(SystemExit, match="2"):
         cli._train(Trainer(made(tmp_path, logger=("wandb", "mlflow"))))
     assert capsys.readouterr().err == "torchrl-loco: the logger mlflow cannot be opened: no login\n"
@@ -138,7 +138,7 @@ def test_seeds_share_a_group_in_wandb(tmp_path, monkeypatch):
             self.experiment.id = f"id{len(given)}"
 
     monkeypatch.setattr(loggers, "WandbLogger", Fake)
-    monkeypatch.setattr(loggers, "check_packages", lambda *_: None)
+    monkeypatch.setattr(config, "check_packages", lambda *_: None)
     monkeypatch.delenv("WANDB_PROJECT", raising=False)
     group = RunGroup.create(made(tmp_path / "template", logger="wandb").load_config(out=tmp_path), [0, 1])
     runs = [RunFolder.create(dataclasses.replace(group.config, seed=seed, out=group.path)) for seed in (0, 1)]

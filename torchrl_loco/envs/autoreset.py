@@ -42,18 +42,18 @@ def step_and_reset(
         It, and what the next step begins with, as TorchRL's ``step_and_maybe_reset``.
     """
     after = env._step(tensordict)
-    env.world.reset_done()
+    env.world.reset_masked()
     begin = env._outputs()  # in the worlds that go on, nothing has changed
     done = after.get("done")
     # As in TorchRL, the policy's outputs are zero where a world was reset.
     for key, value in tensordict.items():
         if key not in begin and key not in rewritten and key != "reward":
-            begin._set_str(key, value.masked_fill(_rows(done, value), 0), inplace=False, validated=True)
+            begin._set_str(key, value.masked_fill(rows_of(done, value), 0), inplace=False, validated=True)
     tensordict.set("next", after)
     return tensordict, begin
 
 
-def _rows(mask: torch.Tensor, entry: torch.Tensor) -> torch.Tensor:
+def rows_of(mask: torch.Tensor, entry: torch.Tensor) -> torch.Tensor:
     """Returns a mask of worlds, ``(*batch, 1)``, in a shape that broadcasts with an entry, ``(*batch, ...)``."""
     return mask.view(*mask.shape[:-1], *[1] * (entry.ndim - mask.ndim + 1))
 
@@ -77,7 +77,7 @@ def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBas
     fresh = env._reset(request, set_state=False)
 
     def merge(old: torch.Tensor, new: torch.Tensor | None) -> torch.Tensor:
-        rows = _rows(mask, old)
+        rows = rows_of(mask, old)
         return old.masked_fill(rows, 0) if new is None else torch.where(rows, new, old)
 
     # As in TorchRL, entries that a reset does not return (a policy's other outputs) are zero where a world was reset.

@@ -26,7 +26,7 @@ from torchrl_loco.checks import (
     check_output_file,
 )
 from torchrl_loco.config import SimConfig, sim_config
-from torchrl_loco.envs.autoreset import _rows, is_plain, reset_done_worlds, step_and_reset
+from torchrl_loco.envs.autoreset import is_plain, reset_done_worlds, rows_of, step_and_reset
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.state import State, write_state
 from torchrl_loco.envs.world import World
@@ -238,7 +238,7 @@ class LocoEnv(EnvBase):
         after = self._outputs(with_reward=True)
         self._set_state(before, held)
         stay = self._skip_tensordict(tensordict.select(*self.full_done_spec, *self.full_observation_spec, strict=False))
-        return after.apply(lambda new, old: torch.where(_rows(held.view(*self.batch_size, 1), new), old, new), stay)
+        return after.apply(lambda new, old: torch.where(rows_of(held.view(*self.batch_size, 1), new), old, new), stay)
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False) -> TensorDictBase:
         self._refuse_after_fork()
@@ -284,7 +284,7 @@ class LocoEnv(EnvBase):
     def _step_and_maybe_reset(
         self, tensordict: TensorDictBase, rewritten: frozenset[str] = frozenset()
     ) -> tuple[TensorDictBase, TensorDictBase]:
-        """Returns what TorchRL's returns, after a third of its work on the host where nothing special is asked for.
+        """Returns what TorchRL's method returns; for a plain TensorDict, after a third of the work on the host.
 
         Args:
             tensordict: has an ``action``, batch ``(num_envs,)``.

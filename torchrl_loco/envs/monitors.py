@@ -15,6 +15,7 @@ import warp as wp
 from tensordict import TensorDict
 
 from torchrl_loco import storage
+from torchrl_loco.envs.state import State
 from torchrl_loco.sim import Buffer, Overflow, Simulation, WorldFunc, fill
 
 INTERVAL = 100
@@ -292,7 +293,7 @@ class NanGuard(Monitor):
         self._path, self._sim, self._seed, self._settings = path, sim, seed, settings
         data = sim.data
         episode, elapsed_steps = (buffer.warp for buffer in inputs)
-        physics = {name: getattr(data, name) for name in ("qpos", "qvel", "qacc_warmstart", "act")}
+        physics = {name: getattr(data, name) for name in State.PHYSICS}
         self._inputs = {"episode": episode, "elapsed_steps": elapsed_steps, **physics}
         self._kept = {name: wp.zeros_like(array) for name, array in {"action": data.ctrl, **self._inputs}.items()}
         self._first = Buffer(1, int, sim.device)
@@ -317,7 +318,7 @@ class NanGuard(Monitor):
         return self._first.torch.long()
 
     def clear(self) -> None:
-        """Clears the finding."""
+        """Forgets the world that was found."""
         self._first.torch.fill_(self._sim.num_envs)
         self._found.torch.zero_()
 

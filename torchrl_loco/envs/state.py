@@ -30,7 +30,8 @@ class State(TensorDict):
     TensorDict that it was given, with the state in it: exclude ``State.KEYS`` before you pass that on as a state again.
     """
 
-    KEYS = ("qpos", "qvel", "qacc_warmstart", "act", "elapsed_steps", "episode")
+    PHYSICS = ("qpos", "qvel", "qacc_warmstart", "act")
+    KEYS = (*PHYSICS, "elapsed_steps", "episode")
 
     def branch(self, world: int, num_envs: int | None = None) -> "State":
         """Returns a state in which every world is a copy of one, to try different futures from the same moment.

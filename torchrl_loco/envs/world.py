@@ -209,11 +209,11 @@ class World:
         self._set_mask(mask)
         if stagger:
             self._stagger.torch.fill_(True)
-        self.reset_done()
+        self.reset_masked()
         if stagger:
             self._stagger.torch.fill_(False)
 
-    def reset_done(self) -> None:
+    def reset_masked(self) -> None:
         """Begins the next episode in the worlds of the mask: after a step, those that are done."""
         if torch_is_recording(self.sim.device):
             with joined_to_torch(self.sim.device):
@@ -222,7 +222,7 @@ class World:
             self._reset_graph.replay()
 
     def poll(self, steps: int = 1) -> None:
-        """Lets the monitors report after so many control steps."""
+        """Tells the monitors that ``steps`` control steps have passed; they may report."""
         for monitor in self._monitors:
             monitor.poll(steps)
 

@@ -77,7 +77,7 @@ class Graph:
 
 
 class TorchGraph:
-    """Work on CUDA without arguments, recorded as a CUDA graph of torch after some warm-up calls.
+    """A function without arguments, recorded as a CUDA graph of torch after some warm-up calls.
 
     ``tensordict.nn.CudaGraphModule`` waits for the device at every call; this does not.
 

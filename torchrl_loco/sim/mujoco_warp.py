@@ -164,7 +164,7 @@ class MujocoWarpEngine:
         self.peak_contacts = Buffer(1, int, device)
 
     def remedy(self, dropped: str, most: int) -> str:
-        """Returns what prevents that something is dropped, if a substep needed so many."""
+        """Returns advice for the warning about dropped constraints or contacts, of which a substep needed ``most``."""
         return f"a physics step needed up to {most}: pass {ROOM[dropped]}={with_margin(most)}"
 
     def step(

@@ -102,7 +102,6 @@ class Simulation:
         self.engine = engines[name](mj_model, config, num_envs, self.device)
         self.model, self.data = self.engine.model, self.engine.data
         self._mujoco_data: mjw.Data | None = None
-        self.graphs: list[Graph] = []
         self._scratch = ScratchPool(self.device) if self.device.is_cuda else None
 
         self.qpos = wp.to_torch(self.data.qpos)
@@ -192,9 +191,7 @@ class Simulation:
 
     def capture(self, launch: Callable[[], None]) -> Graph:
         """Returns a recording of the launches that ``launch`` makes. It also runs them: reset before use."""
-        graph = Graph(launch, self.device, self._scratch)
-        self.graphs.append(graph)
-        return graph
+        return Graph(launch, self.device, self._scratch)
 
 
 def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:

@@ -3,10 +3,11 @@
 import dataclasses
 import math
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
-from torchrl_loco.checks import SEED, check_choice, check_fields, check_int
+from torchrl_loco.checks import SEED, check_choice, check_fields, check_int, check_packages
 from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.registry import canonical_id, env_class
 
@@ -204,6 +205,17 @@ class REPPOConfig(TrainingConfig):
             first, least = getattr(self, f"init_{name}"), getattr(self, f"min_{name}")
             if first < least:
                 raise ValueError(f"init_{name} ({first}) must not be below min_{name} ({least})")
+
+
+def check_loggers(names: Collection[str]) -> None:
+    """Checks that the packages of loggers are installed.
+
+    Raises:
+        ImportError: one is not; the message says how to install it.
+    """
+    for name in names:
+        if name != "csv":
+            check_packages(f"the logger {name}", [name], "train" if name == "tensorboard" else name)
 
 
 CONFIGS: dict[str, type[TrainingConfig]] = {config.algorithm: config for config in (PPOConfig, REPPOConfig)}

@@ -1,7 +1,7 @@
 """Data parallel training: one process a GPU, each with worlds of its own and all with the same parameters.
 
 ``torchrun`` starts the processes, the ranks; :func:`joined` connects them, by NCCL on CUDA and by gloo on the CPU. In a
-process of its own every function here returns what it was given, so that the rest of the training need not ask.
+single process nothing is exchanged: functions return what they were given, so that callers need not check.
 """
 
 import contextlib
@@ -300,7 +300,7 @@ def _device() -> torch.device:
 
 @contextlib.contextmanager
 def _peers() -> Iterator[None]:
-    """Names a failed message as what it mostly is.
+    """Turns a failed exchange into a RankLostError, its usual cause.
 
     Raises:
         RankLostError: it failed.

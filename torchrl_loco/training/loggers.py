@@ -3,31 +3,18 @@
 import contextlib
 import os
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torchrl.record.loggers import Logger, MLFlowLogger, TensorboardLogger, WandbLogger
 
-from torchrl_loco.checks import check_packages, is_run_group
-
-if TYPE_CHECKING:
-    from torchrl_loco.training.run_folder import RunFolder
+from torchrl_loco.checks import is_run_group
+from torchrl_loco.training.run_folder import RunFolder
 
 PROJECT = "torchrl_loco"
 """Project of W&B and experiment of MLflow, unless WANDB_PROJECT or MLFLOW_EXPERIMENT_NAME names another."""
-
-
-def check_loggers(names: Collection[str]) -> None:
-    """Checks that the packages of loggers are installed.
-
-    Raises:
-        ImportError: one is not; the message says how to install it.
-    """
-    for name in names:
-        if name != "csv":
-            check_packages(f"the logger {name}", [name], "train" if name == "tensorboard" else name)
 
 
 class Loggers:
@@ -43,7 +30,7 @@ class Loggers:
         OSError: one cannot be opened, for example because it needs a login.
     """
 
-    def __init__(self, run: "RunFolder", frames: int) -> None:
+    def __init__(self, run: RunFolder, frames: int) -> None:
         self._run = run
         self._frames = frames
         self._open: dict[str, Logger] = {}

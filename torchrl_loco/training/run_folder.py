@@ -21,8 +21,7 @@ from torchrl_loco.checks import check_device, check_run, is_run_group
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import env_class
 from torchrl_loco.training import distributed
-from torchrl_loco.training.config import TrainingConfig, config_from_json
-from torchrl_loco.training.loggers import check_loggers
+from torchrl_loco.training.config import TrainingConfig, check_loggers, config_from_json
 
 CHECKPOINT_VERSION = 4
 ROOM_NEEDED = 200 * 2**20

@@ -9,9 +9,8 @@ from pathlib import Path
 
 from torchrl_loco.checks import SEED, check_device, check_int, is_run_group
 from torchrl_loco.policy import Policy
-from torchrl_loco.training.config import TrainingConfig, config_from_json
+from torchrl_loco.training.config import TrainingConfig, check_loggers, config_from_json
 from torchrl_loco.training.evaluation import describe, poor_return
-from torchrl_loco.training.loggers import check_loggers
 from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.run_folder import RunFolder, new_folder, unused_path
 from torchrl_loco.training.trainer import Trainer

@@ -24,7 +24,7 @@ from torchrl_loco.registry import env_class, make
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
-from torchrl_loco.training.config import TrainingConfig
+from torchrl_loco.training.config import TrainingConfig, check_loggers
 from torchrl_loco.training.evaluation import (
     Evaluator,
     describe,
@@ -35,7 +35,7 @@ from torchrl_loco.training.evaluation import (
     record,
     summarize,
 )
-from torchrl_loco.training.loggers import Loggers, check_loggers
+from torchrl_loco.training.loggers import Loggers
 from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.ppo import PPO
 from torchrl_loco.training.reppo import REPPO

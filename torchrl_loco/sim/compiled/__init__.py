@@ -7,7 +7,7 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 ================  =========================================================================
 ``engine``        all worlds at once
 ``step``          the choice of a schedule, and the size of a launch
-``support``       what a model may not need
+``support``       which models are supported
 ``collision``     which geoms may touch, and with which parameters
 ``traced``        one thread a world: a control step from top to bottom
 ``symbols``       scalars whose arithmetic is traced, and blocks of C++

@@ -105,7 +105,7 @@ class Data:
         )
 
     def outputs(self) -> dict[str, wp.array | None]:
-        """Returns what the kernels write, by name; ``None`` if it was not asked for, which can no longer be done."""
+        """Returns what the kernels write, by name; ``cvel`` is ``None`` if nothing has asked for it before."""
         self._make = None
         written = {name: self._cvel if name == "cvel" else getattr(self, name) for name in ROWS}
         del written["ctrl"]
@@ -186,7 +186,7 @@ class CompiledEngine:
         self.peak_contacts = Buffer(1, int, device)
 
     def remedy(self, dropped: str, most: int) -> str:
-        """Returns what prevents that something is dropped."""
+        """Returns advice for the warning about dropped contacts."""
         return f"a world of the compiled engine has no more places for {dropped}: pass engine='mujoco_warp'"
 
     def step(

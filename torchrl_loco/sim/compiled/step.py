@@ -19,8 +19,8 @@ WARPS = 2
 and more warps wait for each other's instructions (measured)."""
 
 MANY = 2
-"""Above this many times the worlds that fill those warps, the rest of a control step has kernels of its own: it waits
-for memory, and the registers of the physics leave room for few warps."""
+"""Above this multiple of the worlds that fill those warps, observation and bookkeeping run in kernels of their own:
+they wait for memory, and the registers of the physics leave too few warps to hide that."""
 
 
 def is_traced(m: mujoco.MjModel) -> bool:
