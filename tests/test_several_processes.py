@@ -49,3 +49,8 @@ def test_collectors(collector):
 def test_examples(example):
     said = run(f"examples/{example}.py", "--batches", 2, "--num-envs", 8)
     assert "batch 2: " in said
+
+
+@pytest.mark.ci
+def test_the_example_of_off_policy_learning():
+    assert "over 32 episodes" in run("examples/sac.py", "--total-frames", 8192)
