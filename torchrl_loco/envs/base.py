@@ -59,6 +59,15 @@ class LocoEnv(EnvBase):
             non-finite are written to it, within about 100 steps or at :meth:`close`; see ``torchrl-loco inspect``.
         config: fields of :class:`torchrl_loco.SimConfig` to override.
 
+    Attributes:
+        num_envs: number of worlds, 1 without a batch dimension.
+        seed: the seed, also one that was drawn.
+        protocol: the protocol.
+        config: all settings, a :class:`torchrl_loco.SimConfig`.
+        engine: what steps the worlds, ``"compiled"`` or ``"mujoco_warp"``.
+        engine_reason: why.
+        mj_model: the model, a ``mujoco.MjModel``.
+
     Raises:
         ValueError: an argument is out of range or unknown; the message names the valid choices.
         TypeError: an argument has the wrong type.
