@@ -21,8 +21,8 @@ from benchmarks.pack import pack
 from benchmarks.results import circumstances
 from benchmarks.training import train_command
 from torchrl_loco.checks import check_choice
+from torchrl_loco.training.interrupts import interruptible
 from torchrl_loco.training.presets import TASKS
-from torchrl_loco.training.trainer import interruptible
 
 SETTINGS = {"eval_episodes": 128, "video_seconds": 0, "logger": "csv"}
 """What is set for every job, unless the caller sets it."""

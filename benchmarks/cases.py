@@ -20,7 +20,7 @@ from benchmarks.tasks import TASKS
 from torchrl_loco import RolloutCollector, models
 from torchrl_loco.config import DEFAULTS, sim_config
 from torchrl_loco.sim import Simulation, current_stream
-from torchrl_loco.training.trainer import interruptible
+from torchrl_loco.training.interrupts import interruptible
 
 Run = TypeVar("Run")
 INTERRUPTED = threading.Event()

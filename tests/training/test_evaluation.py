@@ -19,9 +19,9 @@ from torchrl_loco.training.evaluation import (
     evaluation_seed,
     fallen_return,
     poor_return,
-    record,
     summarize,
 )
+from torchrl_loco.training.playback import record
 
 
 def test_evaluation_can_be_repeated(ppo_run):

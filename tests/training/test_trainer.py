@@ -20,7 +20,8 @@ from torchrl_loco.policy import Policy
 from torchrl_loco.training import RunFolder, Trainer, evaluate_run, preset, trainer
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.evaluation import Evaluator
-from torchrl_loco.training.trainer import ALGORITHMS, interruptible
+from torchrl_loco.training.interrupts import interruptible
+from torchrl_loco.training.trainer import ALGORITHMS
 
 FILES = {
     *("config.json", "metrics.csv", "evaluations.csv", "checkpoint.pt", "policy.safetensors"),

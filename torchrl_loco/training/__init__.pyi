@@ -5,9 +5,9 @@ from .config import TrainingConfig as TrainingConfig
 from .evaluation import describe as describe
 from .evaluation import evaluate_policy as evaluate_policy
 from .evaluation import evaluate_run as evaluate_run
-from .evaluation import has_display as has_display
-from .evaluation import record as record
-from .evaluation import view as view
+from .playback import has_display as has_display
+from .playback import record as record
+from .playback import view as view
 from .plots import plot_runs as plot_runs
 from .presets import preset as preset
 from .presets import tuning_note as tuning_note

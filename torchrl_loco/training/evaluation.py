@@ -1,13 +1,7 @@
-"""Evaluation, videos and the viewer."""
+"""Evaluation: what a policy earns over full episodes, and what to say of it."""
 
-import os
-import sys
-import time
-import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from pathlib import Path
 
-import imageio.v3 as imageio
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import step_mdp
@@ -52,7 +46,7 @@ class Evaluator:
         env.set_seed(self._seed)
         returns = torch.zeros(env.num_envs, 1, device=env.device)
         alive = torch.ones_like(returns, dtype=torch.bool)
-        for after in _play(policy, env, self._action_repeat, env.config.episode_length, "evaluation"):
+        for after in play(policy, env, self._action_repeat, env.config.episode_length, "evaluation"):
             returns += after["reward"] * alive
             alive &= ~after["done"]
         return returns.squeeze(-1)
@@ -190,64 +184,20 @@ def _next_seed(config: TrainingConfig, seeds: Collection[int]) -> int:
     return max(config.seed, *seeds, -1) + 1
 
 
-def record(
-    policy: PolicyFunc, env: LocoEnv, path: Path, seconds: float, action_repeat: int = 1, camera: str = "side"
-) -> None:
-    """Records the first world of an environment from its reset on, in real time.
-
-    Args:
-        policy: reads ``observation`` and writes ``action``.
-        env: where it plays.
-        path: the video file; its suffix chooses the container, the codec is H.264.
-        seconds: length of the video (s).
-        action_repeat: frames for which an action is held.
-        camera: ``"side"``, ``"back"`` or ``"egocentric"``.
-    """
-    frame_rate = round(1 / env.config.ctrl_dt)
-    with settings_for_small_networks(), imageio.imopen(path, "w", plugin="pyav") as video:
-        video.init_video_stream("h264", fps=frame_rate)
-        for _ in _play(policy, env, action_repeat, round(seconds * frame_rate), "video"):
-            video.write_frame(env.render(camera, 480, 360)[0].cpu().numpy())
-
-
-def has_display() -> bool:
-    """Returns whether MuJoCo's viewer can open a window."""
-    if sys.platform == "darwin":  # where the viewer needs MuJoCo's own launcher
-        return "mjpython" in Path(sys.argv[0]).name or "MJPYTHON_BIN" in os.environ
-    import glfw
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # glfw warns where it fails
-        return bool(glfw.init())
-
-
-def view(policy: PolicyFunc, env: LocoEnv, action_repeat: int = 1) -> None:
-    """Shows the first world of an environment in MuJoCo's viewer, in real time, until its window is closed.
-
-    Args:
-        policy: reads ``observation`` and writes ``action``.
-        env: where it plays.
-        action_repeat: frames for which an action is held.
-    """
-    import mujoco.viewer  # needs a display
-
-    data = mujoco.MjData(env.mj_model)
-    with mujoco.viewer.launch_passive(env.mj_model, data) as window:
-        while window.is_running():
-            due = time.perf_counter()
-            for _ in _play(policy, env, action_repeat, env.config.episode_length, "episode"):
-                data.qpos[:] = env.sim.qpos[0].cpu()
-                mujoco.mj_kinematics(env.mj_model, data)
-                window.sync()
-                due += env.config.ctrl_dt
-                time.sleep(max(0.0, due - time.perf_counter()))
-                if not window.is_running():
-                    break
-
-
 @torch.no_grad()
-def _play(policy: PolicyFunc, env: LocoEnv, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
-    """Yields the result of each frame from a reset on, holding each action for ``action_repeat`` frames."""
+def play(policy: PolicyFunc, env: LocoEnv, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
+    """Yields the result of each frame from a reset on, without exploration.
+
+    Args:
+        policy: reads ``observation`` and writes ``action``.
+        env: where it plays.
+        action_repeat: frames for which an action is held.
+        frames: how many frames.
+        label: of the progress bar.
+
+    Yields:
+        What is under ``"next"`` of each step.
+    """
     td = env.reset()
     for frame in trange(frames, desc=label, leave=False, disable=None):  # no bar in logs
         if frame % action_repeat == 0:

@@ -3,12 +3,9 @@
 import contextlib
 import dataclasses
 import math
-import os
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +29,11 @@ from torchrl_loco.training.evaluation import (
     evaluation_seed,
     fallen_return,
     poor_return,
-    record,
     summarize,
 )
+from torchrl_loco.training.interrupts import interruptible
 from torchrl_loco.training.loggers import Loggers
+from torchrl_loco.training.playback import record
 from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.ppo import PPO
 from torchrl_loco.training.reppo import REPPO
@@ -316,33 +314,3 @@ def make_env(config: TrainingConfig, nan_dump: Path) -> EnvBase:
         nan_dump=None if nan_dump.exists() else nan_dump,
     )
     return env if config.action_repeat == 1 else TransformedEnv(env, FrameSkipTransform(config.action_repeat))
-
-
-@contextlib.contextmanager
-def interruptible(notice: str = "") -> Iterator[Callable[[], bool]]:
-    """Yields a function that tells whether SIGINT or SIGTERM has arrived. The first one does not stop the process.
-
-    It prints ``notice`` on the standard error.
-
-    Outside the main thread, and for signals that are ignored (as SIGINT is under ``nohup``), nothing is changed.
-    """
-    pressed = threading.Event()
-    in_main = threading.current_thread() is threading.main_thread()
-    handlers = {kind: signal.getsignal(kind) for kind in (signal.SIGINT, signal.SIGTERM) if in_main}
-    handlers = {kind: handler for kind, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
-
-    def restore() -> None:
-        for kind, handler in handlers.items():
-            signal.signal(kind, handler)
-
-    def press(*_: object) -> None:
-        pressed.set()
-        restore()
-        os.write(2, f"\n{notice}\n".encode() if notice else b"")  # print may be interrupted while it prints
-
-    for kind in handlers:
-        signal.signal(kind, press)
-    try:
-        yield pressed.is_set
-    finally:
-        restore()

@@ -1,0 +1,37 @@
+"""Ctrl-C and SIGTERM, which end a run after its update."""
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+
+
+@contextlib.contextmanager
+def interruptible(notice: str = "") -> Iterator[Callable[[], bool]]:
+    """Yields a function that tells whether SIGINT or SIGTERM has arrived. The first one does not stop the process.
+
+    It prints ``notice`` on the standard error.
+
+    Outside the main thread, and for signals that are ignored (as SIGINT is under ``nohup``), nothing is changed.
+    """
+    pressed = threading.Event()
+    in_main = threading.current_thread() is threading.main_thread()
+    handlers = {kind: signal.getsignal(kind) for kind in (signal.SIGINT, signal.SIGTERM) if in_main}
+    handlers = {kind: handler for kind, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
+
+    def restore() -> None:
+        for kind, handler in handlers.items():
+            signal.signal(kind, handler)
+
+    def press(*_: object) -> None:
+        pressed.set()
+        restore()
+        os.write(2, f"\n{notice}\n".encode() if notice else b"")  # print may be interrupted while it prints
+
+    for kind in handlers:
+        signal.signal(kind, press)
+    try:
+        yield pressed.is_set
+    finally:
+        restore()

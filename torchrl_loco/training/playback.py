@@ -1,0 +1,68 @@
+"""Videos and the viewer."""
+
+import os
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import imageio.v3 as imageio
+
+from torchrl_loco.envs import LocoEnv
+from torchrl_loco.training.algorithm import settings_for_small_networks
+from torchrl_loco.training.evaluation import PolicyFunc, play
+
+
+def record(
+    policy: PolicyFunc, env: LocoEnv, path: Path, seconds: float, action_repeat: int = 1, camera: str = "side"
+) -> None:
+    """Records the first world of an environment from its reset on, in real time.
+
+    Args:
+        policy: reads ``observation`` and writes ``action``.
+        env: where it plays.
+        path: the video file; its suffix chooses the container, the codec is H.264.
+        seconds: length of the video (s).
+        action_repeat: frames for which an action is held.
+        camera: ``"side"``, ``"back"`` or ``"egocentric"``.
+    """
+    frame_rate = round(1 / env.config.ctrl_dt)
+    with settings_for_small_networks(), imageio.imopen(path, "w", plugin="pyav") as video:
+        video.init_video_stream("h264", fps=frame_rate)
+        for _ in play(policy, env, action_repeat, round(seconds * frame_rate), "video"):
+            video.write_frame(env.render(camera, 480, 360)[0].cpu().numpy())
+
+
+def has_display() -> bool:
+    """Returns whether MuJoCo's viewer can open a window."""
+    if sys.platform == "darwin":  # where the viewer needs MuJoCo's own launcher
+        return "mjpython" in Path(sys.argv[0]).name or "MJPYTHON_BIN" in os.environ
+    import glfw
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # glfw warns where it fails
+        return bool(glfw.init())
+
+
+def view(policy: PolicyFunc, env: LocoEnv, action_repeat: int = 1) -> None:
+    """Shows the first world of an environment in MuJoCo's viewer, in real time, until its window is closed.
+
+    Args:
+        policy: reads ``observation`` and writes ``action``.
+        env: where it plays.
+        action_repeat: frames for which an action is held.
+    """
+    import mujoco.viewer  # needs a display
+
+    data = mujoco.MjData(env.mj_model)
+    with mujoco.viewer.launch_passive(env.mj_model, data) as window:
+        while window.is_running():
+            due = time.perf_counter()
+            for _ in play(policy, env, action_repeat, env.config.episode_length, "episode"):
+                data.qpos[:] = env.sim.qpos[0].cpu()
+                mujoco.mj_kinematics(env.mj_model, data)
+                window.sync()
+                due += env.config.ctrl_dt
+                time.sleep(max(0.0, due - time.perf_counter()))
+                if not window.is_running():
+                    break
