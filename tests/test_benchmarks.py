@@ -91,7 +91,7 @@ def test_fidelity_is_measured_on_real_worlds(tmp_path, monkeypatch):
     assert (tmp_path / "fidelity.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_policies_are_played_here_and_in_dm_control():
     theirs, ours = suite.suite(["walker_walk"], 4, torch.device("cpu"), None)
     assert ours["mean"] > 960

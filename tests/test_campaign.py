@@ -76,6 +76,7 @@ sys.exit("first line\\nof task " + task)
 """
 
 
+@pytest.mark.slow
 def test_jobs_begin_in_order_and_failures_are_recorded_and_tried_again(tmp_path, process, capsys):
     process(REPORT)
     for processes in "12":

@@ -146,6 +146,7 @@ def test_new_results_appear_by_themselves(tmp_path):
     assert "| walker_walk | 12.5 |" in text
 
 
+@pytest.mark.slow
 def test_the_picture_of_the_readme_shows_moments_of_tasks_in_rows(tmp_path):
     runners.draw(tmp_path / "rows.png", (("walker_stand", "walker_walk"), ("cheetah_run", "walker_stand")))
     seen = imageio.imread(tmp_path / "rows.png").astype(int)

@@ -267,6 +267,7 @@ def test_bodies_that_are_excluded_do_not_touch():
     assert {pair.geoms for pair in collision.pairs(model)} == {tuple(geoms) for geoms in data.contact.geom.tolist()}
 
 
+@pytest.mark.parametrize("form", [31], indirect=True, ids=["traced"])
 def test_more_pairs_of_geoms_than_a_byte_counts(form):
     """Of 4 rows of 8 balls the last two collide."""
     balls = "".join(f'<geom size="0.04" pos="{0.1 * i} 0 0"/>' for i in range(8))

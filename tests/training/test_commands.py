@@ -59,6 +59,7 @@ def test_from_training_to_a_video(tmp_path, capsys, monkeypatch):
     assert "protocol dm_control" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_trained_on(ppo_run, tmp_path):
     run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
     assert cli.main(["resume", str(run.path), "--total_frames", "512"]) == 0

@@ -62,6 +62,7 @@ def test_each_seed_is_as_if_it_were_alone(tmp_path, capsys):
         group.train()
 
 
+@pytest.mark.slow
 def test_a_seed_that_fails_loses_no_other(tmp_path, monkeypatch, capsys):
     """Its traceback is kept; resuming trains it alone, and touches nothing of the others."""
     small = [f"--{key}={value}" for key, value in SMALL.items() if key != "hidden"]
