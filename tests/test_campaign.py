@@ -92,6 +92,7 @@ def test_jobs_begin_in_order_and_failures_are_recorded_and_tried_again(tmp_path,
     assert "walker_run-playground-5: failed of task walker_run" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_devices_work_side_by_side_on_one_job_each(tmp_path, process, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7,9")
     process(REPORT)

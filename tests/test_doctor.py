@@ -15,6 +15,7 @@ def test_healthy(capsys):
     assert "problems" not in out
 
 
+@pytest.mark.slow
 def test_wrong_physics(capsys, monkeypatch):
     """Of one body it is wrong, of the others not even finite."""
     make = doctor.make

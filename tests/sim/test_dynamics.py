@@ -50,6 +50,7 @@ def assert_agrees(model, rng):
     np.testing.assert_allclose(mass @ value(factor.solve(x)), vector, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=40, suppress_health_check=list(hypothesis.HealthCheck), **SETTINGS)
 @hypothesis.given(models(max_bodies=5))
 def test_random_models(xml):

@@ -69,6 +69,7 @@ def traced(tree):
 VALUES = st.fixed_dictionaries({symbol: st.sampled_from([-1.7, -0.4, 0.0, 0.3, 1.0, 2.5]) for symbol in SYMBOLS})
 
 
+@pytest.mark.slow
 @hypothesis.settings(deadline=None, derandomize=True, max_examples=300)
 @hypothesis.given(tree=EXPRESSIONS, values=VALUES)
 def test_values_are_those_of_plain_arithmetic(tree, values):

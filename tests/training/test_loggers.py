@@ -70,6 +70,7 @@ def test_a_missing_package_is_named_before_anything_is_made(tmp_path, monkeypatc
     assert run.load_config().logger == ("wandb",)  # it can be evaluated and plotted without
 
 
+@pytest.mark.slow
 def test_a_logger_that_fails_does_not_end_the_run(tmp_path, monkeypatch):
     """Neither while it logs nor when it is closed; the others go on."""
 

@@ -121,6 +121,7 @@ def full_disk(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_while_training(tmp_path, capsys):
     """The previous checkpoint is kept, and the command says how to continue from it."""
     run = made(tmp_path, hidden=(128,), checkpoint_seconds=1e-9)

@@ -43,6 +43,7 @@ def test_run_folder_is_complete(run):
     assert all(math.isfinite(float(value)) for row in rows for value in row.values())
 
 
+@pytest.mark.slow
 def test_pictures(ppo_run):
     video = imageio.imread(ppo_run.video, plugin="pyav")
     assert video.shape == (4, 360, 480, 3)  # a tenth of a second at 40 frames a second
