@@ -193,9 +193,14 @@ def check_run(path: Path, or_group: bool = False) -> Path:
         if or_group:
             return Path(path)
         raise FileNotFoundError(f"{path} holds the runs of several seeds: name the folder of one of them, in it")
-    if not (Path(path) / "config.json").is_file():
+    if not is_run(path):
         raise FileNotFoundError(f"{path} is not a run folder: it has no config.json")
     return Path(path)
+
+
+def is_run(path: Path) -> bool:
+    """Returns whether ``path`` is a run folder."""
+    return (Path(path) / "config.json").is_file()
 
 
 def is_run_group(path: Path) -> bool:

@@ -24,6 +24,7 @@ from torchrl_loco.checks import (
     check_int,
     check_output_file,
     check_run,
+    is_run,
     is_run_group,
 )
 
@@ -124,7 +125,7 @@ Protocol = Annotated[
 
 
 def _policy(run_or_task: str, protocol: str, device: str | None) -> tuple["torchrl_loco.Policy", Path]:
-    """Returns the policy that was named, and the file beside which what is made of it goes."""
+    """Returns a policy, and the path from which the default names of its video and of its export derive."""
     if task := _shipped_task(run_or_task):
         return torchrl_loco.load_policy(task, device, protocol), Path(task)
     source = Path(run_or_task)
@@ -240,7 +241,7 @@ class Video:
         """Records the policy into ``out``, or into ``default`` or a numbered sibling of it, and prints the path."""
         from torchrl_loco import training
 
-        out = check_output_file("out", training.unused_path(default) if self.out is None else self.out)
+        out = check_output_file("out", training.unused_path(default)) if self.out is None else self.out
         print(f"recording {self.seconds:g} s; on a CPU this takes a while", file=sys.stderr)  # logs have no bar
         training.record(policy, self.env(policy), out, self.seconds, policy.info["action_repeat"], self.camera)
         print(out)
@@ -292,9 +293,8 @@ def play(run_or_task: RunOrTask, /, protocol: Protocol = "playground", video: Vi
 
 
 def _video_file(policy: "torchrl_loco.Policy", beside: Path) -> Path:
-    """Returns the video of a run folder or of a policy elsewhere, which is named after its task."""
-    name = "video" if (beside.parent / "config.json").is_file() else policy.info["task"]
-    return beside.with_name(f"{name}.mp4")
+    """Returns the default file of a video: that of a run folder; elsewhere it is named after the task."""
+    return beside.with_name("video.mp4" if is_run(beside.parent) else f"{policy.info['task']}.mp4")
 
 
 def export(
@@ -313,14 +313,13 @@ def export(
         protocol: which policy of the package.
     """
     with _user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
-        _shipped_task(run_or_task)  # before imports that take seconds
+        policy, beside = _policy(run_or_task, protocol, "cpu")
         from torchrl_loco import training
         from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy
 
         suffix = SUFFIXES[format]
         if out is not None:
             check_output_file("out", out, (suffix,))
-        policy, beside = _policy(run_or_task, protocol, "cpu")
         out = training.unused_path(beside.with_suffix(suffix)) if out is None else out
         error = export_policy(policy, out)
     print(f"largest difference from the policy, on random observations: {error:.1e} (at most {TOLERANCE:.0e})")

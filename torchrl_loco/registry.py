@@ -125,6 +125,13 @@ def summary(id: str) -> str:
     return registered()[id].summary or (env_class(id).__doc__ or "").strip().split("\n")[0]
 
 
+TAKEN_BY_TORCHRL = {
+    "auto_reset": "step_and_maybe_reset, rollout and collectors reset by themselves",
+    "policy": "pass it to rollout or to a collector",
+}
+"""Arguments that TorchRL takes out of those of every environment before it is made, and what to do instead."""
+
+
 def make(id: str, *args: Any, **kwargs: Any) -> "LocoEnv":
     """Makes an environment.
 
@@ -148,9 +155,9 @@ def make(id: str, *args: Any, **kwargs: Any) -> "LocoEnv":
         >>> env.rollout(100)["next", "reward"].shape
         torch.Size([16, 100, 1])
     """
-    for name in ("auto_reset", "policy"):  # TorchRL takes them from every environment's arguments
+    for name, instead in TAKEN_BY_TORCHRL.items():
         if kwargs.get(name):
-            raise ValueError(f"{name} is no argument: step_and_maybe_reset, rollout and collectors reset by themselves")
+            raise ValueError(f"{name} is no argument: {instead}")
     env = env_class(id)(*args, **kwargs)
     if env.engine == "compiled" and (ignored := [name for name in ("njmax", "naconmax") if name in kwargs]):
         why = "the compiled step has no such limits, engine='mujoco_warp' has"

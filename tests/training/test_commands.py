@@ -60,12 +60,16 @@ def test_from_training_to_a_video(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_finished_run_is_trained_on(ppo_run, tmp_path):
+def test_a_finished_run_is_trained_on(ppo_run, tmp_path, capsys):
     run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
     assert cli.main(["resume", str(run.path), "--total_frames", "512"]) == 0
     assert run.load_config().total_frames == 512
     assert run.read_metrics()["frames"] == [128, 256, 384, 512]
     assert run.is_finished
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["resume", str(run.path), "--total_frames", "384"])
+    assert "must be more than the 512 frames" in capsys.readouterr().err
+    assert run.load_config().total_frames == 512
 
 
 def test_the_policy_of_the_package_is_evaluated(capsys):

@@ -61,8 +61,8 @@ def check(mj_model: mujoco.MjModel) -> mujoco.MjModel:
         wrong.append("actions beyond [-1, 1] must be clipped: leave ctrllimited and the flag clampctrl on")
     if mj_model.actuator_delay.any():
         wrong.append("delays of actuators are not supported: they are not part of the state that is reset")
-    groups = np.clip(mj_model.actuator_group, 0, 30)
-    if ((mj_model.opt.disableactuator >> groups) & 1).any():
+    disabled = {group for group in range(31) if mj_model.opt.disableactuator >> group & 1}
+    if disabled.intersection(mj_model.actuator_group.tolist()):
         wrong.append("groups of actuators cannot be disabled (actuatorgroupdisable): leave the actuators out")
     for i in range(mj_model.nsensor):
         camera = int(mujoco.mjtObj.mjOBJ_CAMERA)

@@ -120,8 +120,7 @@ def evaluate_run(
         FileNotFoundError: the run has no policy yet.
         ValueError: an argument is out of range, or the policy cannot be read.
     """
-    config = run.load_config() if device is None else run.load_config(device=device)
-    return evaluate_policy(run.load_policy(config.device), episodes, seed)
+    return evaluate_policy(run.load_policy(device or run.load_config().device), episodes, seed)
 
 
 POOR = 0.8

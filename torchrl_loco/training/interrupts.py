@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator
 
 @contextlib.contextmanager
 def interruptible(notice: str = "") -> Iterator[Callable[[], bool]]:
-    """Yields a function that tells whether SIGINT or SIGTERM has arrived. The first one does not stop the process.
+    """Yields a function that tells whether SIGINT or SIGTERM has arrived.
 
-    It prints ``notice`` on the standard error.
+    The first signal does not stop the process; it prints ``notice`` on the standard error. The second one does.
 
     Outside the main thread, and for signals that are ignored (as SIGINT is under ``nohup``), nothing is changed.
     """
@@ -27,7 +27,8 @@ def interruptible(notice: str = "") -> Iterator[Callable[[], bool]]:
     def press(*_: object) -> None:
         pressed.set()
         restore()
-        os.write(2, f"\n{notice}\n".encode() if notice else b"")  # print may be interrupted while it prints
+        if notice:
+            os.write(2, f"\n{notice}\n".encode())  # print could be called while it is printing
 
     for kind in handlers:
         signal.signal(kind, press)

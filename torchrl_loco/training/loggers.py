@@ -68,12 +68,11 @@ class Loggers:
         """Logs a row of metrics at a number of frames."""
         for name, logger in list(self._open.items()):
             try:
-                logger.log_metrics(row, step=frames)
+                with _closed_at_errors(logger):
+                    logger.log_metrics(row, step=frames)
             except Exception as error:
                 _report(name, error)
                 del self._open[name]
-                with contextlib.suppress(Exception):
-                    _close(logger, type(error))  # else the next run of this process would be written into this one
 
 
 def _report(name: str, error: Exception) -> None:
@@ -144,14 +143,12 @@ class _MLflow(MLFlowLogger):
     def _create_experiment(self) -> Any:
         import mlflow
 
-        if self._of is None:
-            run = super()._create_experiment()
-            self._begun = True
-            mlflow.set_tag("mlflow.runName", self._name)
-            return run
-        run = mlflow.start_run(run_id=self._of)
+        run = super()._create_experiment() if self._of is None else mlflow.start_run(run_id=self._of)
         self._begun = True
-        self.id = run.info.experiment_id
+        if self._of is None:
+            mlflow.set_tag("mlflow.runName", self._name)
+        else:
+            self.id = run.info.experiment_id
         return run
 
 
@@ -169,7 +166,7 @@ _OPEN = {"tensorboard": _open_tensorboard, "wandb": _open_wandb, "mlflow": _open
 
 @contextlib.contextmanager
 def _closed_at_errors(logger: Logger) -> Iterator[None]:
-    """Closes a logger if what is done with it fails."""
+    """Closes a logger if a call of it fails: else the next run of this process would be written into this one."""
     try:
         yield
     except Exception as error:

@@ -158,8 +158,10 @@ def _untuned(config: TrainingConfig) -> str:
 
 def _values_cut_off(config: TrainingConfig) -> str:
     """Returns a note if returns may be larger than the critic of REPPO can represent, else an empty string."""
+    if not isinstance(config, REPPOConfig):
+        return ""
     largest = config.reward_scale * config.action_repeat / max(1.0 - config.gamma, 1e-9)
-    if not isinstance(config, REPPOConfig) or largest <= config.max_value * (1.0 + 1e-9):
+    if largest <= config.max_value * (1.0 + 1e-9):  # of rounding
         return ""
     scale = config.reward_scale * config.max_value / largest
     return (

@@ -136,11 +136,14 @@ class RunFolder:
         return dataclasses.replace(config, **overrides)
 
     def extend(self, total_frames: int) -> None:
-        """Gives the run more frames, or fewer: the next process that resumes it trains to that number.
+        """Sets the number of frames to which the run is trained when it is resumed.
 
         Raises:
-            ValueError: ``total_frames`` is less than a batch.
+            ValueError: the run has as many frames already.
         """
+        done = max((row["frames"] for row in self._read("metrics.csv")), default=0)
+        if total_frames <= done:
+            raise ValueError(f"total_frames must be more than the {done:.0f} frames of {self.path}, got {total_frames}")
         storage.replace_file(self.path / "config.json", _as_json(self.load_config(total_frames=total_frames)))
 
     @property

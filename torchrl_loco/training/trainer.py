@@ -117,7 +117,7 @@ class Trainer:
             Loggers(self.run, self.frames) if first else contextlib.nullcontext() as loggers,
             tqdm(**frames, unit="frame", unit_scale=True, desc=config.task, disable=not first) as bar,
             interruptible(
-                "the update is finished and a checkpoint written; Ctrl-C again stops at once" if first else ""
+                "stopping after this update, with a checkpoint; Ctrl-C again stops at once" if first else ""
             ) as interrupted,
         ):
             while self.frames < self.last_frame:
