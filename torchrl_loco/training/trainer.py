@@ -25,7 +25,7 @@ from torchrl_loco.training.config import TrainingConfig, check_loggers
 from torchrl_loco.training.evaluation import (
     Evaluator,
     describe,
-    evaluate_run,
+    evaluate_policy,
     evaluation_seed,
     fallen_return,
     poor_return,
@@ -204,7 +204,7 @@ class Trainer:
         """Evaluates the best policy in episodes that did not select it, plots the learning curve, records a video."""
         config = self.config
         policy = Policy.load(self.run.policy, config.device)
-        summary = evaluate_run(self.run)
+        summary = evaluate_policy(policy)
         plot_runs([self.run], self.run.path / "learning_curve.png")
         if config.video_seconds > 0:
             env = make(
