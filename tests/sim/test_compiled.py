@@ -11,7 +11,7 @@ import torchrl_loco
 from torchrl_loco import models
 from torchrl_loco.config import DEFAULTS, SimConfig, sim_config
 from torchrl_loco.sim import Simulation
-from torchrl_loco.sim.compiled import collision, contacts, lanes, step, unsupported
+from torchrl_loco.sim.compiled import collision, dense_contacts, lanes, step, unsupported
 from torchrl_loco.sim.simulation import choose_engine
 
 BODY = '<body name="arm"><joint name="elbow" damping="1"/><geom name="hand" type="capsule" size="0.1 0.2"/></body>'
@@ -365,7 +365,7 @@ ROW = "".join(f'<body name="{i or "root"}" pos="0 0 {0.19 * i}">{SLIDE}</body>' 
 def column(places, monkeypatch, qpos, qvel):
     """Returns the simulation after a control step, with so many places for contacts between moving bodies."""
     with monkeypatch.context() as patched:
-        patched.setattr(contacts, "MAX_DENSE", places)
+        patched.setattr(dense_contacts, "MAX_DENSE", places)
         patched.setattr(lanes, "ENOUGH_FRICTIONAL", places)
         patched.setattr(lanes, "MOST_FRICTIONAL", places)
         sim = simulated(scene(ROW, gravity="0 0 0"), len(qpos))

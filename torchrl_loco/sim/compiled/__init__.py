@@ -4,20 +4,24 @@ Small bodies are traced: the physics is written on symbolic scalars and run once
 fold, zeros vanish, and common terms are computed once. Larger ones are stepped by a group of lanes, in loops over
 tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps)`` shows it.
 
-================  =========================================================================
-``engine``        all worlds at once
-``step``          the choice of a schedule, and the size of a launch
-``support``       which models are supported
-``collision``     which geoms may touch, and with which parameters
-``traced``        one thread a world: a control step from top to bottom
-``symbols``       scalars whose arithmetic is traced, and blocks of C++
-``dynamics``      poses, inertias, forces; M x and (M + K)^-1 x by sweeps over the tree
-``constraints``   softness of constraints; rows of limits and dry friction
-``contacts``      rows of contacts
-``solver``        Newton iterations and their line search
-``sensors``       velocities of subtrees, and touch
-``lanes``         a group of lanes a world: what ``lanes.h`` has to know about a model
-================  =========================================================================
+===================  =====================================================================
+``engine``           all worlds at once
+``step``             the choice of a schedule, and the size of a launch
+``support``          which models are supported
+``collision``        which geoms may touch, and with which parameters
+``traced``           one thread a world: a control step from top to bottom
+``symbols``          scalars whose arithmetic is traced, and blocks of C++
+``dynamics``         poses, inertias, forces; M x and (M + K)^-1 x by sweeps over the tree
+``constraints``      softness of constraints; rows of limits and dry friction
+``pyramid``          rows of a contact
+``ground_contacts``  contacts with planes of the world: a stiffness of a body each
+``dense_contacts``   all other contacts: their Jacobians are stored
+``solver``           Newton iterations and their line search
+``sensors``          velocities of subtrees, and touch
+``lanes``            a group of lanes a world: what ``lanes.h`` has to know about a model
+``links``            bodies that are welded together
+``tables``           constants and tables as C++
+===================  =====================================================================
 """
 
 from torchrl_loco.sim.compiled.engine import CompiledEngine as CompiledEngine

@@ -67,6 +67,13 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
     return found
 
 
+def contact_weight(m: mujoco.MjModel, pair: Pair) -> float:
+    """Returns the approximate inverse inertia along a row of a contact."""
+    if pair.condim == 1:
+        return pair.weight
+    return pair.weight * (1 + pair.friction**2) * 2 * pair.friction**2 / m.opt.impratio
+
+
 def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
     """Returns a pair with its mixed parameters (MuJoCo's ``mj_contactParam``)."""
     one_decides = m.geom_priority[a] != m.geom_priority[b]

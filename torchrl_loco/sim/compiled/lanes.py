@@ -9,17 +9,16 @@ import itertools
 import math
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import ClassVar
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
 
 from torchrl_loco.sim.compiled import collision
-from torchrl_loco.sim.compiled.collision import CAPSULE, MINVAL, PLANE, Pair, pairs
+from torchrl_loco.sim.compiled.collision import CAPSULE, MINVAL, PLANE, Pair, contact_weight, pairs
 from torchrl_loco.sim.compiled.constraints import Softness, tolerance
-from torchrl_loco.sim.compiled.contacts import contact_weight
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, SLIDE
+from torchrl_loco.sim.compiled.links import Mass, matrix, moving_bodies, places
+from torchrl_loco.sim.compiled.tables import Tables
 from torchrl_loco.sim.overflow import Overflow
 
 TEMPLATE = pathlib.Path(__file__).with_name("lanes.h")
@@ -41,180 +40,6 @@ LOCKSTEP = True
 """Whether the worlds of a block wait for each other twice a substep, so that they share what they fetch of the text."""
 ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 16, 16
 """Places for contacts with friction, which a world should have and may have, and for those without."""
-
-
-# Rigid links: bodies welded together.
-
-
-@dataclasses.dataclass(frozen=True)
-class Place:
-    """Where a body is: in a link, or in the world if ``link`` is -1.
-
-    Attributes:
-        link: index of the link.
-        position: of the body in the frame of the link, ``(3,)`` (m).
-        quaternion: the same for its orientation, ``(4,)``.
-    """
-
-    link: int
-    position: np.ndarray
-    quaternion: np.ndarray
-
-    def point(self, offset: np.ndarray) -> np.ndarray:
-        """Returns a point of the body in the frame of the link."""
-        return self.position + matrix(self.quaternion) @ offset
-
-    def turn(self, quaternion: np.ndarray) -> np.ndarray:
-        """Returns an orientation in the body as one in the link."""
-        return product(self.quaternion, quaternion)
-
-
-@dataclasses.dataclass
-class Mass:
-    """Mass, center and moments of inertia of a part of a link, in its frame."""
-
-    mass: float
-    center: np.ndarray
-    moments: np.ndarray
-
-    @classmethod
-    def join(cls, m: mujoco.MjModel, places: Sequence[Place], bodies: Sequence[int]) -> "Mass":
-        """Returns several bodies of one link as one."""
-        masses = m.body_mass[bodies]
-        centers = np.array([places[b].point(m.body_ipos[b]) for b in bodies])
-        mass = masses.sum()
-        center = masses @ centers / mass if mass > 0 else centers[0]
-        moments = np.zeros((3, 3))
-        for b, d in zip(bodies, centers - center, strict=True):
-            axes = matrix(places[b].turn(m.body_iquat[b]))
-            moments += axes @ np.diag(m.body_inertia[b]) @ axes.T
-            moments += m.body_mass[b] * (d @ d * np.eye(3) - np.outer(d, d))
-        return cls(float(mass), center, moments)
-
-
-def matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Returns the matrix of a quaternion, exact zeros where rounding left something else."""
-    result = np.zeros(9)
-    mujoco.mju_quat2Mat(result, np.asarray(quaternion, float))
-    result[np.abs(result) < 1e-12] = 0
-    return result.reshape(3, 3)
-
-
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns the product of two quaternions."""
-    result = np.zeros(4)
-    mujoco.mju_mulQuat(result, a, b)
-    return result
-
-
-def moving_bodies(m: mujoco.MjModel) -> list[int]:
-    """Returns the bodies that have joints, each the first body of a link."""
-    return [b for b in range(1, m.nbody) if m.body_dofnum[b]]
-
-
-def places(m: mujoco.MjModel) -> list[Place]:
-    """Returns where each body is."""
-    links = {b: i for i, b in enumerate(moving_bodies(m))}
-    found = [Place(-1, np.zeros(3), np.array([1.0, 0, 0, 0]))]
-    for b in range(1, m.nbody):
-        parent = found[m.body_parentid[b]]
-        if b in links:
-            found.append(Place(links[b], np.zeros(3), np.array([1.0, 0, 0, 0])))
-        else:
-            found.append(Place(parent.link, parent.point(m.body_pos[b]), parent.turn(m.body_quat[b])))
-    return found
-
-
-# Functions and constants of struct Model.
-
-
-class Tables:
-    """The members of struct ``Model``."""
-
-    COMPONENTS: ClassVar = {"Vec": 3, "Quat": 4, "Symmetric": 6, "Mat": 9, "Softness": 9}
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def size(self, **values: int) -> None:
-        """Adds integer constants."""
-        self.lines += [f"  enum {{ {name} = {int(value)} }};" for name, value in values.items()]
-
-    def constant(self, **values: float) -> None:
-        """Adds functions that return a number."""
-        for name, value in values.items():
-            self._function("float", name, [f"return {literal(value)};"], parameter="")
-
-    def vector(self, name: str, value: ArrayLike) -> None:
-        """Adds a function that returns a vector."""
-        self._function("Vec", name, [f"return {{{', '.join(map(literal, np.asarray(value, float)))}}};"], parameter="")
-
-    def procedure(self, name: str, parameter: str, statements: list[str]) -> None:
-        """Adds a function that returns nothing."""
-        self._function("void", name, statements, parameter)
-
-    def floats(self, name: str, values: Sequence[float] | np.ndarray) -> None:
-        """Adds a function from an index to a number."""
-        statements, result = column([literal(x) for x in values], "float", "table")
-        self._function("float", name, [*statements, f"return {result};"])
-
-    def integers(self, name: str, values: Sequence[int] | np.ndarray, type_: str = "int") -> None:
-        """Adds a function from an index to an integer."""
-        values = [int(x) for x in values]
-        stored = type_
-        if type_ == "int" and all(-128 <= x < 128 for x in values):
-            stored = "signed char"
-        elif type_ == "int":
-            stored = "short"
-        suffix = {"unsigned": "u", "unsigned long long": "ull"}.get(type_, "")
-        statements, result = column([f"{x}{suffix}" for x in values], stored, "table")
-        self._function(type_, name, [*statements, f"return {result};"])
-
-    def structs(self, type_: str, name: str, values: Sequence[ArrayLike] | np.ndarray) -> None:
-        """Adds a function from an index to a struct of numbers."""
-        count = self.COMPONENTS[type_]
-        rows = [[literal(x) for x in row] for row in np.asarray(values, float).reshape(-1, count)]
-        if type_ == "Softness":  # member by member, since constraints often share all but one
-            columns = [column([row[k] for row in rows], "float", f"table{k}") for k in range(count)]
-            statements, parts = [s for c in columns for s in c[0]], [c[1] for c in columns]
-        elif all(row == rows[0] for row in rows):
-            statements, parts = [], rows[0] if rows else ["0.0f"] * count
-        else:
-            statements = [f"static const float table[] = {{{', '.join(x for row in rows for x in row)}}};"]
-            parts = [f"table[{count} * i + {k}]" for k in range(count)]
-        if type_ == "Mat":
-            parts = [f"{{{', '.join(parts[k : k + 3])}}}" for k in (0, 3, 6)]
-        self._function(type_, name, [*statements, f"return {{{', '.join(parts)}}};"])
-
-    def _function(self, type_: str, name: str, statements: list[str], parameter: str = "int i") -> None:
-        head, body = f"  static INLINE {type_} {name}({parameter}) {{", " ".join(statements)
-        if len(head) + len(body) + 3 <= 120:
-            self.lines.append(f"{head} {body} }}")
-        else:
-            self.lines += [head, *(f"    {s}" for s in statements), "  }"]
-
-    def text(self) -> str:
-        """Returns the struct."""
-        return "\n".join(["struct Model {", *self.lines, "};"])
-
-
-def column(values: list[str], type_: str, table: str) -> tuple[list[str], str]:
-    """Returns statements, and an expression for the value at index ``i``: a constant if possible, else from a table."""
-    distinct = [v for k, v in enumerate(values) if k == 0 or v != values[k - 1]]
-    if len(distinct) <= 1:
-        return [], distinct[0] if distinct else "0"
-    if len(distinct) == 2:
-        return [], f"i < {values.index(distinct[1])} ? {distinct[0]} : {distinct[1]}"
-    return [f"static const {type_} {table}[] = {{{', '.join(values)}}};"], f"{table}[i]"
-
-
-def literal(x: float) -> str:
-    """Returns a float32 literal of C++."""
-    text = repr(float(np.float32(x)))
-    return f"{np.format_float_scientific(np.float32(x), trim='0') if 'e' in text or len(text) > 14 else text}f"
-
-
-# The model.
 
 
 @dataclasses.dataclass

@@ -12,8 +12,9 @@ from collections.abc import Callable
 
 from torchrl_loco.sim.compiled.collision import Pair
 from torchrl_loco.sim.compiled.constraints import DryFriction, JointLimits, Variables, tolerance
-from torchrl_loco.sim.compiled.contacts import DenseContacts, GroundContacts
+from torchrl_loco.sim.compiled.dense_contacts import DenseContacts
 from torchrl_loco.sim.compiled.dynamics import Dynamics
+from torchrl_loco.sim.compiled.ground_contacts import GroundContacts
 from torchrl_loco.sim.compiled.sensors import TouchSensors
 from torchrl_loco.sim.compiled.symbols import Block, cell, cells, dot, literal, total
 
