@@ -6,6 +6,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from torchrl_loco.sim.compiled.symbols import literal
+
 
 class Tables:
     """The members of struct ``Model``."""
@@ -85,9 +87,3 @@ def column(values: list[str], type_: str, table: str) -> tuple[list[str], str]:
     if len(distinct) == 2:
         return [], f"i < {values.index(distinct[1])} ? {distinct[0]} : {distinct[1]}"
     return [f"static const {type_} {table}[] = {{{', '.join(values)}}};"], f"{table}[i]"
-
-
-def literal(x: float) -> str:
-    """Returns a float32 literal of C++."""
-    text = repr(float(np.float32(x)))
-    return f"{np.format_float_scientific(np.float32(x), trim='0') if 'e' in text or len(text) > 14 else text}f"
