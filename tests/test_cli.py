@@ -7,10 +7,12 @@ import pytest
 import tyro
 
 from torchrl_loco import cli
+from torchrl_loco.cli.options import VALUES
 
 FRESH = """
 import sys
-from torchrl_loco.cli import EXTRA, main
+from torchrl_loco.cli import main
+from torchrl_loco.cli.errors import EXTRA
 
 class Missing:  # the extra "train", as if it were not installed
     @staticmethod
@@ -82,8 +84,8 @@ def test_ctrl_c_while_a_command_starts(monkeypatch, capsys):
 
 def test_integers(capsys):
     for word, number in (("100_000", 100_000), ("1e5", 100_000), ("12", 12)):
-        assert tyro.cli(tuple[int, ...], args=[word, "8"], registry=cli.VALUES) == (number, 8)
-        assert type(tyro.cli(int | None, args=[word], registry=cli.VALUES)) is int
+        assert tyro.cli(tuple[int, ...], args=[word, "8"], registry=VALUES) == (number, 8)
+        assert type(tyro.cli(int | None, args=[word], registry=VALUES)) is int
     for word in ("100k", "1.5", "inf", "nan", ""):
         for option in (["doctor", f"--num_envs={word}"], ["eval", "x", f"--episodes={word}"]):
             with pytest.raises(SystemExit, match="2"):

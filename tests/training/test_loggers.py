@@ -124,7 +124,7 @@ def test_a_logger_that_cannot_be_opened_is_said_in_a_line(tmp_path, monkeypatch,
     monkeypatch.setattr(loggers, "_OPEN", openers)
     monkeypatch.setattr(config, "check_packages", lambda *_: None)
     with pytest.raises(SystemExit, match="2"):
-        cli._train(Trainer(made(tmp_path, logger=("wandb", "mlflow"))))
+        cli.runs.train_to_end(Trainer(made(tmp_path, logger=("wandb", "mlflow"))))
     assert capsys.readouterr().err == "torchrl-loco: the logger mlflow cannot be opened: no login\n"
     assert closed == ["first"]
 

@@ -130,7 +130,7 @@ def test_a_disk_that_fills_up_while_training(tmp_path, capsys):
     trainer.save()
     before = networks(run)
     with full_disk(2**16), pytest.raises(SystemExit, match="2"):
-        cli._train(trainer)
+        cli.runs.train_to_end(trainer)
     problem, way = capsys.readouterr().err.splitlines()[-2:]
     assert problem.startswith("torchrl-loco: ")
     assert problem.endswith(f"the previous file is kept: '{run.path / 'checkpoint.pt'}'")

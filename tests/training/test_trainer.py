@@ -168,7 +168,7 @@ def test_the_command_says_how_to_continue(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(Algorithm, "update", press)
         before = signal.getsignal(kind)
         with pytest.raises(KeyboardInterrupt):
-            cli._train(Trainer(run))
+            cli.runs.train_to_end(Trainer(run))
         assert run.load_checkpoint("cpu")["iteration"] == 1
         assert capsys.readouterr().err.splitlines()[-1] == f"to continue: torchrl-loco resume {run.path}"
         assert signal.getsignal(kind) is before

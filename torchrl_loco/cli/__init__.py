@@ -1,0 +1,63 @@
+"""The command ``torchrl-loco``: parse, call, exit.
+
+Modules that take seconds to import are imported where they are used, so that help and errors appear at once.
+"""
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Annotated
+
+import tyro
+
+import torchrl_loco
+from torchrl_loco.checks import check_choice
+from torchrl_loco.cli import runs
+from torchrl_loco.cli.diagnosis import diagnose, inspect, list_tasks
+from torchrl_loco.cli.errors import process_name, user_errors
+from torchrl_loco.cli.options import VALUES, task_options
+from torchrl_loco.cli.policies import evaluate, export, play, record
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the command line. Returns 0, or 130 when interrupted; exits with 2 for errors of the user."""
+    try:
+        _run(sys.argv[1:] if args is None else list(args))
+    except KeyboardInterrupt:
+        print(f"{process_name()}: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _run(args: list[str]) -> None:
+    """Runs one command."""
+    complete = list(args)
+    options_type = task_options(args) if args[:1] == ["train"] else None
+
+    def train(options: Annotated[options_type, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]
+        """Train a policy: evaluation, learning curve and video included. All settings: train TASK --help."""
+        runs.train(options, complete)
+
+    commands: dict[str, Callable[..., None]] = {
+        "train": train,
+        "resume": runs.resume,
+        "eval": evaluate,
+        "record": record,
+        "play": play,
+        "plot": runs.plot,
+        "export": export,
+        "inspect": inspect,
+        "list": list_tasks,
+        "doctor": diagnose,
+    }
+    if args and not args[0].startswith("-"):
+        with user_errors():
+            check_choice("command", args[0], commands)
+        commands = {args[0]: commands[args[0]]}  # alone, so that the parser's hints are about this command
+    tyro.extras.subcommand_cli_from_dict(
+        commands,
+        prog="torchrl-loco",
+        description=torchrl_loco.__doc__,
+        args=args,
+        use_underscores=True,
+        registry=VALUES,
+    )

@@ -1,0 +1,56 @@
+"""Commands about the installation and the physics: list, doctor and inspect."""
+
+from pathlib import Path
+
+import tyro
+
+from torchrl_loco.checks import check_device
+from torchrl_loco.cli.errors import user_errors
+from torchrl_loco.cli.options import summaries
+
+
+def list_tasks() -> None:
+    """List the environments."""
+    for name, words in summaries().items():
+        print(f"{name:<16} {words}")
+
+
+def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None = None) -> None:
+    """Print versions, devices and the kernel cache, and test the physics of each device against C MuJoCo.
+
+    Args:
+        size: a task: measure its njmax and naconmax instead.
+        num_envs: number of worlds to measure with.
+        device: where to measure; default: CUDA if there is any.
+    """
+    from torchrl_loco import doctor
+
+    if size is not None:
+        with user_errors():
+            for name, (needed, advised) in doctor.size(size, num_envs, device).items():
+                print(f"{name:<9} up to {needed} needed under random actions, {advised} advised")
+        return
+    problems = []
+    for finding in doctor.diagnose():
+        print(f"{finding.subject:<20} {finding.text}", flush=True)
+        if finding.problem:
+            problems.append(finding.subject)
+    if problems:
+        print(f"verdict: problems with {', '.join(problems)}")
+        raise SystemExit(1)
+    print("verdict: everything works")
+
+
+def inspect(file: tyro.conf.Positional[Path], /, device: str | None = None) -> None:
+    """Inspect a NaN dump: step its world again, substep by substep, in Warp and in C MuJoCo.
+
+    Args:
+        file: the file that make(..., nan_dump=FILE) or a training run wrote.
+        device: where Warp computes; default: CUDA if there is any.
+    """
+    with user_errors():
+        from torchrl_loco import nan_dump
+
+        check_device(device)  # before the first line is printed
+        for line in nan_dump.describe(nan_dump.load(file), device):
+            print(line)

@@ -1,0 +1,114 @@
+"""How values are parsed, and how the settings of a training run become options."""
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
+
+import tyro
+
+from torchrl_loco.cli.errors import user_errors
+
+if TYPE_CHECKING:
+    from torchrl_loco import training
+
+VALUES = tyro.constructors.ConstructorRegistry()
+"""How values are parsed, where the parser's own rules are inconvenient."""
+
+
+@VALUES.primitive_rule
+def _integers_and_optionals(info: tyro.constructors.PrimitiveTypeInfo) -> Any:
+    """Parses integers as people write them, and optional values without the word None."""
+    kinds = get_args(info.type) if info.type_origin in (Union, UnionType) else (info.type,)
+    named = [kind for kind in kinds if kind is not NoneType]
+    if named != [int] and (len(named) != 1 or len(kinds) == 1):
+        return None
+    parse: Callable[[str], Any] = _integer if named == [int] else named[0]
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=named[0].__name__.upper(),
+        instance_from_str=lambda words: parse(words[0]),
+        is_instance=lambda value: isinstance(value, tuple(kinds)),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _integer(word: str) -> int:
+    with contextlib.suppress(ValueError):
+        return int(word)
+    with contextlib.suppress(ValueError):
+        if (value := float(word)).is_integer():
+            return int(value)
+    raise ValueError(f"{word!r} is not an integer: write it as 100000, 100_000 or 1e5")
+
+
+def summaries() -> dict[str, str]:
+    """Returns what each environment asks for, by id."""
+    from torchrl_loco.registry import list_envs, summary
+
+    found = {}
+    for name in list_envs():
+        try:
+            found[name] = summary(name)
+        except ImportError as error:
+            found[name] = f"NOT USABLE: {error}"
+    return found
+
+
+def task_options(args: list[str]) -> Any:
+    """Returns the type of a task's settings; removes from ``args`` the options that choose the preset."""
+    from torchrl_loco.registry import canonical_id
+    from torchrl_loco.training.config import CONFIGS, TrainingConfig
+    from torchrl_loco.training.presets import preset, tuning_note
+
+    about = summaries()
+    device, algorithm = (_take(flag, args) for flag in ("--device", "--algorithm"))
+    if len(args) > 1 and not args[1].startswith("-"):
+        with user_errors():
+            task = args[1] = canonical_id(args[1])
+            config = _options(preset(task, device, algorithm))
+        about[task] += f" {tuning_note(config)}\n\n--algorithm, {' or '.join(CONFIGS)} (here {config.algorithm}), and"
+        about[task] += " --device choose the\nsettings and their defaults."
+        configs = {task: config}
+    else:  # the list of tasks need not wait for the imports of presets
+        configs = {task: TrainingConfig(task) for task in about}
+    return tyro.extras.subcommand_type_from_defaults(configs, about, prefix_names=False)
+
+
+GPUS = Annotated[
+    int | None,
+    tyro.conf.arg(
+        help="Train on so many GPUs of this machine, each with num_envs worlds; on a CPU, in so many processes."
+    ),
+]
+SEEDS = Annotated[tuple[int, ...], tyro.conf.arg(help="Train these seeds one after the other, into one folder.")]
+
+
+def _options(config: "training.TrainingConfig") -> "training.TrainingConfig":
+    """Returns the settings as options: with their task fixed, as a preset belongs to one, several seeds and GPUs."""
+    hidden = Annotated[str, tyro.conf.Suppress, tyro.conf.Fixed]
+    kind = type(config)
+    fields = [("task", hidden, config.task), ("seeds", SEEDS, ()), ("gpus", GPUS, None)]
+    cls = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=True)
+    return cls(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
+
+
+def settings(options: Any) -> tuple["training.TrainingConfig", tuple[int, ...], int | None]:
+    """Returns the settings, the seeds and the number of GPUs of what :func:`_options` returned."""
+    (kind,) = type(options).__bases__
+    settings = kind(**{field.name: getattr(options, field.name) for field in dataclasses.fields(kind)})
+    return settings, options.seeds, options.gpus
+
+
+def _take(flag: str, args: list[str]) -> str | None:
+    """Removes ``flag`` and its value from ``args`` and returns the value, by which the other options are chosen."""
+    for i, arg in enumerate(args):
+        if arg == flag and i + 1 < len(args):
+            value = args[i + 1]
+            del args[i : i + 2]
+            return value
+        if arg.startswith(f"{flag}="):
+            del args[i]
+            return arg.removeprefix(f"{flag}=")
+    return None

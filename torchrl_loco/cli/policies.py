@@ -1,0 +1,189 @@
+"""Commands on trained policies: eval, record, play and export."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+import torchrl_loco
+from torchrl_loco.checks import SEED, check_device, check_float, check_int, check_output_file, is_run
+from torchrl_loco.cli.errors import user_errors
+
+CONTAINERS = (".mp4", ".mkv", ".mov")
+"""Suffixes of a video."""
+
+RunOrTask = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(
+        metavar="RUN_OR_TASK", help="a run folder, a policy file, or the id of a task for the policy of the package."
+    ),
+]
+Protocol = Annotated[
+    Literal["playground", "dm_control"],
+    tyro.conf.arg(help="which policy of the package, by what it was trained under; any is played under its own."),
+]
+
+
+def _policy(run_or_task: str, protocol: str, device: str | None) -> tuple["torchrl_loco.Policy", Path]:
+    """Returns a policy, and the path from which the default names of its video and of its export derive."""
+    if task := _shipped_task(run_or_task):
+        return torchrl_loco.load_policy(task, device, protocol), Path(task)
+    source = Path(run_or_task)
+    if not source.is_dir():
+        return torchrl_loco.Policy.load(source, device), source
+    from torchrl_loco import training
+
+    run = training.RunFolder(source)
+    return run.load_policy(device), run.policy
+
+
+def _shipped_task(name: str) -> str:
+    """Returns the id of the task that was named instead of a file or a folder, or an empty string."""
+    if Path(name).exists():
+        return ""
+    from torchrl_loco.registry import canonical_id
+
+    try:
+        return canonical_id(name)
+    except ValueError as error:
+        raise ValueError(f"there is no run folder or policy file {name!r}, and {error}") from None
+
+
+def evaluate(
+    run_or_task: RunOrTask,
+    /,
+    episodes: int | None = None,
+    seed: int | None = None,
+    protocol: Protocol = "playground",
+    device: str | None = None,
+) -> None:
+    """Evaluate a trained policy over full episodes, without exploration.
+
+    Args:
+        run_or_task: what to evaluate.
+        episodes: number of episodes; default: as the policy was evaluated after its training.
+        seed: seed of the episodes; default: those of that evaluation.
+        protocol: which policy of the package.
+        device: where to play them; default: CUDA if there is any.
+    """
+    with user_errors():
+        policy, _ = _policy(run_or_task, protocol, device)
+        from torchrl_loco import training
+
+        summary = training.evaluate_policy(policy, episodes, seed)
+    print(training.describe(summary))
+
+
+@dataclasses.dataclass(frozen=True)
+class Video:
+    """Options of a video."""
+
+    seconds: float = 10.0
+    """Length of the video (s)."""
+    camera: Literal["side", "back", "egocentric"] = "side"
+    """Which of the model's cameras."""
+    seed: int = 0
+    """Seed of the episode."""
+    device: str | None = None
+    """Where to play; default: CUDA if there is any."""
+    out: Path | None = None
+    """The video, a new file; default: a new file in the run folder, or TASK.mp4."""
+
+    def check(self) -> None:
+        """Checks all options before anything is printed or made."""
+        check_float("seconds", self.seconds)
+        check_int("seed", self.seed, SEED)
+        if self.device is not None:  # looking for devices imports torch
+            check_device(self.device)
+        if self.out is not None:
+            check_output_file("out", self.out, CONTAINERS)
+
+    def make(self, policy: "torchrl_loco.Policy", default: Path) -> None:
+        """Records the policy into ``out``, or into ``default`` or a numbered sibling of it, and prints the path."""
+        from torchrl_loco import training
+
+        out = check_output_file("out", training.unused_path(default)) if self.out is None else self.out
+        print(f"recording {self.seconds:g} s; on a CPU this takes a while", file=sys.stderr)  # logs have no bar
+        training.record(policy, self.env(policy), out, self.seconds, policy.info["action_repeat"], self.camera)
+        print(out)
+
+    def env(self, policy: "torchrl_loco.Policy") -> "torchrl_loco.LocoEnv":
+        """Returns one world of the policy's task."""
+        info = policy.info
+        return torchrl_loco.make(info["task"], 1, self.device, self.seed, info["protocol"], world_offset=0)
+
+
+VideoOptions = Annotated[Video, tyro.conf.arg(name="")]
+
+
+def record(run_or_task: RunOrTask, /, protocol: Protocol = "playground", video: VideoOptions = Video()) -> None:
+    """Record a video of a trained policy.
+
+    Args:
+        run_or_task: what to record.
+        protocol: which policy of the package.
+        video: which part of an episode is shown, and how.
+    """
+    with user_errors():
+        video.check()
+        policy, beside = _policy(run_or_task, protocol, video.device)
+        video.make(policy, _video_file(policy, beside))
+
+
+def play(run_or_task: RunOrTask, /, protocol: Protocol = "playground", video: VideoOptions = Video()) -> None:
+    """Show a trained policy: in a window if there is a display, else as a video.
+
+    Args:
+        run_or_task: what to play.
+        protocol: which policy of the package.
+        video: which part of an episode is shown, and how; --out always records a video.
+    """
+    with user_errors():
+        from torchrl_loco import training
+
+        video.check()
+        policy, beside = _policy(run_or_task, protocol, video.device)
+        info, shown = policy.info, ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
+        print(info["task"], *(f"{key} {info[key]}" for key in shown if key in info), sep=", ")
+        if "mean" in info:
+            print(training.describe(info))
+        if video.out is None and training.has_display():
+            training.view(policy, video.env(policy), info["action_repeat"])
+        else:
+            video.make(policy, _video_file(policy, beside))
+
+
+def _video_file(policy: "torchrl_loco.Policy", beside: Path) -> Path:
+    """Returns the default file of a video: that of a run folder; elsewhere it is named after the task."""
+    return beside.with_name("video.mp4" if is_run(beside.parent) else f"{policy.info['task']}.mp4")
+
+
+def export(
+    run_or_task: RunOrTask,
+    /,
+    format: Literal["onnx", "torch"] = "onnx",
+    out: Path | None = None,
+    protocol: Protocol = "playground",
+) -> None:
+    """Write a policy as a file for programs without this package, and compare it with the policy.
+
+    Args:
+        run_or_task: what to export.
+        format: onnx, or torch for a program of torch.export (.pt2).
+        out: the file, a new one; default: a new file beside the policy, or TASK.onnx for a policy of the package.
+        protocol: which policy of the package.
+    """
+    with user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
+        policy, beside = _policy(run_or_task, protocol, "cpu")
+        from torchrl_loco import training
+        from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy
+
+        suffix = SUFFIXES[format]
+        if out is not None:
+            check_output_file("out", out, (suffix,))
+        out = training.unused_path(beside.with_suffix(suffix)) if out is None else out
+        error = export_policy(policy, out)
+    print(f"largest difference from the policy, on random observations: {error:.1e} (at most {TOLERANCE:.0e})")
+    print(out)
