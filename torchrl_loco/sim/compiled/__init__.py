@@ -15,7 +15,7 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 ``constraints``      softness of constraints; rows of limits and dry friction
 ``pyramid``          rows of a contact
 ``ground_contacts``  contacts with planes of the world: a stiffness of a body each
-``dense_contacts``   all other contacts: their Jacobians are stored
+``dense_contacts``   all other contacts, and limits of ball joints
 ``solver``           Newton iterations and their line search
 ``sensors``          velocities of subtrees, and touch
 ``lanes``            a group of lanes a world: what ``lanes.h`` has to know about a model

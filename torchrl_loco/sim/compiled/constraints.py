@@ -8,8 +8,9 @@ Along a search direction ``s`` the residual changes by ``v = J s``. Source: MuJo
 ====================  ===========================================================================================
 :class:`JointLimits`  J is plus or minus one at one degree of freedom; each limit has a place of its own
 :class:`DryFriction`  J is one at one degree of freedom
-``contacts``          the rows of contacts, in a module of their own
 ====================  ===========================================================================================
+
+The rows of contacts are in ``ground_contacts`` and ``dense_contacts``.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Contacts whose Jacobians are stored, traced for one model."""
+"""Contacts whose Jacobians are stored, and limits of ball joints, traced for one model."""
 
 from collections.abc import Callable
 
