@@ -11,6 +11,7 @@ from small_runs import SMALL, made, small_walker
 
 import torchrl_loco
 from torchrl_loco import cli
+from torchrl_loco.cli.runs import missing_processes, way_to_resume
 from torchrl_loco.training import RunFolder, Trainer, distributed
 
 pytestmark = pytest.mark.slow  # several processes train
@@ -146,12 +147,10 @@ def test_what_several_ranks_cannot_do(tmp_path, monkeypatch):
 
 
 def test_the_way_to_resume_keeps_the_number_of_ranks(monkeypatch):
-    assert cli.runs.way_to_resume("runs/a", 1) == "torchrl-loco resume runs/a"
+    assert way_to_resume("runs/a", 1) == "torchrl-loco resume runs/a"
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    assert cli.runs.way_to_resume("runs/a", 2) == "torchrl-loco resume runs/a --gpus 2"
-    assert cli.runs.way_to_resume("runs/a", 4).startswith(
-        "torchrun, with the options of this launch"
-    )  # several machines
+    assert way_to_resume("runs/a", 2) == "torchrl-loco resume runs/a --gpus 2"
+    assert way_to_resume("runs/a", 4).startswith("torchrun, with the options of this launch")  # several machines
 
 
 def test_wrong_numbers_of_gpus(tmp_path, monkeypatch, capsys):
@@ -168,7 +167,7 @@ def test_wrong_numbers_of_gpus(tmp_path, monkeypatch, capsys):
         assert message in " ".join((said.out + said.err).replace("│", " ").split())
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(ValueError, match="gpus must be at most the 1 GPUs"):
-        cli.runs.missing_processes(2, "cuda:0")
+        missing_processes(2, "cuda:0")
     monkeypatch.setenv("RANK", "0")
     monkeypatch.setenv("WORLD_SIZE", "4")
     with pytest.raises(SystemExit, match="2"):
