@@ -311,6 +311,7 @@ def test_contacts_whose_damping_differs_by_rounding_are_all_damped_once(form):
 
 SPHERE = '<body name="root" pos="{pos}"><freejoint/><geom size="0.1" condim="{condim}"/></body>'
 PLANE = '<geom type="plane" size="5 5 0.1" euler="{euler}"/>'
+CORNER = [PLANE.format(euler=f"0 {angle} 0") for angle in (40, -40)]
 
 
 def settled(model, seconds=2.0):
@@ -333,12 +334,21 @@ def test_a_ball_comes_to_rest_on_the_floor(form, condim):
 
 def test_a_ball_comes_to_rest_in_a_corner(form):
     """Of two planes, at the place that is symmetric."""
-    planes = [PLANE.format(euler=f"0 {angle} 0") for angle in (40, -40)]
-    qpos, qvel, _ = settled(scene(*planes, SPHERE.format(pos="0.02 0 0.2", condim=3)), seconds=4.0)
+    qpos, qvel, _ = settled(scene(*CORNER, SPHERE.format(pos="0.02 0 0.2", condim=3)), seconds=4.0)
     height = 0.1 / np.cos(np.deg2rad(40))
     assert qpos[:2].abs().max() < 1e-3
     assert height - 2e-3 < qpos[2] < height
     assert qvel.abs().max() < 1e-2
+
+
+def test_a_tolerance_below_single_precision_counts_as_the_least(form):
+    """Otherwise the solver would iterate over rounding. MuJoCo-Warp has the same bound, 1e-6."""
+    ends = []
+    for tolerance in (1e-6, 1e-12):
+        model = scene(*CORNER, SPHERE.format(pos="0.02 0 0.2", condim=3))
+        model.opt.tolerance = tolerance
+        ends.append(settled(model, seconds=0.4)[:2])
+    assert torch.equal(torch.cat(ends[0]), torch.cat(ends[1]))
 
 
 @pytest.mark.parametrize(("friction", "stays"), [(0.6, True), (0.05, False)])
