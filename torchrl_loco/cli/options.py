@@ -97,8 +97,8 @@ def _options(config: "training.TrainingConfig") -> "training.TrainingConfig":
 def settings(options: Any) -> tuple["training.TrainingConfig", tuple[int, ...], int | None]:
     """Returns the settings, the seeds and the number of GPUs of what :func:`_options` returned."""
     (kind,) = type(options).__bases__
-    settings = kind(**{field.name: getattr(options, field.name) for field in dataclasses.fields(kind)})
-    return settings, options.seeds, options.gpus
+    config = kind(**{field.name: getattr(options, field.name) for field in dataclasses.fields(kind)})
+    return config, options.seeds, options.gpus
 
 
 def _take(flag: str, args: list[str]) -> str | None:

@@ -124,7 +124,7 @@ def evaluate_run(
 
 
 POOR = 0.92
-"""Fraction of the shipped policy's return below which a return is called poor. Under `dm_control` walker_run's
+"""Fraction of the shipped policy's return below which a return is called poor. Under ``dm_control`` walker_run's
 crouching gait earns 0.91 of what the upright one does."""
 FALLEN = 0.9
 """Fraction of a run's best evaluation below which its last one is called fallen."""

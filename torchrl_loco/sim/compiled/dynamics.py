@@ -14,6 +14,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
+from torchrl_loco.sim.compiled.links import matrix
 from torchrl_loco.sim.compiled.symbols import (
     Block,
     Scalar,
@@ -47,10 +48,10 @@ def rotation(axis: np.ndarray, angle: Scalar) -> np.ndarray:
     if len(along) == 1:  # a coordinate axis
         k = int(along[0])
         i, j, sine = (k + 1) % 3, (k + 2) % 3, sine * np.sign(axis[k])
-        matrix = zeros(3, 3)
-        matrix[k, k], matrix[i, i], matrix[j, j] = scalar(1), cosine, cosine
-        matrix[i, j], matrix[j, i] = -sine, sine
-        return matrix
+        turn = zeros(3, 3)
+        turn[k, k], turn[i, i], turn[j, j] = scalar(1), cosine, cosine
+        turn[i, j], turn[j, i] = -sine, sine
+        return turn
     skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return identity(3) + skew * sine + (skew @ skew) * (1 - cosine)
 
@@ -70,11 +71,8 @@ def quaternion_matrix(q: list[Scalar]) -> np.ndarray:
 
 
 def constant_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Returns the matrix of a constant quaternion (w, x, y, z)."""
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    matrix[np.abs(matrix) < 1e-12] = 0
-    return array(matrix.reshape(3, 3))
+    """Returns the matrix of a constant quaternion (w, x, y, z), as scalars."""
+    return array(matrix(quaternion))
 
 
 # Spatial algebra.
