@@ -248,6 +248,7 @@ def observe_paid(world: int, inputs: PaidInputs, observation: wp.array[float], t
 
 class Paid(WalkerStand):
     observation_size = 1
+    term_names = ("bonus",)
     answer = staticmethod(lambda data: (observe_paid, fill(PaidInputs, data, bonus=0.125)))
 
     def observation_func(self, world):
@@ -266,8 +267,10 @@ def test_a_function_that_was_written_anew_is_used(engine, monkeypatch):
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
+        (lambda data: observe_paid, "observation_func must return a wp.func and its inputs"),
         (lambda data: (len, fill(PaidInputs, data, bonus=0.0)), "observation_func must return a wp.func"),
         (lambda data: (observe_paid, [data.qvel]), r"inputs of observe_paid must be an instance of a wp\.struct"),
+        (lambda data: (pay, fill(PaidInputs, data, bonus=0.0)), "pay must take the index of the world, the inputs"),
         (
             lambda data: (observe_paid, fill(PaidInputs, data)),
             "PaidInputs has the fields bonus, qvel: bonus is missing",
@@ -277,6 +280,47 @@ def test_a_function_that_was_written_anew_is_used(engine, monkeypatch):
 )
 def test_wrong_inputs_are_named(answer, message, monkeypatch):
     monkeypatch.setattr(Paid, "answer", staticmethod(answer))
+    with pytest.raises(TypeError, match=message):
+        Paid(2, "cpu", seed=0)
+
+
+@wp.func
+def observe_two(world: int, inputs: PaidInputs, observation: wp.array[float], terms: wp.array[float]) -> float:
+    observation[0] = inputs.bonus
+    observation[1] = 0.5
+    terms[0] = 1.0
+    return 1.0
+
+
+@pytest.mark.parametrize(
+    ("size", "term_names", "message"),
+    [
+        (1, ("bonus",), "observation_size is 1, but observe_two writes 2 numbers"),
+        (4, ("bonus",), r"observation_size is 4, but observe_two does not write the numbers \[2, 3\]"),
+        (2, (), "the number of term_names is 0, but observe_two writes 1 numbers"),
+        (2, ("a", "b"), r"the number of term_names is 2, but observe_two does not write the numbers \[1\]"),
+    ],
+)
+def test_rows_of_another_length_are_refused(size, term_names, message, monkeypatch):
+    """What is written beyond a row would be another world's reward, or nobody's memory."""
+    monkeypatch.setattr(Paid, "answer", staticmethod(lambda data: (observe_two, fill(PaidInputs, data, bonus=0.5))))
+    monkeypatch.setattr(Paid, "observation_size", size)
+    monkeypatch.setattr(Paid, "term_names", term_names)
+    with pytest.raises(ValueError, match=message):
+        Paid(2, "cpu", seed=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("observation_size", 1.0, "observation_size must be an integer"),
+        ("defaults", {"ctrl_dt": 0.02}, "defaults must be a torchrl_loco.SimConfig"),
+        ("term_names", "bonus", "term_names must be a tuple of names"),
+        ("initial_states", lambda self: None, "set pose_func = torchrl_loco.LocoEnv.pose_func in Paid"),
+    ],
+)
+def test_wrong_attributes_are_named(name, value, message, monkeypatch):
+    monkeypatch.setattr(Paid, name, value, raising=False)
     with pytest.raises(TypeError, match=message):
         Paid(2, "cpu", seed=0)
 

@@ -128,15 +128,29 @@ class LocoEnv(EnvBase):
 
     @classmethod
     def check_class(cls) -> None:
-        """Checks that a subclass has set all class attributes that it must.
+        """Checks what a subclass has set.
 
         Raises:
-            TypeError: some are missing; the message names them.
+            TypeError: an attribute is missing or has the wrong type, or a table of initial states would not be used.
+            ValueError: ``observation_size`` is less than 1.
         """
         names = ("body", "mjcf", "defaults", "observation_size", "term_names")
         missing = [name for name in names if not hasattr(cls, name)]
         if missing:
             raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.LocoEnv)")
+        check_int("observation_size", cls.observation_size)
+        if not isinstance(cls.defaults, SimConfig):
+            raise TypeError(f"{cls.__name__}.defaults must be a torchrl_loco.SimConfig, got {cls.defaults!r}")
+        if isinstance(cls.term_names, str) or not all(isinstance(name, str) for name in cls.term_names):
+            raise TypeError(f"{cls.__name__}.term_names must be a tuple of names, got {cls.term_names!r}")
+        table, poses = (
+            next(base for base in cls.__mro__ if name in vars(base)) for name in ("initial_states", "pose_func")
+        )
+        if poses is not LocoEnv and cls.__mro__.index(table) < cls.__mro__.index(poses):
+            raise TypeError(
+                f"{table.__name__}.initial_states is not used, since {poses.__name__}.pose_func draws the states; "
+                f"set pose_func = torchrl_loco.LocoEnv.pose_func in {table.__name__}"
+            )
 
     def __repr__(self) -> str:
         num_envs = self.num_envs if self.batch_size else None

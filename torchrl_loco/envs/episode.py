@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from torchrl_loco.envs.body_funcs import struct_of
 from torchrl_loco.sim import WorldFunc, fill
 from torchrl_loco.sim.sampling import world_stream
 from torchrl_loco.sim.world_func import write_rows
@@ -126,19 +127,6 @@ def _observer(observe: wp.Function, Inputs: Any, size: int, coalesced: bool) -> 
             mark_non_finite(out.observation[world], world, args.non_finite)
 
     return write_observation, Observer
-
-
-def struct_of(method: str, func: Any, inputs: Any) -> Any:
-    """Returns the struct of the inputs that a method of a body returned with a function.
-
-    Raises:
-        TypeError: they are not what the method must return.
-    """
-    if not isinstance(func, wp.Function):
-        raise TypeError(f"{method} must return a wp.func and its inputs, got {func!r} as the function")
-    if not hasattr(inputs, "_cls"):
-        raise TypeError(f"the inputs of {func.key} must be an instance of a wp.struct, got {inputs!r}")
-    return inputs._cls
 
 
 @wp.func

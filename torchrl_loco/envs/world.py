@@ -14,6 +14,7 @@ import torch
 import warp as wp
 
 from torchrl_loco.config import SimConfig
+from torchrl_loco.envs.body_funcs import check_rows, pair_of
 from torchrl_loco.envs.episode import (
     Control,
     EpisodeStart,
@@ -152,14 +153,17 @@ class World:
         mine.outputs, mine.flags = fill(Outputs, mine), fill(Flags, mine)
         counters = {"counter_bits": self.health.counter_bits, "counts": self.health.counts.warp}
         size, coalesced = task.observation_size, self.sim.engine.coalesced
-        self._observe = observer(*task.observation_func(self), mine.outputs, mine.non_finite, size, coalesced=coalesced)
+        func, inputs = pair_of("observation_func", task.observation_func(self))
+        if not type(task).__module__.startswith("torchrl_loco."):  # the tests check those of the package
+            check_rows(func, inputs, size, len(task.term_names), self.sim.device)
+        self._observe = observer(func, inputs, mine.outputs, mine.non_finite, size, coalesced=coalesced)
         self._check_finite = WorldFunc(zero_non_finite, fill(FiniteCheck, mine, qpos=data.qpos, qvel=data.qvel))
         self._finish = WorldFunc(finish_step, fill(StepEnd, mine, overflow=data.overflow, **counters))
         self._begin = [WorldFunc(begin_episode, fill(EpisodeStart, mine, stagger=self._stagger.warp))]
         self._begins_at_rest = True
         pose = task.pose_func(self)
         if pose is not None:
-            func, inputs = pose
+            func, inputs = pair_of("pose_func", pose)
             self._begin.append(poser(func, inputs, self.stream.warp))
             self._begins_at_rest = not holds(inputs, data.qvel)
 
