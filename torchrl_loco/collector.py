@@ -9,33 +9,15 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
-from torchrl.envs import (
-    ClipTransform,
-    Compose,
-    DoubleToFloat,
-    EnvBase,
-    FrameSkipTransform,
-    InitTracker,
-    ObservationNorm,
-    RewardClipping,
-    RewardScaling,
-    RewardSum,
-    StepCounter,
-    Transform,
-)
+from torchrl.envs import EnvBase, Transform
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_loco.checks import check_int
 from torchrl_loco.envs import LocoEnv
+from torchrl_loco.envs.autoreset import PLAIN_TRANSFORMS
 from torchrl_loco.envs.state import State
 from torchrl_loco.sim import TorchGraph
-
-RECORDED_TRANSFORMS = (
-    *(ClipTransform, Compose, DoubleToFloat, FrameSkipTransform, InitTracker),
-    *(ObservationNorm, RewardClipping, RewardScaling, RewardSum, StepCounter),
-)
-"""Transforms that keep nothing on the host from step to step. Others may, and a recording would leave that out."""
 
 
 class RolloutCollector:
@@ -271,7 +253,7 @@ def what_forbids_recording(env: EnvBase, base: LocoEnv, policy: Any) -> str | No
         return "the policy is no nn.Module, so it would not be noticed if its weights were replaced"
     transforms = env.transform.modules() if isinstance(env, TorchRLTransformedEnv) else ()
     for transform in transforms:
-        if isinstance(transform, Transform) and type(transform) not in RECORDED_TRANSFORMS:
+        if isinstance(transform, Transform) and type(transform) not in PLAIN_TRANSFORMS:
             return f"{type(transform).__name__} may keep something on the host from step to step"
     return None
 

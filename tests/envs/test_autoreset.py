@@ -3,7 +3,7 @@
 import pytest
 import torch
 from cases import coarse
-from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter
+from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter, VecNormV2
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
 import torchrl_loco
@@ -55,6 +55,23 @@ def test_same_data_as_torchrl(shared, body_task, actions, wrap, at_once, reward_
     ended = expected["next", "done"].squeeze(-1)
     assert ended.any(dim=1).sum() > 5
     assert not ended.all(dim=1).any()
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # for any batch
+@pytest.mark.parametrize("nested", [False, True])
+def test_statistics_count_what_torchrl_counts(shared, actions, nested):
+    """A transform that learns from a reset may not be reset where no world is done."""
+    traces, counts = [], []
+    for copy, wrapper in enumerate((TorchRLTransformedEnv, torchrl_loco.TransformedEnv)):
+        base = shared("walker_run", 4, copy=copy, episode_length=6, stagger=True, **coarse("walker_run"))
+        norm = VecNormV2(in_keys=["observation"], reduce_batch_dims=True)
+        env = wrapper(base, Compose(RewardSum(), norm))
+        if nested:
+            env = wrapper(env, StepCounter(), auto_unwrap=False)
+        traces.append(play(env, actions(base, 20), env.step_and_maybe_reset))
+        counts.append(norm._count["observation"].item())
+    assert counts[0] == counts[1]
+    assert (traces[0] == traces[1]).all()
 
 
 def test_hooks_of_torchrl_are_called():

@@ -147,8 +147,10 @@ def test_a_restored_state_is_not_returned(shared):
     td = env.reset(state, set_state=True)
     assert not set(State.KEYS) & set(td.keys())
     assert set(state.keys()) == set(State.KEYS) - {"act"}
-    transformed = TransformedEnv(env, InitTracker())
-    assert transformed.reset(state, set_state=True) is state  # TorchRL's own returns what it was given
+    td = torchrl_loco.TransformedEnv(env, InitTracker()).reset(state, set_state=True)
+    assert not set(State.KEYS) & set(td.keys())
+    assert set(state.keys()) == set(State.KEYS) - {"act"}
+    assert TransformedEnv(env, InitTracker()).reset(state, set_state=True) is state  # TorchRL's own
 
 
 def test_branches_are_copies(shared, body_task, actions):

@@ -4,8 +4,23 @@ from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase
+from torchrl.envs import (
+    ClipTransform,
+    Compose,
+    DoubleToFloat,
+    EnvBase,
+    FrameSkipTransform,
+    InitTracker,
+    ObservationNorm,
+    RewardClipping,
+    RewardScaling,
+    RewardSum,
+    StepCounter,
+    Transform,
+)
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
+
+from torchrl_loco.envs.state import without_state
 
 if TYPE_CHECKING:
     from torchrl_loco.envs.base import LocoEnv
@@ -85,11 +100,29 @@ def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBas
     return merged.update(fresh.exclude(*merged.keys(True, True)).exclude("_reset"))
 
 
+PLAIN_TRANSFORMS = (
+    *(ClipTransform, Compose, DoubleToFloat, FrameSkipTransform, InitTracker),
+    *(ObservationNorm, RewardClipping, RewardScaling, RewardSum, StepCounter),
+)
+"""Transforms that keep nothing on the host from step to step, and whose reset of no world changes nothing."""
+
+
+def resets_by_mask(transform: Transform) -> bool:
+    """Returns whether the reset of a transform, and of those in it, changes nothing if no world is reset.
+
+    A class that is not known does if it has no reset of its own. That of ``VecNormV2``, for example, counts the
+    observations that it is given.
+    """
+    parts = (part for part in transform.modules() if isinstance(part, Transform))
+    return all(type(part) in PLAIN_TRANSFORMS or type(part)._reset is Transform._reset for part in parts)
+
+
 class TransformedEnv(TorchRLTransformedEnv):
     """TorchRL's ``TransformedEnv`` for the environments of this package, without waiting for the device.
 
-    TorchRL's own works too and gives the same data, but reads from the device at every step. The arguments are those
-    of TorchRL's: an environment, and a transform or a ``Compose`` of them.
+    TorchRL's own works too and gives the same data, but reads from the device at every step. So does this one with a
+    transform that has a reset of its own and is not in ``PLAIN_TRANSFORMS``. The arguments are those of TorchRL's: an
+    environment, and a transform or a ``Compose`` of them.
     """
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -101,4 +134,13 @@ class TransformedEnv(TorchRLTransformedEnv):
         Returns:
             The same, batch ``(num_envs,)``, with new episodes in the worlds that were done.
         """
+        env: EnvBase = self
+        while isinstance(env, TorchRLTransformedEnv):
+            if not resets_by_mask(env.transform):
+                return super().maybe_reset(tensordict)
+            env = env.base_env
         return reset_done_worlds(self, tensordict)
+
+    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        """Returns what ``reset`` returns, without a state that was passed to it, which would become stale."""
+        return super()._reset_proc_data(without_state(tensordict), tensordict_reset)

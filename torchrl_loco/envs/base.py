@@ -28,7 +28,7 @@ from torchrl_loco.checks import (
 from torchrl_loco.config import SimConfig, sim_config
 from torchrl_loco.envs.autoreset import is_plain, reset_done_worlds, rows_of, step_and_reset
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
-from torchrl_loco.envs.state import State, write_state
+from torchrl_loco.envs.state import State, without_state, write_state
 from torchrl_loco.envs.world import World
 from torchrl_loco.sim import Simulation, fill
 from torchrl_loco.sim.sampling import Table, draw_from_table
@@ -331,10 +331,7 @@ class LocoEnv(EnvBase):
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
         """Returns what ``reset`` returns, without a state that was passed to it, which would become stale."""
-        if tensordict is not None and any(key in tensordict for key in State.KEYS):
-            kept = {key: value for key, value in tensordict.items() if key not in State.KEYS}
-            tensordict = TensorDict(kept, batch_size=tensordict.batch_size, device=self.device)
-        return super()._reset_proc_data(tensordict, tensordict_reset)
+        return super()._reset_proc_data(without_state(tensordict), tensordict_reset)
 
     def _set_seed(self, seed: int | None) -> None:
         """Starts the random streams of all worlds again, at their episode 0."""

@@ -26,8 +26,9 @@ class State(TensorDict):
     To make a state by hand: ``State({"qpos": ..., "qvel": ...}, batch_size=[num_envs])``.
 
     It differs from a TensorDict in one method: ``select("_reset")`` also keeps these entries, because
-    ``TransformedEnv`` passes only that selection to the inner environment. ``TransformedEnv.reset`` also returns the
-    TensorDict that it was given, with the state in it: exclude ``State.KEYS`` before you pass that on as a state again.
+    ``TransformedEnv`` passes only that selection to the inner environment. TorchRL's own ``TransformedEnv.reset``
+    also writes into the TensorDict that it is given and returns it, with the state in it: pass it a copy, and exclude
+    ``State.KEYS`` from what it returns.
     """
 
     PHYSICS = ("qpos", "qvel", "qacc_warmstart", "act")
@@ -63,6 +64,14 @@ class State(TensorDict):
         """
         state = [key for key in self.KEYS if key in self] if "_reset" in keys else []
         return super().select(*keys, *state, inplace=inplace, strict=strict)
+
+
+def without_state(tensordict: TensorDictBase | None) -> TensorDictBase | None:
+    """Returns a TensorDict itself, or if it has entries of a state, a new one with its others."""
+    if tensordict is None or not any(key in tensordict for key in State.KEYS):
+        return tensordict
+    kept = {key: value for key, value in tensordict.items() if key not in State.KEYS}
+    return TensorDict(kept, batch_size=tensordict.batch_size, device=tensordict.device)
 
 
 def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor], mask: torch.Tensor) -> None:
