@@ -6,7 +6,7 @@ import sys
 import pytest
 import tyro
 
-from torchrl_loco import cli
+from torchrl_loco import __version__, cli
 from torchrl_loco.cli.options import VALUES
 
 FRESH = """
@@ -61,7 +61,7 @@ def test_settings_of_a_task_wait_for_torch_alone(tmp_path):
     assert imported[1] == "imported ['torch']"
     assert "--algorithm, ppo or reppo (here ppo)" in said
     assert "--task" not in said  # the preset is for no other
-    assert "Perhaps you meant: --num_envs" in said
+    assert "did you mean 'num_envs'?" in said
     assert not {"walker_run", "doctor"} & set(said.split())  # other tasks and commands have such an option too
     assert said.count("install it with: pip install 'torchrl-loco[train]'") == 2
     assert not (tmp_path / "runs").exists()
@@ -71,6 +71,11 @@ def test_an_unknown_command_names_the_nearest(capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(["tain"])
     assert "did you mean 'train'?" in capsys.readouterr().err
+
+
+def test_the_version(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"{__version__}\n"
 
 
 def test_ctrl_c_while_a_command_starts(monkeypatch, capsys):

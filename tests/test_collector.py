@@ -91,6 +91,8 @@ def test_endless_and_wrong_sizes(make):
     for frames in (0, 6, -4):
         with pytest.raises(ValueError, match="positive multiple of the 4 worlds"):
             RolloutCollector(made, policy(made), frames_per_batch=frames)
+    with pytest.raises(TypeError, match="policy must be a function or module"):
+        RolloutCollector(made, None, frames_per_batch=8)
 
 
 def test_its_state_goes_on_in_another_collector(make):

@@ -239,6 +239,11 @@ class PaidInputs:
     qvel: wp.array2d[float]
 
 
+@wp.struct
+class ForceInputs:
+    actuator_force: wp.array2d[float]
+
+
 @wp.func
 def observe_paid(world: int, inputs: PaidInputs, observation: wp.array[float], terms: wp.array[float]) -> float:
     observation[0] = inputs.qvel[world, 0]
@@ -276,6 +281,7 @@ def test_a_function_that_was_written_anew_is_used(engine, monkeypatch):
             "PaidInputs has the fields bonus, qvel: bonus is missing",
         ),
         (lambda data: (observe_paid, fill(PaidInputs, data, bonus=0.0, bonos=1.0)), "there is no bonos"),
+        (lambda data: fill(ForceInputs, data), 'actuator_force is missing, which engine="mujoco_warp" has'),
     ],
 )
 def test_wrong_inputs_are_named(answer, message, monkeypatch):

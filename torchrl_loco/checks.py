@@ -194,7 +194,9 @@ def check_run(path: Path, or_group: bool = False) -> Path:
             return Path(path)
         raise FileNotFoundError(f"{path} holds the runs of several seeds: name the folder of one of them, in it")
     if not is_run(path):
-        raise FileNotFoundError(f"{path} is not a run folder: it has no config.json")
+        inside = sorted(entry.name for entry in Path(path).glob("*/") if is_run(entry) or is_run_group(entry))
+        hint = f"; name one of those in it: {', '.join(inside)}" if inside else ""
+        raise FileNotFoundError(f"{path} is not a run folder: it has no config.json{hint}")
     return Path(path)
 
 

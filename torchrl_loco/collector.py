@@ -45,7 +45,7 @@ class RolloutCollector:
     Raises:
         ValueError: ``frames_per_batch`` is not a positive multiple of the number of worlds, or ``total_frames`` is
             below -1.
-        TypeError: one of them is no integer.
+        TypeError: one of them is no integer, or the policy cannot be called.
     """
 
     def __init__(
@@ -58,6 +58,8 @@ class RolloutCollector:
         exploration_type: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
         worlds = env.batch_size.numel()
+        if not callable(policy):
+            raise TypeError(f"policy must be a function or module from TensorDict to TensorDict, got {policy!r}")
         check_int("total_frames", total_frames, "[-1, inf)")
         if check_int("frames_per_batch", frames_per_batch, "(-inf, inf)") < 1 or frames_per_batch % worlds:
             raise ValueError(

@@ -174,7 +174,7 @@ def test_branches_are_copies(shared, body_task, actions):
     assert torch.equal(other.get_state()["qpos"], state["qpos"][-1:].expand(3, -1))
     branch["qpos"][0] += 1.0  # each has its own memory
     assert (branch["qpos"][0] != branch["qpos"][1]).all()
-    with pytest.raises(IndexError):
+    with pytest.raises(IndexError, match="the worlds 0 to 3"):
         state.branch(4)
     with pytest.raises(ValueError, match="num_envs must lie in"):
         state.branch(0, 0)

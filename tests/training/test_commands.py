@@ -96,9 +96,11 @@ def test_errors_of_the_user(ppo_run, tmp_path, capsys):
     cases = {
         "train walker_wlak": "did you mean 'walker_walk'",
         "train mjx/walker_walk-v0 --gamma 2": "gamma must lie in (0, 1]",
-        "train walker_walk --gama 0.9": "--gamma",
+        "train walker_walk --gama 0.9": "did you mean 'gamma'?",
+        "train walker_walk --learning_rate=0.1": "unknown setting 'learning_rate': choose one of action_repeat",
+        "train walker_walk --device cpu --kl_bound 0.1": "--kl_bound is a setting of --algorithm reppo",
         "train walker_walk --device cuda:9": "choose one of cpu",
-        "train walker_walk --task walker_run": "Unrecognized options: --task",
+        "train walker_walk --task walker_run": "unknown setting 'task'",
         "train walker_walk --algorithm pppo": "did you mean 'ppo'",
         "train walker_walk --device cpu --out {file}": "out must be a folder",
         "eval no/such/run": "there is no run folder or policy file 'no/such/run', and unknown environment",
@@ -106,6 +108,7 @@ def test_errors_of_the_user(ppo_run, tmp_path, capsys):
         "eval {broken}": "{broken}/config.json is damaged",
         "resume no/such/run": "is not a run folder",
         "resume {run}": "is complete",
+        "resume {several}": "has no config.json; name one of those in it: one, two",
         "resume {broken}": "{broken}/config.json is damaged",
         "record {run} --seconds 0": "seconds must lie in (0, inf)",
         "record {run} --device cpu --out {file}": "already exists",
@@ -116,6 +119,9 @@ def test_errors_of_the_user(ppo_run, tmp_path, capsys):
         "plot {broken}": "{broken}/config.json is damaged",
         "fly": "train, resume, eval",
     }
+    for name in ("one", "two"):
+        (tmp_path / "several" / name).mkdir(parents=True)
+        (tmp_path / "several" / name / "config.json").write_text("{}")
     swapped, renamed = (shutil.copytree(ppo_run.path, tmp_path / name) for name in ("swapped", "renamed"))
     load_policy("walker_walk", "cpu").save(swapped / "policy.safetensors")
     text = (renamed / "config.json").read_text()
@@ -125,6 +131,7 @@ def test_errors_of_the_user(ppo_run, tmp_path, capsys):
         "renamed": renamed,
         "run": ppo_run.path,
         "broken": broken,
+        "several": tmp_path / "several",
         "file": tmp_path / "file.mp4",
     }
     for arguments, message in cases.items():

@@ -30,6 +30,9 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _run(args: list[str]) -> None:
     """Runs one command."""
+    if args == ["--version"]:
+        print(torchrl_loco.__version__)
+        return
     complete = list(args)
     options_type = task_options(args) if args[:1] == ["train"] else None
 
@@ -51,13 +54,10 @@ def _run(args: list[str]) -> None:
     }
     if args and not args[0].startswith("-"):
         with user_errors():
-            check_choice("command", args[0], commands)
-        commands = {args[0]: commands[args[0]]}  # alone, so that the parser's hints are about this command
+            command = commands[check_choice("command", args[0], commands)]
+        prog = f"torchrl-loco {args[0]}"  # to which the parser's hints refer
+        tyro.cli(command, prog=prog, args=args[1:], use_underscores=True, registry=VALUES)
+        return
     tyro.extras.subcommand_cli_from_dict(
-        commands,
-        prog="torchrl-loco",
-        description=torchrl_loco.__doc__,
-        args=args,
-        use_underscores=True,
-        registry=VALUES,
+        commands, prog="torchrl-loco", description=torchrl_loco.__doc__, args=args, use_underscores=True
     )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
 
 import tyro
 
+from torchrl_loco.checks import check_choice
 from torchrl_loco.cli.errors import user_errors
 
 if TYPE_CHECKING:
@@ -68,6 +69,7 @@ def task_options(args: list[str]) -> Any:
         with user_errors():
             task = args[1] = canonical_id(args[1])
             config = _options(preset(task, device, algorithm))
+            _check_names(args[2:], config)
         about[task] += f" {tuning_note(config)}\n\n--algorithm, {' or '.join(CONFIGS)} (here {config.algorithm}), and"
         about[task] += " --device choose the\nsettings and their defaults."
         configs = {task: config}
@@ -92,6 +94,26 @@ def _options(config: "training.TrainingConfig") -> "training.TrainingConfig":
     fields = [("task", hidden, config.task), ("seeds", SEEDS, ()), ("gpus", GPUS, None)]
     cls = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=True)
     return cls(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
+
+
+def _check_names(args: list[str], config: Any) -> None:
+    """Checks the names of options, which the parser would not name.
+
+    Raises:
+        ValueError: there is no such setting; the message names the nearest one, or the algorithm that has it.
+    """
+    from torchrl_loco.training.config import CONFIGS
+
+    settings_of = {algorithm: {field.name for field in dataclasses.fields(kind)} for algorithm, kind in CONFIGS.items()}
+    mine = {field.name for field in dataclasses.fields(config)} - {"task"}
+    for arg in args:
+        name = arg.partition("=")[0].removeprefix("--").replace("-", "_")
+        if not arg.startswith("--") or name.removeprefix("no_") in mine or name == "help":
+            continue
+        for algorithm, names in settings_of.items():
+            if name in names - settings_of[config.algorithm]:
+                raise ValueError(f"--{name} is a setting of --algorithm {algorithm}, and this is {config.algorithm}")
+        check_choice("setting", name, sorted(mine | {"device", "algorithm"}))
 
 
 def settings(options: Any) -> tuple["training.TrainingConfig", tuple[int, ...], int | None]:

@@ -1,5 +1,6 @@
 """A snapshot of an environment's worlds."""
 
+import operator
 from collections.abc import Mapping
 from typing import Any
 
@@ -38,15 +39,18 @@ class State(TensorDict):
         """Returns a state in which every world is a copy of one, to try different futures from the same moment.
 
         Args:
-            world: index of the world to copy; ignored if the environment has no batch dimension.
+            world: index of the world to copy, negative from the end; ignored without a batch dimension.
             num_envs: number of copies; ``None`` makes as many as there are worlds.
 
         Raises:
             IndexError: there is no such world.
-            TypeError: ``num_envs`` is no integer.
+            TypeError: ``world`` or ``num_envs`` is no integer.
             ValueError: ``num_envs`` is less than 1.
         """
-        count = self.batch_size.numel() if num_envs is None else check_int("num_envs", num_envs)
+        worlds = self.batch_size.numel()
+        count = worlds if num_envs is None else check_int("num_envs", num_envs)
+        if self.batch_size and not -worlds <= operator.index(world) < worlds:
+            raise IndexError(f"there is no world {world}: this state has the worlds 0 to {worlds - 1}")
         one = {key: value[world] if self.batch_size else value for key, value in self.items()}
         copies = {key: value.expand(count, *value.shape).clone() for key, value in one.items()}
         return State(copies, batch_size=[count], device=self.device)

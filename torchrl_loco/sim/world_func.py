@@ -1,6 +1,7 @@
 """Functions of one world, which an engine runs before and after the physics: in the same kernel, if that is faster."""
 
 import contextlib
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -41,7 +42,13 @@ def fill(struct: Any, source: Any = None, /, **fields: Any) -> Any:
                 given[name] = getattr(source, name)
     missing, unknown = sorted(struct.vars.keys() - given.keys()), sorted(given.keys() - struct.vars.keys())
     if missing or unknown:
-        wrong = [f"{name} is missing" for name in missing] + [f"there is no {name}" for name in unknown]
+        import mujoco_warp as mjw  # takes a second, and the engine "compiled" does without it
+
+        of_mujoco_warp = {field.name for field in dataclasses.fields(mjw.Data)}
+        wrong = [
+            f'{name} is missing, which engine="mujoco_warp" has' if name in of_mujoco_warp else f"{name} is missing"
+            for name in missing
+        ] + [f"there is no {name}" for name in unknown]
         raise TypeError(f"{struct.key} has the fields {', '.join(struct.vars)}: {', '.join(wrong)}")
     devices = {name: str(value.device) for name, value in given.items() if isinstance(value, wp.array)}
     if len(set(devices.values())) > 1:
