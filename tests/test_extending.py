@@ -298,22 +298,46 @@ def observe_two(world: int, inputs: PaidInputs, observation: wp.array[float], te
     return 1.0
 
 
+@wp.func
+def observe_in_all(world: int, inputs: PaidInputs, observation: wp.array[float], terms: wp.array[float]) -> float:
+    """Takes the row for the memory of all worlds, and writes before that of the terms."""
+    observation[world] = inputs.bonus
+    terms[-3] = 1.0
+    return 1.0
+
+
 @pytest.mark.parametrize(
-    ("size", "term_names", "message"),
+    ("func", "size", "term_names", "message"),
     [
-        (1, ("bonus",), "observation_size is 1, but observe_two writes 2 numbers"),
-        (4, ("bonus",), r"observation_size is 4, but observe_two does not write the numbers \[2, 3\]"),
-        (2, (), "the number of term_names is 0, but observe_two writes 1 numbers"),
-        (2, ("a", "b"), r"the number of term_names is 2, but observe_two does not write the numbers \[1\]"),
+        (observe_two, 1, ("bonus",), "observation_size is 1, but observe_two writes the numbers 1 too"),
+        (observe_two, 2, ("a", "b"), "the number of term_names is 2, but observe_two does not write the numbers 1$"),
+        (observe_in_all, 1, ("bonus",), "observation_size is 1, but observe_in_all writes the numbers 2 too"),
+        (observe_in_all, 3, ("bonus",), "does not write the numbers 0, 1$"),
     ],
 )
-def test_rows_of_another_length_are_refused(size, term_names, message, monkeypatch):
+def test_rows_of_another_length_are_refused(func, size, term_names, message, monkeypatch):
     """What is written beyond a row would be another world's reward, or nobody's memory."""
-    monkeypatch.setattr(Paid, "answer", staticmethod(lambda data: (observe_two, fill(PaidInputs, data, bonus=0.5))))
+    monkeypatch.setattr(Paid, "answer", staticmethod(lambda data: (func, fill(PaidInputs, data, bonus=0.5))))
     monkeypatch.setattr(Paid, "observation_size", size)
     monkeypatch.setattr(Paid, "term_names", term_names)
     with pytest.raises(ValueError, match=message):
-        Paid(2, "cpu", seed=0)
+        Paid(3, "cpu", seed=0)
+
+
+def test_a_table_is_read_again_in_a_subclass_of_a_class_with_one():
+    class Lies(WalkerStand):
+        pose_func = torchrl_loco.LocoEnv.pose_func
+
+        def initial_states(self):
+            return np.zeros((1, 9))
+
+    class Stands(Lies):
+        def initial_states(self):
+            return np.full((1, 9), 0.125)
+
+    env = Stands(2, "cpu", seed=0)
+    env.reset()
+    assert (env.get_state()["qpos"] == 0.125).all()
 
 
 @pytest.mark.parametrize(
@@ -343,12 +367,13 @@ def test_broken_plug_ins_are_named_and_harm_no_other(tmp_path, discover, capsys,
         "broken_loco:number": "is no subclass of torchrl_loco.LocoEnv",
         "failing_loco:Env": "cannot be loaded: ZeroDivisionError: division by zero",
         "broken_loco:Ant": "Ant must set mjcf, defaults, term_names",
+        "broken_loco:Empty": r"Empty.observation_size must lie in \[1, 2\*\*31\)",
     }
     distribution(
         tmp_path,
         "broken_loco",
         "\n".join(f"ant_{i} = {value}" for i, value in enumerate(broken)),
-        f"{INCOMPLETE}number = 5\n",
+        f"{INCOMPLETE}number = 5\nclass Empty(torchrl_loco.WalkerStand):\n    observation_size = 0\n",
     )
     (tmp_path / "failing_loco.py").write_text("1 / 0")
     discover(tmp_path)

@@ -194,8 +194,9 @@ def check_run(path: Path, or_group: bool = False) -> Path:
             return Path(path)
         raise FileNotFoundError(f"{path} holds the runs of several seeds: name the folder of one of them, in it")
     if not is_run(path):
-        inside = sorted(entry.name for entry in Path(path).glob("*/") if is_run(entry) or is_run_group(entry))
-        hint = f"; name one of those in it: {', '.join(inside)}" if inside else ""
+        inside = [entry for entry in Path(path).glob("*/") if is_run(entry) or (or_group and is_run_group(entry))]
+        newest = sorted(inside, key=lambda entry: (entry.stat().st_mtime, entry.name))[-5:]
+        hint = f"; name one of those in it, such as {', '.join(entry.name for entry in newest)}" if newest else ""
         raise FileNotFoundError(f"{path} is not a run folder: it has no config.json{hint}")
     return Path(path)
 

@@ -109,7 +109,7 @@ def env_class(id: str) -> "type[LocoEnv]":
         raise ImportError(f"{origin} is no subclass of torchrl_loco.LocoEnv")
     try:
         cls.check_class()
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise ImportError(f"{origin}: {error}") from error
     return cls
 

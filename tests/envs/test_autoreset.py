@@ -60,7 +60,7 @@ def test_same_data_as_torchrl(shared, body_task, actions, wrap, at_once, reward_
 @pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # for any batch
 @pytest.mark.parametrize("nested", [False, True])
 def test_statistics_count_what_torchrl_counts(shared, actions, nested):
-    """A transform that learns from a reset may not be reset where no world is done."""
+    """A transform that learns from a reset may not be reset at a step after which no world is done."""
     traces, counts = [], []
     for copy, wrapper in enumerate((TorchRLTransformedEnv, torchrl_loco.TransformedEnv)):
         base = shared("walker_run", 4, copy=copy, episode_length=6, stagger=True, **coarse("walker_run"))

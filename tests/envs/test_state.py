@@ -147,6 +147,7 @@ def test_a_restored_state_is_not_returned(shared):
     td = env.reset(state, set_state=True)
     assert not set(State.KEYS) & set(td.keys())
     assert set(state.keys()) == set(State.KEYS) - {"act"}
+    assert env.reset(State(state.to_dict(), batch_size=[4]), set_state=True).device == env.device
     td = torchrl_loco.TransformedEnv(env, InitTracker()).reset(state, set_state=True)
     assert not set(State.KEYS) & set(td.keys())
     assert set(state.keys()) == set(State.KEYS) - {"act"}

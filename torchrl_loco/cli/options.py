@@ -73,6 +73,9 @@ def task_options(args: list[str]) -> Any:
         about[task] += f" {tuning_note(config)}\n\n--algorithm, {' or '.join(CONFIGS)} (here {config.algorithm}), and"
         about[task] += " --device choose the\nsettings and their defaults."
         configs = {task: config}
+    elif len(args) > 1 and args[1] not in ("-h", "--help"):
+        with user_errors():
+            raise ValueError(f"name the task before its settings: torchrl-loco train TASK {args[1]} ...")
     else:  # the list of tasks need not wait for the imports of presets
         configs = {task: TrainingConfig(task) for task in about}
     return tyro.extras.subcommand_type_from_defaults(configs, about, prefix_names=False)
@@ -97,10 +100,10 @@ def _options(config: "training.TrainingConfig") -> "training.TrainingConfig":
 
 
 def _check_names(args: list[str], config: Any) -> None:
-    """Checks the names of options, which the parser would not name.
+    """Checks that options are settings: the parser's own message does not say which there are.
 
     Raises:
-        ValueError: there is no such setting; the message names the nearest one, or the algorithm that has it.
+        ValueError: there is no such setting; the message names the nearest or all, or the algorithm that has it.
     """
     from torchrl_loco.training.config import CONFIGS
 
@@ -108,7 +111,7 @@ def _check_names(args: list[str], config: Any) -> None:
     mine = {field.name for field in dataclasses.fields(config)} - {"task"}
     for arg in args:
         name = arg.partition("=")[0].removeprefix("--").replace("-", "_")
-        if not arg.startswith("--") or name.removeprefix("no_") in mine or name == "help":
+        if not arg.startswith("--") or name.removeprefix("no_") in mine or name in ("", "help"):
             continue
         for algorithm, names in settings_of.items():
             if name in names - settings_of[config.algorithm]:

@@ -5,18 +5,33 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import (
+    CatTensors,
+    CenterCrop,
     ClipTransform,
     Compose,
+    Crop,
     DoubleToFloat,
+    DTypeCastTransform,
     EnvBase,
+    ExcludeTransform,
+    FlattenObservation,
     FrameSkipTransform,
+    GrayScale,
     InitTracker,
     ObservationNorm,
+    PermuteTransform,
+    RenameTransform,
+    Resize,
     RewardClipping,
     RewardScaling,
     RewardSum,
+    SelectTransform,
+    SignTransform,
+    SqueezeTransform,
     StepCounter,
+    ToTensorImage,
     Transform,
+    UnsqueezeTransform,
 )
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
@@ -104,7 +119,14 @@ PLAIN_TRANSFORMS = (
     *(ClipTransform, Compose, DoubleToFloat, FrameSkipTransform, InitTracker),
     *(ObservationNorm, RewardClipping, RewardScaling, RewardSum, StepCounter),
 )
-"""Transforms that keep nothing on the host from step to step, and whose reset of no world changes nothing."""
+"""Transforms that keep nothing on the host from step to step; their reset changes only worlds that are reset."""
+
+STATELESS_TRANSFORMS = (
+    *(CatTensors, CenterCrop, Crop, DTypeCastTransform, ExcludeTransform, FlattenObservation, GrayScale),
+    *(PermuteTransform, RenameTransform, Resize, SelectTransform, SignTransform, SqueezeTransform),
+    *(ToTensorImage, UnsqueezeTransform),
+)
+"""Further transforms that compute the same of the same data, also at a reset."""
 
 
 def resets_by_mask(transform: Transform) -> bool:
@@ -113,16 +135,21 @@ def resets_by_mask(transform: Transform) -> bool:
     A class that is not known does if it has no reset of its own. That of ``VecNormV2``, for example, counts the
     observations that it is given.
     """
-    parts = (part for part in transform.modules() if isinstance(part, Transform))
-    return all(type(part) in PLAIN_TRANSFORMS or type(part)._reset is Transform._reset for part in parts)
+    for part in (part for part in transform.modules() if isinstance(part, Transform)):
+        kind = type(part)
+        own = [getattr(kind, name) is not getattr(Transform, name) for name in ("_reset", "_reset_env_preprocess")]
+        if any(own) and kind not in PLAIN_TRANSFORMS and kind not in STATELESS_TRANSFORMS:
+            return False
+    return True
 
 
 class TransformedEnv(TorchRLTransformedEnv):
-    """TorchRL's ``TransformedEnv`` for the environments of this package, without waiting for the device.
+    """TorchRL's ``TransformedEnv`` for the environments of this package; most transforms need not wait for the device.
 
-    TorchRL's own works too and gives the same data, but reads from the device at every step. So does this one with a
-    transform that has a reset of its own and is not in ``PLAIN_TRANSFORMS``. The arguments are those of TorchRL's: an
-    environment, and a transform or a ``Compose`` of them.
+    TorchRL's own works too and gives the same data, but reads from the device at every step, to reset only if a world
+    is done. So does this one if a transform has a reset of its own and is not known to change nothing then
+    (``PLAIN_TRANSFORMS`` and ``STATELESS_TRANSFORMS``). The arguments are those of TorchRL's: an environment, and a
+    transform or a ``Compose`` of them.
     """
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -143,4 +170,4 @@ class TransformedEnv(TorchRLTransformedEnv):
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
         """Returns what ``reset`` returns, without a state that was passed to it, which would become stale."""
-        return super()._reset_proc_data(without_state(tensordict), tensordict_reset)
+        return super()._reset_proc_data(without_state(tensordict, self.device), tensordict_reset)

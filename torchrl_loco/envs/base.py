@@ -138,19 +138,20 @@ class LocoEnv(EnvBase):
         missing = [name for name in names if not hasattr(cls, name)]
         if missing:
             raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.LocoEnv)")
-        check_int("observation_size", cls.observation_size)
+        check_int(f"{cls.__name__}.observation_size", cls.observation_size)
         if not isinstance(cls.defaults, SimConfig):
             raise TypeError(f"{cls.__name__}.defaults must be a torchrl_loco.SimConfig, got {cls.defaults!r}")
-        if isinstance(cls.term_names, str) or not all(isinstance(name, str) for name in cls.term_names):
+        names_terms = isinstance(cls.term_names, tuple | list) and all(isinstance(name, str) for name in cls.term_names)
+        if not names_terms:
             raise TypeError(f"{cls.__name__}.term_names must be a tuple of names, got {cls.term_names!r}")
-        table, poses = (
-            next(base for base in cls.__mro__ if name in vars(base)) for name in ("initial_states", "pose_func")
-        )
-        if poses is not LocoEnv and cls.__mro__.index(table) < cls.__mro__.index(poses):
-            raise TypeError(
-                f"{table.__name__}.initial_states is not used, since {poses.__name__}.pose_func draws the states; "
-                f"set pose_func = torchrl_loco.LocoEnv.pose_func in {table.__name__}"
-            )
+        # None of the package's own functions reads a table, but the one of LocoEnv.
+        if cls.pose_func is not LocoEnv.pose_func and cls.pose_func.__module__.startswith("torchrl_loco."):
+            table = next(base for base in cls.__mro__ if {"pose_func", "initial_states"} & vars(base).keys())
+            if "pose_func" not in vars(table):
+                raise TypeError(
+                    f"{table.__name__}.initial_states is not used, since an inherited pose_func draws the states: "
+                    f"set pose_func = torchrl_loco.LocoEnv.pose_func in {table.__name__}"
+                )
 
     def __repr__(self) -> str:
         num_envs = self.num_envs if self.batch_size else None
@@ -296,7 +297,7 @@ class LocoEnv(EnvBase):
             entries["reward"] = reward.view(*batch, 1)
         result = TensorDict._new_unsafe(entries, batch_size=batch, device=self.device)  # they need no checks
         if self.reward_terms:
-            columns = terms.view(*batch, len(self.term_names)).split(1, dim=-1)
+            columns = terms.view(*batch, len(self.term_names), 1).unbind(-2)
             result["reward_terms"] = dict(zip(self.term_names, columns, strict=True))
         return result
 
@@ -331,7 +332,7 @@ class LocoEnv(EnvBase):
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
         """Returns what ``reset`` returns, without a state that was passed to it, which would become stale."""
-        return super()._reset_proc_data(without_state(tensordict), tensordict_reset)
+        return super()._reset_proc_data(without_state(tensordict, self.device), tensordict_reset)
 
     def _set_seed(self, seed: int | None) -> None:
         """Starts the random streams of all worlds again, at their episode 0."""

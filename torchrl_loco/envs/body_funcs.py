@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-BEHIND = 4096
-"""Numbers behind a row in which a write beyond its end is noticed."""
+AROUND = 4096
+"""Numbers before and behind a row in which a write beyond its ends is noticed."""
 
 
 def pair_of(method: str, returned: Any) -> tuple[Any, Any]:
@@ -33,14 +33,16 @@ def struct_of(method: str, func: Any, inputs: Any) -> Any:
     return inputs._cls
 
 
-def check_rows(func: wp.Function, inputs: Any, size: int, terms: int, device: wp.Device) -> None:
-    """Checks that a body's function writes the rows of observation and terms: every number, and nothing behind them.
+def check_rows(func: wp.Function, inputs: Any, world: int, size: int, terms: int, device: wp.Device) -> None:
+    """Checks that a body's function writes the rows of observation and terms: every number, and none beyond.
 
-    It runs once, in memory of its own: a write behind a row would change the data of another world, or crash.
+    A write beyond a row would change the data of another world, or crash. The function runs twice for one world, with
+    rows between others that nobody reads. What it writes into its inputs stays.
 
     Args:
         func: the body's function.
         inputs: its inputs.
+        world: the world; one with a high index tells the row of a world from the memory of all.
         size: length of an observation.
         terms: number of the terms.
         device: where the inputs are.
@@ -50,32 +52,39 @@ def check_rows(func: wp.Function, inputs: Any, size: int, terms: int, device: wp
         ValueError: the function writes too much or too little; the message says which numbers.
     """
     struct = struct_of("observation_func", func, inputs)
-    if len(func.input_types) != 4:
+    required = [name for name in func.input_types if name not in func.defaults]
+    if not len(required) <= 4 <= len(func.input_types):
         raise TypeError(
             f"{func.key} must take the index of the world, the inputs, the row of the observation and that of the "
             f"terms, got the parameters {', '.join(func.input_types)}"
         )
     kernel = _writer(func, struct)
     rows = {"observation_size": size, "the number of term_names": terms}
-    unwritten = []  # of each row, by what it held before
-    for before in (-1.5e30, 2.5e30):
-        whole = [wp.full(length + BEHIND, before, dtype=float, device=device) for length in rows.values()]
-        parts = [memory[:length] for memory, length in zip(whole, rows.values(), strict=True)]
-        wp.launch(kernel, 1, [inputs, *parts, wp.zeros(1, dtype=float, device=device)], device=device)
-        same = [memory.numpy() == np.float32(before) for memory in whole]
-        for (name, length), untouched in zip(rows.items(), same, strict=True):
-            if not untouched[length:].all():
-                most = int(np.flatnonzero(~untouched)[-1]) + 1
-                raise ValueError(f"{name} is {length}, but {func.key} writes {most} numbers")
-        unwritten.append([set(np.flatnonzero(part[:length])) for part, length in zip(same, rows.values(), strict=True)])
-    for (name, length), first, second in zip(rows.items(), *unwritten, strict=True):
-        if left := sorted(int(index) for index in first & second):
-            raise ValueError(f"{name} is {length}, but {func.key} does not write the numbers {left}")
+    written = {name: np.zeros(length + 2 * AROUND, dtype=bool) for name, length in rows.items()}
+    for before in (-1.5e30, 2.5e30):  # the function may write one of them
+        memory = [wp.full(length + 2 * AROUND, before, dtype=float, device=device) for length in rows.values()]
+        parts = [numbers[AROUND : numbers.size - AROUND] for numbers in memory]
+        wp.launch(kernel, 1, [world, inputs, *parts, wp.zeros(1, dtype=float, device=device)], device=device)
+        for name, numbers in zip(rows, memory, strict=True):
+            written[name] |= numbers.numpy() != np.float32(before)
+    for name, length in rows.items():
+        places = set((np.flatnonzero(written[name]) - AROUND).tolist())
+        if beyond := sorted(places - set(range(length))):
+            raise ValueError(f"{name} is {length}, but {func.key} writes the numbers {_some(beyond)} too")
+        if left := sorted(set(range(length)) - places):
+            raise ValueError(f"{name} is {length}, but {func.key} does not write the numbers {_some(left)}")
+
+
+def _some(numbers: list[int]) -> str:
+    """Returns the first few of some numbers, as text."""
+    return ", ".join(map(str, numbers[:5])) + (", ..." if len(numbers) > 5 else "")
 
 
 def _writer(observe: wp.Function, Inputs: Any) -> wp.Kernel:  # noqa: N803
     @wp.kernel(enable_backward=False, module="unique")
-    def write_rows_once(inputs: Inputs, observation: wp.array[float], terms: wp.array[float], reward: wp.array[float]):
-        reward[0] = observe(0, inputs, observation, terms)
+    def write_rows_once(
+        world: int, inputs: Inputs, observation: wp.array[float], terms: wp.array[float], reward: wp.array[float]
+    ):
+        reward[0] = observe(world, inputs, observation, terms)
 
     return write_rows_once

@@ -1,6 +1,5 @@
 """A snapshot of an environment's worlds."""
 
-import operator
 from collections.abc import Mapping
 from typing import Any
 
@@ -47,9 +46,9 @@ class State(TensorDict):
             TypeError: ``world`` or ``num_envs`` is no integer.
             ValueError: ``num_envs`` is less than 1.
         """
-        worlds = self.batch_size.numel()
+        worlds, world = self.batch_size.numel(), check_int("world", world, "(-inf, inf)")
         count = worlds if num_envs is None else check_int("num_envs", num_envs)
-        if self.batch_size and not -worlds <= operator.index(world) < worlds:
+        if self.batch_size and not -worlds <= world < worlds:
             raise IndexError(f"there is no world {world}: this state has the worlds 0 to {worlds - 1}")
         one = {key: value[world] if self.batch_size else value for key, value in self.items()}
         copies = {key: value.expand(count, *value.shape).clone() for key, value in one.items()}
@@ -70,12 +69,12 @@ class State(TensorDict):
         return super().select(*keys, *state, inplace=inplace, strict=strict)
 
 
-def without_state(tensordict: TensorDictBase | None) -> TensorDictBase | None:
-    """Returns a TensorDict itself, or if it has entries of a state, a new one with its others."""
+def without_state(tensordict: TensorDictBase | None, device: torch.device | None) -> TensorDictBase | None:
+    """Returns a TensorDict itself, or if it has entries of a state, a new one on ``device`` with its others."""
     if tensordict is None or not any(key in tensordict for key in State.KEYS):
         return tensordict
     kept = {key: value for key, value in tensordict.items() if key not in State.KEYS}
-    return TensorDict(kept, batch_size=tensordict.batch_size, device=tensordict.device)
+    return TensorDict(kept, batch_size=tensordict.batch_size, device=device)
 
 
 def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor], mask: torch.Tensor) -> None:

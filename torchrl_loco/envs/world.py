@@ -155,7 +155,7 @@ class World:
         size, coalesced = task.observation_size, self.sim.engine.coalesced
         func, inputs = pair_of("observation_func", task.observation_func(self))
         if not type(task).__module__.startswith("torchrl_loco."):  # the tests check those of the package
-            check_rows(func, inputs, size, len(task.term_names), self.sim.device)
+            check_rows(func, inputs, task.num_envs - 1, size, len(task.term_names), self.sim.device)
         self._observe = observer(func, inputs, mine.outputs, mine.non_finite, size, coalesced=coalesced)
         self._check_finite = WorldFunc(zero_non_finite, fill(FiniteCheck, mine, qpos=data.qpos, qvel=data.qvel))
         self._finish = WorldFunc(finish_step, fill(StepEnd, mine, overflow=data.overflow, **counters))

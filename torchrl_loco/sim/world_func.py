@@ -46,7 +46,8 @@ def fill(struct: Any, source: Any = None, /, **fields: Any) -> Any:
 
         of_mujoco_warp = {field.name for field in dataclasses.fields(mjw.Data)}
         wrong = [
-            f'{name} is missing, which engine="mujoco_warp" has' if name in of_mujoco_warp else f"{name} is missing"
+            f"{name} is missing"
+            + (', which engine="mujoco_warp" has' if source is not None and name in of_mujoco_warp else "")
             for name in missing
         ] + [f"there is no {name}" for name in unknown]
         raise TypeError(f"{struct.key} has the fields {', '.join(struct.vars)}: {', '.join(wrong)}")
