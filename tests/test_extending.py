@@ -309,10 +309,10 @@ def observe_in_all(world: int, inputs: PaidInputs, observation: wp.array[float],
 @pytest.mark.parametrize(
     ("func", "size", "term_names", "message"),
     [
-        (observe_two, 1, ("bonus",), "observation_size is 1, but observe_two writes the numbers 1 too"),
-        (observe_two, 2, ("a", "b"), "the number of term_names is 2, but observe_two does not write the numbers 1$"),
-        (observe_in_all, 1, ("bonus",), "observation_size is 1, but observe_in_all writes the numbers 2 too"),
-        (observe_in_all, 3, ("bonus",), "does not write the numbers 0, 1$"),
+        (observe_two, 1, ("bonus",), "observation_size is 1, but observe_two also writes at index 1$"),
+        (observe_two, 2, ("a", "b"), "the number of term_names is 2, but observe_two does not write at index 1$"),
+        (observe_in_all, 1, ("bonus",), "observation_size is 1, but observe_in_all also writes at index 2$"),
+        (observe_in_all, 3, ("bonus",), "does not write at index 0, 1$"),
     ],
 )
 def test_rows_of_another_length_are_refused(func, size, term_names, message, monkeypatch):

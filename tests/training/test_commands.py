@@ -108,7 +108,7 @@ def test_errors_of_the_user(ppo_run, tmp_path, capsys):
         "eval {broken}": "{broken}/config.json is damaged",
         "resume no/such/run": "is not a run folder",
         "resume {run}": "is complete",
-        "resume {several}": "has no config.json; name one of those in it, such as",
+        "resume {several}": "has no config.json; name one of those in it, such as one, two",
         "resume {broken}": "{broken}/config.json is damaged",
         "record {run} --seconds 0": "seconds must lie in (0, inf)",
         "record {run} --device cpu --out {file}": "already exists",

@@ -119,7 +119,7 @@ PLAIN_TRANSFORMS = (
     *(ClipTransform, Compose, DoubleToFloat, FrameSkipTransform, InitTracker),
     *(ObservationNorm, RewardClipping, RewardScaling, RewardSum, StepCounter),
 )
-"""Transforms that keep nothing on the host from step to step; their reset changes only worlds that are reset."""
+"""Transforms that can be recorded, as they keep nothing on the host; a reset changes only the worlds of its mask."""
 
 STATELESS_TRANSFORMS = (
     *(CatTensors, CenterCrop, Crop, DTypeCastTransform, ExcludeTransform, FlattenObservation, GrayScale),
@@ -132,8 +132,8 @@ STATELESS_TRANSFORMS = (
 def resets_by_mask(transform: Transform) -> bool:
     """Returns whether the reset of a transform, and of those in it, changes nothing if no world is reset.
 
-    A class that is not known does if it has no reset of its own. That of ``VecNormV2``, for example, counts the
-    observations that it is given.
+    Of other classes than the listed ones, those without a reset of their own qualify. ``VecNormV2`` does not: its reset
+    counts the observations that it is given.
     """
     for part in (part for part in transform.modules() if isinstance(part, Transform)):
         kind = type(part)
@@ -147,8 +147,8 @@ class TransformedEnv(TorchRLTransformedEnv):
     """TorchRL's ``TransformedEnv`` for the environments of this package; most transforms need not wait for the device.
 
     TorchRL's own works too and gives the same data, but reads from the device at every step, to reset only if a world
-    is done. So does this one if a transform has a reset of its own and is not known to change nothing then
-    (``PLAIN_TRANSFORMS`` and ``STATELESS_TRANSFORMS``). The arguments are those of TorchRL's: an environment, and a
+    is done. So does this one with a transform that has a reset of its own, unless ``PLAIN_TRANSFORMS`` or
+    ``STATELESS_TRANSFORMS`` list it. The arguments are those of TorchRL's: an environment, and a
     transform or a ``Compose`` of them.
     """
 

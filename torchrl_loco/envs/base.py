@@ -141,10 +141,9 @@ class LocoEnv(EnvBase):
         check_int(f"{cls.__name__}.observation_size", cls.observation_size)
         if not isinstance(cls.defaults, SimConfig):
             raise TypeError(f"{cls.__name__}.defaults must be a torchrl_loco.SimConfig, got {cls.defaults!r}")
-        names_terms = isinstance(cls.term_names, tuple | list) and all(isinstance(name, str) for name in cls.term_names)
-        if not names_terms:
+        if not isinstance(cls.term_names, tuple | list) or not all(isinstance(name, str) for name in cls.term_names):
             raise TypeError(f"{cls.__name__}.term_names must be a tuple of names, got {cls.term_names!r}")
-        # None of the package's own functions reads a table, but the one of LocoEnv.
+        # Of the package's own functions only LocoEnv's reads the table.
         if cls.pose_func is not LocoEnv.pose_func and cls.pose_func.__module__.startswith("torchrl_loco."):
             table = next(base for base in cls.__mro__ if {"pose_func", "initial_states"} & vars(base).keys())
             if "pose_func" not in vars(table):

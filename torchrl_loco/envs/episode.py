@@ -4,7 +4,6 @@ from typing import Any
 
 import warp as wp
 
-from torchrl_loco.envs.body_funcs import struct_of
 from torchrl_loco.sim import WorldFunc, fill
 from torchrl_loco.sim.sampling import world_stream
 from torchrl_loco.sim.world_func import write_rows
@@ -103,7 +102,7 @@ def observer(
         size: length of an observation.
         coalesced: whether the threads of a warp take neighbouring worlds, and write observations together.
     """
-    write, struct = _observer(func, struct_of("observation_func", func, inputs), size, coalesced)
+    write, struct = _observer(func, inputs._cls, size, coalesced)
     return WorldFunc(write, fill(struct, inputs=inputs, outputs=outputs, non_finite=non_finite))
 
 
@@ -267,7 +266,7 @@ def begin_episode(world: int, args: EpisodeStart):
 
 def poser(func: wp.Function, inputs: Any, stream: wp.array) -> WorldFunc:
     """Returns what draws initial states from ``stream`` ``(nworld,)``, from what a body names in its ``pose_func``."""
-    draw, struct = _poser(func, struct_of("pose_func", func, inputs))
+    draw, struct = _poser(func, inputs._cls)
     return WorldFunc(draw, fill(struct, inputs=inputs, stream=stream))
 
 

@@ -14,7 +14,7 @@ import torch
 import warp as wp
 
 from torchrl_loco.config import SimConfig
-from torchrl_loco.envs.body_funcs import check_rows, pair_of
+from torchrl_loco.envs.body_funcs import check_pair, check_rows
 from torchrl_loco.envs.episode import (
     Control,
     EpisodeStart,
@@ -153,7 +153,7 @@ class World:
         mine.outputs, mine.flags = fill(Outputs, mine), fill(Flags, mine)
         counters = {"counter_bits": self.health.counter_bits, "counts": self.health.counts.warp}
         size, coalesced = task.observation_size, self.sim.engine.coalesced
-        func, inputs = pair_of("observation_func", task.observation_func(self))
+        func, inputs = check_pair("observation_func", task.observation_func(self))
         if not type(task).__module__.startswith("torchrl_loco."):  # the tests check those of the package
             check_rows(func, inputs, task.num_envs - 1, size, len(task.term_names), self.sim.device)
         self._observe = observer(func, inputs, mine.outputs, mine.non_finite, size, coalesced=coalesced)
@@ -163,7 +163,7 @@ class World:
         self._begins_at_rest = True
         pose = task.pose_func(self)
         if pose is not None:
-            func, inputs = pair_of("pose_func", pose)
+            func, inputs = check_pair("pose_func", pose)
             self._begin.append(poser(func, inputs, self.stream.warp))
             self._begins_at_rest = not holds(inputs, data.qvel)
 

@@ -42,14 +42,10 @@ def fill(struct: Any, source: Any = None, /, **fields: Any) -> Any:
                 given[name] = getattr(source, name)
     missing, unknown = sorted(struct.vars.keys() - given.keys()), sorted(given.keys() - struct.vars.keys())
     if missing or unknown:
-        import mujoco_warp as mjw  # takes a second, and the engine "compiled" does without it
-
-        of_mujoco_warp = {field.name for field in dataclasses.fields(mjw.Data)}
-        wrong = [
-            f"{name} is missing"
-            + (', which engine="mujoco_warp" has' if source is not None and name in of_mujoco_warp else "")
-            for name in missing
-        ] + [f"there is no {name}" for name in unknown]
+        others = mujoco_warp_arrays() if missing and source is not None else set()
+        hints = {name: ', which engine="mujoco_warp" has' for name in missing if name in others}
+        wrong = [f"{name} is missing{hints.get(name, '')}" for name in missing]
+        wrong += [f"there is no {name}" for name in unknown]
         raise TypeError(f"{struct.key} has the fields {', '.join(struct.vars)}: {', '.join(wrong)}")
     devices = {name: str(value.device) for name, value in given.items() if isinstance(value, wp.array)}
     if len(set(devices.values())) > 1:
@@ -58,6 +54,13 @@ def fill(struct: Any, source: Any = None, /, **fields: Any) -> Any:
     for name, value in given.items():
         setattr(instance, name, value)
     return instance
+
+
+def mujoco_warp_arrays() -> set[str]:
+    """Returns the names of what ``world.sim.data`` has with ``engine="mujoco_warp"``."""
+    import mujoco_warp as mjw  # takes a second, and the engine "compiled" does without it
+
+    return {field.name for field in dataclasses.fields(mjw.Data)}
 
 
 def holds(args: Any, array: wp.array) -> bool:
