@@ -148,8 +148,8 @@ class TransformedEnv(TorchRLTransformedEnv):
 
     TorchRL's own works too and gives the same data, but reads from the device at every step, to reset only if a world
     is done. So does this one with a transform that has a reset of its own, unless ``PLAIN_TRANSFORMS`` or
-    ``STATELESS_TRANSFORMS`` list it. The arguments are those of TorchRL's: an environment, and a
-    transform or a ``Compose`` of them.
+    ``STATELESS_TRANSFORMS`` lists it. The arguments are those of TorchRL's: an environment, and a transform or a
+    ``Compose`` of them.
     """
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
