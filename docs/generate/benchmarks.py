@@ -28,10 +28,9 @@ def all_results(results: Path, pictures: Path) -> str:
 def _folder(folder: Path, root: Path, pictures: Path) -> str:
     date, device = folder.name[:10], folder.name[11:]
     parts = [f"## {device}, {date}\n"]
-    campaign = folder / "campaign"
-    if campaign.is_dir():
-        parts.append(_campaign(campaign, root, pictures / f"{folder.name}-campaign.png"))
-    for path in sorted(path for path in folder.rglob("*") if campaign not in path.parents):
+    campaigns = sorted(path.parent for path in folder.rglob("about.json"))
+    parts += [_campaign(path, root, pictures / f"{folder.name}-{path.name}.png") for path in campaigns]
+    for path in sorted(path for path in folder.rglob("*") if path.parent not in campaigns):
         link = f"../{path.relative_to(root).as_posix()}"
         heading = f"### {path.relative_to(folder).with_suffix('').as_posix().replace('/', ', ')}\n"
         if path.suffix == ".json":
@@ -61,7 +60,7 @@ def _campaign(folder: Path, root: Path, picture: Path) -> str:
     how = "".join(f"`{call['command']}`: {call['devices']} x {call['device']}, {call['date']}\n\n" for call in calls)
     notes = "".join(f"{note}\n\n" for note in dict.fromkeys(call["note"] for call in calls if "note" in call))
     return (
-        "### campaign\n\nThe best policy of each seed in new episodes, beside marks and published returns:\n\n"
+        f"### {folder.name}\n\nThe best policy of each seed in new episodes, beside marks and published returns:\n\n"
         f"{notes}{table(tuple(COLUMNS), lines)}\n"
         f"![Return against training time]({picture.relative_to(root / 'docs').as_posix()})\n\n"
         f"{how}All numbers: {links}.\n"
