@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.cases import CASES, INTERRUPTED, VARIANTS
+from benchmarks.cases import CASES, INTERRUPTED, LEARNING, VARIANTS
 from benchmarks.results import save, show
 from benchmarks.tasks import TASKS
 from torchrl_loco import list_envs
@@ -39,8 +39,8 @@ commands.choices["fidelity"].add_argument("--picture", type=Path, help="file for
 add("profile", "time of each kernel (CUDA)", small)
 add("soak", "millions of steps under hostile actions and states", small)
 commands.choices["soak"].add_argument("--frames", type=float, default=1e5 if DEVICE == "cpu" else 5e7)
-for name, default in (("throughput", list(CASES)), ("profile", ["env_step_and_maybe_reset"])):
-    commands.choices[name].add_argument("--cases", nargs="+", choices=[*CASES, *VARIANTS], default=default)
+for name, further, default in (("throughput", {}, list(CASES)), ("profile", LEARNING, ["env_step_and_maybe_reset"])):
+    commands.choices[name].add_argument("--cases", nargs="+", choices=[*CASES, *VARIANTS, *further], default=default)
 commands.choices["peers"].add_argument("--path", type=Path, help="folder that the peers' packages were installed in")
 train = commands.add_parser("training", help="time to a return, compared with Brax's PPO on Playground")
 train.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_walk"])

@@ -20,7 +20,10 @@ from benchmarks.tasks import TASKS
 from torchrl_loco import RolloutCollector, models
 from torchrl_loco.config import DEFAULTS, sim_config
 from torchrl_loco.sim import Simulation, current_stream
+from torchrl_loco.training import preset
+from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.interrupts import interruptible
+from torchrl_loco.training.reppo import REPPO
 
 Run = TypeVar("Run")
 INTERRUPTED = threading.Event()
@@ -149,6 +152,20 @@ def torchrl_collector(body: str, n: int, device: torch.device) -> Callable[[], N
     return every_batch(collector)
 
 
+def update(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """REPPO's gradient steps on one step of all worlds, with the settings for the task."""
+    config = preset(TASKS[body], device, "reppo", num_envs=n, num_steps=1, epochs=1)
+    learner = REPPO(config)
+    env = torchrl_loco.make(TASKS[body], n, device, seed=0, stagger=True)
+    batch = RolloutCollector(env, learner.actor, frames_per_batch=n).rollout().clone()
+
+    def step() -> None:
+        with settings_for_small_networks(), torch.enable_grad():
+            learner.update(batch, progress=0.0)
+
+    return step
+
+
 def env_and_policy(body: str, n: int, device: torch.device) -> tuple[EnvBase, TensorDictModule]:
     """An environment with staggered episodes, and a policy for it."""
     torch.set_float32_matmul_precision("high")  # TF32, as training does
@@ -196,3 +213,5 @@ CASES = {
 """From the bare simulator to a collector."""
 VARIANTS = {case.__name__: case for case in (env_dm_control, env_deterministic)}
 """What settings cost."""
+LEARNING = {update.__name__: update}
+"""What learning costs, of which only a profile is taken."""

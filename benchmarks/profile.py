@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
-from benchmarks.cases import CASES
+from benchmarks.cases import CASES, LEARNING, VARIANTS
 from benchmarks.results import Row
 
 COLUMNS = {"kernel": "", "body": "", "case": "", "launches": ".0f", "us each": ".2f", "us": ".1f", "share": ".1%"}
@@ -17,7 +17,7 @@ def profile(bodies: Sequence[str], worlds: int, cases: Sequence[str], device: to
     rows: list[Row] = []
     for body in bodies:
         for case in cases:
-            step = CASES[case](body, worlds, device)
+            step = {**CASES, **VARIANTS, **LEARNING}[case](body, worlds, device)
             for _ in range(WARMUP):
                 step()
             torch.cuda.synchronize(device)

@@ -50,17 +50,32 @@ def test_training_waits_for_nothing(trainer):
 
 
 def test_actor_and_critic_see_the_same_normalised_observations(trainer):
-    algorithm, seen = trainer.algorithm, torch.randn(50, 24)
-    critic = algorithm.critic
+    algorithm, batch = trainer.algorithm, trainer.collector.rollout()
+    values = "returns" if algorithm.config.algorithm == "reppo" else "value_target"
 
     @torch.no_grad()
     def now():
-        value = critic.module(seen) if hasattr(critic, "module") else critic(seen, torch.zeros(50, 6))[0]
-        return value, algorithm.actor[0].module(seen)[0]
+        torch.manual_seed(0)
+        return algorithm.prepare(batch)[values], algorithm.actor[0].module(batch["observation"])[0]
 
     before = now()
     algorithm.norm.update(torch.randn(100, 24) * 5 + 3)
     assert all((new != old).any() for new, old in zip(now(), before, strict=True))
+
+
+def test_gradient_steps_see_what_the_actor_sees(trainer):
+    """Whether they normalise observations themselves, or get them normalised."""
+    algorithm, batch = trainer.algorithm, trainer.collector.rollout()
+    algorithm.norm.update(torch.randn(100, 24) * 5 + 3)
+    with torch.no_grad():
+        data = algorithm.prepare(batch)
+        own = (
+            algorithm.distribution if algorithm.config.algorithm == "reppo" else algorithm.loss.actor_network[0].module
+        )
+        for parameter, other in zip(
+            own(data["observation"]), algorithm.actor[0].module(batch["observation"]), strict=True
+        ):
+            torch.testing.assert_close(parameter, other)
 
 
 def test_gradients_of_one_minibatch_do_not_reach_the_next(trainer):

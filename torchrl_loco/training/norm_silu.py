@@ -12,7 +12,7 @@ import torch
 import warp as wp
 from torch import nn
 
-from torchrl_loco.sim import current_stream, joined_to_torch, torch_is_recording
+from torchrl_loco.sim import launch_on_tensors
 
 LANES = 32
 """Threads that share a row on CUDA; they hold it in registers. On the CPU one does."""
@@ -194,7 +194,8 @@ class _NormSiLU(torch.autograd.Function):
     def forward(ctx: Any, x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, eps: float) -> torch.Tensor:
         rows, weight, bias = _aligned(x).view(-1, x.shape[-1]), _aligned(weight), _aligned(bias)
         y, moments = rows.new_empty(x.shape), rows.new_empty(2 * len(rows))
-        _launch("forward", _lanes(rows) * len(rows), (rows, weight, bias, eps), (y.view(rows.shape), moments))
+        kernel, outputs = _kernels(rows.shape[-1])["forward"], (y.view(rows.shape), moments)
+        launch_on_tensors(kernel, _lanes(rows) * len(rows), (rows, weight, bias, eps), outputs, BLOCK)
         ctx.save_for_backward(rows, weight, bias, moments)
         return y
 
@@ -207,7 +208,8 @@ class _NormSiLU(torch.autograd.Function):
         blocks = min(BLOCKS, -(-len(rows) * _lanes(rows) // threads))
         of_parameters = any(ctx.needs_input_grad[1:])
         sums = rows.new_empty(blocks if of_parameters else 0, 2 * rows.shape[-1])
-        _launch("backward", threads * blocks, (blocks, rows, weight, bias, moments, given), (grad_x, sums))
+        kernel, inputs = _kernels(rows.shape[-1])["backward"], (blocks, rows, weight, bias, moments, given)
+        launch_on_tensors(kernel, threads * blocks, inputs, (grad_x, sums), BLOCK)
         grad_weight, grad_bias = sums.sum(0).chunk(2) if of_parameters else (None, None)
         return grad_x.view(grad_y.shape), grad_weight, grad_bias, None
 
@@ -220,24 +222,6 @@ def _aligned(x: torch.Tensor) -> torch.Tensor:
 
 def _lanes(rows: torch.Tensor) -> int:
     return LANES if rows.is_cuda else 1
-
-
-def _launch(kind: str, threads: int, inputs: tuple[Any, ...], outputs: tuple[torch.Tensor, ...]) -> None:
-    """Launches a kernel on torch's current stream; while torch records, the launch joins the recording."""
-    width = outputs[0].shape[-1]
-    device = wp.get_device(str(outputs[0].device))
-    arrays = [wp.from_torch(value.detach()) if isinstance(value, torch.Tensor) else value for value in inputs]
-    recording = torch_is_recording(device)
-    with joined_to_torch(device) if recording else wp.ScopedDevice(device):
-        wp.launch(
-            _kernels(width)[kind],
-            dim=threads,
-            inputs=arrays,
-            outputs=[wp.from_torch(value) for value in outputs],
-            device=device,
-            stream=None if recording else current_stream(device),  # a second one would end the recording of the first
-            block_dim=BLOCK,
-        )
 
 
 @functools.cache

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor
 from torch import nn
-from torch.nn.functional import cross_entropy, mse_loss, softplus
+from torch.nn.functional import mse_loss
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
@@ -22,6 +22,8 @@ from torchrl_loco.training.actor import make_actor
 from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import REPPOConfig
 from torchrl_loco.training.norm_silu import Layers
+from torchrl_loco.training.squashed_normal import kl, sample
+from torchrl_loco.training.value_bins import ValueBins
 
 
 class REPPO(Algorithm):
@@ -36,7 +38,7 @@ class REPPO(Algorithm):
     def __init__(self, config: REPPOConfig) -> None:
         super().__init__(config)
         self.actor, self.critic, self.norm = make_actor_q(config)
-        self.distribution = self.actor[0].module  # from observations to means and standard deviations
+        self.distribution = self.actor[0].module[1:]  # from normalised observations to means and standard deviations
         self.dual = DualVariables(config).to(self.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "dual": self.dual})
         self.critic_optimizer = self.make_optimizer("critic", self.critic.parameters())
@@ -45,15 +47,15 @@ class REPPO(Algorithm):
         self.actor_optimizer = self.make_optimizer("actor", groups)
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """Returns soft lambda-returns, ``(num_envs, num_steps)``, and the features to predict.
+        """Returns soft lambda-returns, ``(num_envs, num_steps)``, the features to predict, and normalised observations.
 
         Entropy counts as reward. Values of next states are those of one sampled action. At a time limit the value of
         the true terminal observation is bootstrapped; termination ends the return.
         """
         config, after = self.config, batch["next"]
-        loc, scale = self.distribution(after["observation"])
-        action, log_prob = sample(loc, scale)
-        value, features = self.critic.value_and_features(after["observation"], action)
+        observation, next_observation = self.norm(batch["observation"]), self.norm(after["observation"])
+        action, log_prob = sample(*self.distribution(next_observation))
+        value, features = self.critic.value_and_features(next_observation, action)
         alive = ~after["terminated"]
         reward = after["reward"] * config.reward_scale
         reward = reward - config.gamma * self.dual.temperature * log_prob.unsqueeze(-1) * alive
@@ -61,7 +63,7 @@ class REPPO(Algorithm):
             config.gamma, config.lmbda, value.unsqueeze(-1), reward, after["done"], after["terminated"]
         )
         estimates = {"returns": returns.squeeze(-1), "features": features, "alive": alive.squeeze(-1).float()}
-        return batch.select("observation", "action", "loc", "scale").update(estimates)
+        return batch.select("action", "loc", "scale").update({"observation": observation, **estimates})
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
         """Returns the metrics, a scalar each, of a step of the critic, then one of the actor and the dual variables."""
@@ -74,8 +76,7 @@ class REPPO(Algorithm):
             Its metrics.
         """
         logits, predicted = self.critic(minibatch["observation"], minibatch["action"])
-        target = self.critic.bins.encode(minibatch["returns"])
-        loss = cross_entropy(logits, target)
+        loss = self.critic.bins.cross_entropy(logits, minibatch["returns"])
         aux = (mse_loss(predicted, minibatch["features"], reduction="none").mean(-1) * minibatch["alive"]).mean()
         self.critic_optimizer.zero_grad()
         (loss + self.config.aux_coeff * aux).backward()
@@ -88,27 +89,24 @@ class REPPO(Algorithm):
         Returns:
             Its metrics.
         """
-        config, dual = self.config, self.dual
+        config, temperature, kl_weight = self.config, self.dual.temperature, self.dual.kl_weight
         loc, scale = self.distribution(minibatch["observation"])
         action, log_prob = sample(loc, scale)
         with frozen(self.critic):
             value, _ = self.critic.value_and_features(minibatch["observation"], action)
         divergence = kl(minibatch["loc"], minibatch["scale"], loc, scale)
         exceeded = divergence >= config.kl_bound
-        objective = dual.temperature.detach() * log_prob - value
-        loss = torch.where(exceeded, dual.kl_weight.detach() * divergence, objective).mean()
+        objective = temperature.detach() * log_prob - value
+        loss = torch.where(exceeded, kl_weight.detach() * divergence, objective).mean()
         # The dual variables rise while their constraint is violated: too little entropy, too much divergence.
-        excess_entropy = (-log_prob.detach() - config.target_entropy * action.shape[-1]).mean()
-        excess_kl = (divergence.detach() - config.kl_bound).mean()
-        dual_loss = dual.temperature * excess_entropy - dual.kl_weight * excess_kl
+        entropy, mean_divergence = -log_prob.detach().mean(), divergence.detach().mean()
+        excess_entropy = entropy - config.target_entropy * action.shape[-1]
+        dual_loss = temperature * excess_entropy - kl_weight * (mean_divergence - config.kl_bound)
         self.actor_optimizer.zero_grad()
         (loss + dual_loss).backward()
         grad_norm = clip_and_step(self.actor_optimizer, config.max_grad_norm)
-        dual.clamp_()
-        return [
-            *(loss, divergence.mean(), exceeded.float().mean(), -log_prob.mean()),
-            *(dual.temperature, dual.kl_weight, grad_norm),
-        ]
+        self.dual.clamp_()
+        return [loss, mean_divergence, exceeded.float().mean(), entropy, temperature, kl_weight, grad_norm]
 
 
 @contextlib.contextmanager
@@ -151,84 +149,23 @@ class DualVariables(nn.Module):
         return self.log_kl_weight.exp()
 
 
-def sample(loc: torch.Tensor, scale: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns actions ``tanh(u)``, u ~ N(loc, scale), by reparametrisation, and their log-probabilities ``(...)``.
-
-    The log-probability is computed from u, not from the action, so it stays exact where tanh saturates.
-
-    Args:
-        loc: means before tanh, shape ``(..., nu)``.
-        scale: standard deviations before tanh, of the same shape.
-    """
-    noise = torch.randn_like(loc)
-    u = loc + scale * noise
-    log_prob = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2 * math.pi)
-    log_slope = 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))
-    return u.tanh(), (log_prob - log_slope).sum(-1)
-
-
-def kl(old_loc: torch.Tensor, old_scale: torch.Tensor, loc: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
-    """Returns KL(old || new) of diagonal Gaussians, shape ``(...)``, which equals that of their images under tanh.
-
-    Means and standard deviations have shape ``(..., nu)``.
-    """
-    ratio = old_scale / scale
-    return (0.5 * (ratio.square() + ((old_loc - loc) / scale).square() - 1.0) - ratio.log()).sum(-1)
-
-
 # The networks.
-
-
-class ValueBins(nn.Module):
-    """Returns as distributions over evenly spaced bins (HL-Gauss: Imani and White, 2018; Farebrother et al., 2024).
-
-    Args:
-        low: return at the center of the first bin.
-        high: return at the center of the last bin.
-        count: number of bins.
-
-    Attributes:
-        centers: returns at the centers of the bins, shape ``(count,)``.
-        edges: returns at the edges of the bins, shape ``(count + 1,)``.
-    """
-
-    SPREAD = 0.75
-    """Standard deviation of a target, in widths of a bin."""
-
-    centers: torch.Tensor
-    edges: torch.Tensor
-
-    def __init__(self, low: float, high: float, count: int) -> None:
-        super().__init__()
-        half = (high - low) / (count - 1) / 2
-        self.register_buffer("centers", torch.linspace(low, high, count), persistent=False)
-        self.register_buffer("edges", torch.linspace(low - half, high + half, count + 1), persistent=False)
-        self.low, self.high, self.sigma = low, high, 2 * half * self.SPREAD
-
-    def encode(self, returns: torch.Tensor) -> torch.Tensor:
-        """Returns the probabilities, shape ``(..., count)``, of a Gaussian about each return of shape ``(...)``."""
-        returns = returns.clamp(self.low, self.high).unsqueeze(-1)
-        below = torch.erf((self.edges - returns) / (math.sqrt(2.0) * self.sigma))
-        return below.diff(dim=-1) / (below[..., -1:] - below[..., :1])
-
-    def decode(self, logits: torch.Tensor) -> torch.Tensor:
-        """Returns the mean, shape ``(...)``, of distributions given as logits of shape ``(..., count)``."""
-        return logits.softmax(-1) @ self.centers
 
 
 class DistributionalQ(nn.Module):
     """Critic Q(s, a) whose output is a distribution over returns, with a second head that predicts its next features.
 
+    It reads normalised observations.
+
     Args:
-        norm: normalises observations.
         sizes: length of an observation and of an action.
         hidden: widths of the encoder's layers; the heads have one hidden layer of the last width.
         bins: the bins of the distribution.
     """
 
-    def __init__(self, norm: ObservationNorm, sizes: tuple[int, int], hidden: tuple[int, ...], bins: ValueBins) -> None:
+    def __init__(self, sizes: tuple[int, int], hidden: tuple[int, ...], bins: ValueBins) -> None:
         super().__init__()
-        self.norm, self.bins = norm, bins
+        self.bins = bins
         width = hidden[-1]
         self.encoder = Layers(*normed_layers(sum(sizes), hidden), nn.Linear(width, width))
         last = nn.Linear(width, len(bins.centers))
@@ -241,12 +178,12 @@ class DistributionalQ(nn.Module):
 
     def forward(self, observation: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns logits of shape ``(..., count)`` and the predicted next features of shape ``(..., hidden[-1])``."""
-        features = self.encoder(torch.cat([self.norm(observation), action], dim=-1))
+        features = self.encoder(torch.cat([observation, action], dim=-1))
         return self.value_head(features), self.predictor(features)
 
     def value_and_features(self, observation: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the mean return, shape ``(...)``, and the features, shape ``(..., hidden[-1])``."""
-        features = self.encoder(torch.cat([self.norm(observation), action], dim=-1))
+        features = self.encoder(torch.cat([observation, action], dim=-1))
         return self.bins.decode(self.value_head(features)), features
 
 
@@ -260,11 +197,11 @@ def normed_layers(inputs: int, hidden: tuple[int, ...]) -> list[nn.Module]:
 
 
 def make_actor_q(config: REPPOConfig) -> tuple[ProbabilisticActor, DistributionalQ, ObservationNorm]:
-    """Returns actor, critic and the observation norm that they share, for REPPO."""
+    """Returns actor, critic and the actor's observation norm, for REPPO."""
     norm = ObservationNorm(config.observation_size)
     head = nn.Linear(config.hidden[-1], 2 * config.action_size)
     body = normed_layers(config.observation_size, config.hidden)
     actor = make_actor(config, Layers(norm, *body, head, NormalParamExtractor("exp")), log_prob=False)
     bins = ValueBins(0.0, config.max_value, config.num_bins)
-    critic = DistributionalQ(norm, (config.observation_size, config.action_size), config.hidden, bins)
+    critic = DistributionalQ((config.observation_size, config.action_size), config.hidden, bins)
     return actor, critic.to(config.device), norm

@@ -23,7 +23,7 @@ from torchrl_loco.registry import env_class
 from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig, check_loggers, config_from_json
 
-CHECKPOINT_VERSION = 4
+CHECKPOINT_VERSION = 5
 ROOM_NEEDED = 200 * 2**20
 """Bytes that a run may need: checkpoints, video, metrics."""
 
