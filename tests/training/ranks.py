@@ -63,6 +63,8 @@ def whole_and_resumed(out, algorithm):
     Returns the folders of both, and of each update of the first one the batch, and the parameters afterwards.
     """
     settings = {"total_frames": 4 * 2 * BATCH, "episode_length": 23, "logger": ("csv",)}
+    if algorithm == "reppo":
+        settings |= {"trials": 2, "trial_fraction": 0.3}
     update, updates = Algorithm.update, []
 
     def noted(self, batch, progress):

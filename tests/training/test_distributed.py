@@ -139,6 +139,9 @@ def test_what_several_ranks_cannot_do(tmp_path, monkeypatch):
     run = made(tmp_path, total_frames=2 * BATCH - 1)
     with pytest.raises(ValueError, match=rf"total_frames \({2 * BATCH - 1}\) must be at least {2 * BATCH}"):
         Trainer(run)
+    run = made(tmp_path, total_frames=8 * BATCH, trials=2)
+    with pytest.raises(ValueError, match=rf"trial_fraction \({8 * BATCH // 5}\) must be at least {2 * BATCH}"):
+        Trainer(run)
     for name, value in {"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"}.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)

@@ -73,12 +73,19 @@ def test_same_seed_same_run(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "action_repeat"),
-    [("ppo", 4), *(pytest.param(*case, marks=pytest.mark.slow) for case in (("ppo", 1), ("reppo", 1), ("reppo", 4)))],
+    ("algorithm", "action_repeat", "trials"),
+    [
+        ("ppo", 4, 1),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("ppo", 1, 1), ("reppo", 1, 1), ("reppo", 4, 1), ("ppo", 4, 3), ("reppo", 1, 3))
+        ),
+    ],
 )
-def test_resumed_equals_uninterrupted(algorithm, action_repeat, tmp_path, monkeypatch):
+def test_resumed_equals_uninterrupted(algorithm, action_repeat, trials, tmp_path, monkeypatch):
     """Stopped by Ctrl-C after two of five batches and resumed, a run ends bit for bit where one without a stop does."""
     settings = {"total_frames": 5 * 4 * 8 * action_repeat, "action_repeat": action_repeat, "episode_length": 23}
+    settings |= {"trials": trials, "trial_fraction": 0.3}  # each a batch, so that it is stopped after the second
     whole = trained(tmp_path / "whole", algorithm, **settings)
 
     stopped = made(tmp_path / "stopped", algorithm, **settings)

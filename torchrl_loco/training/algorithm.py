@@ -115,6 +115,28 @@ class Algorithm(ABC):
         if isinstance(self._step, TorchGraph):
             self._step.release()
 
+    def begin_anew(self) -> None:
+        """Draws parameters as at the start of a run, in place, so that what was recorded stays valid."""
+        self.networks.load_state_dict(type(self)(self.config).networks.state_dict())
+        for optimizer in self.optimizers.values():
+            for moments_of_one in optimizer.state.values():
+                for value in moments_of_one.values():
+                    value.zero_()
+
+    def parameters_and_moments(self) -> dict[str, Any]:
+        """Returns parameters, normalisation and what optimizers know of the gradients, as they are: not as copies."""
+        optimizers = {name: optimizer.state_dict()["state"] for name, optimizer in self.optimizers.items()}
+        return {"networks": self.networks.state_dict(), "optimizers": optimizers}
+
+    @torch.no_grad()
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Overwrites, in place, what :meth:`parameters_and_moments` returns with a copy ``kept`` of it."""
+        self.networks.load_state_dict(kept["networks"])
+        for name, own in self.parameters_and_moments()["optimizers"].items():
+            for index, moments_of_one in own.items():
+                for key, value in moments_of_one.items():
+                    value.copy_(kept["optimizers"][name][index][key])
+
     def state_dict(self) -> dict[str, Any]:
         """Returns all that an exact continuation needs."""
         return {

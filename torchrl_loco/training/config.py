@@ -17,6 +17,7 @@ INTERVALS = {
     "eval_interval": "[0, 2**31)",
     "gamma": "(0, 1]",
     "lmbda": "[0, 1]",
+    "trial_fraction": "(0, 1)",
     "final_lr_fraction": "[0, 1]",
     "video_seconds": "[0, inf)",
     "checkpoint_seconds": "[0, inf)",
@@ -57,6 +58,11 @@ class TrainingConfig:
     """Worlds stepped together."""
     total_frames: int = 1_228_800
     """Frames to collect, over all worlds, rounded down to whole batches."""
+    trials: int = 1
+    """Policies that are begun, one after the other. The one with the best evaluation is trained on, the others are
+    dropped; their frames count as the run's."""
+    trial_fraction: float = 0.2
+    """Fraction of total_frames that each trial takes, if there are several."""
     action_repeat: int = 4
     """Frames for which an action is held."""
     episode_length: int = 400
@@ -119,10 +125,16 @@ class TrainingConfig:
                 f"num_steps ({self.num_steps}) = {self.batch_size}: pass minibatch_size={self.batch_size} or less, or "
                 f"num_steps={math.ceil(self.minibatch_size / self.num_envs)} or more"
             )
-        if self.total_frames < self.frames_per_batch:
+        if self.trials > 1 and self.trials * self.trial_fraction >= 1.0:
             raise ValueError(
-                f"total_frames ({self.total_frames}) must be at least one batch of num_envs * num_steps * "
-                f"action_repeat ({self.frames_per_batch})"
+                f"trials ({self.trials}) * trial_fraction ({self.trial_fraction}) must be less than 1, so that frames "
+                f"are left for the best of them: pass trial_fraction={0.5 / self.trials:.2g}, for example"
+            )
+        part, frames = self.shortest_part
+        if frames < self.frames_per_batch:
+            raise ValueError(
+                f"{part} ({frames}) must be at least one batch of num_envs * num_steps * action_repeat "
+                f"({self.frames_per_batch})"
             )
 
     def to_json(self) -> dict[str, Any]:
@@ -138,6 +150,18 @@ class TrainingConfig:
     def frames_per_batch(self) -> int:
         """Frames in one batch."""
         return self.batch_size * self.action_repeat
+
+    @property
+    def trial_frames(self) -> int:
+        """Frames of each trial, if there are several."""
+        return int(self.trial_fraction * self.total_frames)
+
+    @property
+    def shortest_part(self) -> tuple[str, int]:
+        """The part of a run that must have at least a batch, as an expression, and its frames."""
+        if self.trials == 1:
+            return "total_frames", self.total_frames
+        return "total_frames * trial_fraction", self.trial_frames
 
     @property
     def observation_size(self) -> int:

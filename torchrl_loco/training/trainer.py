@@ -38,6 +38,7 @@ from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.ppo import PPO
 from torchrl_loco.training.reppo import REPPO
 from torchrl_loco.training.run_folder import RunFolder
+from torchrl_loco.training.trials import Trials
 
 ALGORITHMS: dict[str, Callable[[Any], Algorithm]] = {"ppo": PPO, "reppo": REPPO}
 
@@ -68,15 +69,17 @@ class Trainer:
         check_device(config.device)
         check_loggers(config.logger)
         checkpoint = run.load_checkpoint(config.device) if resume else None
-        if checkpoint is None and config.total_frames < self.frames_per_iteration:
+        part, frames = config.shortest_part
+        if checkpoint is None and frames < self.frames_per_iteration:
             raise ValueError(
-                f"total_frames ({config.total_frames}) must be at least {self.frames_per_iteration}: one batch of "
+                f"{part} ({frames}) must be at least {self.frames_per_iteration}: one batch of "
                 f"{config.frames_per_batch} on each of {distributed.ranks()} ranks"
             )
         torch.manual_seed(config.seed)
         first, rank = distributed.is_first(), distributed.rank()
         self.env = make_env(config, run.nan_dump if first else run.nan_dump.with_stem(f"nan_dump_rank{rank}"))
         self.algorithm = ALGORITHMS[config.algorithm](config)
+        self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
         self.collector = RolloutCollector(self.env, self.algorithm.actor, frames_per_batch=config.batch_size)
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
         self._best = -math.inf  # the evaluation that selected the policy
@@ -125,12 +128,18 @@ class Trainer:
                 if loggers is not None:
                     self.run.append_metrics(row)
                     loggers.log(row, self.frames)
-                bar.set_postfix({"return": f"{row['return']:.0f}"}, refresh=False)
+                trial = {"trial": self.trials.label} if self.trials.running else {}
+                bar.set_postfix({**trial, "return": f"{row['return']:.0f}"}, refresh=False)
                 bar.update(self.frames_per_iteration)
-                if self.frames >= self.last_frame or self._evaluation_is_due():
+                trial_is_over = self.trials.is_over(self.frames)
+                if trial_is_over or self.frames >= self.last_frame or self._evaluation_is_due():
+                    mean = None
                     if loggers is not None:
-                        loggers.log({"evaluation": self._evaluate()["mean"]}, self.frames)
+                        mean = self._evaluate()["mean"]
+                        loggers.log({"evaluation": mean}, self.frames)
                     distributed.wait_for_all()
+                    if trial_is_over:
+                        self.trials.end(self.frames, distributed.from_first(mean))
                 is_late = time.perf_counter() - saved > config.checkpoint_seconds
                 stop, is_late = distributed.any_rank(interrupted(), is_late)
                 if stop or is_late:
@@ -165,7 +174,7 @@ class Trainer:
         full_length = env_class(config.task).defaults.episode_length  # in training, episodes may be shorter
         batch = self.collector.rollout()
         reward = batch["next", "reward"].mean() / config.action_repeat
-        metrics = algorithm.update(batch, progress=self.frames / config.total_frames)
+        metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
         mean_reward, *means = distributed.mean_of_ranks(torch.cat([reward.view(1), metrics])).tolist()
         self.frames += self.frames_per_iteration
         self.iteration += 1
@@ -231,7 +240,11 @@ class Trainer:
         ranks = distributed.gathered(own)
         if distributed.is_first():
             counters = {"frames": self.frames, "iteration": self.iteration, "seconds": self.seconds}
-            of = {"settings": self._identity(), "algorithm": self.algorithm.state_dict()}
+            of = {
+                "settings": self._identity(),
+                "algorithm": self.algorithm.state_dict(),
+                "trials": self.trials.state_dict(),
+            }
             self.run.save_checkpoint({**counters, **of, **ranks[0], "further_ranks": ranks[1:]})
         distributed.wait_for_all()
 
@@ -254,6 +267,7 @@ class Trainer:
         rank = distributed.rank()
         generator = self.algorithm.generator.get_state()
         self.algorithm.load_state_dict(checkpoint["algorithm"])
+        self.trials.load_state_dict(checkpoint["trials"])
         if distributed.is_first():
             self.run.forget_after(self.frames)
             means = [row["mean"] for row in self.run.read_evaluations()]
