@@ -16,6 +16,7 @@ from benchmarks.cases import until_interrupted
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
 from benchmarks.throughput import phases
+from torchrl_loco.training.reppo import REPPO
 
 RESULTS = Path(__file__).parents[1] / "benchmarks/results/2026-11-21-h200"
 
@@ -139,3 +140,16 @@ def test_the_cost_model_adds_the_exchanges_to_an_iteration():
     row = {"gpus": 4, "collection": 39.0, "training": 15.0, "gradient_steps": 5, "exchange, recorded": 2.0}
     found = scaling.compared(row, first)
     assert found == {"collection, ratio": 3.9, "training, ratio": 3.0, "predicted": 3.0}  # 30 of 30 + 5 * 2 ms
+
+
+def test_what_is_profiled_of_learning_are_gradient_steps(monkeypatch):
+    sizes, gradient_step = [], REPPO.gradient_step
+
+    def noted(self, minibatch):
+        sizes.append(len(minibatch))
+        return gradient_step(self, minibatch)
+
+    monkeypatch.setattr(REPPO, "gradient_step", noted)
+    with torch.no_grad():
+        cases.update("walker", 512, torch.device("cpu"))()
+    assert sizes == [256, 256]

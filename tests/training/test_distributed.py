@@ -68,7 +68,7 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(ranks, algorithm):
     whole, stopped = (RunFolder(runs[name]) for name in ("whole", "stopped"))
     assert runs["stopped_at"] == 2
     first, second = whole.load_checkpoint("cpu"), stopped.load_checkpoint("cpu")
-    for name in ("frames", "iteration", "algorithm", "collector", "rng", "further_ranks"):
+    for name in ("frames", "iteration", "algorithm", "trials", "collector", "rng", "further_ranks"):
         assert_same({name: first[name]}, {name: second[name]})
     (further,) = first["further_ranks"]
     assert not torch.equal(first["rng"], further["rng"])  # each rank draws actions and minibatches of its own

@@ -59,6 +59,20 @@ def test_soft_returns_by_hand(monkeypatch):
     assert data["alive"].tolist() == [[1.0, 1.0, 0.0, 1.0]]
 
 
+def test_values_are_those_of_normalised_observations():
+    reppo, seen = made(num_envs=4), []
+    batch = collected(reppo, 4)
+    reppo.norm.update(batch["observation"] * 5 + 3)
+    value_and_features = reppo.critic.value_and_features
+    reppo.critic.value_and_features = lambda observation, action: (
+        seen.append(observation) or value_and_features(observation, action)
+    )
+    with torch.no_grad():
+        reppo.prepare(batch)
+    torch.testing.assert_close(seen, [reppo.norm(batch["next", "observation"])])
+    assert not torch.allclose(seen[0], batch["next", "observation"], atol=0.1)
+
+
 @pytest.mark.slow
 def test_updates_raise_what_is_rewarded():
     """Rewarded for the first joint alone, the actor moves that joint."""
@@ -87,12 +101,12 @@ def test_the_actor_returns_where_the_kl_bound_is_exceeded():
     reppo = made(num_envs=16, num_steps=8, minibatch_size=128, kl_bound=1e-12, init_kl_weight=1.0, lr=1e-3)
     batch = collected(reppo, 16)
     batch["loc"] += 0.3  # as if the policy that collected had been another
-    before = kl(batch["loc"], batch["scale"], *reppo.distribution(batch["observation"])).mean()
+    before = kl(batch["loc"], batch["scale"], *reppo.distribution(reppo.norm(batch["observation"]))).mean()
     data = reppo.prepare(batch).detach().reshape(-1)
     reppo.critic.value_and_features = lambda observation, action: (1e6 * action.sum(-1), None)
     for _ in range(20):
         reppo._actor_step(data)
-    after = kl(batch["loc"], batch["scale"], *reppo.distribution(batch["observation"])).mean()
+    after = kl(batch["loc"], batch["scale"], *reppo.distribution(reppo.norm(batch["observation"]))).mean()
     assert after < before / 2
 
 
@@ -108,7 +122,7 @@ def test_the_actor_ascends_value_and_entropy(slope, temperature):
 
     def now():
         torch.manual_seed(1)
-        loc, scale = reppo.distribution(batch["observation"])
+        loc, scale = reppo.distribution(reppo.norm(batch["observation"]))
         return loc.mean().item() if slope else -sample(loc, scale)[1].mean().item()
 
     before = now()

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
-from torchrl_loco.training.squashed_normal import kl, sample
+from torchrl_loco.training.squashed_normal import _Sample, kl, sample
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
@@ -40,6 +40,26 @@ def test_samples_and_their_gradients(device, shape):
     (gradient,) = torch.autograd.grad((action * weight).sum() + log_prob.sum(), both)
     (expected,) = torch.autograd.grad((expected_action * weight).sum() + expected_log_prob.sum(), exact)
     torch.testing.assert_close(gradient.double(), expected, atol=1e-4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_rows_in_any_order_of_memory(device):
+    """The time first or the world first, which for torch are the same memory."""
+    found = []
+    for turned in (False, True):
+        loc, scale = (x.detach() for x in normal((5, 3, 6), device).chunk(2, dim=-1))
+        if turned:
+            loc, scale = (x.transpose(0, 1).contiguous().transpose(0, 1) for x in (loc, scale))
+        loc, scale = loc.requires_grad_(), scale.requires_grad_()
+        torch.manual_seed(0)
+        noise = torch.randn(5, 3, 6).to(device)
+        action, log_prob = _Sample.apply(loc, scale, noise)
+        divergence = kl(scale.detach(), scale.detach(), loc, scale)
+        found.append(
+            [action, log_prob, *torch.autograd.grad((action.sum() + log_prob + divergence).sum(), [loc, scale])]
+        )
+    for straight, other in zip(*found, strict=True):
+        assert torch.equal(straight, other)
 
 
 @pytest.mark.parametrize("device", DEVICES)

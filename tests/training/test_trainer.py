@@ -109,6 +109,7 @@ def test_resumed_equals_uninterrupted(algorithm, action_repeat, trials, tmp_path
     first, second = whole.load_checkpoint("cpu"), stopped.load_checkpoint("cpu")
     assert_same(first["algorithm"], second["algorithm"])
     assert_same(first["collector"], second["collector"])
+    assert_same(first["trials"], second["trials"])
     for name in ("frames", "return", "grad_norm" if algorithm == "ppo" else "loss_critic"):
         assert whole.read_metrics()[name] == stopped.read_metrics()[name]
     assert whole.read_evaluations()[0]["mean"] == stopped.read_evaluations()[0]["mean"]

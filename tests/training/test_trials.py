@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 from compare import assert_same
-from small_runs import made, networks
+from small_runs import made
 
 from torchrl_loco.training import Trainer
 
@@ -24,6 +24,12 @@ def moments(trainer):
     return [value for of in optimizers.values() for state in of.values() for value in state.values()]
 
 
+def addresses(trainer):
+    """What a recorded gradient step reads and writes must stay where it is."""
+    trained = [p for o in trainer.algorithm.optimizers.values() for group in o.param_groups for p in group["params"]]
+    return [x.data_ptr() for x in (*trainer.algorithm.networks.state_dict().values(), *trained, *moments(trainer))]
+
+
 @pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
 @pytest.mark.parametrize("best", [0, 1, 2])
 def test_the_best_goes_on(algorithm, best, tmp_path):
@@ -37,7 +43,9 @@ def test_the_best_goes_on(algorithm, best, tmp_path):
         trainer._iterate()
         assert trials.is_over(trainer.frames)
         ended.append(knowledge(trainer))
+        before = addresses(trainer)
         trials.end(trainer.frames, 500.0 if number == best else 100.0 * number)
+        assert addresses(trainer) == before
         if number < 2:
             begun.append(knowledge(trainer))
             assert not any(value.any() for value in moments(trainer))
@@ -50,14 +58,15 @@ def test_the_best_goes_on(algorithm, best, tmp_path):
         assert all((first != second).any() for first, second in matrices)
     assert trials.progress(trainer.frames) == 0.5  # two of its four batches
     trainer._iterate()
-    assert any((value != ended[best]["networks"][name]).any() for name, value in knowledge(trainer)["networks"].items())
+    for name, parameter in trainer.algorithm.networks.named_parameters():
+        assert (parameter != ended[best]["networks"][name]).any(), name
     assert trials.state_dict()["best"] is None
 
 
 def test_a_run_with_trials(tmp_path, capsys):
-    """The first trial is the run without any; the policy is that of the best evaluation."""
-    run = made(tmp_path, total_frames=5 * BATCH, trials=2, trial_fraction=0.4)
-    alone = made(tmp_path, total_frames=2 * BATCH, final_lr_fraction=1.0)
+    """The first trial is the beginning of a run without any; the policy is that of the best evaluation."""
+    run = made(tmp_path, total_frames=5 * BATCH, trials=2, trial_fraction=0.4, eval_interval=3 * BATCH)
+    alone = made(tmp_path, total_frames=3 * BATCH)
     for one in (run, alone):
         Trainer(one).train()
     rows = run.read_evaluations()
@@ -67,10 +76,31 @@ def test_a_run_with_trials(tmp_path, capsys):
         assert f"trial {number} of 2: {row['mean']:.1f} after 256 frames" in out.out + out.err
     assert run.load_policy("cpu").info["selected_by"] == max(row["mean"] for row in rows)
     assert run.load_checkpoint("cpu")["trials"] == {
-        "ended": 2,
-        "began": 2 * BATCH,
-        "mean": rows[0]["mean"],
-        "best": None,
+        **{"ended": 2, "began": 2 * BATCH, "length": 2 * BATCH, "batch": BATCH},
+        **{"mean": rows[0]["mean"], "best": None},
     }
-    assert run.read_metrics()["return"][0] == alone.read_metrics()["return"][0]
-    assert networks(run).keys() == networks(alone).keys()
+    for name in ("return", "grad_norm", "kl_approx"):
+        assert run.read_metrics()[name][:2] == alone.read_metrics()[name][:2]
+
+
+def test_resumed_while_trials_run(tmp_path, monkeypatch):
+    """A trial keeps its length, whatever becomes of the run; all are compared after the same number of frames."""
+    run = made(tmp_path, total_frames=10 * BATCH, trials=3, trial_fraction=0.2)
+    trainer = Trainer(run)
+    for _ in range(2):
+        trainer._iterate()
+    trainer.trials.end(trainer.frames, 500.0)
+    trainer._iterate()
+    trainer.save()
+    run.extend(20 * BATCH)
+    longer = Trainer(run, resume=True)
+    longer._iterate()
+    assert longer.trials.is_over(longer.frames)
+    assert longer.trials.progress(longer.frames) == 2 / 16
+    run.extend(6 * BATCH)
+    with pytest.raises(ValueError, match=rf"\({6 * BATCH}\) must be more than the {6 * BATCH} frames of the 3 trials"):
+        Trainer(run, resume=True)
+    run.extend(20 * BATCH)
+    monkeypatch.setattr(Trainer, "frames_per_iteration", 2 * BATCH)
+    with pytest.raises(ValueError, match=r"trial 2 of 3 is running, .* continue with as many ranks as before"):
+        Trainer(run, resume=True)

@@ -48,6 +48,14 @@ def test_cross_entropy_and_its_gradient(device, count):
     torch.testing.assert_close(gradient.double(), other, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_rows_in_any_order_of_memory(device):
+    bins, logits, returns = case(device)
+    columns, every_second = logits.detach().T.contiguous().T.requires_grad_(), torch.stack([returns, returns], 1)[:, 0]
+    expected = torch.autograd.grad(bins.cross_entropy(logits, returns), logits)
+    assert torch.equal(*torch.autograd.grad(bins.cross_entropy(columns, every_second), columns), *expected)
+
+
 @pytest.mark.gpu
 def test_recorded_gradients_are_those_of_a_direct_call():
     bins, logits, returns = case("cuda")

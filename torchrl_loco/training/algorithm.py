@@ -78,7 +78,7 @@ class Algorithm(ABC):
 
         Args:
             batch: experience of shape ``(num_envs, num_steps)``; each rank passes its own.
-            progress: fraction of the run that is done, in [0, 1], which sets the learning rate.
+            progress: fraction of the policy's training that is done, in [0, 1], which sets the learning rate.
 
         Returns:
             The mean of the metrics over all gradient steps, shape ``(len(metric_names),)``.

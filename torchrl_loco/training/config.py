@@ -91,7 +91,7 @@ class TrainingConfig:
     """Widths of the hidden layers of actor and critic."""
 
     eval_interval: int = 0
-    """Frames between two evaluations during training; 0 evaluates at the end only."""
+    """Frames between two evaluations during training; 0 evaluates at the end only, and at that of each trial."""
     eval_episodes: int = 32
     """Episodes of an evaluation."""
     video_seconds: float = 10.0

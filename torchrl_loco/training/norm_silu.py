@@ -195,7 +195,7 @@ class _NormSiLU(torch.autograd.Function):
         rows, weight, bias = _aligned(x).view(-1, x.shape[-1]), _aligned(weight), _aligned(bias)
         y, moments = rows.new_empty(x.shape), rows.new_empty(2 * len(rows))
         kernel, outputs = _kernels(rows.shape[-1])["forward"], (y.view(rows.shape), moments)
-        launch_on_tensors(kernel, _lanes(rows) * len(rows), (rows, weight, bias, eps), outputs, BLOCK)
+        launch_on_tensors(kernel, lanes(rows) * len(rows), (rows, weight, bias, eps), outputs, BLOCK)
         ctx.save_for_backward(rows, weight, bias, moments)
         return y
 
@@ -205,7 +205,7 @@ class _NormSiLU(torch.autograd.Function):
         rows, weight, bias, moments = ctx.saved_tensors
         grad_x, given = torch.empty_like(rows), _aligned(grad_y).view(rows.shape)
         threads = BLOCK if rows.is_cuda else 1
-        blocks = min(BLOCKS, -(-len(rows) * _lanes(rows) // threads))
+        blocks = min(BLOCKS, -(-len(rows) * lanes(rows) // threads))
         of_parameters = any(ctx.needs_input_grad[1:])
         sums = rows.new_empty(blocks if of_parameters else 0, 2 * rows.shape[-1])
         kernel, inputs = _kernels(rows.shape[-1])["backward"], (blocks, rows, weight, bias, moments, given)
@@ -220,7 +220,8 @@ def _aligned(x: torch.Tensor) -> torch.Tensor:
     return x if x.data_ptr() % 16 == 0 else x.clone()
 
 
-def _lanes(rows: torch.Tensor) -> int:
+def lanes(rows: torch.Tensor) -> int:
+    """Returns how many threads share a row."""
     return LANES if rows.is_cuda else 1
 
 

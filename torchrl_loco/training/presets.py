@@ -80,10 +80,10 @@ start, in which the hopper can still turn to a side from which it gets up."""
 UPRIGHT: Settings = {"lr": 2e-3, "minibatch_size": 2048, "target_entropy": -1.0}
 """Less noise, and twice the gradient steps of MORE_STEPS at twice the learning rate. With the steps and the rate of
 MORE_STEPS three of four runs under ``dm_control`` settled on a crouching gait, which earns a tenth less; with these
-two of ten in 40 million frames, and none of eleven in 60 or 65 million."""
+two of ten in 40 million frames, none of six in 65 million, and none of five in 60 million after BETTER_OF_TWO."""
 BETTER_OF_TWO: Settings = {"trials": 2, "trial_fraction": 0.2}
-"""For gaits that are decided early, by chance. Of eleven runs of walker_run under ``playground`` with one trial, the
-three that ended below 920 had the lowest returns after 15 million frames."""
+"""For gaits that are decided early, by chance. Of eleven runs of walker_run under ``playground`` with one trial at this
+learning rate, the three that ended below 920 had the lowest returns after 15 million frames."""
 GETTING_UP: Settings = {"episode_length": 100, "gamma": 0.98, "max_value": 75.0}
 """For tasks that lose return mostly while the body gets up or gains speed, which is much of a short episode."""
 STEADY: Settings = {"init_kl_weight": 0.02, "min_kl_weight": 0.02}

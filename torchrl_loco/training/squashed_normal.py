@@ -1,7 +1,6 @@
 """Normal variables under tanh: samples with their log-probabilities, and divergences, in one kernel each.
 
-A gradient step on a small network is bound by the number of its kernels, not by their arithmetic: operation by
-operation, what is here would be half of them.
+A gradient step with small networks is bound by the number of its kernels more than by their arithmetic.
 """
 
 from typing import Any
@@ -42,7 +41,7 @@ def kl(old_loc: torch.Tensor, old_scale: torch.Tensor, loc: torch.Tensor, scale:
 class _Sample(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, loc: torch.Tensor, scale: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        action, log_prob = torch.empty_like(loc), loc.new_empty(loc.shape[:-1])
+        action, log_prob = loc.new_empty(loc.shape), loc.new_empty(loc.shape[:-1])
         _launch(sample_forward, (loc, scale, noise), (action, log_prob))
         ctx.save_for_backward(scale, noise, action)
         return action, log_prob
@@ -50,7 +49,7 @@ class _Sample(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_action: torch.Tensor, grad_log_prob: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        grad_loc, grad_scale = (torch.empty_like(ctx.saved_tensors[2]) for _ in range(2))
+        grad_loc, grad_scale = (ctx.saved_tensors[2].new_empty(ctx.saved_tensors[2].shape) for _ in range(2))
         _launch(sample_backward, (*ctx.saved_tensors, grad_action, grad_log_prob), (grad_loc, grad_scale))
         return grad_loc, grad_scale, None
 
@@ -66,7 +65,7 @@ class _KL(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_divergence: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        grad_loc, grad_scale = (torch.empty_like(ctx.saved_tensors[2]) for _ in range(2))
+        grad_loc, grad_scale = (ctx.saved_tensors[2].new_empty(ctx.saved_tensors[2].shape) for _ in range(2))
         _launch(kl_backward, (*ctx.saved_tensors, grad_divergence), (grad_loc, grad_scale))
         return None, None, grad_loc, grad_scale
 
@@ -74,10 +73,9 @@ class _KL(torch.autograd.Function):
 def _launch(kernel: wp.Kernel, inputs: tuple[torch.Tensor, ...], outputs: tuple[torch.Tensor, ...]) -> None:
     """Launches a kernel on tensors whose last dimension is a row's, and on those that have a number for each row."""
     shape = inputs[0].shape
-    inputs, outputs = (
-        tuple(x.reshape(-1, shape[-1]) if x.shape == shape else x.reshape(-1) for x in xs) for xs in (inputs, outputs)
-    )
-    launch_on_tensors(kernel, shape[:-1].numel(), inputs, outputs, BLOCK)
+    of_rows = [x.reshape(-1, shape[-1]) if x.shape == shape else x.reshape(-1) for x in inputs]
+    written = [x.view(-1, shape[-1]) if x.shape == shape else x.view(-1) for x in outputs]
+    launch_on_tensors(kernel, shape[:-1].numel(), of_rows, written, BLOCK)
 
 
 @wp.kernel(enable_backward=False)

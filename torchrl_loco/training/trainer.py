@@ -58,7 +58,8 @@ class Trainer:
 
     Raises:
         FileNotFoundError: there is no checkpoint to resume from.
-        ValueError: the checkpoint cannot be read, the run is complete, or too short for so many ranks.
+        ValueError: the checkpoint cannot be read; the run is complete, or too short for so many ranks; trials are
+            running that another number of ranks or of frames does not fit.
         ImportError: the package of a logger is missing.
     """
 
@@ -191,7 +192,7 @@ class Trainer:
 
     def _evaluation_is_due(self) -> bool:
         interval = self.config.eval_interval
-        return interval > 0 and self.frames % interval < self.frames_per_iteration
+        return interval > 0 and self.trials.own_frames(self.frames) % interval < self.frames_per_iteration
 
     def _evaluate(self) -> dict[str, float]:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""

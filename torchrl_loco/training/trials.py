@@ -24,9 +24,8 @@ class Trials:
 
     def __init__(self, config: TrainingConfig, algorithm: Algorithm, frames_per_iteration: int) -> None:
         self._algorithm = algorithm
-        self._count = config.trials
-        self._length = max(config.trial_frames // frames_per_iteration, 1) * frames_per_iteration
-        self._total = config.total_frames
+        self._count, self._total, self._batch = config.trials, config.total_frames, frames_per_iteration
+        self._length = config.trial_frames // frames_per_iteration * frames_per_iteration
         self._ended = 0
         self._began = 0  # frames of the run at which the policy in training had none
         self._best: dict[str, Any] | None = None
@@ -42,14 +41,18 @@ class Trials:
         """The trial that is running, such as ``"1 of 3"``."""
         return f"{self._ended + 1} of {self._count}"
 
+    def own_frames(self, frames: int) -> int:
+        """Returns the frames that the policy in training has had after ``frames`` frames of the run."""
+        return frames - self._began
+
     def progress(self, frames: int) -> float:
         """Returns the fraction of the policy's training that is done, in [0, 1], after ``frames`` frames of the run."""
         dropped = (self._count - 1) * self._length if self.running else self._began
-        return (frames - self._began) / (self._total - dropped)
+        return self.own_frames(frames) / (self._total - dropped)
 
     def is_over(self, frames: int) -> bool:
         """Returns whether a trial is running that is complete after ``frames`` frames of the run."""
-        return self.running and frames - self._began >= self._length
+        return self.running and self.own_frames(frames) >= self._length
 
     def end(self, frames: int, mean: float) -> None:
         """Ends a trial: the next policy begins, or after the last trial the best one goes on.
@@ -59,7 +62,7 @@ class Trials:
             mean: return of the policy in its evaluation.
         """
         if distributed.is_first():
-            tqdm.write(f"trial {self.label}: {mean:.1f} after {frames - self._began:,} frames")
+            tqdm.write(f"trial {self.label}: {mean:.1f} after {self.own_frames(frames):,} frames")
         is_best = mean > self._mean
         self._ended += 1
         if self.running:
@@ -76,8 +79,24 @@ class Trials:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns all that an exact continuation needs."""
-        return {"ended": self._ended, "began": self._began, "mean": self._mean, "best": self._best}
+        when = {"ended": self._ended, "began": self._began, "length": self._length, "batch": self._batch}
+        return {**when, "mean": self._mean, "best": self._best}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from a ``state`` that :meth:`state_dict` returned."""
-        self._ended, self._began, self._mean, self._best = (state[key] for key in ("ended", "began", "mean", "best"))
+        """Continues from a ``state`` that :meth:`state_dict` returned; a trial keeps the length with which it began.
+
+        Raises:
+            ValueError: trials are running, and another number of ranks or of frames does not fit them.
+        """
+        self._ended, self._began, self._length = state["ended"], state["began"], state["length"]
+        self._mean, self._best = state["mean"], state["best"]
+        if self.running and state["batch"] != self._batch:
+            raise ValueError(
+                f"trial {self.label} is running, with {state['batch']} frames in a batch of all ranks, now it would be "
+                f"{self._batch}: continue with as many ranks as before until the trials are over"
+            )
+        if self.running and self._count * self._length >= self._total:
+            raise ValueError(
+                f"total_frames ({self._total}) must be more than the {self._count * self._length} frames of the "
+                f"{self._count} trials, of which {self.label} is running"
+            )

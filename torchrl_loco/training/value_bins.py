@@ -12,9 +12,8 @@ import warp as wp
 from torch import nn
 
 from torchrl_loco.sim import launch_on_tensors
+from torchrl_loco.training.norm_silu import lanes
 
-LANES = 32
-"""Threads that share a row on CUDA. On the CPU one has it."""
 BLOCK = 128
 """Threads of a block on CUDA."""
 
@@ -112,11 +111,10 @@ class ValueBins(nn.Module):
 class _CrossEntropy(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, logits: torch.Tensor, returns: torch.Tensor, bins: ValueBins) -> torch.Tensor:
-        logits, losses, gradient = logits.contiguous(), torch.empty_like(returns), torch.empty_like(logits)
-        slope = 1.0 / (math.sqrt(2.0) * bins.sigma)
-        inputs = (logits, returns.contiguous(), bins.edges, bins.low, bins.high, slope)
-        threads = len(logits) * (LANES if logits.is_cuda else 1)
-        launch_on_tensors(_kernel(logits.shape[-1]), threads, inputs, (losses, gradient), BLOCK)
+        logits, returns = logits.contiguous(), returns.contiguous()
+        losses, gradient = torch.empty_like(returns), torch.empty_like(logits)
+        inputs = (logits, returns, bins.edges, bins.low, bins.high, 1.0 / (math.sqrt(2.0) * bins.sigma))
+        launch_on_tensors(_kernel(logits.shape[-1]), lanes(logits) * len(logits), inputs, (losses, gradient), BLOCK)
         ctx.save_for_backward(gradient)
         return losses
 
