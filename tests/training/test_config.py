@@ -42,7 +42,7 @@ def test_wrong_settings():
         (
             {"trials": 2, "total_frames": 20_000, "num_envs": 4, "minibatch_size": 128, "trial_fraction": 0.02},
             ValueError,
-            "total_frames * trial_fraction (400) must be at least one batch",
+            "(400) must be at least one batch of num_envs * num_steps * action_repeat (512), or trials must be 1",
         ),
         ({"trials": 5}, ValueError, "trials (5) * trial_fraction (0.2) must be less than 1"),
         ({"seed": -1}, ValueError, "seed must lie in [0, 2**32)"),

@@ -134,7 +134,7 @@ class TrainingConfig:
         if frames < self.frames_per_batch:
             raise ValueError(
                 f"{part} ({frames}) must be at least one batch of num_envs * num_steps * action_repeat "
-                f"({self.frames_per_batch})"
+                f"({self.frames_per_batch}){', or trials must be 1' if self.trials > 1 else ''}"
             )
 
     def to_json(self) -> dict[str, Any]:
