@@ -16,12 +16,15 @@ THREE = {"trials": 3, "trial_fraction": 0.3, "total_frames": 8 * BATCH}
 
 
 def knowledge(trainer):
-    return copy.deepcopy(trainer.algorithm.parameters_and_moments())
+    """Returns networks, and the moments of their gradients."""
+    state = copy.deepcopy(trainer.algorithm.state_dict())
+    moments = {name: optimizer["state"] for name, optimizer in state["optimizers"].items()}
+    return {"networks": state["networks"], "moments": moments}
 
 
 def moments(trainer):
-    optimizers = trainer.algorithm.parameters_and_moments()["optimizers"]
-    return [value for of in optimizers.values() for state in of.values() for value in state.values()]
+    optimizers = trainer.algorithm.optimizers.values()
+    return [value for optimizer in optimizers for state in optimizer.state.values() for value in state.values()]
 
 
 def addresses(trainer):

@@ -123,22 +123,21 @@ class Algorithm(ABC):
                 for value in moments_of_one.values():
                     value.zero_()
 
-    def parameters_and_moments(self) -> dict[str, Any]:
-        """Returns parameters, normalisation and what optimizers know of the gradients, as they are: not as copies."""
-        optimizers = {name: optimizer.state_dict()["state"] for name, optimizer in self.optimizers.items()}
-        return {"networks": self.networks.state_dict(), "optimizers": optimizers}
-
     @torch.no_grad()
-    def restore(self, kept: dict[str, Any]) -> None:
-        """Overwrites, in place, what :meth:`parameters_and_moments` returns with a copy ``kept`` of it."""
-        self.networks.load_state_dict(kept["networks"])
-        for name, own in self.parameters_and_moments()["optimizers"].items():
-            for index, moments_of_one in own.items():
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes back to the networks and moments of a copy of an earlier :meth:`state_dict`, in place as well.
+
+        The generator and the learning rate go on.
+        """
+        self.networks.load_state_dict(state["networks"])
+        for name, optimizer in self.optimizers.items():
+            kept = state["optimizers"][name]["state"]
+            for index, moments_of_one in optimizer.state_dict()["state"].items():
                 for key, value in moments_of_one.items():
-                    value.copy_(kept["optimizers"][name][index][key])
+                    value.copy_(kept[index][key])
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that an exact continuation needs."""
+        """Returns all that an exact continuation needs, as it is: not as a copy."""
         return {
             "networks": self.networks.state_dict(),
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},

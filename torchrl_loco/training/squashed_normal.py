@@ -49,9 +49,10 @@ class _Sample(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_action: torch.Tensor, grad_log_prob: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        grad_loc, grad_scale = (ctx.saved_tensors[2].new_empty(ctx.saved_tensors[2].shape) for _ in range(2))
-        _launch(sample_backward, (*ctx.saved_tensors, grad_action, grad_log_prob), (grad_loc, grad_scale))
-        return grad_loc, grad_scale, None
+        scale, noise, action = ctx.saved_tensors
+        gradients = scale.new_empty(scale.shape), scale.new_empty(scale.shape)
+        _launch(sample_backward, (scale, noise, action, grad_action, grad_log_prob), gradients)
+        return *gradients, None
 
 
 class _KL(torch.autograd.Function):
@@ -65,9 +66,10 @@ class _KL(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_divergence: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        grad_loc, grad_scale = (ctx.saved_tensors[2].new_empty(ctx.saved_tensors[2].shape) for _ in range(2))
-        _launch(kl_backward, (*ctx.saved_tensors, grad_divergence), (grad_loc, grad_scale))
-        return None, None, grad_loc, grad_scale
+        scale = ctx.saved_tensors[-1]
+        gradients = scale.new_empty(scale.shape), scale.new_empty(scale.shape)
+        _launch(kl_backward, (*ctx.saved_tensors, grad_divergence), gradients)
+        return None, None, *gradients
 
 
 def _launch(kernel: wp.Kernel, inputs: tuple[torch.Tensor, ...], outputs: tuple[torch.Tensor, ...]) -> None:

@@ -67,7 +67,7 @@ class Trials:
         self._ended += 1
         if self.running:
             if is_best:
-                self._mean, self._best = mean, copy.deepcopy(self._algorithm.parameters_and_moments())
+                self._mean, self._best = mean, copy.deepcopy(self._algorithm.state_dict())
             self._algorithm.begin_anew()
             distributed.copy_from_first(self._algorithm.networks.state_dict().values())
             self._began = frames
