@@ -27,7 +27,7 @@ test-all: lint tests tests-ci  ## the same as test, then site, notebooks, wheel 
 tests: $(VENV)/installed
 	$(PYTEST) -m "not ci"
 
-tests-ci: $(VENV)/installed-ray
+tests-ci: $(VENV)/installed-ci
 	$(PYTEST) -m ci
 
 lint: $(VENV)/installed
@@ -60,8 +60,8 @@ $(VENV)/installed: pyproject.toml
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --editable ".[dev]"
 	touch $@
 
-$(VENV)/installed-ray: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --editable ".[ray]"
+$(VENV)/installed-ci: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --editable ".[ray,wrappers]"
 	touch $@
 
 clean:

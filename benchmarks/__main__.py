@@ -37,6 +37,8 @@ add("peers", "other simulators compared with ours, in processes of their own", s
 add("fidelity", "deviation from C MuJoCo in double precision", [256])
 commands.choices["fidelity"].add_argument("--picture", type=Path, help="file for a plot")
 add("profile", "time of each kernel (CUDA)", small)
+add("hooks", "what a task in plain torch costs beside the physics", small)
+commands.choices["hooks"].add_argument("--task", required=True, help="id, or file.py:Class")
 add("soak", "millions of steps under hostile actions and states", small)
 commands.choices["soak"].add_argument("--frames", type=float, default=1e5 if DEVICE == "cpu" else 5e7)
 for name, further, default in (("throughput", {}, list(CASES)), ("profile", LEARNING, ["env_step_and_maybe_reset"])):
@@ -131,6 +133,10 @@ elif args.command == "fidelity":
     rows = fidelity(args.bodies, args.worlds[0], args.device)
     if args.picture:
         plot_fidelity(rows, args.picture)
+elif args.command == "hooks":
+    from benchmarks.hooks import COLUMNS, hooks
+
+    rows = hooks(args.task, args.worlds, args.device)
 elif args.command == "soak":
     from benchmarks.soak import COLUMNS, soak
 

@@ -21,8 +21,8 @@ from benchmarks.pack import pack
 from benchmarks.results import circumstances
 from benchmarks.training import train_command
 from torchrl_loco.checks import check_choice
+from torchrl_loco.registry import OURS, env_class
 from torchrl_loco.training.interrupts import interruptible
-from torchrl_loco.training.presets import TASKS
 
 SETTINGS = {"eval_episodes": 128, "video_seconds": 0, "logger": "csv"}
 """What is set for every job, unless the caller sets it."""
@@ -38,7 +38,7 @@ POLL = 0.1
 """Time between two looks at a process and at its evaluations (s)."""
 STOPPED = (130, -signal.SIGINT, -signal.SIGTERM, -signal.SIGKILL)
 """Return codes of a process that was stopped and did not fail."""
-TUNED = tuple(dict.fromkeys(task for _, task in TASKS))
+TUNED = tuple(task for task in OURS if env_class(task).presets)
 """Tasks that have a preset of their own."""
 
 

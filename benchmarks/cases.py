@@ -17,13 +17,15 @@ from tqdm import tqdm
 
 import torchrl_loco
 from benchmarks.tasks import TASKS
-from torchrl_loco import RolloutCollector, models
-from torchrl_loco.config import DEFAULTS, sim_config
-from torchrl_loco.sim import Simulation, current_stream
+from torchrl_loco import RolloutCollector
+from torchrl_loco.config import sim_config
+from torchrl_loco.registry import env_class
+from torchrl_loco.sim import Simulation, current_stream, models
 from torchrl_loco.training import preset
 from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.interrupts import interruptible
 from torchrl_loco.training.reppo import REPPO
+from torchrl_loco.training.spaces import Spaces
 
 Run = TypeVar("Run")
 INTERRUPTED = threading.Event()
@@ -54,8 +56,8 @@ def waiter(device: torch.device) -> Callable[[], None]:
 
 def bare_default(body: str, n: int, device: torch.device, protocol: str = "playground") -> Callable[[], None]:
     """A plain loop of ``mujoco_warp.step`` in a graph, with mujoco_warp's own settings but for the printing."""
-    config = sim_config(DEFAULTS[body], protocol, n, {"engine": "mujoco_warp"})
-    sim = Simulation(models.load(models.PATHS[body]), config, n, device)
+    config = sim_config(env_class(TASKS[body]).config, protocol, n, {"engine": "mujoco_warp"})
+    sim = Simulation(models.load(env_class(TASKS[body]).model), config, n, device)
     sim.model.opt.graph_conditional, sim.model.opt.run_qacc_smooth = True, True
     mask = wp.ones(n, dtype=bool, device=sim.device)
     with wp.ScopedDevice(sim.device):
@@ -84,8 +86,8 @@ def bare_compiled(body: str, n: int, device: torch.device) -> Callable[[], None]
 
 
 def _bare(body: str, n: int, device: torch.device, engine: str) -> Callable[[], None]:
-    config = sim_config(DEFAULTS[body], "playground", n, {"engine": engine})
-    sim = Simulation(models.load(models.PATHS[body]), config, n, device)
+    config = sim_config(env_class(TASKS[body]).config, "playground", n, {"engine": engine})
+    sim = Simulation(models.load(env_class(TASKS[body]).model), config, n, device)
     mask = wp.ones(n, dtype=bool, device=sim.device)
     graph = sim.capture(sim.step)
     sim.capture(lambda: sim.reset(mask)).replay()
@@ -155,8 +157,8 @@ def torchrl_collector(body: str, n: int, device: torch.device) -> Callable[[], N
 def update(body: str, n: int, device: torch.device) -> Callable[[], None]:
     """REPPO's gradient steps on one step of all worlds, with the settings for the task."""
     config = preset(TASKS[body], device, "reppo", num_envs=n, num_steps=1, epochs=1)
-    learner = REPPO(config)
     env = torchrl_loco.make(TASKS[body], n, device, seed=0, stagger=True)
+    learner = REPPO(config, Spaces.of(env))
     batch = RolloutCollector(env, learner.actor, frames_per_batch=n).rollout().clone()
 
     def step() -> None:

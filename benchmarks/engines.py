@@ -15,9 +15,9 @@ from benchmarks.cases import bare_default, until_interrupted, waiter
 from benchmarks.results import Row
 from benchmarks.tasks import TASKS
 from benchmarks.timing import milliseconds
-from torchrl_loco import models
 from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.envs import State
+from torchrl_loco.sim import models
 from torchrl_loco.sim.simulation import memory
 
 COLUMNS = {

@@ -12,7 +12,7 @@ from tqdm import tqdm
 import torchrl_loco
 from benchmarks.results import Row
 from benchmarks.tasks import TASKS
-from torchrl_loco import models
+from torchrl_loco.sim import models
 
 COLUMNS = {
     "body": "",

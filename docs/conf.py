@@ -21,9 +21,9 @@ extensions = [
     *("myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"),
     *("sphinx.ext.mathjax", "sphinx-mathjax-offline"),  # formulas without a network
 ]
-exclude_patterns = ["_build", "tasks/parts", "generated/fragments", "generated/notebooks/README.md"]
+exclude_patterns = ["_build", "generated/fragments", "generated/notebooks/README.md"]
 nitpicky = True  # a reference to a name that is gone is an error
-ELSEWHERE = "torch|torchrl|tensordict|mujoco|mujoco_warp|warp|wp|mjw|numpy|collections|pathlib"
+ELSEWHERE = "gymnasium|torch|torchrl|tensordict|mujoco|mujoco_warp|warp|wp|mjw|numpy|collections|pathlib"
 nitpick_ignore_regex = [("py:.*", rf"({ELSEWHERE})\..*")]
 nitpick_ignore = [("py:class", "torchrl_loco.sim.graph.ScratchPool")]  # internal
 
@@ -32,7 +32,7 @@ nb_execution_mode = "off"
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 
-# The sections of an environment's docstring, as they are written in torchrl_loco/envs.
+# The sections of an environment's docstring, as they are written in torchrl_loco/tasks.
 napoleon_custom_sections = ["Observation", "Action", "Reward", "Start", "Termination", "Source"]
 napoleon_numpy_docstring = False
 autodoc_member_order = "bysource"

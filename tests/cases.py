@@ -1,6 +1,16 @@
 """What tests are run for."""
 
+import hook_tasks
+
 from torchrl_loco import registry
+
+HOOK_TASKS = ("dog_follow", "walker_backwards", "walker_blindly")
+"""Tasks in plain torch, wholly or in part."""
+for _id, _class in zip(
+    HOOK_TASKS, (hook_tasks.FollowVelocity, hook_tasks.WalkBackwards, hook_tasks.WalkBlindly), strict=True
+):
+    registry.register(_id, _class)
+
 
 TASKS = list(registry.OURS)  # not those of plug-ins that happen to be installed
 PROTOCOLS = ("playground", "dm_control")
@@ -9,10 +19,14 @@ COMPILED = ("walker_run", "humanoid_run", "cheetah_run", "hopper_hop")
 """A task of each body that both engines can step, for what does not depend on the task."""
 BODIES = (*COMPILED, "quadruped_run")
 """A task of each body."""
+MODELS = {registry.env_class(task).body: registry.env_class(task).model for task in BODIES}
+"""The MJCF file of each body."""
+CONFIGS = {registry.env_class(task).body: registry.env_class(task).config for task in BODIES}
+"""The settings of each body under ``playground``."""
 COARSE = {"sim_dt": 0.0125}
 """Two physics steps in a control step, for tests in which the physics does not matter: the fewer, the faster."""
 
 
 def coarse(task):
     """The same for any task: COARSE is for the walker and the humanoid."""
-    return {"sim_dt": registry.env_class(task).defaults.ctrl_dt / 2}
+    return {"sim_dt": registry.env_class(task).config.ctrl_dt / 2}

@@ -5,7 +5,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads
 
 import pytest
 import torch
-from cases import BODIES, ENGINES, PROTOCOLS, TASKS
+from cases import BODIES, ENGINES, HOOK_TASKS, PROTOCOLS, TASKS
 
 import torchrl_loco
 
@@ -34,7 +34,7 @@ def task(request):
     return request.param
 
 
-@pytest.fixture(params=BODIES)
+@pytest.fixture(params=[*BODIES, HOOK_TASKS[0]])
 def body_task(request):
     return request.param
 

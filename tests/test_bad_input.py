@@ -35,6 +35,7 @@ BAD = {
     "episode_length": (2**31, ValueError),
     "deterministic": (None, TypeError),
     "engine": ("compield", ValueError),
+    "integrator": ("eular", ValueError),
 }
 
 
@@ -56,9 +57,12 @@ def test_unknown_arguments_and_ids():
             torchrl_loco.make(wrong)
         with pytest.raises(ValueError, match=r"did you mean '(mjx/)?walker_walk"):
             torchrl_loco.load_policy(wrong)
-    for wrong in (None, 3, "", "walker", "../walker_walk"):
-        with pytest.raises(ValueError, match="choose one of walker_stand"):
+    for wrong in ("", "walker", "../walker_walk"):
+        with pytest.raises(ValueError, match="choose one of cheetah_run"):
             torchrl_loco.make(wrong)
+    for other in (None, 3):
+        with pytest.raises(TypeError, match=r"no subclass of torchrl_loco\.LocoEnv"):
+            torchrl_loco.make(other)
     with pytest.raises(ValueError, match=r"Policy\.load\('runs/policy\.safetensors'\)"):
         torchrl_loco.load_policy("runs/policy.safetensors")
 

@@ -15,7 +15,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 import torchrl_loco
 from torchrl_loco import RolloutCollector
 from torchrl_loco.collector import stack, what_forbids_recording
-from torchrl_loco.envs import WalkerRun
+from torchrl_loco.tasks.walker import WalkerRun
 
 QUICK = {"episode_length": 7, "on_overflow": "ignore"}
 """Coarse steps make a humanoid fly apart, with more contacts than there are places."""

@@ -12,6 +12,7 @@ import imageio.v3 as imageio
 import mujoco
 import numpy as np
 import pytest
+from cases import BODIES
 from generate import benchmarks, bodies, rewards, runners
 from oracle import tolerance
 from sybil import Example, Sybil
@@ -27,8 +28,10 @@ DOCS = ROOT / "docs"
 HIDDEN = {"_build", "generated"}
 PAGES = sorted(path for path in DOCS.rglob("*.md") if not HIDDEN & set(path.relative_to(DOCS).parts))
 WITH_CODE = [path for path in [ROOT / "README.md", *PAGES] if "```python" in path.read_text()]
-LONG = {"docs/guides/training.md"}
+LONG = {"docs/guides/training.md", "docs/guides/with-other-libraries.md"}
 """Pages whose code trains."""
+NEEDS = {"docs/guides/with-other-libraries.md": ("gymnasium", "moviepy", "rsl_rl", "stable_baselines3")}
+"""Pages whose code needs packages that not every installation has."""
 
 # The code.
 
@@ -61,9 +64,12 @@ def page(path):
     return pytest.param(path, id=name, marks=pytest.mark.ci if name in LONG else pytest.mark.slow)
 
 
+@pytest.mark.filterwarnings("ignore:.*autoreset mode is same-step")  # Gymnasium's, as the page says
 @pytest.mark.parametrize("path", [page(path) for path in WITH_CODE])
 def test_code_runs_and_prints_what_the_page_says(path, tmp_path, monkeypatch):
     """All blocks of a page, in order, in one namespace and an empty folder."""
+    for package in NEEDS.get(str(path.relative_to(ROOT)), ()):
+        pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     for example in PARSER.parse(path).examples():
         example.evaluate()
@@ -86,6 +92,7 @@ def scattered(env, actions):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("body_task", BODIES)
 def test_every_entry_of_the_observation_tables(body_task, protocol, shared, actions):
     env = shared(body_task, 6, "cpu", 3, protocol=protocol, reward_terms=True)
     after, worlds = scattered(env, actions)

@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from cases import MODELS
 
 import torchrl_loco
-from torchrl_loco import cli, doctor, models
+from torchrl_loco import cli, doctor
 
 
 def test_healthy(capsys):
@@ -30,8 +31,8 @@ def test_wrong_physics(capsys, monkeypatch):
     with pytest.raises(SystemExit, match="1"):
         cli.main(["doctor"])
     out = capsys.readouterr().out
-    assert out.count("WRONG: differs") == len(models.PATHS)
-    assert "verdict: problems with walker on cpu, humanoid on cpu" in out
+    assert out.count("WRONG: differs") == len(MODELS) + 1  # the dog of the tests is registered too
+    assert "verdict: problems with cheetah on cpu, hopper on cpu" in out
 
 
 def test_a_body_that_fails_does_not_hide_the_others(monkeypatch):

@@ -68,6 +68,21 @@ def test_exported_policies_do_the_same(name, read, tmp_path):
     }
 
 
+def test_actions_without_bounds_have_none_in_the_file(tmp_path):
+    """The time between control steps is that of the training, so the class of the task need not be there."""
+    network = nn.Sequential(ObservationNorm(24), nn.Linear(24, 8), nn.ELU(0.5), nn.Linear(8, 6))
+    with torch.no_grad():
+        network[-1].bias.fill_(5.0)
+    info = {**INFO, "task": "/no/such/file.py:Task", "control_timestep": 0.02}
+    original = Policy(network, info)
+    export_policy(original, tmp_path / "policy.pt2")
+    play, facts = read_program(tmp_path / "policy.pt2")
+    seen = torch.randn(3, 24)
+    np.testing.assert_allclose(play(seen), original(observation=seen).detach().numpy(), rtol=0, atol=TOLERANCE)
+    assert play(seen).max() > 1.0
+    assert (facts["action_low"], facts["action_high"], facts["control_timestep"]) == (None, None, 0.02)
+
+
 def test_what_differs_is_not_written(tmp_path, monkeypatch):
     """Here because what is read back is a policy with another bias."""
     load, wrong = torch.export.load, tmp_path / "wrong.pt2"

@@ -46,15 +46,16 @@ def distribution(path, name, entry_points, module=None):
 
 @pytest.fixture
 def discover(monkeypatch):
-    """Adds a folder of installed distributions for the duration of a test."""
+    """Adds a folder of installed distributions for the duration of a test, in which nothing else is registered."""
+    monkeypatch.setattr(registry, "_added", {})
 
     def add(path):
         monkeypatch.syspath_prepend(str(path))
-        registry.registered.cache_clear()
+        registry.installed.cache_clear()
 
     yield add
     monkeypatch.undo()
-    registry.registered.cache_clear()
+    registry.installed.cache_clear()
 
 
 @pytest.fixture
@@ -344,7 +345,7 @@ def test_a_table_is_read_again_in_a_subclass_of_a_class_with_one():
     ("name", "value", "message"),
     [
         ("observation_size", 1.0, "observation_size must be an integer"),
-        ("defaults", {"ctrl_dt": 0.02}, "defaults must be a torchrl_loco.SimConfig"),
+        ("config", {"ctrl_dt": 0.02}, "config must be a torchrl_loco.SimConfig"),
         ("term_names", "bonus", "term_names must be a tuple of names"),
         ("initial_states", lambda self: None, "set pose_func = torchrl_loco.LocoEnv.pose_func in Paid"),
     ],
@@ -364,9 +365,9 @@ def test_broken_plug_ins_are_named_and_harm_no_other(tmp_path, discover, capsys,
     broken = {
         "no_such_module:Env": "cannot be loaded: ModuleNotFoundError: No module named 'no_such_module'",
         "broken_loco:Missing": "cannot be loaded: AttributeError: .*Missing",
-        "broken_loco:number": "is no subclass of torchrl_loco.LocoEnv",
+        "broken_loco:number": "5 is no subclass of torchrl_loco.LocoEnv",
         "failing_loco:Env": "cannot be loaded: ZeroDivisionError: division by zero",
-        "broken_loco:Ant": "Ant must set mjcf, defaults, term_names",
+        "broken_loco:Ant": "Ant must set model, config",
         "broken_loco:Empty": r"Empty.observation_size must lie in \[1, 2\*\*31\)",
     }
     distribution(
@@ -403,7 +404,7 @@ def test_an_incomplete_class_is_refused():
         body = "ant"
         observation_size = 3
 
-    with pytest.raises(TypeError, match="Ant must set mjcf, defaults, term_names"):
+    with pytest.raises(TypeError, match="Ant must set model, config"):
         Ant(1, "cpu")
 
 

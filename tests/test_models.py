@@ -4,10 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from cases import MODELS
 from oracle import reference_model
 
 import torchrl_loco
-from torchrl_loco import models
+from torchrl_loco.sim import models
 
 SECTIONS = {"names", "sizes", "option", "source"}
 INDICES = {"sensor_objid"}
@@ -43,9 +44,9 @@ def assert_figures_are_dm_controls(model, body):
         np.testing.assert_allclose(getattr(model.opt, option), value, err_msg=option)
 
 
-@pytest.mark.parametrize("body", models.PATHS)
+@pytest.mark.parametrize("body", MODELS)
 def test_figures_names_and_scene(body):
-    model = models.load(models.PATHS[body])
+    model = models.load(MODELS[body])
     assert_figures_are_dm_controls(model, body)
     names = reference_model(body)["names"]
     for kind in ("body", "joint", "actuator"):
@@ -104,7 +105,7 @@ def test_a_model_that_would_go_wrong_in_silence_is_refused():
 def test_load(tmp_path):
     """A scene of its own comes before ours; a missing or broken file is named."""
     path = tmp_path / "ant.xml"
-    with pytest.raises(ValueError, match=r"ant\.xml"):
+    with pytest.raises(FileNotFoundError, match=r"ant\.xml"):
         models.load(path)
     path.write_text('<mujoco><include file="scene.xml"/></mujoco>')
     assert models.load(path).nmat == 3
@@ -113,10 +114,10 @@ def test_load(tmp_path):
 
 
 def test_an_environment_refuses_such_a_model(tmp_path):
-    unclipped = models.PATHS["walker"].read_text().replace('ctrlrange="-1 1" ctrllimited="true"', "")
+    unclipped = MODELS["walker"].read_text().replace('ctrlrange="-1 1" ctrllimited="true"', "")
     path = tmp_path / "walker.xml"
     path.write_text(unclipped)
-    body = type("Strong", (torchrl_loco.WalkerWalk,), {"mjcf": path})
+    body = type("Strong", (torchrl_loco.WalkerWalk,), {"model": path})
     with pytest.raises(ValueError, match="every actuator needs a ctrlrange"):
         body(2, "cpu", seed=0)
 

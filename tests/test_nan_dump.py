@@ -58,7 +58,7 @@ def test_the_file_holds_what_the_step_began_with(device, engine, file, actions, 
     torch.testing.assert_close(dump.tensors["action"], action[BAD].cpu(), rtol=0, atol=0, equal_nan=True)
     settings = dump.settings
     assert (settings["world"], settings["episode"], settings["elapsed_steps"], settings["seed"]) == (BAD, 1, 3, 7)
-    assert (settings["env"], settings["protocol"]) == ("torchrl_loco.envs.walker.WalkerWalk", "playground")
+    assert (settings["env"], settings["protocol"]) == ("torchrl_loco.tasks.walker.WalkerWalk", "playground")
     assert (settings["config"]["iterations"], settings["config"]["engine"]) == (3, engine)
 
 
@@ -215,7 +215,7 @@ def test_files_that_are_no_nan_dump(file, tmp_path, capsys):
         cli.main(["inspect", str(file)])
     assert "its format is 'torchrl_loco policy 1'" in capsys.readouterr().err
     storage.save(file, NAN_DUMP, {}, {"env": "Ant"})
-    with pytest.raises(ValueError, match=r"is of 'Ant'; installed are torchrl_loco\.envs\.walker\.WalkerStand"):
+    with pytest.raises(ValueError, match=r"is of 'Ant'; installed are torchrl_loco\.tasks\.cheetah\.CheetahRun"):
         nan_dump.load(file)
     with pytest.raises(FileNotFoundError, match="there is no NaN dump"):
         nan_dump.load(tmp_path / "none")

@@ -11,12 +11,13 @@ import torchrl_loco
 
 ROOT = Path(torchrl_loco.__file__).parent
 LAYERS = [  # a module imports from its own layer or from those before it
-    {"checks", "config", "rewards", "models", "storage"},
+    {"checks", "config", "rewards", "storage"},
     {"sim"},
     {"rendering"},
     {"envs"},
+    {"tasks"},
     {"registry", "collector"},
-    {"policy", "nan_dump", "doctor"},
+    {"policy", "nan_dump", "doctor", "wrappers"},
     {"export"},
     {"training"},
     {"cli", "__main__"},

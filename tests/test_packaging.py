@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 import yaml
+from cases import MODELS
 
 import torchrl_loco
-from torchrl_loco import models
+from torchrl_loco.sim import models
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -66,7 +67,7 @@ def test_wheel_holds_the_package_and_nothing_else(built):
         entry_points = wheel.read(f"{info}/entry_points.txt").decode()
     inside = {name for name in names if not name.startswith(info)}
     assert inside == files_below(ROOT / "torchrl_loco")
-    assert {f"torchrl_loco/models/{path.name}" for path in [*models.PATHS.values(), models.SCENE]} < inside
+    assert {path.relative_to(ROOT).as_posix() for path in [*MODELS.values(), models.SCENE]} < inside
     assert {f"torchrl_loco/policies/playground/walker_{goal}.safetensors" for goal in ("stand", "walk", "run")} < inside
     assert "torchrl_loco/py.typed" in inside
     assert {f"{info}/licenses/LICENSE", f"{info}/licenses/NOTICE"} < names

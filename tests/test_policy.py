@@ -10,8 +10,9 @@ from safetensors.torch import save_file
 from torch import nn
 
 import torchrl_loco
-from torchrl_loco import models, storage
+from torchrl_loco import storage
 from torchrl_loco.policy import ObservationNorm, Policy, shipped_policies
+from torchrl_loco.sim import models
 
 INFO = {"task": "walker_stand", "protocol": "playground", "action_repeat": 2, "mean": 12.5}
 
@@ -39,8 +40,40 @@ def test_observations_are_normalised_by_all_that_were_seen():
     assert norm(seen).max() == 2.0
 
 
-def test_round_trip(policy, shared, tmp_path):
+ACTIVATIONS = [
+    *(nn.SiLU(), nn.ELU(), nn.ELU(0.5), nn.ReLU(), nn.LeakyReLU(), nn.LeakyReLU(0.3), nn.Tanh(), nn.GELU()),
+    *(nn.GELU("tanh"), nn.Softplus(), nn.Softplus(2.0, 5.0), nn.Mish(), nn.Identity(), nn.ReLU(inplace=True)),
+    *(nn.LayerNorm(7), nn.LayerNorm(7, eps=0.5), nn.Sequential(nn.Linear(7, 7, bias=False), nn.ELU())),
+]
+
+
+@pytest.mark.parametrize("layer", ACTIVATIONS, ids=str)
+def test_a_file_holds_what_a_policy_computes(layer, tmp_path):
+    """To the bit."""
+    torch.manual_seed(0)
+    norm = ObservationNorm(5, limit=2.0)
+    norm.update(torch.randn(100, 5) * 3 + 1)
+    body = nn.Sequential(nn.Linear(5, 7), layer)
+    policy = Policy(nn.Sequential(norm, body, nn.Linear(7, 2)), {"task": "walker_stand"})
     policy.save(tmp_path / "policy.safetensors")
+    again, seen = Policy.load(tmp_path / "policy.safetensors", "cpu"), torch.randn(50, 5) * 9
+    assert torch.equal(again(observation=seen), policy(observation=seen))
+    assert not again.is_bounded
+
+
+def test_layers_that_a_file_cannot_hold(tmp_path):
+    for layer, message in ((nn.Dropout(), "cannot hold Dropout"), (nn.LayerNorm((2, 3)), "over 2 dimensions")):
+        policy = Policy(nn.Sequential(ObservationNorm(3), layer), {})
+        with pytest.raises(TypeError, match=message):
+            policy.save(tmp_path / "policy.safetensors")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_round_trip(policy, shared, tmp_path):
+    policy.save(tmp_path / "policy.safetensors", half=True)
+    whole = tmp_path / "whole.safetensors"
+    policy.save(whole)
+    assert whole.stat().st_size > 1.5 * (tmp_path / "policy.safetensors").stat().st_size
     again = Policy.load(tmp_path / "policy.safetensors", "cpu")
     assert again.info == INFO
     assert not any(parameter.requires_grad for parameter in again.parameters())
@@ -55,7 +88,7 @@ def test_large_observations_survive_a_file(tmp_path):
     norm, center = ObservationNorm(2), torch.tensor([1e5, 3000.0])
     norm.update(torch.randn(1000, 2) * 1000 + center)
     policy = Policy(nn.Sequential(norm, nn.Linear(2, 1), nn.Tanh()), {})
-    policy.save(tmp_path / "policy.safetensors")
+    policy.save(tmp_path / "policy.safetensors", half=True)
     seen = torch.randn(50, 2) * 1000 + center
     again = Policy.load(tmp_path / "policy.safetensors", "cpu")
     torch.testing.assert_close(again(observation=seen), policy(observation=seen), atol=2e-3, rtol=0)
@@ -99,7 +132,8 @@ def test_files_that_are_no_policy(policy, tmp_path):
     for layers, tensors, message in [
         (["os.system"], {"0.weight": torch.zeros(3)}, "unknown layer 'os.system'"),
         (["linear"], {}, "'linear' has no tensors"),
-        (["linear"], {"0.weight": torch.zeros(3, 2)}, "cannot be read as a policy.*bias"),
+        (["layer_norm"], {"0.weight": torch.zeros(3)}, "cannot be read as a policy.*bias"),
+        ([["elu", {"beta": 1.0}]], {}, "layer 'elu' has no setting 'beta'"),
     ]:
         storage.save(path, "policy", tensors, {"layers": layers, "info": {}})
         with pytest.raises(ValueError, match=f"(?s){message}"):
@@ -117,7 +151,7 @@ def test_shipped_policies_are_small_and_belong_to_their_task_and_protocol():
         assert (policy.info["task"], policy.info["protocol"]) == (name, protocol)
         env_class = torchrl_loco.registry.env_class(name)
         zeros = torch.zeros(2, env_class.observation_size)
-        assert policy(observation=zeros).shape == (2, models.load(env_class.mjcf).nu)
+        assert policy(observation=zeros).shape == (2, models.load(env_class.model).nu)
 
 
 @pytest.mark.ci

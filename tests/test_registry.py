@@ -1,12 +1,17 @@
 """From an id to an environment with the documented settings. Plug-ins are in test_extending.py."""
 
 import dataclasses
+import json
+import subprocess
+import sys
 
 import pytest
+import torch
+from cases import CONFIGS
 
 import torchrl_loco
 from torchrl_loco import SimConfig, list_envs, make, registry
-from torchrl_loco.config import DEFAULTS, sim_config
+from torchrl_loco.config import sim_config
 
 EXPECTED = {
     "walker": {"nu": 6, "obs": 24, "ctrl_dt": 0.025, "sim_dt": 0.0025, "naconmax": 50_000, "njmax": 100},
@@ -25,12 +30,13 @@ GOALS = {
 
 
 def test_our_environments():
-    tasks = [f"{body}_{goal}" for body, goals in GOALS.items() for goal in goals]
+    tasks = [f"{body}_{goal}" for body, goals in sorted(GOALS.items()) for goal in goals]
     assert list_envs()[: len(tasks)] == tasks == list(registry.OURS)
     for task in tasks:
         cls = registry.env_class(task)
         assert cls is registry.env_class(f"mjx/{task}-v0") is getattr(torchrl_loco, task.title().replace("_", ""))
-        # The table has summaries of its own, so that they can be shown without importing the classes.
+        assert cls is registry.resolve(task) is registry.resolve(cls) is getattr(torchrl_loco.tasks, cls.__name__)
+        assert task == registry.task_name(task) == registry.task_name(cls) == registry.task_name(f"mjx/{task}-v0")
         assert registry.summary(task) == cls.__doc__.split("\n")[0]
         assert cls.observation_size == EXPECTED[cls.body]["obs"]
 
@@ -47,12 +53,12 @@ def test_an_alias_and_sizes(body):
 @pytest.mark.parametrize("body", EXPECTED)
 def test_defaults(body):
     for protocol in ("playground", "dm_control"):
-        config = sim_config(DEFAULTS[body], protocol, 2048, {})
+        config = sim_config(CONFIGS[body], protocol, 2048, {})
         for field in ("ctrl_dt", "sim_dt", "naconmax", "njmax"):
             assert getattr(config, field) == EXPECTED[body][field]
         assert config.episode_length == 1000
     cut = {"walker": (2, 5), "humanoid": (4, 8), "cheetah": (4, 8), "hopper": (4, 10), "quadruped": (4, 10)}[body]
-    playground, dm_control = (sim_config(DEFAULTS[body], name, 2048, {}) for name in ("playground", "dm_control"))
+    playground, dm_control = (sim_config(CONFIGS[body], name, 2048, {}) for name in ("playground", "dm_control"))
     damped = body == "quadruped"
     assert (playground.iterations, playground.ls_iterations, playground.euler_damping) == (*cut, damped)
     assert (dm_control.iterations, dm_control.ls_iterations, dm_control.euler_damping) == (100, 50, True)
@@ -67,6 +73,7 @@ def test_every_field_can_be_overridden():
         "iterations": 3,
         "ls_iterations": 4,
         "euler_damping": True,
+        "integrator": "euler",
         "episode_length": 11,
         "deterministic": True,
         "engine": "mujoco_warp",
@@ -86,6 +93,174 @@ def test_what_torchrl_would_take_from_the_arguments_is_refused():
         make("walker_walk", 2, "cpu", auto_reset=True)
 
 
+@pytest.mark.parametrize("of", [make, registry.resolve("walker_walk")])
+@pytest.mark.parametrize(
+    ("name", "instead"), [("from_pixels", "VideoRecorder"), ("frame_skip", "ctrl_dt"), ("render_mode", "wrappers")]
+)
+def test_arguments_of_other_libraries_get_a_hint(of, name, instead):
+    task = ["walker_walk"] if of is make else []
+    with pytest.raises(ValueError, match=f"{name} is no argument: .*{instead}"):
+        of(*task, num_envs=2, device="cpu", **{name: 2})
+
+
+# Classes of users.
+
+
+@pytest.fixture
+def nothing_added(monkeypatch):
+    """What is registered or named in a test is forgotten."""
+    monkeypatch.setattr(registry, "_added", {})
+    monkeypatch.setattr(registry, "_named", {})
+    monkeypatch.setattr(registry, "_folders", set())
+
+
+def walk_slowly(name="WalkSlowly"):
+    class WalkSlowly(torchrl_loco.WalkerWalk):
+        """Walk slowly.
+
+        No faster.
+        """
+
+        target_speed = 0.5
+
+    WalkSlowly.__qualname__ = name
+    return WalkSlowly
+
+
+def test_register(nothing_added):
+    cls = walk_slowly()
+    assert torchrl_loco.register("walk_slowly", cls) is None
+    assert list_envs() == [*registry.installed(), "walk_slowly"]
+    assert registry.env_class("walk_slowly") is registry.resolve("walk_slowly") is cls
+    assert registry.summary("walk_slowly") == "Walk slowly."
+    assert type(make("walk_slowly", 2, "cpu")) is cls is type(make(cls, 2, "cpu"))
+    again = walk_slowly()  # as when a cell of a notebook runs again
+    torchrl_loco.register("walk_slowly", again)
+    torchrl_loco.register("walk_slowly", again)
+    assert registry.env_class("walk_slowly") is again
+    torchrl_loco.register("walker_walk", torchrl_loco.WalkerWalk)  # changes nothing
+    assert list_envs() == [*registry.installed(), "walk_slowly"]
+
+
+def test_what_register_refuses(nothing_added):
+    torchrl_loco.register("walk_slowly", walk_slowly())
+    for id in ("walk slowly", "mjx/walker_walk-v0", "walk.py:Slowly", "", 3):
+        with pytest.raises(ValueError, match="an id consists of letters, digits"):
+            torchrl_loco.register(id, walk_slowly())
+    for id, owner in (("walker_walk", "tasks.walker:WalkerWalk"), ("walk_slowly", ":WalkSlowly")):
+        with pytest.raises(ValueError, match=f"{id!r} is taken by .*{owner}: choose another than cheetah_run"):
+            torchrl_loco.register(id, walk_slowly("Other"))
+    for thing in (dict, "walker_walk", torch.nn.Module, None):
+        with pytest.raises(TypeError, match=r"no subclass of torchrl_loco\.LocoEnv"):
+            torchrl_loco.register("thing", thing)
+    with pytest.raises(TypeError, match="must set"):
+        torchrl_loco.register("empty", type("Empty", (torchrl_loco.LocoEnv,), {}))
+    assert list_envs() == [*registry.installed(), "walk_slowly"]
+
+
+SLOWLY = """
+import numbers_beside
+from torchrl_loco import WalkerWalk
+
+class Base(WalkerWalk):
+    pass
+
+class Slowly(Base):
+    target_speed = numbers_beside.SPEED
+
+count = globals().get("count", 0) + 1
+"""
+
+
+@pytest.fixture
+def file(tmp_path, nothing_added, monkeypatch):
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    monkeypatch.setattr(sys, "modules", sys.modules.copy())
+    (tmp_path / "numbers_beside.py").write_text("SPEED = 0.25")
+    path = tmp_path / "walk-slowly.py"
+    path.write_text(SLOWLY)
+    return path
+
+
+def test_a_class_in_a_file(file, monkeypatch):
+    """The file runs once, by whatever name; its neighbours can be imported."""
+    cls = registry.resolve(f"{file}:Slowly")
+    assert cls.target_speed == 0.25
+    assert issubclass(cls, torchrl_loco.WalkerWalk)
+    monkeypatch.chdir(file.parent)
+    assert registry.resolve("walk-slowly.py:Slowly") is registry.resolve(f"./{file.name}:Slowly") is cls
+    assert registry.task_name("walk-slowly.py:Slowly") == registry.task_name(cls) == f"{file}:Slowly"
+    assert registry.summary("walker_walk") == "Walk at 1 m/s or faster."
+    torchrl_loco.register("slowly", cls)  # other processes do not know this id
+    assert registry.task_name("slowly") == f"{file}:Slowly"
+    assert make("walk-slowly.py:Slowly", 2, "cpu").target_speed == 0.25
+
+
+def test_a_class_in_a_module(nothing_added, monkeypatch):
+    assert registry.resolve("torchrl_loco:WalkerWalk") is torchrl_loco.WalkerWalk
+    assert registry.task_name("torchrl_loco:WalkerWalk") == "walker_walk"
+    cls = walk_slowly()
+    assert registry.task_name(cls) == f"{__name__}:WalkSlowly"
+    with pytest.raises(ValueError, match=f"{__name__} has no class 'Walk': it defines no subclass"):
+        registry.resolve(f"{__name__}:Walk")
+    assert registry.resolve(registry.task_name(cls)) is cls  # in this process
+    monkeypatch.setattr(registry, "_named", {})  # as in another one
+    with pytest.raises(ValueError, match=f"{__name__} has no class 'WalkSlowly'"):
+        registry.resolve(f"{__name__}:WalkSlowly")
+    for name in ("__main__:Walk", f"{__name__}:f.<locals>.Walk"):
+        with pytest.raises(ValueError, match="move the class into a file"):
+            registry.resolve(name)
+
+
+def test_a_class_in_a_script(file):
+    """A script is its own module, here and where its file is looked up; so is a file beside it, under its name."""
+    script = file.with_name("script.py")
+    script.write_text(
+        "import json, pathlib\n"
+        "from torchrl_loco.registry import resolve, task_name\n"
+        "from neighbour import Slowly\n"
+        "class Own(Slowly): pass\n"
+        "if __name__ == '__main__':\n"
+        "    names = [task_name(Own), task_name(Slowly)]\n"
+        "    assert [resolve(name) for name in names] == [Own, Slowly]\n"
+        "    print(json.dumps(names))\n"
+    )
+    file.rename(file.with_name("neighbour.py"))
+    run = subprocess.run([sys.executable, script], check=True, capture_output=True, text=True, timeout=120)
+    names = json.loads(run.stdout)
+    assert names == [f"{script}:Own", f"{script.with_name('neighbour.py')}:Slowly"]
+    assert [registry.resolve(name).target_speed for name in names] == [0.25, 0.25]
+    assert [registry.task_name(name) for name in names] == names
+
+
+def test_what_is_wrong_with_the_name_of_a_class(file):
+    for task, kind, message in [
+        (
+            "walker_wolk",
+            ValueError,
+            r"did you mean 'walker_walk'.*a class of your own as path/to/file\.py:Class",
+        ),
+        ("no_such.py:Slowly", FileNotFoundError, "there is no file .*no_such.py"),
+        (f"{file}:Slow", ValueError, "has no class 'Slow', did you mean 'Slowly'.*: choose one of Base, Slowly"),
+        (str(file), ValueError, "names no class: choose one of Base, Slowly"),
+        (f"{file.with_name('numbers_beside.py')}:A", ValueError, "has no class 'A': it defines no subclass of"),
+        (f"{file}:numbers_beside", TypeError, r"walk-slowly\.py:numbers_beside: .* is no subclass of"),
+        ("no_such_module:Slowly", ImportError, r"'no_such_module' cannot be loaded: .*path/to/file\.py:Class"),
+        (dict, TypeError, "is no subclass of torchrl_loco"),
+        (None, TypeError, "None is no subclass of torchrl_loco"),
+    ]:
+        with pytest.raises(kind, match=message):
+            registry.resolve(task)
+        with pytest.raises(kind, match=message):
+            registry.task_name(task)
+    for text, message in (("1 / 0", "ZeroDivisionError: division"), ("exit(3)", "SystemExit"), ("a =", "SyntaxError")):
+        file.write_text(text)
+        for _ in range(2):  # what has failed is tried again
+            with pytest.raises(ImportError, match=f"broken.py cannot be loaded: {message}"):
+                registry.resolve(f"{file.rename(file.with_name('broken.py'))}:Slowly")
+            file.with_name("broken.py").rename(file)
+
+
 def test_limits_without_effect_are_said():
     with pytest.warns(UserWarning, match="njmax and naconmax have no effect: the compiled step"):
         make("walker_walk", 2, "cpu", njmax=50, naconmax=100)
@@ -93,5 +268,5 @@ def test_limits_without_effect_are_said():
 
 def test_naconmax_grows_with_the_worlds():
     for num_envs, expected in ((1, 1024), (2048, 50_000), (4096, 100_000)):
-        assert sim_config(DEFAULTS["walker"], "playground", num_envs, {}).naconmax == expected
+        assert sim_config(CONFIGS["walker"], "playground", num_envs, {}).naconmax == expected
     assert make("walker_stand", 100, "cpu", engine="mujoco_warp").sim.data.naconmax == 2442

@@ -15,8 +15,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_loco.checks import check_int
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.envs.autoreset import PLAIN_TRANSFORMS
 from torchrl_loco.envs.state import State
+from torchrl_loco.envs.transforms import PLAIN_TRANSFORMS
 from torchrl_loco.sim import TorchGraph
 
 

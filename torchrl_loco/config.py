@@ -1,4 +1,4 @@
-"""Simulation settings and their defaults."""
+"""Simulation settings."""
 
 import dataclasses
 import math
@@ -11,10 +11,14 @@ PROTOCOLS = ("playground", "dm_control")
 
 ENGINES = ("auto", "compiled", "mujoco_warp")
 
+INTEGRATORS = ("euler", "implicitfast", "rk4")
+
 # The documented naconmax is for this many worlds (Playground's default batch) and scales with num_envs.
 NACONMAX_WORLDS = 2048
 # Minimum for few worlds: naconmax also limits broadphase pairs, and a curled-up humanoid has more pairs than contacts.
 NACONMAX_FLOOR = 1024
+# Maximum: contacts are indexed with 32 bits. So many fill 360 GB, and their worlds more: memory is what refuses them.
+NACONMAX_CEILING = 2**31 - 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,26 +42,34 @@ class SimConfig:
         engine: what steps the physics. ``compiled`` is one kernel made for the model, 6 to 50 times as fast on an
             H200; ``mujoco_warp`` is MuJoCo-Warp; ``auto`` takes ``compiled`` if it supports the model,
             else ``mujoco_warp``.
+        integrator: how velocities and positions advance: ``euler`` (semi-implicit, under both engines),
+            ``implicitfast`` or ``rk4`` (both under ``mujoco_warp``). It replaces the one that the model names, and a
+            line of the log says so.
 
     Raises:
         TypeError: a value has the wrong type.
-        ValueError: a value is out of range, or ``ctrl_dt`` is no multiple of ``sim_dt``.
+        ValueError: a value is out of range, ``ctrl_dt`` is no multiple of ``sim_dt``, or ``deterministic`` does not go
+            with the integrator.
     """
 
     ctrl_dt: float
     sim_dt: float
-    naconmax: int
-    njmax: int
-    iterations: int
-    ls_iterations: int
+    naconmax: int = 100_000
+    njmax: int = 300
+    iterations: int = 100
+    ls_iterations: int = 50
     euler_damping: bool = False
     episode_length: int = 1000
     deterministic: bool = False
     engine: str = "auto"
+    integrator: str = "euler"
 
     def __post_init__(self) -> None:
         check_fields(self, {})
         check_choice("engine", self.engine, ENGINES)
+        check_choice("integrator", self.integrator, INTEGRATORS)
+        if self.deterministic and self.integrator != "euler":
+            raise ValueError(f"deterministic=True needs integrator='euler', got {self.integrator!r}")
         check_multiple("ctrl_dt", self.ctrl_dt, "sim_dt", self.sim_dt)
 
     @property
@@ -66,25 +78,16 @@ class SimConfig:
         return round(self.ctrl_dt / self.sim_dt)
 
 
-DEFAULTS = {
-    "walker": SimConfig(ctrl_dt=0.025, sim_dt=0.0025, naconmax=50_000, njmax=100, iterations=2, ls_iterations=5),
-    "humanoid": SimConfig(ctrl_dt=0.025, sim_dt=0.005, naconmax=200_000, njmax=250, iterations=4, ls_iterations=8),
-    "cheetah": SimConfig(ctrl_dt=0.01, sim_dt=0.01, naconmax=100_000, njmax=100, iterations=4, ls_iterations=8),
-    "hopper": SimConfig(ctrl_dt=0.02, sim_dt=0.005, naconmax=50_000, njmax=50, iterations=4, ls_iterations=10),
-    "quadruped": SimConfig(
-        ctrl_dt=0.02,
-        sim_dt=0.005,
-        naconmax=50_000,
-        njmax=100,
-        iterations=4,
-        ls_iterations=10,
-        euler_damping=True,  # its hinges are damped so strongly that without it a control step errs by 0.01 rad
-    ),
-}
-"""By body, under the protocol ``playground``."""
-
 CONVERGED: dict[str, Any] = {"iterations": 100, "ls_iterations": 50, "euler_damping": True}
 """Settings of the protocol ``dm_control`` that differ from ``playground``, for any body."""
+
+
+NO_ARGUMENTS = {
+    "from_pixels": "pixels come from env.render() or a VideoRecorder around env.render, see docs/guides/pixels.md",
+    "frame_skip": "pass ctrl_dt, the time between two actions, or use TorchRL's FrameSkipTransform",
+    "render_mode": "call env.render(); the Gymnasium wrapper in torchrl_loco.wrappers takes a render_mode",
+}
+"""Arguments that other environments take, and what to do instead."""
 
 
 def sim_config(
@@ -94,10 +97,10 @@ def sim_config(
     overrides: dict[str, Any],
     arguments: Collection[str] = (),
 ) -> SimConfig:
-    """Returns the settings of a body under ``protocol`` for ``num_envs`` worlds, with ``overrides`` on top.
+    """Returns the settings of an environment under ``protocol`` for ``num_envs`` worlds, with ``overrides`` on top.
 
     Args:
-        defaults: the body's settings under ``playground``, with ``naconmax`` for 2048 worlds.
+        defaults: the settings of the class under ``playground``, with ``naconmax`` for 2048 worlds.
         protocol: one of :data:`PROTOCOLS`.
         num_envs: number of worlds, by which ``naconmax`` is scaled.
         overrides: fields of :class:`SimConfig`.
@@ -109,12 +112,12 @@ def sim_config(
     """
     check_choice("protocol", protocol, PROTOCOLS)
     for key in overrides:
+        if key in NO_ARGUMENTS:
+            raise ValueError(f"{key} is no argument: {NO_ARGUMENTS[key]}")
         check_choice("argument", key, [*arguments, *(field.name for field in dataclasses.fields(SimConfig))])
     changes = CONVERGED if protocol == "dm_control" else {}
     config = dataclasses.replace(defaults, **{**changes, **overrides})
     if "naconmax" in overrides:
         return config
     scaled = math.ceil(config.naconmax * num_envs / NACONMAX_WORLDS)
-    if scaled >= 2**31:
-        raise ValueError(f"num_envs={num_envs} is too large: contacts are indexed with 32 bits")
-    return dataclasses.replace(config, naconmax=max(scaled, NACONMAX_FLOOR))
+    return dataclasses.replace(config, naconmax=min(max(scaled, NACONMAX_FLOOR), NACONMAX_CEILING))

@@ -16,7 +16,6 @@ import warp as wp
 from tqdm.auto import trange
 
 import torchrl_loco
-from torchrl_loco import models
 from torchrl_loco.envs import State
 from torchrl_loco.registry import env_class, list_envs, make
 from torchrl_loco.sim.mujoco_warp import with_margin
@@ -66,7 +65,7 @@ def diagnose() -> Iterator[Finding]:
     tasks: dict[str, str] = {}
     for task in list_envs():
         try:
-            tasks.setdefault(env_class(task).body, task)  # one of a body is enough
+            tasks.setdefault(env_class(task).body or task, task)  # one of a body is enough
         except ImportError as error:
             yield Finding(task, str(error), problem=True)
     for device in devices:
@@ -149,12 +148,12 @@ def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, st
         before = env.get_state().cpu().numpy()
         td = env.step(td.set("action", action.to(env.device)))["next"]
         after = env.get_state()["qpos"].cpu().numpy()
-        if td["terminated"].any():  # a world was not finite
+        if env.world.non_finite.torch.any():
             return seconds, float("nan"), engine
         for world in range(env.num_envs):
             for name in State.PHYSICS:
                 getattr(data, name)[:] = before.get(name, {world: ()})[world]
-            data.ctrl[:] = models.control(env.mj_model, action[world].numpy())
+            data.ctrl[:] = env.sim.ctrl[world].cpu()
             mujoco.mj_step(env.mj_model, data, env.config.substeps)
             errors.append(np.abs(data.qpos - after[world]).max())
     return seconds, float(np.median(errors)), engine

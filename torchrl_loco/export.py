@@ -17,7 +17,7 @@ import torchrl_loco
 from torchrl_loco import storage
 from torchrl_loco.checks import check_output_file, check_packages
 from torchrl_loco.policy import ObservationNorm, Policy
-from torchrl_loco.registry import env_class
+from torchrl_loco.registry import resolve
 
 SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
 """Formats and the suffixes of their files."""
@@ -33,10 +33,11 @@ def export_policy(policy: Policy, path: Path) -> float:
     """Writes a policy, with its normalisation of observations, as a file that needs none of this package.
 
     What is written takes ``observation``, float32 of shape ``(batch, n)`` for any batch, and gives ``action``, float32
-    of shape ``(batch, m)`` in [-1, 1]. Before the file is written, it is compared with the policy, on the CPU and on
-    random observations that reach beyond those of the training. Information travels with it: task, protocol, sizes,
-    bounds of an action, the time between two control steps (s), for how many of them an action is held, and all of
-    ``policy.info``; as ``metadata_props`` in ONNX, in the extra file ``metadata.json`` with torch.export.
+    of shape ``(batch, m)``, in [-1, 1] unless the task's actions are unbounded. Before the file is written, it is
+    compared with the policy, on the CPU and on random observations that reach beyond those of the training. Information
+    travels with it: task, protocol, sizes, bounds of an action, the time between two control steps (s), for how many of
+    them an action is held, and all of ``policy.info``; as ``metadata_props`` in ONNX, in the extra file
+    ``metadata.json`` with torch.export.
 
     Args:
         policy: the policy, on any device.
@@ -103,9 +104,10 @@ def _facts(policy: Policy, n: int, m: int) -> dict[str, Any]:
         "protocol": info["protocol"],
         "observation_size": n,
         "action_size": m,
-        "action_low": -1.0,
-        "action_high": 1.0,
-        "control_timestep": env_class(info["task"]).defaults.ctrl_dt,
+        "action_low": -1.0 if policy.is_bounded else None,
+        "action_high": 1.0 if policy.is_bounded else None,
+        # Older files do not say it.
+        "control_timestep": info.get("control_timestep") or resolve(info["task"]).config.ctrl_dt,
         "action_repeat": info["action_repeat"],
         "torchrl_loco": torchrl_loco.__version__,
         "info": info,

@@ -11,12 +11,13 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torchrl_loco import models, storage
+from torchrl_loco import storage
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs import LocoEnv, State
 from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.monitors import NAN_DUMP
 from torchrl_loco.registry import env_class, list_envs
+from torchrl_loco.sim import models
 from torchrl_loco.sim.simulation import set_options
 
 RESETS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -92,7 +93,7 @@ def mujoco_trace(dump: NanDump) -> np.ndarray:
     C MuJoCo resets a world that is not finite; from there on the trace is NaN.
     """
     config = SimConfig(**dump.settings["config"])
-    model = models.load(_classes()[dump.settings["env"]].mjcf)
+    model = models.load(_classes()[dump.settings["env"]].model)
     set_options(model, config)
     data = mujoco.MjData(model)
     for name, value in dump.state.items():

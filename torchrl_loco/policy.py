@@ -1,5 +1,7 @@
 """Trained policies, in files that hold tensors and settings but no code."""
 
+import copy
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -78,11 +80,11 @@ def moments(observation: torch.Tensor) -> tuple[int, torch.Tensor, torch.Tensor]
 
 
 class Policy(TensorDictModule):
-    """A deterministic policy: reads ``observation``, shape ``(..., n)``, and writes ``action`` in [-1, 1].
+    """A deterministic policy: reads ``observation``, shape ``(..., n)``, and writes ``action``, shape ``(..., m)``.
 
     Args:
-        network: a :class:`~torchrl_loco.policy.ObservationNorm`, then linear layers, layer norms and SiLUs, then a
-            tanh.
+        network: an :class:`~torchrl_loco.policy.ObservationNorm`, then linear layers, layer norms and activations; the
+            last is a tanh where actions are bounded by [-1, 1]. :func:`layers_of` says what a file can hold.
         info: ``task``, ``protocol``, ``action_repeat``, and further information such as the return.
     """
 
@@ -90,14 +92,31 @@ class Policy(TensorDictModule):
         super().__init__(network, in_keys=["observation"], out_keys=["action"])
         self.info = info
 
-    def save(self, path: Path) -> None:
-        """Writes the policy to ``path`` in half precision, which changes an action by some thousandths at most."""
-        layers = [_LAYER_NAMES[type(layer)] for layer in self.module]
-        tensors = {  # half precision has too small a range for the observation's statistics
-            name: tensor.to(torch.float32 if name.startswith("0.") else torch.float16)
-            for name, tensor in self.module.state_dict().items()
+    @property
+    def is_bounded(self) -> bool:
+        """Whether all actions lie in [-1, 1]: whether the last layer is a tanh."""
+        return isinstance(self.module[-1], nn.Tanh)
+
+    def save(self, path: Path, half: bool = False) -> None:
+        """Writes the policy to a file.
+
+        Args:
+            path: where to.
+            half: whether to store weights in half precision, which halves the file and changes an action by some
+                thousandths at most. The observation's statistics, whose range is larger, stay in single precision.
+
+        Raises:
+            TypeError: a layer is of a kind that a file cannot hold.
+        """
+        layers = layers_of(self.module)
+        tensors = {
+            f"{i}.{name}": tensor.to(
+                torch.float16 if half and not isinstance(layer, ObservationNorm) else torch.float32
+            )
+            for i, layer in enumerate(layers)
+            for name, tensor in layer.state_dict().items()
         }
-        storage.save(path, "policy", tensors, {"layers": layers, "info": self.info})
+        storage.save(path, "policy", tensors, {"layers": [_description(layer) for layer in layers], "info": self.info})
 
     @classmethod
     def load(cls, path: Path, device: torch.device | str | None = None) -> "Policy":
@@ -118,44 +137,99 @@ class Policy(TensorDictModule):
         tensors, settings = storage.load(path, "policy")
         tensors = {name: tensor.float() for name, tensor in tensors.items()}
         try:
-            names = settings["layers"]
-            sized = [tensors.get(f"{i}.weight", tensors.get(f"{i}.mean")) for i in range(len(names))]
-            network = nn.Sequential(*map(_make_layer, names, sized))
+            descriptions = settings["layers"]
+            of_each: list[dict[str, torch.Tensor]] = [{} for _ in descriptions]
+            for name, tensor in tensors.items():
+                index, _, own = name.partition(".")
+                of_each[int(index)][own] = tensor
+            network = nn.Sequential(*map(_make_layer, descriptions, of_each))
             network.load_state_dict(tensors)
             info = settings["info"]
-        except (ValueError, KeyError, RuntimeError) as error:
+        except (ValueError, LookupError, TypeError, RuntimeError) as error:
             raise ValueError(f"{path} cannot be read as a policy: {error}") from error
         return cls(network.to(device).requires_grad_(False), info)
 
 
-_LAYER_NAMES: dict[type[nn.Module], str] = {
-    ObservationNorm: "observation_norm",
-    nn.Linear: "linear",
-    nn.LayerNorm: "layer_norm",
-    nn.SiLU: "silu",
-    nn.Tanh: "tanh",
+KINDS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
+    "observation_norm": (ObservationNorm, ("limit",)),
+    "linear": (nn.Linear, ()),
+    "layer_norm": (nn.LayerNorm, ("eps",)),
+    "silu": (nn.SiLU, ()),
+    "elu": (nn.ELU, ("alpha",)),
+    "relu": (nn.ReLU, ()),
+    "leaky_relu": (nn.LeakyReLU, ("negative_slope",)),
+    "tanh": (nn.Tanh, ()),
+    "gelu": (nn.GELU, ("approximate",)),
+    "softplus": (nn.Softplus, ("beta", "threshold")),
+    "mish": (nn.Mish, ()),
+    "identity": (nn.Identity, ()),
 }
+"""The layers that a file can hold, by their names in it: the class, and the arguments that are stored."""
+
+_NAMES = {kind: name for name, (kind, _) in KINDS.items()}
 
 
-def _make_layer(name: str, sized: torch.Tensor | None) -> nn.Module:
-    """Returns the layer of a name, with the size of its tensor.
+def layers_of(network: nn.Module) -> list[nn.Module]:
+    """Returns the layers of a network that computes one after the other, in their order.
+
+    Raises:
+        TypeError: a part of it is of another kind than a policy's file can hold.
+    """
+    if type(network) in _NAMES:
+        shape = network.normalized_shape if isinstance(network, nn.LayerNorm) else (1,)
+        if len(shape) > 1:
+            raise TypeError(f"a policy cannot hold a LayerNorm over {len(shape)} dimensions: pass the last one's size")
+        return [network]
+    if isinstance(network, nn.Sequential):
+        return [layer for part in network for layer in layers_of(part)]
+    kinds = ", ".join(kind.__name__ for kind, _ in KINDS.values() if kind is not ObservationNorm)
+    raise TypeError(
+        f"a policy cannot hold {type(network).__name__}, so what it computes could not be saved: build the network as "
+        f"nn.Sequential of {kinds}"
+    )
+
+
+def copied(layer: nn.Module) -> nn.Module:
+    """Returns a copy of one of :func:`layers_of` with tensors of its own; a layer norm without weights gets them."""
+    if not isinstance(layer, nn.LayerNorm) or (layer.weight is not None and layer.bias is not None):
+        return copy.deepcopy(layer)
+    (size,) = layer.normalized_shape
+    norm = nn.LayerNorm(size, layer.eps)
+    if layer.weight is not None:
+        norm.load_state_dict({"weight": layer.weight.detach().cpu(), "bias": torch.zeros(size)})
+        norm.to(layer.weight.device)
+    return norm
+
+
+def _description(layer: nn.Module) -> str | list[Any]:
+    """Returns the name of a layer, or its name and its arguments if they are not the default."""
+    name = _NAMES[type(layer)]
+    kind, known = KINDS[name]
+    default = {key: inspect.signature(kind).parameters[key].default for key in known}
+    settings = {key: getattr(layer, key) for key in known if getattr(layer, key) != default[key]}
+    return [name, settings] if settings else name
+
+
+def _make_layer(description: str | list[Any], tensors: dict[str, torch.Tensor]) -> nn.Module:
+    """Returns the layer of a description, with the sizes of its tensors.
 
     Raises:
         ValueError: there is no such layer, or it needs a tensor.
     """
-    if name == "silu":
-        return nn.SiLU()
-    if name == "tanh":
-        return nn.Tanh()
-    if sized is None:
+    name, settings = (description, {}) if isinstance(description, str) else description
+    if name not in KINDS:
+        raise ValueError(f"unknown layer {name!r}")
+    kind, known = KINDS[name]
+    if unknown := settings.keys() - set(known):
+        raise ValueError(f"layer {name!r} has no setting {min(unknown)!r}")
+    if kind not in (ObservationNorm, nn.Linear, nn.LayerNorm):
+        return kind(**settings)
+    if not tensors:
         raise ValueError(f"layer {name!r} has no tensors")
-    if name == "observation_norm":
-        return ObservationNorm(len(sized))
-    if name == "layer_norm":
-        return nn.LayerNorm(len(sized))
-    if name == "linear":
-        return nn.Linear(sized.shape[1], sized.shape[0])
-    raise ValueError(f"unknown layer {name!r}")
+    if kind is nn.Linear:
+        outputs, inputs = tensors["weight"].shape
+        return nn.utils.skip_init(nn.Linear, inputs, outputs, bias="bias" in tensors)
+    return kind(len(tensors["mean" if kind is ObservationNorm else "weight"]), **settings)
 
 
 def load_policy(task: str, device: torch.device | str | None = None, protocol: str = "playground") -> Policy:

@@ -1,14 +1,20 @@
-"""Ids of environments, and ``make``. No environment is imported until it is made."""
+"""From the name of a task to its class, and ``make``. No environment is imported until it is asked for."""
 
 import dataclasses
 import functools
+import hashlib
 import importlib
+import importlib.util
 import re
+import sys
 import warnings
 from importlib import metadata
+from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from torchrl_loco.checks import check_choice
+from torchrl_loco import tasks
+from torchrl_loco.checks import check_choice, suggestion
 
 if TYPE_CHECKING:
     from torchrl_loco.envs import LocoEnv
@@ -24,37 +30,33 @@ class Entry:
     Attributes:
         target: where its class is, as ``"module:Class"``.
         summary: what the task asks for, in a sentence; empty for a plug-in: its class docstring is used.
-        distribution: name and version of the distribution that a plug-in comes from; empty for ours.
+        distribution: name and version of the distribution that a plug-in comes from; empty for the others.
+        cls: the class, if it was registered at run time.
     """
 
     target: str
     summary: str = ""
     distribution: str = ""
+    cls: "type[LocoEnv] | None" = None
 
 
-OURS = {
-    "walker_stand": Entry("torchrl_loco.envs.walker:WalkerStand", "Stand up and stay upright."),
-    "walker_walk": Entry("torchrl_loco.envs.walker:WalkerWalk", "Walk at 1 m/s or faster."),
-    "walker_run": Entry("torchrl_loco.envs.walker:WalkerRun", "Run at 8 m/s or faster."),
-    "humanoid_stand": Entry("torchrl_loco.envs.humanoid:HumanoidStand", "Stand still and upright."),
-    "humanoid_walk": Entry("torchrl_loco.envs.humanoid:HumanoidWalk", "Walk at 1 m/s or faster, in any direction."),
-    "humanoid_run": Entry("torchrl_loco.envs.humanoid:HumanoidRun", "Run at 10 m/s or faster, in any direction."),
-    "cheetah_run": Entry("torchrl_loco.envs.cheetah:CheetahRun", "Run at 10 m/s or faster."),
-    "hopper_stand": Entry("torchrl_loco.envs.hopper:HopperStand", "Stand upright on one leg."),
-    "hopper_hop": Entry("torchrl_loco.envs.hopper:HopperHop", "Hop forward at 2 m/s or faster."),
-    "quadruped_walk": Entry("torchrl_loco.envs.quadruped:QuadrupedWalk", "Walk forward at 0.5 m/s or faster."),
-    "quadruped_run": Entry("torchrl_loco.envs.quadruped:QuadrupedRun", "Run forward at 5 m/s or faster."),
-}
+OURS = {id: Entry(f"{task.module}:{task.name}", task.summary) for id, task in tasks.found().items()}
 """The environments of this package by id."""
 
 ALIASES = {f"mjx/{id}-v0": id for id in OURS}
 
+ID = r"[\w.-]+"
+MALFORMED = "an id consists of letters, digits and _ . -, because run folders are named after it"
+
+_added: dict[str, Entry] = {}
+"""What was registered at run time, by id."""
+
 
 @functools.cache
-def registered() -> dict[str, Entry]:
-    """Returns all environments by id: ours, then the plug-ins of installed distributions, which are looked up once.
+def installed() -> dict[str, Entry]:
+    """Returns what every process finds by its id: our environments, then the plug-ins of installed distributions.
 
-    A plug-in whose id is taken or malformed is left out with a warning.
+    They are looked up once. A plug-in whose id is taken or malformed is left out with a warning.
     """
     entries = dict(OURS)
     for point in sorted(metadata.entry_points(group=GROUP), key=lambda point: point.name):
@@ -62,8 +64,8 @@ def registered() -> dict[str, Entry]:
         taken = entries.get(ALIASES.get(point.name, point.name))
         if taken is not None:
             reason = f"{taken.distribution or 'torchrl_loco'} already has this id"
-        elif not re.fullmatch(r"[\w.-]+", point.name):
-            reason = "an id consists of letters, digits and _ . -, because run folders are named after it"
+        elif not re.fullmatch(ID, point.name):
+            reason = MALFORMED
         else:
             entries[point.name] = Entry(point.value, distribution=origin)
             continue
@@ -71,8 +73,63 @@ def registered() -> dict[str, Entry]:
     return entries
 
 
+def registered() -> dict[str, Entry]:
+    """Returns all environments by id: :func:`installed`, then those that :func:`register` added."""
+    return {**installed(), **_added}
+
+
+def register(id: str, cls: "type[LocoEnv]") -> None:
+    """Gives a class an id, for this process: :func:`torchrl_loco.make` and training then take it like any other.
+
+    A class of the same module and name replaces the one that had the id, so a cell of a notebook can run again. Entry
+    points give a class an id in every process; see docs/guides/your-own-task.md.
+
+    Args:
+        id: letters, digits and ``_ . -``.
+        cls: a subclass of :class:`torchrl_loco.LocoEnv`.
+
+    Raises:
+        ValueError: the id is malformed, or another class has it.
+        TypeError: ``cls`` is no subclass of LocoEnv, or an incomplete one.
+
+    Example:
+        >>> class WalkSlowly(torchrl_loco.WalkerWalk):
+        ...     target_speed = 0.5
+        >>> torchrl_loco.register("walker_walk_slowly", WalkSlowly)
+        >>> torchrl_loco.make("walker_walk_slowly", num_envs=2, device="cpu").target_speed
+        0.5
+    """
+    if not isinstance(id, str) or not re.fullmatch(ID, id):
+        raise ValueError(f"{id!r} cannot be an id: {MALFORMED}")
+    _check_environment(cls).check_class()
+    entry = Entry(_target(cls), _first_line(cls), cls=cls)
+    taken = registered().get(id)
+    if taken is not None and taken.target != entry.target:
+        raise ValueError(f"the id {id!r} is taken by {taken.target}: choose another than {', '.join(list_envs())}")
+    if id not in installed():
+        _added[id] = entry
+
+
+def _target(cls: type) -> str:
+    return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def _first_line(cls: type) -> str:
+    return (cls.__doc__ or "").strip().partition("\n")[0]
+
+
+def _check_environment(cls: Any) -> "type[LocoEnv]":
+    from torchrl_loco.envs import LocoEnv
+
+    if not (isinstance(cls, type) and issubclass(cls, LocoEnv)):
+        raise TypeError(
+            f"{cls!r} is no subclass of torchrl_loco.LocoEnv, as torchrl_loco.WalkerWalk is: pass the class"
+        )
+    return cls
+
+
 def list_envs() -> list[str]:
-    """Returns the ids that :func:`torchrl_loco.make` takes: ours, then those of plug-ins, without aliases."""
+    """Returns the ids that :func:`torchrl_loco.make` takes: ours, those of plug-ins, those registered; no aliases."""
     return list(registered())
 
 
@@ -94,24 +151,23 @@ def env_class(id: str) -> "type[LocoEnv]":
     """
     name = canonical_id(id)
     entry = registered()[name]
+    if entry.cls is not None:
+        return entry.cls
     module, _, attribute = entry.target.partition(":")
     if not entry.distribution:
         return getattr(importlib.import_module(module), attribute)
-
-    from torchrl_loco.envs import LocoEnv
 
     origin = f"environment {name!r} of {entry.distribution} ({entry.target})"
     try:
         cls = functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
     except Exception as error:  # a plug-in's module may raise anything
         raise ImportError(f"{origin} cannot be loaded: {type(error).__name__}: {error}") from error
-    if not (isinstance(cls, type) and issubclass(cls, LocoEnv)):
-        raise ImportError(f"{origin} is no subclass of torchrl_loco.LocoEnv")
     try:
-        cls.check_class()
+        environment = _check_environment(cls)
+        environment.check_class()
     except (TypeError, ValueError) as error:
         raise ImportError(f"{origin}: {error}") from error
-    return cls
+    return environment
 
 
 def summary(id: str) -> str:
@@ -122,7 +178,179 @@ def summary(id: str) -> str:
         ImportError: the plug-in that it comes from is broken.
     """
     id = canonical_id(id)
-    return registered()[id].summary or (env_class(id).__doc__ or "").strip().split("\n")[0]
+    return registered()[id].summary or _first_line(env_class(id))
+
+
+def resolve(task: "str | type[LocoEnv]") -> "type[LocoEnv]":
+    """Returns the class of a task.
+
+    Args:
+        task: an id or alias; a class; a class in a file, as ``"path/to/file.py:Class"``; or a class in a module that
+            Python finds, as ``"module:Class"``. A file is run once. Modules beside it can be imported by it.
+
+    Raises:
+        ValueError: there is no such id or class; the message names those that there are.
+        TypeError: it is a class of something else.
+        FileNotFoundError: there is no such file.
+        ImportError: the file or the module raises an error.
+    """
+    if not isinstance(task, str):
+        return _check_environment(task)
+    if _is_place(task):
+        return _class_at(task)
+    try:
+        return env_class(task)
+    except ValueError as error:
+        raise ValueError(f"{error}, or name a class of your own as path/to/file.py:Class") from None
+
+
+def task_name(task: "str | type[LocoEnv]") -> str:
+    """Returns the name by which :func:`resolve` finds a task, in another process too.
+
+    It is the id, where every process knows it; else ``"/absolute/path/file.py:Class"`` if the class is in a script, in
+    a file that was named by its path, or in one beside them; else ``"module:Class"``. A class of a notebook or
+    of a function is found in this process only. A file is run again where it is looked up: what a script does beside
+    defining classes belongs under ``if __name__ == "__main__"``.
+
+    Args:
+        task: what :func:`resolve` takes.
+
+    Raises:
+        ValueError: as :func:`resolve`.
+        TypeError: as :func:`resolve`.
+        FileNotFoundError: as :func:`resolve`.
+        ImportError: as :func:`resolve`.
+    """
+    if isinstance(task, str) and not _is_place(task) and ALIASES.get(task, task) in installed():
+        return canonical_id(task)
+    cls = resolve(task)
+    for id, entry in installed().items():
+        module, _, attribute = entry.target.partition(":")
+        if _attribute(sys.modules.get(module), attribute) is cls:
+            return id
+    file = _file(sys.modules.get(cls.__module__))
+    by_path = file is not None and (cls.__module__ in (*MAIN, _name_of(file)) or _only_here(cls.__module__, file))
+    name = f"{file}:{cls.__qualname__}" if by_path else _target(cls)
+    _named[name] = cls
+    return name
+
+
+MAIN = ("__main__", "__mp_main__")
+"""Names of the script that this process, or the one that spawned it, was started with."""
+
+_named: dict[str, "type[LocoEnv]"] = {}
+"""Classes by the names that :func:`task_name` has given them: those of functions are found in no other way."""
+
+
+_folders: set[Path] = set()
+"""Folders of files that were named by their path: modules beside them are found in this process only."""
+
+
+def _is_place(task: str) -> bool:
+    """Returns whether a task is named by where its class is."""
+    return ":" in task or task.endswith(".py")
+
+
+def _class_at(place: str) -> "type[LocoEnv]":
+    """Returns the class at ``"path/to/file.py:Class"`` or ``"module:Class"``.
+
+    Raises:
+        ValueError: there is no such class.
+        TypeError: it is a class of something else.
+        OSError: there is no such file.
+        ImportError: the file or the module raises an error.
+    """
+    source, _, name = place.rpartition(":") if ":" in place else (place, "", "")
+    try:
+        module = _module_of_file(Path(source)) if source.endswith(".py") else _module(source)
+        if (cls := _attribute(module, name)) is None:
+            raise ValueError(_no_class(module, source, name))
+    except (ValueError, OSError, ImportError):
+        if place in _named:
+            return _named[place]
+        raise
+    try:
+        return _check_environment(cls)
+    except TypeError as error:
+        raise TypeError(f"{place}: {error}") from None
+
+
+def _no_class(module: ModuleType, source: str, name: str) -> str:
+    """Returns what is wrong with the name of a class that a module does not have."""
+    from torchrl_loco.envs import LocoEnv
+
+    if source in MAIN or "<locals>" in name:
+        return f"{source}:{name} is of another process, of a notebook or a function: move the class into a file"
+    kinds = {key: cls for key, cls in vars(module).items() if isinstance(cls, type) and issubclass(cls, LocoEnv)}
+    own = [key for key, cls in kinds.items() if cls.__module__ == module.__name__]
+    what = f"{source} has no class {name!r}{suggestion(name, own)}" if name else f"{source!r} names no class"
+    return f"{what}: " + (
+        f"choose one of {', '.join(own)}" if own else "it defines no subclass of torchrl_loco.LocoEnv"
+    )
+
+
+def _module(name: str) -> ModuleType:
+    """Returns a module by its name.
+
+    Raises:
+        ImportError: there is none, or it raises an error.
+    """
+    try:
+        return importlib.import_module(name)
+    except Exception as error:  # a module may raise anything
+        hint = "; a class in a file is named as path/to/file.py:Class" if isinstance(error, ModuleNotFoundError) else ""
+        raise ImportError(f"the module {name!r} cannot be loaded: {type(error).__name__}: {error}{hint}") from error
+
+
+def _module_of_file(path: Path) -> ModuleType:
+    """Returns a file as a module, which is run unless it already was, as a script or under its own name too.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ImportError: it raises an error.
+    """
+    path = path.expanduser().resolve()
+    name = _name_of(path)
+    for loaded in (*MAIN, path.stem, name):
+        if _file(sys.modules.get(loaded)) == path:
+            return sys.modules[loaded]
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
+        _folders.add(path.parent)
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:  # a file may raise anything
+        del sys.modules[name]
+        raise ImportError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from error
+    return module
+
+
+def _name_of(path: Path) -> str:
+    """Returns the name under which a file is a module here."""
+    return re.sub(r"\W", "_", path.stem) + "_" + hashlib.sha256(str(path).encode()).hexdigest()[:8]
+
+
+def _file(module: ModuleType | None) -> Path | None:
+    """Returns the file of a module, ``None`` if it has none."""
+    file = getattr(module, "__file__", None)
+    return Path(file).resolve() if file else None
+
+
+def _only_here(module: str, file: Path) -> bool:
+    """Returns whether other processes may not find a module by its name, as it is beside a script or a named file."""
+    scripts = (path.parent for name in MAIN if (path := _file(sys.modules.get(name))))
+    return module == file.stem and file.parent in {Path.cwd(), *scripts, *_folders}
+
+
+def _attribute(thing: Any, name: str) -> Any:
+    """Returns an attribute, which may be that of a class in it, or ``None``."""
+    return functools.reduce(lambda owner, part: getattr(owner, part, None), name.split("."), thing)
 
 
 TAKEN_BY_TORCHRL = {
@@ -132,11 +360,12 @@ TAKEN_BY_TORCHRL = {
 """Arguments that TorchRL takes out of those of every environment before it is made, and what to do instead."""
 
 
-def make(id: str, *args: Any, **kwargs: Any) -> "LocoEnv":
+def make(task: "str | type[LocoEnv]", *args: Any, **kwargs: Any) -> "LocoEnv":
     """Makes an environment.
 
     Args:
-        id: one of :func:`torchrl_loco.list_envs`, or its alias ``mjx/<id>-v0``.
+        task: one of :func:`torchrl_loco.list_envs`, or its alias ``mjx/<id>-v0``; or a class, or where one is, as
+            ``"path/to/file.py:Class"``.
         args: positional arguments of :class:`torchrl_loco.LocoEnv`: ``num_envs``, ``device``, ``seed``, ``protocol``.
         kwargs: keyword arguments of :class:`torchrl_loco.LocoEnv`, fields of :class:`torchrl_loco.SimConfig` among
             them, such as ``episode_length=500``.
@@ -147,7 +376,8 @@ def make(id: str, *args: Any, **kwargs: Any) -> "LocoEnv":
     Raises:
         ValueError: an argument is out of range or unknown; the message names the valid choices.
         TypeError: an argument has the wrong type.
-        ImportError: the plug-in that the environment comes from is broken.
+        ImportError: the plug-in or the file that the environment comes from is broken.
+        FileNotFoundError: there is no such file.
         MemoryError: the device has no room for so many worlds.
 
     Example:
@@ -158,7 +388,7 @@ def make(id: str, *args: Any, **kwargs: Any) -> "LocoEnv":
     for name, instead in TAKEN_BY_TORCHRL.items():
         if kwargs.get(name):
             raise ValueError(f"{name} is no argument: {instead}")
-    env = env_class(id)(*args, **kwargs)
+    env = resolve(task)(*args, **kwargs)
     if env.engine == "compiled" and (ignored := [name for name in ("njmax", "naconmax") if name in kwargs]):
         why = "the compiled step has no such limits, engine='mujoco_warp' has"
         warnings.warn(f"{' and '.join(ignored)} have no effect: {why}", stacklevel=2)

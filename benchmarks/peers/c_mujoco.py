@@ -8,9 +8,11 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+from benchmarks.tasks import TASKS
 from benchmarks.timing import milliseconds
-from torchrl_loco import models
-from torchrl_loco.config import DEFAULTS, sim_config
+from torchrl_loco.config import sim_config
+from torchrl_loco.registry import env_class
+from torchrl_loco.sim import models
 from torchrl_loco.sim.simulation import set_options
 
 CONTROL_STEPS = 20
@@ -18,7 +20,8 @@ CONTROL_STEPS = 20
 
 def main(body: str, worlds: int, threads: int) -> None:
     """Prints the time of a control step."""
-    config, model = sim_config(DEFAULTS[body], "playground", worlds, {}), models.load(models.PATHS[body])
+    cls = env_class(TASKS[body])
+    config, model = sim_config(cls.config, "playground", worlds, {}), models.load(cls.model)
     set_options(model, config)
     data = [mujoco.MjData(model) for _ in range(threads)]
     size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from generate import benchmarks, bodies, rewards, tasks
 from generate.markdown import write
-from torchrl_loco import models
 from torchrl_loco.registry import OURS
 
 DOCS = Path(__file__).parent.parent
@@ -22,7 +21,7 @@ def everything() -> None:
         write(fragments / f"{name}_reward.md", rewards.formula(name))
         write(fragments / f"{name}_policy.md", tasks.shipped_policy(name))
         tasks.picture(name, OUT / "pictures" / f"{name}.png")
-    for body in models.PATHS:
+    for body in tasks.CLASSES:
         write(fragments / f"{body}_observation.md", bodies.observation_table(body))
         write(fragments / f"{body}_action.md", bodies.action_table(body))
         write(fragments / f"{body}_protocols.md", tasks.protocols(body))

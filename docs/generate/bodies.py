@@ -7,9 +7,10 @@ import mujoco
 import numpy as np
 
 from generate.markdown import table
-from torchrl_loco import models
+from generate.tasks import CLASSES
 from torchrl_loco.config import PROTOCOLS
-from torchrl_loco.envs import humanoid
+from torchrl_loco.sim import models
+from torchrl_loco.tasks import humanoid
 
 Value = Callable[[mujoco.MjData], float]
 
@@ -32,7 +33,7 @@ class Entry:
 
 def observation(body: str, protocol: str) -> list[Entry]:
     """Returns the entries of a body's observation in order."""
-    return list(BODIES[body](models.load(models.PATHS[body]), protocol))
+    return list(BODIES[body](models.load(CLASSES[body].model), protocol))
 
 
 def observation_table(body: str) -> str:
@@ -51,7 +52,7 @@ def observation_table(body: str) -> str:
 
 def action_table(body: str) -> str:
     """Returns the table of a body's actuators."""
-    model = models.load(models.PATHS[body])
+    model = models.load(CLASSES[body].model)
     if model.na:
         return _set_points(model)
     rows = []

@@ -3,8 +3,8 @@
 import dataclasses
 import math
 
-from torchrl_loco.envs import hopper, humanoid, walker
 from torchrl_loco.registry import env_class
+from torchrl_loco.tasks import hopper, humanoid, walker
 
 UPRIGHT = "$u$ the z component of the torso's z axis (1 upright, -1 upside down)"
 VELOCITY = "$v$ the velocity of the center of mass (m/s)"

@@ -10,10 +10,13 @@ from torchrl.envs.utils import step_mdp
 
 import torchrl_loco
 from generate.markdown import table
-from torchrl_loco import models
-from torchrl_loco.config import DEFAULTS, NACONMAX_FLOOR, NACONMAX_WORLDS, PROTOCOLS, sim_config
+from torchrl_loco.config import NACONMAX_FLOOR, NACONMAX_WORLDS, PROTOCOLS, sim_config
 from torchrl_loco.policy import shipped_policies
 from torchrl_loco.registry import ALIASES, OURS, env_class
+from torchrl_loco.sim import models
+
+CLASSES = {env_class(name).body: env_class(name) for name in OURS}
+"""A class of each body."""
 
 MOMENTS = (0, 20, 40, 160)
 """Control steps after the reset at which the picture of a task is taken."""
@@ -28,8 +31,8 @@ def _aliases(name: str) -> str:
 def properties(name: str) -> str:
     """Returns the head of a task's page: its picture and a table."""
     cls = env_class(name)
-    config = cls.defaults
-    nu = models.load(cls.mjcf).nu
+    config = cls.config
+    nu = models.load(cls.model).nu
     length = config.episode_length
     rows = [
         ("id", f"`{name}`"),
@@ -50,7 +53,7 @@ def properties(name: str) -> str:
 def _caption(name: str) -> str:
     if _info(name) is None:
         return "*The start.*"
-    dt = env_class(name).defaults.ctrl_dt
+    dt = env_class(name).config.ctrl_dt
     *first, last = (f"{moment * dt:g}" for moment in MOMENTS)
     return f"*The shipped policy, {', '.join(first)} and {last} s after a reset.*"
 
@@ -64,13 +67,13 @@ def overview() -> str:
         policy = _info(name)
         best = f"{policy['mean']:.0f} ± {policy['std']:.0f}" if policy else "none yet"
         link = f"[{name}](/tasks/{name}.md)"
-        rows.append((link, _aliases(name), models.load(cls.mjcf).nu, cls.observation_size, speed, best))
+        rows.append((link, _aliases(name), models.load(cls.model).nu, cls.observation_size, speed, best))
     return table(("id", "alias", "action", "observation", "target speed (m/s)", "return of the policy"), rows)
 
 
 def protocols(body: str) -> str:
     """Returns the settings of a body's simulation under each protocol."""
-    settings = {p: dataclasses.asdict(sim_config(DEFAULTS[body], p, NACONMAX_WORLDS, {})) for p in PROTOCOLS}
+    settings = {p: dataclasses.asdict(sim_config(CLASSES[body].config, p, NACONMAX_WORLDS, {})) for p in PROTOCOLS}
     rows = [(f"`{field}`", *(f"`{settings[p][field]}`" for p in PROTOCOLS)) for field in settings[PROTOCOLS[0]]]
     note = (
         f"\n`naconmax` is for {NACONMAX_WORLDS} worlds and is scaled with `num_envs`, with a minimum of "
@@ -99,7 +102,7 @@ def _about_policy(name: str, protocol: str, info: dict[str, Any]) -> str:
     return (
         f'`torchrl_loco.load_policy("{name}"{chosen})` returns **{info["mean"]:.1f} ± {info["std"]:.1f}** under '
         f"protocol `{protocol}` (mean and standard deviation over {info['episodes']} episodes of "
-        f"{env_class(name).defaults.episode_length} steps that were not used to select it; worst {info['min']:.1f}, "
+        f"{env_class(name).config.episode_length} steps that were not used to select it; worst {info['min']:.1f}, "
         f"best {info['max']:.1f}). It was trained by {info['algorithm'].upper()} for "
         f"{info['frames'] / 1e6:.0f} million frames on one {info['trained_on']}, with {info['num_envs']} worlds and "
         f"seed {info['seed']}.\n"

@@ -81,7 +81,7 @@ def test_nothing_holds_on_to_a_closed_environment(way, engine):
     env = made(engine=engine)
     env.rollout(3)
     env.render(width=16, height=12)
-    held = [weakref.ref(thing) for thing in (env.world, env.sim, env.sim.data, env.world.observation)]
+    held = [weakref.ref(thing) for thing in (env.world, env.sim, env.sim.data, env.world.outputs)]
     if way == "close":
         env = torchrl_loco.TransformedEnv(env)
         env.close()

@@ -5,11 +5,12 @@ import itertools
 import pytest
 import torch
 import warp as wp
-from cases import COMPILED, ENGINES
+from cases import BODIES, COMPILED, ENGINES
 
 import torchrl_loco
 
 
+@pytest.mark.parametrize("body_task", BODIES)  # with hooks there are more
 def test_each_graph_is_recorded_once(body_task, device, actions, monkeypatch):
     captures, capture = [], wp.ScopedCapture
     monkeypatch.setattr(wp, "ScopedCapture", lambda **options: captures.append(options) or capture(**options))

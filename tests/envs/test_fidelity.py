@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from cases import BODIES, COMPILED, TASKS
+from cases import BODIES, COMPILED, MODELS, TASKS
 from oracle import FORCES, Oracle, recorded, without_forces
 
 import torchrl_loco
-from torchrl_loco import models
 
 WALKER_ROW = [-0.8415, -0.5403, -0.7934, 0.6087, -0.9945, 0.1048, -0.9205, -0.3908, -0.8747, -0.4847, 0.911, -0.4125]
 WALKER_ROW += [0.4919, -0.8707, -0.8415] + [0.0] * 9
@@ -23,7 +22,7 @@ def state(record, extra=()):
 
 def test_the_oracle_agrees_with_dm_control(task):
     """The NumPy formulas that the rewards are held against are dm_control's own."""
-    record, oracle = recorded(task), Oracle(task, models.PATHS[task.split("_")[0]])
+    record, oracle = recorded(task), Oracle(task, MODELS[task.split("_")[0]])
     rows = zip(record["next_qpos"], record["next_qvel"], record["action"], strict=True)
     np.testing.assert_allclose([oracle.reward(*row) for row in rows], record["reward"], rtol=0, atol=1e-6)
 
@@ -93,7 +92,7 @@ def test_reward_agrees_with_numpy(shared, task, protocol, engine, device):
     rewards = env.step(td.set("action", action))["next", "reward"].squeeze(-1).cpu().numpy()
 
     after = {key: env.get_state()[key].cpu().numpy().astype(np.float64) for key in ("qpos", "qvel")}
-    oracle = Oracle(task, models.PATHS[env.body])
+    oracle = Oracle(task, MODELS[env.body])
     expected = [oracle.reward(after["qpos"][i], after["qvel"][i], record["action"][i]) for i in range(192)]
     np.testing.assert_allclose(rewards, expected, rtol=0, atol=1e-4)
     assert min(expected) < 0.2

@@ -6,7 +6,7 @@ import warnings
 
 import pytest
 import torch
-from cases import COARSE
+from cases import COARSE, coarse
 from torchrl.envs import EnvCreator, ParallelEnv
 
 import torchrl_loco
@@ -18,6 +18,7 @@ CASES = [
     ("walker_run", "dm_control", "compiled"),
     ("humanoid_run", "dm_control", "compiled"),
     ("walker_run", "dm_control", "mujoco_warp"),
+    ("dog_follow", "playground", "compiled"),
 ]
 
 
@@ -28,7 +29,7 @@ def test_an_offset_draws_what_these_worlds_of_a_larger_environment_draw(
     """To the bit, across several episodes that do not end together."""
     if engine == "mujoco_warp" and device == "cuda":
         pytest.skip("there the order of sums depends on the number of worlds")
-    options = {"protocol": protocol, "engine": engine, "episode_length": 4, "stagger": True, **COARSE}
+    options = {"protocol": protocol, "engine": engine, "episode_length": 4, "stagger": True, **coarse(task)}
     whole = shared(task, WHOLE, device, 5, **options)
     part = shared(task, PART, device, 5, world_offset=OFFSET, **options)
     rows = slice(OFFSET, OFFSET + PART)

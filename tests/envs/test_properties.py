@@ -5,10 +5,11 @@ import numpy as np
 import oracle
 import pytest
 import torch
+from cases import BODIES, MODELS
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_loco import State, models
+from torchrl_loco import State
 
 pytestmark = pytest.mark.slow
 
@@ -22,6 +23,11 @@ SETTINGS = hypothesis.settings(
 
 seeds = st.integers(0, 2**32 - 1)
 masks = st.lists(st.booleans(), min_size=WORLDS, max_size=WORLDS).map(torch.tensor)
+
+
+@pytest.fixture(params=BODIES)
+def body_task(request):
+    return request.param
 
 
 @pytest.fixture
@@ -67,7 +73,7 @@ def test_observation_and_state_are_what_was_set(env, body_task, seed, spread):
     now = env.get_state()
     assert torch.equal(now["qpos"], state["qpos"])
     assert torch.equal(now["qvel"], state["qvel"])
-    reference = oracle.Oracle(body_task, models.PATHS[env.body])
+    reference = oracle.Oracle(body_task, MODELS[env.body])
     for world in range(WORLDS):
         row = {key: now[key][world].double().numpy() for key in ("qpos", "qvel", "act") if key in now}
         expected = reference.observation(env.protocol, **row)

@@ -59,7 +59,7 @@ def test_state(env, shared, body_task, device):
     env.reset()
     env.reset(state, set_state=True)
     now = env.get_state()
-    assert all(torch.equal(now[key], value) for key, value in state.items())
+    assert (now == state).all()
     env.load_state_dict(env.state_dict())
     many = shared(body_task, 3, device, **coarse(body_task))
     many.reset(state.branch(0, 3), set_state=True)

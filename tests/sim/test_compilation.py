@@ -6,10 +6,10 @@ import time
 import pytest
 import torch
 import warp as wp
+from cases import CONFIGS, MODELS
 
-from torchrl_loco import models
-from torchrl_loco.config import DEFAULTS, sim_config
-from torchrl_loco.sim import Simulation
+from torchrl_loco.config import sim_config
+from torchrl_loco.sim import Simulation, models
 from torchrl_loco.sim.compilation import compile_kernels
 
 
@@ -28,8 +28,8 @@ def count(total: wp.array[int]):
     ],
 )
 def test_a_step_finds_every_kernel_compiled(body, protocol, engine, launches, device, monkeypatch):
-    config = sim_config(DEFAULTS[body], protocol, 2, {"engine": engine})
-    sim = Simulation(models.load(models.PATHS[body]), config, 2, torch.device(device))
+    config = sim_config(CONFIGS[body], protocol, 2, {"engine": engine})
+    sim = Simulation(models.load(MODELS[body]), config, 2, torch.device(device))
     sim.compile(sim.step)
     load, asked = wp.Module.load, []
 

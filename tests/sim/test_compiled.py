@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from cases import CONFIGS, MODELS
 from mujoco_warp import OverflowType
 
 import torchrl_loco
-from torchrl_loco import models
-from torchrl_loco.config import DEFAULTS, SimConfig, sim_config
-from torchrl_loco.sim import Simulation
+from torchrl_loco.config import SimConfig, sim_config
+from torchrl_loco.sim import Simulation, models
 from torchrl_loco.sim.compiled import collision, dense_contacts, lanes, step, unsupported
 from torchrl_loco.sim.simulation import choose_engine
 
@@ -86,7 +86,7 @@ def test_what_a_model_must_not_need_is_named(old, new, named):
 
 def test_what_the_quadruped_needs_is_named_in_full():
     """Of many elements that need the same the first are named."""
-    assert unsupported(models.load(models.PATHS["quadruped"])) == [
+    assert unsupported(models.load(MODELS["quadruped"])) == [
         "tendons",
         "equality constraints",
         "actuator 'yaw_front_left', 'lift_front_left', 'extend_front_left' and 9 more: activation dynamics",
@@ -110,7 +110,7 @@ def test_what_changes_nothing_is_supported():
         ('type="capsule" size="0.1 0.2"', 'type="box" size="0.1 0.1 0.1" contype="0" conaffinity="0"'),
     ]:
         assert unsupported(mujoco.MjModel.from_xml_string(MODEL.replace(old, new))) == []
-    for body, path in models.PATHS.items():
+    for body, path in MODELS.items():
         assert (unsupported(models.load(path)) == []) == (body != "quadruped")
 
 
@@ -135,10 +135,10 @@ def test_an_environment_falls_back_and_says_why(tmp_path, caplog):
     class Capped(torchrl_loco.WalkerWalk):
         """A walker whose sensor is cut off."""
 
-        mjcf = tmp_path / "walker.xml"
+        model = tmp_path / "walker.xml"
 
-    text = models.PATHS["walker"].read_text()
-    Capped.mjcf.write_text(text.replace("<subtreelinvel ", '<subtreelinvel cutoff="100" '))
+    text = MODELS["walker"].read_text()
+    Capped.model.write_text(text.replace("<subtreelinvel ", '<subtreelinvel cutoff="100" '))
     with pytest.raises(ValueError, match="sensor 'torso_velocity'"):
         Capped(2, "cpu", engine="compiled")
     env = Capped(2, "cpu")
@@ -425,8 +425,8 @@ def test_settings_of_room_change_nothing():
     """``njmax`` and ``naconmax`` are for the other engine."""
     reached = []
     for overrides in ({}, {"njmax": 1, "naconmax": 1}):
-        settings = sim_config(DEFAULTS["walker"], "playground", 3, {"engine": "compiled", **overrides})
-        sim = Simulation(models.load(models.PATHS["walker"]), settings, 3, torch.device("cpu"))
+        settings = sim_config(CONFIGS["walker"], "playground", 3, {"engine": "compiled", **overrides})
+        sim = Simulation(models.load(MODELS["walker"]), settings, 3, torch.device("cpu"))
         sim.qpos[:, 0] = -0.5
         sim.step()
         reached.append(sim.qvel)

@@ -4,11 +4,11 @@ import hypothesis
 import mujoco
 import numpy as np
 import pytest
-from cases import COMPILED
+from cases import COMPILED, MODELS
 from evaluate import evaluate
 from random_models import models
 
-import torchrl_loco.models
+import torchrl_loco.sim.models
 from torchrl_loco.sim.compiled import unsupported
 from torchrl_loco.sim.compiled.dynamics import Dynamics
 from torchrl_loco.sim.compiled.symbols import names
@@ -61,4 +61,4 @@ def test_random_models(xml):
 
 @pytest.mark.parametrize("body", [task.split("_")[0] for task in COMPILED])
 def test_our_bodies(body):
-    assert_agrees(torchrl_loco.models.load(torchrl_loco.models.PATHS[body]), np.random.default_rng(0))
+    assert_agrees(torchrl_loco.sim.models.load(MODELS[body]), np.random.default_rng(0))

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from cases import COMPILED, ENGINES
+from cases import COMPILED, ENGINES, MODELS
 
 import torchrl_loco
-from torchrl_loco import State, models
+from torchrl_loco import State
+from torchrl_loco.sim import models
 from torchrl_loco.sim.compiled import collision
 from torchrl_loco.sim.simulation import set_options
 
@@ -38,7 +39,7 @@ def after(env, state, action):
 
 def of_c_mujoco(env, state, action):
     """Returns the same from C MuJoCo, and the share of worlds that touch something."""
-    model = models.load(models.PATHS[env.body])
+    model = models.load(MODELS[env.body])
     set_options(model, env.config)
     data, rows, touching = mujoco.MjData(model), [], 0
     for world in range(len(state)):

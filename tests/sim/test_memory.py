@@ -1,15 +1,17 @@
 """The memory of a simulation is known, and refused if it is too much, before anything is allocated."""
 
 import dataclasses
+import types
 
 import pytest
 import torch
 import warp as wp
+from cases import CONFIGS, MODELS
 
 import torchrl_loco
-from torchrl_loco import models
-from torchrl_loco.config import DEFAULTS, sim_config
-from torchrl_loco.sim import Simulation, compiled, mujoco_warp, simulation
+from torchrl_loco.config import sim_config
+from torchrl_loco.sim import Simulation, compiled, models, mujoco_warp, simulation
+from torchrl_loco.sim.compiled import step
 
 
 def allocated(thing):
@@ -24,17 +26,20 @@ def allocated(thing):
 
 
 @pytest.mark.parametrize(
-    ("body", "num_envs", "overrides"),
-    [("walker", 1, {}), ("walker", 40, {"naconmax": 3}), ("humanoid", 100, {"njmax": 77})],
+    ("body", "num_envs", "overrides", "geoms"),
+    [("walker", 1, {}, ()), ("walker", 40, {"naconmax": 3}, (4, 0, 2)), ("humanoid", 100, {"njmax": 77}, (1,))],
 )
-def test_the_estimate_is_what_is_allocated(body, num_envs, overrides):
-    config = sim_config(DEFAULTS[body], "playground", num_envs, overrides)
-    model, device = models.load(models.PATHS[body]), wp.get_device("cpu")
-    engine = mujoco_warp.MujocoWarpEngine(model, config, num_envs, device)
-    assert mujoco_warp.data_bytes(model, config, num_envs) == sum(allocated(engine.data).values())
-    data = compiled.CompiledEngine(model, config, num_envs, device).data
+def test_the_estimate_is_what_is_allocated(body, num_envs, overrides, geoms):
+    config = sim_config(CONFIGS[body], "playground", num_envs, overrides)
+    model, device = models.load(MODELS[body]), wp.get_device("cpu")
+    engine = mujoco_warp.MujocoWarpEngine(model, config, num_envs, device, geoms)
+    needed = sum(allocated(engine.data).values())
+    if geoms:
+        needed += sum(array.capacity for array in vars(engine.contact_forces).values())
+    assert mujoco_warp.data_bytes(model, config, num_envs, len(geoms)) == needed
+    data = compiled.CompiledEngine(model, config, num_envs, device, geoms).data
     arrays = [array for array in vars(data).values() if isinstance(array, wp.array)]
-    assert compiled.data_bytes(model, num_envs) == sum(array.capacity for array in arrays)
+    assert compiled.data_bytes(model, num_envs, len(geoms)) == sum(array.capacity for array in arrays)
 
 
 def test_too_many_worlds_are_refused_before_they_are_allocated(engine, monkeypatch):
@@ -45,17 +50,35 @@ def test_too_many_worlds_are_refused_before_they_are_allocated(engine, monkeypat
         torchrl_loco.make("walker_walk", 10**7, "cpu", engine=engine)
 
 
+def test_a_billion_worlds_are_refused_for_their_memory(engine, monkeypatch):
+    """Not for contacts, which the compiled step does not list; under MuJoCo-Warp there would be more than 2**31."""
+    monkeypatch.setattr(simulation, "free_memory", lambda device: 2**37)
+    config = sim_config(CONFIGS["walker"], "playground", 10**9, {"engine": engine})
+    with pytest.raises(MemoryError, match=r"num_envs=1000000000 needs about \d+\.\d GiB on cpu.* \d+ worlds fit"):
+        Simulation(models.load(MODELS["walker"]), config, 10**9, torch.device("cpu"))
+
+
+@pytest.mark.parametrize(("body", "most"), [("walker", 2**31 // 36), ("humanoid", 2**26 - 1)])
+def test_more_worlds_than_warp_can_address_are_refused(body, most):
+    """On CUDA: the bytes from a body's orientations to the next body's, and threads, are 32-bit numbers."""
+    model, cuda = models.load(MODELS[body]), types.SimpleNamespace(is_cuda=True)
+    step.check_worlds(model, most, cuda)
+    step.check_worlds(model, 2**31 - 1, wp.get_device("cpu"))
+    with pytest.raises(ValueError, match=f"num_envs={most + 1} is too large: Warp addresses {most} worlds"):
+        step.check_worlds(model, most + 1, cuda)
+
+
 def test_as_many_as_fit_are_made(engine, monkeypatch):
-    config = sim_config(DEFAULTS["walker"], "playground", 8, {"engine": engine})
-    model = models.load(models.PATHS["walker"])
+    config = sim_config(CONFIGS["walker"], "playground", 8, {"engine": engine})
+    model = models.load(MODELS["walker"])
     needed = simulation.memory(engine, model, config, 8, torch.device("cpu"))
     for free, fits in ((needed + 1, True), (needed / 2, False)):
         monkeypatch.setattr(simulation, "free_memory", lambda device, free=free: free)
         if fits:
-            Simulation(models.load(models.PATHS["walker"]), config, 8, torch.device("cpu"))
+            Simulation(models.load(MODELS["walker"]), config, 8, torch.device("cpu"))
         else:
             with pytest.raises(MemoryError, match=r"about [34] worlds fit"):
-                Simulation(models.load(models.PATHS["walker"]), config, 8, torch.device("cpu"))
+                Simulation(models.load(MODELS["walker"]), config, 8, torch.device("cpu"))
 
 
 def test_free_memory_is_what_the_machine_and_its_control_group_leave(tmp_path, monkeypatch):

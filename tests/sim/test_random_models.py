@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from contact_forces import net_forces
 from random_models import models, states
 
 from torchrl_loco.config import SimConfig
@@ -51,8 +52,9 @@ def compiled_step(model, state):
         euler_damping=not option.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP,
         engine="compiled",
     )
-    sim = Simulation(model, config, count, torch.device("cpu"))
-    assert sim.data.cvel.shape == (count, model.nbody)  # asking for it makes the step compute it
+    sim = Simulation(model, config, count, torch.device("cpu"), contact_geoms=range(model.ngeom))
+    assert sim.cvel.shape == (count, model.nbody, 6)  # asking for it makes the step compute it
+    assert sim.subtree_com.shape == (count, model.nbody, 3)
     for view, rows in zip((sim.qpos, sim.qvel, sim.qacc_warmstart, sim.ctrl), state, strict=True):
         view.copy_(torch.as_tensor(rows))
     sim.step()
@@ -118,12 +120,17 @@ def assert_poses_belong_to_the_state(model, sim, world):
     np.testing.assert_allclose(sim.xpos[world], data.xpos, rtol=0, atol=far)
     np.testing.assert_allclose(sim.xmat[world].reshape(-1, 9), data.xmat, rtol=0, atol=4e-6)
     np.testing.assert_allclose(sim.data.cvel.numpy()[world], data.cvel, rtol=0, atol=fast)
+    roots = sorted(set(model.body_rootid) - {0})
+    np.testing.assert_allclose(sim.subtree_com[world, roots], data.subtree_com[roots], rtol=0, atol=far)
     velocity = data.subtree_linvel[model.body("body0").id]
     np.testing.assert_allclose(sim.data.sensordata.numpy()[world, :3], velocity, rtol=0, atol=fast)
 
 
-def touch_in_c(model, state, qacc):
-    """Returns the touch sensors of C MuJoCo at an acceleration, and what rounding of its residuals makes of them."""
+def forces_in_c(model, state, qacc):
+    """Returns forces of C MuJoCo at an acceleration, and what rounding of its residuals makes of them.
+
+    Touch sensors first, then contact forces and normal forces of the geoms, ``(ngeom, 3)`` and ``(ngeom,)``.
+    """
     data = c_data(model, *state)
     mujoco.mj_forward(model, data)
     data.qacc[:] = qacc
@@ -131,21 +138,29 @@ def touch_in_c(model, state, qacc):
     mujoco.mj_constraintUpdate(model, data, jacobian @ data.qacc - data.efc_aref, None, 0)
     mujoco.mj_sensorAcc(model, data)
     terms = np.abs(jacobian) @ np.abs(data.qacc) + np.abs(data.efc_aref)
-    return data.sensordata[3:].copy(), 1e-5 * (data.efc_D * terms).max(initial=0)
+    net, normal, _ = net_forces(model, data)
+    return [data.sensordata[3:].copy(), net, normal], 1e-5 * (data.efc_D * terms).max(initial=0)
 
 
-def assert_touch_belongs_to_the_acceleration(model, state, sim, world, rng):
-    """The touch sensors are those of C MuJoCo at the acceleration that was reached; returns how many feel something."""
+def assert_forces_belong_to_the_acceleration(model, state, sim, world, rng):
+    """Touch sensors and contact forces are those of C MuJoCo at the acceleration that was reached.
+
+    Returns:
+        how many touch sensors and how many geoms feel something.
+    """
     qacc = sim.qacc_warmstart[world].double().numpy()
-    expected, rounding = touch_in_c(model, state, qacc)
-    change, (qpos, *rest) = np.zeros_like(expected), state
+    (touch, net, normal), rounding = forces_in_c(model, state, qacc)
+    changes, (qpos, *rest) = [np.zeros_like(touch), np.zeros_like(net)], state
     for _ in range(4):  # a contact that is almost none is as soft as rounding of its distance makes it
         near = qpos.astype(np.float64)
         mujoco.mj_integratePos(model, near, rng.normal(size=model.nv) * NOISE, 1.0)
-        change = np.maximum(change, np.abs(touch_in_c(model, (near, *rest), qacc)[0] - expected))
-    touch = sim.data.sensordata.numpy()[world, 3:]
-    assert (np.abs(touch - expected) <= 0.01 * expected + rounding + 10 * change).all(), (touch, expected)
-    return int((touch > 1e-3).sum())
+        others = forces_in_c(model, (near, *rest), qacc)[0]
+        changes = [np.maximum(c, np.abs(a - b)) for c, a, b in zip(changes, others, (touch, net), strict=False)]
+    felt, pushed = sim.data.sensordata.numpy()[world, 3:], sim.contact_force[world].numpy()
+    assert (np.abs(felt - touch) <= 0.01 * touch + rounding + 10 * changes[0]).all(), (felt, touch)
+    allowed = 0.01 * normal[:, None] + 4 * rounding + 10 * changes[1]
+    assert (np.abs(pushed - net) <= allowed).all(), (pushed, net)
+    return int((felt > 1e-3).sum()), int((np.abs(pushed).max(axis=1) > 1e-3).sum())
 
 
 def compare(xml, count=STATES):
@@ -178,7 +193,11 @@ def compare(xml, count=STATES):
         mujoco.mj_integratePos(model, qpos, sim.qvel[world].double().numpy(), model.opt.timestep)
         np.testing.assert_allclose(sim.qpos[world], qpos, rtol=1e-6, atol=1e-6)
         assert_poses_belong_to_the_state(model, sim, world)
-        found["touch"] += assert_touch_belongs_to_the_acceleration(model, state, sim, world, rng)
+        touch, geoms = assert_forces_belong_to_the_acceleration(model, state, sim, world, rng)
+        found.update({"touch": touch, "geoms": geoms})
+        near = np.abs(data.contact.dist - data.contact.includemargin) < 1e-6  # where rounding decides
+        clear = np.setdiff1d(np.arange(model.ngeom), data.contact.geom[near])
+        assert (sim.in_contact[world].numpy() == net_forces(model, data)[2])[clear].all()
     return found
 
 

@@ -5,11 +5,11 @@ import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
+from cases import CONFIGS, MODELS
 
-from torchrl_loco import models
 from torchrl_loco.checks import check_device
-from torchrl_loco.config import DEFAULTS, sim_config
-from torchrl_loco.sim import Simulation
+from torchrl_loco.config import sim_config
+from torchrl_loco.sim import Simulation, models
 from torchrl_loco.sim.row_order import FIRST_CONTACT, ROW_FIELDS, RowOrder
 
 pytestmark = pytest.mark.slow
@@ -21,8 +21,8 @@ WORLDS = 8
 def sim(request):
     """A simulation of a body that fell under random actions: contacts, and joints at their limits."""
     body = request.param
-    config = sim_config(DEFAULTS[body], "dm_control", WORLDS, {"deterministic": True, "engine": "mujoco_warp"})
-    sim = Simulation(models.load(models.PATHS[body]), config, WORLDS, check_device("cpu"))
+    config = sim_config(CONFIGS[body], "dm_control", WORLDS, {"deterministic": True, "engine": "mujoco_warp"})
+    sim = Simulation(models.load(MODELS[body]), config, WORLDS, check_device("cpu"))
     rng = np.random.default_rng(0)
     step = sim.capture(sim.step)
     sim.reset(wp.ones(WORLDS, dtype=bool))

@@ -5,10 +5,10 @@ import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
+from cases import MODELS
 
-from torchrl_loco import models
 from torchrl_loco.envs.episode import poser
-from torchrl_loco.sim import fill
+from torchrl_loco.sim import fill, models
 from torchrl_loco.sim.sampling import FreePose, draw_free_pose, make_skeleton, segment_distance
 from torchrl_loco.sim.world_func import launch_together
 
@@ -53,7 +53,7 @@ def test_segment_distance_agrees_with_mujoco():
 
 def test_poses_near_the_floor_do_not_touch_it():
     """From a root 0.9 m high most poses reach the floor; C MuJoCo finds no contact in those that are kept."""
-    model = models.load(models.PATHS["humanoid"])
+    model = models.load(MODELS["humanoid"])
     device, n = wp.get_device("cpu"), 500
     with wp.ScopedDevice(device):
         pairs = mjw.put_model(model).nxn_geom_pair_filtered.numpy()
@@ -75,7 +75,7 @@ def test_poses_near_the_floor_do_not_touch_it():
 def test_other_models_are_refused():
     pairs = np.zeros((0, 2), dtype=np.int32)
     with pytest.raises(ValueError, match="free joints and hinges"):
-        make_skeleton(models.load(models.PATHS["walker"]), pairs, wp.get_device("cpu"))
+        make_skeleton(models.load(MODELS["walker"]), pairs, wp.get_device("cpu"))
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 1])
     with pytest.raises(ValueError, match="capsules and spheres"):

@@ -5,17 +5,18 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from cases import CONFIGS, MODELS
 
-from torchrl_loco import models
-from torchrl_loco.config import DEFAULTS, sim_config
-from torchrl_loco.sim import Simulation
+from torchrl_loco.config import SimConfig, sim_config
+from torchrl_loco.sim import Simulation, models
 
+CPU = torch.device("cpu")
 VIEWS = ("qpos", "qvel", "ctrl", "qacc_warmstart", "xpos", "xmat", "time", "overflow")
 
 
 def simulation(body, device, num_envs=4, **overrides):
-    config = sim_config(DEFAULTS[body], "dm_control", num_envs, overrides)
-    sim = Simulation(models.load(models.PATHS[body]), config, num_envs, torch.device(device))
+    config = sim_config(CONFIGS[body], "dm_control", num_envs, overrides)
+    sim = Simulation(models.load(MODELS[body]), config, num_envs, torch.device(device))
     return sim, wp.ones(num_envs, dtype=bool, device=sim.device)
 
 
@@ -142,7 +143,87 @@ def test_options_come_from_the_config(engine):
     sim, _ = simulation("walker", "cpu", sim_dt=0.005, iterations=7, ls_iterations=9, engine=engine)
     assert sim.mj_model.opt.timestep == 0.005
     assert (sim.model.opt.iterations, sim.model.opt.ls_iterations) == (7, 9)
-    playground = sim_config(DEFAULTS["walker"], "playground", 1, {})
-    cut = Simulation(models.load(models.PATHS["walker"]), playground, 1, torch.device("cpu"))
+    playground = sim_config(CONFIGS["walker"], "playground", 1, {})
+    cut = Simulation(models.load(MODELS["walker"]), playground, 1, torch.device("cpu"))
     assert cut.mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     assert not sim.mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+
+
+FALLING = """
+<mujoco><option integrator="{integrator}"/><worldbody>
+  <body pos="0 0 1"><joint type="ball"/><geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.05"/>
+    <body pos="0.3 0 0"><joint axis="0 1 0" damping="0.5"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03"/></body>
+  </body>
+</worldbody></mujoco>
+"""
+
+
+def falling(named="Euler", **overrides):
+    config = SimConfig(ctrl_dt=0.02, sim_dt=0.01, naconmax=4, njmax=4, **overrides)
+    return Simulation(mujoco.MjModel.from_xml_string(FALLING.format(integrator=named)), config, 1, CPU)
+
+
+def velocity_in_c_mujoco(model, steps):
+    data = mujoco.MjData(model)
+    for _ in range(steps):
+        mujoco.mj_step(model, data)
+    return data.qvel.copy()
+
+
+@pytest.mark.parametrize(("chosen", "replaced"), [("euler", "RK4"), ("implicitfast", "Euler"), ("rk4", "implicit")])
+def test_the_integrator_is_that_of_the_config(chosen, replaced, caplog):
+    """What the model names is replaced, which is said once; C MuJoCo with the chosen one does the same."""
+    sim = falling(replaced, integrator=chosen, engine="mujoco_warp")
+    (record,) = caplog.records
+    assert f"integrator {replaced.upper()} is replaced by {chosen}, which config names" in record.message
+    for _ in range(10):
+        sim.step()
+    np.testing.assert_allclose(sim.qvel[0], velocity_in_c_mujoco(sim.mj_model, 20), atol=1e-4)
+    if chosen != "euler":
+        sim.mj_model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        assert np.abs(sim.qvel[0].numpy() - velocity_in_c_mujoco(sim.mj_model, 20)).max() > 1e-2
+
+
+def test_the_compiled_step_has_the_euler_integrator_alone(caplog):
+    assert falling("RK4").engine_choice[0] == "compiled"
+    assert "RK4 is replaced by euler" in caplog.text
+    with pytest.raises(ValueError, match="does not have: an integrator other than Euler"):
+        falling(integrator="implicitfast", engine="compiled")
+    with pytest.raises(ValueError, match="needs integrator='euler', got 'rk4'"):
+        falling(integrator="rk4", deterministic=True)
+    with pytest.raises(ValueError, match=r"did you mean 'implicitfast'.*euler, implicitfast, rk4"):
+        falling(integrator="implicit_fast")
+
+
+def test_nothing_is_said_where_nothing_is_replaced(body, caplog):
+    simulation(body, "cpu", engine="compiled")
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("name", ["qpos0", "body_mass", "opt.gravity"])
+def test_the_model_of_the_compiled_step_cannot_be_written(name):
+    """Its numbers are constants there, so that nothing would come of it. They can be read, also by kernels."""
+    sim = falling()
+    holder, name = (sim.model.opt, "gravity") if name == "opt.gravity" else (sim.model, name)
+    array = getattr(holder, name)
+    for write in (
+        lambda: setattr(holder, name, wp.zeros(1, device="cpu")),
+        lambda: setattr(sim.model, "opt", None),
+        lambda: array.fill_(1.0),
+        lambda: array.zero_(),
+        lambda: array.assign(np.ones(array.numpy().shape)),
+        lambda: array[0:1].fill_(1.0),
+        lambda: array.flatten().zero_(),
+        lambda: wp.to_torch(array),
+        lambda: torch.from_dlpack(array),
+    ):
+        with pytest.raises((AttributeError, TypeError), match="Edit the model before"):
+            write()
+    with pytest.raises(ValueError, match="read-only"):
+        array.numpy()[:] = 0.0
+    source = sim.mj_model.opt.gravity if name == "gravity" else getattr(sim.mj_model, name)
+    np.testing.assert_allclose(array.numpy()[0], source)
+    copy = wp.zeros_like(array)
+    wp.copy(copy, array)
+    np.testing.assert_allclose(copy.numpy(), array.numpy())

@@ -6,10 +6,11 @@ import re
 import hypothesis
 import numpy as np
 import pytest
+from cases import MODELS
 from evaluate import evaluate
 from hypothesis import strategies as st
 
-from torchrl_loco import models
+from torchrl_loco.sim import models
 from torchrl_loco.sim.compiled.dynamics import Dynamics
 from torchrl_loco.sim.compiled.symbols import (
     Block,
@@ -125,7 +126,7 @@ def test_zeros_vanish_and_constants_fold():
 
 def test_a_planar_body_has_planar_arithmetic():
     """The walker moves in a plane: nothing is computed for what is out of it."""
-    m = models.load(models.PATHS["walker"])
+    m = models.load(MODELS["walker"])
     tree = Dynamics(m, names("qpos", m.nq), names("qvel", m.nv), names("ctrl", m.nu))
     for motion in [*tree.cdof, *tree.cvel[1:]]:
         angular, linear = motion[:3], motion[3:]

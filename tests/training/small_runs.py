@@ -9,11 +9,12 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torchrl_loco
-from torchrl_loco.envs.walker import Walker
-from torchrl_loco.training import RunFolder, Trainer, preset
+from torchrl_loco.tasks.walker import Walker
+from torchrl_loco.training import RunFolder, Spaces, Trainer, preset
 
 EPISODE = 40
 """Control steps of an episode of the small walker."""
+WALKER = Spaces(observation=24, action=6)
 SMALL = {
     "num_envs": 4,
     "num_steps": 8,
@@ -32,8 +33,8 @@ SMALL = {
 def small_walker():
     """Makes the walker's tasks cheap: short episodes, which evaluations play in full, and coarse physics."""
     with pytest.MonkeyPatch.context() as patch:
-        small = dataclasses.replace(Walker.defaults, episode_length=EPISODE, sim_dt=0.0125)
-        patch.setattr(Walker, "defaults", small)
+        small = dataclasses.replace(Walker.config, episode_length=EPISODE, sim_dt=0.0125)
+        patch.setattr(Walker, "config", small)
         yield
 
 

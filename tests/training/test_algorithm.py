@@ -38,10 +38,15 @@ def trainer(request, tmp_path):
 
 
 def test_training_waits_for_nothing(trainer):
-    """Neither collecting nor a gradient step, so that a CUDA graph can record the latter."""
+    """Neither collecting nor what is computed of a batch nor a gradient step, which a CUDA graph can so record."""
+    algorithm = trainer.algorithm
+    with HostTraffic() as traffic, torch.no_grad():
+        after = trainer.collector.rollout()["next"]
+        trainer.episodes.add(*(after[name].squeeze(-1) for name in ("reward", "done", "terminated")))
+        algorithm.batch_metrics(algorithm._data)
+    assert traffic.found == []
     with HostTraffic() as traffic:
-        trainer.collector.rollout()
-        trainer.algorithm._minibatch_step()
+        algorithm._minibatch_step()
     assert traffic.found == []
     with HostTraffic() as traffic:  # it would have been noticed
         torch.tensor(1.0)

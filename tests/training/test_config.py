@@ -62,6 +62,8 @@ def test_wrong_settings():
         ({"kl_bound": 0.0}, "kl_bound must lie in (0, inf)"),
         ({"num_bins": 1}, "num_bins must lie in [2, 2**31)"),
         ({"target_entropy": float("nan")}, "target_entropy must lie in"),
+        ({"min_value": 150.0}, "min_value (150) must be below max_value (150)"),
+        ({"min_value": float("-inf")}, "min_value must lie in (-inf, inf)"),
         ({"aux_coeff": -1.0}, "aux_coeff must lie in [0, inf)"),
         ({"init_temperature": 1e-5}, "must not be below min_temperature"),
         ({"min_kl_weight": 0.02}, "init_kl_weight (0.01) must not be below min_kl_weight (0.02)"),
@@ -88,6 +90,12 @@ def test_names():
     assert PPOConfig("mjx/walker_run-v0").task == "walker_run"
     with pytest.raises(ValueError, match="did you mean 'reppo'"):
         preset("walker_stand", "cpu", "repo")
+
+
+def test_a_name_for_files():
+    for task, label in (("walker_run", "walker_run"), ("/some/where/file.py:Outer.Task", "Outer.Task")):
+        assert PPOConfig(task).label == label
+    assert PPOConfig("module:make.<locals>.Task").label == "make.-locals-.Task"
 
 
 def test_every_setting_is_documented():

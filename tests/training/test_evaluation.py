@@ -144,6 +144,15 @@ def test_a_run_of_reppo_that_fell_is_told_of_the_setting_that_steadies_it():
     assert "--episode_length 500" in fallen_return(steady, rows)
 
 
-def test_returns_that_are_never_positive_do_not_fall():
-    rows = [{"frames": i, "mean": mean} for i, mean in enumerate([-10.0, -30.0])]
-    assert fallen_return(preset("walker_stand", "cpu"), rows) == ""
+@pytest.mark.parametrize(
+    ("means", "falls"),
+    [
+        ([-10.0, -30.0], False),  # nothing was gained before
+        ([-1000.0, -50.0, -60.0], False),
+        ([-1000.0, -50.0, -400.0], True),
+        ([-1000.0, 5.0, 4.0], False),  # little of what was gained, though a fifth of the return
+    ],
+)
+def test_where_returns_are_negative_a_fall_is_one_of_what_was_gained(means, falls):
+    rows = [{"frames": i, "mean": mean} for i, mean in enumerate(means)]
+    assert bool(fallen_return(preset("walker_stand", "cpu"), rows)) == falls

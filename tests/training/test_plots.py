@@ -6,6 +6,7 @@ import matplotlib
 import pytest
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from small_runs import made
 
 from torchrl_loco.training import plot_runs
@@ -81,6 +82,23 @@ def test_runs_of_several_ranks_are_averaged_where_they_have_as_many_frames(tmp_p
     (_, millions, mean), options = drawn[0]
     assert list(millions * 1e6) == list(mean) == [256.0, 512.0, 768.0]
     assert ", 2 seeds" in options["label"]
+
+
+def test_axes_show_all_of_any_return(tmp_path, monkeypatch):
+    limits, savefig = [], Figure.savefig
+    monkeypatch.setattr(
+        Figure,
+        "savefig",
+        lambda self, *args, **more: limits.append(self.axes[0].get_ylim()) or savefig(self, *args, **more),
+    )
+    for scale in (-3000.0, 0.01):
+        run = made(tmp_path)
+        for i in (1, 2):
+            run.append_metrics({"frames": i, "seconds": 1.0, "return": scale * i})
+        plot_runs([run], tmp_path / "curve.png")
+        low, high = limits[-1]
+        assert low <= min(scale, 2 * scale) <= max(scale, 2 * scale) <= high
+        assert high - low < 2 * abs(scale)
 
 
 def test_nothing_to_plot(tmp_path):

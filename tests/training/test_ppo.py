@@ -1,10 +1,12 @@
 """Advantages and normalisation against values computed by hand, and what an update does."""
 
 import torch
-from small_runs import collected
+from small_runs import WALKER, collected
 from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_loco.training import preset
+from torchrl_loco.training import Spaces, preset
+from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.algorithm import clip_and_step
 from torchrl_loco.training.ppo import PPO
 
@@ -12,7 +14,7 @@ from torchrl_loco.training.ppo import PPO
 def made(**overrides):
     settings = {"num_envs": 1, "num_steps": 4, "minibatch_size": 4, "total_frames": 10_000, "epochs": 1, **overrides}
     torch.manual_seed(0)
-    return PPO(preset("walker_stand", "cpu", "ppo", **settings))
+    return PPO(preset("walker_stand", "cpu", "ppo", **settings), WALKER)
 
 
 def test_truncation_bootstraps_and_termination_does_not():
@@ -51,6 +53,64 @@ def test_truncation_bootstraps_and_termination_does_not():
     expected = torch.tensor([d0 + gamma * lmbda * d1, d1, d2, d3])
     torch.testing.assert_close(data["advantage"].flatten(), expected)
     torch.testing.assert_close(data["value_target"].flatten(), expected + value)
+
+
+def test_an_end_that_is_both_counts_as_termination():
+    """A world that falls at its time limit earns nothing more."""
+    gamma, ppo = 0.9, made(gamma=0.9, num_steps=1, minibatch_size=1, reward_scale=1.0)
+    ppo.critic.module.forward = lambda observation: observation[..., :1] * 0 + 3.0
+    yes = torch.ones(1, 1, 1, dtype=torch.bool)
+    for terminated, expected in ((True, 1.0 - 3.0), (False, 1.0 + gamma * 3.0 - 3.0)):
+        ends = {"done": yes, "truncated": yes, "terminated": yes & terminated}
+        td = TensorDict(
+            {
+                "observation": torch.zeros(1, 1, 24),
+                "action": torch.zeros(1, 1, 6),
+                "action_log_prob": torch.zeros(1, 1),
+                "next": {"observation": torch.zeros(1, 1, 24), "reward": torch.ones(1, 1, 1), **ends},
+            },
+            batch_size=[1, 1],
+        )
+        with torch.no_grad():
+            torch.testing.assert_close(ppo.prepare(td)["advantage"], torch.full((1, 1, 1), expected))
+
+
+def test_the_critic_reads_what_is_privileged():
+    """With a norm of its own; the actor does not see it."""
+    spaces, settings = Spaces(24, 6, privileged=5), {"num_envs": 1, "num_steps": 4, "minibatch_size": 4}
+    ppo = PPO(preset("walker_stand", "cpu", "ppo", total_frames=10_000, **settings), spaces)
+    seen = 100.0 + 7.0 * torch.randn(1, 4, 5)
+    td = TensorDict({"observation": torch.randn(1, 4, 24), "privileged": seen}, batch_size=[1, 4])
+    with torch.no_grad():
+        td = ppo.actor(td)
+    value = ppo.critic(td.clone())["state_value"]
+    flags = {name: torch.zeros(1, 4, 1, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+    after = {name: td[name].clone() for name in ("observation", "privileged")}
+    td["next"] = TensorDict({**after, "reward": torch.ones(1, 4, 1), **flags}, batch_size=[1, 4])
+    ppo.update(td, progress=0.0)
+    assert not torch.equal(ppo.critic(td.clone())["state_value"], value)
+    torch.testing.assert_close(ppo.norms["privileged"].mean, seen.mean((0, 1)))
+    torch.testing.assert_close(ppo.norm.mean, td["observation"].mean((0, 1)))
+    assert ppo.norms["privileged"] in list(ppo.networks.modules())
+    changed = td.clone().set("privileged", seen + 50.0)
+    assert torch.equal(*(ppo.actor.get_dist(one).deterministic_sample for one in (changed, td)))
+    assert not torch.equal(ppo.critic(changed)["state_value"], ppo.critic(td.clone())["state_value"])
+
+
+def test_actions_without_bounds_are_normal():
+    """Neither samples nor the policy's actions end at 1, and densities are those of the normal distribution."""
+    settings = {"num_envs": 1, "num_steps": 4, "minibatch_size": 4, "total_frames": 10_000, "init_std": 2.0}
+    config = preset("walker_stand", "cpu", "ppo", **settings)
+    ppo = PPO(config, Spaces(24, 6, bounded=False))
+    ppo.actor[0].module[1][-1].bias.data.fill_(3.0)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        td = ppo.actor(TensorDict({"observation": torch.randn(500, 24)}, batch_size=[500]))
+    assert td["action"].abs().max() > 5.0
+    density = torch.distributions.Normal(td["loc"], td["scale"]).log_prob(td["action"]).sum(-1)
+    torch.testing.assert_close(td["action_log_prob"], density)
+    policy = deterministic_policy(ppo.actor, config, {})
+    assert not policy.is_bounded
+    torch.testing.assert_close(policy(observation=td["observation"]), td["loc"])
 
 
 def test_updates_raise_what_is_rewarded():

@@ -4,17 +4,17 @@ import math
 
 import pytest
 import torch
-from small_runs import collected
+from small_runs import WALKER, collected
 from tensordict import TensorDict
 
-from torchrl_loco.training import preset
+from torchrl_loco.training import Spaces, preset
 from torchrl_loco.training.reppo import REPPO, kl, sample
 
 
 def made(**overrides):
     settings = {"num_envs": 1, "num_steps": 4, "minibatch_size": 4, "total_frames": 10_000, "epochs": 1, **overrides}
     torch.manual_seed(0)
-    return REPPO(preset("walker_stand", "cpu", "reppo", hidden=(32,), **settings))
+    return REPPO(preset("walker_stand", "cpu", "reppo", hidden=(32,), **settings), WALKER)
 
 
 def test_critic_begins_at_zero():
@@ -57,6 +57,66 @@ def test_soft_returns_by_hand(monkeypatch):
     g0 = 2 * 0.5 + gamma * (temperature * 1.0 + (1 - lmbda) * 2.0 + lmbda * g1)
     torch.testing.assert_close(data["returns"], torch.tensor([[g0, g1, g2, g3]]))
     assert data["alive"].tolist() == [[1.0, 1.0, 0.0, 1.0]]
+
+
+def with_privileged(reppo, steps):
+    """Returns a batch of one world in which nothing ends, with five numbers for the critic alone."""
+    td = TensorDict({"observation": torch.randn(1, steps, 24), "privileged": 50 + torch.randn(1, steps, 5)}, [1, steps])
+    with torch.no_grad():
+        td = reppo.actor(td)
+    flags = {name: torch.zeros(1, steps, 1, dtype=torch.bool) for name in ("done", "terminated")}
+    after = {name: td[name].clone() for name in ("observation", "privileged")}
+    return td.set("next", TensorDict({**after, "reward": torch.ones(1, steps, 1), **flags}, [1, steps]))
+
+
+def test_the_critic_reads_what_is_privileged():
+    """With a norm of its own, which a checkpoint holds; the actor does not see it."""
+    config = made().config
+    reppo, seen = REPPO(config, Spaces(24, 6, privileged=5)), []
+    batch = with_privileged(reppo, 4)
+    value_and_features = reppo.critic.value_and_features
+    reppo.critic.value_and_features = lambda observation, action: (
+        seen.append(observation) or value_and_features(observation, action)
+    )
+    reppo.update(batch, progress=0.0)
+    assert {tuple(observation.shape) for observation in seen} == {(1, 4, 5), (4, 5)}
+    torch.testing.assert_close(reppo.norms["privileged"].mean, batch["privileged"].mean((0, 1)))
+    torch.testing.assert_close(reppo.norm.mean, batch["observation"].mean((0, 1)))
+    assert torch.equal(reppo.state_dict()["networks"]["privileged_norm.mean"], reppo.norms["privileged"].mean)
+
+
+def test_actions_without_bounds_are_refused():
+    with pytest.raises(ValueError, match=r"set action_range = \(-1, 1\) in the class, or train with algorithm 'ppo'"):
+        REPPO(made().config, Spaces(24, 6, bounded=False))
+
+
+def test_negative_returns_are_learned_with_bins_below_zero():
+    """With bins from zero on, the critic's value of what earns -1 at each step stays at zero."""
+    found = []
+    for low in (0.0, -20.0):
+        reppo = made(num_envs=8, num_steps=8, minibatch_size=64, lr=1e-2, min_value=low, max_value=20.0, gamma=0.5)
+        batch = collected(reppo, 8)
+        batch["next", "reward"].fill_(-10.0)
+        for _ in range(60):
+            reppo.update(batch, progress=0.0)
+        with torch.no_grad():
+            found.append(reppo.critic.value_and_features(reppo.norm(batch["observation"]), batch["action"])[0].mean())
+    assert found[0] > -1.0
+    assert -11.5 < found[1] < -8.5
+
+
+def test_returns_beyond_the_bins_are_counted_and_said():
+    """Of four returns two are beyond: a third one is within a bin of the end."""
+    reppo = made(min_value=-10.0, max_value=10.0, num_bins=21)
+    data = TensorDict({"returns": torch.tensor([-14.0, 3.0, 10.5, 12.0])}, batch_size=[4])
+    metrics = dict(zip(reppo.batch_metric_names, reppo.batch_metrics(data).tolist(), strict=True))
+    assert metrics == {"return_min": -14.0, "return_max": 12.0, "return_clipped": 0.5}
+    note = reppo.note({name: [value, 0.0] for name, value in metrics.items()})
+    assert "Returns from -14 to 12 occurred" in note
+    assert "from -10 to 10 and cut off up to 50.00% of a batch: pass --min_value -21 --max_value 18" in note
+    assert reppo.note({"return_min": [-10.9], "return_max": [10.9], "return_clipped": [0.0]}) == ""
+    wide = made(min_value=-20.0, max_value=20.0, num_bins=21)
+    assert wide.batch_metrics(data)[2] == 0.0
 
 
 def test_values_are_those_of_normalised_observations():

@@ -33,6 +33,15 @@ def addresses(trainer):
     return [x.data_ptr() for x in (*trainer.algorithm.networks.state_dict().values(), *trained, *moments(trainer))]
 
 
+def test_the_return_of_a_trial_is_of_its_own_episodes(tmp_path):
+    """Each trial of two batches begins with episodes that the policy before began: none counts in its first batch."""
+    run = made(tmp_path, episode_length=16, **{**THREE, "num_steps": 4, "total_frames": 8 * BATCH // 2})
+    Trainer(run).train()
+    episodes = run.read_metrics()["episodes"]
+    assert episodes[::2][:3] == [0.0, 0.0, 0.0]
+    assert min(episodes[1::2][:3]) > 0
+
+
 @pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
 @pytest.mark.parametrize("best", [0, 1, 2])
 def test_the_best_goes_on(algorithm, best, tmp_path):

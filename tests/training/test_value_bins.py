@@ -27,18 +27,25 @@ def test_bins_clip_returns_beyond_them():
     torch.testing.assert_close(bins.encode(torch.tensor([-5.0, 99.0])), bins.encode(torch.tensor([0.0, 10.0])))
 
 
-def case(device, count=151, rows=37):
+def test_bins_below_zero_keep_a_return():
+    bins = ValueBins(-20.0, 10.0, 61)
+    returns = torch.tensor([-20.0, -13.3, -0.2, 0.0, 9.0])
+    torch.testing.assert_close(bins.decode(bins.encode(returns).log())[1:], returns[1:], atol=1e-3, rtol=0)
+    assert bins.decode(bins.encode(returns).log())[0] < -19.5
+
+
+def case(device, count=151, rows=37, low=0.0):
     torch.manual_seed(0)
-    bins = ValueBins(0.0, 150.0, count).to(device)
+    bins = ValueBins(low, 150.0, count).to(device)
     logits = (10 * torch.randn(rows, count)).to(device).requires_grad_()
-    returns = torch.linspace(-20.0, 170.0, rows, device=device)  # also beyond the bins
+    returns = torch.linspace(low - 20.0, 170.0, rows, device=device)  # also beyond the bins
     return bins, logits, returns
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("count", [2, 31, 151])
-def test_cross_entropy_and_its_gradient(device, count):
-    bins, logits, returns = case(device, count)
+@pytest.mark.parametrize(("count", "low"), [(2, 0.0), (31, 0.0), (151, 0.0), (151, -150.0)])
+def test_cross_entropy_and_its_gradient(device, count, low):
+    bins, logits, returns = case(device, count, low=low)
     loss = bins.cross_entropy(logits, returns)
     (gradient,) = torch.autograd.grad(3 * loss, logits)
     exact = logits.detach().double().requires_grad_()

@@ -59,7 +59,7 @@ def summaries() -> dict[str, str]:
 
 def task_options(args: list[str]) -> Any:
     """Returns the type of a task's settings; removes from ``args`` the options that choose the preset."""
-    from torchrl_loco.registry import canonical_id
+    from torchrl_loco.registry import list_envs, resolve, task_name
     from torchrl_loco.training.config import CONFIGS, TrainingConfig
     from torchrl_loco.training.presets import preset, tuning_note
 
@@ -67,12 +67,15 @@ def task_options(args: list[str]) -> Any:
     device, algorithm = (_take(flag, args) for flag in ("--device", "--algorithm"))
     if len(args) > 1 and not args[1].startswith("-"):
         with user_errors():
-            task = args[1] = canonical_id(args[1])
+            task = task_name(args[1])
             config = _options(preset(task, device, algorithm))
             _check_names(args[2:], config)
-        about[task] += f" {tuning_note(config)}\n\n--algorithm, {' or '.join(CONFIGS)} (here {config.algorithm}), and"
-        about[task] += " --device choose the\nsettings and their defaults."
-        configs = {task: config}
+            note = tuning_note(config)
+            words = about[task] if task in list_envs() else (resolve(task).__doc__ or "").strip().partition("\n")[0]
+        label = args[1] = config.label  # the parser's names have neither slash nor colon
+        about[label] = f"{words} {note}\n\n--algorithm, {' or '.join(CONFIGS)} (here {config.algorithm}), and --device"
+        about[label] += " choose the\nsettings and their defaults."
+        configs = {label: config}
     elif len(args) > 1 and args[1] not in ("-h", "--help"):
         with user_errors():
             raise ValueError(f"name the task before its settings: torchrl-loco train TASK {args[1]} ...")

@@ -1,6 +1,7 @@
 """Commands on trained policies: eval, record, play and export."""
 
 import dataclasses
+import re
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,8 +18,13 @@ CONTAINERS = (".mp4", ".mkv", ".mov")
 RunOrTask = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(
-        metavar="RUN_OR_TASK", help="a run folder, a policy file, or the id of a task for the policy of the package."
+        metavar="RUN_OR_TASK",
+        help="a run folder, a policy file, or a task: the id of one for the policy of the package, or any, also "
+        "FILE.py:CLASS, with --policy.",
     ),
+]
+OtherPolicy = Annotated[
+    Path | None, tyro.conf.arg(name="policy", help="a run folder or a policy file, to play in the task that is named.")
 ]
 Protocol = Annotated[
     Literal["playground", "dm_control"],
@@ -26,11 +32,27 @@ Protocol = Annotated[
 ]
 
 
-def _policy(run_or_task: str, protocol: str, device: str | None) -> tuple["torchrl_loco.Policy", Path]:
-    """Returns a policy, and the path from which the default names of its video and of its export derive."""
-    if task := _shipped_task(run_or_task):
-        return torchrl_loco.load_policy(task, device, protocol), Path(task)
-    source = Path(run_or_task)
+def _policy(
+    run_or_task: str, protocol: str, device: str | None, other: Path | None = None
+) -> tuple["torchrl_loco.Policy", Path]:
+    """Returns a policy, and the path from which the default names of its video and of its export derive.
+
+    Its task is the one that is named, if ``other`` says where the policy is.
+    """
+    if other is not None:
+        policy, _ = _policy_at(other, device)
+        policy.info["task"] = _task(run_or_task)
+        return policy, Path(_label(policy))
+    if Path(run_or_task).exists():
+        return _policy_at(Path(run_or_task), device)
+    task = _task(run_or_task)
+    if ":" in task:
+        raise ValueError(f"the package has no policy for {task}: name one of yours with --policy, or its run folder")
+    return torchrl_loco.load_policy(task, device, protocol), Path(task)
+
+
+def _policy_at(source: Path, device: str | None) -> tuple["torchrl_loco.Policy", Path]:
+    """Returns the policy of a run folder or a file, and the path of its file."""
     if not source.is_dir():
         return torchrl_loco.Policy.load(source, device), source
     from torchrl_loco import training
@@ -39,16 +61,19 @@ def _policy(run_or_task: str, protocol: str, device: str | None) -> tuple["torch
     return run.load_policy(device), run.policy
 
 
-def _shipped_task(name: str) -> str:
-    """Returns the id of the task that was named instead of a file or a folder, or an empty string."""
-    if Path(name).exists():
-        return ""
-    from torchrl_loco.registry import canonical_id
+def _task(name: str) -> str:
+    """Returns the name of a task, which stood where a file or a folder could be named too."""
+    from torchrl_loco.registry import task_name
 
     try:
-        return canonical_id(name)
+        return task_name(name)
     except ValueError as error:
         raise ValueError(f"there is no run folder or policy file {name!r}, and {error}") from None
+
+
+def _label(policy: "torchrl_loco.Policy") -> str:
+    """Returns the name of a policy's task for files."""
+    return re.sub(r"[^\w.-]+", "-", policy.info["task"].rpartition(":")[2])
 
 
 def evaluate(
@@ -57,6 +82,7 @@ def evaluate(
     episodes: int | None = None,
     seed: int | None = None,
     protocol: Protocol = "playground",
+    policy: OtherPolicy = None,
     device: str | None = None,
 ) -> None:
     """Evaluate a trained policy over full episodes, without exploration.
@@ -66,13 +92,14 @@ def evaluate(
         episodes: number of episodes; default: as the policy was evaluated after its training.
         seed: seed of the episodes; default: those of that evaluation.
         protocol: which policy of the package.
+        policy: a policy that may be of another task.
         device: where to play them; default: CUDA if there is any.
     """
     with user_errors():
-        policy, _ = _policy(run_or_task, protocol, device)
+        played, _ = _policy(run_or_task, protocol, device, policy)
         from torchrl_loco import training
 
-        summary = training.evaluate_policy(policy, episodes, seed)
+        summary = training.evaluate_policy(played, episodes, seed)
     print(training.describe(summary))
 
 
@@ -111,53 +138,68 @@ class Video:
 
     def env(self, policy: "torchrl_loco.Policy") -> "torchrl_loco.LocoEnv":
         """Returns one world of the policy's task."""
-        info = policy.info
-        return torchrl_loco.make(info["task"], 1, self.device, self.seed, info["protocol"], world_offset=0)
+        from torchrl_loco.training.environments import make_for
+
+        return make_for(policy, 1, self.device, self.seed)
 
 
 VideoOptions = Annotated[Video, tyro.conf.arg(name="")]
 
 
-def record(run_or_task: RunOrTask, /, protocol: Protocol = "playground", video: VideoOptions = Video()) -> None:
+def record(
+    run_or_task: RunOrTask,
+    /,
+    protocol: Protocol = "playground",
+    policy: OtherPolicy = None,
+    video: VideoOptions = Video(),
+) -> None:
     """Record a video of a trained policy.
 
     Args:
         run_or_task: what to record.
         protocol: which policy of the package.
+        policy: a policy that may be of another task.
         video: which part of an episode is shown, and how.
     """
     with user_errors():
         video.check()
-        policy, beside = _policy(run_or_task, protocol, video.device)
-        video.make(policy, _video_file(policy, beside))
+        played, beside = _policy(run_or_task, protocol, video.device, policy)
+        video.make(played, _video_file(played, beside))
 
 
-def play(run_or_task: RunOrTask, /, protocol: Protocol = "playground", video: VideoOptions = Video()) -> None:
+def play(
+    run_or_task: RunOrTask,
+    /,
+    protocol: Protocol = "playground",
+    policy: OtherPolicy = None,
+    video: VideoOptions = Video(),
+) -> None:
     """Show a trained policy: in a window if there is a display, else as a video.
 
     Args:
         run_or_task: what to play.
         protocol: which policy of the package.
+        policy: a policy that may be of another task.
         video: which part of an episode is shown, and how; --out always records a video.
     """
     with user_errors():
         from torchrl_loco import training
 
         video.check()
-        policy, beside = _policy(run_or_task, protocol, video.device)
-        info, shown = policy.info, ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
+        played, beside = _policy(run_or_task, protocol, video.device, policy)
+        info, shown = played.info, ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
         print(info["task"], *(f"{key} {info[key]}" for key in shown if key in info), sep=", ")
         if "mean" in info:
             print(training.describe(info))
         if video.out is None and training.has_display():
-            training.view(policy, video.env(policy), info["action_repeat"])
+            training.view(played, video.env(played), info["action_repeat"])
         else:
-            video.make(policy, _video_file(policy, beside))
+            video.make(played, _video_file(played, beside))
 
 
 def _video_file(policy: "torchrl_loco.Policy", beside: Path) -> Path:
     """Returns the default file of a video: that of a run folder; elsewhere it is named after the task."""
-    return beside.with_name("video.mp4" if is_run(beside.parent) else f"{policy.info['task']}.mp4")
+    return beside.with_name("video.mp4" if is_run(beside.parent) else f"{_label(policy)}.mp4")
 
 
 def export(

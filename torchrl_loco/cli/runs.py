@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,7 +41,9 @@ def train(options: Any, args: list[str]) -> None:
     else:
         with _joined(config.device):
             with user_errors():
-                trainer = _begin(config)
+                from torchrl_loco import training
+
+                trainer = training.begin(config)
             train_to_end(trainer)
 
 
@@ -67,6 +68,7 @@ def resume(run: tyro.conf.Positional[Path], /, gpus: int | None = None, total_fr
             group.check()
         else:
             folder = training.RunFolder(run)
+            training.Given().check(folder)
             device = folder.load_config().device
             missing = missing_processes(gpus, device)
     if is_run_group(run):
@@ -101,28 +103,6 @@ def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("lear
             folders += training.RunGroup(run).plotted if is_run_group(run) else [training.RunFolder(run)]
         training.plot_runs(folders, out)
     print(out)
-
-
-def _begin(config: "training.TrainingConfig") -> "training.Trainer":
-    """Makes the run folder and the trainer of a run; in place of a process that died, those of its run."""
-    from torchrl_loco import training
-
-    trainer, distributed = training.Trainer, training.distributed  # imports the extra: else no folder is made
-    path = Path()
-    if distributed.is_first():
-        began = training.RunFolder.of_launch(config) if distributed.is_restart() else None
-        if began is None and (note := training.tuning_note(config)):
-            print(note)
-        path = (began or training.RunFolder.create(config)).path
-        print(f"run folder: {path}{', which torchrun continues after a failure' if began else ''}", flush=True)
-    run = training.RunFolder(distributed.from_first(path))
-    had_checkpoint = run.has_checkpoint
-    try:
-        return trainer(run, resume=had_checkpoint)
-    except BaseException:
-        if distributed.ranks() == 1 and not had_checkpoint:  # an empty run folder is of no use
-            shutil.rmtree(run.path)
-        raise
 
 
 def _refuse_seeds_of_ranks(gpus: int | None) -> None:

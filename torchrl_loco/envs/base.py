@@ -2,13 +2,16 @@
 
 import dataclasses
 import inspect
+import math
 import multiprocessing
 import os
 import secrets
+import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
+import mujoco
 import numpy as np
 import torch
 import warp as wp
@@ -16,7 +19,6 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_loco import models
 from torchrl_loco.checks import (
     SEED,
     check_bool,
@@ -26,21 +28,33 @@ from torchrl_loco.checks import (
     check_output_file,
 )
 from torchrl_loco.config import SimConfig, sim_config
-from torchrl_loco.envs.autoreset import is_plain, reset_done_worlds, rows_of, step_and_reset
+from torchrl_loco.envs.hooks import Hooks, memory_shapes, own_hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.state import State, without_state, write_state
 from torchrl_loco.envs.world import World
-from torchrl_loco.sim import Simulation, fill
+from torchrl_loco.sim import Simulation, fill, models
 from torchrl_loco.sim.sampling import Table, draw_from_table
+from torchrl_loco.sim.simulation import set_options
+
+if TYPE_CHECKING:
+    from torchrl_loco.envs.view import View
+
+BOUNDED, UNBOUNDED = (-1.0, 1.0), (-math.inf, math.inf)
+"""What ``action_range`` can be."""
 
 
 class LocoEnv(EnvBase):
     """Base of the locomotion environments: batched worlds of one body on one device.
 
-    A subclass sets ``body``, ``mjcf`` (path of the model), ``defaults`` (settings under ``playground``),
-    ``observation_size`` and ``term_names``, and names the function that writes observation and reward
-    (:meth:`observation_func`). Initial states come from a table (:meth:`initial_states`) or from a function of the
-    subclass (:meth:`pose_func`). docs/guides/extending.md shows it with a body outside of the package.
+    A task is a subclass: class attributes, and hooks in plain torch, of which :meth:`reward` and :meth:`observation`
+    must be there. A hook is a pure function of the view ``s`` of all worlds (:class:`torchrl_loco.View`) and returns
+    tensors whose first dimension is the world. They are called in the order :meth:`control`, physics, :meth:`update`,
+    :meth:`reward`, :meth:`terminated`, :meth:`events`, :meth:`observation`; at a reset :meth:`begin`, then
+    :meth:`observation`. docs/guides/your-own-task.md shows it.
+
+    Instead of hooks a task can name Warp functions, which become a part of the kernel that steps the physics
+    (:meth:`observation_func`, :meth:`pose_func`), as the built-in tasks do. The most derived definition of each hook
+    wins.
 
     Args:
         num_envs: number of worlds, the batch size. ``None`` makes one world without a batch dimension.
@@ -49,7 +63,8 @@ class LocoEnv(EnvBase):
         protocol: ``"playground"`` (few solver iterations, fast) or ``"dm_control"`` (the solver converges).
         world_offset: index of the first world among the worlds of all workers. Workers or ranks that share a seed and
             step different worlds pass different offsets: worker k of n worlds each passes ``k * n``. ``None`` means 0.
-        reward_terms: whether to return each factor of the reward under ``("next", "reward_terms", name)``.
+        reward_terms: whether to return each term of the reward, if it has any, under
+            ``("next", "reward_terms", name)``.
         stagger: whether a full ``reset()`` starts each world at a random point of its time limit, so that the worlds
             are not truncated together.
         on_overflow: what to do when the physics dropped contacts or constraints for want of room: ``"warn"``,
@@ -74,11 +89,25 @@ class LocoEnv(EnvBase):
         MemoryError: the device has no room for so many worlds.
     """
 
-    body: ClassVar[str]
-    mjcf: ClassVar[Path]
-    defaults: ClassVar[SimConfig]
-    observation_size: ClassVar[int]
-    term_names: ClassVar[tuple[str, ...]]
+    model: ClassVar[Path | str | mujoco.MjSpec]
+    """The body: path of an MJCF file (relative to the file of the class), MJCF text, or a ``mujoco.MjSpec``."""
+    config: SimConfig
+    """Settings of the simulation under ``playground``. An instance's has all that was overridden."""
+    memory: ClassVar[Mapping[str, int | tuple[int, ...]]] = {}
+    """What a world remembers from step to step, by name: the shape of its row, as in ``{"command": 3, "air_time": 4}``.
+    ``s.command`` reads it; :meth:`update`, :meth:`events` and :meth:`begin` return new rows. The state holds it."""
+    episode_length: ClassVar[int | None] = None
+    """Control steps after which an episode is truncated; ``None`` takes that of :attr:`config`."""
+    action_range: ClassVar[tuple[float, float]] = BOUNDED
+    """(-1, 1), or (-inf, inf) for actions without bounds, which need an own :meth:`control`."""
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    """By algorithm, settings of training on CUDA that were tuned for this task."""
+    body: ClassVar[str] = ""
+    """Name of the body; a ``state_dict`` fits environments of the same body."""
+    observation_size: int
+    """Length of ``observation``; to be set beside :meth:`observation_func`."""
+    term_names: tuple[str, ...] = ()
+    """Names of the reward's terms; to be set beside :meth:`observation_func`."""
 
     _has_frame_skip = True  # the substeps are our own
     _supports_set_state = True
@@ -102,7 +131,10 @@ class LocoEnv(EnvBase):
         device = check_device(device)
         seed = None if seed is None else check_int("seed", seed, SEED)
         arguments = list(inspect.signature(LocoEnv.__init__).parameters)[1:-1]
-        sim_settings = sim_config(self.defaults, protocol, worlds, config, arguments)
+        of_class = type(self).config
+        if self.episode_length is not None:
+            of_class = dataclasses.replace(of_class, episode_length=self.episode_length)
+        sim_settings = sim_config(of_class, protocol, worlds, config, arguments)
         if world_offset is not None:
             world_offset = check_int("world_offset", world_offset, "[0, 2**31)")
             check_int("world_offset + num_envs", world_offset + worlds)
@@ -111,38 +143,78 @@ class LocoEnv(EnvBase):
         reward_terms, stagger = check_bool("reward_terms", reward_terms), check_bool("stagger", stagger)
         check_choice("on_overflow", on_overflow, ON_OVERFLOW)
         nan_dump = None if nan_dump is None else check_output_file("nan_dump", nan_dump)
-        mj_model = models.check(models.load(self.mjcf))
+        mj_model = models.load(self.model, _folder_of(type(self)))
 
         super().__init__(device=device, batch_size=[] if num_envs is None else [worlds])
         self.num_envs, self.world_offset = worlds, world_offset
         self.seed = secrets.randbits(32) if seed is None else seed
         self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
-        self.reward_terms, self.stagger = reward_terms, stagger
+        self.stagger = stagger
         self.on_overflow, self.nan_dump = on_overflow, nan_dump
         self._action_shape = torch.Size([*self.batch_size, mj_model.nu])
         self._pid = os.getpid()
         self._world: World | None = None
         self._episodes: torch.Tensor | None = None  # of a closed environment
+        self.hooks = (
+            Hooks(self, mj_model) if own_hooks(type(self)) or self.memory or models.has_home(mj_model) else None
+        )
+        own = self.hooks.own if self.hooks else frozenset()
+        self.groups = dict(self.hooks.groups) if self.hooks else {}
+        if "observation" not in own:
+            self.groups["observation"] = (self.observation_size,)
+        if self.hooks and self.hooks.term_names is not None:
+            self.term_names = self.hooks.term_names
+        if "observation" in self.groups:
+            self.observation_size = math.prod(self.groups["observation"])
+        self.reward_terms = reward_terms and len(self.term_names) > 0
+        self._stepped_model = self._without_unread_sensors(own)
         self._open()
         self._make_specs()
+
+    def _without_unread_sensors(self, own: frozenset[str]) -> mujoco.MjModel:
+        """Returns the model that is stepped: without sensors that no hook asks an engine for, if hooks do all."""
+        model, stepped = self.mj_model, self.mj_model
+        if self.hooks and model.nsensor and {"reward", "observation"} <= own:
+            kept = sorted(self.hooks.catalog.sensors)
+            stepped = models.load(self.model, _folder_of(type(self)), kept)
+            sizes = [int(size) for size in model.sensor_dim[kept]]
+            self.hooks.catalog.sensor_address = {i: sum(sizes[:k]) for k, i in enumerate(kept)}
+            set_options(model, self.config)
+        return models.check(stepped, own_control="control" in own)
 
     @classmethod
     def check_class(cls) -> None:
         """Checks what a subclass has set.
 
         Raises:
-            TypeError: an attribute is missing or has the wrong type, or a table of initial states would not be used.
-            ValueError: ``observation_size`` is less than 1.
+            TypeError: an attribute or a hook is missing or has the wrong type, or a table of initial states would not
+                be used.
+            ValueError: ``observation_size`` is less than 1, or an attribute is none of the valid values.
         """
-        names = ("body", "mjcf", "defaults", "observation_size", "term_names")
-        missing = [name for name in names if not hasattr(cls, name)]
+        name, own = cls.__name__, own_hooks(cls)
+        missing = [attribute for attribute in ("model", "config") if not hasattr(cls, attribute)]
         if missing:
-            raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.LocoEnv)")
-        check_int(f"{cls.__name__}.observation_size", cls.observation_size)
-        if not isinstance(cls.defaults, SimConfig):
-            raise TypeError(f"{cls.__name__}.defaults must be a torchrl_loco.SimConfig, got {cls.defaults!r}")
-        if not isinstance(cls.term_names, tuple | list) or not all(isinstance(name, str) for name in cls.term_names):
-            raise TypeError(f"{cls.__name__}.term_names must be a tuple of names, got {cls.term_names!r}")
+            raise TypeError(f"{name} must set {', '.join(missing)}: see help(torchrl_loco.LocoEnv)")
+        if not isinstance(cls.config, SimConfig):
+            raise TypeError(f"{name}.config must be a torchrl_loco.SimConfig, got {cls.config!r}")
+        if not isinstance(cls.model, str | Path | mujoco.MjSpec):
+            raise TypeError(f"{name}.model must be a path, MJCF text or a mujoco.MjSpec, got {cls.model!r}")
+        lacking = [hook for hook in ("reward", "observation") if hook not in own]
+        if lacking and cls.observation_func is LocoEnv.observation_func:
+            raise TypeError(f"{name} must define {' and '.join(f'{hook}(self, s)' for hook in lacking)}")
+        if lacking:
+            if not hasattr(cls, "observation_size"):
+                raise TypeError(f"{name} must set observation_size: see help(torchrl_loco.LocoEnv)")
+            check_int(f"{name}.observation_size", cls.observation_size)
+            if not isinstance(cls.term_names, tuple | list) or not all(isinstance(key, str) for key in cls.term_names):
+                raise TypeError(f"{name}.term_names must be a tuple of names, got {cls.term_names!r}")
+        if cls.episode_length is not None:
+            check_int(f"{name}.episode_length", cls.episode_length)
+        if tuple(cls.action_range) not in (BOUNDED, UNBOUNDED):
+            raise ValueError(f"{name}.action_range must be (-1, 1) or (-inf, inf), got {cls.action_range!r}")
+        if tuple(cls.action_range) == UNBOUNDED and "control" not in own:
+            raise TypeError(f"{name} has actions without bounds, so it must define control(self, s, action)")
+        memory_shapes(cls)
         # Of the package's own functions only LocoEnv's reads the table.
         if cls.pose_func is not LocoEnv.pose_func and cls.pose_func.__module__.startswith("torchrl_loco."):
             table = next(base for base in cls.__mro__ if {"pose_func", "initial_states"} & vars(base).keys())
@@ -158,7 +230,46 @@ class LocoEnv(EnvBase):
         engine = self.engine if self.engine == "compiled" else f"{self.engine} ({self.engine_reason})"
         return f"{type(self).__name__}({num_envs=}, {device=}, {seed=}, {protocol=}, {engine=})"
 
-    # What a body adds.
+    # The hooks of a task, in plain torch, in the order in which they are called.
+
+    def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
+        """Returns the controls ``(num_envs, nu)`` of actions; by default [-1, 1] is scaled to each ``ctrlrange``.
+
+        Args:
+            s: the worlds before the physics.
+            action: ``(num_envs, nu)``, clipped to :attr:`action_range`, zero in worlds where one is not finite.
+        """
+        raise NotImplementedError
+
+    def update(self, s: "View") -> Mapping[str, torch.Tensor]:
+        """Returns new rows of :attr:`memory` by name, after the physics: what the reward must know of the past."""
+        raise NotImplementedError
+
+    def reward(self, s: "View") -> torch.Tensor | Mapping[str, torch.Tensor]:
+        """Returns the reward ``(num_envs,)``, or its terms by name, which are summed."""
+        raise NotImplementedError
+
+    def terminated(self, s: "View") -> torch.Tensor:
+        """Returns whether the episode ends, bool ``(num_envs,)``; by default never."""
+        raise NotImplementedError
+
+    def events(self, s: "View") -> Mapping[str, torch.Tensor]:
+        """Returns rows for what comes next, by name: of :attr:`memory` (a new command, the last action), qpos, qvel."""
+        raise NotImplementedError
+
+    def observation(self, s: "View") -> torch.Tensor | Mapping[str, torch.Tensor]:
+        """Returns the observation ``(num_envs, n)``, or several by name: ``privileged`` is the critic's."""
+        raise NotImplementedError
+
+    def begin(self, s: "View") -> Mapping[str, torch.Tensor]:
+        """Returns rows that begin an episode, by name: qpos, qvel, and of :attr:`memory`.
+
+        What is not returned begins as zero, ``qpos`` as ``s.home``. The worlds are at rest; ``s`` shows the memory that
+        the last episode left.
+        """
+        return {}
+
+    # The same as Warp functions, which become a part of the kernel.
 
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward of one world, and its inputs.
@@ -221,14 +332,17 @@ class LocoEnv(EnvBase):
     def _make_specs(self) -> None:
         batch, device = self.batch_size, self.device
         as_float: dict[str, Any] = {"device": device, "dtype": torch.float32}
-        observation = {"observation": Unbounded((*batch, self.observation_size), **as_float)}
+        observation: dict[str, Any] = {
+            name: Unbounded((*batch, *shape), **as_float) for name, shape in self.groups.items()
+        }
         if self.reward_terms:
             terms = {name: Unbounded((*batch, 1), **as_float) for name in self.term_names}
             observation["reward_terms"] = Composite(terms, shape=batch, device=device)
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.observation_spec = Composite(observation, shape=batch, device=device)
-        self.action_spec = Bounded(-1.0, 1.0, (*batch, self.mj_model.nu), **as_float)
-        # Rewards lie in [0, 1], but RewardSum would copy the bounds to the sum.
+        bounded, actions = tuple(self.action_range) == BOUNDED, (*batch, self.mj_model.nu)
+        self.action_spec = Bounded(*BOUNDED, actions, **as_float) if bounded else Unbounded(actions, **as_float)
+        # Those of the built-in tasks lie in [0, 1], but RewardSum would copy the bounds to the sum.
         self.reward_spec = Unbounded((*batch, 1), **as_float)
         self.done_spec = Composite(
             done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, device=device
@@ -288,10 +402,11 @@ class LocoEnv(EnvBase):
     def _outputs(self, *, with_reward: bool = False) -> TensorDict:
         """Returns a copy of what the kernels wrote: the buffers themselves change at the next step."""
         outputs, batch = self.world.outputs, self.batch_size
-        observation, reward, terms, flags = outputs.parts(outputs.memory.clone())
+        *groups, reward, terms, flags = outputs.parts(outputs.memory.clone())
         done, terminated, truncated = flags.view(3, *batch, 1).unbind()
         entries = {"done": done, "terminated": terminated, "truncated": truncated}
-        entries["observation"] = observation.view(*batch, self.observation_size)
+        for (name, shape), group in zip(self.groups.items(), groups, strict=True):
+            entries[name] = group.view(*batch, *shape)
         if with_reward:
             entries["reward"] = reward.view(*batch, 1)
         result = TensorDict._new_unsafe(entries, batch_size=batch, device=self.device)  # they need no checks
@@ -314,9 +429,35 @@ class LocoEnv(EnvBase):
             rewritten: entries that the next step need not begin with.
         """
         own = (getattr(type(self), name) is getattr(LocoEnv, name) for name in ("step", "_reset", "maybe_reset"))
-        if all(own) and is_plain(self, tensordict):
-            return step_and_reset(self, tensordict, rewritten)
-        return super()._step_and_maybe_reset(tensordict)
+        if not all(own) or not self._is_plain(tensordict):
+            return super()._step_and_maybe_reset(tensordict)
+        after = self._step(tensordict)
+        self.world.reset_masked()
+        begin = self._outputs()  # in the worlds that go on, nothing has changed
+        done = after.get("done")
+        if self.reward_terms:
+            begin.get("reward_terms").masked_fill_(done, 0.0)
+        # As in TorchRL, the policy's outputs are zero where a world was reset.
+        for key, value in tensordict.items():
+            if key not in begin and key not in rewritten and key != "reward":
+                begin._set_str(key, value.masked_fill(rows_of(done, value), 0), inplace=False, validated=True)
+        tensordict.set("next", after)
+        return tensordict, begin
+
+    def _is_plain(self, tensordict: TensorDictBase) -> bool:
+        """Returns whether a step needs none of TorchRL's further features.
+
+        Those are partial steps, results given in advance, nested entries, checks of types, hooks.
+        """
+        return (
+            type(tensordict) is TensorDict
+            and tensordict.batch_size == self.batch_size
+            and tensordict.device == self.device
+            and not self.run_type_checks
+            and self._post_step_mdp_hooks is None
+            and all(isinstance(value, torch.Tensor) or key == "reward_terms" for key, value in tensordict.items())
+            and "_step" not in tensordict
+        )
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Resets the worlds that are done, without reading from the device.
@@ -363,7 +504,7 @@ class LocoEnv(EnvBase):
 
     def _open(self) -> None:
         """Makes the worlds. Those of an environment that was open before continue with their next episodes."""
-        self._world = World(self)
+        self._world = World(self, self._stepped_model)
         self.engine, self.engine_reason = self._world.sim.engine_choice
         if self._episodes is not None:
             self._world.episode.torch.copy_(self._episodes)
@@ -457,15 +598,17 @@ class LocoEnv(EnvBase):
 
     def get_state(self) -> State:
         """Returns a copy of the state of all worlds, for ``env.reset(state, set_state=True)``."""
-        state = {key: self._batched(value) for key, value in self.world.state().items()}
-        return State(state, batch_size=self.batch_size, device=self.device)
+        state = State({}, batch_size=self.batch_size, device=self.device)
+        for key, value in self.world.state().items():
+            state.set(key, self._batched(value))
+        return state
 
     def _set_state(self, state: TensorDictBase | None, mask: torch.Tensor | None) -> None:
         """Writes a state into the worlds of ``mask``."""
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if state is not None and not self.batch_size:
-            state = TensorDict({key: state[key][None] for key in State.KEYS if key in state}, batch_size=[1])
+            state = TensorDict({key: state[key].unsqueeze(0) for key in State.KEYS if key in state}, batch_size=[1])
         write_state(state, self.world.state(), mask)
         self.world.refresh(mask)
 
@@ -496,13 +639,13 @@ class LocoEnv(EnvBase):
                 raise ValueError(f"the state has {name}={state.get(name)!r}, this environment has {value!r}")
         self.reset(State(state["worlds"], batch_size=self.batch_size, device=self.device), set_state=True)
         self.seed = state["seed"]
-        self.world.seed.torch.fill_(self.seed)
+        self.world.write_seed(self.seed)
 
     def _identity(self) -> dict[str, Any]:
         """Returns what two environments must share to exchange their ``state_dict``."""
         settings = self.settings()
         same = {name: settings[name] for name in ("protocol", "world_offset")}
-        return {"body": self.body, "batch_size": list(self.batch_size), **same}
+        return {"body": self.body or type(self).__name__, "batch_size": list(self.batch_size), **same}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> Any:
         """Restores a ``state_dict``; see :meth:`set_extra_state`.
@@ -528,3 +671,42 @@ def _warn_if_worlds_repeat() -> None:
             "same seed step identical worlds: give worker k of n worlds each its own function, with world_offset=k*n "
             "(ParallelEnv and collectors take a list of functions)"
         )
+
+
+def rows_of(mask: torch.Tensor, entry: torch.Tensor) -> torch.Tensor:
+    """Returns a mask of worlds, ``(*batch, 1)``, in a shape that broadcasts with an entry, ``(*batch, ...)``."""
+    return mask.view(*mask.shape[:-1], *[1] * (entry.ndim - mask.ndim + 1))
+
+
+def _folder_of(cls: type) -> Path | None:
+    """Returns the folder of the file that sets the model of a class, from which a relative path is meant."""
+    base = next(base for base in cls.__mro__ if "model" in vars(base))
+    file = getattr(sys.modules.get(base.__module__), "__file__", None)
+    return Path(file).parent if file else None
+
+
+def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:
+    """Does what TorchRL's ``maybe_reset`` does, without reading from the device.
+
+    The result is the same. What is left out is TorchRL's check that no world is done after its reset; the environments
+    of this package cannot be.
+
+    Args:
+        env: an environment of this package, or one around it.
+        tensordict: what ``step_mdp`` makes of a step, batch ``(num_envs,)``.
+
+    Returns:
+        The same TensorDict, batch ``(num_envs,)``, with the first observation of the next episode in the worlds that
+        were done.
+    """
+    mask, batch = tensordict.get("done").clone(), tensordict.batch_size
+    request = TensorDict({"_reset": mask}, batch_size=batch, device=tensordict.device)
+    fresh = env._reset(request, set_state=False)
+
+    def merge(old: torch.Tensor, new: torch.Tensor | None) -> torch.Tensor:
+        rows = rows_of(mask, old)
+        return old.masked_fill(rows, 0) if new is None else torch.where(rows, new, old)
+
+    # As in TorchRL, entries that a reset does not return (a policy's other outputs) are zero where a world was reset.
+    merged = tensordict._fast_apply(merge, fresh.exclude("_reset"), default=None)
+    return merged.update(fresh.exclude(*merged.keys(True, True)).exclude("_reset"))

@@ -19,6 +19,7 @@ class State(TensorDict):
     ``qvel``            ``(N, nv)``  velocities (m/s, rad/s)
     ``qacc_warmstart``  ``(N, nv)``  initial guess of the constraint solver
     ``act``             ``(N, na)``  activations of the actuators, if the model has any
+    ``memory``          nested       entries of the task's memory by name, if it has any
     ``elapsed_steps``   ``(N,)``     control steps since the world's reset
     ``episode``         ``(N,)``     episodes begun: index of the next random stream
     ==================  ===========  =====================================================
@@ -32,7 +33,7 @@ class State(TensorDict):
     """
 
     PHYSICS = ("qpos", "qvel", "qacc_warmstart", "act")
-    KEYS = (*PHYSICS, "elapsed_steps", "episode")
+    KEYS = (*PHYSICS, "memory", "elapsed_steps", "episode")
 
     def branch(self, world: int, num_envs: int | None = None) -> "State":
         """Returns a state in which every world is a copy of one, to try different futures from the same moment.
@@ -77,7 +78,9 @@ def without_state(tensordict: TensorDictBase | None, device: torch.device | None
     return TensorDict(kept, batch_size=tensordict.batch_size, device=device)
 
 
-def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor], mask: torch.Tensor) -> None:
+def write_state(
+    state: TensorDictBase | None, targets: Mapping[str | tuple[str, str], torch.Tensor], mask: torch.Tensor
+) -> None:
     """Writes a state into the worlds of a mask. Missing entries become zero; a missing episode is left as it is.
 
     Args:
@@ -88,7 +91,13 @@ def write_state(state: TensorDictBase | None, targets: Mapping[str, torch.Tensor
     Raises:
         ValueError: qpos or qvel is missing, a shape is wrong, or a value is not finite. Then nothing is written.
     """
-    given = {key: None if state is None else state.get(key, None) for key in targets}
+    given: dict[Any, Any] = {key: None if state is None else state.get(key, None) for key in targets}
+    memory = None if state is None else state.get("memory", None)
+    if memory is not None:
+        known = [key[1] for key in targets if isinstance(key, tuple)]
+        for name in memory.keys():  # noqa: SIM118, of a TensorDict
+            if name not in known:
+                raise ValueError(f"the state has memory {name!r}, the task {', '.join(known) or 'has none'}")
     new = {key: value.detach().to(mask.device) for key, value in given.items() if value is not None}
     if not {"qpos", "qvel"} <= new.keys():
         raise ValueError(

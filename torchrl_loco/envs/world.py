@@ -2,11 +2,12 @@
 
 import atexit
 import contextlib
+import logging
 import os
 import warnings
 import weakref
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Protocol
 
 import mujoco
@@ -29,6 +30,7 @@ from torchrl_loco.envs.episode import (
     poser,
     zero_non_finite,
 )
+from torchrl_loco.envs.hooks import Hooks, Part
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import (
@@ -36,7 +38,9 @@ from torchrl_loco.sim import (
     Buffer,
     Graph,
     PackedBuffers,
+    Recorded,
     Simulation,
+    TorchGraph,
     WorldFunc,
     fill,
     holds,
@@ -48,16 +52,17 @@ from torchrl_loco.sim import (
 class Task(Protocol):
     """What :class:`World` needs of an environment: its model, its settings and its functions."""
 
-    mj_model: mujoco.MjModel
     config: SimConfig
     num_envs: int
     device: torch.device
     seed: int
     world_offset: int | None
-    observation_size: int
+    groups: dict[str, tuple[int, ...]]
     term_names: tuple[str, ...]
     on_overflow: str
     nan_dump: Path | None
+    observation_size: int
+    hooks: Hooks | None
 
     def observation_func(self, world: "World") -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""
@@ -77,50 +82,61 @@ class World:
 
     Args:
         task: the environment. No reference to it is kept.
+        mj_model: the model that is stepped: the task's, without the sensors that nothing reads.
 
     Attributes:
         sim: the physics.
         action: actions of the last control step, ``(nworld, nu)``, unless torch recorded it; ``sim.ctrl`` holds the
             controls that they became.
-        outputs: the memory of what a step returns: observation, reward, terms; done, terminated and truncated.
-        observation: observations, ``(nworld, observation_size)``.
+        outputs: the memory of what a step returns: each group of the observation, reward, terms; done, terminated and
+            truncated.
+        groups: the groups of the observation by name, tensors ``(nworld, *row)``.
         reward: rewards, ``(nworld,)``.
-        terms: factors of the rewards, ``(nworld, len(term_names))``.
+        terms: terms of the rewards, ``(nworld, len(term_names))``.
+        memory: entries of the task's memory by name, tensors ``(nworld, *row)``.
         mask: worlds to reset, ``(nworld,)``.
         stream: start of the random stream of the current episode, ``(nworld,)`` uint32.
         episode: episodes drawn so far, ``(nworld,)``.
         elapsed_steps: control steps since the world's reset, ``(nworld,)``.
         non_finite: whether the world is non-finite, ``(nworld,)``.
+        ended: whether the task's hook ends the episode, ``(nworld,)``.
         done: terminated or truncated, ``(nworld,)``.
-        terminated: whether the episode ended because the world is not finite, ``(nworld,)``.
+        terminated: whether the episode ended by the task's hook, or because the world is not finite, ``(nworld,)``.
         truncated: whether the episode reached the time limit, ``(nworld,)``.
         seed: seed of all random streams, ``(1,)``.
         health: counts what went wrong in the physics.
     """
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Task, mj_model: mujoco.MjModel) -> None:
         self._closed = True  # until it is made in full
-        n, nu = task.num_envs, task.mj_model.nu
-        self._episode_length, self._ctrl_dt = task.config.episode_length, task.config.ctrl_dt
-        self._world_offset = task.world_offset or 0
+        n, nu, hooks = task.num_envs, mj_model.nu, task.hooks
+        self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own if hooks else frozenset()
+        self._title = type(task).__name__
         # Buffers made in inference mode could not be written outside it; without the device, torch's views would be on
         # the caller's default device.
         with torch.inference_mode(False), EXCLUSIVE, task.device:
-            self.sim = Simulation(task.mj_model, task.config, n, task.device)
+            asked = {"contact_geoms": hooks.catalog.contact_geoms} if hooks and hooks.catalog.contact_geoms else {}
+            self.sim = Simulation(mj_model, task.config, n, task.device, **asked)
             device = self.sim.device
             self.action = Buffer((n, nu), float, device)
-            sizes = [task.observation_size, 1, len(task.term_names)]
+            shapes = task.groups
+            sizes = [*(torch.Size(shape).numel() for shape in shapes.values()), 1, len(task.term_names)]
             self.outputs = PackedBuffers([n * size for size in sizes], 3 * n, task.device)
-            observation, reward, terms, flags = self.outputs.parts(self.outputs.memory)
-            self.observation, self.terms = (Buffer.around(part.view(n, -1)) for part in (observation, terms))
-            self.reward = Buffer.around(reward)
+            *groups, reward, terms, flags = self.outputs.parts(self.outputs.memory)
+            self.groups = {name: part.view(n, *shapes[name]) for name, part in zip(shapes, groups, strict=True)}
+            self.reward, self.terms = Buffer.around(reward), Buffer.around(terms.view(n, -1))
             self.done, self.terminated, self.truncated = map(Buffer.around, flags.view(3, n))
+            self.memory = {
+                name: torch.zeros(n, *shape, device=task.device)
+                for name, shape in (hooks.catalog.memory if hooks else {}).items()
+            }
             self.mask = Buffer(n, bool, device)
             self.stream = Buffer(n, wp.uint32, device)
             self.episode = Buffer(n, int, device)
             self.elapsed_steps = Buffer(n, int, device)
-            self.non_finite = Buffer(n, bool, device)
+            self.non_finite, self.ended = Buffer(n, bool, device), Buffer(n, bool, device)
             self.seed = Buffer(1, wp.uint32, device)
+            self._seed_of_hooks = torch.zeros(1, dtype=torch.long, device=task.device)
             self._stagger = Buffer(1, bool, device)
             self.mask.warp.fill_(True)
 
@@ -132,11 +148,10 @@ class World:
                 self._monitors.append(guard)
 
             self._make_funcs(task)
-            self.sim.compile(self._launch_step, self._launch_reset)
-            self._step_graph = self.sim.capture(self._launch_step)
-            self._reset_graph = self.sim.capture(self._launch_reset)
-            self._refresh_graph: Graph | None = None  # most environments never need it
+            self._make_parts(task)
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
+            if hooks and device.is_cuda:
+                self._compile_parts()
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
             for monitor in self._monitors:
                 monitor.restart()
@@ -144,50 +159,232 @@ class World:
         self._pid, self._closed = os.getpid(), False
         _WORLDS.add(self)
 
-    # What each world does besides the physics.
+    # The control step and the reset, from top to bottom. Warp's launches are recorded; the parts of hooks are torch.
+
+    def _take_step(self, *action: wp.array) -> None:
+        """The control step: under the actions in the buffer, unless torch records it with others."""
+        self._control()  # own control(): actions to controls
+        self._physics(*action)  # default control; the substeps; fused reward and observation
+        self._judge()  # update(), reward(), terminated(), events()
+        self._move()  # poses and velocities again, if events() changed the state
+        self._observe()  # observation(); worlds that are not finite
+        self._conclude()  # time limit, flags, counters
+
+    def _begin_masked(self) -> None:
+        """A new episode in the worlds of the mask."""
+        self._rest()  # home pose, random stream, clock; fused begin
+        self._begin()  # begin(): pose and memory
+        self._settle()  # poses and sensors; fused observation
+        self._observe_begun()  # observation()
+
+    # What each world does besides the physics, in Warp.
 
     def _make_funcs(self, task: Task) -> None:
-        data = self.sim.data
-        buffers = {name: value.warp for name, value in vars(self).items() if isinstance(value, Buffer)}
-        mine = SimpleNamespace(**buffers, episode_length=self._episode_length, world_offset=self._world_offset)
-        mine.outputs, mine.flags = fill(Outputs, mine), fill(Flags, mine)
-        counters = {"counter_bits": self.health.counter_bits, "counts": self.health.counts.warp}
-        size, coalesced = task.observation_size, self.sim.engine.coalesced
-        func, inputs = check_pair("observation_func", task.observation_func(self))
-        if not type(task).__module__.startswith("torchrl_loco."):  # the tests check those of the package
-            check_rows(func, inputs, task.num_envs - 1, size, len(task.term_names), self.sim.device)
-        self._observe = observer(func, inputs, mine.outputs, mine.non_finite, size, coalesced=coalesced)
-        self._check_finite = WorldFunc(zero_non_finite, fill(FiniteCheck, mine, qpos=data.qpos, qvel=data.qvel))
-        self._finish = WorldFunc(finish_step, fill(StepEnd, mine, overflow=data.overflow, **counters))
-        self._begin = [WorldFunc(begin_episode, fill(EpisodeStart, mine, stagger=self._stagger.warp))]
-        self._begins_at_rest = True
-        pose = task.pose_func(self)
+        data, n, device = self.sim.data, task.num_envs, self.sim.device
+        flags = fill(
+            Flags,
+            non_finite=self.non_finite.warp,
+            done=self.done.warp,
+            terminated=self.terminated.warp,
+            truncated=self.truncated.warp,
+        )
+        self._fused: list[WorldFunc] = []
+        self._check_finite: list[WorldFunc] = []
+        if not {"reward", "observation"} <= self._own:
+            outputs, size, terms = self._fused_outputs(task)
+            func, inputs = check_pair("observation_func", task.observation_func(self))
+            if not _of_package(type(task)):  # the tests check those of the package
+                check_rows(func, inputs, n - 1, size, terms, device)
+            coalesced = self.sim.engine.coalesced
+            self._fused = [observer(func, inputs, outputs, self.non_finite.warp, size, coalesced=coalesced)]
+            finite = fill(FiniteCheck, data, outputs=outputs, non_finite=self.non_finite.warp)
+            self._check_finite = [] if self._own else [WorldFunc(zero_non_finite, finite)]
+        end = fill(
+            StepEnd,
+            episode_length=task.config.episode_length,
+            counter_bits=self.health.counter_bits,
+            overflow=data.overflow,
+            ended=self.ended.warp,
+            flags=flags,
+            elapsed_steps=self.elapsed_steps.warp,
+            mask=self.mask.warp,
+            counts=self.health.counts.warp,
+        )
+        self._finish = WorldFunc(finish_step, end)
+        start = fill(
+            EpisodeStart,
+            stagger=self._stagger.warp,
+            seed=self.seed.warp,
+            world_offset=task.world_offset or 0,
+            episode_length=task.config.episode_length,
+            episode=self.episode.warp,
+            stream=self.stream.warp,
+            elapsed_steps=self.elapsed_steps.warp,
+            flags=flags,
+        )
+        self._start = [WorldFunc(begin_episode, start)]
+        self._starts_at_rest = "begin" not in self._own
+        pose = task.pose_func(self) if "begin" not in self._own else None
         if pose is not None:
             func, inputs = check_pair("pose_func", pose)
-            self._begin.append(poser(func, inputs, self.stream.warp))
-            self._begins_at_rest = not holds(inputs, data.qvel)
+            self._start.append(poser(func, inputs, self.stream.warp))
+            self._starts_at_rest = not holds(inputs, data.qvel)
 
-    # What the graphs record.
+    def _fused_outputs(self, task: Task) -> tuple[Any, int, int]:
+        """Returns where a fused function writes, and the sizes of its rows; what a hook returns instead is not used."""
+        cls, n, device = type(task), task.num_envs, self.sim.device
+        observation = Buffer.around(self.groups["observation"]) if "observation" not in self._own else None
+        if observation is None:
+            observation = Buffer((n, cls.observation_size), float, device)
+        reward, terms = self.reward, self.terms
+        if "reward" in self._own:
+            reward, terms = Buffer(n, float, device), Buffer((n, len(cls.term_names)), float, device)
+        self._kept_alive = observation, reward, terms
+        outputs = fill(Outputs, observation=observation.warp, reward=reward.warp, terms=terms.warp)
+        return outputs, observation.warp.shape[1], terms.warp.shape[1]
 
     def _launch_step(self, action: wp.array | None = None) -> None:
-        """The control step, under actions ``(nworld, nu)`` or those in the buffer."""
+        """The physics of a step, under actions ``(nworld, nu)`` or those in the buffer; without hooks, all of it."""
         sim, action = self.sim, self.action.warp if action is None else action
         control = {"ctrlrange": sim.model.actuator_ctrlrange, "ctrl": sim.data.ctrl, "non_finite": self.non_finite.warp}
-        apply = WorldFunc(apply_action, fill(Control, action=action, **control))
+        apply = [WorldFunc(apply_action, fill(Control, action=action, **control))]
         sim.step(
-            before=[apply],
-            after=[self._observe, self._check_finite, self._finish],
+            before=[] if "control" in self._own else apply,
+            after=[*self._fused, *self._check_finite, *([] if self._own else [self._finish])],
             first=[func for monitor in self._monitors for func in monitor.first_of_step(action)],
-            last=[func for monitor in self._monitors for func in monitor.last_of_step()],
+            last=[] if self._own else self._last_of_step(),
         )
 
+    def _launch_conclude(self) -> None:
+        self.sim.apart([self._finish, *self._last_of_step()])
+
+    def _last_of_step(self) -> list[WorldFunc]:
+        return [func for monitor in self._monitors for func in monitor.last_of_step()]
+
+    def _launch_rest(self) -> None:
+        self.sim.rest(self.mask.warp, self._start)
+
     def _launch_reset(self) -> None:
-        """A new episode in the worlds of the mask."""
-        self.sim.reset(self.mask.warp, before=self._begin, after=[self._observe], at_rest=self._begins_at_rest)
+        """A reset as one launch, or what follows the begin of hooks."""
+        if self._own:
+            self.sim.forward(self.mask.warp, after=self._fused)
+        else:
+            self.sim.reset(self.mask.warp, before=self._start, after=self._fused, at_rest=self._starts_at_rest)
+
+    def _launch_move(self) -> None:
+        self.sim.forward(self._moved.warp, after=self._fused)
 
     def _launch_refresh(self) -> None:
-        """The outputs after the state of the masked worlds was written."""
-        self.sim.forward(self.mask.warp, after=[self._observe, self._check_finite])
+        self.sim.forward(self.mask.warp, after=[*self._fused, *self._check_finite])
+
+    # The parts of the step, and what they become on the device.
+
+    def _make_parts(self, task: Task) -> None:
+        sim, hooks, own = self.sim, task.hooks, self._own
+        self._moved = Buffer(task.num_envs, bool, sim.device)
+        arrays = self._arrays(task) if hooks else {}
+
+        def part(name: str, *needed: str) -> Callable[[], None]:
+            wanted = hooks is not None and bool(own & set(needed))
+            return Part(getattr(hooks, name), arrays, self._title) if wanted else _nothing
+
+        launches: list[Callable[..., None]] = [self._launch_step, self._launch_reset]
+        if own:
+            launches += [self._launch_rest, self._launch_conclude]
+        moves = hooks is not None and hooks.moves
+        if moves:
+            launches.append(self._launch_move)
+        sim.compile(*launches)
+        self._physics, self._settle = self._record(self._launch_step), self._record(self._launch_reset)
+        self._rest = self._record(self._launch_rest) if own else _nothing
+        self._conclude = self._record(self._launch_conclude) if own else _nothing
+        self._move = self._keeping_reward(self._record(self._launch_move)) if moves else _nothing
+        self._refresh_graph: Graph | None = None  # most environments never need it
+        self._control = part("control", "control")
+        self._judge = part("judge", "update", "reward", "terminated", "events")
+        self._observe = part("observe", *own)
+        self._begin = part("begin", *(own if self.memory else ["begin"]))
+        self._observe_begun = part("observe_begun", "observation")
+        self._run_step, self._run_reset = self._as_graph("_take_step"), self._as_graph("_begin_masked")
+
+    def _arrays(self, task: Task) -> dict[str, torch.Tensor]:
+        """Returns the arrays that hooks read and write, by name."""
+        sim = self.sim
+        assert task.hooks is not None
+        catalog = task.hooks.catalog
+        arrays = {name: getattr(sim, name) for name in ("qpos", "qvel", "ctrl", "time", "xpos", "xmat")}
+        arrays |= {name: getattr(sim, name) for name in catalog.arrays & {"cvel", "subtree_com"}}
+        if "sensordata" in catalog.arrays:
+            arrays["sensordata"] = wp.to_torch(sim.data.sensordata)
+        if catalog.contact_geoms:
+            arrays |= {"contact_force": sim.contact_force, "in_contact": sim.in_contact}
+        first = task.world_offset or 0
+        arrays |= {
+            "action": self.action.torch,
+            "seed": self._seed_of_hooks,
+            "world": torch.arange(first, first + task.num_envs, device=task.device),
+            "episode": self.episode.torch,
+            "elapsed_steps": self.elapsed_steps.torch,
+            "mask": self.mask.torch,
+            "moved": self._moved.torch,
+            "non_finite": self.non_finite.torch,
+            "ended": self.ended.torch,
+            "reward": self.reward.torch,
+            "terms": self.terms.torch,
+        }
+        arrays |= {f"out.{name}": group for name, group in self.groups.items()}
+        return arrays | {f"memory.{name}": rows for name, rows in self.memory.items()}
+
+    def _record(self, launch: Callable[..., None]) -> Recorded:
+        return Recorded(launch, self.sim.capture(launch), self.sim.device)
+
+    def _keeping_reward(self, move: Callable[[], None]) -> Callable[[], None]:
+        """Returns ``move`` such that a fused function, which runs again, leaves the reward of the step as it was."""
+        if not self._fused:
+            return move
+        rewards = self.reward.torch, self.terms.torch
+
+        def moved() -> None:
+            kept = [values.clone() for values in rewards]
+            move()
+            for values, value in zip(rewards, kept, strict=True):
+                values.copy_(value)
+
+        return moved
+
+    def _compile_parts(self) -> None:
+        """Compiles what hooks do, on CUDA. It runs each part once, on whatever the worlds hold."""
+        for part in (self._control, self._judge, self._observe, self._begin, self._observe_begun):
+            if isinstance(part, Part):
+                part.compile()
+
+    def _as_graph(self, name: str) -> Callable[[], None]:
+        """Returns a method of this world as one CUDA graph, where hooks take part in it; else as it is."""
+        this = weakref.ref(self)
+
+        def work() -> None:
+            world = this()
+            assert world is not None
+            getattr(world, name)()
+
+        if not self._own or not self.sim.device.is_cuda:
+            return work
+        graph, recorded = TorchGraph(work, self.sim.qpos.device, warmup=1), True
+
+        def run() -> None:
+            nonlocal recorded
+            if not recorded:
+                work()
+                return
+            try:
+                graph()
+            except RuntimeError as error:
+                recorded = False
+                message = str(error).strip().split("\n")[0]
+                logging.getLogger("torchrl_loco").warning("a hook cannot be recorded as a CUDA graph: %s", message)
+                work()
+
+        return run
 
     # What the environment calls. Nothing waits for the device but the first refresh, which is recorded then.
 
@@ -195,12 +392,14 @@ class World:
         """Steps all worlds under actions of shape ``(nworld, nu)``."""
         action = action.detach()  # else the buffer would keep every past policy's autograd graph
         if torch_is_recording(self.sim.device):
-            action = action.float().contiguous()
-            with joined_to_torch(self.sim.device):
-                self._launch_step(wp.from_torch(action))
+            if self._own:  # hooks read the buffer
+                self.action.torch.copy_(action)
+                self._take_step()
+            else:
+                self._take_step(wp.from_torch(action.float().contiguous()))
             return
         self.action.torch.copy_(action)
-        self._step_graph.replay()
+        self._run_step()
         self.poll()
 
     def reset(self, mask: torch.Tensor | None, stagger: bool) -> None:
@@ -220,22 +419,26 @@ class World:
     def reset_masked(self) -> None:
         """Begins the next episode in the worlds of the mask: after a step, those that are done."""
         if torch_is_recording(self.sim.device):
-            with joined_to_torch(self.sim.device):
-                self._launch_reset()
+            self._begin_masked()
         else:
-            self._reset_graph.replay()
+            self._run_reset()
 
     def poll(self, steps: int = 1) -> None:
         """Tells the monitors that ``steps`` control steps have passed; they may report."""
         for monitor in self._monitors:
             monitor.poll(steps)
 
-    def state(self) -> dict[str, torch.Tensor]:
+    def state(self) -> dict[str | tuple[str, str], torch.Tensor]:
         """Returns the buffers that make up the state of the worlds, by key of :class:`torchrl_loco.State`."""
         sim = self.sim
-        physics = {"qpos": sim.qpos, "qvel": sim.qvel, "qacc_warmstart": sim.qacc_warmstart}
+        physics: dict[str | tuple[str, str], torch.Tensor] = {
+            "qpos": sim.qpos,
+            "qvel": sim.qvel,
+            "qacc_warmstart": sim.qacc_warmstart,
+        }
         if sim.mj_model.na:
             physics["act"] = sim.act
+        physics |= {("memory", name): rows for name, rows in self.memory.items()}
         return {**physics, "elapsed_steps": self.elapsed_steps.torch, "episode": self.episode.torch}
 
     def refresh(self, mask: torch.Tensor) -> None:
@@ -248,10 +451,11 @@ class World:
         if torch_is_recording(self.sim.device):
             with joined_to_torch(self.sim.device):
                 self._launch_refresh()
-            return
-        if self._refresh_graph is None:
-            self._refresh_graph = self._record_refresh()
-        self._refresh_graph.replay()
+        else:
+            if self._refresh_graph is None:
+                self._refresh_graph = self._record_refresh()
+            self._refresh_graph.replay()
+        self._observe_begun()
 
     def _record_refresh(self) -> Graph:
         device = self.sim.device
@@ -270,8 +474,13 @@ class World:
 
     def set_seed(self, seed: int) -> None:
         """Restarts all random streams at episode 0."""
-        self.seed.torch.fill_(seed)
+        self.write_seed(seed)
         self.episode.torch.zero_()
+
+    def write_seed(self, seed: int) -> None:
+        """Changes the seed of all random streams, which go on."""
+        self.seed.torch.fill_(seed)
+        self._seed_of_hooks.fill_(seed)
 
     def render(self, camera: str, width: int, height: int) -> torch.Tensor:
         """Returns pixels of all worlds, uint8 of shape ``(nworld, height, width, 3)``."""
@@ -315,3 +524,15 @@ def _close_all() -> None:
     """Closes all worlds before torch is torn down."""
     for world in list(_WORLDS):
         _close_quietly(world)
+
+
+def _nothing(*args: Any) -> None:
+    """What a part of the step is where no hook takes part in it."""
+
+
+def _of_package(cls: type) -> bool:
+    """Returns whether the function that observes in a class, and the sizes that it must fit, are this package's."""
+    for base in cls.__mro__:
+        if {"observation_func", "observation_size", "term_names"} & vars(base).keys():
+            return base.__module__.startswith("torchrl_loco.")
+    return False

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import threading
+import weakref
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -101,6 +102,33 @@ class Graph:
         """Runs the recorded work on torch's current stream of the device, without waiting for it."""
         with contextlib.nullcontext() if self._device.is_cuda else EXCLUSIVE:
             wp.capture_launch(self._graph, stream=current_stream(self._device))
+
+
+class Recorded:
+    """Warp launches as a call: a recording of them is replayed, or they join the CUDA graph that torch records.
+
+    Args:
+        launch: a method that makes the launches and does not read from the device. Its object is not kept alive.
+        graph: a recording of it.
+        device: the Warp device.
+    """
+
+    def __init__(self, launch: Callable[..., None], graph: Graph, device: wp.Device) -> None:
+        self._launch, self._graph, self._device = weakref.WeakMethod(launch), graph, device
+
+    def __call__(self, *args: Any) -> None:
+        """Runs them on torch's current stream, without waiting for the device.
+
+        Args:
+            args: of the method, where they join torch's recording; in a replay they are those of its recording.
+        """
+        if torch_is_recording(self._device):
+            launch = self._launch()
+            assert launch is not None
+            with joined_to_torch(self._device):
+                launch(*args)
+        else:
+            self._graph.replay()
 
 
 class TorchGraph:

@@ -10,12 +10,13 @@ import mujoco
 import warp as wp
 
 from torchrl_loco.config import SimConfig
-from torchrl_loco.models import FORCE_SENSORS
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.buffer import Buffer
+from torchrl_loco.sim.contact_forces import ContactForces, contact_forces_bytes
 from torchrl_loco.sim.graph import torch_is_recording
+from torchrl_loco.sim.models import FORCE_SENSORS
 from torchrl_loco.sim.row_order import RowOrder
-from torchrl_loco.sim.world_func import WorldFunc, launch_together
+from torchrl_loco.sim.world_func import WorldFunc, holds, launch_together
 
 UNROLLED_ITERATIONS = 10
 """Up to this many solver iterations, the recorded step contains all of them, without an early exit."""
@@ -127,10 +128,13 @@ class MujocoWarpEngine:
         config: settings of the simulation.
         num_envs: number of worlds.
         device: where they live.
+        contact_geoms: geoms whose contact forces are computed.
 
     Attributes:
         model: the model on the device.
         data: the state of all worlds.
+        contact_forces: what is computed of them, if any were asked for.
+        with_subtree_com: whether ``data.subtree_com`` is up to date in a world at rest too.
         peak_constraints: most constraint rows that a substep needed, by world, ``(nworld,)``.
         peak_contacts: most contacts that a substep needed, over all worlds, ``(1,)``.
         coalesced: false: the numbers of a world are contiguous.
@@ -138,7 +142,14 @@ class MujocoWarpEngine:
 
     coalesced = False
 
-    def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
+    def __init__(
+        self,
+        mj_model: mujoco.MjModel,
+        config: SimConfig,
+        num_envs: int,
+        device: wp.Device,
+        contact_geoms: Sequence[int] = (),
+    ) -> None:
         self._num_envs, self._device = num_envs, device
         self._substeps = config.substeps
         with wp.ScopedDevice(device):
@@ -154,8 +165,11 @@ class MujocoWarpEngine:
         # Threads per small matrix of a world: measured in benchmarks/README.md.
         self.model.block_dim.update_gradient_cholesky = 32
         self.model.block_dim.update_gradient_JTDAJ_dense = 64
+        self.contact_forces = ContactForces(mj_model, contact_geoms, self.data) if contact_geoms else None
+        self.with_subtree_com = False
+        self._has_force_sensors = not FORCE_SENSORS.isdisjoint(mj_model.sensor_type)
         self._kept_sensors: tuple[wp.array, wp.array] | None = None
-        if not FORCE_SENSORS.isdisjoint(mj_model.sensor_type):
+        if self._has_force_sensors or self.contact_forces is not None:
             self._kept_sensors = wp.clone(self.data.sensordata), wp.clone(self.data.overflow)
         self._row_order = RowOrder(self.model, self.data) if config.deterministic else None
         self._all = wp.ones(num_envs, dtype=bool, device=device)
@@ -166,6 +180,16 @@ class MujocoWarpEngine:
     def remedy(self, dropped: str, most: int) -> str:
         """Returns advice for the warning about dropped constraints or contacts, of which a substep needed ``most``."""
         return f"a physics step needed up to {most}: pass {ROOM[dropped]}={with_margin(most)}"
+
+    def contact_arrays(self) -> tuple[wp.array, wp.array]:
+        """Returns net contact forces ``(nworld, geoms)`` vec3 and whether there is a contact, ``(nworld, geoms)``."""
+        assert self.contact_forces is not None
+        return self.contact_forces.force, self.contact_forces.in_contact
+
+    def subtree_com(self) -> wp.array:
+        """Returns ``data.subtree_com``, which from now on is up to date in worlds at rest too."""
+        self.with_subtree_com = True
+        return self.data.subtree_com
 
     def step(
         self,
@@ -189,9 +213,11 @@ class MujocoWarpEngine:
         """
         launch_together([*first, *before], self._all)
         for i in range(self._substeps):
-            with self._substep_only(sensors=self._kept_sensors is not None and i == self._substeps - 1):
+            with self._substep_only(sensors=self._has_force_sensors and i == self._substeps - 1):
                 self._substep()
                 self._record_peaks()
+        if self.contact_forces is not None:
+            self.contact_forces.update(self.model, self.data, self._all)
         self._evaluate()
         launch_together([*after, *last], self._all)
 
@@ -254,6 +280,8 @@ class MujocoWarpEngine:
             elif at_rest:
                 self._rest(mask)
                 mjw.kinematics(self.model, self.data)
+                if self.with_subtree_com or any(holds(args, self.data.subtree_com) for _, args in after):
+                    mjw.com_pos(self.model, self.data)
             else:
                 self._evaluate()
             launch_together(after, mask)
@@ -289,6 +317,8 @@ class MujocoWarpEngine:
         model.opt.disableflags |= mjw.DisableBit.ACTUATION
         mjw.forward(model, data)
         model.opt.disableflags = flags
+        if self.contact_forces is not None:
+            self.contact_forces.update(model, data, mask)
         wp.launch(
             restore_others,
             dim=self._num_envs,
@@ -314,18 +344,24 @@ class MujocoWarpEngine:
         )
 
 
-def data_bytes(mj_model: mujoco.MjModel, config: SimConfig, num_envs: int) -> int:
+def data_bytes(mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, contact_geoms: int = 0) -> int:
     """Returns the memory that ``mjData`` of so many worlds takes (bytes), without allocating it.
 
     Its size is linear in the number of worlds and in ``naconmax``; three small instances give the coefficients.
+
+    Args:
+        mj_model: the model.
+        config: settings of the simulation.
+        num_envs: number of worlds.
+        contact_geoms: number of geoms whose contact forces are asked for.
     """
 
     def size(worlds: int, contacts: int) -> int:
         with wp.ScopedDevice("cpu"):
             return _array_bytes(mjw.make_data(mj_model, nworld=worlds, naconmax=contacts, njmax=config.njmax))
 
-    base = size(1, 1)
-    return base + (num_envs - 1) * (size(2, 1) - base) + (config.naconmax - 1) * (size(1, 2) - base)
+    base, forces = size(1, 1), contact_forces_bytes(mj_model, contact_geoms, num_envs, config.naconmax)
+    return base + (num_envs - 1) * (size(2, 1) - base) + (config.naconmax - 1) * (size(1, 2) - base) + forces
 
 
 def _array_bytes(thing: Any) -> int:

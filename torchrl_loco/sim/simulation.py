@@ -3,6 +3,7 @@
 import gc
 import logging
 import math
+import operator
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import compiled, mjw, mujoco_warp
 from torchrl_loco.sim.compilation import compile_kernels
 from torchrl_loco.sim.graph import Graph, ScratchPool
-from torchrl_loco.sim.world_func import WorldFunc, fill
+from torchrl_loco.sim.world_func import WorldFunc, WorldKernel, fill
 
 SCRATCH = 1.4
 """Memory of a simulation as a multiple of its ``mjData``; the rest is scratch memory (measured: 1.3 to 1.4)."""
@@ -72,36 +73,59 @@ class Simulation:
     ``xmat``            ``(nworld, nbody, 3, 3)``  orientations of the bodies
     ``time``            ``(nworld,)``              time since the world's reset (s)
     ``overflow``        ``(nworld,)``              ``Overflow`` bits, kept until you zero them
+    ``contact_force``   ``(nworld, geoms, 3)``     net force of all contacts on each of ``contact_geoms``, in the
+                                                   world's frame (N)
+    ``in_contact``      ``(nworld, geoms)``        whether it has any contact, bool
+    ``cvel``            ``(nworld, nbody, 6)``     velocities of the bodies about their tree's center of mass (rad/s,
+                                                   m/s); ask for them before the first step
+    ``subtree_com``     ``(nworld, nbody, 3)``     that center of mass (m), in the row of each tree's root; likewise
     ==================  =========================  ========================================================
+
+    Contact forces are those of the last substep, which is one behind the pose, as with touch sensors; after ``reset``
+    and ``forward`` those of the present state without control. MuJoCo's ``mj_contactForce`` has them by contact.
 
     Args:
         mj_model: the compiled model; its options are set from ``config``.
         config: settings of the simulation.
         num_envs: number of worlds.
         device: where they live.
+        contact_geoms: ids of the geoms whose contact forces are computed.
 
     Attributes:
         engine: what advances the worlds.
         engine_choice: its name, and why it is not another one.
 
     Raises:
-        ValueError: ``config.engine`` is "compiled", and the model needs something that it does not have.
+        ValueError: ``config.engine`` is "compiled", and the model needs something that it does not have; or an id of a
+            geom is out of range or named twice.
         MemoryError: the device has no room for so many worlds.
     """
 
     engine: compiled.CompiledEngine | mujoco_warp.MujocoWarpEngine
 
-    def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        mj_model: mujoco.MjModel,
+        config: SimConfig,
+        num_envs: int,
+        device: torch.device,
+        *,
+        contact_geoms: Sequence[int] = (),
+    ) -> None:
+        warn_of_integrator(mj_model, config)
         set_options(mj_model, config)
+        geoms = check_geoms(mj_model, contact_geoms)
         self.engine_choice = name, _ = choose_engine(mj_model, config)
-        check_memory(memory(name, mj_model, config, num_envs, device), num_envs, device)
+        check_memory(memory(name, mj_model, config, num_envs, device, len(geoms)), num_envs, device)
         self.mj_model, self.config = mj_model, config
         self.num_envs = num_envs
         self.device = wp.get_device(str(device))
         engines: dict[str, type] = {"compiled": compiled.CompiledEngine, "mujoco_warp": mujoco_warp.MujocoWarpEngine}
-        self.engine = engines[name](mj_model, config, num_envs, self.device)
+        self.engine = engines[name](mj_model, config, num_envs, self.device, geoms)
         self.model, self.data = self.engine.model, self.engine.data
         self._mujoco_data: mjw.Data | None = None
+        self._every = wp.ones(num_envs, dtype=bool, device=self.device)
+        self._kernels: dict[tuple[wp.Function, ...], WorldKernel] = {}
         self._scratch = ScratchPool(self.device) if self.device.is_cuda else None
 
         self.qpos = wp.to_torch(self.data.qpos)
@@ -113,6 +137,24 @@ class Simulation:
         self.xmat = wp.to_torch(self.data.xmat)
         self.time = wp.to_torch(self.data.time)
         self.overflow = wp.to_torch(self.data.overflow)
+        self.contact_force = torch.empty((num_envs, 0, 3), device=device)
+        self.in_contact = torch.empty((num_envs, 0), dtype=torch.bool, device=device)
+        if geoms:
+            self.contact_force, self.in_contact = map(wp.to_torch, self.engine.contact_arrays())
+
+    @property
+    def cvel(self) -> torch.Tensor:
+        """Velocities of the bodies, angular then linear, ``(nworld, nbody, 6)``; see the table above."""
+        return wp.to_torch(self.data.cvel)
+
+    @property
+    def subtree_com(self) -> torch.Tensor:
+        """What :attr:`cvel` is about, ``(nworld, nbody, 3)``; see the table above.
+
+        A point ``p`` of a body whose tree has the root ``mj_model.body_rootid[body]`` moves with
+        ``cvel[:, body, 3:] + cross(cvel[:, body, :3], p - subtree_com[:, root])``.
+        """
+        return wp.to_torch(self.engine.subtree_com())
 
     def step(
         self,
@@ -149,6 +191,25 @@ class Simulation:
         """
         rest = WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0))
         self.engine.forward(mask, [rest, *before], after, at_rest=at_rest)
+
+    def rest(self, mask: wp.array, then: Sequence[WorldFunc]) -> None:
+        """Puts worlds at rest in the default pose, without updating their poses and sensors.
+
+        Args:
+            mask: the worlds, bool ``(nworld,)``.
+            then: what each of them does after that.
+        """
+        self._apart([WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0)), *then], mask)
+
+    def apart(self, funcs: Sequence[WorldFunc]) -> None:
+        """Calls functions in every world, in a kernel of their own."""
+        self._apart(funcs, self._every)
+
+    def _apart(self, funcs: Sequence[WorldFunc], mask: wp.array) -> None:
+        key = tuple(func for func, _ in funcs)
+        if key not in self._kernels:
+            self._kernels[key] = WorldKernel(funcs)
+        self._kernels[key].launch(funcs, mask)
 
     def forward(self, mask: wp.array, after: Sequence[WorldFunc] = ()) -> None:
         """Updates poses and sensors after ``qpos`` and ``qvel`` were changed.
@@ -197,6 +258,7 @@ class Simulation:
 def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
     """Sets the options of a model from ``config``."""
     option = mj_model.opt
+    option.integrator = integrator(config)
     option.timestep = config.sim_dt
     option.iterations = config.iterations
     option.ls_iterations = config.ls_iterations
@@ -204,6 +266,38 @@ def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
     option.disableflags = (
         option.disableflags & ~euler_damping if config.euler_damping else option.disableflags | euler_damping
     )
+
+
+def integrator(config: SimConfig) -> int:
+    """Returns MuJoCo's number of the integrator that ``config`` names."""
+    return int(getattr(mujoco.mjtIntegrator, f"mjINT_{config.integrator.upper()}"))
+
+
+def warn_of_integrator(mj_model: mujoco.MjModel, config: SimConfig) -> None:
+    """Says so if the integrator of ``config`` replaces another one that the model names."""
+    if mj_model.opt.integrator != integrator(config):
+        named = mujoco.mjtIntegrator(mj_model.opt.integrator).name.removeprefix("mjINT_")
+        logging.getLogger("torchrl_loco").warning(
+            "the model's integrator %s is replaced by %s, which config names: pass integrator=... to choose another",
+            named,
+            config.integrator,
+        )
+
+
+def check_geoms(mj_model: mujoco.MjModel, geoms: Sequence[int]) -> tuple[int, ...]:
+    """Returns ids of geoms.
+
+    Raises:
+        ValueError: one is out of range or named twice.
+    """
+    ids = tuple(map(operator.index, geoms))
+    wrong = [geom for geom in ids if not 0 <= geom < mj_model.ngeom]
+    if wrong:
+        raise ValueError(f"contact_geoms must lie in [0, {mj_model.ngeom}), got {wrong}")
+    twice = sorted({geom for geom in ids if ids.count(geom) > 1})
+    if twice:
+        raise ValueError(f"contact_geoms must name each geom once, got {twice} twice")
+    return ids
 
 
 def choose_engine(mj_model: mujoco.MjModel, config: SimConfig) -> tuple[str, str]:
@@ -226,12 +320,19 @@ def choose_engine(mj_model: mujoco.MjModel, config: SimConfig) -> tuple[str, str
     return "mujoco_warp", f"engine 'compiled' does not have: {'; '.join(missing)}"
 
 
-def memory(engine: str, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: torch.device) -> int:
+def memory(
+    engine: str,
+    mj_model: mujoco.MjModel,
+    config: SimConfig,
+    num_envs: int,
+    device: torch.device,
+    contact_geoms: int = 0,
+) -> int:
     """Returns the memory that a simulation takes (bytes)."""
     if engine == "compiled":
-        return compiled.data_bytes(mj_model, num_envs)
+        return compiled.data_bytes(mj_model, num_envs, contact_geoms)
     scratch = DETERMINISTIC_SCRATCH if config.deterministic and device.type == "cuda" else SCRATCH
-    return int(scratch * mujoco_warp.data_bytes(mj_model, config, num_envs))
+    return int(scratch * mujoco_warp.data_bytes(mj_model, config, num_envs, contact_geoms))
 
 
 def check_memory(needed: int, num_envs: int, device: torch.device) -> None:

@@ -1,4 +1,5 @@
 from . import distributed as distributed
+from .algorithm import Algorithm as Algorithm
 from .config import PPOConfig as PPOConfig
 from .config import REPPOConfig as REPPOConfig
 from .config import TrainingConfig as TrainingConfig
@@ -9,9 +10,15 @@ from .playback import has_display as has_display
 from .playback import record as record
 from .playback import view as view
 from .plots import plot_runs as plot_runs
+from .ppo import PPO as PPO
 from .presets import preset as preset
 from .presets import tuning_note as tuning_note
+from .reppo import REPPO as REPPO
 from .run_folder import RunFolder as RunFolder
 from .run_folder import unused_path as unused_path
 from .run_group import RunGroup as RunGroup
+from .spaces import Spaces as Spaces
+from .start import begin as begin
+from .start import train as train
+from .trainer import Given as Given
 from .trainer import Trainer as Trainer

@@ -1,19 +1,46 @@
-"""The actor that all algorithms share: a squashed Gaussian on raw observations, and the policy it becomes."""
+"""The actor that all algorithms share: a Gaussian on raw observations, and the policy it becomes."""
 
 import copy
 import dataclasses
+import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
 from torch.distributions import Independent, Normal, TransformedDistribution
-from torchrl.data import Bounded
+from torchrl.data import Bounded, Unbounded
 from torchrl.modules import ProbabilisticActor
 from torchrl.modules.distributions.continuous import SafeTanhTransform
 
-from torchrl_loco.policy import ObservationNorm, Policy
+from torchrl_loco.policy import ObservationNorm, Policy, copied, layers_of
 from torchrl_loco.training.config import TrainingConfig
+from torchrl_loco.training.spaces import Spaces
+
+Network = Callable[[int, int], nn.Module]
+"""Makes a network of so many inputs and so many outputs."""
+
+TOLERANCE = 1e-4
+"""Largest difference of an action of a saved policy from the actor's, as a fraction of those above 1: rounding."""
+
+
+class DiagonalNormal(Independent):
+    """Independent normal variables.
+
+    Args:
+        loc: means, shape ``(..., n)``.
+        scale: standard deviations, of the same shape.
+    """
+
+    def __init__(self, loc: torch.Tensor, scale: torch.Tensor) -> None:
+        super().__init__(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+
+    @property
+    def deterministic_sample(self) -> torch.Tensor:
+        """The mean, shape ``(..., n)``."""
+        return self.mean
 
 
 class SquashedNormal(TransformedDistribution):
@@ -37,32 +64,94 @@ class SquashedNormal(TransformedDistribution):
         return self.base_dist.mean.tanh()
 
 
-def make_actor(config: TrainingConfig, network: nn.Module, log_prob: bool) -> ProbabilisticActor:
-    """Returns a tanh-normal actor around a network that gives means and standard deviations.
+class StateIndependentScale(nn.Module):
+    """Appends a learned log standard deviation, the same in every state, to the mean of an action."""
+
+    def __init__(self, size: int, init_std: float) -> None:
+        super().__init__()
+        self.log_std = nn.Parameter(torch.full((size,), math.log(init_std)))
+
+    def forward(self, loc: torch.Tensor) -> torch.Tensor:
+        """Returns means of shape ``(..., size)`` with the log deviations behind them, ``(..., 2 size)``."""
+        return torch.cat([loc, self.log_std.expand_as(loc)], dim=-1)
+
+
+def make_actor(spaces: Spaces, device: torch.device | str, network: nn.Module, log_prob: bool) -> ProbabilisticActor:
+    """Returns a Gaussian actor around a network that gives means and standard deviations, under tanh if it is bounded.
 
     It reads ``observation`` and writes ``loc``, ``scale``, ``action`` and, if asked to, ``action_log_prob``.
     """
+    shape = (spaces.action,)
+    spec = Bounded(-1.0, 1.0, shape, device=device) if spaces.bounded else Unbounded(shape, device=device)
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
-        spec=Bounded(-1.0, 1.0, (config.action_size,), device=config.device, dtype=torch.float32),
-        distribution_class=SquashedNormal,
+        spec=spec,
+        distribution_class=SquashedNormal if spaces.bounded else DiagonalNormal,
         return_log_prob=log_prob,
-    ).to(config.device)
+    ).to(device)
 
 
 def deterministic_policy(actor: ProbabilisticActor, config: TrainingConfig, info: dict[str, Any]) -> Policy:
     """Returns the policy that takes the mode of an actor's distribution, without the parts that only training needs.
 
     Its info holds the settings of the training, and ``info`` on top.
+
+    Raises:
+        TypeError: the network has a part that a policy's file cannot hold.
+        RuntimeError: what can be held acts differently from the actor.
     """
-    kinds = (ObservationNorm, nn.Linear, nn.LayerNorm, nn.SiLU)
-    *layers, last = (copy.deepcopy(module) for module in actor.modules() if isinstance(module, kinds))
-    # The mean's rows of the last layer; initialising it would draw from the generator that training draws from.
-    head = nn.utils.skip_init(nn.Linear, config.hidden[-1], config.action_size)
-    head.load_state_dict({name: value[: config.action_size] for name, value in last.state_dict().items()})
+    network: Any = actor[0].module
+    of_scale = (StateIndependentScale, NormalParamExtractor)
+    parts = [part for part in network if not isinstance(part, of_scale)]
+    *layers, last = (copied(layer) for part in parts for layer in layers_of(part))
+    if not any(isinstance(part, StateIndependentScale) for part in network):
+        last = _first_half(last)
+    tanh = [nn.Tanh()] if actor[-1].distribution_class is SquashedNormal else []
     settings = {
         name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "device", "logger")
     }
-    network = nn.Sequential(*layers, head.to(config.device), nn.Tanh())
-    return Policy(network, {"algorithm": config.algorithm, **settings, **info})
+    policy = Policy(nn.Sequential(*layers, last, *tanh), {"algorithm": config.algorithm, **settings, **info})
+    _check_that_they_agree(policy, actor)
+    return policy
+
+
+def _first_half(last: nn.Module) -> nn.Module:
+    """Returns the layer that gives the first half of what a last layer gives: the means.
+
+    Raises:
+        TypeError: it is no linear one.
+    """
+    if not isinstance(last, nn.Linear):
+        raise TypeError(
+            f"the network must end in a Linear that gives means and deviations, not in {type(last).__name__}"
+        )
+    half = last.out_features // 2
+    # Initialising it would draw from the generator that training draws from.
+    head = nn.utils.skip_init(nn.Linear, last.in_features, half, bias=last.bias is not None)
+    head.load_state_dict({name: value[:half] for name, value in last.state_dict().items()})
+    return head.to(last.weight.device)
+
+
+@torch.no_grad()
+def _check_that_they_agree(policy: Policy, actor: ProbabilisticActor) -> None:
+    """Compares a policy with the actor that it was made of, on the CPU and on random observations.
+
+    Raises:
+        TypeError: the actor does not begin by normalising observations.
+        RuntimeError: their actions differ by more than rounding does.
+    """
+    norm: Any = policy.module[0]
+    if not isinstance(norm, ObservationNorm):
+        raise TypeError(f"an actor must begin by normalising observations, not with {type(norm).__name__}")
+    noise = torch.randn(64, len(norm.mean), generator=torch.Generator().manual_seed(0))
+    observation = norm.mean.cpu() + 2 * noise * (norm.var.cpu() + 1e-6).sqrt()
+    td = TensorDict({"observation": observation}, [len(noise)])
+    expected = copy.deepcopy(actor).cpu().get_dist(td).deterministic_sample
+    action = copy.deepcopy(policy.module).cpu()(observation)
+    error = ((action - expected).abs() / expected.abs().clamp(min=1.0)).max().item()
+    if not error <= TOLERANCE:  # true for NaN too
+        raise RuntimeError(
+            f"the policy would act differently from the actor that was trained, by up to {error:.2g}: a Sequential in "
+            "its network computes something else than its layers one after the other"
+        )

@@ -2,7 +2,7 @@
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -13,7 +13,9 @@ from torchrl.modules import ProbabilisticActor
 from torchrl_loco.policy import ObservationNorm, moments
 from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed
+from torchrl_loco.training.actor import Network
 from torchrl_loco.training.config import TrainingConfig
+from torchrl_loco.training.spaces import Spaces
 
 WARMUP = 3
 """Gradient steps before one is recorded: optimizers and cuBLAS allocate at their first."""
@@ -22,21 +24,28 @@ WARMUP = 3
 class Algorithm(ABC):
     """Improves an actor on one batch after another.
 
-    A subclass sets ``actor``, ``norm`` and ``networks``, turns a batch into what gradient steps need (:meth:`prepare`)
-    and makes one gradient step (:meth:`gradient_step`).
+    A subclass sets ``config_type`` and ``metric_names``, and in ``__init__`` ``actor``, ``norms`` and ``networks``; it
+    turns a batch into what gradient steps need (:meth:`prepare`) and makes one gradient step (:meth:`gradient_step`).
 
     Args:
-        config: the run's settings.
+        config: the run's settings, of type ``config_type``.
+        spaces: what networks read and write.
+        network: makes networks of so many inputs and outputs; ``None`` leaves that to the algorithm.
     """
 
+    config_type: ClassVar[type[TrainingConfig]]
     metric_names: ClassVar[tuple[str, ...]]
+    """Names of what :meth:`gradient_step` returns."""
+    batch_metric_names: ClassVar[tuple[str, ...]] = ()
+    """Names of what :meth:`batch_metrics` returns."""
 
     actor: ProbabilisticActor
-    norm: ObservationNorm
+    norms: dict[str, ObservationNorm]
+    """The norms of what networks read, by entry; ``observation`` is the actor's."""
     networks: nn.Module
 
-    def __init__(self, config: TrainingConfig) -> None:
-        self.config = config
+    def __init__(self, config: TrainingConfig, spaces: Spaces, network: Network | None = None) -> None:
+        self.config, self.spaces, self.network = config, spaces, network
         self.device = torch.device(config.device)
         self.optimizers: dict[str, torch.optim.Adam] = {}
         self.generator = torch.Generator(config.device).manual_seed(distributed.own_seed(config.seed))
@@ -45,6 +54,11 @@ class Algorithm(ABC):
         self._data: TensorDictBase | None = None
         on_cuda = self.device.type == "cuda"
         self._step = TorchGraph(self._minibatch_step, self.device, warmup=WARMUP) if on_cuda else self._minibatch_step
+
+    @property
+    def norm(self) -> ObservationNorm:
+        """The norm of what the actor reads."""
+        return self.norms["observation"]
 
     @abstractmethod
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
@@ -60,6 +74,17 @@ class Algorithm(ABC):
         Returns:
             The metrics, a scalar each, in the order of ``metric_names``.
         """
+
+    def batch_metrics(self, data: TensorDictBase) -> torch.Tensor:
+        """Returns metrics of what :meth:`prepare` made of a batch, shape ``(len(batch_metric_names),)``, on all ranks.
+
+        They are computed once for a batch, also without transfers between host and device.
+        """
+        return torch.zeros(0, device=self.device)
+
+    def note(self, metrics: Mapping[str, Sequence[float]]) -> str:
+        """Returns what a user should know of ``metrics``, by name from one batch or several, or an empty string."""
+        return ""
 
     def make_optimizer(self, name: str, parameters: Iterable[Any]) -> torch.optim.Adam:
         """Makes an optimizer of ``parameters`` or groups, whose learning rate recorded steps follow.
@@ -81,7 +106,8 @@ class Algorithm(ABC):
             progress: fraction of the policy's training that is done, in [0, 1], which sets the learning rate.
 
         Returns:
-            The mean of the metrics over all gradient steps, shape ``(len(metric_names),)``.
+            The mean of the metrics over all gradient steps, then those of the batch, of shape ``(len(metric_names) +
+            len(batch_metric_names),)``.
         """
         config = self.config
         lr = config.lr * (1.0 - (1.0 - config.final_lr_fraction) * progress)
@@ -90,6 +116,7 @@ class Algorithm(ABC):
                 group["lr"].fill_(lr)
         with torch.no_grad():
             data = self.prepare(batch).reshape(-1)
+            of_batch = self.batch_metrics(data)
             if self._data is None:
                 self._data = data.clone()
             else:
@@ -103,8 +130,9 @@ class Algorithm(ABC):
                 self._indices.copy_(indices)
                 self._step()
         # After the update: the losses need the normalisation used while collecting.
-        self.norm.merge(*distributed.merged_moments(*moments(batch["observation"])))
-        return self._totals / (config.epochs * minibatches)
+        for key, norm in self.norms.items():
+            norm.merge(*distributed.merged_moments(*moments(batch[key])))
+        return torch.cat([self._totals / (config.epochs * minibatches), of_batch])
 
     def _minibatch_step(self) -> None:
         assert self._data is not None
@@ -117,7 +145,7 @@ class Algorithm(ABC):
 
     def begin_anew(self) -> None:
         """Draws parameters as at the start of a run, in place, so that what was recorded stays valid."""
-        self.networks.load_state_dict(type(self)(self.config).networks.state_dict())
+        self.networks.load_state_dict(type(self)(self.config, self.spaces, self.network).networks.state_dict())
         for optimizer in self.optimizers.values():
             for moments_of_one in optimizer.state.values():
                 for value in moments_of_one.values():

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, get_args
 
 from torchrl_loco.checks import SEED, check_choice, check_fields, check_int, check_packages
 from torchrl_loco.config import PROTOCOLS
-from torchrl_loco.registry import canonical_id, env_class
+from torchrl_loco.registry import task_name
 
 LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow"]
 INTERVALS = {
@@ -26,6 +26,9 @@ INTERVALS = {
     "target_entropy": "(-inf, inf)",
     "aux_coeff": "[0, inf)",
     "num_bins": "[2, 2**31)",
+    "min_value": "(-inf, inf)",
+    "max_value": "(-inf, inf)",
+    "episode_length": "[0, 2**31)",
 }
 """Intervals of the fields that are not simply positive."""
 
@@ -44,7 +47,7 @@ class TrainingConfig:
     algorithm: ClassVar[str]
 
     task: str
-    """Id of the environment."""
+    """The task, an id or the file or module of a class and its name, with a colon between."""
     protocol: Literal["playground", "dm_control"] = "playground"
     """Settings of the solver and of the reset."""
     device: str = "cpu"
@@ -66,8 +69,8 @@ class TrainingConfig:
     action_repeat: int = 4
     """Frames for which an action is held."""
     episode_length: int = 400
-    """Frames after which an episode is truncated in training; evaluation always plays the task's own length. Shorter
-    episodes practise getting up more often."""
+    """Frames after which an episode is truncated in training, 0 for the task's own length, which evaluation always
+    plays. Shorter episodes practise getting up more often."""
     num_steps: int = 32
     """Steps of the policy in each world between two updates."""
 
@@ -102,7 +105,7 @@ class TrainingConfig:
     """Where metrics go besides the run's CSV files, which are always written; csv adds nothing to them."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "task", canonical_id(self.task))
+        object.__setattr__(self, "task", _stored_name(self.task))
         check_choice("protocol", self.protocol, PROTOCOLS)
         check_fields(self, INTERVALS)
         loggers = (self.logger,) if isinstance(self.logger, str) else tuple(self.logger)
@@ -137,6 +140,11 @@ class TrainingConfig:
                 f"({self.frames_per_batch}){', or trials must be 1' if self.trials > 1 else ''}"
             )
 
+    @property
+    def label(self) -> str:
+        """The name of the task for people and file systems, its id or the name of its class."""
+        return re.sub(r"[^\w.-]+", "-", self.task.rpartition(":")[2])
+
     def to_json(self) -> dict[str, Any]:
         """Returns the settings as values that JSON can hold, from which ``config_from_json`` makes them again."""
         return {"algorithm": self.algorithm, **dataclasses.asdict(self), "out": str(self.out)}
@@ -163,18 +171,6 @@ class TrainingConfig:
             return "total_frames", self.total_frames
         return "total_frames * trial_fraction", self.trial_frames
 
-    @property
-    def observation_size(self) -> int:
-        """Length of an observation."""
-        return env_class(self.task).observation_size
-
-    @property
-    def action_size(self) -> int:
-        """Length of an action."""
-        from torchrl_loco import models  # imports MuJoCo, which reading settings need not wait for
-
-        return models.load(env_class(self.task).mjcf).nu
-
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig(TrainingConfig):
@@ -186,8 +182,13 @@ class PPOConfig(TrainingConfig):
     """Range of the probability ratio that is not clipped."""
     entropy_coeff: float = 1e-3
     """Weight of the entropy bonus."""
+    compile: bool = False
+    """Whether torch.compile makes kernels of the loss on CUDA. It is up to twice as fast then, after half a minute at
+    the first start on a machine."""
+    bf16: bool = False
+    """Whether networks compute in bfloat16 on CUDA."""
     init_std: float = 1.0
-    """Standard deviation of an action before tanh, at the start."""
+    """Standard deviation of an action at the start; before tanh, if actions are bounded."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,9 +218,12 @@ class REPPOConfig(TrainingConfig):
     """Lower bound of the entropy's weight. A much smaller weight would recover too slowly when the entropy falls."""
     num_bins: int = 151
     """Bins of the critic's distribution over returns."""
+    min_value: float = 0.0
+    """Return at the center of the first bin. The critic cannot tell lower ones apart; rewards that may be negative need
+    one below 0."""
     max_value: float = 150.0
-    """Return at the center of the last bin; the first is at 0. Rewards in [0, 1] give returns of up to reward_scale *
-    action_repeat / (1 - gamma): the critic cannot tell those above max_value apart."""
+    """Return at the center of the last bin. Rewards in [0, 1] give returns of up to reward_scale * action_repeat /
+    (1 - gamma): the critic cannot tell those above max_value apart."""
     aux_coeff: float = 1.0
     """Weight of the critic's auxiliary loss, the prediction of its own features at the next step."""
 
@@ -229,6 +233,19 @@ class REPPOConfig(TrainingConfig):
             first, least = getattr(self, f"init_{name}"), getattr(self, f"min_{name}")
             if first < least:
                 raise ValueError(f"init_{name} ({first}) must not be below min_{name} ({least})")
+        if self.min_value >= self.max_value:
+            raise ValueError(f"min_value ({self.min_value:g}) must be below max_value ({self.max_value:g})")
+
+
+def _stored_name(task: Any) -> str:
+    """Returns the name of a task; one that says already where its class is stays as it is.
+
+    The class is looked up where it is needed: without it, the curve of a run can still be plotted.
+    """
+    source, _, name = task.rpartition(":") if isinstance(task, str) else ("", "", "")
+    if name and source and (not source.endswith(".py") or Path(source).is_absolute()):
+        return task
+    return task_name(task)
 
 
 def check_loggers(names: Collection[str]) -> None:

@@ -235,6 +235,16 @@ def mean_of_ranks(values: torch.Tensor) -> torch.Tensor:
     return values / ranks()
 
 
+def extremes_of_ranks(least: torch.Tensor, largest: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the least and the largest number of all ranks from those of each, which are scalars."""
+    if ranks() == 1:
+        return least, largest
+    both = torch.stack([-least, largest])
+    with _peers():
+        dist.all_reduce(both, dist.ReduceOp.MAX)
+    return -both[0], both[1]
+
+
 def any_rank(*flags: bool) -> list[bool]:
     """Returns for each flag whether it is set on some rank."""
     if ranks() == 1:

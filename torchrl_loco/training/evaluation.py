@@ -1,19 +1,20 @@
 """Evaluation: what a policy earns over full episodes, and what to say of it."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import step_mdp
+from torchrl.envs import EnvBase, step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import trange
 
 from torchrl_loco.checks import SEED, check_int
-from torchrl_loco.envs import LocoEnv
 from torchrl_loco.policy import Policy, load_policy, shipped_policies
 from torchrl_loco.registry import make
 from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.config import REPPOConfig, TrainingConfig
+from torchrl_loco.training.environments import make_for
 from torchrl_loco.training.presets import STEADY, tuned_settings
 from torchrl_loco.training.run_folder import RunFolder
 
@@ -25,18 +26,26 @@ class Evaluator:
     """Plays full episodes of a task in worlds of its own, without exploration; the same episodes every time.
 
     Args:
-        task: id of the environment.
+        task: id of the environment, or where its class is.
         episodes: number of episodes, one per world.
         device: where to play.
         seed: decides their initial states.
         protocol: settings of the solver and of the reset.
         action_repeat: frames for which an action is held.
+        env: the worlds, one for each episode; ``None`` makes them from the arguments before.
     """
 
     def __init__(
-        self, task: str, episodes: int, device: str, seed: int, protocol: str = "playground", action_repeat: int = 1
+        self,
+        task: str,
+        episodes: int,
+        device: str,
+        seed: int,
+        protocol: str = "playground",
+        action_repeat: int = 1,
+        env: EnvBase | None = None,
     ) -> None:
-        self._env = make(task, episodes, device, seed, protocol, world_offset=0)
+        self._env: Any = make(task, episodes, device, seed, protocol, world_offset=0) if env is None else env
         self._seed = seed
         self._action_repeat = action_repeat
 
@@ -91,14 +100,15 @@ def evaluate_policy(policy: Policy, episodes: int | None = None, seed: int | Non
         Number, mean, standard deviation and extremes of the returns.
 
     Raises:
-        ValueError: an argument is out of range.
+        ValueError: an argument is out of range, or the policy was trained behind transforms.
     """
     info = policy.info
     episodes = check_int("episodes", info["eval_episodes"] if episodes is None else episodes)
     seed = evaluation_seed(info["seed"], final=True) if seed is None else check_int("seed", seed, SEED)
     device = str(next(policy.parameters()).device)
     with settings_for_small_networks():
-        evaluator = Evaluator(info["task"], episodes, device, seed, info["protocol"], info["action_repeat"])
+        env = make_for(policy, episodes, device, seed)
+        evaluator = Evaluator(info["task"], episodes, device, seed, info["protocol"], info["action_repeat"], env)
         return summarize(evaluator(policy))
 
 
@@ -127,7 +137,8 @@ POOR = 0.92
 """Fraction of the shipped policy's return below which a return is called poor. Under ``dm_control`` walker_run's
 crouching gait earns 0.91 of what the upright one does."""
 FALLEN = 0.9
-"""Fraction of a run's best evaluation below which its last one is called fallen."""
+"""Fraction of a run's best evaluation below which its last one is called fallen. Where returns are negative, it is one
+of what the run has gained up to its best evaluation."""
 
 
 def poor_return(config: TrainingConfig, summary: dict[str, float], seeds: Collection[int] = ()) -> str:
@@ -167,7 +178,9 @@ def fallen_return(
         seeds: further seeds that were tried.
     """
     best, last = max(evaluations, key=lambda row: row["mean"]), evaluations[-1]
-    if best["mean"] <= 0 or last["mean"] >= FALLEN * best["mean"]:
+    least = min(row["mean"] for row in evaluations[: evaluations.index(best) + 1])
+    gained = best["mean"] - min(least, 0.0)
+    if gained <= 0.0 or last["mean"] >= best["mean"] - (1 - FALLEN) * gained:
         return ""
     remedy = f"shorter episodes (--episode_length {max(config.episode_length // 2, 1)})"
     if isinstance(config, REPPOConfig) and config.min_kl_weight < STEADY["min_kl_weight"]:
@@ -185,7 +198,7 @@ def _next_seed(config: TrainingConfig, seeds: Collection[int]) -> int:
 
 
 @torch.no_grad()
-def play(policy: PolicyFunc, env: LocoEnv, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
+def play(policy: PolicyFunc, env: EnvBase, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
     """Yields the result of each frame from a reset on, without exploration.
 
     Args:

@@ -40,7 +40,7 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     figure = Figure(figsize=(7, 4.2), layout="constrained")  # without pyplot: a caller's backend stays as it is
     axes = figure.subplots()
     for config, group in groups.items():
-        label = f"{config.task}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds"
+        label = f"{config.label}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds"
         metrics = [run.read_metrics() for run in group]
         whole = [m for m in metrics if _is_whole(m["frames"], config.total_frames)] or metrics
         curves = [dict(zip(m["frames"], m["return"], strict=True)) for m in whole]
@@ -67,13 +67,12 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
             )
     axes.set(
         xlabel="frames (million)",
-        ylabel="return of 1000 steps",
+        ylabel="return of an episode",
         title="line: sampled actions in training; dots: evaluations without exploration",
-        ylim=(0, 1000),
     )
     axes.title.set_fontsize("small")
     axes.grid(alpha=0.3)
-    axes.legend(loc="lower right", fontsize="small")
+    axes.legend(loc="best", fontsize="small")
     figure.savefig(picture, dpi=150)
 
 

@@ -1,7 +1,7 @@
 """Proximal policy optimization (Schulman et al., 2017), by TorchRL's ClipPPOLoss and GAE."""
 
-import math
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -12,20 +12,22 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from torchrl_loco.policy import ObservationNorm
-from torchrl_loco.training.actor import make_actor
+from torchrl_loco.training.actor import Network, StateIndependentScale, make_actor
 from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import PPOConfig
+from torchrl_loco.training.spaces import Spaces
 
 
 class PPO(Algorithm):
     """Generalised advantage estimates, then epochs of minibatches over the clipped loss."""
 
+    config_type = PPOConfig
     metric_names = ("loss_objective", "loss_critic", "entropy", "kl_approx", "clip_fraction", "grad_norm")
     config: PPOConfig
 
-    def __init__(self, config: PPOConfig) -> None:
-        super().__init__(config)
-        self.actor, self.critic, self.norm = make_actor_critic(config)
+    def __init__(self, config: PPOConfig, spaces: Spaces, network: Network | None = None) -> None:
+        super().__init__(config, spaces, network)
+        self.actor, self.critic, self.norms = make_actor_critic(config, spaces, network)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic})
         # At a time limit the value of the true terminal observation is bootstrapped; termination ends the return.
         self.gae = GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=self.critic, average_gae=False)
@@ -39,6 +41,8 @@ class PPO(Algorithm):
             normalize_advantage=True,
         )
         self.optimizer = self.make_optimizer("actor and critic", self.loss.parameters())
+        on_cuda = self.device.type == "cuda"
+        self._losses = torch.compile(self.loss, fullgraph=True) if config.compile and on_cuda else self.loss
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns the ``batch``, of shape ``(num_envs, num_steps)``, with advantages and value targets."""
@@ -48,33 +52,46 @@ class PPO(Algorithm):
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
         """Returns the metrics, a scalar each, of a step down the clipped loss, the critic's and the entropy's."""
-        losses = self.loss(minibatch)
+        losses = self._losses(minibatch)
         self.optimizer.zero_grad()
         (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
         grad_norm = clip_and_step(self.optimizer, self.config.max_grad_norm)
         return [*(losses[name] for name in self.metric_names[:-1]), grad_norm]
 
 
-class StateIndependentScale(nn.Module):
-    """Appends a learned log standard deviation, the same in every state, to the mean of an action."""
+class InBFloat16(nn.Sequential):
+    """A network whose matrix products are in bfloat16 on CUDA; its results are float32."""
 
-    def __init__(self, size: int, init_std: float) -> None:
-        super().__init__()
-        self.log_std = nn.Parameter(torch.full((size,), math.log(init_std)))
-
-    def forward(self, loc: torch.Tensor) -> torch.Tensor:
-        """Returns means of shape ``(..., size)`` with the log deviations behind them, ``(..., 2 size)``."""
-        return torch.cat([loc, self.log_std.expand_as(loc)], dim=-1)
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        """Returns what the network gives, float32."""
+        with torch.autocast("cuda", torch.bfloat16, enabled=input.is_cuda):
+            return super().forward(input).float()
 
 
-def make_actor_critic(config: PPOConfig) -> tuple[ProbabilisticActor, ValueOperator, ObservationNorm]:
-    """Returns actor, critic and the observation norm that they share, for PPO; the critic writes ``state_value``."""
-    layers = {"num_cells": list(config.hidden), "activation_class": nn.SiLU}
-    norm = ObservationNorm(config.observation_size)
-    mean = MLP(in_features=config.observation_size, out_features=config.action_size, **layers)
-    nn.init.orthogonal_(mean[-1].weight, gain=0.01)
-    scale = StateIndependentScale(config.action_size, config.init_std)
-    actor = make_actor(config, nn.Sequential(norm, mean, scale, NormalParamExtractor("exp")), log_prob=True)
-    value = MLP(in_features=config.observation_size, out_features=1, **layers)
-    critic = ValueOperator(nn.Sequential(norm, value), in_keys=["observation"])
-    return actor, critic.to(config.device), norm
+def make_actor_critic(
+    config: PPOConfig, spaces: Spaces, network: Network | None = None
+) -> tuple[ProbabilisticActor, ValueOperator, dict[str, ObservationNorm]]:
+    """Returns actor, critic and the norms of what they read, for PPO; the critic writes ``state_value``.
+
+    Args:
+        config: the settings.
+        spaces: what they read and write.
+        network: makes the actor's network, from an observation to means, and the critic's; else both are MLPs.
+    """
+
+    def mlp(inputs: int, outputs: int) -> nn.Sequential:
+        return MLP(inputs, outputs, num_cells=list(config.hidden), activation_class=nn.SiLU)
+
+    make = network or mlp
+    norms = {"observation": ObservationNorm(spaces.observation)}
+    mean: Any = make(spaces.observation, spaces.action)
+    if network is None:
+        nn.init.orthogonal_(mean[-1].weight, gain=0.01)  # the first actions are near zero, whatever is observed
+    scale = StateIndependentScale(spaces.action, config.init_std)
+    mean, value = (InBFloat16(part) if config.bf16 else part for part in (mean, make(spaces.critic, 1)))
+    whole = nn.Sequential(norms["observation"], mean, scale, NormalParamExtractor("exp"))
+    actor = make_actor(spaces, config.device, whole, log_prob=True)
+    if spaces.privileged is not None:
+        norms["privileged"] = ObservationNorm(spaces.privileged)
+    critic = ValueOperator(nn.Sequential(norms[spaces.critic_key], value), in_keys=[spaces.critic_key])
+    return actor, critic.to(config.device), norms

@@ -7,7 +7,7 @@ actor minimises the KL divergence from the policy that collected the data wherev
 
 import contextlib
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -17,30 +17,45 @@ from torch.nn.functional import mse_loss
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
-from torchrl_loco.policy import ObservationNorm
-from torchrl_loco.training.actor import make_actor
+from torchrl_loco.policy import ObservationNorm, layers_of
+from torchrl_loco.training import distributed
+from torchrl_loco.training.actor import Network, make_actor
 from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import REPPOConfig
 from torchrl_loco.training.norm_silu import Layers
+from torchrl_loco.training.spaces import Spaces
 from torchrl_loco.training.squashed_normal import kl, sample
 from torchrl_loco.training.value_bins import ValueBins
 
 
 class REPPO(Algorithm):
-    """Soft lambda-returns, then epochs of minibatches: the critic's cross entropy, the actor's constrained ascent."""
+    """Soft lambda-returns, then epochs of minibatches: the critic's cross entropy, the actor's constrained ascent.
 
+    Raises:
+        ValueError: actions are unbounded.
+    """
+
+    config_type = REPPOConfig
     metric_names = (
         *("loss_critic", "loss_aux", "value", "grad_norm_critic"),
         *("loss_actor", "kl", "kl_exceeded", "entropy", "temperature", "kl_weight", "grad_norm_actor"),
     )
+    batch_metric_names = ("return_min", "return_max", "return_clipped")
     config: REPPOConfig
 
-    def __init__(self, config: REPPOConfig) -> None:
-        super().__init__(config)
-        self.actor, self.critic, self.norm = make_actor_q(config)
+    def __init__(self, config: REPPOConfig, spaces: Spaces, network: Network | None = None) -> None:
+        if not spaces.bounded:
+            raise ValueError(
+                f"reppo needs actions in [-1, 1], and those of {config.task} are unbounded: set action_range = (-1, 1) "
+                "in the class, or train with algorithm 'ppo'"
+            )
+        super().__init__(config, spaces, network)
+        self.actor, self.critic, self.norms = make_actor_q(config, spaces, network)
         self.distribution = self.actor[0].module[1:]  # from normalised observations to means and standard deviations
         self.dual = DualVariables(config).to(self.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "dual": self.dual})
+        if spaces.privileged is not None:  # the critic's networks read what is normalised already
+            self.networks["privileged_norm"] = self.norms["privileged"]
         self.critic_optimizer = self.make_optimizer("critic", self.critic.parameters())
         # The gradient of a dual variable's logarithm shrinks with the variable: an eps of 1e-5 would keep it small.
         groups = [{"params": list(self.actor.parameters())}, {"params": list(self.dual.parameters()), "eps": 1e-8}]
@@ -53,9 +68,9 @@ class REPPO(Algorithm):
         the true terminal observation is bootstrapped; termination ends the return.
         """
         config, after = self.config, batch["next"]
-        observation, next_observation = self.norm(batch["observation"]), self.norm(after["observation"])
-        action, log_prob = sample(*self.distribution(next_observation))
-        value, features = self.critic.value_and_features(next_observation, action)
+        now, later = ({key: norm(td[key]) for key, norm in self.norms.items()} for td in (batch, after))
+        action, log_prob = sample(*self.distribution(later["observation"]))
+        value, features = self.critic.value_and_features(later[self.spaces.critic_key], action)
         alive = ~after["terminated"]
         reward = after["reward"] * config.reward_scale
         reward = reward - config.gamma * self.dual.temperature * log_prob.unsqueeze(-1) * alive
@@ -63,7 +78,31 @@ class REPPO(Algorithm):
             config.gamma, config.lmbda, value.unsqueeze(-1), reward, after["done"], after["terminated"]
         )
         estimates = {"returns": returns.squeeze(-1), "features": features, "alive": alive.squeeze(-1).float()}
-        return batch.select("action", "loc", "scale").update({"observation": observation, **estimates})
+        return batch.select("action", "loc", "scale").update({**now, **estimates})
+
+    def batch_metrics(self, data: TensorDictBase) -> torch.Tensor:
+        """Returns least and largest return of a batch, and the fraction beyond the critic's bins by more than a bin."""
+        returns, bins = data["returns"], self.critic.bins
+        least, largest = distributed.extremes_of_ranks(*returns.aminmax())
+        beyond = (returns < bins.low - bins.width) | (returns > bins.high + bins.width)
+        return torch.stack([least, largest, beyond.float().mean()])
+
+    def note(self, metrics: Mapping[str, Sequence[float]]) -> str:
+        """Returns which returns the critic could not represent, and which settings change that, if there were any."""
+        beyond = [fraction for fraction in metrics["return_clipped"] if fraction > 0.0]
+        if not beyond:
+            return ""
+        config, least, largest = self.config, min(metrics["return_min"]), max(metrics["return_max"])
+        options = []
+        if least < config.min_value:
+            options.append(f"--min_value {math.floor(1.5 * least):g}")
+        if largest > config.max_value:
+            options.append(f"--max_value {math.ceil(1.5 * largest):g}")
+        return (
+            f"Returns from {least:.4g} to {largest:.4g} occurred, but the critic represents those from "
+            f"{config.min_value:g} to {config.max_value:g} and cut off up to {max(beyond):.2%} of a batch: pass "
+            f"{' '.join(options)}, or a smaller --reward_scale"
+        )
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
         """Returns the metrics, a scalar each, of a step of the critic, then one of the actor and the dual variables."""
@@ -75,7 +114,7 @@ class REPPO(Algorithm):
         Returns:
             Its metrics.
         """
-        logits, predicted = self.critic(minibatch["observation"], minibatch["action"])
+        logits, predicted = self.critic(minibatch[self.spaces.critic_key], minibatch["action"])
         loss = self.critic.bins.cross_entropy(logits, minibatch["returns"])
         aux = (mse_loss(predicted, minibatch["features"], reduction="none").mean(-1) * minibatch["alive"]).mean()
         self.critic_optimizer.zero_grad()
@@ -93,7 +132,7 @@ class REPPO(Algorithm):
         loc, scale = self.distribution(minibatch["observation"])
         action, log_prob = sample(loc, scale)
         with frozen(self.critic):
-            value, _ = self.critic.value_and_features(minibatch["observation"], action)
+            value, _ = self.critic.value_and_features(minibatch[self.spaces.critic_key], action)
         divergence = kl(minibatch["loc"], minibatch["scale"], loc, scale)
         exceeded = divergence >= config.kl_bound
         objective = temperature.detach() * log_prob - value
@@ -158,7 +197,7 @@ class DistributionalQ(nn.Module):
     It reads normalised observations.
 
     Args:
-        sizes: length of an observation and of an action.
+        sizes: length of what it observes and of an action.
         hidden: widths of the encoder's layers; the heads have one hidden layer of the last width.
         bins: the bins of the distribution.
     """
@@ -196,12 +235,26 @@ def normed_layers(inputs: int, hidden: tuple[int, ...]) -> list[nn.Module]:
     return layers
 
 
-def make_actor_q(config: REPPOConfig) -> tuple[ProbabilisticActor, DistributionalQ, ObservationNorm]:
-    """Returns actor, critic and the actor's observation norm, for REPPO."""
-    norm = ObservationNorm(config.observation_size)
-    head = nn.Linear(config.hidden[-1], 2 * config.action_size)
-    body = normed_layers(config.observation_size, config.hidden)
-    actor = make_actor(config, Layers(norm, *body, head, NormalParamExtractor("exp")), log_prob=False)
-    bins = ValueBins(0.0, config.max_value, config.num_bins)
-    critic = DistributionalQ((config.observation_size, config.action_size), config.hidden, bins)
-    return actor, critic.to(config.device), norm
+def make_actor_q(
+    config: REPPOConfig, spaces: Spaces, network: Network | None = None
+) -> tuple[ProbabilisticActor, DistributionalQ, dict[str, ObservationNorm]]:
+    """Returns actor, critic and the norms of what they read, for REPPO.
+
+    Args:
+        config: the settings.
+        spaces: what they read and write.
+        network: makes the actor's network, from an observation to means and log deviations.
+    """
+    norms, outputs = {"observation": ObservationNorm(spaces.observation)}, 2 * spaces.action
+    if network is None:
+        head = nn.Linear(config.hidden[-1], outputs)
+        layers = [*normed_layers(spaces.observation, config.hidden), head]
+    else:
+        layers = layers_of(network(spaces.observation, outputs))
+    whole = Layers(norms["observation"], *layers, NormalParamExtractor("exp"))
+    actor = make_actor(spaces, config.device, whole, log_prob=False)
+    if spaces.privileged is not None:
+        norms["privileged"] = ObservationNorm(spaces.privileged).to(config.device)
+    bins = ValueBins(config.min_value, config.max_value, config.num_bins)
+    critic = DistributionalQ((spaces.critic, spaces.action), config.hidden, bins)
+    return actor, critic.to(config.device), norms

@@ -10,6 +10,7 @@ import pickle
 import shutil
 import zipfile
 import zlib
+from collections.abc import Collection
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,11 @@ import torch
 from torchrl_loco import storage
 from torchrl_loco.checks import check_device, check_run, is_run_group
 from torchrl_loco.policy import Policy
-from torchrl_loco.registry import env_class
+from torchrl_loco.registry import resolve
 from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig, check_loggers, config_from_json
 
-CHECKPOINT_VERSION = 5
+CHECKPOINT_VERSION = 6
 ROOM_NEEDED = 200 * 2**20
 """Bytes that a run may need: checkpoints, video, metrics."""
 
@@ -49,11 +50,11 @@ def new_folder(config: TrainingConfig, ending: str) -> Path:
 
     Raises:
         ValueError: this machine does not have the device.
-        ImportError: the package of a logger is missing, or the environment is a plug-in, which is broken.
-        OSError: the folder cannot be made, or the disk has no room for a run.
+        ImportError: the package of a logger is missing, or the module of the environment is broken.
+        OSError: the folder cannot be made, the disk has no room for a run, or the file of the environment is missing.
     """
     check_device(config.device)
-    env_class(config.task)
+    resolve(config.task)
     check_loggers(config.logger)
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     try:
@@ -64,7 +65,7 @@ def new_folder(config: TrainingConfig, ending: str) -> Path:
     if free < ROOM_NEEDED:
         raise OSError(f"{config.out} has {free / 2**20:.0f} MiB left, a run may need {ROOM_NEEDED / 2**20:.0f} MiB")
     while True:  # runs may start within the same second
-        path = unused_path(config.out / f"{config.task}-{stamp}-{ending}")
+        path = unused_path(config.out / f"{config.label}-{stamp}-{ending}")
         with contextlib.suppress(FileExistsError):
             path.mkdir()
             return path
@@ -85,7 +86,8 @@ class RunFolder:
 
     It holds ``config.json``, ``metrics.csv``, ``evaluations.csv``, ``checkpoint.pt``, ``policy.safetensors``,
     ``learning_curve.png``, ``video.mp4``, what its loggers write (``tensorboard/``, ``wandb/``, ``mlflow.db``), and
-    ``nan_dump.safetensors`` if a world became non-finite. ``launch.txt`` names the launch by torchrun that began it.
+    ``nan_dump.safetensors`` if a world became non-finite. ``launch.txt`` names the launch by torchrun that began it,
+    ``given.json`` what was handed to :func:`torchrl_loco.training.train` as an object.
 
     Args:
         path: an existing run folder.
@@ -98,19 +100,25 @@ class RunFolder:
         self.path = check_run(path)
 
     @classmethod
-    def create(cls, config: TrainingConfig) -> "RunFolder":
+    def create(cls, config: TrainingConfig, given: Collection[str] = ()) -> "RunFolder":
         """Makes a new folder for a run in ``config.out``, named after task, time and seed.
+
+        Args:
+            config: the settings.
+            given: what is handed to the trainer as an object, such as ``"network"``.
 
         Returns:
             The folder, with ``config`` in it.
 
         Raises:
             ValueError: this machine does not have the device.
-            ImportError: the package of a logger is missing, or the environment is a plug-in, which is broken.
-            OSError: the folder cannot be made, or the disk has no room for a run.
+            ImportError: the package of a logger is missing, or the module of the environment is broken.
+            OSError: the folder cannot be made, the disk has no room, or the file of the environment is missing.
         """
         path = new_folder(config, f"seed{config.seed}")
         (path / "config.json").write_bytes(_as_json(config))
+        if given:
+            (path / "given.json").write_text(f"{json.dumps(list(given))}\n")
         if launch := distributed.launch_id():
             (path / "launch.txt").write_text(launch)
         return cls(path)
@@ -145,6 +153,12 @@ class RunFolder:
         if total_frames <= done:
             raise ValueError(f"total_frames must be more than the {done:.0f} frames of {self.path}, got {total_frames}")
         storage.replace_file(self.path / "config.json", _as_json(self.load_config(total_frames=total_frames)))
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """What was handed to the trainer as an object, such as ``"network"``: the folder does not hold it."""
+        path = self.path / "given.json"
+        return tuple(json.loads(path.read_text())) if path.exists() else ()
 
     @property
     def video(self) -> Path:

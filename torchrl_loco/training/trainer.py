@@ -5,27 +5,26 @@ import dataclasses
 import math
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.envs import EnvBase, FrameSkipTransform
+from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
 from torchrl_loco.checks import check_device
 from torchrl_loco.collector import RolloutCollector
-from torchrl_loco.envs.autoreset import TransformedEnv
 from torchrl_loco.policy import Policy
-from torchrl_loco.registry import env_class, make
 from torchrl_loco.training import distributed
-from torchrl_loco.training.actor import deterministic_policy
+from torchrl_loco.training.actor import Network, deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
-from torchrl_loco.training.config import TrainingConfig, check_loggers
+from torchrl_loco.training.config import check_loggers
+from torchrl_loco.training.environments import Environments, unwrapped
+from torchrl_loco.training.environments import make_env as make_env
+from torchrl_loco.training.episodes import Episodes
 from torchrl_loco.training.evaluation import (
     Evaluator,
     describe,
-    evaluate_policy,
     evaluation_seed,
     fallen_return,
     poor_return,
@@ -38,9 +37,54 @@ from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.ppo import PPO
 from torchrl_loco.training.reppo import REPPO
 from torchrl_loco.training.run_folder import RunFolder
+from torchrl_loco.training.spaces import Spaces
 from torchrl_loco.training.trials import Trials
 
-ALGORITHMS: dict[str, Callable[[Any], Algorithm]] = {"ppo": PPO, "reppo": REPPO}
+ALGORITHMS: dict[str, type[Algorithm]] = {"ppo": PPO, "reppo": REPPO}
+
+
+@dataclasses.dataclass(frozen=True)
+class Given:
+    """What is handed to a trainer as objects, instead of being made from the settings of the run.
+
+    Attributes:
+        env: the environment in which it trains.
+        network: makes the networks.
+        algorithm: the class of the algorithm.
+    """
+
+    env: EnvBase | None = None
+    network: Network | None = None
+    algorithm: type[Algorithm] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what is handed in."""
+        return tuple(name for name in ("env", "network", "algorithm") if getattr(self, name) is not None)
+
+    def check(self, run: RunFolder) -> None:
+        """Checks that a run that is continued is handed what it was begun with.
+
+        Raises:
+            ValueError: it is not.
+        """
+        if self.names == run.given:
+            return
+        if extra := [name for name in self.names if name not in run.given]:
+            raise ValueError(f"{run.path} was begun without {' and '.join(extra)} of yours: leave that out")
+        raise ValueError(
+            f"{run.path} was begun with {' and '.join(run.given)} of your own, which the folder does not hold: "
+            f"continue it in Python with {_call_to_resume(run.path, run.given)}"
+        )
+
+    def way_to_resume(self, run: Path) -> str:
+        """Returns the call or the command that continues a run."""
+        return _call_to_resume(run, self.names) if self.names else f"torchrl-loco resume {run}"
+
+
+def _call_to_resume(run: Path, given: tuple[str, ...]) -> str:
+    arguments = ["env" if "env" in given else "task", *(f"{name}=..." for name in given if name != "env")]
+    return f"torchrl_loco.training.train({', '.join(arguments)}, resume={str(run)!r})"
 
 
 class Trainer:
@@ -55,16 +99,21 @@ class Trainer:
         resume: whether to continue from the run's checkpoint. On the CPU, a run that was stopped and resumed equals one
             that was not, bit for bit. With another number of ranks, parameters and counters continue, the worlds start
             anew, and what that changes is printed.
+        given: what is handed in as objects.
 
     Raises:
         FileNotFoundError: there is no checkpoint to resume from.
         ValueError: the checkpoint cannot be read; the run is complete, or too short for so many ranks; trials are
-            running that another number of ranks or of frames does not fit.
+            running that another number of ranks or of frames does not fit; the run was begun with other objects.
+        TypeError: the network has a part that a policy's file cannot hold.
         ImportError: the package of a logger is missing.
     """
 
-    def __init__(self, run: RunFolder, resume: bool = False) -> None:
+    def __init__(self, run: RunFolder, resume: bool = False, given: Given | None = None) -> None:
         self.run = run
+        given = given or Given()
+        if resume:
+            given.check(run)
         config = run.load_config()
         self.config = config = dataclasses.replace(config, device=distributed.own_device(config.device))
         check_device(config.device)
@@ -78,8 +127,18 @@ class Trainer:
             )
         torch.manual_seed(config.seed)
         first, rank = distributed.is_first(), distributed.rank()
-        self.env = make_env(config, run.nan_dump if first else run.nan_dump.with_stem(f"nan_dump_rank{rank}"))
-        self.algorithm = ALGORITHMS[config.algorithm](config)
+        self.environments = Environments(config, given.env)
+        dump = run.nan_dump if first else run.nan_dump.with_stem(f"nan_dump_rank{rank}")
+        self.env = self.environments.training(dump)
+        make_algorithm = given.algorithm or ALGORITHMS[config.algorithm]
+        self.algorithm = make_algorithm(config, Spaces.of(self.env), given.network)
+        deterministic_policy(self.algorithm.actor, config, {})  # raises an error where it could not be saved
+        base, _ = unwrapped(self.env)
+        length, from_start = self.environments.full_length, not base.stagger
+        self.episodes = Episodes(config.num_envs, config.device, config.action_repeat, length, from_start)
+        self._training_length = base.config.episode_length
+        terms = self.env.observation_spec.get("reward_terms", None)
+        self._terms = () if terms is None else tuple(terms.keys())
         self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
         self.collector = RolloutCollector(self.env, self.algorithm.actor, frames_per_batch=config.batch_size)
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
@@ -96,8 +155,8 @@ class Trainer:
     def train(self) -> None:
         """Trains to the last frame, then evaluates the best policy, plots the learning curve and records a video.
 
-        A progress bar shows the return (mean reward of the last batch times the length of an episode) and the frames
-        per second. At Ctrl-C or SIGTERM the iteration is finished and a checkpoint written before KeyboardInterrupt is
+        A progress bar shows the return (see :class:`torchrl_loco.training.episodes.Episodes`) and the frames per
+        second. At Ctrl-C or SIGTERM the iteration is finished and a checkpoint written before KeyboardInterrupt is
         raised; a second one stops at once.
 
         Raises:
@@ -115,11 +174,11 @@ class Trainer:
             distributed.wait_for_all()
 
     def _train(self) -> None:
-        config, first = self.config, distributed.is_first()
+        config, first, noted = self.config, distributed.is_first(), False
         saved, frames = time.perf_counter(), {"total": self.last_frame, "initial": self.frames}
         with (
             Loggers(self.run, self.frames) if first else contextlib.nullcontext() as loggers,
-            tqdm(**frames, unit="frame", unit_scale=True, desc=config.task, disable=not first) as bar,
+            tqdm(**frames, unit="frame", unit_scale=True, desc=config.label, disable=not first) as bar,
             interruptible(
                 "stopping after this update, with a checkpoint; Ctrl-C again stops at once" if first else ""
             ) as interrupted,
@@ -130,8 +189,11 @@ class Trainer:
                     self.run.append_metrics(row)
                     loggers.log(row, self.frames)
                 trial = {"trial": self.trials.label} if self.trials.running else {}
-                bar.set_postfix({**trial, "return": f"{row['return']:.0f}"}, refresh=False)
+                bar.set_postfix({**trial, "return": _rounded(row["return"])}, refresh=False)
                 bar.update(self.frames_per_iteration)
+                if first and not noted and (note := self.algorithm.note({key: [row[key]] for key in row})):
+                    noted = True
+                    tqdm.write(f"after {self.frames:,} frames: {note}")
                 trial_is_over = self.trials.is_over(self.frames)
                 if trial_is_over or self.frames >= self.last_frame or self._evaluation_is_due():
                     mean = None
@@ -141,6 +203,7 @@ class Trainer:
                     distributed.wait_for_all()
                     if trial_is_over:
                         self.trials.end(self.frames, distributed.from_first(mean))
+                        self.episodes.restart()
                 is_late = time.perf_counter() - saved > config.checkpoint_seconds
                 stop, is_late = distributed.any_rank(interrupted(), is_late)
                 if stop or is_late:
@@ -172,23 +235,44 @@ class Trainer:
     def _iterate(self) -> dict[str, float]:
         """Returns the metrics of collecting a batch and updating on it; reads from the device once."""
         config, algorithm, start = self.config, self.algorithm, time.perf_counter()
-        full_length = env_class(config.task).defaults.episode_length  # in training, episodes may be shorter
         batch = self.collector.rollout()
-        reward = batch["next", "reward"].mean() / config.action_repeat
+        after = batch["next"]
+        reward = after["reward"].mean() / config.action_repeat
+        flags = (after[name].squeeze(-1) for name in ("done", "terminated"))
+        ended = self.episodes.add(after["reward"].squeeze(-1), *flags)
+        terms = [after["reward_terms", name].mean() / config.action_repeat for name in self._terms]
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
-        mean_reward, *means = distributed.mean_of_ranks(torch.cat([reward.view(1), metrics])).tolist()
+        numbers = torch.cat([torch.stack([reward, *terms]), ended, metrics])
+        mean_reward, *means = distributed.mean_of_ranks(numbers).tolist()
+        of_terms = [means.pop(0) for _ in self._terms]
+        self.episodes.take(*(means.pop(0) * distributed.ranks() for _ in ended))
         self.frames += self.frames_per_iteration
         self.iteration += 1
         seconds = time.perf_counter() - start
         self.seconds += seconds
+        names = (*algorithm.metric_names, *algorithm.batch_metric_names)
         return {
             "iteration": self.iteration,
             "frames": self.frames,
             "seconds": round(self.seconds, 3),
             "frames_per_second": round(self.frames_per_iteration / seconds, 1),
-            "return": round(mean_reward * full_length, 3),
-            **{name: round(value, 6) for name, value in zip(algorithm.metric_names, means, strict=True)},
+            **self._of_episodes(mean_reward),
+            **{f"reward/{name}": round(mean, 6) for name, mean in zip(self._terms, of_terms, strict=True)},
+            **{name: round(value, 6) for name, value in zip(names, means, strict=True)},
         }
+
+    def _of_episodes(self, mean_reward: float) -> dict[str, float]:
+        """Returns the mean return and length (control steps) of the last episodes, and their number.
+
+        Until one has ended that was seen from its start, they are what follows from the mean reward of the batch if no
+        episode ends before its time limit, and their number is 0.
+        """
+        if not self.episodes.count:
+            estimate = round(mean_reward * self.environments.full_length, 3)
+            return {"return": estimate, "episode_length": self._training_length, "episodes": 0}
+        episodes = self.episodes
+        means = round(episodes.mean_return, 3), round(episodes.mean_length, 1)
+        return {"return": means[0], "episode_length": means[1], "episodes": episodes.count}
 
     def _evaluation_is_due(self) -> bool:
         interval = self.config.eval_interval
@@ -197,12 +281,13 @@ class Trainer:
     def _evaluate(self) -> dict[str, float]:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""
         if self._evaluator is None:
-            config, seed = self.config, evaluation_seed(self.config.seed, final=False)
-            self._evaluator = Evaluator(
-                config.task, config.eval_episodes, config.device, seed, config.protocol, config.action_repeat
-            )
+            self._evaluator = self._make_evaluator(evaluation_seed(self.config.seed, final=False))
         when = {"frames": self.frames, "seconds": round(self.seconds, 3)}
-        policy = deterministic_policy(self.algorithm.actor, self.config, {**when, "trained_on": self.device_name})
+        base, _ = unwrapped(self.env)
+        of_env: dict[str, Any] = {"trained_on": self.device_name, "control_timestep": base.config.ctrl_dt}
+        if self.environments.transforms:
+            of_env["transforms"] = self.environments.names_of_transforms
+        policy = deterministic_policy(self.algorithm.actor, self.config, {**when, **of_env})
         summary = summarize(self._evaluator(policy))
         self.run.append_evaluation({**when, **summary})
         if summary["mean"] >= self._best:
@@ -210,22 +295,28 @@ class Trainer:
             policy.save(self.run.policy)
         return summary
 
+    def _make_evaluator(self, seed: int) -> Evaluator:
+        """Returns what evaluates policies of this run in episodes that begin as the seed says."""
+        config = self.config
+        env = self.environments.evaluation(config.eval_episodes, seed)
+        args = (config.task, config.eval_episodes, config.device, seed, config.protocol, config.action_repeat)
+        return Evaluator(*args, env=env)
+
     def _finish(self) -> None:
         """Evaluates the best policy in episodes that did not select it, plots the learning curve, records a video."""
         config = self.config
         policy = Policy.load(self.run.policy, config.device)
-        summary = evaluate_policy(policy)
+        summary = summarize(self._make_evaluator(evaluation_seed(config.seed, final=True))(policy))
         plot_runs([self.run], self.run.path / "learning_curve.png")
         if config.video_seconds > 0:
-            env = make(
-                config.task, 1, config.device, evaluation_seed(config.seed, final=True), config.protocol, world_offset=0
-            )
+            env = self.environments.evaluation(1, evaluation_seed(config.seed, final=True))
             record(policy, env, self.run.video, config.video_seconds, config.action_repeat)
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
         print(f"best policy, in new episodes: {describe(summary)}")
         fallen = fallen_return(config, self.run.read_evaluations(), self.run.seeds)
-        for note in filter(None, (fallen, poor_return(config, summary, self.run.seeds))):
+        of_all = self.algorithm.note(self.run.read_metrics())
+        for note in filter(None, (fallen, poor_return(config, summary, self.run.seeds), of_all)):
             print(note)
 
     def save(self) -> None:
@@ -233,6 +324,7 @@ class Trainer:
         on_cuda = self.algorithm.device.type == "cuda"
         own = {
             "collector": self.collector.state_dict(),
+            "episodes": self.episodes.state_dict(),
             "rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state(self.algorithm.device) if on_cuda else None,
         }
@@ -277,11 +369,13 @@ class Trainer:
             self._best = max(means, default=-math.inf)
         before = 1 + len(checkpoint.get("further_ranks", ()))  # a checkpoint without is of one process
         if before != distributed.ranks():
+            self.episodes.load_state_dict(checkpoint["episodes"], running=False)
             self.algorithm.generator.set_state(generator)
             self._say_what_changes(before)
             return
         own = checkpoint if rank == 0 else checkpoint["further_ranks"][rank - 1]
         self.collector.load_state_dict(own["collector"])
+        self.episodes.load_state_dict(own["episodes"], running=True)
         torch.set_rng_state(own["rng"].cpu())
         if own["cuda_rng"] is not None and self.algorithm.device.type == "cuda":
             torch.cuda.set_rng_state(own["cuda_rng"].cpu(), self.algorithm.device)
@@ -310,22 +404,6 @@ class Trainer:
             )
 
 
-def make_env(config: TrainingConfig, nan_dump: Path) -> EnvBase:
-    """Returns the environment of a run: each action is held for ``config.action_repeat`` frames, rewards are summed.
-
-    Its worlds are those of this rank: world k of rank r is world ``r * num_envs + k`` of the whole.
-
-    If a world becomes non-finite, a NaN dump is written to ``nan_dump``, unless one is already there.
-    """
-    env = make(
-        config.task,
-        config.num_envs,
-        config.device,
-        config.seed,
-        config.protocol,
-        world_offset=distributed.rank() * config.num_envs,
-        stagger=True,
-        episode_length=config.episode_length,
-        nan_dump=None if nan_dump.exists() else nan_dump,
-    )
-    return env if config.action_repeat == 1 else TransformedEnv(env, FrameSkipTransform(config.action_repeat))
+def _rounded(value: float) -> str:
+    """Returns a number with three digits or more."""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

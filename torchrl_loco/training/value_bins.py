@@ -63,9 +63,11 @@ CROSS_ENTROPY = """
 class ValueBins(nn.Module):
     """Returns as distributions over evenly spaced bins.
 
+    A return below the first bin's center counts as one at it, and so does one above the last.
+
     Args:
         low: return at the center of the first bin.
-        high: return at the center of the last bin.
+        high: return at the center of the last bin, more than ``low``.
         count: number of bins.
 
     Attributes:
@@ -85,6 +87,7 @@ class ValueBins(nn.Module):
         self.register_buffer("centers", torch.linspace(low, high, count), persistent=False)
         self.register_buffer("edges", torch.linspace(low - half, high + half, count + 1), persistent=False)
         self.low, self.high, self.sigma = low, high, 2 * half * self.SPREAD
+        self.width = 2 * half
 
     def encode(self, returns: torch.Tensor) -> torch.Tensor:
         """Returns the probabilities, shape ``(..., count)``, of a Gaussian about each return of shape ``(...)``."""

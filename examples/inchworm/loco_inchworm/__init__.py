@@ -51,8 +51,8 @@ class InchwormCrawl(LocoEnv):
     """
 
     body = "inchworm"
-    mjcf = Path(__file__).with_name("inchworm.xml")
-    defaults = SimConfig(ctrl_dt=0.02, sim_dt=0.005, naconmax=20_000, njmax=50, iterations=4, ls_iterations=8)
+    model = Path(__file__).with_name("inchworm.xml")
+    config = SimConfig(ctrl_dt=0.02, sim_dt=0.005, naconmax=20_000, njmax=50, iterations=4, ls_iterations=8)
     observation_size = 9
     term_names = ("move",)
 

@@ -17,10 +17,11 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 ``ground_contacts``  contacts with planes of the world: a stiffness of a body each
 ``dense_contacts``   all other contacts, and limits of ball joints
 ``solver``           Newton iterations and their line search
-``sensors``          velocities of subtrees, and touch
+``sensors``          velocities of subtrees, touch, and contact forces of geoms
 ``lanes``            a group of lanes a world: what ``lanes.h`` has to know about a model
 ``links``            bodies that are welded together
 ``tables``           constants and tables as C++
+``read_only``        the model that environments see
 ===================  =====================================================================
 """
 

@@ -76,10 +76,23 @@ class DenseContacts:
         found: pairs of geoms that may touch.
         ground: the contacts that come before these.
         touch: the sensors that may feel them.
+        with_frames: whether their directions and pairs are stored too, which the solver does without.
+
+    Attributes:
+        directions: of contact ``k``, if they are stored: the normal, and the two tangents times friction, ``(3,)``
+            each.
     """
 
-    def __init__(self, tree: Dynamics, found: list[Pair], ground: GroundContacts, touch: TouchSensors) -> None:
-        m, self.tree, self.ground, self.touch = tree.m, tree, ground, touch
+    def __init__(
+        self,
+        tree: Dynamics,
+        found: list[Pair],
+        ground: GroundContacts,
+        touch: TouchSensors,
+        *,
+        with_frames: bool = False,
+    ) -> None:
+        m, self.tree, self.ground, self.touch, self._with_frames = tree.m, tree, ground, touch, with_frames
         planes = {corner.pair for corner in ground.corners}
         self.pairs = [pair for pair in found if pair not in planes]
         self.balls = [j for j in range(m.njnt) if m.jnt_limited[j] and m.jnt_type[j] == BALL]
@@ -95,6 +108,13 @@ class DenseContacts:
             "mode_weight": self.modes,
             "mode_solution": self.modes * m.nv,
         }
+        if with_frames:
+            self.arrays.update({f"dense_{title}{i}": self.count for title in ("normal", "tangent") for i in range(3)})
+        normal, tangent = (
+            np.array([cell(f"dense_{title}{i}[k - ground]") for i in range(3)], dtype=object)
+            for title in ("normal", "tangent")
+        )
+        self.directions = [normal, tangent, cross(normal, tangent)]
 
     def create(self, block: Block, variables: Variables) -> None:
         """Finds the contacts, and sets Jacobians, weights and residuals."""
@@ -171,6 +191,11 @@ class DenseContacts:
                 contact_weight_, residual = softness.row(weight, name("position"))
                 self._store(point, jacobians, contact_weight_ * share, residual, softness.damping, variables)
                 self._feel(point, touching, contact_point + origin)
+                if self._with_frames:
+                    point(f"contact_corner[k] = {len(self.ground.corners)} + pair;")
+                    for title, axis in (("normal", axes[0]), ("tangent", axes[1])):
+                        for i in range(3):
+                            point.set(f"dense_{title}{i}[k - ground]", axis[i])
 
     def _store(
         self,
@@ -226,6 +251,8 @@ class DenseContacts:
                 weight, residual = softness.row(m.dof_invweight0[dof], name("position"))
                 share = self.pyramid.share(1)
                 self._store(violated, jacobians, weight * share, residual, softness.damping, variables)
+                if self._with_frames:
+                    violated(f"contact_corner[k] = {len(self.ground.corners) + len(self.pairs)};  // no geoms")
 
     def _moved_by(self, body: int) -> int:
         """Returns the degrees of freedom that move a body, as bits."""

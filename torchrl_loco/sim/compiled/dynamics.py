@@ -173,7 +173,7 @@ class Dynamics:
         m: the model.
         qpos: positions, ``nq`` of them.
         qvel: velocities, ``nv``.
-        ctrl: controls, ``nu``.
+        ctrl: controls, ``nu``; without them there is no actuation.
 
     Attributes:
         poses: where everything is.
@@ -183,7 +183,7 @@ class Dynamics:
         force: smooth generalised force: passive, actuation, minus bias, ``(nv,)``.
     """
 
-    def __init__(self, m: mujoco.MjModel, qpos: list[Scalar], qvel: list[Scalar], ctrl: list[Scalar]) -> None:
+    def __init__(self, m: mujoco.MjModel, qpos: list[Scalar], qvel: list[Scalar], ctrl: list[Scalar] | None) -> None:
         self.m = m
         self.poses = kinematics(m, qpos)
         self.com = self._centers_of_mass()
@@ -191,7 +191,7 @@ class Dynamics:
         self.cdof = self._motion_subspaces()
         bias = self._bias_force(qvel)
         passive = self._passive_force(qpos, qvel)
-        actuation = self._actuator_force(qpos, qvel, ctrl)
+        actuation = [scalar(0)] * m.nv if ctrl is None else self._actuator_force(qpos, qvel, ctrl)
         self.force = [passive[i] + actuation[i] - bias[i] for i in range(m.nv)]
 
     def keep(self, block: Block) -> None:

@@ -12,7 +12,8 @@ import warp as wp
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.buffer import Buffer
-from torchrl_loco.sim.compiled.step import WARP, launch_size, source, structure_of_arrays
+from torchrl_loco.sim.compiled.read_only import ReadOnly, read_only
+from torchrl_loco.sim.compiled.step import WARP, check_worlds, launch_size, source, structure_of_arrays
 from torchrl_loco.sim.world_func import Chain, WorldFunc, WorldKernel
 
 ROWS = {
@@ -24,10 +25,16 @@ ROWS = {
     "xpos": ("nbody", wp.vec3),
     "xmat": ("nbody", wp.mat33),
     "cvel": ("nbody", wp.spatial_vector),
+    "subtree_com": ("nbody", wp.vec3),
+    "contact_force": ("contact_geoms", wp.vec3),
+    "in_contact": ("contact_geoms", wp.bool),
     "sensordata": ("nsensordata", wp.float32),
     "overflow": (None, wp.int32),
 }
 """Type of each array of :class:`Data`, and the size in the model that is the length of its rows."""
+
+LATER = ("cvel", "subtree_com")
+"""Arrays that are made, and computed, if they are asked for before the first step."""
 
 
 class Data:
@@ -38,6 +45,7 @@ class Data:
         nworld: number of worlds.
         device: where they live.
         structure_of_arrays: whether the world is the fastest index in memory.
+        contact_geoms: number of geoms whose contact forces are asked for.
 
     Attributes:
         qpos: positions, ``(nworld, nq)``.
@@ -47,6 +55,9 @@ class Data:
         time: time since the world's reset (s), ``(nworld,)``.
         xpos: positions of the bodies (m), ``(nworld, nbody)`` vec3.
         xmat: orientations of the bodies, ``(nworld, nbody)`` mat33.
+        contact_force: net force of the contacts on each of the geoms that were asked for, in the world's frame (N),
+            ``(nworld, contact_geoms)`` vec3.
+        in_contact: whether they have any, ``(nworld, contact_geoms)`` bool.
         sensordata: sensors, ``(nworld, nsensordata)``.
         overflow: ``Overflow`` bits, ``(nworld,)``.
         act: activations of the actuators, ``(nworld, 0)``: a supported model has none.
@@ -59,27 +70,41 @@ class Data:
     time: wp.array
     xpos: wp.array
     xmat: wp.array
+    contact_force: wp.array
+    in_contact: wp.array
     sensordata: wp.array
     overflow: wp.array
     act: wp.array
 
-    def __init__(self, m: mujoco.MjModel, nworld: int, device: wp.Device, *, structure_of_arrays: bool) -> None:
+    def __init__(
+        self,
+        m: mujoco.MjModel,
+        nworld: int,
+        device: wp.Device,
+        *,
+        structure_of_arrays: bool,
+        contact_geoms: int = 0,
+    ) -> None:
         def make(name: str) -> wp.array:
-            shape, dtype = _shape(m, nworld, name), ROWS[name][1]
+            shape, dtype = _shape(m, nworld, name, contact_geoms), ROWS[name][1]
             if structure_of_arrays:
                 return wp.zeros(shape[::-1], dtype=dtype, device=device).transpose()
             return wp.zeros(shape, dtype=dtype, device=device)
 
         self.act = wp.zeros((nworld, 0), dtype=float, device=device)
         self._make: Callable[[str], wp.array] | None = make
-        self._cvel: wp.array | None = None
+        self._later: dict[str, wp.array] = {}
         for name in ROWS:
-            if name != "cvel":
+            if name not in LATER:
                 setattr(self, name, make(name))
         start = mujoco.MjData(m)
         mujoco.mj_kinematics(m, start)
-        for array, row in ((self.xpos, start.xpos), (self.xmat, start.xmat)):  # the step leaves out what is constant
-            array.assign(np.broadcast_to(row.reshape(-1, *array.numpy().shape[2:]), array.numpy().shape))
+        mujoco.mj_comPos(m, start)
+        roots = np.arange(m.nbody) == m.body_rootid
+        roots[0] = False
+        self._start_com = np.where(roots[:, None], start.subtree_com, 0.0)
+        _fill_rows(self.xpos, start.xpos)  # the step leaves out what is constant
+        _fill_rows(self.xmat, start.xmat)
 
     @property
     def cvel(self) -> wp.array:
@@ -90,11 +115,29 @@ class Data:
         Raises:
             RuntimeError: it is too late.
         """
-        if self._cvel is None:
+        return self._asked("cvel")
+
+    @property
+    def subtree_com(self) -> wp.array:
+        """Centers of mass of the trees (m), ``(nworld, nbody)`` vec3, in the rows of their roots; other rows are zero.
+
+        The root of a body is ``mj_model.body_rootid``, and :attr:`cvel` is about that row: a point ``p`` of the body
+        moves with ``cvel[3:] + cross(cvel[:3], p - subtree_com[root])``. They are computed if they were asked for
+        before the first step.
+
+        Raises:
+            RuntimeError: it is too late.
+        """
+        return self._asked("subtree_com")
+
+    def _asked(self, name: str) -> wp.array:
+        if name not in self._later:
             if self._make is None:
-                raise RuntimeError("cvel is not computed: ask for data.cvel before the first step")
-            self._cvel = self._make("cvel")
-        return self._cvel
+                raise RuntimeError(f"{name} is not computed: ask for data.{name} before the first step")
+            self._later[name] = self._make(name)
+            if name == "subtree_com":
+                _fill_rows(self._later[name], self._start_com)
+        return self._later[name]
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -105,26 +148,51 @@ class Data:
         )
 
     def outputs(self) -> dict[str, wp.array | None]:
-        """Returns what the kernels write, by name; ``cvel`` is ``None`` if nothing has asked for it before."""
+        """Returns what the kernels write, by name; ``None`` for those of :data:`LATER` that nothing has asked for."""
         self._make = None
-        written = {name: self._cvel if name == "cvel" else getattr(self, name) for name in ROWS}
+        written = {name: self._later.get(name) if name in LATER else getattr(self, name) for name in ROWS}
         del written["ctrl"]
         return written
 
 
-def _shape(m: mujoco.MjModel, nworld: int, name: str) -> tuple[int, ...]:
-    size = ROWS[name][0]
-    return (nworld,) if size is None else (nworld, getattr(m, size))
+def _fill_rows(array: wp.array, row: np.ndarray) -> None:
+    """Writes the same row into all worlds."""
+    shape = array.numpy().shape
+    array.assign(np.broadcast_to(row.reshape(shape[1:]), shape))
 
 
-def data_bytes(m: mujoco.MjModel, num_envs: int) -> int:
-    """Returns the memory that the state of so many worlds takes, without ``cvel`` (bytes)."""
-    sizes = {name: math.prod(_shape(m, num_envs, name)) * wp.types.type_size_in_bytes(ROWS[name][1]) for name in ROWS}
-    return sum(sizes.values()) - sizes["cvel"]
+def _shape(m: mujoco.MjModel, nworld: int, name: str, contact_geoms: int) -> tuple[int, ...]:
+    match ROWS[name][0]:
+        case None:
+            return (nworld,)
+        case "contact_geoms":
+            return nworld, contact_geoms
+        case size:
+            return nworld, getattr(m, size)
 
 
-class Model:
-    """The model on the device: what ``mujoco_warp.Model`` has, under the same names.
+def data_bytes(m: mujoco.MjModel, num_envs: int, contact_geoms: int = 0) -> int:
+    """Returns the memory that the state of so many worlds takes, without what is asked for later (bytes).
+
+    Args:
+        m: the model.
+        num_envs: number of worlds.
+        contact_geoms: number of geoms whose contact forces are asked for.
+    """
+    return sum(
+        math.prod(_shape(m, num_envs, name, contact_geoms)) * wp.types.type_size_in_bytes(dtype)
+        for name, (_, dtype) in ROWS.items()
+        if name not in LATER
+    )
+
+
+class Model(ReadOnly):
+    """The model on the device: what ``mujoco_warp.Model`` has, under the same names, to be read only.
+
+    Its numbers are constants of the compiled step: to write them would change nothing. So setting an attribute raises
+    ``AttributeError``, writing an array ``TypeError`` (``fill_``, ``zero_``, ``assign``, views for torch) or
+    ``ValueError`` (what ``numpy()`` returns). Kernels and structs take the arrays like any other. ``wp.copy`` into an
+    array and kernels that write to it cannot be caught.
 
     Only what environments read when they are made is copied here. Anything else makes the model of MuJoCo-Warp, which
     imports it and takes a second or two.
@@ -135,20 +203,17 @@ class Model:
     """
 
     def __init__(self, m: mujoco.MjModel, device: wp.Device) -> None:
-        self._mj_model, self._device = m, device
-        self.qpos0 = wp.array(m.qpos0.reshape(1, m.nq), dtype=wp.float32, device=device)
-        self.jnt_range = wp.array(m.jnt_range.reshape(1, m.njnt, 2), dtype=wp.vec2, device=device)
-        self.actuator_ctrlrange = wp.array(m.actuator_ctrlrange.reshape(1, m.nu, 2), dtype=wp.vec2, device=device)
+        arrays = {
+            "qpos0": wp.array(m.qpos0.reshape(1, m.nq), dtype=wp.float32, device=device),
+            "jnt_range": wp.array(m.jnt_range.reshape(1, m.njnt, 2), dtype=wp.vec2, device=device),
+            "actuator_ctrlrange": wp.array(m.actuator_ctrlrange.reshape(1, m.nu, 2), dtype=wp.vec2, device=device),
+        }
+        self.__dict__.update({name: read_only(array) for name, array in arrays.items()}, _mj_model=m, _device=device)
 
     @functools.cached_property
-    def _complete(self) -> "mjw.Model":
+    def _source(self) -> "mjw.Model":
         with wp.ScopedDevice(self._device):
             return mjw.put_model(self._mj_model)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return getattr(self._complete, name)
 
 
 class CompiledEngine:
@@ -162,6 +227,7 @@ class CompiledEngine:
         config: settings of the simulation.
         num_envs: number of worlds.
         device: where they live.
+        contact_geoms: geoms whose contact forces are computed.
 
     Attributes:
         model: the model on the device.
@@ -170,14 +236,27 @@ class CompiledEngine:
         peak_contacts: zero likewise, ``(1,)``.
         coalesced: whether functions of a world have kernels of their own, in which the threads of a warp take
             neighbouring worlds whose numbers are neighbours in memory.
+
+    Raises:
+        ValueError: there are more worlds than Warp can address.
     """
 
-    def __init__(self, mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, device: wp.Device) -> None:
+    def __init__(
+        self,
+        mj_model: mujoco.MjModel,
+        config: SimConfig,
+        num_envs: int,
+        device: wp.Device,
+        contact_geoms: Sequence[int] = (),
+    ) -> None:
         self._mj_model, self._substeps, self._device = mj_model, config.substeps, device
+        self._contact_geoms = tuple(contact_geoms)
+        check_worlds(mj_model, num_envs, device)
         self.model = Model(mj_model, device)
         self._launch_size = launch_size(mj_model, num_envs, device)
         by_world = structure_of_arrays(mj_model, device)
-        self.data = Data(mj_model, num_envs, device, structure_of_arrays=by_world)
+        count = len(self._contact_geoms)
+        self.data = Data(mj_model, num_envs, device, structure_of_arrays=by_world, contact_geoms=count)
         self.coalesced = by_world and not self._launch_size.one_kernel
         self._kernels: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
         self._kernels_apart: dict[tuple, WorldKernel] = {}
@@ -188,6 +267,14 @@ class CompiledEngine:
     def remedy(self, dropped: str, most: int) -> str:
         """Returns advice for the warning about dropped contacts."""
         return f"a world of the compiled engine has no more places for {dropped}: pass engine='mujoco_warp'"
+
+    def contact_arrays(self) -> tuple[wp.array, wp.array]:
+        """Returns net contact forces ``(nworld, geoms)`` vec3 and whether there is a contact, ``(nworld, geoms)``."""
+        return self.data.contact_force, self.data.in_contact
+
+    def subtree_com(self) -> wp.array:
+        """Returns ``data.subtree_com``."""
+        return self.data.subtree_com
 
     def step(
         self,
@@ -241,7 +328,8 @@ class CompiledEngine:
         outputs = self.data.outputs()
         key = substeps, *(func for func, _ in before), None, *(func for func, _ in after)
         if key not in self._kernels:
-            text = source(self._mj_model, substeps, with_cvel=outputs["cvel"] is not None)
+            asked = {f"with_{name}": outputs[name] is not None for name in LATER}
+            text = source(self._mj_model, substeps, contact_geoms=self._contact_geoms, **asked)
             start, end = Chain(before), Chain(after)
             self._kernels[key] = _kernel(text, start.func, start.struct, end.func, end.struct), start, end
         kernel, start, end = self._kernels[key]
@@ -280,6 +368,9 @@ def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, Aft
         xpos_out: wp.array2d[wp.vec3],
         xmat_out: wp.array2d[wp.mat33],
         cvel_out: wp.array2d[wp.spatial_vector],
+        subtree_com_out: wp.array2d[wp.vec3],
+        contact_force_out: wp.array2d[wp.vec3],
+        in_contact_out: wp.array2d[bool],
         sensordata_out: wp.array2d[float],
         overflow_out: wp.array[int],
     ): ...
@@ -302,6 +393,9 @@ def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, Aft
         xpos_out: wp.array2d[wp.vec3],
         xmat_out: wp.array2d[wp.mat33],
         cvel_out: wp.array2d[wp.spatial_vector],
+        subtree_com_out: wp.array2d[wp.vec3],
+        contact_force_out: wp.array2d[wp.vec3],
+        in_contact_out: wp.array2d[bool],
         sensordata_out: wp.array2d[float],
         overflow_out: wp.array[int],
     ):
@@ -325,6 +419,9 @@ def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, Aft
             xpos_out,
             xmat_out,
             cvel_out,
+            subtree_com_out,
+            contact_force_out,
+            in_contact_out,
             sensordata_out,
             overflow_out,
         )

@@ -20,6 +20,9 @@ class GroundContacts:
         tree: the dynamics.
         found: pairs of geoms that may touch.
         touch: the sensors that may feel them.
+
+    Attributes:
+        directions: of contact ``k``: the normal, and the two tangents times friction, ``(3,)`` each.
     """
 
     def __init__(self, tree: Dynamics, found: list[Pair], touch: TouchSensors) -> None:
@@ -31,12 +34,12 @@ class GroundContacts:
         self.live = [i for i in range(6) if any(scalar(twists[b][i]).constant != 0 for b in self.bodies)]
         self._frames = [self._frame(corner) for corner in self.corners]
         self._lever = self._varying("lever", [self._point(corner) for corner in self.corners])
-        self._directions = [
+        self.directions = [
             self._varying(title, [frames[i] for frames in self._frames])
             for i, title in enumerate(("normal", "tangent"))
         ]
-        normal, tangent = self._directions
-        self._directions.append(cross(normal, tangent))
+        normal, tangent = self.directions
+        self.directions.append(cross(normal, tangent))
         if all(corner.pair.condim == 1 for corner in self.corners):
             self.pyramid = FRICTIONLESS
         elif self._velocity(self._stored_twist())[2].constant == 0:
@@ -103,7 +106,7 @@ class GroundContacts:
     def _velocity(self, twist: np.ndarray) -> list[Scalar]:
         """Returns the velocity at contact ``k`` along the normal and the scaled tangents."""
         linear = twist[3:] + cross(twist[:3], self._lever)
-        return [dot(direction, linear) for direction in self._directions]
+        return [dot(direction, linear) for direction in self.directions]
 
     def create(self, block: Block, variables: Variables) -> None:
         """Finds the contacts, and sets weights and residuals."""
@@ -191,8 +194,7 @@ class GroundContacts:
             x = [cell(f"contact_x{d}[k]") for d in pyramid.directions]
             gradient, hessian = pyramid.response(cell("contact_D[k]"), x)
             wrenches = [
-                np.concatenate([cross(self._lever, self._directions[d]), self._directions[d]])
-                for d in pyramid.directions
+                np.concatenate([cross(self._lever, self.directions[d]), self.directions[d]]) for d in pyramid.directions
             ]
             force = total(gradient[d] * wrenches[d] for d in pyramid.directions)
             for i, component in enumerate(live):

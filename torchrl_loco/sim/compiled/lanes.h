@@ -239,6 +239,11 @@ struct Step : Math {
   int frictional, frictionless;  // contacts
   int limits;                    // violated limits of hinges and slides
   int limit_row[SLOTS];          // the row of the limit of each own degree of freedom, or -1
+//IF CONTACT_GEOMS
+  // What the solver overwrites of the contacts that this lane adds up: number lane, lane + LANES, ...
+  enum { OWN_CONTACTS = (CONTACTS + LANES - 1) / LANES };
+  struct OwnContact { Vec normal, tangent; int pair; } own_contacts[OWN_CONTACTS];
+//END
 
   INLINE Step(World& w, int lane, const float* ctrl, int* overflow, int world)
       : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world) {}
@@ -465,10 +470,10 @@ struct Step : Math {
     const int q = Model::dof_qpos(d);
     float force = -Model::damping(d) * w.qvel[d];
     if (Model::HAS_SPRINGS) force = force - Model::stiffness(d) * (w.qpos[q] - Model::spring(q));
-    const int end = Model::first_actuator(d + 1);
+    const int end = Model::first_actuator(d + (Model::SUBSTEPS > 0));  // a step that is not taken has no actuation
     ROLLED for (int a = Model::first_actuator(d); a < end; ++a) {
       const float gear = Model::gear(a);
-      const float control = Model::SUBSTEPS ? ctrl[world * Model::CONTROLS + Model::control(a)] : 0.0f;
+      const float control = ctrl[world * Model::CONTROLS + Model::control(a)];
       float f = Model::gain(a) * clamp(control, Model::control_low(a), Model::control_high(a));
       if (Model::HAS_ACTUATOR_BIAS)
         f = f + Model::bias(a) + gear * (Model::bias_position(a) * w.qpos[q] + Model::bias_velocity(a) * w.qvel[d]);
@@ -1279,6 +1284,57 @@ struct Step : Math {
     }
   }
 
+//IF CONTACT_GEOMS
+  // ---- Contact forces of geoms
+
+  INLINE void keep_contacts() {
+    UNROLLED for (int own = 0; own < OWN_CONTACTS; ++own) {
+      const int i = lane + LANES * own;
+      if (i >= frictional + frictionless) continue;
+      const Contact c = contact(i);
+      own_contacts[own] = {c.normal, c.normal, c.pair};
+      if (i < frictional) own_contacts[own].tangent = w.tangents[i] * Model::friction(c.pair);
+    }
+    sync();
+  }
+
+  // The force of an own contact on its second geom: along the normal and the tangents, times friction, that the edges
+  // of its pyramid are made of.
+  INLINE Vec contact_force(int i, const OwnContact& c) const {
+    if (i >= frictional) {
+      const int r = first_frictionless() + i - frictional;
+      return c.normal * (-w.weight[r] * smaller(w.x[r], 0.0f));
+    }
+    float edge[4];
+    UNROLLED for (int k = 0; k < 4; ++k) edge[k] = -w.weight[4 * i + k] * smaller(w.x[4 * i + k], 0.0f);
+    return c.normal * (edge[0] + edge[1] + edge[2] + edge[3]) + c.tangent * (edge[0] - edge[1]) +
+           c.normal.cross(c.tangent) * (edge[2] - edge[3]);
+  }
+
+  // The sum of the contact forces on each geom, and whether there is a contact.
+  INLINE void write_contact_forces(float* forces, bool* touches) const {
+    ROLLED for (int g = 0; g < Model::CONTACT_GEOMS; ++g) {
+      float force[3] = {0.0f, 0.0f, 0.0f};
+      bool touched = false;
+      UNROLLED for (int own = 0; own < OWN_CONTACTS; ++own) {
+        const int i = lane + LANES * own;
+        if (i >= frictional + frictionless) continue;
+        const OwnContact c = own_contacts[own];
+        const bool first = Model::first_contact_geom(c.pair) == g, second = Model::second_contact_geom(c.pair) == g;
+        if (!first && !second) continue;
+        const Vec push = contact_force(i, c) * (second ? 1.0f : -1.0f);
+        UNROLLED for (int k = 0; k < 3; ++k) force[k] += push.component(k);
+        touched = true;
+      }
+      sum(force, 3);
+      touched = ballot(touched) != 0;
+      if (lane > 0) continue;
+      UNROLLED for (int k = 0; k < 3; ++k) forces[3 * g + k] = force[k];
+      touches[g] = touched;
+    }
+  }
+
+//END
   // ---- The whole
 
   INLINE void kinematics() {
@@ -1317,6 +1373,14 @@ struct Step : Math {
     }
   }
 
+//IF SUBTREE_COM
+  // Centres of mass of the trees, in the rows of their roots.
+  INLINE void write_centers(float* subtree_com) const {
+    SHARED_LOOP(t, Model::TREES)
+      UNROLLED for (int k = 0; k < 3; ++k) subtree_com[3 * Model::root_body(t) + k] = w.com[t].component(k);
+  }
+
+//END
   // Momentum of a subtree over its mass.
   INLINE void write_subtree_velocities(float* sensordata) const {
     ROLLED for (int s = 0; s < Model::SUBTREES; ++s) {
@@ -1362,12 +1426,25 @@ if (live) {
   SHARED_LOOP(i, DOFS * STRIDE) w.mass[i] = 0.0f;
   step.sync();
 }
+//IF CONTACT_GEOMS
+float* const contact_forces = reinterpret_cast<float*>(contact_force_out.data + world * Model::CONTACT_GEOMS);
+bool* const in_contact = in_contact_out.data + world * Model::CONTACT_GEOMS;
+if (live && Model::SUBSTEPS == 0) {  // a step that is not taken finds forces
+  step.kinematics();
+  step.dynamics();
+  step.keep_contacts();
+  step.solve();
+  step.write_touch(sensors);
+  step.write_contact_forces(contact_forces, in_contact);
+}
+//ELSE
 if (live && Model::TOUCH && Model::SUBSTEPS == 0) {  // touch is a force: a step that is not taken finds it
   step.kinematics();
   step.dynamics();
   step.solve();
   step.write_touch(sensors);
 }
+//END
 ROLLED for (int substep = 0;; ++substep) {
   LOCKSTEP();
   if (live) step.kinematics();
@@ -1375,8 +1452,14 @@ ROLLED for (int substep = 0;; ++substep) {
   if (live) step.dynamics();
   LOCKSTEP();
   if (live) {
+//IF CONTACT_GEOMS
+    if (substep == Model::SUBSTEPS - 1) step.keep_contacts();
+//END
     step.solve();
     if (Model::TOUCH && substep == Model::SUBSTEPS - 1) step.write_touch(sensors);
+//IF CONTACT_GEOMS
+    if (substep == Model::SUBSTEPS - 1) step.write_contact_forces(contact_forces, in_contact);
+//END
     step.integrate();
   }
 }
@@ -1384,6 +1467,9 @@ if (live) {
   const int first_body = world * Model::BODIES;
   step.write_bodies(reinterpret_cast<float*>(xpos_out.data + first_body), reinterpret_cast<float*>(xmat_out.data + first_body),
                     cvel_out.data ? reinterpret_cast<float*>(cvel_out.data + first_body) : nullptr);
+//IF SUBTREE_COM
+  step.write_centers(reinterpret_cast<float*>(subtree_com_out.data + first_body));
+//END
   step.write_subtree_velocities(sensors);
   if (Model::SUBSTEPS > 0) {
     SHARED_LOOP(i, Model::POSITIONS) qpos_out.data[world * Model::POSITIONS + i] = w.qpos[i];

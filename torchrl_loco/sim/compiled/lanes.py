@@ -177,7 +177,7 @@ class Description:
         more = max(r for r in range(frictionless + 1) if sized(count, r).bytes <= budget)
         return sized(count, more)
 
-    def tables(self, substeps: int) -> str:
+    def tables(self, substeps: int, *, with_subtree_com: bool = False, contact_geoms: Sequence[int] = ()) -> str:
         """Returns struct ``Model``."""
         m, layout, tables = self.m, self.layout, Tables()
         mask = "unsigned" if m.nv <= 32 else "unsigned long long"
@@ -221,6 +221,10 @@ class Description:
         self._add_geoms(tables, mask)
         self._add_limits(tables)
         self._add_outputs(tables)
+        if with_subtree_com:
+            tables.integers("root_body", self.roots)
+        if contact_geoms:
+            self._add_contact_geoms(tables, contact_geoms)
         return tables.text()
 
     def _add_links(self, tables: Tables) -> None:
@@ -422,6 +426,12 @@ class Description:
         tables.integers("first_body", [first for first, _ in bodies])
         tables.integers("second_body", [second for _, second in bodies])
 
+    def _add_contact_geoms(self, tables: Tables, geoms: Sequence[int]) -> None:
+        index, balls = {geom: i for i, geom in enumerate(geoms)}, [-1] * len(self.limited_balls)
+        tables.size(CONTACT_GEOMS=len(geoms))
+        for i, title in enumerate(("first", "second")):
+            tables.integers(f"{title}_contact_geom", [*(index.get(p.geoms[i], -1) for p in self.pairs), *balls])
+
     def _is_below(self, body: int, top: int) -> bool:
         while body and body != top:
             body = self.m.body_parentid[body]
@@ -439,16 +449,41 @@ class Description:
         return "\n".join(f"    eliminate(h, {first}, {end});" for first, end in itertools.pairwise(edges))
 
 
-def source(m: mujoco.MjModel, substeps: int) -> str:
+def source(
+    m: mujoco.MjModel, substeps: int, *, with_subtree_com: bool = False, contact_geoms: Sequence[int] = ()
+) -> str:
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 
     Args:
         m: the model.
         substeps: physics steps; 0 evaluates the state without stepping.
+        with_subtree_com: whether the centers of mass of the trees are written.
+        contact_geoms: geoms whose contact forces are written.
     """
     description = Description(m)
-    text = TEMPLATE.read_text().replace("//MODEL", description.tables(substeps))
-    return text.replace("//ELIMINATE", description.elimination())
+    text = _parts(TEMPLATE.read_text(), {"SUBTREE_COM": with_subtree_com, "CONTACT_GEOMS": len(contact_geoms) > 0})
+    tables = description.tables(substeps, with_subtree_com=with_subtree_com, contact_geoms=contact_geoms)
+    return text.replace("//MODEL", tables).replace("//ELIMINATE", description.elimination())
+
+
+def _parts(text: str, asked: dict[str, bool]) -> str:
+    """Returns a text without the parts that are not asked for.
+
+    A part stands between the lines ``//IF NAME`` and ``//END``; what follows a line ``//ELSE`` in it is for the
+    opposite.
+    """
+    lines, keep = [], True
+    for line in text.splitlines(keepends=True):
+        match line.split():
+            case ["//IF", name]:
+                keep = asked[name]
+            case ["//ELSE"]:
+                keep = not keep
+            case ["//END"]:
+                keep = True
+            case _ if keep:
+                lines.append(line)
+    return "".join(lines)
 
 
 def worlds_per_block(m: mujoco.MjModel) -> int:

@@ -7,7 +7,9 @@ a pyramid; each edge is a row.
 import dataclasses
 from collections.abc import Sequence
 
-from torchrl_loco.sim.compiled.symbols import Scalar, cell, literal, scalar, select
+import numpy as np
+
+from torchrl_loco.sim.compiled.symbols import Scalar, cell, literal, scalar, select, total
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,8 +62,19 @@ class Pyramid:
 
     def normal_force(self) -> Scalar:
         """Returns the normal force of contact ``k`` (N)."""
-        gradient, _ = self.response(cell("contact_D[k]"), [cell(f"contact_x{d}[k]") for d in self.directions])
-        return -gradient[0]
+        return -self._gradient()[0]
+
+    def force(self, axes: Sequence[np.ndarray]) -> np.ndarray:
+        """Returns the force of contact ``k`` on its second geom, ``(3,)`` (N).
+
+        Args:
+            axes: the directions in the world's frame, ``(3,)`` each: the normal, and the tangents times friction.
+        """
+        return -total(g * axis for g, axis in zip(self._gradient(), axes, strict=False))
+
+    def _gradient(self) -> list[Scalar]:
+        """Returns the gradient of the cost of contact ``k`` with respect to the directions."""
+        return self.response(cell("contact_D[k]"), [cell(f"contact_x{d}[k]") for d in self.directions])[0]
 
     def loop(self, first: str, count: str, body: str) -> str:
         """Returns a C++ loop over the edges of contacts, with x, v and D."""

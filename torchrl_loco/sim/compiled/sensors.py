@@ -1,12 +1,14 @@
-"""Sensors of one world, traced for one model: velocities of subtrees, and touch.
+"""Sensors of one world, traced for one model: velocities of subtrees, touch, and contact forces of geoms.
 
 ===========================  ===========================================================================
 :func:`subtree_velocity`     of the present state
 :class:`TouchSensors`        of the forces of the last substep, as acceleration sensors are in MuJoCo
+:class:`ContactForces`       likewise
 ===========================  ===========================================================================
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -160,6 +162,49 @@ class TouchSensors:
     def outputs(self) -> dict[int, Scalar]:
         """Returns the sums by their address in ``sensordata``."""
         return {address: name(f"touch[{s}]") for s, address in enumerate(self.addresses)}
+
+
+class ContactForces:
+    """Net forces of the contacts on some geoms, and whether they have any contact.
+
+    C++ variables: ``contact_corner``, the place of the geoms of contact ``k`` in ``pairs``; behind its end for what is
+    no contact. The results are added up where they are read from, ``contact_force`` and ``in_contact``.
+
+    Args:
+        geoms: the geoms.
+        pairs: geoms that may touch, in the order that ``contact_corner`` counts.
+    """
+
+    def __init__(self, geoms: Sequence[int], pairs: Sequence[tuple[int, int]]) -> None:
+        self.count = len(geoms)
+        index = {geom: i for i, geom in enumerate(geoms)}
+        self._places = [[*(index.get(pair[i], -1) for pair in pairs), -1] for i in range(2)]
+
+    def clear(self, block: Block) -> None:
+        """Sets all to no contact."""
+        with block.scope(f"for (int i = 0; i < {self.count}; ++i)") as each:
+            each("wp::index(contact_force_out, world, i) = wp::vec3(0.0f, 0.0f, 0.0f);")
+            each("wp::index(in_contact_out, world, i) = false;")
+        for title, places in zip(("first", "second"), self._places, strict=True):
+            block(f"static const int force_{title}[{len(places)}] = {{{', '.join(map(str, places))}}};")
+
+    def add(self, block: Block, bounds: tuple[str, str], force: np.ndarray) -> None:
+        """Adds contacts.
+
+        Args:
+            block: a block after the solver and :meth:`clear`.
+            bounds: C++ expressions of the first contact, and of the one behind the last.
+            force: force of contact ``k`` on its second geom, ``(3,)`` (N).
+        """
+        with block.scope(f"for (int k = {bounds[0]}; k < {bounds[1]}; ++k)") as contact:
+            contact("const int first = force_first[contact_corner[k]], second = force_second[contact_corner[k]];")
+            contact("if (first < 0 && second < 0) continue;")
+            parts = ", ".join(contact.value(component) for component in force)
+            contact(f"const wp::vec3 push({parts});")
+            for geom, sign in (("second", "+"), ("first", "-")):
+                with contact.scope(f"if ({geom} >= 0)") as asked:
+                    asked(f"wp::index(contact_force_out, world, {geom}) {sign}= push;")
+                    asked(f"wp::index(in_contact_out, world, {geom}) = true;")
 
 
 def read(m: mujoco.MjModel, tree: Dynamics, touch: TouchSensors) -> list[Scalar | None]:

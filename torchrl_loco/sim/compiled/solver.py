@@ -8,14 +8,14 @@ are. Source: MuJoCo's documentation, chapter Computation ("Solver algorithms", N
 stopping tests are those of mujoco_warp, so that both engines stop at the same iteration.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from torchrl_loco.sim.compiled.collision import Pair
 from torchrl_loco.sim.compiled.constraints import DryFriction, JointLimits, Variables, tolerance
 from torchrl_loco.sim.compiled.dense_contacts import DenseContacts
 from torchrl_loco.sim.compiled.dynamics import Dynamics
 from torchrl_loco.sim.compiled.ground_contacts import GroundContacts
-from torchrl_loco.sim.compiled.sensors import TouchSensors
+from torchrl_loco.sim.compiled.sensors import ContactForces, TouchSensors
 from torchrl_loco.sim.compiled.symbols import Block, cell, cells, dot, literal, total
 
 LINE_SEARCH = """
@@ -117,15 +117,16 @@ class NewtonSolver:
     Args:
         tree: the dynamics.
         found: pairs of geoms that may touch.
+        contact_geoms: geoms whose contact forces are asked for.
     """
 
-    def __init__(self, tree: Dynamics, found: list[Pair]) -> None:
+    def __init__(self, tree: Dynamics, found: list[Pair], contact_geoms: Sequence[int] = ()) -> None:
         self.tree = tree
         m = self.m = tree.m
         self.limits, self.friction = JointLimits(m), DryFriction(m)
         self.touch = TouchSensors(m, tree.poses)
         self.ground = GroundContacts(tree, found, self.touch)
-        self.dense = DenseContacts(tree, found, self.ground, self.touch)
+        self.dense = DenseContacts(tree, found, self.ground, self.touch, with_frames=bool(contact_geoms))
         self.arrays = dict.fromkeys(("qacc", "force", "search", "M_qacc", "M_search"), m.nv)
         for rows in (self.limits, self.friction, self.ground, self.dense):
             self.arrays.update(rows.arrays)
@@ -136,6 +137,9 @@ class NewtonSolver:
         self.arrays["touch"] = len(self.touch)
         if self.dense.count:
             self.arrays.update({"gradient": m.nv, "solution": m.nv})
+        if contact_geoms:
+            corners = [corner.pair.geoms for corner in self.ground.corners]
+            self.contact_forces = ContactForces(contact_geoms, corners + [pair.geoms for pair in self.dense.pairs])
 
     def write(self, block: Block, variables: Variables) -> None:
         """Appends constraints and solver to a block, after which ``qacc`` is the acceleration.
@@ -178,6 +182,13 @@ class NewtonSolver:
             self.touch.add(block, "0", "ground", self.ground.pyramid.normal_force())
         if self.dense.count:
             self.touch.add(block, "ground", "contacts", self.dense.pyramid.normal_force())
+
+    def read_contact_forces(self, block: Block) -> None:
+        """Writes the forces of the contacts on the geoms that were asked for."""
+        self.contact_forces.clear(block)
+        for rows, first, end in ((self.ground, "0", "ground"), (self.dense, "ground", "contacts")):
+            if rows.count:
+                self.contact_forces.add(block, (first, end), rows.pyramid.force(rows.directions))
 
     def _direction(self, block: Block) -> None:
         """Sets ``search`` to -H^-1 gradient, and the two measures of convergence."""

@@ -1,6 +1,7 @@
 """A control step of one model as one function of C++: all substeps of a world, then what an observation reads."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -36,15 +37,41 @@ def structure_of_arrays(m: mujoco.MjModel, device: wp.Device) -> bool:
     return device.is_cuda and is_traced(m)
 
 
-def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
+def check_worlds(m: mujoco.MjModel, num_envs: int, device: wp.Device) -> None:
+    """Checks that 32 bits, with which Warp counts threads and the bytes from a row to the next, are enough.
+
+    Raises:
+        ValueError: there are too many worlds.
+    """
+    if not device.is_cuda:
+        return
+    most = (2**31 - 1) // (wp.types.type_size_in_bytes(wp.mat33) if structure_of_arrays(m, device) else WARP)
+    if num_envs > most:
+        raise ValueError(f"num_envs={num_envs} is too large: Warp addresses {most} worlds with its 32 bits")
+
+
+def source(
+    m: mujoco.MjModel,
+    substeps: int,
+    *,
+    with_cvel: bool = False,
+    with_subtree_com: bool = False,
+    contact_geoms: Sequence[int] = (),
+) -> str:
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 
     Args:
         m: the model.
         substeps: physics steps; 0 evaluates the state without stepping.
         with_cvel: whether the velocities of the bodies are written.
+        with_subtree_com: whether the centers of mass of the trees are written.
+        contact_geoms: geoms whose contact forces are written.
     """
-    return traced.source(m, substeps, with_cvel=with_cvel) if is_traced(m) else lanes.source(m, substeps)
+    if not is_traced(m):  # lanes write cvel wherever there is an array for it
+        return lanes.source(m, substeps, with_subtree_com=with_subtree_com, contact_geoms=contact_geoms)
+    return traced.source(
+        m, substeps, with_cvel=with_cvel, with_subtree_com=with_subtree_com, contact_geoms=contact_geoms
+    )
 
 
 class LaunchSize(NamedTuple):

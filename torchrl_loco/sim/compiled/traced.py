@@ -69,13 +69,22 @@ INPUTS = {"qpos": "nq", "qvel": "nv", "qacc": "nv", "ctrl": "nu"}
 """What a world reads, and how many numbers of it. ``qacc`` starts as the warm start."""
 
 
-def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
+def source(
+    m: mujoco.MjModel,
+    substeps: int,
+    *,
+    with_cvel: bool = False,
+    with_subtree_com: bool = False,
+    contact_geoms: Sequence[int] = (),
+) -> str:
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 
     Args:
         m: the model.
         substeps: physics steps; 0 evaluates the state without stepping.
         with_cvel: whether the velocities of the bodies are written.
+        with_subtree_com: whether the centers of mass of the trees are written.
+        contact_geoms: geoms whose contact forces are written.
     """
     world = Block()
     world("if (!live) return;")
@@ -84,11 +93,10 @@ def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
         world(f"float {title}[{max(count, 1)}];")
         world(f"for (int i = 0; i < {count}; ++i) {title}[i] = wp::index({argument}, world, i);")
     world("int overflow = 0;")
-    if substeps or TOUCH in m.sensor_type:
+    if substeps or TOUCH in m.sensor_type or contact_geoms:
         if not substeps:
-            world("// Touch is a force: a step that is not taken finds it, without control.")
-            world(f"for (int i = 0; i < {m.nu}; ++i) ctrl[i] = 0.0f;")
-        step, arrays = _substep(m, substeps)
+            world("// Touch is a force: a step that is not taken finds it, without actuation.")
+        step, arrays = _substep(m, substeps, contact_geoms)
         for title, count in arrays.items():
             if count and title != "qacc":
                 world(f"float {title}[{count}];")
@@ -105,7 +113,7 @@ def source(m: mujoco.MjModel, substeps: int, *, with_cvel: bool = False) -> str:
                 world(f"for (int i = 0; i < {getattr(m, size)}; ++i) {row} = {title}[i];")
         world(f"time_out.data[world] += {literal(substeps * m.opt.timestep)};")
         world("overflow_out.data[world] |= overflow;")
-    _outputs(world, m, with_cvel)
+    _outputs(world, m, with_cvel, with_subtree_com)
     bits = f"#define NO_PLACE {int(Overflow.NARROWPHASE)}\n#define LIMIT_REACHED {int(Overflow.ITERATIONS)}\n"
     return PRELUDE + bits + world.text() + "\n"
 
@@ -115,19 +123,22 @@ def _argument(title: str) -> str:
     return {"qacc": "qacc_warmstart_out", "ctrl": "ctrl_in"}.get(title, f"{title}_out")
 
 
-def _substep(m: mujoco.MjModel, substeps: int) -> tuple[Block, dict[str, int]]:
+def _substep(m: mujoco.MjModel, substeps: int, contact_geoms: Sequence[int]) -> tuple[Block, dict[str, int]]:
     """Returns one of ``substeps`` physics steps, and the arrays that it needs; with 0 it does not integrate."""
     block = Block()
-    qpos, qvel, ctrl = names("qpos", m.nq), names("qvel", m.nv), names("ctrl", m.nu)
-    tree = Dynamics(m, qpos, qvel, ctrl)
+    qpos, qvel = names("qpos", m.nq), names("qvel", m.nv)
+    tree = Dynamics(m, qpos, qvel, names("ctrl", m.nu) if substeps else None)
     tree.keep(block)
     for i, force in enumerate(tree.force):
         block.set(f"force[{i}]", force)
-    solver = NewtonSolver(tree, pairs(m))
+    solver = NewtonSolver(tree, pairs(m), contact_geoms)
     solver.write(block, (qpos, qvel, cells("qacc", m.nv)))
-    if solver.touch:
+    if solver.touch or contact_geoms:
         with block.scope(f"if (step == {max(substeps - 1, 0)})") as last:
-            solver.read_touch(last)
+            if solver.touch:
+                solver.read_touch(last)
+            if contact_geoms:
+                solver.read_contact_forces(last)
     if substeps:
         _integrate(block, m, tree)
     return block, solver.arrays
@@ -177,7 +188,7 @@ def _turn(block: Block, q: list[Scalar], omega: list[Scalar], h: float) -> list[
     return [component * norm for component in product]
 
 
-def _outputs(world: Block, m: mujoco.MjModel, with_cvel: bool) -> None:
+def _outputs(world: Block, m: mujoco.MjModel, with_cvel: bool, with_subtree_com: bool) -> None:
     """Appends what an observation reads: poses and velocities of the bodies, and sensors, of the present state.
 
     Constants are left out: they are in the arrays from the start.
@@ -190,6 +201,8 @@ def _outputs(world: Block, m: mujoco.MjModel, with_cvel: bool) -> None:
     }
     if with_cvel:
         rows["cvel"] = tree.cvel
+    if with_subtree_com:
+        rows["subtree_com"] = [tree.com[b] if b and m.body_rootid[b] == b else () for b in range(m.nbody)]
     for title, row in rows.items():
         for i, element in enumerate(row):
             for k, x in enumerate(element):

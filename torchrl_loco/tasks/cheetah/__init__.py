@@ -1,14 +1,14 @@
 """Cheetah: a planar body on a back and a front leg that learns to run."""
 
 import hashlib
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import warp as wp
 
-from torchrl_loco import models
-from torchrl_loco.config import DEFAULTS
+from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.episode import observe_row
 from torchrl_loco.envs.world import World
@@ -77,10 +77,11 @@ class CheetahRun(LocoEnv):
     """
 
     body = "cheetah"
-    mjcf = models.PATHS["cheetah"]
-    defaults = DEFAULTS["cheetah"]
+    model = Path(__file__).with_name("cheetah.xml")
+    config = SimConfig(ctrl_dt=0.01, sim_dt=0.01, naconmax=100_000, njmax=100, iterations=4, ls_iterations=8)
     observation_size = 17
     term_names = ("move",)
+    presets = {"reppo": {"total_frames": 30_000_000, "lr": 1e-3, "minibatch_size": 4096, "min_temperature": 1e-9}}
     target_speed = RUN_SPEED
 
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:

@@ -1,11 +1,11 @@
 """Quadruped: four legs on a free torso, learning to walk and run."""
 
+from pathlib import Path
 from typing import Any
 
 import warp as wp
 
-from torchrl_loco import models
-from torchrl_loco.config import DEFAULTS
+from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.episode import observe_row
 from torchrl_loco.envs.world import World
@@ -91,8 +91,16 @@ class Quadruped(LocoEnv):
     """What the quadruped's two tasks share; they differ in ``target_speed`` (m/s)."""
 
     body = "quadruped"
-    mjcf = models.PATHS["quadruped"]
-    defaults = DEFAULTS["quadruped"]
+    model = Path(__file__).with_name("quadruped.xml")
+    config = SimConfig(
+        ctrl_dt=0.02,
+        sim_dt=0.005,
+        naconmax=50_000,
+        njmax=100,
+        iterations=4,
+        ls_iterations=10,
+        euler_damping=True,  # its hinges are damped so strongly that without it a control step errs by 0.01 rad
+    )
     observation_size = 78
     term_names = ("upright", "move")
     target_speed = WALK_SPEED
@@ -148,6 +156,8 @@ class QuadrupedWalk(Quadruped):
         dm_control ``suite/quadruped.py``.
     """
 
+    presets = {"reppo": {"total_frames": 30_000_000, "lr": 1e-3, "minibatch_size": 4096, "min_temperature": 1e-9}}
+
 
 class QuadrupedRun(Quadruped):
     """Run forward at 5 m/s or faster.
@@ -156,3 +166,4 @@ class QuadrupedRun(Quadruped):
     """
 
     target_speed = RUN_SPEED
+    presets = {"reppo": {"total_frames": 50_000_000, "lr": 1e-3, "minibatch_size": 4096, "min_temperature": 1e-9}}

@@ -1,11 +1,11 @@
 """Hopper: a planar body on one leg that learns to stand and to hop."""
 
+from pathlib import Path
 from typing import Any
 
 import warp as wp
 
-from torchrl_loco import models
-from torchrl_loco.config import DEFAULTS
+from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.episode import observe_row
 from torchrl_loco.envs.world import World
@@ -74,8 +74,8 @@ class Hopper(LocoEnv):
     """What the hopper's two tasks share; they differ in ``target_speed`` (m/s, 0 to stand)."""
 
     body = "hopper"
-    mjcf = models.PATHS["hopper"]
-    defaults = DEFAULTS["hopper"]
+    model = Path(__file__).with_name("hopper.xml")
+    config = SimConfig(ctrl_dt=0.02, sim_dt=0.005, naconmax=50_000, njmax=50, iterations=4, ls_iterations=10)
     observation_size = 15
     target_speed = 0.0
 
@@ -131,6 +131,19 @@ class HopperStand(Hopper):
     """
 
     term_names = ("standing", "small_control")
+    presets = {
+        "reppo": {
+            "total_frames": 60_000_000,
+            "lr": 1e-3,
+            "minibatch_size": 4096,
+            "min_temperature": 1e-9,
+            # The reward is sparse: noise held for two frames explores further, and more of a short episode is the fall
+            # at its start, in which the hopper can still turn to a side from which it gets up.
+            "action_repeat": 2,
+            "reward_scale": 0.5,
+            "episode_length": 100,
+        }
+    }
 
 
 class HopperHop(Hopper):
@@ -146,3 +159,14 @@ class HopperHop(Hopper):
 
     target_speed = HOP_SPEED
     term_names = ("standing", "hopping")
+    presets = {
+        "reppo": {
+            "total_frames": 160_000_000,
+            "lr": 1e-3,
+            "minibatch_size": 4096,
+            "min_temperature": 1e-9,
+            "action_repeat": 2,  # as in HopperStand
+            "reward_scale": 0.5,
+            "episode_length": 100,
+        }
+    }

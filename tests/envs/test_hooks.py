@@ -1,0 +1,442 @@
+"""Tasks in plain torch: what hooks see, what becomes of what they return, and what is said where they are wrong."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from hook_tasks import DOG, FollowVelocity, WalkBackwards, WalkBlindly
+from oracle import tolerance as numpy_tolerance
+
+import torchrl_loco
+from torchrl_loco import LocoEnv, SimConfig, State, WalkerWalk, tolerance
+from torchrl_loco.envs.hooks import own_hooks
+
+SENSORS = ("gyro", "velocimeter", "attitude", "sole_in_trunk", "sole_velocity", "shank_rotation", "geom_axis")
+CONFIG = SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=20, ls_iterations=20, euler_damping=True)
+
+
+class SeesEverything(LocoEnv):
+    """Returns all that a view shows, as groups of the observation."""
+
+    model = DOG
+    config = CONFIG
+
+    def reward(self, s):
+        return torch.zeros_like(s.time)
+
+    def observation(self, s):
+        bodies, soles, feet = ("trunk", "hr_shank", "fl_thigh"), ".*_sole", [f"{leg}_foot" for leg in ("fl", "hr")]
+        return {
+            **{name: s.sensor(name) for name in (*SENSORS, "knee", "knee_speed", "velocity")},
+            "linvel": s.linvel(bodies),
+            "angvel": s.angvel(bodies),
+            "one_linvel": s.linvel("trunk"),
+            "one_angvel": s.angvel("trunk"),
+            "site_xpos": s.site_xpos(soles),
+            "site_xmat": s.site_xmat("imu"),
+            "site_linvel": s.site_linvel(soles),
+            "geom_xpos": s.geom_xpos(feet),
+            "force": s.contact_force(".*_foot"),
+            "touching": s.in_contact(".*_foot").float(),
+            "joints": s.joint_qpos(["hr_knee", "fl_hip"]),
+            "root": s.joint_qvel("root"),
+            "gravity": s.projected_gravity("hr_shank"),
+            "friction": s.model("geom_friction"),
+        }
+
+
+def random_state(env, seed=0):
+    """States on the ground, with all joints moving."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.rand(env.num_envs, *shape, generator=generator) * 2 - 1
+
+    m = env.mj_model
+    qpos = torch.cat(
+        [
+            draw(2),
+            torch.zeros(env.num_envs, 1),
+            torch.nn.functional.normalize(draw(4), dim=-1),
+            0.3 * draw(m.nq - 7) + env.hooks.catalog.home[7:].cpu(),
+        ],
+        -1,
+    )
+    data = mujoco.MjData(m)
+    for pose in qpos:  # the lowest point in the floor by 4 mm
+        data.qpos[:] = pose
+        mujoco.mj_fwdPosition(m, data)
+        pose[2] -= data.contact.dist.min() + 0.004
+    return State({"qpos": qpos, "qvel": draw(m.nv)}, batch_size=[env.num_envs])
+
+
+@pytest.fixture(scope="module", params=["compiled", "mujoco_warp"])
+def everything(request):
+    """The worlds, what they see of random states, and C MuJoCo's data of the same."""
+    env = SeesEverything(24, "cpu", 0, "dm_control", engine=request.param)
+    state = random_state(env)
+    td = env.reset(state, set_state=True)
+    every = []
+    for world in range(env.num_envs):
+        data = mujoco.MjData(env.mj_model)
+        data.qpos[:], data.qvel[:] = state["qpos"][world], state["qvel"][world]
+        flags = env.mj_model.opt.disableflags
+        env.mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)  # as after a reset in dm_control
+        mujoco.mj_forward(env.mj_model, data)
+        env.mj_model.opt.disableflags = flags
+        every.append(data)
+    return env, td, every
+
+
+class Still:
+    """A policy that does nothing."""
+
+    def __init__(self, env):
+        self.env = env
+
+    def __call__(self, td):
+        return td.set("action", self.env.action_spec.zero())
+
+
+def by_world(td, name, every, expected, atol=2e-5):
+    rows = np.stack([np.asarray(expected(data), dtype=float) for data in every])
+    np.testing.assert_allclose(td[name].numpy(), rows.reshape(td[name].shape), rtol=1e-5, atol=atol)
+
+
+def velocity_of(model, data, kind, element):
+    result = np.zeros(6)
+    mujoco.mj_objectVelocity(model, data, kind, element, result, 0)
+    return result
+
+
+def test_sensors_are_those_of_c_mujoco(everything):
+    env, td, every = everything
+    for name in (*SENSORS, "knee", "knee_speed", "velocity"):
+        if name == "attitude":
+            continue
+        by_world(td, name, every, lambda data, name=name: data.sensor(name).data)
+    quaternions = np.stack([data.sensor("attitude").data for data in every])
+    np.testing.assert_allclose(np.abs((td["attitude"].numpy() * quaternions).sum(-1)), 1, rtol=0, atol=1e-5)
+    assert env.sim.mj_model.nsensor == 1  # the one that an engine must evaluate
+
+
+def test_poses_and_velocities_are_those_of_c_mujoco(everything):
+    env, td, every = everything
+    m, kinds = env.mj_model, mujoco.mjtObj
+    bodies = [m.body(name).id for name in ("trunk", "hr_shank", "fl_thigh")]
+    soles = [i for i in range(m.nsite) if m.site(i).name.endswith("_sole")]
+    feet = [m.geom(name).id for name in ("fl_foot", "hr_foot")]
+    of_bodies = lambda data, part: [velocity_of(m, data, kinds.mjOBJ_XBODY, body)[part] for body in bodies]  # noqa: E731
+    by_world(td, "linvel", every, lambda data: of_bodies(data, slice(3, 6)))
+    by_world(td, "angvel", every, lambda data: of_bodies(data, slice(0, 3)))
+    by_world(td, "one_linvel", every, lambda data: of_bodies(data, slice(3, 6))[0])
+    by_world(td, "one_angvel", every, lambda data: of_bodies(data, slice(0, 3))[0])
+    by_world(td, "site_xpos", every, lambda data: data.site_xpos[soles])
+    by_world(td, "site_xmat", every, lambda data: data.site("imu").xmat)
+    by_world(
+        td,
+        "site_linvel",
+        every,
+        lambda data: [velocity_of(m, data, kinds.mjOBJ_SITE, site)[3:] for site in soles],
+    )
+    by_world(td, "geom_xpos", every, lambda data: data.geom_xpos[feet])
+    by_world(td, "joints", every, lambda data: [data.joint("hr_knee").qpos, data.joint("fl_hip").qpos])
+    by_world(td, "root", every, lambda data: data.qvel[:6])
+    by_world(td, "gravity", every, lambda data: -data.body("hr_shank").xmat.reshape(3, 3)[2])
+    by_world(td, "friction", every, lambda data: m.geom_friction)
+
+
+def test_contacts_are_those_of_c_mujoco(everything):
+    env, td, every = everything
+    m = env.mj_model
+    geoms = [i for i in range(m.ngeom) if m.geom(i).name.endswith("_foot")]
+    some = 0
+    for world, data in enumerate(every):
+        force, touching = np.zeros((4, 3)), np.zeros(4)
+        for i in range(data.ncon):
+            wrench = np.zeros(6)
+            mujoco.mj_contactForce(m, data, i, wrench)
+            pushed = data.contact[i].frame.reshape(3, 3).T @ wrench[:3]
+            for side, sign in ((0, -1), (1, 1)):
+                if data.contact[i].geom[side] in geoms:
+                    row = geoms.index(data.contact[i].geom[side])
+                    force[row] += sign * pushed
+                    touching[row] = 1
+        np.testing.assert_array_equal(td["touching"][world].numpy(), touching)
+        np.testing.assert_allclose(td["force"][world].numpy(), force, rtol=5e-3, atol=0.05 + 2e-3 * np.abs(force).max())
+        some += touching.sum()
+    assert some > 10
+
+
+def stepped_like_walker_walk(shared, task, actions):
+    """Yields, step by step, a task's result and worlds, and what WalkerWalk makes of the same states and actions."""
+    env, fused = shared(task, 6), shared("walker_walk", 6)
+    td = env.reset()
+    for action in actions(env, 40):
+        fused.reset(env.get_state(), set_state=True)
+        td = env.step(td.exclude("reward").set("action", action))["next"]
+        yield td, env, fused.step(td.select("done", "terminated", "truncated").set("action", action))["next"]
+
+
+def test_reward_in_torch_beside_the_fused_observation(shared, actions):
+    for td, env, other in stepped_like_walker_walk(shared, "walker_backwards", actions):
+        up, speed = env.sim.xmat[:, 1, 2, 2].double().numpy(), env.sim.data.sensordata.numpy()[:, 0]
+        expected = (1 + up) / 2 * numpy_tolerance(-speed, 1, np.inf, 1, "linear", 0)
+        np.testing.assert_allclose(td["reward"].squeeze(-1), expected, rtol=1e-5, atol=1e-6)
+        assert torch.equal(td["terminated"].squeeze(-1), env.sim.xpos[:, 1, 2] < 0.7)
+        assert torch.equal(td["observation"], other["observation"])
+
+
+def test_observation_in_torch_beside_the_fused_reward(shared, actions):
+    for td, env, other in stepped_like_walker_walk(shared, "walker_blindly", actions):
+        assert torch.equal(td["observation"], torch.cat([env.sim.qpos[:, 1:], env.sim.qvel], dim=-1))
+        assert torch.equal(td["reward"], other["reward"])
+
+
+def test_an_episode_that_ends_shows_its_true_last_observation_and_begins_anew(shared, device):
+    """Falling is termination, the time limit truncation; the first observation of the next episode is another one."""
+    env = shared("dog_follow", 8, device, episode_length=40)
+    td = env.reset()
+    fallen = env.get_state()
+    fallen["qpos"][:2, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])  # on its back
+    td = env.reset(fallen, set_state=True)
+    current, begun = env.step_and_maybe_reset(td.set("action", env.action_spec.zero()))
+    after = current["next"]
+    assert after["terminated"].squeeze(-1).tolist() == [True] * 2 + [False] * 6
+    assert not after["truncated"].any()
+    assert (after["observation"][:2, 8] > 0.3).all()  # gravity as it was seen lying
+    assert (begun["observation"][:2, 8] < -0.9).all()
+    assert not begun["done"].any()
+    memory, elapsed = env.get_state()["memory"], env.get_state()["elapsed_steps"]
+    assert elapsed.tolist() == [0, 0] + [1] * 6
+    assert (memory["last_action"][:2] == 0).all()
+    assert (memory["air_time"][:2] == 0).all()
+    assert (memory["until_push"] > 0).all()
+
+
+def test_memory_is_written_by_update_and_events_and_seen_in_this_order():
+    class Counts(WalkerWalk):
+        memory = {"before": (), "steps": (), "seen": 2}
+
+        def update(self, s):
+            return {"steps": s.steps + 1}
+
+        def reward(self, s):
+            return {"steps": s.steps, "before": s.before}
+
+        def events(self, s):
+            return {"before": s.steps, "seen": torch.stack([s.steps, s.before], dim=-1)}
+
+        def observation(self, s):
+            return torch.cat([s.seen, s.before.unsqueeze(-1)], dim=-1)
+
+        def begin(self, s):
+            return {"before": s.before + 100}  # what the last episode left
+
+    env = Counts(2, "cpu", seed=0, episode_length=3)
+    td, rows = env.reset(), []
+    for _ in range(4):
+        current, td = env.step_and_maybe_reset(td.set("action", env.action_spec.zero()))
+        rows.append([current["next", "reward"][0].item(), *current["next", "observation"][0].tolist()])
+    assert rows == [[101, 1, 100, 1], [3, 2, 1, 2], [5, 3, 2, 3], [104, 1, 103, 1]]
+
+
+def test_a_push_moves_the_world_before_it_is_observed(shared):
+    """The fused observation and reward: the one is of the pushed state, the other of the state before."""
+
+    class Pushed(WalkerWalk):
+        def events(self, s):
+            return {"qvel": s.qvel + 1.0}
+
+    pushed, free = Pushed(4, "cpu", seed=0), shared("walker_walk", 4)
+    action = free.action_spec.zero()
+    one = pushed.step(pushed.reset().set("action", action))["next"]
+    other = free.step(free.reset().set("action", action))["next"]
+    assert torch.equal(one["reward"], other["reward"])
+    torch.testing.assert_close(one["observation"][:, 15:], other["observation"][:, 15:] + 1.0)
+    assert torch.equal(one["observation"][:, :15], other["observation"][:, :15])
+
+
+def test_draws_depend_on_seed_world_episode_and_step_alone():
+    class Draws(WalkerWalk):
+        def reward(self, s):
+            return s.uniform(2.0, 3.0)
+
+        def observation(self, s):
+            return torch.cat([s.uniform(-1.0, 1.0, 2), s.normal(3), s.uniform(-1.0, 1.0, 2)], dim=-1)
+
+    def played(num_envs, seed=0, **options):
+        env = Draws(num_envs, "cpu", seed, episode_length=50, **options)
+        td = env.rollout(120, Still(env), break_when_any_done=False)
+        return torch.cat([td["observation"], td["next", "reward"]], dim=-1)
+
+    many, few = played(300), played(3, world_offset=100)
+    assert torch.equal(many[100:103], few)
+    assert not torch.equal(played(3, seed=1), few)
+    numbers = many.flatten(0, 1).double()
+    assert len(torch.unique(numbers[:, 0])) > 0.99 * len(numbers)
+    uniform, normal, reward = numbers[:, [0, 1, 5, 6]], numbers[:, 2:5], numbers[:, 7]
+    error = 5 / math.sqrt(len(numbers))
+    assert (uniform.mean(0).abs() < error).all()
+    assert ((uniform.square().mean(0) - 1 / 3).abs() < error).all()
+    assert (normal.mean(0).abs() < error).all()
+    assert ((normal.square().mean(0) - 1).abs() < 2 * error).all()
+    assert ((normal.square().square().mean(0) - 3).abs() < 12 * error).all()
+    assert 2 <= reward.min() < 2.01 < 2.99 < reward.max() < 3
+    correlation = torch.corrcoef(numbers.T) - torch.eye(8)
+    assert correlation.abs().max() < error
+    shifted = (uniform[:-1, 0] * uniform[1:, 0]).mean()  # from step to step
+    assert shifted.abs() < error
+
+
+def test_the_most_derived_definition_wins_hook_by_hook():
+    class InTorch(WalkerWalk):
+        def reward(self, s):
+            return s.time
+
+        def begin(self, s):
+            return {}
+
+    class FusedAgain(InTorch):
+        observation_func, pose_func = WalkerWalk.observation_func, WalkerWalk.pose_func
+
+    assert own_hooks(WalkerWalk) == frozenset()
+    assert own_hooks(WalkBackwards) == {"reward", "terminated"}
+    assert own_hooks(WalkBlindly) == {"observation"}
+    assert own_hooks(InTorch) == {"reward", "begin"}
+    assert own_hooks(FusedAgain) == frozenset()
+    env = InTorch(2, "cpu", seed=0)
+    env.reset()
+    assert torch.equal(env.sim.qpos, torch.tensor(env.mj_model.qpos0).float().expand(2, -1))
+
+
+def test_compiled_hooks_do_the_same(actions):
+    """As on CUDA, where torch.compile makes kernels of them: with the same random numbers, up to rounding."""
+    plain, compiled = (WalkBackwardsInNoise(5, "cpu", seed=0, episode_length=20) for _ in range(2))
+    compiled.world._compile_parts()
+    compiled.set_seed(0)
+    assert all(part._compiled is not None for part in (compiled.world._judge, compiled.world._observe))
+    one, other = plain.reset(), compiled.reset()
+    for action in actions(plain, 30):
+        torch.testing.assert_close(one["observation"], other["observation"], rtol=0, atol=1e-4)
+        (current, one), (expected, other) = (
+            env.step_and_maybe_reset(td.set("action", action)) for env, td in ((plain, one), (compiled, other))
+        )
+        torch.testing.assert_close(current["next", "reward"], expected["next", "reward"], rtol=0, atol=1e-4)
+
+
+class WalkBackwardsInNoise(WalkBackwards):
+    memory = {"command": 2}
+
+    def events(self, s):
+        return {"command": s.uniform(0.0, 1.0, 2)}
+
+    def observation(self, s):
+        return torch.cat([s.qvel + s.normal(s.qvel.shape[-1]), s.command], dim=-1)
+
+    def begin(self, s):
+        return {"command": s.normal(2)}
+
+
+def test_a_hook_that_cannot_be_compiled_runs_as_it_is_and_says_why(caplog):
+    class Looks(WalkerWalk):
+        def reward(self, s):
+            return s.time if bool((s.time > 0).all()) else s.time + 1
+
+    env = Looks(2, "cpu", seed=0)
+    env.world._compile_parts()
+    assert "Looks.judge is not compiled and runs as plain torch" in caplog.text
+    assert env.rollout(2)["next", "reward"].shape == (2, 2, 1)
+
+
+# Errors, at construction.
+
+BASE = {"model": DOG, "config": CONFIG, "reward": lambda self, s: s.time, "observation": lambda self, s: s.qpos}
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"reward": None}, TypeError, "must define reward"),
+        ({"config": None}, TypeError, "must set config"),
+        ({"model": "nowhere.xml"}, FileNotFoundError, "no model 'nowhere.xml'"),
+        ({"reward": lambda self, s: s.qpos}, ValueError, r"must return shape \(4,\)"),
+        ({"reward": lambda self, s: {"a": s.time, "b": 0.0}}, TypeError, r"reward\['b'\] must return a tensor"),
+        ({"terminated": lambda self, s: s.time}, TypeError, "must return a bool tensor"),
+        ({"observation": lambda self, s: {"reward": s.qpos}}, ValueError, "'reward' is no name"),
+        ({"observation": lambda self, s: s.action}, ValueError, "keep what you need of it in memory"),
+        ({"update": lambda self, s: {"command": s.time}}, ValueError, "which has no entries"),
+        ({"memory": {"comand": 3}, "events": lambda self, s: {"command": s.time}}, ValueError, "did you mean 'comand'"),
+        ({"memory": {"a": 3}, "events": lambda self, s: {"a": s.qpos}}, ValueError, r"a of shape \(4, 3\)"),
+        ({"memory": {"qpos": 3}}, ValueError, "'qpos' is taken"),
+        ({"memory": {"a": 0}}, ValueError, "sizes of 1 or more"),
+        ({"begin": lambda self, s: {"qpos": s.home / 0}}, ValueError, "not finite"),
+        ({"control": lambda self, s, action: action[:, :2]}, ValueError, r"shape \(4, 8\)"),
+        ({"action_range": (0, 1)}, ValueError, r"must be \(-1, 1\) or"),
+        ({"action_range": (-math.inf, math.inf)}, TypeError, "must define control"),
+        ({"reward": lambda self, s: s.xpos("trunc")[:, 0]}, KeyError, "did you mean 'trunk'"),
+        ({"reward": lambda self, s: s.comand}, AttributeError, "the memory has no entries"),
+        ({"reward": lambda self, s: s.model("geom_fiction")}, AttributeError, "no array 'geom_fiction'"),
+        ({"reward": lambda self, s: s.joint_qpos(".*")[:, 0]}, ValueError, "name a free or ball joint alone"),
+        ({"reward": lambda self, s: s.sensor("unread")[:, 0], "engine": "compiled"}, ValueError, "'unread'"),
+    ],
+)
+def test_wrong_tasks_are_refused(changes, error, message):
+    options = {"engine": changes["engine"]} if "engine" in changes else {}
+    entries = {name: value for name, value in {**BASE, **changes}.items() if value is not None and name != "engine"}
+    with pytest.raises(error, match=message):
+        type("Wrong", (LocoEnv,), entries)(4, "cpu", seed=0, **options)
+
+
+def test_a_sensor_of_forces_is_asked_of_mujoco_warp():
+    task = type("Feels", (LocoEnv,), {**BASE, "reward": lambda self, s: s.sensor("unread")[:, 2]})
+    env = task(2, "cpu", seed=0)
+    assert env.engine == "mujoco_warp"
+    td = env.rollout(100, Still(env))
+    assert (td["next", "reward"][:, -1].abs() < 100).all()
+    assert (td["next", "reward"] != 0).all()
+
+
+def test_bounds_of_actions():
+    free = type("Free", (FollowVelocity,), {"action_range": (-math.inf, math.inf)})(2, "cpu", seed=0)
+    td = free.step(free.reset().set("action", torch.full((2, 8), 3.0)))
+    expected = torch.tensor(free.mj_model.key_qpos[0][7:]).float() + 1.5
+    torch.testing.assert_close(free.sim.ctrl, expected.expand(2, -1))
+    assert free.action_spec.contains(td["action"] * 1e6)
+    bound = FollowVelocity(2, "cpu", seed=0)
+    bound.step(bound.reset().set("action", torch.full((2, 8), 3.0)))
+    torch.testing.assert_close(bound.sim.ctrl, (expected - 1.0).expand(2, -1))
+
+
+def test_the_model_as_text_path_and_spec(tmp_path, monkeypatch):
+    (tmp_path / "dog.xml").write_text(DOG)
+    monkeypatch.chdir(tmp_path)
+    spec = mujoco.MjSpec.from_string(DOG)
+    envs = [type("Dog", (FollowVelocity,), {"model": m})(2, "cpu", seed=0) for m in (DOG, "dog.xml", spec)]
+    rollouts = [env.rollout(3, Still(env)) for env in envs]
+    for rollout in rollouts[1:]:
+        assert torch.equal(rollout["observation"], rollouts[0]["observation"])
+    assert spec.sensor("unread") is not None  # it stays as it was
+    assert envs[0].sim.mj_model.nsensor == 0
+    assert envs[0].mj_model.nsensor == 11
+
+
+# tolerance in torch.
+
+
+@pytest.mark.parametrize("sigmoid", torchrl_loco.envs.tolerance.SIGMOIDS)
+def test_tolerance_is_dm_controls(sigmoid):
+    x = np.linspace(-4, 6, 401)
+    for lower, upper, margin, value in ((0, 1, 2, 0.3), (1, np.inf, 0.5, 0.1), (-np.inf, 0.5, 1, 0.7), (0, 1, 0, 0.1)):
+        ours = tolerance(torch.tensor(x), (lower, upper), margin, sigmoid, value)
+        expected = [numpy_tolerance(each, lower, upper, margin, sigmoid, value) for each in x]
+        np.testing.assert_allclose(ours.numpy(), expected, rtol=0, atol=1e-9)
+
+
+def test_tolerance_refuses_what_is_not_valid():
+    x = torch.zeros(2)
+    for arguments in ({"bounds": (1, 0)}, {"margin": -1}, {"sigmoid": "lineer"}, {"value_at_margin": 0.0, "margin": 1}):
+        with pytest.raises(ValueError, match=r"bounds|margin|did you mean 'linear'|value_at_margin"):
+            tolerance(x, **arguments)

@@ -1,0 +1,119 @@
+"""Where a run trains: what networks read there, actions that are held, and lengths of episodes."""
+
+import dataclasses
+
+import pytest
+import torch
+from small_runs import EPISODE, SMALL
+from torchrl.data import Bounded, Unbounded
+from torchrl.envs import StepCounter, Transform, TransformedEnv, UnsqueezeTransform
+
+import torchrl_loco
+from torchrl_loco.training import PPOConfig, Spaces
+from torchrl_loco.training.environments import ActionRepeat, Environments, make_env
+
+
+class Stumble(torchrl_loco.WalkerStand):
+    """Ends at its third step alone, after which it could go on; earns 1 in each."""
+
+    def reward(self, s):
+        return {"one": torch.ones_like(s.time), "nothing": torch.zeros_like(s.time)}
+
+    def terminated(self, s):
+        return (s.time > 2.5 * 0.025) & (s.time < 3.5 * 0.025)
+
+    def observation(self, s):
+        return torch.cat([s.qpos, s.time.unsqueeze(-1)], dim=-1)
+
+
+class Free(torchrl_loco.WalkerStand):
+    """Actions without bounds, something for the critic, a reward without terms."""
+
+    action_range = (-float("inf"), float("inf"))
+
+    def control(self, s, action):
+        return action.tanh()
+
+    def reward(self, s):
+        return s.qvel[:, 0]
+
+    def observation(self, s):
+        return {"observation": s.qpos, "privileged": torch.cat([s.qpos, s.qvel], dim=-1)}
+
+
+def test_sizes_are_those_of_the_environment():
+    assert Spaces.of(torchrl_loco.make("walker_run", 3, "cpu")) == Spaces(24, 6)
+    spaces = Spaces.of(Free(2, "cpu"))
+    assert spaces == Spaces(9, 6, privileged=18, bounded=False)
+    assert (spaces.critic_key, spaces.critic) == ("privileged", 18)
+    assert (Spaces(9, 6).critic_key, Spaces(9, 6).critic) == ("observation", 9)
+
+
+def test_what_cannot_be_trained_on():
+    env = torchrl_loco.make("walker_run", 3, "cpu")
+    images = TransformedEnv(env, UnsqueezeTransform(-1, in_keys=["observation"]))
+    with pytest.raises(ValueError, match=r"'observation' must be a row of numbers.*\(24, 1\).*FlattenObservation"):
+        Spaces.of(images)
+    env.action_spec = Bounded(-2.0, 2.0, (3, 6))
+    with pytest.raises(ValueError, match=r"bounded by \[-1, 1\], or by nothing"):
+        Spaces.of(env)
+    env.action_spec = Unbounded((3, 6))
+    assert not Spaces.of(env).bounded
+
+
+def test_a_held_action_ends_where_the_world_does():
+    """Of four steps the third terminates: its reward, its observation and its end are what is returned."""
+    env, held = Stumble(2, "cpu", seed=0, reward_terms=True), Stumble(2, "cpu", seed=0, reward_terms=True)
+    expected = env.rollout(3, lambda td: td.set("action", torch.full((2, 6), 0.3)))[:, 2]["next"]
+    held = torchrl_loco.TransformedEnv(held, ActionRepeat(4))
+    after = held.step(held.reset().set("action", torch.full((2, 6), 0.3)))["next"]
+    assert after["terminated"].all()
+    assert after["done"].all()
+    assert (after["reward"] == 3.0).all()
+    assert (after["reward_terms", "one"] == 3.0).all()
+    assert torch.equal(after["observation"], expected["observation"])
+
+
+def test_lengths_of_episodes(tmp_path):
+    """In training that of the settings, or the task's own; evaluations always play the latter."""
+    config = PPOConfig("walker_stand", episode_length=23)
+    for length, expected in ((23, 23), (0, EPISODE)):
+        environments = Environments(dataclasses.replace(config, episode_length=length))
+        assert environments.training(tmp_path / "none").config.episode_length == expected
+        assert environments.evaluation(2, seed=0).config.episode_length == environments.full_length == EPISODE
+
+
+def test_terms_of_the_reward_are_returned_where_a_task_has_them(tmp_path):
+    for task, terms in ((Stumble, {"one", "nothing"}), (Free, set()), ("walker_stand", set())):
+        config = PPOConfig(task, num_envs=2, num_steps=4, minibatch_size=8, total_frames=100)
+        spec = make_env(config, tmp_path / "none").observation_spec
+        assert set(spec.get("reward_terms", {}).keys()) == terms
+
+
+class Counted(Transform):
+    """Counts steps, in place."""
+
+    def __init__(self):
+        super().__init__()
+        self.steps = torch.zeros(3)
+
+    def _step(self, tensordict, next_tensordict):
+        self.steps += 1
+        return next_tensordict
+
+
+def test_evaluations_are_behind_the_transforms_of_an_environment_that_was_handed_in():
+    """What those learn from evaluations stays apart."""
+    base = torchrl_loco.make("walker_stand", 3, "cpu", seed=5, protocol="dm_control", sim_dt=0.025)
+    env = torchrl_loco.TransformedEnv(torchrl_loco.TransformedEnv(base, StepCounter()), Counted())
+    env.rollout(3)
+    config = PPOConfig("walker_stand", **{**SMALL, "num_envs": 3, "minibatch_size": 8, "logger": ("csv",)})
+    environments = Environments(config, env)
+    other = environments.evaluation(2, seed=7)
+    assert (other.num_envs, other.seed, other.protocol, other.config.sim_dt) == (3, 7, "dm_control", 0.025)
+    assert "step_count" in other.reset().keys()  # noqa: SIM118
+    assert environments.names_of_transforms == ["StepCounter", "Counted"]
+    other.rollout(3)
+    assert env.transform.steps.tolist() == [3, 3, 3]
+    assert env.base_env.base_env is base
+    assert Environments(config, base).evaluation(2, seed=7).num_envs == 2

@@ -1,0 +1,83 @@
+"""Returns of the episodes that end in training, against a loop over worlds and steps."""
+
+import pytest
+import torch
+
+from torchrl_loco.training.episodes import WINDOW, Episodes
+
+
+def by_hand(reward, done, terminated, *, from_start, action_repeat, full_length):
+    """Returns number, sum of returns and sum of lengths of the whole episodes that end."""
+    found = []
+    for rewards, ends, falls in zip(reward.tolist(), done.tolist(), terminated.tolist(), strict=True):
+        total, steps, whole = 0.0, 0, from_start
+        for r, end, fell in zip(rewards, ends, falls, strict=True):
+            total, steps = total + r, steps + action_repeat
+            if end:
+                if whole:
+                    found.append((1, total if fell else total * full_length / steps, steps))
+                total, steps, whole = 0.0, 0, True
+    return [sum(row[i] for row in found) for i in range(3)]
+
+
+@pytest.mark.parametrize("from_start", [True, False])
+def test_sums_are_those_of_a_loop(from_start):
+    """Over batches of several lengths, in one of which no episode ends."""
+    torch.manual_seed(0)
+    worlds, lengths = 7, (5, 1, 9, 4, 12)
+    reward = torch.randn(worlds, sum(lengths))
+    done = torch.rand(worlds, sum(lengths)) < 0.3
+    done[:, 6:15] = False
+    terminated = done & (torch.rand(worlds, sum(lengths)) < 0.5)
+    episodes = Episodes(worlds, "cpu", action_repeat=3, full_length=40, from_start=from_start)
+    parts = zip(*(x.split(lengths, dim=1) for x in (reward, done, terminated)), strict=True)
+    sums = torch.stack([episodes.add(*part) for part in parts]).sum(0)
+    expected = by_hand(reward, done, terminated, from_start=from_start, action_repeat=3, full_length=40)
+    assert expected[0] > 10
+    torch.testing.assert_close(sums, torch.tensor(expected))
+
+
+def test_the_return_of_a_fall_is_what_was_earned_and_that_of_a_time_limit_what_the_whole_would_have_earned():
+    """Two worlds that earn 2 in each of four steps; the task's own episodes have ten."""
+    ends = torch.tensor([[False, False, False, True]] * 2)
+    episodes = Episodes(2, "cpu", action_repeat=1, full_length=10, from_start=True)
+    falls = ends & torch.tensor([[True], [False]])
+    episodes.take(*episodes.add(torch.full((2, 4), 2.0), ends, falls).tolist())
+    assert (episodes.count, episodes.mean_return, episodes.mean_length) == (2, (8.0 + 20.0) / 2, 4.0)
+
+
+def test_means_are_over_the_last_hundred_episodes_in_whole_batches():
+    episodes = Episodes(1, "cpu", 1, 10, from_start=True)
+    for value in range(10):
+        episodes.take(40, 40.0 * value, 40.0)
+        assert episodes.count == min(40 * (value + 1), 120) >= min(WINDOW, 40 * (value + 1))
+        episodes.take(0, 0.0, 0.0)
+    assert episodes.mean_return == (7 + 8 + 9) / 3
+    episodes.take(1000, 5000.0, 1000.0)
+    assert (episodes.count, episodes.mean_return) == (1000, 5.0)
+
+
+def test_another_policy_begins_with_whole_episodes_of_its_own():
+    episodes = Episodes(1, "cpu", 1, 2, from_start=True)
+    episodes.take(3, 3.0, 3.0)
+    reward, end = torch.ones(1, 2), torch.tensor([[False, True]])
+    episodes.restart()
+    assert episodes.count == 0
+    assert [episodes.add(reward, end, end)[0].item() for _ in range(2)] == [0.0, 1.0]  # the first was another's
+
+
+def test_sums_continue_from_a_state():
+    torch.manual_seed(0)
+    batches = [(torch.randn(3, 4), torch.rand(3, 4) < 0.3) for _ in range(4)]
+
+    def after(episodes, some):
+        for reward, done in some:
+            episodes.take(*episodes.add(reward, done, done).tolist())
+        return episodes
+
+    whole = after(Episodes(3, "cpu", 1, 9, from_start=True), batches)
+    first = after(Episodes(3, "cpu", 1, 9, from_start=True), batches[:2])
+    second = Episodes(3, "cpu", 1, 9, from_start=False)
+    second.load_state_dict(first.state_dict(), running=True)
+    after(second, batches[2:])
+    assert (second.count, second.mean_return, second.mean_length) == (whole.count, whole.mean_return, whole.mean_length)

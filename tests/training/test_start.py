@@ -1,0 +1,264 @@
+"""``train``: what it takes, what it returns, and how what was handed in as an object is continued."""
+
+import re
+import sys
+
+import pytest
+from compare import assert_same
+from hook_tasks import FollowVelocity
+from small_runs import SMALL, WALKER, made, networks, trained
+from torch import nn
+from torchrl.envs import ObservationNorm, StepCounter
+
+import torchrl_loco
+from torchrl_loco import cli, registry
+from torchrl_loco.policy import Policy
+from torchrl_loco.training import PPO, RunFolder, Trainer, evaluate_policy, preset, train
+from torchrl_loco.training.algorithm import Algorithm
+
+QUICK = {**SMALL, "logger": ("csv",)}
+
+
+def elu(inputs, outputs):
+    return nn.Sequential(nn.Linear(inputs, 8), nn.ELU(), nn.Linear(8, outputs))
+
+
+class Counted(PPO):
+    """PPO that counts its updates."""
+
+    updates = 0
+
+    def update(self, batch, progress):
+        type(self).updates += 1
+        return super().update(batch, progress)
+
+
+def test_what_train_returns_is_what_the_trainer_leaves(tmp_path, capsys):
+    run = train("mjx/walker_stand-v0", device="cpu", out=tmp_path / "a", **QUICK)
+    assert f"run folder: {run.path}\n" in capsys.readouterr().out
+    assert_same(networks(run), networks(trained(tmp_path / "b", **{**QUICK})))
+    assert run.is_finished
+    config = run.load_config()
+    again = train(torchrl_loco.WalkerStand, config, seed=3, out=tmp_path / "c")
+    assert again.load_config().seed == 3
+    assert again.load_config().num_envs == SMALL["num_envs"]
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+def test_networks_of_ones_own(algorithm, tmp_path):
+    """They are what is trained, saved and played; PPO's critic is one too."""
+    sizes = []
+    run = train(
+        "walker_stand",
+        network=lambda *size: sizes.append(size) or elu(*size),
+        algorithm=algorithm,
+        device="cpu",
+        out=tmp_path,
+        **QUICK,
+    )
+    assert sizes == ([(24, 6), (24, 1)] if algorithm == "ppo" else [(24, 12)])
+    layers = [type(layer) for layer in run.load_policy("cpu").module]
+    assert layers[1:] == [nn.Linear, nn.ELU, nn.Linear, nn.Tanh]
+
+
+def test_a_network_that_cannot_be_saved_is_refused_before_the_first_frame(tmp_path, monkeypatch):
+    monkeypatch.setattr(Algorithm, "update", None)
+
+    class Residual(nn.Module):
+        def __init__(self, inputs, outputs):
+            super().__init__()
+            self.layer = nn.Linear(inputs, outputs)
+
+        def forward(self, x):
+            return self.layer(x)
+
+    class Twice(nn.Sequential):
+        def forward(self, x):
+            return 2 * super().forward(x)
+
+    cases = [
+        (Residual, TypeError, "cannot hold Residual.* nn.Sequential of Linear, LayerNorm, SiLU, ELU"),
+        (lambda i, o: Twice(nn.Linear(i, o)), RuntimeError, "would act differently from the actor"),
+    ]
+    for network, error, message in cases:
+        with pytest.raises(error, match=message):
+            train("walker_stand", network=network, device="cpu", out=tmp_path, **QUICK)
+    ends = lambda i, o: nn.Sequential(nn.Linear(i, o), nn.ELU())  # noqa: E731
+    with pytest.raises(TypeError, match="must end in a Linear"):
+        train("walker_stand", network=ends, algorithm="reppo", device="cpu", out=tmp_path, **QUICK)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_objects_are_handed_in_again_where_a_run_goes_on(tmp_path, capsys):
+    Counted.updates = 0
+    run = train("walker_stand", network=elu, algorithm=Counted, device="cpu", out=tmp_path, **QUICK)
+    assert Counted.updates == 2
+    assert run.load_config().algorithm == "ppo"
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["resume", str(run.path), "--total_frames", "384"])
+    call = f"torchrl_loco.training.train(task, network=..., algorithm=..., resume={str(run.path)!r})"
+    assert (
+        f"was begun with network and algorithm of your own, which the folder does not hold: continue it in Python "
+        f"with {call}" in capsys.readouterr().err
+    )
+    with pytest.raises(ValueError, match=re.escape(call)):
+        train("walker_stand", network=elu, resume=run, total_frames=384)
+    with pytest.raises(ValueError, match="is a run of walker_stand, but task is walker_run"):
+        train("walker_run", network=elu, algorithm=Counted, resume=run, total_frames=384)
+    with pytest.raises(ValueError, match="keeps its settings: pass no other than total_frames"):
+        train("walker_stand", network=elu, algorithm=Counted, resume=run, seed=2)
+    again = train("walker_stand", network=elu, algorithm=Counted, resume=str(run.path), total_frames=384)
+    assert (again.path, Counted.updates) == (run.path, 3)
+    plain = made(tmp_path)
+    plain.save_checkpoint({})
+    with pytest.raises(ValueError, match="was begun without network of yours"):
+        train("walker_stand", network=elu, resume=plain)
+
+
+def test_an_environment_that_is_made_already(tmp_path):
+    """Its worlds, protocol, settings and transforms are used, and it stays open."""
+    base = torchrl_loco.make("walker_stand", 4, "cpu", seed=7, protocol="dm_control", episode_length=16)
+    env = torchrl_loco.TransformedEnv(base, StepCounter())
+    env.append_transform(ObservationNorm(loc=0.0, scale=0.5, in_keys=["observation"], standard_normal=False))
+    settings = {name: value for name, value in QUICK.items() if name not in ("num_envs", "action_repeat")}
+    run = train(env, algorithm="ppo", out=tmp_path, **settings)
+    config = run.load_config()
+    assert (config.task, config.seed, config.protocol) == ("walker_stand", 7, "dm_control")
+    assert (config.num_envs, config.episode_length, config.action_repeat) == (4, 16, 1)
+    assert run.given == ("env",)
+    assert not env.is_closed
+    metrics = run.read_metrics()
+    assert metrics["episodes"][-1] == 4 * 64 // 16  # of worlds that begin together, the first counts too
+    assert set(metrics["episode_length"][1:]) == {16.0}
+    with pytest.raises(ValueError, match="was trained behind StepCounter, ObservationNorm"):
+        evaluate_policy(run.load_policy("cpu"))
+    with pytest.raises(ValueError, match="num_envs is that of the environment, 4"):
+        train(env, algorithm="ppo", out=tmp_path, **{**settings, "num_envs": 8})
+    with pytest.raises(ValueError, match="make the environment with num_envs=1 or more"):
+        train(torchrl_loco.make("walker_stand", None, "cpu"), out=tmp_path)
+
+
+def test_what_does_not_fit(tmp_path):
+    config = preset("walker_stand", "cpu", "ppo", out=tmp_path, **QUICK)
+    cases = [
+        (("walker_run", config), {}, "config is for walker_stand, but task is walker_run"),
+        (("walker_stand", config), {"algorithm": "reppo"}, "config is of ppo, but algorithm is reppo"),
+        (("walker_stand", config), {"gama": 0.9}, "did you mean 'gamma'"),
+        (("walker_stand",), {"device": "cpu", "gama": 0.9}, "did you mean 'gamma'"),
+    ]
+    for args, more, message in cases:
+        with pytest.raises(ValueError, match=message):
+            train(*args, **more)
+    assert list(tmp_path.iterdir()) == []
+
+
+TASK = '''
+import torch, torchrl_loco
+
+class StandShaky(torchrl_loco.WalkerStand):
+    """Stand up, or fall."""
+
+    def reward(self, s):
+        return {"height": s.xpos("torso")[:, 2] - 1.0}
+
+    def terminated(self, s):
+        return s.time > 0.3
+'''
+
+
+@pytest.mark.slow
+def test_a_class_in_a_file(tmp_path, monkeypatch, capsys):
+    """Trained, evaluated, resumed, recorded and exported by the command line; without the file, it is named."""
+    file = tmp_path / "tasks" / "shaky.py"
+    file.parent.mkdir()
+    file.write_text(TASK)
+    monkeypatch.chdir(tmp_path)
+    small = [f"--{key}={value}" for key, value in SMALL.items() if key != "hidden"]
+    assert cli.main(["train", "tasks/shaky.py:StandShaky", *small, "--hidden=16", "--device=cpu", "--out=runs"]) == 0
+    (path,) = (tmp_path / "runs").iterdir()
+    assert path.name.startswith("StandShaky-")
+    run = RunFolder(path)
+    assert run.load_config().task == f"{file}:StandShaky"
+    assert run.load_policy("cpu").info["task"] == f"{file}:StandShaky"
+    assert "reward/height" in run.read_metrics()
+    assert cli.main(["resume", str(path), "--total_frames=384"]) == 0
+    assert cli.main(["eval", str(path), "--device=cpu"]) == 0
+    capsys.readouterr()
+    for command in (
+        ["eval", "tasks/shaky.py:StandShaky", "--policy", str(path), "--episodes=2", "--device=cpu"],
+        ["eval", "walker_walk", "--policy", str(path), "--episodes=2", "--device=cpu"],
+        ["record", "walker_walk", "--policy", str(path), "--seconds=0.05", "--device=cpu"],
+    ):
+        assert cli.main(command) == 0
+    said = capsys.readouterr().out
+    assert said.count("over 2 episodes") == 2
+    assert (tmp_path / "walker_walk.mp4").exists()
+    assert cli.main(["export", str(path), "--format", "torch"]) == 0
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["eval", "tasks/shaky.py:StandShaky"])
+    assert "name one of yours with --policy" in capsys.readouterr().err
+    file.rename(tmp_path / "moved.py")
+    monkeypatch.setattr(registry, "_named", {})  # as in another process
+    for name in [name for name in sys.modules if name.startswith("shaky")]:
+        monkeypatch.delitem(sys.modules, name)
+    for command in (["eval", str(path), "--device=cpu"], ["resume", str(path), "--total_frames=512"]):
+        with pytest.raises(SystemExit, match="2"):
+            cli.main(command)
+        assert f"there is no file {file}" in capsys.readouterr().err
+    assert cli.main(["plot", str(path), "--out=curve.png"]) == 0
+
+
+HOOKS = {
+    **{"num_envs": 8, "num_steps": 16, "minibatch_size": 64, "epochs": 2, "hidden": (16,), "action_repeat": 1},
+    **{"episode_length": 60, "eval_episodes": 2, "video_seconds": 0.0, "logger": ("csv",), "total_frames": 512},
+}
+
+
+def in_parts(task, out, settings):
+    """Returns a run that was stopped after two batches, and resumed."""
+    trainer = Trainer(RunFolder.create(preset(task, out=out, **settings)))
+    for _ in range(2):
+        trainer.run.append_metrics(trainer._iterate())
+    trainer.save()
+    Trainer(trainer.run, resume=True).train()
+    return trainer.run
+
+
+class Clumsy(FollowVelocity):
+    """Falls at random too."""
+
+    def terminated(self, s):
+        return super().terminated(s) | (s.uniform(0.0, 1.0) < 0.05)
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+def test_a_task_with_memory_falls_and_what_the_critic_alone_reads(algorithm, tmp_path):
+    """Episodes end early, and a run that is stopped and goes on equals one that was not."""
+    more = {"min_value": -20.0, "max_value": 20.0} if algorithm == "reppo" else {}
+    settings = {"algorithm": algorithm, "device": "cpu", **HOOKS, **more}
+    whole = train(Clumsy, out=tmp_path / "whole", **settings)
+    parts = in_parts(Clumsy, tmp_path / "parts", settings)
+    metrics = whole.read_metrics()
+    assert metrics["episodes"][-1] > 3
+    assert metrics["episode_length"][-1] < 60
+    assert {"reward/track", "reward/slip"} <= metrics.keys()
+    assert len(Policy.load(whole.policy, "cpu").module[0].mean) == 36  # the actor does not read what the critic does
+    sizes = {name: len(value) for name, value in networks(whole).items() if name.endswith("mean")}
+    assert set(sizes.values()) == {36, 44}
+    for name in ("return", "episode_length", "episodes", "reward/track"):
+        assert parts.read_metrics()[name] == metrics[name]
+    assert_same(networks(parts), networks(whole))
+
+
+def test_metrics_of_episodes_survive_a_stop(tmp_path):
+    trainer = Trainer(made(tmp_path, episode_length=8, total_frames=10_000))
+    for _ in range(4):
+        trainer._iterate()
+    assert trainer.episodes.count > 0
+    trainer.save()
+    rows = [trainer._iterate() for _ in range(3)]
+    again = Trainer(trainer.run, resume=True)
+    for row, other in zip(rows, [again._iterate() for _ in range(3)], strict=True):
+        for name in ("return", "episode_length", "episodes"):
+            assert row[name] == other[name]
+    assert again.algorithm.spaces == WALKER

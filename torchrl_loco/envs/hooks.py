@@ -1,0 +1,388 @@
+"""The hooks of a task: which are its own, what they return and ask for, and the parts of a control step they make."""
+
+import logging
+import warnings
+import weakref
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import torch
+from torch.fx.experimental.proxy_tensor import make_fx
+
+from torchrl_loco.checks import suggestion
+from torchrl_loco.envs.episode import MAX_VALUE
+from torchrl_loco.envs.view import Catalog, View, usable
+from torchrl_loco.sim import models
+
+if TYPE_CHECKING:
+    from torchrl_loco.envs.base import LocoEnv
+
+Arrays = Mapping[str, torch.Tensor]
+"""The arrays of all worlds by name: physics, ``memory.<name>``, ``out.<group>``, counters and flags."""
+
+HOOKS = ("control", "update", "reward", "terminated", "events", "observation", "begin")
+
+FUSED = {
+    "reward": ("observation_func",),
+    "observation": ("observation_func",),
+    "begin": ("pose_func", "initial_states"),
+}
+"""The methods that name a Warp function instead of a hook."""
+
+
+def own_hooks(cls: type) -> frozenset[str]:
+    """Returns the hooks that are plain torch in a class: of each, the most derived definition wins, torch or Warp."""
+    from torchrl_loco.envs.base import LocoEnv
+
+    found = set()
+    for hook in HOOKS:
+        for base in cls.__mro__[: cls.__mro__.index(LocoEnv)]:
+            if hook in vars(base):
+                found.add(hook)
+            if {hook, *FUSED.get(hook, ())} & vars(base).keys():
+                break
+    return frozenset(found)
+
+
+def _draws_states(cls: type["LocoEnv"]) -> bool:
+    """Returns whether a class has a hook, a Warp function or a table that begins its episodes."""
+    from torchrl_loco.envs.base import LocoEnv
+
+    return any(getattr(cls, name) is not getattr(LocoEnv, name) for name in ("begin", *FUSED["begin"]))
+
+
+def memory_shapes(cls: type) -> dict[str, tuple[int, ...]]:
+    """Returns the shapes of a row of each entry of the memory of a class.
+
+    Raises:
+        TypeError: ``memory`` is no table of names and shapes.
+        ValueError: a name is taken, or a size is less than 1.
+    """
+    memory: Any = getattr(cls, "memory", {})
+    if not isinstance(memory, Mapping):
+        raise TypeError(f"{cls.__name__}.memory must be a dict of names and shapes, such as {{'command': 3}}")
+    taken = {name for name in vars(View) if not name.startswith("_")}
+    shapes = {}
+    for name, shape in memory.items():
+        if not isinstance(name, str) or not name.isidentifier() or name.startswith("_"):
+            raise ValueError(f"{cls.__name__}.memory: {name!r} is no name of an attribute")
+        if name in taken:
+            raise ValueError(f"{cls.__name__}.memory: {name!r} is taken, since s.{name} is something else: rename it")
+        sizes = (shape,) if isinstance(shape, int) else shape
+        if not isinstance(sizes, tuple | list) or not all(isinstance(n, int) for n in sizes):
+            raise TypeError(f"{cls.__name__}.memory[{name!r}] must be a size or a tuple of sizes, got {shape!r}")
+        if any(n < 1 for n in sizes):
+            raise ValueError(f"{cls.__name__}.memory[{name!r}] must have sizes of 1 or more, got {shape!r}")
+        shapes[name] = tuple(sizes)
+    return shapes
+
+
+class Hooks:
+    """The hooks of an environment's task that are plain torch.
+
+    They are called once when this is made, in worlds at rest in the home pose, which tells what they return and what of
+    the physics they ask for.
+
+    Args:
+        env: the environment. No reference to it is kept that would keep it alive.
+        mj_model: its model.
+
+    Attributes:
+        own: names of the hooks.
+        catalog: the model's names, and what the hooks ask for.
+        groups: shape of a row of each tensor of the observation, by name; empty if a Warp function observes.
+        term_names: names of the terms of the reward; ``None`` if a Warp function rewards.
+        moves: whether ``events`` changes qpos or qvel.
+
+    Raises:
+        TypeError: a hook returns something of the wrong type.
+        ValueError: a hook returns something of the wrong shape, name or value.
+    """
+
+    def __init__(self, env: "LocoEnv", mj_model: mujoco.MjModel) -> None:
+        self._env = weakref.ref(env)
+        self._title = type(env).__name__
+        self.own = own_hooks(type(env))
+        if models.has_home(mj_model) and not _draws_states(type(env)):
+            self.own |= {"begin"}
+        bounded = env.action_range != (-float("inf"), float("inf"))
+        shapes = memory_shapes(type(env))
+        self.catalog = Catalog(mj_model, env.num_envs, env.device, shapes, env.config.ctrl_dt, bounded=bounded)
+        self.groups: dict[str, tuple[int, ...]] = {}
+        self.term_names: tuple[str, ...] | None = None
+        self.moves = False
+        with torch.no_grad():
+            self._probe(self._at_home())
+
+    def _call(self, hook: str, arrays: Arrays, *, steps: int = 0, args: tuple[Any, ...] = ()) -> Any:
+        env = self._env()
+        assert env is not None
+        return getattr(env, hook)(View(self.catalog, arrays, hook, steps), *args)
+
+    # Calling the hooks once.
+
+    def _at_home(self) -> dict[str, torch.Tensor]:
+        """Returns arrays of worlds at rest in the home pose, which share one row."""
+        catalog = self.catalog
+        m, n, device = catalog.mj_model, catalog.num_envs, catalog.device
+        data = mujoco.MjData(m)
+        data.qpos[:] = catalog.home.cpu().numpy()
+        mujoco.mj_forward(m, data)
+        rows: dict[str, Any] = {name: getattr(data, name) for name in ("qpos", "qvel", "ctrl", "xpos", "cvel")}
+        rows |= {"xmat": data.xmat.reshape(-1, 3, 3), "subtree_com": data.subtree_com, "sensordata": data.sensordata}
+        rows |= {"time": 0.0, "contact_force": [[0.0] * 3], "in_contact": [0.0], "action": [0.0] * m.nu}
+        rows |= {f"memory.{name}": torch.zeros(shape) for name, shape in catalog.memory.items()}
+        arrays = {name: torch.as_tensor(row, dtype=torch.float32).to(device) for name, row in rows.items()}
+        arrays = {name: row.expand(n, *row.shape) for name, row in arrays.items()}
+        zeros = torch.zeros(n, dtype=torch.long, device=device)
+        return {**arrays, "seed": zeros[:1], "world": zeros, "episode": zeros, "elapsed_steps": zeros}
+
+    def _probe(self, arrays: dict[str, torch.Tensor]) -> None:
+        m, n = self.catalog.mj_model, self.catalog.num_envs
+        if "control" in self.own:
+            controls = self._call("control", arrays, args=(arrays["action"],))
+            self._check("control", controls, (n, m.nu))
+        rows = self._rows("update", arrays, self.catalog.memory) if "update" in self.own else {}
+        arrays |= {f"memory.{name}": row.float() for name, row in rows.items()}
+        if "reward" in self.own:
+            terms = self._call("reward", arrays, steps=1)
+            for name, term in terms.items() if isinstance(terms, Mapping) else [("", terms)]:
+                self._check("reward", term, (n,), name)
+            self.term_names = tuple(terms) if isinstance(terms, Mapping) else ()
+        if "terminated" in self.own:
+            ended = self._call("terminated", arrays, steps=1)
+            self._check("terminated", ended, (n,))
+            if ended.dtype != torch.bool:
+                raise TypeError(f"{self._title}.terminated must return a bool tensor, got {ended.dtype}")
+        state = {"qpos": (m.nq,), "qvel": (m.nv,)}
+        if "events" in self.own:
+            rows = self._rows("events", arrays, {**self.catalog.memory, **state})
+            self.moves = bool(state.keys() & rows.keys())
+            arrays |= {f"memory.{name}": row.float() for name, row in rows.items() if name in self.catalog.memory}
+        if "begin" in self.own:
+            rows = self._rows("begin", arrays, {**self.catalog.memory, **state})
+            for name, row in rows.items():
+                if not row.isfinite().all():
+                    raise ValueError(f"{self._title}.begin returns {name} with numbers that are not finite")
+        if "observation" in self.own:
+            groups = self._groups(arrays)
+            for name, values in groups.items():
+                self._check("observation", values, (n, *values.shape[1:]), name)
+                if not values.is_floating_point():
+                    raise TypeError(f"{self._title}.observation{_of(name)} must be of floats, got {values.dtype}")
+            self.groups = {name: tuple(values.shape[1:]) for name, values in groups.items()}
+
+    def _groups(self, arrays: Arrays, steps: int = 0) -> dict[str, torch.Tensor]:
+        groups = self._call("observation", arrays, steps=steps)
+        if not isinstance(groups, Mapping):
+            groups = {"observation": groups}
+        wrong = [name for name in groups if not isinstance(name, str) or name in NO_GROUPS or "." in name]
+        if wrong or not groups:
+            raise ValueError(
+                f"{self._title}.observation must return a tensor or tensors by name, such as 'observation' and "
+                f"'privileged'{f'; {wrong[0]!r} is no name that they can have' if wrong else ''}"
+            )
+        return dict(groups)
+
+    def _rows(
+        self, hook: str, arrays: Arrays, known: Mapping[str, tuple[int, ...]], steps: int = 1
+    ) -> dict[str, torch.Tensor]:
+        """Returns the new rows that a hook returns, by name, each of full shape.
+
+        Raises:
+            TypeError: it returns no rows by name.
+            ValueError: a name is unknown, or a row has the wrong shape.
+        """
+        rows = self._call(hook, arrays, steps=0 if hook == "begin" else steps)
+        if rows is None:
+            return {}
+        if not isinstance(rows, Mapping):
+            raise TypeError(f"{self._title}.{hook} must return new rows by name, got {_kind(rows)}")
+        n = self.catalog.num_envs
+        for name, row in rows.items():
+            if name not in known:
+                raise ValueError(
+                    f"{self._title}.{hook} returns {name!r}{suggestion(str(name), list(known))}: choose of "
+                    f"{', '.join(known) or 'the names of memory, which has no entries'}"
+                )
+            shape = (n, *known[name])
+            if not isinstance(row, torch.Tensor) or not _broadcasts(row.shape, shape):
+                raise ValueError(f"{self._title}.{hook} must return {name} of shape {shape}, got {_kind(row)}")
+        return {name: row.expand(n, *known[name]) for name, row in rows.items()}
+
+    def _check(self, hook: str, values: Any, shape: tuple[int, ...], name: str = "") -> None:
+        if not isinstance(values, torch.Tensor):
+            raise TypeError(f"{self._title}.{hook}{_of(name)} must return a tensor, got {_kind(values)}")
+        if tuple(values.shape) != shape:
+            what = f"{self._title}.{hook}{_of(name)}"
+            raise ValueError(f"{what} must return shape {shape}, the worlds first, got {tuple(values.shape)}")
+        if values.device != self.catalog.device:
+            raise ValueError(f"{self._title}.{hook}{_of(name)} must return a tensor on {self.catalog.device}")
+
+    # The parts of a control step, in their order. Each reads and writes arrays of all worlds in place.
+
+    def control(self, a: Arrays) -> None:
+        """Before the physics: writes ``ctrl``. Worlds whose action or control is not finite are marked; that is 0."""
+        action = usable(a["action"], self.catalog.bounded)
+        controls = self._call("control", a, args=(action,))
+        finite = controls.isfinite()
+        a["ctrl"].copy_(torch.where(finite, controls, 0.0))
+        a["non_finite"].copy_(~(finite & a["action"].isfinite()).all(-1))
+
+    def judge(self, a: Arrays) -> None:
+        """After the physics: writes memory, reward, its terms and ``ended``; then what events change, and ``moved``."""
+        if "update" in self.own:
+            self._remember(a, self._rows("update", a, self.catalog.memory))
+        if "reward" in self.own:
+            terms = self._call("reward", a, steps=1)
+            if isinstance(terms, Mapping):
+                columns = torch.stack([term.float() for term in terms.values()], dim=-1)
+                a["terms"].copy_(columns)
+                terms = columns.sum(-1)
+            a["reward"].copy_(terms)
+        if "terminated" in self.own:
+            a["ended"].copy_(self._call("terminated", a, steps=1))
+        if "events" in self.own:
+            m = self.catalog.mj_model
+            rows = self._rows("events", a, {**self.catalog.memory, "qpos": (m.nq,), "qvel": (m.nv,)})
+            changed = [(rows[name] != a[name]).any(-1) for name in ("qpos", "qvel") if name in rows]
+            if changed:
+                a["moved"].copy_(torch.stack(changed).any(0))
+            self._remember(a, rows)
+
+    def observe(self, a: Arrays) -> None:
+        """At the end of a step: writes the observation, and marks and zeroes worlds that are not finite."""
+        groups = self._groups(a, steps=1) if "observation" in self.own else {}
+        for name, values in groups.items():
+            a[f"out.{name}"].copy_(values)
+        outputs = [a[name] for name in a if name.startswith("out.")]
+        wrong = a["non_finite"] | _beyond(a["reward"], a["qpos"], a["qvel"], *outputs)
+        a["non_finite"].copy_(wrong)
+        for values in (*outputs, a["reward"], a["terms"]):
+            values.masked_fill_(_rows(wrong, values), 0.0)
+
+    def begin(self, a: Arrays) -> None:
+        """At a reset, in the masked worlds, which are at rest: writes pose and memory."""
+        m, memory = self.catalog.mj_model, self.catalog.memory
+        rows: dict[str, torch.Tensor] = {}
+        if "begin" in self.own:
+            home = {"qpos": self.catalog.home.expand_as(a["qpos"])}
+            rows = {**home, **self._rows("begin", a, {**memory, "qpos": (m.nq,), "qvel": (m.nv,)})}
+        zeros = {name: torch.zeros_like(a[f"memory.{name}"]) for name in memory if name not in rows}
+        self._remember(a, {**zeros, **rows}, a["mask"])
+
+    def observe_begun(self, a: Arrays) -> None:
+        """After a reset, or after a state was written: writes the observation of the masked worlds."""
+        groups = self._groups(a)
+        wrong = _beyond(a["qpos"], a["qvel"], *groups.values()) & a["mask"]
+        a["non_finite"].copy_(a["non_finite"] | wrong)
+        for name, values in groups.items():
+            target, values = a[f"out.{name}"], values.masked_fill(_rows(wrong, values), 0.0)
+            target.copy_(torch.where(_rows(a["mask"], target), values, target))
+
+    def _remember(self, a: Arrays, rows: Mapping[str, torch.Tensor], mask: torch.Tensor | None = None) -> None:
+        for name, row in rows.items():
+            target = a[f"memory.{name}"] if name in self.catalog.memory else a[name]
+            row = unit_quaternions(self.catalog.mj_model, row) if name == "qpos" else row
+            if mask is not None:
+                row = torch.where(_rows(mask, target), row.to(target.dtype), target)
+            target.copy_(row)
+
+
+NO_GROUPS = ("reward", "done", "terminated", "truncated", "action", "next", "reward_terms")
+"""Names that a tensor of the observation cannot have: those of a step's other entries."""
+
+
+def _beyond(*arrays: torch.Tensor) -> torch.Tensor:
+    """Returns in which worlds a number of arrays ``(num_envs, ...)`` is not finite, or as good as that."""
+    finite = [(values.flatten(1) if values.ndim > 1 else values.unsqueeze(1)).abs() < MAX_VALUE for values in arrays]
+    return ~torch.stack([part.all(-1) for part in finite]).all(0)
+
+
+def _rows(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """Returns a mask of worlds in a shape that broadcasts with ``(num_envs, ...)``."""
+    return mask.view(-1, *[1] * (values.ndim - 1))
+
+
+def unit_quaternions(m: mujoco.MjModel, qpos: torch.Tensor) -> torch.Tensor:
+    """Returns poses ``(num_envs, nq)`` with the quaternions of free and ball joints normalised."""
+    starts = [int(m.jnt_qposadr[j]) + 3 * (m.jnt_type[j] == 0) for j in range(m.njnt) if m.jnt_type[j] in (0, 1)]
+    for q in starts:
+        unit = torch.nn.functional.normalize(qpos[:, q : q + 4], dim=-1)
+        qpos = torch.cat([qpos[:, :q], unit, qpos[:, q + 4 :]], dim=-1)
+    return qpos
+
+
+def _broadcasts(shape: torch.Size, target: tuple[int, ...]) -> bool:
+    try:
+        return tuple(torch.broadcast_shapes(shape, target)) == tuple(target)
+    except RuntimeError:
+        return False
+
+
+def _kind(value: Any) -> str:
+    return f"a tensor of shape {tuple(value.shape)}" if isinstance(value, torch.Tensor) else repr(value)
+
+
+def _of(name: str) -> str:
+    return f"[{name!r}]" if name else ""
+
+
+def constants_on(device: torch.device, traced: torch.fx.GraphModule) -> torch.fx.GraphModule:
+    """Returns a trace in which tensors of other devices are copied to ``device`` once, and not at each step."""
+    copies = (torch.ops.aten._to_copy.default, torch.ops.aten.lift_fresh_copy.default)
+    for node in list(traced.graph.nodes):
+        if node.target not in copies or node.args[0].op != "get_attr":
+            continue
+        constant = getattr(traced, node.args[0].target)
+        if constant.device == device:
+            continue
+        name = f"{node.args[0].target}_{node.name}"
+        traced.register_buffer(name, node.target(constant, *node.args[1:], **node.kwargs).to(device), persistent=False)
+        with traced.graph.inserting_before(node):
+            node.replace_all_uses_with(traced.graph.get_attr(name))
+        traced.graph.erase_node(node)
+    traced.recompile()
+    return traced
+
+
+class Part:
+    """A part of a step in plain torch: as it is on the CPU, compiled on CUDA.
+
+    Hooks are traced there by running them once on the present worlds, so whatever Python they use is evaluated then:
+    what shall change later must be a tensor that is changed in place.
+
+    Args:
+        work: reads and writes arrays in place.
+        arrays: the arrays of all worlds.
+        title: of the task, for messages.
+    """
+
+    def __init__(self, work: Callable[[Arrays], None], arrays: dict[str, torch.Tensor], title: str) -> None:
+        self._work, self._arrays, self._title = work, arrays, title
+        self._compiled: Callable[[Arrays], None] | None = None
+
+    @torch.no_grad()
+    def __call__(self) -> None:
+        """Runs it."""
+        work = self._work if self._compiled is None else self._compiled
+        work(self._arrays)
+
+    @torch.no_grad()
+    def compile(self) -> None:
+        """Compiles it with torch.compile, and runs it; if that fails, logs why, and it goes on as plain torch."""
+        device = self._arrays["qpos"].device
+        try:
+            traced = constants_on(device, make_fx(lambda arrays: self._work(arrays))(self._arrays))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # those of torch's own code
+                compiled = torch.compile(traced, fullgraph=True, dynamic=False)
+                compiled(self._arrays)
+        except Exception as error:  # whatever hooks, tracing or the compiler raise
+            message = " ".join(str(error).split("\n")[:3]).strip()
+            logging.getLogger("torchrl_loco").warning(
+                "%s.%s is not compiled and runs as plain torch: %s", self._title, self._work.__name__, message
+            )
+        else:
+            self._compiled = compiled

@@ -1,0 +1,120 @@
+"""TransformedEnv, whose transforms need not wait for the device, and which transforms allow that."""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import (
+    CatTensors,
+    CenterCrop,
+    ClipTransform,
+    Compose,
+    Crop,
+    DoubleToFloat,
+    DTypeCastTransform,
+    EnvBase,
+    ExcludeTransform,
+    FlattenObservation,
+    FrameSkipTransform,
+    GrayScale,
+    InitTracker,
+    ObservationNorm,
+    PermuteTransform,
+    RenameTransform,
+    Resize,
+    RewardClipping,
+    RewardScaling,
+    RewardSum,
+    SelectTransform,
+    SignTransform,
+    SqueezeTransform,
+    StepCounter,
+    ToTensorImage,
+    Transform,
+    UnsqueezeTransform,
+)
+from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
+
+from torchrl_loco.envs.base import reset_done_worlds, rows_of
+from torchrl_loco.envs.state import without_state
+
+
+class ActionRepeat(FrameSkipTransform):
+    """Holds an action for several control steps and sums their rewards, up to the step that terminates a world.
+
+    TorchRL's FrameSkipTransform goes on stepping a world that has terminated, and loses the termination and the true
+    terminal observation.
+    """
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        parent: Any = self.parent
+        for _ in range(self.frame_skip - 1):
+            before, after = next_tensordict, parent._step(tensordict)
+            over = before.get("terminated")
+            for key in after.keys(True, True):
+                if key == "reward" or key[0] == "reward_terms":
+                    after.set(key, before.get(key) + after.get(key))
+
+            def chosen(new: torch.Tensor, old: torch.Tensor, over: torch.Tensor = over) -> torch.Tensor:
+                return torch.where(rows_of(over, new), old, new)
+
+            next_tensordict = after.apply(chosen, before)
+        return next_tensordict
+
+
+PLAIN_TRANSFORMS = (
+    *(ActionRepeat, ClipTransform, Compose, DoubleToFloat, FrameSkipTransform, InitTracker),
+    *(ObservationNorm, RewardClipping, RewardScaling, RewardSum, StepCounter),
+)
+"""Transforms that can be recorded, as they keep nothing on the host; a reset changes only the worlds of its mask."""
+
+STATELESS_TRANSFORMS = (
+    *(CatTensors, CenterCrop, Crop, DTypeCastTransform, ExcludeTransform, FlattenObservation, GrayScale),
+    *(PermuteTransform, RenameTransform, Resize, SelectTransform, SignTransform, SqueezeTransform),
+    *(ToTensorImage, UnsqueezeTransform),
+)
+"""Further transforms that compute the same of the same data, also at a reset."""
+
+
+def resets_by_mask(transform: Transform) -> bool:
+    """Returns whether the reset of a transform, and of those in it, changes nothing if no world is reset.
+
+    Of other classes than the listed ones, those without a reset of their own qualify. ``VecNormV2`` does not: its reset
+    counts the observations that it is given.
+    """
+    for part in (part for part in transform.modules() if isinstance(part, Transform)):
+        kind = type(part)
+        own = [getattr(kind, name) is not getattr(Transform, name) for name in ("_reset", "_reset_env_preprocess")]
+        if any(own) and kind not in PLAIN_TRANSFORMS and kind not in STATELESS_TRANSFORMS:
+            return False
+    return True
+
+
+class TransformedEnv(TorchRLTransformedEnv):
+    """TorchRL's ``TransformedEnv`` for the environments of this package; most transforms need not wait for the device.
+
+    TorchRL's own works too and gives the same data, but reads from the device at every step, to reset only if a world
+    is done. So does this one with a transform that has a reset of its own, unless ``PLAIN_TRANSFORMS`` or
+    ``STATELESS_TRANSFORMS`` lists it. The arguments are those of TorchRL's: an environment, and a transform or a
+    ``Compose`` of them.
+    """
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Resets the worlds that are done; see :func:`reset_done_worlds`.
+
+        Args:
+            tensordict: what ``step_mdp`` makes of a step, batch ``(num_envs,)``.
+
+        Returns:
+            The same, batch ``(num_envs,)``, with new episodes in the worlds that were done.
+        """
+        env: EnvBase = self
+        while isinstance(env, TorchRLTransformedEnv):
+            if not resets_by_mask(env.transform):
+                return super().maybe_reset(tensordict)
+            env = env.base_env
+        return reset_done_worlds(self, tensordict)
+
+    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        """Returns what ``reset`` returns, without a state that was passed to it, which would become stale."""
+        return super()._reset_proc_data(without_state(tensordict, self.device), tensordict_reset)

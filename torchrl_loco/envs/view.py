@@ -1,0 +1,398 @@
+"""What hooks see of all worlds: the view ``s``, by MuJoCo's names and by the names in the model."""
+
+import difflib
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+from torchrl_loco.envs import draws, sensors
+
+Names = str | Sequence[str]
+"""A name, several names, or a regular expression that matches whole names."""
+
+KINDS = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "site": "nsite", "sensor": "nsensor", "actuator": "nu"}
+"""What has names in a model, and how many there are."""
+
+OF_A_STEP = frozenset({"action", "ctrl"})
+"""What belongs to a step: an observation is also made after a reset, where there was none."""
+
+
+class Catalog:
+    """What is the same at every step: the model's names, its numbers as tensors, and what hooks have asked for.
+
+    Args:
+        mj_model: the model.
+        num_envs: number of worlds.
+        device: where the tensors live.
+        memory: shape of a row of each entry of the memory, by name.
+        ctrl_dt: time of a control step (s).
+        bounded: whether actions are clipped to [-1, 1].
+
+    Attributes:
+        arrays: names of the arrays that hooks have read.
+        sensors: ids of the sensors that only an engine can evaluate.
+        contact_geoms: ids of the geoms whose contacts were asked for, in the order of the engine's columns.
+        sensor_address: where a sensor's numbers begin in ``sensordata``, by its id.
+        home: home pose, ``(nq,)``: the keyframe ``home`` if there is one, else ``qpos0``.
+    """
+
+    def __init__(
+        self,
+        mj_model: mujoco.MjModel,
+        num_envs: int,
+        device: torch.device,
+        memory: Mapping[str, tuple[int, ...]],
+        ctrl_dt: float,
+        *,
+        bounded: bool,
+    ) -> None:
+        self.mj_model, self.num_envs, self.device = mj_model, num_envs, device
+        self.memory, self.ctrl_dt, self.bounded = dict(memory), ctrl_dt, bounded
+        self.arrays: set[str] = set()
+        self.sensors: set[int] = set()
+        self.contact_geoms: list[int] = []
+        self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}
+        self.home = self._tensor(home_pose(mj_model))
+        self._names: dict[str, list[str]] = {}
+        self._found: dict[tuple[str, Any], tuple[list[int], bool]] = {}
+        self._index: dict[tuple[int, ...], torch.Tensor] = {}
+        self._constants: dict[Any, torch.Tensor] = {}
+        self._places: dict[tuple[int, int], torch.Tensor] = {}
+
+    def names(self, kind: str) -> list[str]:
+        """Returns the names of all elements of a kind, by their ids."""
+        if kind not in self._names:
+            element = getattr(self.mj_model, kind)
+            self._names[kind] = [element(i).name for i in range(getattr(self.mj_model, KINDS[kind]))]
+        return self._names[kind]
+
+    def ids(self, kind: str, names: Names) -> tuple[list[int], bool]:
+        """Returns the ids of elements, and whether one was named, so that results need no dimension for several.
+
+        Raises:
+            KeyError: a name or pattern matches none; the message names the nearest.
+        """
+        key = kind, names if isinstance(names, str) else tuple(names)
+        if key not in self._found:
+            known = self.names(kind)
+            if isinstance(names, str) and names in known:
+                self._found[key] = [known.index(names)], True
+            else:
+                self._found[key] = [i for name in _several(names) for i in self._matches(kind, name)], False
+        return self._found[key]
+
+    def _matches(self, kind: str, pattern: str) -> list[int]:
+        known = self.names(kind)
+        if pattern in known:
+            return [known.index(pattern)]
+        try:
+            found = [i for i, name in enumerate(known) if name and re.fullmatch(pattern, name)]
+        except re.error as error:
+            raise KeyError(f"{pattern!r} is neither the name of a {kind} nor a regular expression: {error}") from None
+        if not found:
+            near = difflib.get_close_matches(pattern, known, n=1)
+            hint = f", did you mean {near[0]!r}?" if near else ""
+            raise KeyError(f"the model has no {kind} {pattern!r}{hint}: it has {', '.join(filter(None, known))}")
+        return found
+
+    def pick(self, values: torch.Tensor, ids: list[int], one: bool) -> torch.Tensor:
+        """Returns the columns ``ids`` of an array ``(num_envs, count, ...)``, without their dimension for one."""
+        if one:
+            return values[:, ids[0]]
+        key = tuple(ids)
+        if key not in self._index:
+            self._index[key] = torch.tensor(ids, device=self.device)
+        return values.index_select(1, self._index[key])
+
+    def constant(self, field: str, ids: Sequence[int] | None = None) -> torch.Tensor:
+        """Returns numbers of a field of the model, float32, of the elements ``ids`` or of all."""
+        key = field, None if ids is None else tuple(ids)
+        if key not in self._constants:
+            values = getattr(self.mj_model, field)
+            self._constants[key] = self._tensor(values if ids is None else values[list(ids)])
+        return self._constants[key]
+
+    def places(self, first: int, count: int) -> torch.Tensor:
+        """Returns places of random streams, which a compiler would compute wrongly: they wrap around 64 bits."""
+        if (first, count) not in self._places:
+            self._places[first, count] = draws.places(first, count, self.device)
+        return self._places[first, count]
+
+    def derived(self, key: Any, make: Any) -> torch.Tensor:
+        """Returns a tensor made by ``make()`` from the model when it is first asked for."""
+        if key not in self._constants:
+            self._constants[key] = self._tensor(make())
+        return self._constants[key]
+
+    def _tensor(self, values: Any) -> torch.Tensor:
+        return torch.tensor(np.array(values), dtype=torch.float32, device=self.device)
+
+
+def _several(names: Names) -> list[str]:
+    return [names] if isinstance(names, str) else list(names)
+
+
+def home_pose(mj_model: mujoco.MjModel) -> Any:
+    """Returns the pose of the keyframe ``home`` of a model, or else its ``qpos0``, ``(nq,)``."""
+    keys = [mj_model.key(i).name for i in range(mj_model.nkey)]
+    return mj_model.key_qpos[keys.index("home")] if "home" in keys else mj_model.qpos0
+
+
+class View:
+    """All worlds, as a hook sees them. The first dimension of every tensor is the world; hooks must not write to it.
+
+    Names are those of the model; several names, or a regular expression, add a dimension behind the world's.
+
+    Args:
+        catalog: the model's names and numbers.
+        arrays: the arrays of all worlds, by name.
+        hook: name of the hook that sees it, from which its random numbers depend.
+        steps: control steps that the worlds have taken beyond those that are counted.
+    """
+
+    def __init__(self, catalog: Catalog, arrays: Mapping[str, torch.Tensor], hook: str, steps: int = 0) -> None:
+        self._catalog, self._arrays, self._hook, self._steps = catalog, arrays, hook, steps
+        self._stream: torch.Tensor | None = None
+        self._drawn = 0
+
+    # The state.
+
+    def _array(self, name: str) -> torch.Tensor:
+        if name in OF_A_STEP and self._hook in ("observation", "begin"):
+            raise ValueError(  # an AttributeError of a property would go on to __getattr__
+                f"s.{name} belongs to a step, and {self._hook}() is also called after a reset: "
+                f"keep what you need of it in memory, by returning it from events()"
+            )
+        self._catalog.arrays.add(name)
+        return self._arrays[name]
+
+    @property
+    def qpos(self) -> torch.Tensor:
+        """Positions (m, rad, unit quaternions), ``(num_envs, nq)``."""
+        return self._array("qpos")
+
+    @property
+    def qvel(self) -> torch.Tensor:
+        """Velocities (m/s, rad/s), ``(num_envs, nv)``."""
+        return self._array("qvel")
+
+    @property
+    def ctrl(self) -> torch.Tensor:
+        """Controls of the step, ``(num_envs, nu)``; not in ``observation`` and ``begin``."""
+        return self._array("ctrl")
+
+    @property
+    def action(self) -> torch.Tensor:
+        """Actions as they were used, ``(num_envs, nu)``: clipped to ``action_range``, zero where one is not finite.
+
+        Not in ``observation`` and ``begin``: return it from ``events`` into ``memory`` to observe it.
+        """
+        return usable(self._array("action"), self._catalog.bounded)
+
+    @property
+    def time(self) -> torch.Tensor:
+        """Time since the world's reset (s), ``(num_envs,)``."""
+        return self._array("time")
+
+    @property
+    def dt(self) -> float:
+        """Time of a control step (s)."""
+        return self._catalog.ctrl_dt
+
+    @property
+    def num_envs(self) -> int:
+        """Number of worlds."""
+        return self._catalog.num_envs
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors live."""
+        return self._catalog.device
+
+    @property
+    def home(self) -> torch.Tensor:
+        """Home pose, ``(num_envs, nq)``: the model's keyframe ``home`` if there is one, else its ``qpos0``."""
+        return self._catalog.home.expand(self._catalog.num_envs, -1)
+
+    def model(self, field: str) -> torch.Tensor:
+        """Returns a field of the model, such as ``"geom_friction"``: ``(num_envs, *shape)``, float32.
+
+        Raises:
+            AttributeError: ``MjModel`` has no such field, or it is no array.
+        """
+        values = getattr(self._catalog.mj_model, field, None)
+        if not hasattr(values, "shape"):
+            raise AttributeError(f"MjModel has no array {field!r}")
+        numbers = self._catalog.constant(field)
+        return numbers.expand(self._catalog.num_envs, *numbers.shape)
+
+    def __getattr__(self, name: str) -> torch.Tensor:
+        """Returns an entry of the memory, ``(num_envs, *row)``.
+
+        Raises:
+            AttributeError: there is no such entry.
+        """
+        if name.startswith("_"):
+            raise AttributeError(name)
+        memory = self._catalog.memory
+        if name in memory:
+            return self._arrays[f"memory.{name}"]
+        public = [key for key in vars(View) if not key.startswith("_")]
+        near = difflib.get_close_matches(name, [*public, *memory], n=1)
+        hint = f", did you mean s.{near[0]}?" if near else ""
+        raise AttributeError(f"s has no {name!r}{hint}: the memory has {', '.join(memory) or 'no entries'}")
+
+    # Poses and velocities.
+
+    def xpos(self, bodies: Names) -> torch.Tensor:
+        """Returns positions of bodies (m), ``(num_envs, 3)``, or ``(num_envs, count, 3)`` for several."""
+        return self._catalog.pick(self._array("xpos"), *self._catalog.ids("body", bodies))
+
+    def xmat(self, bodies: Names) -> torch.Tensor:
+        """Returns orientations of bodies, ``(num_envs, 3, 3)``, or ``(num_envs, count, 3, 3)`` for several."""
+        return self._catalog.pick(self._array("xmat"), *self._catalog.ids("body", bodies))
+
+    def linvel(self, bodies: Names) -> torch.Tensor:
+        """Returns velocities of the origins of bodies in the world's frame (m/s), shaped as :meth:`xpos`."""
+        ids, one = self._catalog.ids("body", bodies)
+        return sensors.linear_velocity(self, ids, one)
+
+    def angvel(self, bodies: Names) -> torch.Tensor:
+        """Returns angular velocities of bodies in the world's frame (rad/s), shaped as :meth:`xpos`."""
+        ids, one = self._catalog.ids("body", bodies)
+        return sensors.angular_velocity(self, ids, one)
+
+    def site_xpos(self, sites: Names) -> torch.Tensor:
+        """Returns positions of sites (m), shaped as :meth:`xpos`."""
+        return sensors.attached_position(self, "site", *self._catalog.ids("site", sites))
+
+    def site_xmat(self, sites: Names) -> torch.Tensor:
+        """Returns orientations of sites, shaped as :meth:`xmat`."""
+        return sensors.attached_orientation(self, "site", *self._catalog.ids("site", sites))
+
+    def site_linvel(self, sites: Names) -> torch.Tensor:
+        """Returns velocities of sites in the world's frame (m/s), shaped as :meth:`xpos`."""
+        return sensors.attached_velocity(self, "site", *self._catalog.ids("site", sites))
+
+    def geom_xpos(self, geoms: Names) -> torch.Tensor:
+        """Returns positions of the centers of geoms (m), shaped as :meth:`xpos`."""
+        return sensors.attached_position(self, "geom", *self._catalog.ids("geom", geoms))
+
+    def joint_qpos(self, joints: Names) -> torch.Tensor:
+        """Returns positions of joints: ``(num_envs, count)`` for several hinges and slides (rad, m).
+
+        One joint that is named has ``(num_envs,)``; a free or ball joint, which must be named, 7 or 4 numbers.
+        """
+        return self._of_joints("qpos", joints)
+
+    def joint_qvel(self, joints: Names) -> torch.Tensor:
+        """Returns velocities of joints (rad/s, m/s), shaped as :meth:`joint_qpos`; 6 or 3 for a free or ball joint."""
+        return self._of_joints("qvel", joints)
+
+    def _of_joints(self, array: str, joints: Names) -> torch.Tensor:
+        m, (ids, one) = self._catalog.mj_model, self._catalog.ids("joint", joints)
+        address = m.jnt_qposadr if array == "qpos" else m.jnt_dofadr
+        sizes = {0: (7, 6), 1: (4, 3)}
+        size = [sizes.get(int(m.jnt_type[j]), (1, 1))[array == "qvel"] for j in ids]
+        if one and size[0] > 1:
+            first = int(address[ids[0]])
+            return self._array(array)[:, first : first + size[0]]
+        if max(size) > 1:
+            wide = [self._catalog.names("joint")[j] for j, n in zip(ids, size, strict=True) if n > 1]
+            raise ValueError(f"name a free or ball joint alone: {', '.join(wide)} is among several joints")
+        return self._catalog.pick(self._array(array), [int(address[j]) for j in ids], one)
+
+    # Frames.
+
+    def to_body(self, body: str, vectors: torch.Tensor) -> torch.Tensor:
+        """Returns vectors of the world's frame, ``(num_envs, ..., 3)``, in the frame of a body."""
+        return into_frame(self.xmat(body), vectors)
+
+    def projected_gravity(self, body: str) -> torch.Tensor:
+        """Returns the direction of gravity in the frame of a body, ``(num_envs, 3)``: (0, 0, -1) if it is upright."""
+        return -self.xmat(body)[:, 2]
+
+    # Sensors and contacts.
+
+    def sensor(self, name: str) -> torch.Tensor:
+        """Returns a sensor of the model, ``(num_envs, size)``, in MuJoCo's units.
+
+        Those of poses and velocities (gyro, velocimeter, frame*, joint*) are computed here; touch and the velocity of a
+        subtree by either engine; any other by ``engine="mujoco_warp"``.
+        """
+        (sensor,), _ = self._catalog.ids("sensor", _one("sensor", name))
+        derived = sensors.evaluate(self, sensor)
+        if derived is not None:
+            return derived
+        self._catalog.sensors.add(sensor)
+        first = self._catalog.sensor_address[sensor]
+        return self._array("sensordata")[:, first : first + int(self._catalog.mj_model.sensor_dim[sensor])]
+
+    def contact_force(self, geoms: Names) -> torch.Tensor:
+        """Returns the net force of all contacts on each geom, world frame (N), of the last physics step.
+
+        Shape ``(num_envs, 3)``, or ``(num_envs, count, 3)`` for several.
+        """
+        return self._of_contacts("contact_force", geoms)
+
+    def in_contact(self, geoms: Names) -> torch.Tensor:
+        """Returns whether each geom had a contact in the last physics step, bool ``(num_envs,)`` or with ``count``."""
+        return self._of_contacts("in_contact", geoms) > 0
+
+    def _of_contacts(self, array: str, geoms: Names) -> torch.Tensor:
+        ids, one = self._catalog.ids("geom", geoms)
+        columns = self._catalog.contact_geoms
+        columns += [geom for geom in ids if geom not in columns]
+        values = self._array(array)
+        if len(columns) > values.shape[1]:  # being asked for the first time
+            values = values[:, :1].expand(-1, len(columns), *values.shape[2:])
+        return self._catalog.pick(values, [columns.index(geom) for geom in ids], one)
+
+    # Random numbers.
+
+    def uniform(self, low: float | torch.Tensor, high: float | torch.Tensor, *shape: int) -> torch.Tensor:
+        """Returns draws from [low, high), ``(num_envs, *shape)``, a function of (seed, world, episode, step).
+
+        The same numbers come for any number of worlds and at every run; on another device up to rounding.
+        """
+        return low + (high - low) * draws.to_unit(self._draw(math.prod(shape))).view(self.num_envs, *shape)
+
+    def normal(self, *shape: int) -> torch.Tensor:
+        """Returns draws from the standard normal distribution, ``(num_envs, *shape)``; see :meth:`uniform`."""
+        count = math.prod(shape)
+        first, second = self._draw(2 * count).split(count, dim=1)
+        return draws.to_normal(first, second).view(self.num_envs, *shape)
+
+    def _draw(self, count: int) -> torch.Tensor:
+        if self._stream is None:
+            a = self._arrays
+            self._stream = draws.stream(
+                a["seed"], a["world"], a["episode"], a["elapsed_steps"] + self._steps, self._hook
+            )
+        first, self._drawn = self._drawn, self._drawn + count
+        return draws.draw(self._stream, self._catalog.places(first, count))
+
+
+def _one(kind: str, name: Any) -> str:
+    if not isinstance(name, str):
+        raise TypeError(f"name one {kind}, got {name!r}")
+    return name
+
+
+def usable(action: torch.Tensor, bounded: bool) -> torch.Tensor:
+    """Returns actions ``(num_envs, nu)`` as a step uses them: zero in worlds where one is not finite, else clipped."""
+    finite = action.isfinite().all(dim=-1, keepdim=True)
+    action = torch.where(finite, action, 0.0)
+    return action.clamp(-1.0, 1.0) if bounded else action
+
+
+def into_frame(xmat: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """Returns vectors of the world ``(num_envs, ..., 3)`` in frames with the axes ``xmat`` ``(num_envs, 3, 3)``."""
+    between = vectors.ndim - 2
+    axes = xmat.view(xmat.shape[0], *[1] * between, 3, 3)
+    return (axes * vectors.unsqueeze(-1)).sum(-2)

@@ -1,0 +1,126 @@
+"""Models from MJCF files, and what a model must keep to."""
+
+from collections.abc import Collection
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+SCENE = Path(__file__).with_name("scene.xml")
+"""What every model can include by its name, from any folder: light, materials, the look of the floor."""
+
+VELOCITY_SENSORS = {
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
+    for name in (
+        *("JOINTVEL", "BALLANGVEL", "VELOCIMETER", "GYRO"),
+        *("FRAMELINVEL", "FRAMEANGVEL", "SUBTREELINVEL", "SUBTREEANGMOM"),
+    )
+}
+"""Sensors of velocities: they belong to the state after a step, and are zero at rest."""
+
+FORCE_SENSORS = {
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}")) for name in ("TOUCH", "ACCELEROMETER", "FORCE", "TORQUE")
+}
+"""Sensors of forces and accelerations: those of the last physics step, or without control if none was taken yet."""
+
+
+def load(
+    source: Path | str | mujoco.MjSpec, folder: Path | None = None, sensors: Collection[int] | None = None
+) -> mujoco.MjModel:
+    """Returns a model. MJCF may include ``scene.xml``, which is ours unless one lies beside it.
+
+    A model without a camera ``side`` gets one that follows its first body, so that videos show something.
+
+    Args:
+        source: path of an MJCF file, MJCF text, or a ``mujoco.MjSpec``, which stays as it is.
+        folder: where a relative path is looked for first.
+        sensors: ids of the sensors that are kept; ``None`` keeps all.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no valid MJCF.
+    """
+    spec = specification(source, folder)
+    for i, sensor in enumerate(list(spec.sensors)):
+        if sensors is not None and i not in sensors:
+            spec.delete(sensor)
+    model = spec.compile()
+    if "side" in [camera.name for camera in spec.cameras] or model.nbody == 1:
+        return model
+    distance = 3.0 * max(np.linalg.norm(model.body_ipos, axis=1).max() + model.geom_rbound[1:].max(initial=0.1), 0.3)
+    camera = spec.bodies[1].add_camera(name="side", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
+    camera.pos, camera.alt.xyaxes = [0, -2 * distance, 0.5 * distance], [1, 0, 0, 0, 0.25, 1]
+    return spec.compile()
+
+
+def specification(source: Path | str | mujoco.MjSpec, folder: Path | None = None) -> mujoco.MjSpec:
+    """Returns what :func:`load` compiles, to be edited; of a ``mujoco.MjSpec`` a copy.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
+    if isinstance(source, mujoco.MjSpec):
+        return source.copy()
+    if isinstance(source, str) and source.lstrip().startswith("<"):
+        return mujoco.MjSpec.from_string(source, {SCENE.name: SCENE.read_bytes()})
+    tried = [Path(source) if folder is None else folder / source, Path(source)]
+    path = next((path for path in tried if path.is_file()), None)
+    if path is None:
+        where = " and ".join(dict.fromkeys(str(path.absolute()) for path in tried))
+        raise FileNotFoundError(f"there is no model {str(source)!r}: looked for {where}")
+    own = path.with_name(SCENE.name).exists()
+    return mujoco.MjSpec.from_file(str(path), {} if own else {SCENE.name: SCENE.read_bytes()})
+
+
+def has_home(mj_model: mujoco.MjModel) -> bool:
+    """Returns whether a model has a keyframe named ``home``."""
+    return "home" in [mj_model.key(i).name for i in range(mj_model.nkey)]
+
+
+def control(mj_model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
+    """Returns the controls of actions in [-1, 1], which are scaled to the range of each actuator.
+
+    Args:
+        mj_model: the model.
+        action: ``(..., nu)``, clipped beyond.
+    """
+    low, high = mj_model.actuator_ctrlrange.T
+    return 0.5 * (low + high) + 0.5 * (high - low) * np.clip(action, -1.0, 1.0)
+
+
+def check(mj_model: mujoco.MjModel, *, own_control: bool = False) -> mujoco.MjModel:
+    """Returns the model if an environment supports it.
+
+    Args:
+        mj_model: the model that will be stepped.
+        own_control: whether the task computes controls itself, and need not scale actions to ranges.
+
+    Raises:
+        ValueError: the model uses something unsupported; the message names it.
+    """
+    wrong = []
+    low, high = mj_model.actuator_ctrlrange.T
+    if not own_control and not (low < high).all():
+        wrong.append(
+            "every actuator needs a ctrlrange, to which actions in [-1, 1] are scaled, or the task a control()"
+        )
+    unclipped = mj_model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    if not own_control and (unclipped or not mj_model.actuator_ctrllimited.all()):
+        wrong.append("actions beyond [-1, 1] must be clipped: leave ctrllimited and the flag clampctrl on")
+    if mj_model.actuator_delay.any():
+        wrong.append("delays of actuators are not supported: they are not part of the state that is reset")
+    disabled = {group for group in range(31) if mj_model.opt.disableactuator >> group & 1}
+    if disabled.intersection(mj_model.actuator_group.tolist()):
+        wrong.append("groups of actuators cannot be disabled (actuatorgroupdisable): leave the actuators out")
+    for i in range(mj_model.nsensor):
+        camera = int(mujoco.mjtObj.mjOBJ_CAMERA)
+        of_camera = camera in (mj_model.sensor_objtype[i], mj_model.sensor_reftype[i])
+        if of_camera or mj_model.sensor_type[i] not in VELOCITY_SENSORS | FORCE_SENSORS:
+            name = mj_model.sensor(i).name
+            wrong.append(
+                f"sensor {name!r} is not evaluated, only velocities, touch, accelerometers, forces and torques are: "
+                "compute it from sim.data in a kernel"
+            )
+    if wrong:
+        raise ValueError("; ".join(wrong))
+    return mj_model

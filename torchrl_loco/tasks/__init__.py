@@ -1,0 +1,60 @@
+"""The tasks: a folder for each body, with its model, its tasks and their settings, and its page of the documentation.
+
+A task is a class whose name begins with that of its folder: ``WalkerWalk`` in ``walker`` has the id ``walker_walk``.
+"""
+
+import ast
+import functools
+import importlib
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+class Task(NamedTuple):
+    """Where a task is, and what it asks for.
+
+    Attributes:
+        module: the module of its class.
+        name: the name of its class.
+        summary: the first line of the docstring of its class.
+    """
+
+    module: str
+    name: str
+    summary: str
+
+
+@functools.cache
+def found() -> dict[str, Task]:
+    """Returns the tasks in the folders by id, read without importing them: torch and Warp take seconds."""
+    tasks = {}
+    for path in sorted(Path(__file__).parent.glob("*/__init__.py")):
+        folder = path.parent.name
+        body, environments = folder.title().replace("_", ""), {"LocoEnv"}
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and environments & {
+                base.id for base in node.bases if isinstance(base, ast.Name)
+            }:
+                environments.add(node.name)
+                if node.name.startswith(body) and node.name != body:
+                    id = f"{folder}{re.sub('(?=[A-Z])', '_', node.name.removeprefix(body)).lower()}"
+                    summary = (ast.get_docstring(node) or "").partition("\n")[0]
+                    tasks[id] = Task(f"{__name__}.{folder}", node.name, summary)
+    return tasks
+
+
+def __getattr__(name: str) -> Any:
+    """Returns the class of a task, which is imported when it is asked for.
+
+    Raises:
+        AttributeError: there is no such task.
+    """
+    for task in found().values():
+        if task.name == name:
+            return getattr(importlib.import_module(task.module), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *(task.name for task in found().values())]

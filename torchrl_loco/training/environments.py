@@ -1,0 +1,139 @@
+"""The environments of a run: where it trains, where it is evaluated, and what is filmed."""
+
+import copy
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
+from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
+
+from torchrl_loco.envs import LocoEnv
+from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv
+from torchrl_loco.policy import Policy
+from torchrl_loco.registry import make, resolve
+from torchrl_loco.training import distributed
+from torchrl_loco.training.config import TrainingConfig
+from torchrl_loco.training.presets import is_ours
+
+
+class Environments:
+    """Makes the environments of a run, from its settings or after an environment that was handed in.
+
+    Args:
+        config: the settings of the run.
+        given: an environment of the package, which may be transformed, in which the run trains.
+
+    Attributes:
+        full_length: control steps of the task's own episodes.
+        transforms: the transforms of the environment that was handed in.
+    """
+
+    def __init__(self, config: TrainingConfig, given: EnvBase | None = None) -> None:
+        self._config, self._given = config, given
+        self._base: LocoEnv | None = None
+        self.transforms: tuple[Transform, ...] = ()
+        if given is not None:
+            self._base, self.transforms = unwrapped(given)
+        self.full_length = length_of(resolve(config.task)) if self._base is None else self._base.config.episode_length
+
+    @property
+    def names_of_transforms(self) -> list[str]:
+        """Names of the transforms' classes."""
+        parts = [list(part) if isinstance(part, Compose) else [part] for part in self.transforms]
+        return [type(one).__name__ for some in parts for one in some]
+
+    def training(self, nan_dump: Path) -> EnvBase:
+        """Returns the environment in which the run trains; see :func:`make_env`."""
+        if self._given is None:
+            return make_env(self._config, nan_dump)
+        return _holding(self._given, self._config)
+
+    def evaluation(self, episodes: int, seed: int) -> EnvBase:
+        """Returns new worlds in which a policy of the run can be played, each for an episode of the task's own length.
+
+        They have the settings and the transforms of the environment that was handed in. With transforms there are as
+        many worlds as there, whatever ``episodes`` is: some transforms keep a row for each.
+        """
+        config, base = self._config, self._base
+        if base is None:
+            return make(config.task, episodes, config.device, seed, config.protocol, world_offset=0)
+        settings = {**dataclasses.asdict(base.config)}
+        del settings["naconmax"]  # which is for the number of its worlds
+        worlds = base.num_envs if self.transforms else episodes
+        env: EnvBase = type(base)(worlds, base.device, seed, base.protocol, world_offset=0, **settings)
+        for transform in self.transforms:
+            env = TransformedEnv(env, copy.deepcopy(transform.clone()))  # that it learns in evaluations stays apart
+        return env
+
+
+def length_of(task: type[LocoEnv]) -> int:
+    """Returns the control steps of a task's own episodes."""
+    return task.config.episode_length if task.episode_length is None else task.episode_length
+
+
+def unwrapped(env: EnvBase) -> tuple[LocoEnv, tuple[Transform, ...]]:
+    """Returns the environment of this package that lies below transforms, and them, the innermost first.
+
+    Raises:
+        TypeError: there is none.
+        ValueError: it has no batch dimension.
+    """
+    transforms: list[Transform] = []
+    while isinstance(env, TorchRLTransformedEnv):
+        transforms.insert(0, env.transform)
+        env = env.base_env
+    if not isinstance(env, LocoEnv):
+        raise TypeError(f"train takes a LocoEnv, or one in TransformedEnv, got {type(env).__name__}")
+    if not env.batch_size:
+        raise ValueError("train takes a batch of worlds: make the environment with num_envs=1 or more, not None")
+    return env, tuple(part for part in transforms if not isinstance(part, Compose) or len(part))
+
+
+def make_env(config: TrainingConfig, nan_dump: Path) -> EnvBase:
+    """Returns the environment of a run: each action is held for ``config.action_repeat`` frames, rewards are summed.
+
+    Its worlds are those of this rank: world k of rank r is world ``r * num_envs + k`` of the whole. It returns the
+    terms of its reward, unless the task is one of the package.
+
+    If a world becomes non-finite, a NaN dump is written to ``nan_dump``, unless one is already there.
+    """
+    new = functools.partial(
+        make,
+        config.task,
+        config.num_envs,
+        config.device,
+        config.seed,
+        config.protocol,
+        world_offset=distributed.rank() * config.num_envs,
+        stagger=True,
+        nan_dump=None if nan_dump.exists() else nan_dump,
+        episode_length=config.episode_length or length_of(resolve(config.task)),
+    )
+    return _holding(new(reward_terms=not is_ours(config.task)), config)
+
+
+def _holding(env: EnvBase, config: TrainingConfig) -> EnvBase:
+    if config.action_repeat == 1:
+        return env
+    # Our tasks end at the time limit alone, and TorchRL's transform has less to do.
+    kind = FrameSkipTransform if is_ours(config.task) else ActionRepeat
+    return TransformedEnv(env, kind(config.action_repeat))
+
+
+def make_for(policy: Policy, num_envs: int, device: Any, seed: int) -> LocoEnv:
+    """Returns new worlds of the task of a policy, under the protocol that it was trained under.
+
+    Raises:
+        ValueError: it was trained behind transforms.
+        OSError: the file of its task is missing.
+        ImportError: the file or module of its task is broken.
+    """
+    info = policy.info
+    if names := info.get("transforms"):
+        raise ValueError(
+            f"this policy was trained behind {', '.join(names)}, which its file does not hold: play it in an "
+            "environment with these transforms, by env.rollout(steps, policy)"
+        )
+    return make(info["task"], num_envs, device, seed, info["protocol"], world_offset=0)

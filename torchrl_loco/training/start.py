@@ -1,0 +1,197 @@
+"""``train``: from a task to a trained policy, for scripts, notebooks and the command line."""
+
+import contextlib
+import dataclasses
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from torchrl.envs import EnvBase
+
+from torchrl_loco.checks import check_choice
+from torchrl_loco.envs import LocoEnv
+from torchrl_loco.registry import task_name
+from torchrl_loco.training import distributed
+from torchrl_loco.training.actor import Network
+from torchrl_loco.training.algorithm import Algorithm
+from torchrl_loco.training.config import CONFIGS, TrainingConfig
+from torchrl_loco.training.environments import unwrapped
+from torchrl_loco.training.presets import preset, tuning_note
+from torchrl_loco.training.run_folder import RunFolder
+from torchrl_loco.training.trainer import ALGORITHMS, Given, Trainer
+
+
+def train(
+    task: str | type[LocoEnv] | EnvBase,
+    config: TrainingConfig | None = None,
+    *,
+    network: Network | None = None,
+    algorithm: str | type[Algorithm] | None = None,
+    out: Path | str | None = None,
+    device: Any = None,
+    resume: RunFolder | Path | str | None = None,
+    **settings: Any,
+) -> RunFolder:
+    """Trains a policy: evaluation, learning curve and video included.
+
+    Args:
+        task: a class, an id, or a class in a file as ``"path/to/file.py:Class"``; or an environment that is made
+            already, of this package, also with transforms. Its worlds, device and transforms are used then.
+        config: the settings; ``None`` takes the preset of task, device and algorithm.
+        network: a function of the numbers of inputs and outputs that returns a network, an ``nn.Sequential`` of the
+            layers that a policy's file can hold. It makes the actor's, and PPO's critic with one output. What it
+            returns is not initialised again. Observations are normalised before it.
+        algorithm: ``"ppo"``, ``"reppo"`` or a subclass of :class:`torchrl_loco.training.algorithm.Algorithm`; ``None`` takes that
+            of ``config``, or the default of the device.
+        out: the folder in which the run's own folder is made.
+        device: where to train; ``None`` takes CUDA if there is any.
+        resume: a run that was stopped, to continue from its checkpoint with the same task, network and algorithm; of
+            ``settings`` only ``total_frames`` can be another. The settings are the run's own.
+        settings: fields of the settings, on top of ``config`` or of the preset.
+
+    Returns:
+        The folder of the run. ``run.load_policy()`` gives the policy, ``run.read_metrics()`` and
+        ``run.read_evaluations()`` its figures.
+
+    Raises:
+        ValueError: an argument is out of range or does not fit; the message names what is valid.
+        TypeError: an argument has the wrong type, or the network has a layer that a policy's file cannot hold.
+        KeyboardInterrupt: Ctrl-C, after a checkpoint; the call that continues is printed.
+
+    Example:
+        >>> run = training.train("walker_walk", total_frames=4_000_000)  # doctest: +SKIP
+        >>> policy = run.load_policy()  # doctest: +SKIP
+    """
+    given = Given(
+        env=task if isinstance(task, EnvBase) else None,
+        network=network,
+        algorithm=algorithm if isinstance(algorithm, type) else None,
+    )
+    cls: Any = task if given.env is None else type(unwrapped(given.env)[0])
+    if given.algorithm is not None:
+        kind = given.algorithm.config_type
+        CONFIGS.setdefault(kind.algorithm, kind)  # by which the settings of the run are read again
+    chosen = {name: value for name, value in (("out", out), ("device", device)) if value is not None}
+    if resume is not None:
+        if config is not None or settings.keys() - {"total_frames"} or isinstance(algorithm, str) or chosen:
+            raise ValueError("a run that is resumed keeps its settings: pass no other than total_frames")
+        return _train(_resumed(resume, cls, settings), given)
+    if given.env is not None:
+        chosen |= _settings_of(given.env, {**settings, **chosen})
+    config = _config(cls, config, algorithm, {**settings, **chosen})
+    return _train(config, given)
+
+
+def _config(
+    task: Any, config: TrainingConfig | None, algorithm: str | type[Algorithm] | None, settings: dict[str, Any]
+) -> TrainingConfig:
+    """Returns the settings of a new run.
+
+    Raises:
+        ValueError: ``config`` is of another task or algorithm, or ``settings`` names something else.
+    """
+    kind = algorithm.config_type if isinstance(algorithm, type) else None
+    name = algorithm.config_type.algorithm if isinstance(algorithm, type) else algorithm
+    if config is None:
+        if kind is not None and name not in ALGORITHMS:  # which has no presets
+            return kind(task_name(task), **settings)
+        return preset(task, settings.pop("device", None), name, **settings)
+    if name is not None and name != config.algorithm:
+        raise ValueError(f"config is of {config.algorithm}, but algorithm is {name}: pass one of them")
+    if task_name(task) != config.task:
+        raise ValueError(f"config is for {config.task}, but task is {task_name(task)}")
+    for setting in settings:
+        check_choice("setting", setting, [field.name for field in dataclasses.fields(config)])
+    return dataclasses.replace(config, **settings)
+
+
+def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
+    """Returns the settings that follow from an environment that is made already.
+
+    Raises:
+        ValueError: ``settings`` has another value for one.
+    """
+    base, _ = unwrapped(env)
+    own: dict[str, Any] = {"num_envs": base.num_envs, "device": str(base.device), "protocol": base.protocol}
+    own |= {"episode_length": base.config.episode_length}
+    for name, value in own.items():
+        if name in settings and str(settings[name]) != str(value):
+            raise ValueError(f"{name} is that of the environment, {value!r}: leave it out, got {settings[name]!r}")
+    return {**own, "seed": settings.get("seed", base.seed), "action_repeat": settings.get("action_repeat", 1)}
+
+
+def _resumed(resume: RunFolder | Path | str, task: Any, settings: dict[str, Any]) -> RunFolder:
+    """Returns the run that is to be continued.
+
+    Raises:
+        ValueError: it is of another task.
+    """
+    run = resume if isinstance(resume, RunFolder) else RunFolder(Path(resume))
+    config = run.load_config()
+    if task_name(task) != config.task:
+        raise ValueError(f"{run.path} is a run of {config.task}, but task is {task_name(task)}")
+    if settings and distributed.is_first():
+        run.extend(settings["total_frames"])
+    return run
+
+
+def _train(what: TrainingConfig | RunFolder, given: "Given") -> RunFolder:
+    """Trains a new run, or goes on with one.
+
+    Returns:
+        Its folder.
+    """
+    config = what.load_config() if isinstance(what, RunFolder) else what
+    with distributed.joined(config.device):
+        trainer = Trainer(what, resume=True, given=given) if isinstance(what, RunFolder) else begin(what, given)
+        with _closed_after(trainer, given):
+            trainer.train()
+        return trainer.run
+
+
+@contextlib.contextmanager
+def _closed_after(trainer: Trainer, given: "Given") -> Iterator[None]:
+    """Closes the environment of a run at the end, unless it was handed in.
+
+    Raises:
+        KeyboardInterrupt: the run was interrupted; the way to continue is printed before.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        if distributed.is_first() and trainer.run.has_checkpoint:
+            print(f"to continue: {given.way_to_resume(trainer.run.path)}", file=sys.stderr)
+        raise
+    finally:
+        if given.env is None:
+            trainer.env.close()
+
+
+def begin(config: TrainingConfig, given: "Given | None" = None) -> Trainer:
+    """Makes the folder and the trainer of a run; in place of a process that died, those of its run.
+
+    Args:
+        config: the settings.
+        given: what is handed in as objects.
+
+    Returns:
+        The trainer, which has collected nothing yet. Where it cannot be made, no folder is left.
+    """
+    given = given or Given()
+    path = Path()
+    if distributed.is_first():
+        began = RunFolder.of_launch(config) if distributed.is_restart() else None
+        if began is None and given.env is None and (note := tuning_note(config)):
+            print(note)
+        path = (began or RunFolder.create(config, given.names)).path
+        print(f"run folder: {path}{', which torchrun continues after a failure' if began else ''}", flush=True)
+    run = RunFolder(distributed.from_first(path))
+    had_checkpoint = run.has_checkpoint
+    try:
+        return Trainer(run, resume=had_checkpoint, given=given)
+    except BaseException:
+        if distributed.ranks() == 1 and not had_checkpoint:  # an empty run folder is of no use
+            shutil.rmtree(run.path)
+        raise
