@@ -23,6 +23,7 @@ BAD = {
     "world_offset": (-1, ValueError),
     "reward_terms": ("yes", TypeError),
     "stagger": (1, TypeError),
+    "compile_hooks": (1, TypeError),
     "on_overflow": ("shout", ValueError),
     "nan_dump": ("no/such/folder/file", ValueError),
     "ctrl_dt": (0.003, ValueError),

@@ -215,7 +215,9 @@ def test_files_that_are_no_nan_dump(file, tmp_path, capsys):
         cli.main(["inspect", str(file)])
     assert "its format is 'torchrl_loco policy 1'" in capsys.readouterr().err
     storage.save(file, NAN_DUMP, {}, {"env": "Ant"})
-    with pytest.raises(ValueError, match=r"is of 'Ant'; installed are torchrl_loco\.tasks\.cheetah\.CheetahRun"):
+    with pytest.raises(
+        ValueError, match=r"is of 'Ant', which is not there; installed are torchrl_loco\.tasks\.cheetah\.CheetahRun"
+    ):
         nan_dump.load(file)
     with pytest.raises(FileNotFoundError, match="there is no NaN dump"):
         nan_dump.load(tmp_path / "none")

@@ -16,8 +16,7 @@ from torchrl_loco.config import SimConfig
 from torchrl_loco.envs import LocoEnv, State
 from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.monitors import NAN_DUMP
-from torchrl_loco.registry import env_class, list_envs
-from torchrl_loco.sim import models
+from torchrl_loco.registry import env_class, list_envs, resolve
 from torchrl_loco.sim.simulation import set_options
 
 RESETS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -31,8 +30,8 @@ class NanDump:
     Attributes:
         tensors: ``qpos`` ``(nq,)``, ``qvel`` ``(nv,)``, ``qacc_warmstart`` ``(nv,)``, ``act`` ``(na,)`` if there are
             activations, and ``action`` ``(nu,)``, before the step.
-        settings: ``env`` (module and name of the class), ``protocol``, ``config``, ``seed``, ``device``, ``num_envs``,
-            ``world_offset``, and ``world``, ``episode`` and ``elapsed_steps`` before the step.
+        settings: ``env`` (module and name of the class), ``file`` (of the module), ``protocol``, ``config``, ``seed``,
+            ``device``, ``num_envs``, ``world_offset``, and ``world``, ``episode`` and ``elapsed_steps`` before the step.
     """
 
     tensors: dict[str, torch.Tensor]
@@ -40,7 +39,7 @@ class NanDump:
 
     def make_env(self, device: torch.device | str | None = None, **config: Any) -> LocoEnv:
         """Returns an environment of one world with the settings of the dump, and ``config`` on top."""
-        env, settings = _classes()[self.settings["env"]], {**self.settings["config"], **config}
+        env, settings = _class_of(self.settings), {**self.settings["config"], **config}
         arguments = (1, device, self.settings["seed"], self.settings["protocol"])
         return env(*arguments, world_offset=0, on_overflow="ignore", **settings)
 
@@ -58,10 +57,20 @@ def load(path: Path) -> NanDump:
         ValueError: it is no NaN dump, damaged, or of an environment that is not installed.
     """
     dump = NanDump(*storage.load(path, NAN_DUMP))
-    names = _classes()
-    if dump.settings["env"] not in names:
-        raise ValueError(f"{path} is of {dump.settings['env']!r}; installed are {', '.join(names)}")
+    try:
+        _class_of(dump.settings)
+    except (KeyError, OSError, ImportError, ValueError) as error:
+        names = ", ".join(_classes())
+        raise ValueError(f"{path} is of {dump.settings['env']!r}, which is not there; installed are {names}") from error
     return dump
+
+
+def _class_of(settings: dict[str, Any]) -> type[LocoEnv]:
+    """Returns the class of a dump: one that is installed, or one of the file that it was in."""
+    classes = _classes()
+    if settings["env"] in classes or not settings.get("file"):
+        return classes[settings["env"]]
+    return resolve(f"{settings['file']}:{settings['env'].rpartition('.')[2]}")
 
 
 def _classes() -> dict[str, type[LocoEnv]]:
@@ -93,13 +102,16 @@ def mujoco_trace(dump: NanDump) -> np.ndarray:
     C MuJoCo resets a world that is not finite; from there on the trace is NaN.
     """
     config = SimConfig(**dump.settings["config"])
-    model = models.load(_classes()[dump.settings["env"]].model)
+    env = dump.make_env("cpu")
+    model = env.mj_model
     set_options(model, config)
     data = mujoco.MjData(model)
     for name, value in dump.state.items():
         getattr(data, name)[:] = value[0].numpy()
     trace = [np.concatenate([data.qpos, data.qvel])]
-    data.ctrl[:] = models.control(model, dump.tensors["action"].numpy())
+    env.reset(dump.state, set_state=True)
+    env.step(TensorDict({"action": dump.tensors["action"][None]}, batch_size=[1]))
+    data.ctrl[:] = env.sim.ctrl[0]  # a task may compute them itself
     mujoco.set_mju_user_warning(lambda message: None)  # else it prints, and writes a log into the working directory
     try:
         for _ in range(config.substeps):

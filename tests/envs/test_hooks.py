@@ -8,10 +8,12 @@ import pytest
 import torch
 from hook_tasks import DOG, FollowVelocity, WalkBackwards, WalkBlindly
 from oracle import tolerance as numpy_tolerance
+from torch.fx.experimental.proxy_tensor import make_fx
 
 import torchrl_loco
 from torchrl_loco import LocoEnv, SimConfig, State, WalkerWalk, tolerance
 from torchrl_loco.envs.hooks import own_hooks
+from torchrl_loco.envs.part import Part
 
 SENSORS = ("gyro", "velocimeter", "attitude", "sole_in_trunk", "sole_velocity", "shank_rotation", "geom_axis")
 CONFIG = SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=20, ls_iterations=20, euler_damping=True)
@@ -312,12 +314,15 @@ def test_the_most_derived_definition_wins_hook_by_hook():
     assert torch.equal(env.sim.qpos, torch.tensor(env.mj_model.qpos0).float().expand(2, -1))
 
 
-def test_compiled_hooks_do_the_same(actions):
-    """As on CUDA, where torch.compile makes kernels of them: with the same random numbers, up to rounding."""
-    plain, compiled = (WalkBackwardsInNoise(5, "cpu", seed=0, episode_length=20) for _ in range(2))
-    compiled.world._compile_parts()
-    compiled.set_seed(0)
-    assert all(part._compiled is not None for part in (compiled.world._judge, compiled.world._observe))
+@pytest.mark.parametrize("way", ["kernel", pytest.param("torch.compile", marks=pytest.mark.slow)])
+def test_compiled_hooks_do_the_same(actions, monkeypatch, way):
+    """With the same random numbers, up to rounding; torch.compile takes over on CUDA where there can be no kernel."""
+    plain = WalkBackwardsInNoise(5, "cpu", seed=0, episode_length=20, compile_hooks=False)
+    if way == "torch.compile":
+        monkeypatch.setattr(Part, "compile", lambda self, num_envs, device: by_torch(self))
+    compiled = WalkBackwardsInNoise(5, "cpu", seed=0, episode_length=20)
+    assert {part.kind for part in (compiled.world._judge, compiled.world._observe, compiled.world._begin)} == {way}
+    assert plain.world._judge.kind == "plain torch"
     one, other = plain.reset(), compiled.reset()
     for action in actions(plain, 30):
         torch.testing.assert_close(one["observation"], other["observation"], rtol=0, atol=1e-4)
@@ -325,6 +330,12 @@ def test_compiled_hooks_do_the_same(actions):
             env.step_and_maybe_reset(td.set("action", action)) for env, td in ((plain, one), (compiled, other))
         )
         torch.testing.assert_close(current["next", "reward"], expected["next", "reward"], rtol=0, atol=1e-4)
+
+
+def by_torch(part):
+    with torch.no_grad():
+        part._compile_by_torch(make_fx(lambda arrays: part._work(arrays))(part._arrays))
+    return False
 
 
 class WalkBackwardsInNoise(WalkBackwards):
@@ -346,7 +357,6 @@ def test_a_hook_that_cannot_be_compiled_runs_as_it_is_and_says_why(caplog):
             return s.time if bool((s.time > 0).all()) else s.time + 1
 
     env = Looks(2, "cpu", seed=0)
-    env.world._compile_parts()
     assert "Looks.judge is not compiled and runs as plain torch" in caplog.text
     assert env.rollout(2)["next", "reward"].shape == (2, 2, 1)
 

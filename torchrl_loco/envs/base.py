@@ -72,6 +72,8 @@ class LocoEnv(EnvBase):
             :meth:`health`.
         nan_dump: a file that does not exist yet. The state and action before the first step that made a world
             non-finite are written to it, within about 100 steps or at :meth:`close`; see ``torchrl-loco inspect``.
+        compile_hooks: whether hooks in torch become kernels. ``False`` runs them as they are at every step, to print
+            from them or to debug them.
         config: fields of :class:`torchrl_loco.SimConfig` to override.
 
     Attributes:
@@ -124,6 +126,7 @@ class LocoEnv(EnvBase):
         stagger: bool = False,
         on_overflow: str = "warn",
         nan_dump: Path | str | None = None,
+        compile_hooks: bool = True,
         **config: Any,
     ) -> None:
         self.check_class()
@@ -141,6 +144,7 @@ class LocoEnv(EnvBase):
         elif seed is not None:
             _warn_if_worlds_repeat()
         reward_terms, stagger = check_bool("reward_terms", reward_terms), check_bool("stagger", stagger)
+        compile_hooks = check_bool("compile_hooks", compile_hooks)
         check_choice("on_overflow", on_overflow, ON_OVERFLOW)
         nan_dump = None if nan_dump is None else check_output_file("nan_dump", nan_dump)
         mj_model = models.load(self.model, _folder_of(type(self)))
@@ -149,7 +153,7 @@ class LocoEnv(EnvBase):
         self.num_envs, self.world_offset = worlds, world_offset
         self.seed = secrets.randbits(32) if seed is None else seed
         self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
-        self.stagger = stagger
+        self.stagger, self.compile_hooks = stagger, compile_hooks
         self.on_overflow, self.nan_dump = on_overflow, nan_dump
         self._action_shape = torch.Size([*self.batch_size, mj_model.nu])
         self._pid = os.getpid()
@@ -617,6 +621,7 @@ class LocoEnv(EnvBase):
         cls = type(self)
         return {
             "env": f"{cls.__module__}.{cls.__qualname__}",
+            "file": getattr(sys.modules.get(cls.__module__), "__file__", None),
             "protocol": self.protocol,
             "num_envs": self.num_envs,
             "world_offset": self.world_offset or 0,

@@ -1,14 +1,11 @@
 """The hooks of a task: which are its own, what they return and ask for, and the parts of a control step they make."""
 
-import logging
-import warnings
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import torch
-from torch.fx.experimental.proxy_tensor import make_fx
 
 from torchrl_loco.checks import suggestion
 from torchrl_loco.envs.episode import MAX_VALUE
@@ -327,62 +324,3 @@ def _kind(value: Any) -> str:
 
 def _of(name: str) -> str:
     return f"[{name!r}]" if name else ""
-
-
-def constants_on(device: torch.device, traced: torch.fx.GraphModule) -> torch.fx.GraphModule:
-    """Returns a trace in which tensors of other devices are copied to ``device`` once, and not at each step."""
-    copies = (torch.ops.aten._to_copy.default, torch.ops.aten.lift_fresh_copy.default)
-    for node in list(traced.graph.nodes):
-        if node.target not in copies or node.args[0].op != "get_attr":
-            continue
-        constant = getattr(traced, node.args[0].target)
-        if constant.device == device:
-            continue
-        name = f"{node.args[0].target}_{node.name}"
-        traced.register_buffer(name, node.target(constant, *node.args[1:], **node.kwargs).to(device), persistent=False)
-        with traced.graph.inserting_before(node):
-            node.replace_all_uses_with(traced.graph.get_attr(name))
-        traced.graph.erase_node(node)
-    traced.recompile()
-    return traced
-
-
-class Part:
-    """A part of a step in plain torch: as it is on the CPU, compiled on CUDA.
-
-    Hooks are traced there by running them once on the present worlds, so whatever Python they use is evaluated then:
-    what shall change later must be a tensor that is changed in place.
-
-    Args:
-        work: reads and writes arrays in place.
-        arrays: the arrays of all worlds.
-        title: of the task, for messages.
-    """
-
-    def __init__(self, work: Callable[[Arrays], None], arrays: dict[str, torch.Tensor], title: str) -> None:
-        self._work, self._arrays, self._title = work, arrays, title
-        self._compiled: Callable[[Arrays], None] | None = None
-
-    @torch.no_grad()
-    def __call__(self) -> None:
-        """Runs it."""
-        work = self._work if self._compiled is None else self._compiled
-        work(self._arrays)
-
-    @torch.no_grad()
-    def compile(self) -> None:
-        """Compiles it with torch.compile, and runs it; if that fails, logs why, and it goes on as plain torch."""
-        device = self._arrays["qpos"].device
-        try:
-            traced = constants_on(device, make_fx(lambda arrays: self._work(arrays))(self._arrays))
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # those of torch's own code
-                compiled = torch.compile(traced, fullgraph=True, dynamic=False)
-                compiled(self._arrays)
-        except Exception as error:  # whatever hooks, tracing or the compiler raise
-            message = " ".join(str(error).split("\n")[:3]).strip()
-            logging.getLogger("torchrl_loco").warning(
-                "%s.%s is not compiled and runs as plain torch: %s", self._title, self._work.__name__, message
-            )
-        else:
-            self._compiled = compiled

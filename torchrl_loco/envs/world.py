@@ -30,8 +30,9 @@ from torchrl_loco.envs.episode import (
     poser,
     zero_non_finite,
 )
-from torchrl_loco.envs.hooks import Hooks, Part
+from torchrl_loco.envs.hooks import Hooks
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
+from torchrl_loco.envs.part import Part
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import (
     EXCLUSIVE,
@@ -63,6 +64,7 @@ class Task(Protocol):
     nan_dump: Path | None
     observation_size: int
     hooks: Hooks | None
+    compile_hooks: bool
 
     def observation_func(self, world: "World") -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""
@@ -150,8 +152,8 @@ class World:
             self._make_funcs(task)
             self._make_parts(task)
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
-            if hooks and device.is_cuda:
-                self._compile_parts()
+            for rows in self.memory.values():
+                rows.zero_()  # recording wrote into it
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
             for monitor in self._monitors:
                 monitor.restart()
@@ -284,27 +286,32 @@ class World:
         self._moved = Buffer(task.num_envs, bool, sim.device)
         arrays = self._arrays(task) if hooks else {}
 
-        def part(name: str, *needed: str) -> Callable[[], None]:
-            wanted = hooks is not None and bool(own & set(needed))
-            return Part(getattr(hooks, name), arrays, self._title) if wanted else _nothing
+        parts: list[Part] = []
 
-        launches: list[Callable[..., None]] = [self._launch_step, self._launch_reset]
-        if own:
-            launches += [self._launch_rest, self._launch_conclude]
-        moves = hooks is not None and hooks.moves
-        if moves:
-            launches.append(self._launch_move)
-        sim.compile(*launches)
-        self._physics, self._settle = self._record(self._launch_step), self._record(self._launch_reset)
-        self._rest = self._record(self._launch_rest) if own else _nothing
-        self._conclude = self._record(self._launch_conclude) if own else _nothing
-        self._move = self._keeping_reward(self._record(self._launch_move)) if moves else _nothing
-        self._refresh_graph: Graph | None = None  # most environments never need it
+        def part(name: str, *needed: str) -> Callable[[], None]:
+            if hooks is None or not own & set(needed):
+                return _nothing
+            parts.append(Part(getattr(hooks, name), arrays, self._title))
+            return parts[-1]
+
         self._control = part("control", "control")
         self._judge = part("judge", "update", "reward", "terminated", "events")
         self._observe = part("observe", *own)
         self._begin = part("begin", *(own if self.memory else ["begin"]))
         self._observe_begun = part("observe_begun", "observation")
+        kernels = [each for each in parts if task.compile_hooks and each.compile(task.num_envs, sim.device)]
+
+        moves = hooks is not None and hooks.moves
+        launches = [self._launch_step, self._launch_reset, *(each.launch for each in kernels)]
+        launches += [self._launch_rest, self._launch_conclude] if own else []
+        sim.compile(*launches, *([self._launch_move] if moves else []))
+        for each in kernels:
+            each.record(sim)
+        self._physics, self._settle = self._record(self._launch_step), self._record(self._launch_reset)
+        self._rest = self._record(self._launch_rest) if own else _nothing
+        self._conclude = self._record(self._launch_conclude) if own else _nothing
+        self._move = self._keeping_reward(self._record(self._launch_move)) if moves else _nothing
+        self._refresh_graph: Graph | None = None  # most environments never need it
         self._run_step, self._run_reset = self._as_graph("_take_step"), self._as_graph("_begin_masked")
 
     def _arrays(self, task: Task) -> dict[str, torch.Tensor]:
@@ -351,12 +358,6 @@ class World:
                 values.copy_(value)
 
         return moved
-
-    def _compile_parts(self) -> None:
-        """Compiles what hooks do, on CUDA. It runs each part once, on whatever the worlds hold."""
-        for part in (self._control, self._judge, self._observe, self._begin, self._observe_begun):
-            if isinstance(part, Part):
-                part.compile()
 
     def _as_graph(self, name: str) -> Callable[[], None]:
         """Returns a method of this world as one CUDA graph, where hooks take part in it; else as it is."""

@@ -1,0 +1,89 @@
+"""A part of a step in plain torch as one kernel: a thread a world, whose numbers are scalars of straight-line C++.
+
+The traced graph is interpreted once on symbols. A tensor of all worlds becomes a NumPy array of nodes, in which the
+dimension of the worlds has size 1; views of tensors are views of such arrays, so that writing to one changes the other.
+What a world does depends on no other world: on neither their number nor their numbers, bit for bit.
+
+===========  ==========================================================
+``program``  the interpreter: nodes, tensors of them, and C++ of both
+``rules``    what each operator of torch does, as data
+===========  ==========================================================
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import warp as wp
+from torch._decomp import decomposition_table
+from torch.fx.experimental.proxy_tensor import make_fx
+
+from torchrl_loco.envs.fusion.program import CannotFuse as CannotFuse
+from torchrl_loco.envs.fusion.program import NoRule, Program
+from torchrl_loco.envs.fusion.rules import RULES
+from torchrl_loco.sim.world_func import BLOCK_DIM, fill
+
+
+def _written(
+    traced: torch.fx.GraphModule, arrays: dict[str, torch.Tensor], num_envs: int, device: torch.device
+) -> tuple[Program, str]:
+    """Returns a graph as C++; operators without a rule are decomposed as torch does it for its compilers.
+
+    Raises:
+        NoRule: and cannot be.
+    """
+    missing, graph = dict[Any, Any](), traced
+    while True:
+        program = Program(arrays, num_envs, device, RULES)
+        try:
+            return program, program.run(graph.graph, functools.partial(getattr, graph))
+        except NoRule as error:
+            if error.target in missing or error.target not in decomposition_table:
+                raise
+            missing[error.target] = decomposition_table[error.target]
+        copies = {name: tensor.clone() for name, tensor in arrays.items()}  # tracing runs it
+        graph = make_fx(traced, decomposition_table=missing)(copies)
+
+
+def _kernel(text: str, Args: Any) -> wp.Kernel:  # noqa: N803
+    @wp.func_native(text)
+    def run(world: int, args: Args): ...
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def fused_hooks(args: Args):
+        world = wp.tid()
+        run(world, args)
+
+    return fused_hooks
+
+
+def fuse(
+    traced: torch.fx.GraphModule, arrays: dict[str, torch.Tensor], num_envs: int, device: wp.Device
+) -> Callable[[], None]:
+    """Returns a function that does what a traced one does to arrays, in one launch on Warp's current stream.
+
+    Tensors that it uses are read from memory at each launch, so what is changed in place is seen, but for
+    indices, which are those of now. The tensors live as long as the returned function.
+
+    Args:
+        traced: of a function of ``arrays`` that changes them in place, by ``make_fx``.
+        arrays: tensors by name, ``(num_envs, ...)`` in any order of memory; others are read only, and so is ``seed``.
+        num_envs: number of worlds.
+        device: where they live.
+
+    Raises:
+        CannotFuse: the graph has an operator, type or shape that cannot be written as the code of one world.
+    """
+    with torch.no_grad():
+        program, text = _written(traced, arrays, num_envs, torch.device(wp.device_to_torch(device)))
+    names = [f"p{index}" for index in program.used]
+    struct = wp.struct(type("Pointers", (), {"__annotations__": dict.fromkeys(names, wp.uint64)}))
+    tensors = [program.tensors[index] for index in program.used]
+    pointers = fill(struct, **{name: tensor.data_ptr() for name, tensor in zip(names, tensors, strict=True)})
+    kernel = _kernel(text, struct)
+
+    def launch(kept: Any = tensors) -> None:
+        wp.launch(kernel, num_envs, [pointers], device=device, block_dim=BLOCK_DIM)
+
+    return launch

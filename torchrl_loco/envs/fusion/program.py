@@ -1,0 +1,494 @@
+"""A traced graph as straight-line C++ of one world: numbers as nodes, tensors as arrays of them."""
+
+import itertools
+import math
+import operator
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchrl_loco.sim.compiled.symbols import literal
+
+TYPES = {torch.float32: "float", torch.int64: "long long", torch.int32: "int", torch.bool: "bool"}
+MOST_NUMBERS = 100_000
+"""Numbers of a tensor, or of a part, that are still worth writing out one by one."""
+LONG = 64
+"""Rows of a user's tensor that are taken for those of the worlds, if there are as many worlds; fewer may be chance."""
+
+ADD, SUB, MUL, NEG, SHL, DIV = "{0} + {1}", "{0} - {1}", "{0} * {1}", "-{0}", "{0} << {1}", "{0} / {1}"
+WRAPPING = (ADD, SUB, MUL, NEG, SHL)
+"""Operators that wrap around for integers: C++ defines that for unsigned ones only."""
+WHERE, AND, OR, EQUAL = "{0} ? {1} : {2}", "{0} & {1}", "{0} | {1}", "{0} == {1}"
+LEAST, MOST = "{0} < {1} || {0} != {0} ? {0} : {1}", "{0} > {1} || {0} != {0} ? {0} : {1}"  # NaN wins, as in torch
+VIEWS = ("view", "reshape", "_unsafe_view", "flatten", "unflatten")
+INFINITE = "(1e30f * 1e30f)"
+FORMS = ("{}", "{}_like", "new_{}")
+FILLERS = ("empty_strided", *(form.format(name) for name in ("zeros", "ones", "empty", "full") for form in FORMS))
+"""Operators that make tensors, which may have a row for each world."""
+
+
+class CannotFuse(Exception):  # noqa: N818
+    """A graph that is no straight-line code of each world; the message tells which operator or shape."""
+
+
+class NoRule(CannotFuse):
+    """An operator that has no rule.
+
+    Attributes:
+        target: the operator.
+    """
+
+    def __init__(self, target: Any) -> None:
+        super().__init__(f"{target} has no rule")
+        self.target = target
+
+
+class Node:
+    """A number of a world.
+
+    Args:
+        text: C++ of it, in which ``{0}`` is its first part; of a constant, a literal.
+        dtype: its type.
+        args: its parts.
+        varies: whether it may differ from world to world.
+        number: value of a constant.
+        place: of what is read from memory, the index of the tensor, and how many elements the world's begins later
+            than that of the first, and how many each world's later than that of the last.
+    """
+
+    __slots__ = ("args", "dtype", "number", "place", "text", "varies")
+
+    def __init__(self, text: str, dtype: torch.dtype, args: tuple["Node", ...], number: Any, place: Any) -> None:
+        self.text, self.dtype, self.args, self.number, self.place = text, dtype, args, number, place
+        self.varies: bool = any(arg.varies for arg in args) or bool(place and place[2])
+
+
+@dataclass
+class Value:
+    """A tensor of nodes.
+
+    Attributes:
+        array: nodes, of the tensor's shape, but that the dimension of the worlds counts what each of them has there.
+        dtype: type of the tensor.
+        world: dimension of the worlds; ``None`` if there is none.
+    """
+
+    array: Any
+    dtype: torch.dtype
+    world: int | None
+
+    def rowwise(self, dims: Iterable[int]) -> list[int]:
+        """Returns dimensions as numbers from 0, none of which may be that of the worlds.
+
+        Raises:
+            CannotFuse: one is that.
+        """
+        found = [dim % max(self.array.ndim, 1) for dim in dims]
+        if self.world in found:
+            raise CannotFuse("{op} goes across worlds")
+        return found
+
+    def with_array(self, array: np.ndarray, world: int | None) -> "Value":
+        """Returns a value of the same type."""
+        return Value(array, self.dtype, world)
+
+
+def _shifted(world: int | None, by: int) -> int | None:
+    return None if world is None else world + by
+
+
+@dataclass
+class Worldwise:
+    """Tensors of worlds one after another, which is how torch begins to stack them."""
+
+    parts: list[Value]
+
+
+class Program:
+    """A traced graph as C++.
+
+    Args:
+        arrays: what it is called with.
+        num_envs: number of worlds.
+        device: where they live.
+        rules: by operator's name without overload, a function of the program and the operator's arguments.
+
+    Attributes:
+        tensors: what it reads and writes.
+    """
+
+    def __init__(
+        self,
+        arrays: dict[str, torch.Tensor],
+        num_envs: int,
+        device: torch.device,
+        rules: dict[str, Callable[..., Any]],
+    ) -> None:
+        self._arrays, self._n, self._device, self._rules = arrays, num_envs, device, rules
+        self.tensors: list[torch.Tensor] = []
+        self._nodes: dict[Any, Node] = {}
+        self._sources: dict[Any, tuple[int, Value, Any]] = {}
+        self._meta: Any = None  # what torch says about the result of the present operator
+
+    # Nodes and values.
+
+    def node(self, text: str, dtype: torch.dtype, *args: Node, number: Any = None, place: Any = None) -> Node:
+        """Returns a number, a new one if there is none like it.
+
+        Raises:
+            CannotFuse: there are too many.
+        """
+        if text == WHERE and args[1] is args[2]:
+            return args[1]
+        if text in WRAPPING and dtype in (torch.int32, torch.int64):
+            text = text.replace("{", f"(unsigned {TYPES[dtype]}){{")
+        key = text, dtype, place, *map(id, args)
+        if key not in self._nodes:
+            if len(self._nodes) > 10 * MOST_NUMBERS:
+                raise CannotFuse("it has too many numbers")
+            self._nodes[key] = Node(text, dtype, args, number, place)
+        return self._nodes[key]
+
+    def constant(self, number: Any, dtype: torch.dtype) -> Node:
+        """Returns a constant."""
+        if dtype == torch.float32:
+            plain = math.isfinite(np.float32(number))
+            text = literal(number) if plain else INFINITE if number > 0 else f"(-{INFINITE})"
+            text = f"({INFINITE} - {INFINITE})" if number != number else f"({text})"
+            return self.node(text, dtype, number=float(number))
+        number = bool(number) if dtype == torch.bool else int(number)
+        text = (
+            str(number).lower()
+            if dtype == torch.bool
+            else f"({number}LL)"
+            if number != -(2**63)
+            else f"(-{2**63 - 1}LL - 1)"
+        )
+        return self.node(text, dtype, number=number)
+
+    def each(self, text: str, dtype: torch.dtype, *arrays: Any) -> np.ndarray:
+        """Returns the array of an operator's results, of arrays that broadcast."""
+        made = np.frompyfunc(lambda *nodes: self.node(text, dtype, *nodes), len(arrays), 1)(*arrays)
+        return np.asarray(made, dtype=object)
+
+    def value(self, x: Any) -> Value:
+        """Returns an operand as a value: a number or a constant tensor, or what already is one.
+
+        Raises:
+            CannotFuse: it is nothing of these.
+        """
+        if isinstance(x, Value):
+            return x
+        if isinstance(x, bool | int | float):
+            dtype = {bool: torch.bool, int: torch.int64, float: torch.float32}[type(x)]
+            return Value(np.asarray(self.constant(x, dtype), dtype=object), dtype, None)
+        if not isinstance(x, torch.Tensor) or x.dtype not in TYPES or x.numel() > MOST_NUMBERS:
+            raise CannotFuse(
+                f"{{op}} takes {f'a large tensor of {x.dtype}' if isinstance(x, torch.Tensor) else repr(x)}"
+            )
+        array: Any = np.empty(x.shape, dtype=object)
+        array.flat = [self.constant(number, x.dtype) for number in x.flatten().tolist()]
+        return Value(array, x.dtype, None)
+
+    def cast(self, x: Any, dtype: torch.dtype) -> Value:
+        """Returns an operand as a value of a type.
+
+        Raises:
+            CannotFuse: there is no such type of C++ here.
+        """
+        x = self.value(x)
+
+        def convert(node: Node) -> Node:
+            if node.number is not None and math.isfinite(node.number):
+                return self.constant(node.number, dtype)
+            return self.node("{0} != 0" if dtype == torch.bool else f"({TYPES[dtype]}){{0}}", dtype, node)
+
+        if x.dtype == dtype:
+            return x
+        if dtype not in TYPES:
+            raise CannotFuse(f"{{op}} is of {dtype}")
+        return Value(np.asarray(np.frompyfunc(convert, 1, 1)(x.array), dtype=object), dtype, x.world)
+
+    def source(self, tensor: torch.Tensor, world: int | None) -> Value:
+        """Returns a tensor that is read from memory, and whose changes are written there.
+
+        Raises:
+            CannotFuse: it is too large, or of another type.
+        """
+        key = tensor.data_ptr(), tuple(tensor.shape), tensor.stride(), tensor.dtype
+        if key not in self._sources:
+            if tensor.dtype not in TYPES or tensor.numel() > (MOST_NUMBERS * (1 if world is None else self._n)):
+                raise CannotFuse(f"it reads a tensor of shape {tuple(tensor.shape)} and {tensor.dtype}")
+            shape, index = list(tensor.shape), len(self.tensors)
+            by_world = 0
+            if world is not None:
+                shape[world], by_world = 1, tensor.stride(world)
+            offsets = sum(
+                (np.arange(size) * step).reshape(-1, *[1] * (tensor.ndim - dim - 1))
+                for dim, (size, step) in enumerate(zip(shape, tensor.stride(), strict=True))
+            )
+            array: Any = np.empty(shape, dtype=object)
+            array.flat = [
+                self.read(index, offset, by_world, tensor.dtype)
+                for offset in np.ravel(np.broadcast_to(offsets, shape)).tolist()
+            ]
+            self.tensors.append(tensor)
+            self._sources[key] = index, Value(array, tensor.dtype, world), array.copy()
+        return self._sources[key][1]
+
+    def read(self, index: int, offset: int, by_world: int, dtype: torch.dtype) -> Node:
+        """Returns a number in memory."""
+        return self.node(f"p{index}_{by_world}[{offset}]", dtype, place=(index, offset, by_world))
+
+    def aligned(self, *operands: Any) -> tuple[list[Value], int | None]:
+        """Returns operands with the same number of dimensions, and where the worlds are.
+
+        Raises:
+            CannotFuse: they are in different places.
+        """
+        values = [self.value(x) for x in operands]
+        ndim = max(x.array.ndim for x in values)
+        places = [None if x.world is None else x.world + ndim - x.array.ndim for x in values]
+        varying = {place for x, place in zip(values, places, strict=True) if place is not None and _varies(x)}
+        if len(varying) > 1:
+            raise CannotFuse("{op} mixes worlds")
+        world = min(varying) if varying else min((place for place in places if place is not None), default=None)
+        result = []
+        for x, place in zip(values, places, strict=True):
+            array = x.array
+            if place is not None and place != world:  # the same in all worlds, so it can be read as any other tensor
+                array = np.repeat(array, self._n, axis=x.world)
+            array = array.reshape((1,) * (ndim - array.ndim) + array.shape)
+            if world is not None and place != world and array.shape[world] > 1:
+                array = self._by_world(array, world)
+            result.append(x.with_array(array, world))
+        return result, world
+
+    def _by_world(self, array: np.ndarray, world: int) -> np.ndarray:
+        """Returns what each world takes of a tensor that has a row for each.
+
+        Raises:
+            CannotFuse: its rows are not those of the worlds.
+        """
+        rows = np.moveaxis(array, world, 0)
+        made = np.empty(rows.shape[1:], dtype=object)
+        for at in np.ndindex(*made.shape):
+            column = [rows[(i, *at)] for i in range(len(rows))]
+            if all(node is column[0] for node in column):
+                made[at] = column[0]
+                continue
+            reads = [node.place for node in column]
+            if len(rows) != self._n or None in reads or len({(place[0], place[2]) for place in reads}) > 1:
+                raise CannotFuse(f"{{op}} takes a tensor of {len(rows)} rows for those of the worlds")
+            steps = {b[1] - a[1] for a, b in itertools.pairwise(reads)}
+            if len(steps) > 1 or reads[0][2]:
+                raise CannotFuse("{op} takes a tensor whose rows are not those of the worlds")
+            made[at] = self.read(reads[0][0], reads[0][1], steps.pop(), column[0].dtype)
+        return np.expand_dims(made, world)
+
+    def apply(self, text: str, dtype: torch.dtype, *operands: Any, of: torch.dtype | None = None) -> Value:
+        """Returns an operator's result of type ``dtype`` on operands of type ``of``, by default the same."""
+        values, world = self.aligned(*operands)
+        return Value(self.each(text, dtype, *(self.cast(x, of or dtype).array for x in values)), dtype, world)
+
+    def where(self, mask: Any, a: Any, b: Any, dtype: torch.dtype | None = None) -> Value:
+        """Returns ``a`` where ``mask`` is set, else ``b``."""
+        dtype = dtype or self._meta.dtype
+        values, world = self.aligned(mask, a, b)
+        types = torch.bool, dtype, dtype
+        arrays = [self.cast(x, to).array for x, to in zip(values, types, strict=True)]
+        return Value(self.each(WHERE, dtype, *arrays), dtype, world)
+
+    def numbers(self, x: Any) -> np.ndarray:
+        """Returns constants, or what is in memory now, as numbers: for indices.
+
+        Raises:
+            CannotFuse: they are known only when the kernel runs.
+        """
+        if isinstance(x, torch.Tensor):
+            return x.numpy()
+        values = np.empty(x.array.shape, dtype=bool if x.dtype == torch.bool else int)
+        memory: dict[int, torch.Tensor] = {}
+        for at in np.ndindex(*values.shape):
+            node = x.array[at]
+            if node.number is None and (node.place is None or node.varies):
+                raise CannotFuse("{op} has indices that depend on the state")
+            if node.number is None and node.place[0] not in memory:
+                tensor = self.tensors[node.place[0]]
+                memory[node.place[0]] = torch.as_strided(tensor, (_span(tensor),), (1,)).cpu()
+            values[at] = node.number if node.number is not None else memory[node.place[0]][node.place[1]]
+        return values
+
+    # The graph.
+
+    def run(self, graph: torch.fx.Graph, constants: Callable[[str], torch.Tensor]) -> str:
+        """Returns the C++ of a graph whose operators all have a rule.
+
+        Args:
+            graph: the graph.
+            constants: returns a tensor of the graph by name.
+
+        Raises:
+            CannotFuse: it cannot be written so.
+            NoRule: an operator has none.
+        """
+        inputs, found = iter(self._arrays.items()), dict[torch.fx.Node, Any]()
+        for node in graph.nodes:
+            if node.op == "placeholder":
+                name, tensor = next(inputs)
+                by_world = tensor.ndim > 0 and tensor.shape[0] == self._n and name != "seed"
+                found[node] = self.source(tensor, 0 if by_world else None)
+            elif node.op == "get_attr":
+                found[node] = self._constant(node, constants(node.target))
+            elif node.op == "call_function":
+                try:
+                    found[node] = self._call(node, found)
+                except NoRule:
+                    raise
+                except CannotFuse as error:
+                    raise CannotFuse(str(error).replace("{op}", _title(node.target))) from None
+        return self._text()
+
+    def _constant(self, node: torch.fx.Node, tensor: torch.Tensor) -> Any:
+        fresh = all(user.target is torch.ops.aten.lift_fresh_copy.default for user in node.users)
+        if (
+            fresh or tensor.device != self._device
+        ):  # torch.tensor(...) in a hook, or a copy that was made when it was traced
+            return tensor.detach().cpu()
+        long = self._n >= LONG and tensor.ndim > 0 and tensor.shape[0] == self._n
+        return self.source(tensor, 0 if long else None)
+
+    def _call(self, node: torch.fx.Node, found: dict[torch.fx.Node, Any]) -> Any:
+        target: Any = node.target
+        args: Any
+        kwargs: Any
+        args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda arg: found[arg])
+        if target is operator.getitem:
+            return args[0][args[1]]
+        name, self._meta = _name(target), node.meta.get("val")
+        if torch.Tag.nondeterministic_seeded in target.tags:
+            raise CannotFuse("{op} draws numbers that are no function of the world: use s.uniform or s.normal")
+        leaves = torch.utils._pytree.tree_leaves((args, kwargs))
+        if name not in VIEWS and any(isinstance(leaf, Worldwise) for leaf in leaves):
+            raise CannotFuse("{op} mixes worlds")
+        if not any(isinstance(leaf, Value | Worldwise) for leaf in leaves) and name not in FILLERS:
+            # torch computes constants
+            kwargs = {**kwargs, "device": "cpu"} if "device" in kwargs else kwargs
+            return target(*args, **kwargs)
+        if name in self._rules or not name.endswith("_") or name[:-1] not in self._rules:
+            result = self._rule(name, target)(self, *args, **kwargs)
+        else:
+            self._assign(args[0], self._rule(name[:-1], target)(self, *args, **kwargs))
+            result = args[0]
+        if isinstance(result, Value) and isinstance(self._meta, torch.Tensor):
+            shape = list(result.array.shape)
+            if result.world is not None:
+                shape[result.world] *= self._n
+            if tuple(shape) != tuple(self._meta.shape) or result.dtype != self._meta.dtype:
+                raise CannotFuse(f"{{op}} gives shape {tuple(self._meta.shape)} of {self._meta.dtype}")
+        return result
+
+    def _rule(self, name: str, target: Any) -> Callable[..., Any]:
+        if name not in self._rules:
+            raise NoRule(target)
+        return self._rules[name]
+
+    def _assign(self, target: Any, result: Value) -> None:
+        if not isinstance(target, Value) or not target.array.flags.writeable:
+            raise CannotFuse("{op} writes to a constant, or to a copy")
+        if target.world is None and _varies(result):
+            raise CannotFuse("{op} writes what differs from world to world to a tensor that has no worlds")
+        (_, source), world = self.aligned(target, self.cast(result, target.dtype))
+        if world != target.world:
+            raise CannotFuse("{op} mixes worlds")
+        target.array[...] = source.array
+
+    # The C++.
+
+    def _text(self) -> str:
+        """Returns statements that compute what has changed, and write it.
+
+        Raises:
+            CannotFuse: it cannot be written by one thread a world.
+        """
+        stores: list[tuple[Node, Node]] = []
+        for _, value, before in self._sources.values():
+            for at in np.ndindex(*before.shape):
+                if value.array[at] is not before[at]:
+                    if value.world is None:
+                        raise CannotFuse("a tensor that has no worlds is changed")
+                    stores.append((before[at], value.array[at]))
+        needed, stack = set[Node](), [node for _, node in stores]
+        while stack:
+            node = stack.pop()
+            if node not in needed:
+                needed.add(node)
+                stack += node.args
+        if len(needed) > MOST_NUMBERS:
+            raise CannotFuse(f"it has {len(needed)} numbers")
+        names: dict[Node, str] = {}
+        lines: list[str] = []
+        for target, node in stores:
+            _write(node, names, lines)
+            if target in needed:  # of the old value, which is used later
+                _write(target, names, lines)
+            lines.append(f"{target.text} = {names[node]};")
+        places = {node.place for pair in stores for node in pair} | {node.place for node in needed}
+        used = sorted({(place[0], place[2]) for place in places if place})
+        pointers = [
+            f"{TYPES[self.tensors[index].dtype]}* const p{index}_{step} = "
+            f"reinterpret_cast<{TYPES[self.tensors[index].dtype]}*>(args.p{index}) + world * {step}LL;"
+            for index, step in used
+        ]
+        self.used = sorted({index for index, _ in used})
+        for written in {target.place[0] for target, _ in stores}:
+            first, last = _ends(self.tensors[written])
+            others = [_ends(self.tensors[index]) for index in self.used if index != written]
+            if any(start < last and first < end for start, end in others):
+                raise CannotFuse("a tensor that is written shares memory with another")
+        return "\n".join([*pointers, *lines])
+
+
+def _write(node: Node, names: dict[Node, str], lines: list[str]) -> None:
+    """Appends statements for a node and its parts, each once."""
+    stack = [node]
+    while stack:
+        node = stack[-1]
+        waiting = [arg for arg in node.args if arg not in names]
+        if node in names or waiting:
+            stack += reversed(waiting)
+            if not waiting:
+                stack.pop()
+            continue
+        stack.pop()
+        if node.number is not None:
+            names[node] = node.text
+            continue
+        text = node.text.format(*(names[arg] for arg in node.args)) if node.args else node.text
+        names[node] = f"t{len(names)}"
+        lines.append(f"const {TYPES[node.dtype]} {names[node]} = {text};")
+
+
+def _varies(x: Value) -> bool:
+    return any(node.varies for node in x.array.flat)
+
+
+def _span(tensor: torch.Tensor) -> int:
+    """Returns over how many elements a tensor extends in memory."""
+    return 1 + sum((size - 1) * step for size, step in zip(tensor.shape, tensor.stride(), strict=True))
+
+
+def _ends(tensor: torch.Tensor) -> tuple[int, int]:
+    return tensor.data_ptr(), tensor.data_ptr() + _span(tensor) * tensor.element_size() * bool(tensor.numel())
+
+
+def _name(target: Any) -> str:
+    """Returns the name of an operator without its overload: that of one in place ends with an underscore."""
+    return target._schema.name.split("::")[-1] if hasattr(target, "_schema") else str(target)
+
+
+def _title(target: Any) -> str:
+    return str(target)

@@ -1,0 +1,536 @@
+"""What each operator of torch does to the numbers of a world: rules as data, an operator a line of :data:`RULES`."""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchrl_loco.envs.fusion.program import (
+    ADD,
+    AND,
+    DIV,
+    EQUAL,
+    FILLERS,
+    LEAST,
+    LONG,
+    MOST,
+    MUL,
+    NEG,
+    OR,
+    SHL,
+    SUB,
+    TYPES,
+    VIEWS,
+    WHERE,
+    CannotFuse,
+    Program,
+    Value,
+    Worldwise,
+    _shifted,
+    _varies,
+)
+
+BEATS = {"max": "{0} > {1} || ({0} != {0} && {1} == {1})", "min": "{0} < {1} || ({0} != {0} && {1} == {1})"}
+REMAINDER = "{0} != 0 && ({0} < 0) != ({1} < 0) ? {0} + {1} : {0}"
+
+LOG1P = (  # Warp's compiler for the CPU has neither this nor the next
+    "1.0f + {0} == 1.0f ? {0} : 1.0f + {0} == {0} ? logf({0}) : logf(1.0f + {0}) * ({0} / ((1.0f + {0}) - 1.0f))"
+)
+EXPM1 = "fabsf({0}) > 0.5f ? expf({0}) - 1.0f : expf({0}) == 1.0f ? {0} : (expf({0}) - 1.0f) * ({0} / logf(expf({0})))"
+FUNCTIONS = "exp exp2 log log2 log10 sqrt sin cos tan asin acos atan sinh cosh tanh erf floor ceil trunc"
+POINTWISE: dict[str, str | tuple[str, str]] = {
+    **{name: f"{name}f({{0}})" for name in FUNCTIONS.split()},
+    **{
+        "atan2": "atan2f({0}, {1})",
+        "log1p": LOG1P,
+        "expm1": EXPM1,
+        "rsqrt": "1.0f / sqrtf({0})",
+        "reciprocal": "1.0f / {0}",
+    },
+    **{"sigmoid": "1.0f / (1.0f + expf(-{0}))", "silu": "{0} / (1.0f + expf(-{0}))", "relu": "{0} < 0 ? 0 : {0}"},
+    **{"abs": ("fabsf({0})", "{0} < 0 ? -{0} : {0}"), "neg": NEG, "square": "{0} * {0}", "mul": MUL},
+    **{"sign": "{0} > 0 ? 1 : {0} < 0 ? -1 : 0", "minimum": LEAST, "maximum": MOST},
+    **{"clamp_min": MOST, "clamp_max": LEAST, "fmod": ("fmodf({0}, {1})", "{1} == 0 ? 0 : {0} % {1}")},
+    **{"bitwise_and": AND, "bitwise_or": OR, "bitwise_xor": "{0} ^ {1}", "bitwise_not": "~{0}"},
+    **{"bitwise_right_shift": "{0} >> {1}", "bitwise_left_shift": SHL},
+    **{"__and__": AND, "__or__": OR, "__xor__": "{0} ^ {1}", "__rshift__": "{0} >> {1}", "__lshift__": SHL},
+}
+"""Operators whose operands are of the type of the result: C++ for floats, and for integers if that differs."""
+
+TESTS = {
+    **{"lt": "{0} < {1}", "le": "{0} <= {1}", "gt": "{0} > {1}", "ge": "{0} >= {1}", "eq": EQUAL, "ne": "{0} != {1}"},
+    **{"logical_and": "{0} && {1}", "logical_or": "{0} || {1}", "logical_xor": "!{0} != !{1}", "logical_not": "!{0}"},
+    **{"isnan": "{0} != {0}", "isfinite": "{0} - {0} == 0", "isinf": "{0} == {0} && {0} - {0} != 0"},
+}
+"""Operators that are bool, on operands of a common type."""
+
+FOLDS = {"sum": ADD, "prod": MUL, "amax": MOST, "amin": LEAST, "all": AND, "any": OR}
+"""Reductions, from left to right."""
+
+
+# Rules: an operator's result, of the program and the operator's arguments.
+
+
+def _pointwise(text: str | tuple[str, str], p: Program, *args: Any) -> Value:
+    dtype = p._meta.dtype
+    text = text if isinstance(text, str) else text[dtype != torch.float32]
+    return p.apply("!{0}" if dtype == torch.bool and text == "~{0}" else text, dtype, *args)
+
+
+def _common(*operands: Any) -> torch.dtype:
+    like = [torch.empty([1] * x.array.ndim, dtype=x.dtype) if isinstance(x, Value) else x for x in operands]
+    return torch.result_type(*like) if len(like) == 2 else like[0].dtype
+
+
+def _test(text: str, p: Program, *args: Any) -> Value:
+    return p.apply(text, torch.bool, *args, of=_common(*args))
+
+
+def _add(text: str, p: Program, a: Any, b: Any, alpha: Any = 1) -> Value:
+    dtype = p._meta.dtype
+    return p.apply(text, dtype, a, b if alpha == 1 else p.apply(MUL, dtype, b, alpha))
+
+
+def _remainder(p: Program, a: Any, b: Any) -> Value:
+    return p.apply(REMAINDER, p._meta.dtype, _pointwise(POINTWISE["fmod"], p, a, b), b)
+
+
+def _div(p: Program, a: Any, b: Any, rounding_mode: str | None = None) -> Value:
+    dtype = p._meta.dtype
+    if rounding_mode is None:
+        return p.apply(DIV, dtype, a, b)
+    if dtype != torch.float32:
+        a = a if rounding_mode == "trunc" else p.apply(SUB, dtype, a, _remainder(p, a, b))
+        return p.apply("{1} == 0 ? 0 : {0} / {1}", dtype, a, b)
+    if rounding_mode == "trunc":
+        return p.apply("truncf({0} / {1})", dtype, a, b)
+    return p.apply("{1} == 0 ? {2} / {1} : rintf({0} / {1})", dtype, p.apply(SUB, dtype, a, _remainder(p, a, b)), b, a)
+
+
+def _pow(p: Program, base: Any, exponent: Any) -> Value:
+    dtype = p._meta.dtype
+    if isinstance(exponent, int | float) and float(exponent).is_integer() and 0 < abs(exponent) <= 16:
+        powers, count = [p.cast(base, dtype)], int(abs(exponent))
+        while 2 ** len(powers) <= count:
+            powers.append(p.apply(MUL, dtype, powers[-1], powers[-1]))
+        product = functools.reduce(
+            lambda a, b: p.apply(MUL, dtype, a, b), [power for i, power in enumerate(powers) if count >> i & 1]
+        )
+        return product if exponent > 0 else p.apply("1.0f / {0}", dtype, product)
+    if dtype != torch.float32:
+        raise CannotFuse("{op} takes integers to a power")
+    return p.apply("sqrtf({0})", dtype, base) if exponent == 0.5 else p.apply("powf({0}, {1})", dtype, base, exponent)
+
+
+def _round(p: Program, x: Value, decimals: int = 0) -> Value:
+    if decimals:
+        raise CannotFuse("{op} rounds to decimals")
+    return p.apply("rintf({0})", p._meta.dtype, x) if x.dtype == torch.float32 else x
+
+
+def _clamp(p: Program, x: Value, min: Any = None, max: Any = None) -> Value:
+    x = x if min is None else p.apply(MOST, p._meta.dtype, x, min)
+    return x if max is None else p.apply(LEAST, p._meta.dtype, x, max)
+
+
+def _filler(number: Any, p: Program, *args: Any, **kwargs: Any) -> Value:
+    """Returns a new tensor: one with a row for each world is one of worlds.
+
+    Raises:
+        CannotFuse: it is of another type.
+    """
+    like, dtype, shape = args[0] if args else None, p._meta.dtype, list(p._meta.shape)
+    number = (kwargs.get("fill_value", args[-1]) if args else kwargs["fill_value"]) if number is None else number
+    if dtype not in TYPES or not isinstance(number, bool | int | float):
+        raise CannotFuse(f"{{op}} makes a tensor of {dtype}")
+    same = isinstance(like, Value) and list(like.array.shape) == [
+        size // p._n if dim == like.world else size for dim, size in enumerate(shape)
+    ]
+    world = like.world if same and isinstance(like, Value) else 0 if shape and shape[0] == p._n else None
+    if world is not None:
+        shape[world] //= p._n
+    return Value(np.full(shape, p.constant(number, dtype), dtype=object), dtype, world)
+
+
+def _filled(p: Program, x: Value, new: Any, *args: Any) -> Value:
+    (x, value), world = p.aligned(x, p.cast(new, x.dtype))
+    return value.with_array(np.broadcast_to(value.array, x.array.shape).copy(), world)
+
+
+def _copy(p: Program, x: Any, *args: Any, **kwargs: Any) -> Value:
+    x = p.cast(x, p._meta.dtype)
+    return x.with_array(x.array.copy(order="K"), x.world)
+
+
+def _view(p: Program, x: Any, *args: Any, **kwargs: Any) -> Value:
+    shape = list(p._meta.shape)
+    if isinstance(x, Worldwise):
+        if shape[:2] != [len(x.parts), p._n]:
+            raise CannotFuse("{op} mixes worlds")
+        return _stack(p, x.parts)
+    world = x.world
+    if world is not None:
+        before = math.prod(x.array.shape[:world])
+        fits = [i for i, size in enumerate(shape) if math.prod(shape[:i]) == before and size % p._n == 0]
+        if not fits:
+            raise CannotFuse(f"{{op}} makes shape {tuple(shape)}, which mixes worlds")
+        world = fits[0]
+        shape[world] //= p._n
+    array = x.array.reshape(shape)
+    if not np.shares_memory(array, x.array):
+        array.flags.writeable = False  # torch's is a view
+    return x.with_array(array, world)
+
+
+def _expand(p: Program, x: Value, *args: Any, **kwargs: Any) -> Value:
+    shape, more = list(p._meta.shape), p._meta.ndim - x.array.ndim
+    world = _shifted(x.world, more)
+    if world is None and shape and shape[0] == p._n and (more or x.array.shape[0] == 1):
+        world = 0
+    if world is not None:
+        shape[world] = 1 if x.world is None else x.array.shape[x.world]
+    return x.with_array(np.broadcast_to(x.array, shape), world)
+
+
+def _permute(p: Program, x: Value, dims: Sequence[int]) -> Value:
+    dims = [dim % x.array.ndim for dim in dims]
+    return x.with_array(x.array.transpose(dims), None if x.world is None else dims.index(x.world))
+
+
+def _transpose(p: Program, x: Value, first: int = 0, second: int = 1) -> Value:
+    dims = list(range(x.array.ndim))
+    if dims:
+        dims[first], dims[second] = dims[second], dims[first]
+    return _permute(p, x, dims)
+
+
+def _unsqueeze(p: Program, x: Value, dim: int) -> Value:
+    dim %= x.array.ndim + 1
+    return x.with_array(np.expand_dims(x.array, dim), _shifted(x.world, x.world is not None and dim <= x.world))
+
+
+def _squeeze(p: Program, x: Value, dim: int | Sequence[int] | None = None) -> Value:
+    dims = range(x.array.ndim) if dim is None else [dim] if isinstance(dim, int) else dim
+    gone = tuple({d % x.array.ndim for d in dims if x.array.shape[d] == 1} - {x.world}) if x.array.ndim else ()
+    world = _shifted(x.world, -sum(x.world is not None and d < x.world for d in gone))
+    return x.with_array(np.squeeze(x.array, gone), world)
+
+
+def _slice(
+    p: Program, x: Value, dim: int = 0, start: int | None = None, end: int | None = None, step: int = 1
+) -> Value:
+    if dim % x.array.ndim == x.world:
+        if (start or 0) == 0 and (end is None or end >= p._n * x.array.shape[dim]) and step == 1:
+            return x
+    x = _plain(p, x, dim)
+    (dim,) = x.rowwise([dim])
+    return x.with_array(x.array[(*[slice(None)] * dim, slice(start, end, step))], x.world)
+
+
+def _plain(p: Program, x: Value, dim: int) -> Value:
+    """Returns a value without worlds if it is the same in all, and if their dimension is ``dim``: a model's numbers."""
+    if x.world is None or dim % x.array.ndim != x.world or x.array.shape[x.world] != 1 or _varies(x):
+        return x
+    shape = [p._n if d == x.world else size for d, size in enumerate(x.array.shape)]
+    return x.with_array(np.broadcast_to(x.array, shape), None)
+
+
+def _select(p: Program, x: Value, dim: int, index: int) -> Value:
+    x = _plain(p, x, dim)
+    (dim,) = x.rowwise([dim])
+    world = _shifted(x.world, -int(x.world is not None and dim < x.world))
+    return x.with_array(x.array[(*[slice(None)] * dim, index, ...)], world)
+
+
+def _unbind(p: Program, x: Value, dim: int = 0) -> list[Value]:
+    (dim,) = x.rowwise([dim])
+    return [_select(p, x, dim, i) for i in range(x.array.shape[dim])]
+
+
+def _split(p: Program, x: Value, size: int | Sequence[int], dim: int = 0) -> list[Value]:
+    (dim,) = x.rowwise([dim])
+    total = x.array.shape[dim]
+    sizes = [min(size, total - i) for i in range(0, total, size)] if isinstance(size, int) else list(size)
+    ends = np.cumsum(sizes).tolist()
+    return [_slice(p, x, dim, end - n, end) for n, end in zip(sizes, ends, strict=True)]
+
+
+def _flip(p: Program, x: Value, dims: Sequence[int]) -> Value:
+    return x.with_array(np.flip(x.array, tuple(x.rowwise(dims))).copy(), x.world)
+
+
+def _repeat(p: Program, x: Value, repeats: Sequence[int]) -> Value:
+    world = _shifted(x.world, len(repeats) - x.array.ndim)
+    if world is not None and repeats[world] != 1:
+        raise CannotFuse("{op} repeats worlds")
+    if world is None and repeats and repeats[0] == p._n and p._meta.shape[0] == p._n:
+        world, repeats = 0, [1, *repeats[1:]]
+    return x.with_array(np.tile(x.array, repeats), world)
+
+
+def _cat(p: Program, tensors: Sequence[Any], dim: int = 0) -> Any:
+    parts = [x for x in map(p.value, tensors) if x.array.size or x.array.ndim != 1]
+    values, world = p.aligned(*parts)
+    whole = Value(values[0].array, p._meta.dtype, world)
+    if dim % whole.array.ndim == world == 0:
+        return Worldwise(values)
+    (dim,) = whole.rowwise([dim])
+    return Value(np.concatenate([p.cast(x, whole.dtype).array for x in values], axis=dim), whole.dtype, world)
+
+
+def _pad(p: Program, x: Value, pad: Sequence[int], value: Any = 0) -> Value:
+    widths = [(0, 0)] * (x.array.ndim - len(pad) // 2) + [(pad[i], pad[i + 1]) for i in range(0, len(pad), 2)][::-1]
+    x.rowwise(dim for dim, width in enumerate(widths) if width != (0, 0))
+    if min(pad) < 0:
+        raise CannotFuse("{op} cuts")
+    fill_with: Any = p.constant(value, x.dtype)
+    return x.with_array(np.pad(x.array, widths, constant_values=fill_with), x.world)
+
+
+def _stack(p: Program, tensors: Sequence[Any], dim: int = 0) -> Any:
+    values, world = p.aligned(*tensors)
+    return _cat(p, [_unsqueeze(p, x.with_array(x.array, world), dim) for x in values], dim)
+
+
+def _index_select(p: Program, x: Any, dim: int, index: Any) -> Value:
+    x = p.value(x)
+    (dim,) = x.rowwise([dim])
+    return x.with_array(np.take(x.array, p.numbers(index), axis=dim), x.world)
+
+
+def _pick(p: Program, columns: Sequence[Any], index: Value) -> Value:
+    """Returns of several values that of an index, which may be counted from the end.
+
+    Raises:
+        CannotFuse: there are many.
+    """
+    if len(columns) > LONG:
+        raise CannotFuse(f"{{op}} chooses among {len(columns)} numbers")
+    index, found = p.cast(index, torch.int64), p.value(columns[0])
+    for i, column in enumerate(columns[1:], 1):
+        chosen = p.apply(f"{{0}} == {i} || {{0}} == {i - len(columns)}", torch.bool, index, of=torch.int64)
+        found = p.where(chosen, column, found)
+    return found
+
+
+def _gather(p: Program, x: Any, dim: int, index: Any, sparse_grad: bool = False) -> Value:
+    (x, index), world = p.aligned(x, index)
+    (dim,) = Value(x.array, x.dtype, world).rowwise([dim])
+    cut = tuple(slice(None) if d == dim else slice(size) for d, size in enumerate(index.array.shape))
+    columns = [_slice(p, x.with_array(x.array[cut], world), dim, i, i + 1) for i in range(x.array.shape[dim])]
+    return _pick(p, columns, index)
+
+
+def _index(p: Program, x: Any, indices: Sequence[Any]) -> Value:
+    x, some = p.value(x), [index for index in indices if index is not None]
+    if len(some) == 1 and isinstance(some[0], Value) and _varies(some[0]) and x.world is None and indices[0] is some[0]:
+        shape = (1,) * some[0].array.ndim  # of a table, the row that each world asks for
+        rows = [row.reshape(shape + row.shape) for row in map(np.asarray, x.array)]
+        index = some[0].array.reshape(some[0].array.shape + (1,) * (x.array.ndim - 1))
+        return _pick(p, [x.with_array(row, None) for row in rows], some[0].with_array(index, some[0].world))
+    if x.world == 0 and indices[0] is not None and len(some) == len(indices) == 2:  # x[arange(n), i]
+        if np.array_equal(p.numbers(indices[0]), np.arange(p._n)):
+            index = p.value(indices[1])
+            if index.world == 0 and index.array.ndim == 1 and x.array.ndim > 1:
+                index = index.with_array(index.array.reshape(-1, *[1] * (x.array.ndim - 2)), 0)
+                return _pick(p, [_select(p, x, 1, i) for i in range(x.array.shape[1])], index)
+    at: list[Any] = [slice(None) if index is None else p.numbers(index) for index in indices]
+    x.rowwise(dim for dim, index in enumerate(indices) if index is not None)
+    world = x.world
+    if world is not None:  # goes where those of a mark go
+        mark = np.repeat(np.zeros(x.array.shape, dtype=int), 2, axis=world)
+        np.moveaxis(mark, world, 0)[len(mark) // 2 if world == 0 else mark.shape[world] // 2 :] = 1
+        moved = mark[tuple(at)]
+        world = next(d for d in range(moved.ndim) if np.diff(moved, axis=d).any())
+    return x.with_array(x.array[tuple(at)], world)
+
+
+def _index_put(p: Program, x: Any, indices: Sequence[Any], values: Any, accumulate: bool = False) -> Value:
+    mask, new = indices[0], p.value(values)
+    if (
+        len(indices) != 1
+        or accumulate
+        or not isinstance(mask, Value)
+        or mask.dtype != torch.bool
+        or new.world is not None
+    ):
+        raise CannotFuse("{op} writes to other places than those of a mask of worlds")
+    if new.array.ndim > x.array.ndim - mask.array.ndim:
+        new = new.with_array(new.array[0] if new.array.shape[0] == 1 else np.empty((0, 0)), None)
+    shape = mask.array.shape + (1,) * (x.array.ndim - mask.array.ndim)
+    return p.where(mask.with_array(mask.array.reshape(shape), mask.world), new, x, x.dtype)
+
+
+def _dims(x: Value, dim: Any) -> list[int]:
+    dims = range(x.array.ndim) if dim is None or dim == [] else [dim] if isinstance(dim, int) else dim
+    return sorted(x.rowwise(dims))
+
+
+def _reduced(p: Program, x: Any, dim: Any, keepdim: bool, reduce: Callable[[Any], Any], dtype: torch.dtype) -> Value:
+    """Returns what ``reduce`` makes of the sequence of the numbers along dimensions."""
+    x = p.value(x)
+    dims = _dims(x, dim)
+    rows = np.moveaxis(x.array, dims, range(len(dims)))
+    rest = rows.shape[len(dims) :]
+    array = np.asarray(reduce(rows.reshape(-1, *rest)), dtype=object).reshape(rest)
+    if keepdim:
+        return Value(np.expand_dims(array, dims), dtype, x.world)
+    return Value(array, dtype, _shifted(x.world, -sum(x.world is not None and d < x.world for d in dims)))
+
+
+def _fold(text: str, p: Program, x: Any, dim: Any = None, keepdim: bool = False, dtype: Any = None) -> Value:
+    kind = p._meta.dtype
+    empty = {ADD: 0, MUL: 1, AND: True, OR: False}
+
+    def reduce(rows: Any) -> Any:
+        if not len(rows) and text in empty:
+            return np.full(rows.shape[1:], p.constant(empty[text], kind), dtype=object)
+        return functools.reduce(lambda a, b: p.each(text, kind, a, b), rows)
+
+    return _reduced(p, p.cast(x, kind), dim, keepdim, reduce, kind)
+
+
+def _mean(p: Program, x: Value, dim: Any = None, keepdim: bool = False, dtype: Any = None) -> Value:
+    count = math.prod(x.array.shape[d] for d in _dims(x, dim))
+    return p.apply(DIV, p._meta.dtype, _fold(ADD, p, x, dim, keepdim), count)
+
+
+def _var(
+    p: Program, x: Value, dim: Any = None, unbiased: bool = True, keepdim: bool = False, *, correction: Any = None
+) -> Value:
+    kind, dims = p._meta.dtype, _dims(x, dim)
+    off = p.apply(SUB, kind, x, _mean(p, x, dims, keepdim=True))
+    count = math.prod(x.array.shape[d] for d in dims) - (int(unbiased) if correction is None else correction)
+    return p.apply(DIV, kind, _fold(ADD, p, p.apply("{0} * {0}", kind, off), dims, keepdim), max(count, 0))
+
+
+def _std(p: Program, *args: Any, **kwargs: Any) -> Value:
+    return p.apply("sqrtf({0})", p._meta.dtype, _var(p, *args, **kwargs))
+
+
+def _norm(p: Program, x: Value, ord: Any = 2, dim: Any = None, keepdim: bool = False, dtype: Any = None) -> Value:
+    kind, ord = p._meta.dtype, 2 if ord is None else ord
+    size = p.apply("fabsf({0})", kind, x)
+    if math.isinf(ord):
+        return _fold(MOST if ord > 0 else LEAST, p, size, dim, keepdim)
+    if ord == 2:
+        return p.apply("sqrtf({0})", kind, _fold(ADD, p, p.apply("{0} * {0}", kind, x), dim, keepdim))
+    if ord == 1:
+        return _fold(ADD, p, size, dim, keepdim)
+    raise CannotFuse(f"{{op}} is of order {ord}")
+
+
+def _best(p: Program, name: str, x: Value, dim: int, keepdim: bool) -> tuple[Value, Value]:
+    """Returns the largest or smallest numbers along a dimension, and where each is first."""
+
+    def reduce(rows: Any) -> tuple[Any, Any]:
+        best, place = rows[0], np.full(np.shape(rows[0]), p.constant(0, torch.int64), dtype=object)
+        for i, row in enumerate(rows[1:], 1):
+            beats = p.each(BEATS[name], torch.bool, row, best)
+            best = p.each(WHERE, x.dtype, beats, row, best)
+            place = p.each(WHERE, torch.int64, beats, p.constant(i, torch.int64), place)
+        return best, place
+
+    values = _reduced(p, x, dim, keepdim, lambda rows: reduce(rows)[0], x.dtype)
+    return values, _reduced(p, x, dim, keepdim, lambda rows: reduce(rows)[1], torch.int64)
+
+
+def _extreme(name: str, p: Program, x: Value, dim: Any = None, keepdim: bool = False) -> Any:
+    text = MOST if name == "max" else LEAST
+    if isinstance(dim, Value | torch.Tensor):
+        return p.apply(text, p._meta.dtype, x, dim)
+    return _fold(text, p, x) if dim is None else _best(p, name, x, dim, keepdim)
+
+
+def _place(name: str, p: Program, x: Value, dim: int | None = None, keepdim: bool = False) -> Value:
+    if dim is None:
+        raise CannotFuse("{op} goes across worlds")
+    return _best(p, name, x, dim, keepdim)[1]
+
+
+def _cumsum(p: Program, x: Value, dim: int, dtype: Any = None) -> Value:
+    (dim,), rows = x.rowwise([dim]), p.cast(x, p._meta.dtype).array.copy()
+    columns = np.moveaxis(rows, dim, 0)
+    for i in range(1, len(columns)):
+        columns[i] = p.each(ADD, p._meta.dtype, columns[i - 1], columns[i])
+    return Value(rows, p._meta.dtype, x.world)
+
+
+def _cross(p: Program, a: Any, b: Any, dim: int = -1) -> Value:
+    kind = p._meta.dtype
+    (a, b), _ = p.aligned(a, b)
+    x, y = _unbind(p, a, dim), _unbind(p, b, dim)
+    terms = [(p.apply(MUL, kind, x[i], y[j]), p.apply(MUL, kind, x[j], y[i])) for i, j in ((1, 2), (2, 0), (0, 1))]
+    return _stack(p, [p.apply(SUB, kind, *pair) for pair in terms], dim % a.array.ndim)
+
+
+def _matmul(p: Program, a: Any, b: Any) -> Value:
+    a, b = p.value(a), p.value(b)
+    if b.array.ndim == 1:
+        return _fold(ADD, p, p.apply(MUL, p._meta.dtype, a, b), -1)
+    product = p.apply(MUL, p._meta.dtype, _unsqueeze(p, a, -1), _unsqueeze(p, b, -3))
+    return _fold(ADD, p, product, -2)
+
+
+def _fused(p: Program, text: str, x: Any, a: Any, b: Any, value: Any) -> Value:
+    kind = p._meta.dtype
+    return p.apply(ADD, kind, x, p.apply(MUL, kind, p.apply(text, kind, a, b), value))
+
+
+_Rule = Callable[..., Any]
+FILLED_WITH = {"ones": 1, "full": None}
+"""What operators that make tensors write, if it is not 0."""
+
+
+def _stem(name: str) -> str:
+    return name.removeprefix("new_").removesuffix("_like")
+
+
+RULES: dict[str, _Rule] = {
+    **{name: functools.partial(_pointwise, text) for name, text in POINTWISE.items()},
+    **{name: functools.partial(_test, text) for name, text in TESTS.items()},
+    **{name: functools.partial(_fold, text) for name, text in FOLDS.items()},
+    **{
+        name: functools.partial(_filler, FILLED_WITH.get(name.removeprefix("new_").removesuffix("_like"), 0))
+        for name in FILLERS
+    },
+    **{"add": functools.partial(_add, ADD), "sub": functools.partial(_add, SUB)},
+    **{"rsub": lambda p, a, b, alpha=1: _add(SUB, p, b, a, alpha), "remainder": _remainder, "div": _div, "pow": _pow},
+    **{"floor_divide": lambda p, a, b: _div(p, a, b, "floor"), "round": _round, "clamp": _clamp},
+    **{"where": lambda p, mask, a, b: p.where(mask, a, b)},
+    **{"masked_fill": lambda p, x, mask, new: p.where(mask, new, x)},
+    **{"copy": _filled, "fill": _filled, "zero": lambda p, x: _filled(p, x, 0)},
+    **{"addcmul": lambda p, x, a, b, value=1: _fused(p, MUL, x, a, b, value)},
+    **{"addcdiv": lambda p, x, a, b, value=1: _fused(p, DIV, x, a, b, value)},
+    **{"lerp": lambda p, a, b, w: _fused(p, SUB, a, b, a, w)},
+    **{
+        "var": _var,
+        "std": _std,
+        "mean": _mean,
+        "linalg_vector_norm": _norm,
+        "norm": _norm,
+        "cumsum": _cumsum,
+        "linalg_cross": _cross,
+    },
+    **{name: functools.partial(_extreme, name) for name in BEATS},
+    **{f"arg{name}": functools.partial(_place, name) for name in BEATS},
+    **{"mm": _matmul, "bmm": _matmul, "mv": _matmul, "dot": _matmul},
+    **dict.fromkeys(("_to_copy", "clone", "lift_fresh_copy", "contiguous"), _copy),
+    **{name: lambda p, x: x for name in ("alias", "detach", "detach_", "lift_fresh")},
+    **dict.fromkeys(VIEWS, _view),
+    **{"expand": _expand, "permute": _permute, "transpose": _transpose, "t": _transpose, "unsqueeze": _unsqueeze},
+    **{"squeeze": _squeeze, "slice": _slice, "select": _select, "unbind": _unbind, "split": _split},
+    **{
+        "split_with_sizes": _split,
+        "flip": _flip,
+        "repeat": _repeat,
+        "cat": _cat,
+        "stack": _stack,
+        "constant_pad_nd": _pad,
+    },
+    **{"index_select": _index_select, "index": _index, "index_put": _index_put, "gather": _gather},
+}
+"""Operators by name, without overload."""
