@@ -20,8 +20,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled.collision import MINVAL
-from torchrl_loco.sim.compiled.dynamics import BALL, FREE
+from torchrl_loco.sim.compiled.dynamics import BALL, FREE, MINVAL
 from torchrl_loco.sim.compiled.symbols import (
     Block,
     Scalar,
@@ -38,6 +37,9 @@ from torchrl_loco.sim.compiled.symbols import (
 
 MINIMP, MAXIMP = 1e-4, 0.9999
 """MuJoCo's mjMINIMP and mjMAXIMP."""
+
+DEFAULT_SOLREF = 0.02, 1.0
+"""What MuJoCo takes in the place of a ``solref`` that mixes its two formats, with a warning."""
 
 MIN_TOLERANCE = 1e-6
 """Tolerance below which a solver in single precision would only see rounding; mujoco_warp has the same bound."""
@@ -84,6 +86,8 @@ class Softness:
     def make(cls, m: mujoco.MjModel, solref: Sequence[float], solimp: Sequence[float]) -> "Softness":
         """Returns the softness for the parameters of a model."""
         dmin, dmax, midpoint = (float(np.clip(solimp[i], MINIMP, MAXIMP)) for i in (0, 1, 3))
+        if (solref[0] > 0) != (solref[1] > 0):  # neither of the two formats
+            solref = DEFAULT_SOLREF
         safe = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
         time = max(solref[0], 2 * m.opt.timestep) if safe else solref[0]
         if solref[0] <= 0:
@@ -112,15 +116,16 @@ class Softness:
         above = 1 - self.upper * raised(1 - x, self.power)
         return self.dmin + select(x, "<=", self.midpoint, below, above) * self.rise
 
-    def row(self, weight: float | Scalar, position: Scalar) -> tuple[Scalar, Scalar]:
+    def row(self, weight: float | Scalar, position: Scalar, least: float | Scalar = MINVAL) -> tuple[Scalar, Scalar]:
         """Returns D, and the part of the residual that the position makes.
 
         Args:
             weight: approximate inverse inertia along the row.
             position: distance, negative if violated (m or rad).
+            least: least regularisation, one over the largest D.
         """
         impedance = self.impedance(position)
-        regularisation = maximum(scalar(weight) * (1 - impedance) / impedance, MINVAL)
+        regularisation = maximum(scalar(weight) * (1 - impedance) / impedance, least)
         return 1 / regularisation, self.stiffness * impedance * position
 
 
@@ -162,8 +167,16 @@ class Table:
         return f"{self.prefix}_{title}[{self.index}]"
 
 
+def both_sides(m: mujoco.MjModel, joint: int) -> bool:
+    """Returns whether a joint can be within the margin of both its limits, each of which is a row then."""
+    low, high = m.jnt_range[joint]
+    return bool(2 * m.jnt_margin[joint] > high - low)
+
+
 class JointLimits:
     """Limits of hinges and slides. Each has a place of its own, whose weight is zero while the joint is within them.
+
+    Where a joint cannot be near both its limits, they share a place.
 
     Args:
         m: the model.
@@ -171,17 +184,21 @@ class JointLimits:
 
     def __init__(self, m: mujoco.MjModel) -> None:
         self.m = m
-        self.joints = [j for j in range(m.njnt) if m.jnt_limited[j] and m.jnt_type[j] not in (FREE, BALL)]
-        self.count = len(self.joints)
+        joints = [j for j in range(m.njnt) if m.jnt_limited[j] and m.jnt_type[j] not in (FREE, BALL)]
+        self.rows = [(j, sign) for j in joints for sign in ((1, -1) if both_sides(m, j) else (None,))]
+        self.count = len(self.rows)
         self.arrays = {f"limit_{field}": self.count for field in ("D", "x", "v", "sign")}
 
     def create(self, block: Block, variables: Variables) -> None:
         """Sets weights, signs and residuals."""
         m, (qpos, qvel, qacc) = self.m, variables
-        for i, j in enumerate(self.joints):
+        for i, (j, side) in enumerate(self.rows):
             d, (low, high) = int(m.jnt_dofadr[j]), m.jnt_range[j]
             below, above = qpos[m.jnt_qposadr[j]] - low, high - qpos[m.jnt_qposadr[j]]
-            position, sign = minimum(below, above) - m.jnt_margin[j], select(below, "<", above, 1, -1)
+            if side is None:
+                position, sign = minimum(below, above) - m.jnt_margin[j], select(below, "<", above, 1, -1)
+            else:
+                position, sign = (below if side > 0 else above) - m.jnt_margin[j], scalar(side)
             block.set(f"limit_sign[{i}]", sign)
             block(f"limit_D[{i}] = limit_x[{i}] = 0.0f;")
             with block.scope(f"if ({block.value(position)} < 0.0f)") as violated:
@@ -192,12 +209,12 @@ class JointLimits:
 
     def project(self, block: Block, search: list[Scalar]) -> None:
         """Sets how the residuals change along the search direction."""
-        for i, j in enumerate(self.joints):
+        for i, (j, _) in enumerate(self.rows):
             block.set(f"limit_v[{i}]", cell(f"limit_sign[{i}]") * search[self.m.jnt_dofadr[j]])
 
     def add_to(self, gradient: list[Scalar], diagonal: list[Scalar]) -> None:
         """Adds the rows to the gradient of the cost and to the diagonal of its Hessian."""
-        for i, j in enumerate(self.joints):
+        for i, (j, _) in enumerate(self.rows):
             d, x, sign = self.m.jnt_dofadr[j], cell(f"limit_x[{i}]"), cell(f"limit_sign[{i}]")
             weight = select(x, "<", 0, cell(f"limit_D[{i}]"), 0)
             gradient[d] = gradient[d] + weight * sign * x

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from torchrl_loco.sim.compiled.collision import CAPSULE, Pair, contact_weight, geom_pose
+from torchrl_loco.sim.compiled.collision import CAPSULE, Pair, contact_weight, geom_pose, least_regularisation
 from torchrl_loco.sim.compiled.constraints import Softness, Table, Variables
 from torchrl_loco.sim.compiled.dynamics import BALL, Dynamics
 from torchrl_loco.sim.compiled.ground_contacts import GroundContacts
@@ -157,6 +157,7 @@ class DenseContacts:
         margin = table.column("margin", [pair.margin for pair in self.pairs])
         shares = [contact_weight(m, pair) for pair in self.pairs]
         weight = table.column("weight", shares)
+        least = table.column("least", [least_regularisation(pair) for pair in self.pairs])
         share = table.column("share", [self.pyramid.share(pair.condim) for pair in self.pairs])
         friction = table.column("friction", [pair.friction for pair in self.pairs])
         softness = Softness.from_table(table, [Softness.make(m, pair.solref, pair.solimp) for pair in self.pairs])
@@ -188,7 +189,7 @@ class DenseContacts:
                     for i in self.pyramid.directions:
                         moment = cross(lever, axes[i])
                         jacobians[i][d] = sign * dot(tree.cdof[d], np.concatenate([moment, axes[i]]))
-                contact_weight_, residual = softness.row(weight, name("position"))
+                contact_weight_, residual = softness.row(weight, name("position"), least)
                 self._store(point, jacobians, contact_weight_ * share, residual, softness.damping, variables)
                 self._feel(point, touching, contact_point + origin)
                 if self._with_frames:

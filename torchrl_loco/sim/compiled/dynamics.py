@@ -34,6 +34,8 @@ from torchrl_loco.sim.compiled.symbols import (
 FREE, BALL, SLIDE, HINGE = (
     int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE")
 )
+MINVAL = 1e-15
+"""MuJoCo's mjMINVAL."""
 SAME = 1e-9
 """Relative difference below which two numbers of a model count as equal."""
 
@@ -117,6 +119,15 @@ def cross_force(v: np.ndarray, force: np.ndarray) -> np.ndarray:
 
 
 # The tree.
+
+
+def acting(m: mujoco.MjModel) -> list[int]:
+    """Returns the actuators whose group the options do not disable."""
+    return [
+        i
+        for i in range(m.nu)
+        if not (0 <= m.actuator_group[i] < 31 and m.opt.disableactuator >> m.actuator_group[i] & 1)
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -286,7 +297,7 @@ class Dynamics:
     def _actuator_force(self, qpos: list[Scalar], qvel: list[Scalar], ctrl: list[Scalar]) -> list[Scalar]:
         """Returns the forces of actuators: gain * ctrl + affine bias, each clipped to its range (``qfrc_actuator``)."""
         m, force = self.m, [scalar(0)] * self.m.nv
-        for i in range(m.nu):
+        for i in acting(m):
             j, gear = m.actuator_trnid[i, 0], m.actuator_gear[i, 0]
             q, d = m.jnt_qposadr[j], m.jnt_dofadr[j]
             control = clip(ctrl[i], m.actuator_ctrlrange[i]) if m.actuator_ctrllimited[i] else ctrl[i]
@@ -344,7 +355,10 @@ class ArticulatedFactor:
             inertia = articulated[body]
             for d in reversed(tree.dofs(body)):
                 projected = inertia @ tree.cdof[d]
-                inverse = 1 / (dot(tree.cdof[d], projected) + m.dof_armature[d] + diagonal[d])
+                pivot = dot(tree.cdof[d], projected) + m.dof_armature[d] + diagonal[d]
+                if pivot.constant is not None:  # of joints that do the same: MuJoCo divides by mjMINVAL too
+                    pivot = scalar(max(pivot.constant, MINVAL))
+                inverse = 1 / pivot
                 inertia = inertia - outer(projected, projected * inverse)
                 self.projected[d], self.inverse[d] = projected, inverse
             parent = m.body_parentid[body]

@@ -5,7 +5,15 @@ J acts on one body, so that ``J' D J`` is a stiffness of that body.
 
 import numpy as np
 
-from torchrl_loco.sim.compiled.collision import Corner, Pair, contact_weight, corners, frame, geom_pose
+from torchrl_loco.sim.compiled.collision import (
+    Corner,
+    Pair,
+    contact_weight,
+    corners,
+    frame,
+    geom_pose,
+    least_regularisation,
+)
 from torchrl_loco.sim.compiled.constraints import Softness, Table, Variables
 from torchrl_loco.sim.compiled.dynamics import Dynamics
 from torchrl_loco.sim.compiled.pyramid import FLAT, FRICTIONLESS, FULL
@@ -134,6 +142,7 @@ class GroundContacts:
         rows = [Softness.make(m, corner.pair.solref, corner.pair.solimp) for corner in self.corners]
         softness = Softness.from_table(table, rows)
         weight = table.column("weight", [contact_weight(m, corner.pair) for corner in self.corners])
+        least = table.column("least", [least_regularisation(corner.pair) for corner in self.corners])
         share = table.column("share", [self.pyramid.share(corner.pair.condim) for corner in self.corners])
         for damping in sorted({float(np.float32(row.damping)) for row in rows}):
             with block.scope("if (ground > 0)") as some:
@@ -142,7 +151,7 @@ class GroundContacts:
                     if scalar(softness.damping).constant is None:
                         contact(f"if ({contact.value(softness.damping)} != {literal(damping)}) continue;")
                     position = contact.keep(cell("contact_x0[k]"))
-                    inertia, residual = softness.row(weight, position)
+                    inertia, residual = softness.row(weight, position, least)
                     contact.set("contact_D[k]", inertia * share)
                     self._set(contact, "x", residual)
 

@@ -238,7 +238,7 @@ struct Step : Math {
   const int world;
   int frictional, frictionless;  // contacts
   int limits;                    // violated limits of hinges and slides
-  int limit_row[SLOTS];          // the row of the limit of each own degree of freedom, or -1
+  int limit_row[Model::LIMIT_SIDES][SLOTS];  // the row of the limit of each own degree of freedom, or -1
 //IF CONTACT_GEOMS
   // What the solver overwrites of the contacts that this lane adds up: number lane, lane + LANES, ...
   enum { OWN_CONTACTS = (CONTACTS + LANES - 1) / LANES };
@@ -683,9 +683,9 @@ struct Step : Math {
   }
 
   // A row from the inverse inertia along it and how far it is violated. Velocity and acceleration follow in solve().
-  INLINE void set_row(int r, Softness softness, float inverse_inertia, float position) {
+  INLINE void set_row(int r, Softness softness, float inverse_inertia, float position, float least) {
     const float impedance = softness.impedance(position);
-    w.weight[r] = divide(1.0f, larger(divide(inverse_inertia * (1.0f - impedance), impedance), MINVAL));
+    w.weight[r] = divide(1.0f, larger(divide(inverse_inertia * (1.0f - impedance), impedance), least));
     w.x[r] = softness.stiffness * impedance * position;
   }
 
@@ -694,22 +694,23 @@ struct Step : Math {
   INLINE void set_rows() {
     SHARED_LOOP(r, first_limit()) {
       const Contact& c = contact(contact_of_row(r));
-      set_row(r, Model::contact_softness(c.pair), Model::inverse_inertia(c.pair), c.distance);
+      set_row(r, Model::contact_softness(c.pair), Model::inverse_inertia(c.pair), c.distance,
+              Model::least_regularisation(c.pair));
     }
     limits = 0;
-    OWN_DOFS(slot, d) {
-      limit_row[slot] = -1;
+    OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
+      limit_row[side][slot] = -1;
       if (Model::LIMITS == 0) continue;
       const int e = d < DOFS ? d : 0;
       const float q = w.qpos[Model::dof_qpos(e)], below = q - Model::limit_low(e), above = Model::limit_high(e) - q;
-      const float position = smaller(below, above) - Model::limit_margin(e);
+      const bool upper = Model::LIMIT_SIDES == 2 ? side : !(below < above);  // the nearer one, if there is one row
+      const float position = (upper ? above : below) - Model::limit_margin(e);
       const bool violated = d < DOFS && position < 0.0f;
       const unsigned hits = ballot(violated);
       if (violated) {
-        const int i = limits + bits(hits & lanes_below());
-        limit_row[slot] = first_limit() + i;
-        w.limits[i] = (unsigned char)(below < above ? d : d + 128);
-        set_row(limit_row[slot], Model::limit_softness(d), Model::limit_inverse_inertia(d), position);
+        const int i = limits + bits(hits & lanes_below()), r = limit_row[side][slot] = first_limit() + i;
+        w.limits[i] = (unsigned char)(upper ? d + 128 : d);
+        set_row(r, Model::limit_softness(d), Model::limit_inverse_inertia(d), position, MINVAL);
       }
       limits += bits(hits);
     }
@@ -777,8 +778,9 @@ struct Step : Math {
   // M + J' D J over the active rows, and the gradient.
   INLINE void add_constraints(Slots& h) const {
     OWN_DOFS(slot, d) {
-      if (limit_row[slot] >= 0) {
-        const int r = limit_row[slot];
+      UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
+        const int r = limit_row[side][slot];
+        if (r < 0) continue;
         const float x = w.x[r], weight = w.weight[r];
         if (x < 0.0f) {
           h.diagonal[slot] += weight;
@@ -1402,8 +1404,8 @@ struct Step : Math {
 
 // ---- The control step ----------------------------------------------------------------------------------------------
 
-#ifdef __CUDA_ARCH__
 static_assert(sizeof(World) == Model::WORLD_BYTES, "lanes.py counts on this size");
+#ifdef __CUDA_ARCH__
 static __shared__ World worlds[Model::WORLDS_PER_BLOCK];
 World& w = worlds[threadIdx.x / LANES];
 // Warps that run in step share what they fetch of the text. Lanes without a world keep to the step but do nothing else.

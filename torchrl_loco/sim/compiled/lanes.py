@@ -14,9 +14,9 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled import collision
-from torchrl_loco.sim.compiled.collision import CAPSULE, MINVAL, PLANE, Pair, contact_weight, pairs
-from torchrl_loco.sim.compiled.constraints import Softness, tolerance
-from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, SLIDE
+from torchrl_loco.sim.compiled.collision import CAPSULE, PLANE, Pair, contact_weight, least_regularisation, pairs
+from torchrl_loco.sim.compiled.constraints import Softness, both_sides, tolerance
+from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, MINVAL, SLIDE, acting
 from torchrl_loco.sim.compiled.links import Mass, matrix, moving_bodies, places
 from torchrl_loco.sim.compiled.tables import Tables
 from torchrl_loco.sim.overflow import Overflow
@@ -31,7 +31,15 @@ SHAPES = {
 UNLIMITED = 1e30
 BLOCK_BYTES = 48 * 1024
 """Static shared memory that a block of a GPU may have."""
-WORLD_BYTES = (11136, BLOCK_BYTES // 4, BLOCK_BYTES // 3, BLOCK_BYTES // 2, BLOCK_BYTES)
+WARP_BYTES = 4 * 32
+"""What Warp takes of it for the threads of a world, 4 bytes each, whether a kernel has tiles or not."""
+WORLD_BYTES = (
+    11136,
+    BLOCK_BYTES // 4 - WARP_BYTES,
+    BLOCK_BYTES // 3 - WARP_BYTES,
+    BLOCK_BYTES // 2 - WARP_BYTES,
+    BLOCK_BYTES - WARP_BYTES,
+)
 """Shared memory that a world may fill: the first that leaves room for enough contacts. With 11136 bytes, 20 worlds in
 blocks of 4 fit a multiprocessor of an H100 or H200."""
 MOST_WORLDS = 4
@@ -111,6 +119,7 @@ class Description:
         self.geoms = sorted({g for p in self.pairs for g in p.geoms if m.geom_type[g] != PLANE})
         limited = [j for j in range(m.njnt) if m.jnt_limited[j]]
         self.limited = [j for j in limited if m.jnt_type[j] in (SLIDE, HINGE)]
+        self.limit_sides = 2 if any(both_sides(m, j) for j in self.limited) else 1
         self.limited_balls = [j for j in limited if m.jnt_type[j] == BALL]
         self.losses = [d for d in range(m.nv) if m.dof_frictionloss[d] > 0]
         sensors = [(int(m.sensor_type[i]), int(m.sensor_objid[i]), int(m.sensor_adr[i])) for i in range(m.nsensor)]
@@ -154,7 +163,7 @@ class Description:
             links=len(self.moving),
             geoms=len(self.geoms),
             trees=len(self.roots),
-            limits=len(self.limited),
+            limits=self.limit_sides * len(self.limited),
             friction_losses=len(self.losses),
             touch=len(self.touch),
             candidates=max(1, sum(not self.is_plane(p) for p in self.pairs)),
@@ -171,7 +180,7 @@ class Description:
         budget = next((b for b in WORLD_BYTES if sized(enough).bytes <= b), None)
         if budget is None:
             raise ValueError(
-                f"a body so large: a world needs {sized(enough).bytes} bytes of shared memory, of {BLOCK_BYTES}"
+                f"a body so large: a world needs {sized(enough).bytes} bytes of shared memory, of {WORLD_BYTES[-1]}"
             )
         count = max(n for n in range(enough, most + 1) if sized(n).bytes <= budget)
         more = max(r for r in range(frictionless + 1) if sized(count, r).bytes <= budget)
@@ -200,6 +209,7 @@ class Description:
             TREES=layout.trees,
             GEOMS=layout.geoms,
             LIMITS=layout.limits,
+            LIMIT_SIDES=self.limit_sides,
             FRICTION_LOSSES=layout.friction_losses,
             CANDIDATES=layout.candidates,
             FRICTIONAL=layout.frictional,
@@ -289,7 +299,7 @@ class Description:
         tables.floats("armature", m.dof_armature)
         tables.integers("ancestors", self.ancestors, mask)
         dofs = m.jnt_dofadr[m.actuator_trnid[:, 0]]
-        used = sorted(range(m.nu), key=lambda a: dofs[a])
+        used = sorted(acting(m), key=lambda a: dofs[a])
         unbiased = m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE)
         bias = np.where(unbiased[:, None], 0, m.actuator_biasprm[:, :3])[used]
         clamped = m.actuator_ctrllimited.astype(bool)
@@ -297,7 +307,7 @@ class Description:
         limits = np.where(clamped[:, None], m.actuator_ctrlrange, [-UNLIMITED, UNLIMITED])[used]
         forces = np.where(limited[:, None], m.actuator_forcerange, [-UNLIMITED, UNLIMITED])[used]
         tables.size(HAS_ACTUATOR_BIAS=bool(bias.any()), HAS_FORCE_LIMITS=limited[used].any())
-        tables.integers("first_actuator", [sum(d < k for d in dofs) for k in range(m.nv + 1)])
+        tables.integers("first_actuator", [sum(d < k for d in dofs[used]) for k in range(m.nv + 1)])
         tables.integers("control", used)
         tables.floats("gear", m.actuator_gear[used, 0])
         tables.floats("gain", m.actuator_gainprm[used, 0])
@@ -354,6 +364,8 @@ class Description:
         soft = [*((p.solref, p.solimp) for p in found), *((m.jnt_solref[j], m.jnt_solimp[j]) for j in balls)]
         tables.structs("Softness", "contact_softness", [self._softness(*s) for s in soft])
         weights = [contact_weight(m, pair) for pair in found]
+        least = [least_regularisation(pair) for pair in found]
+        tables.floats("least_regularisation", [*least, *(MINVAL for _ in balls)])
         tables.floats("inverse_inertia", [*weights, *m.dof_invweight0[m.jnt_dofadr[balls]]])
 
     def _dofs_of_geom(self, g: int) -> int:
@@ -439,7 +451,8 @@ class Description:
 
     def worlds_per_block(self) -> int:
         """Returns how many worlds share a block of threads: a power of two, as shared memory allows."""
-        return max(1, min(MOST_WORLDS, 1 << int(math.log2(max(1, BLOCK_BYTES // self.layout.bytes)))))
+        fit = max(1, BLOCK_BYTES // (self.layout.bytes + WARP_BYTES))
+        return min(MOST_WORLDS, 1 << int(math.log2(fit)))
 
     def elimination(self) -> str:
         """Returns calls that eliminate all rows, two by two, in parts: the fewer rows are left, the fewer columns."""

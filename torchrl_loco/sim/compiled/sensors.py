@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled.collision import MINVAL, SPHERE
-from torchrl_loco.sim.compiled.dynamics import Dynamics, Poses, constant_matrix
+from torchrl_loco.sim.compiled.collision import SPHERE
+from torchrl_loco.sim.compiled.dynamics import MINVAL, Dynamics, Poses, constant_matrix
 from torchrl_loco.sim.compiled.symbols import (
     Block,
     Scalar,

@@ -22,8 +22,16 @@ Found = dict[str, list[str]]
 
 
 def unsupported(m: mujoco.MjModel) -> list[str]:
-    """Returns what a model needs that the compiled step does not have, in words; an empty list if nothing."""
-    found = [*_options(m), *_elements(m), *_joints(m), *_actuators(m), *_contacts(m), *_sensors(m)]
+    """Returns what a model needs that the compiled step does not have, in words; an empty list if nothing.
+
+    It raises nothing: what cannot be read is not supported.
+    """
+    found: list[str] = []
+    for part in (_options, _elements, _joints, _actuators, _contacts, _sensors):
+        try:
+            found += part(m)
+        except Exception as error:  # a kind of element that nobody has thought of
+            found.append(f"{part.__name__[1:]} of an unknown kind ({type(error).__name__}: {error})")
     return found or _size(m)
 
 
@@ -95,8 +103,10 @@ def _joints(m: mujoco.MjModel) -> list[str]:
 
 def _actuators(m: mujoco.MjModel) -> list[str]:
     found: Found = {}
-    for i in range(m.nu):
+    for i in range(m.nactuator):  # not nu: an actuator may have several controls
         name, joint = m.actuator(i).name, m.actuator_trnid[i, 0]
+        if m.actuator_ctrlnum[i] != 1:
+            found.setdefault("other than one control", []).append(name)
         if m.actuator_trntype[i] != int(mujoco.mjtTrn.mjTRN_JOINT) or m.jnt_type[joint] in (FREE, BALL):
             found.setdefault("a transmission other than a hinge or slide", []).append(name)
         if m.actuator_dyntype[i] != int(mujoco.mjtDyn.mjDYN_NONE):

@@ -51,7 +51,7 @@ class Scalar:
             return NotImplemented
         a, b = self, scalar(other)
         if a.constant is not None and b.constant is not None:
-            return scalar(a.constant + b.constant)
+            return _sum(a.constant, b.constant)
         if a.constant == 0:
             return b
         if b.constant == 0:
@@ -69,7 +69,7 @@ class Scalar:
             return NotImplemented
         a, b = self, scalar(other)
         if a.constant is not None and b.constant is not None:
-            return scalar(a.constant - b.constant)
+            return _sum(a.constant, -b.constant)
         if b.constant == 0:
             return a
         if a.constant == 0:
@@ -133,13 +133,25 @@ class Scalar:
         return f"Scalar({self.op!r}, {', '.join(map(repr, self.args))})"
 
 
+ROUNDING = 1e-14
+"""What is left of numbers that cancel, relative to them."""
+
+
 def scalar(x: Any) -> Scalar:
-    """Returns ``x`` as a scalar. Numbers within rounding of an integer become that integer, so that 0 and 1 fold."""
+    """Returns ``x`` as a scalar. Numbers within rounding of an integer become that integer, so that 1 folds.
+
+    That is not so of zero, of which nothing is within rounding: a small number may be all that there is.
+    """
     if isinstance(x, Scalar):
         return x
     x = float(x)
     nearest = float(round(x)) if abs(x) < 1e15 else x
-    return Scalar("const", nearest if abs(x - nearest) < 1e-14 else x)
+    return Scalar("const", nearest if nearest and abs(x - nearest) < ROUNDING else x + 0.0)  # + 0.0: no negative zero
+
+
+def _sum(a: float, b: float) -> Scalar:
+    """Returns the sum of two constants, which is zero where they cancel."""
+    return scalar(0 if abs(a + b) < ROUNDING * max(abs(a), abs(b)) else a + b)
 
 
 def name(text: str) -> Scalar:
@@ -205,8 +217,15 @@ def select(left: Any, comparison: str, right: Any, if_true: Any, if_false: Any) 
 
 # Arrays of scalars.
 
-array: Callable[..., np.ndarray] = np.vectorize(scalar, otypes=[object])
-"""Returns numbers as an array of scalars."""
+_scalars: Callable[..., np.ndarray] = np.vectorize(scalar, otypes=[object])
+
+
+def array(x: Any) -> np.ndarray:
+    """Returns numbers as an array of scalars, zero where rounding left something else beside the largest of them."""
+    numbers = np.asarray(x)
+    if numbers.dtype != object and numbers.size:
+        numbers = np.where(np.abs(numbers) < ROUNDING * np.abs(numbers).max(), 0.0, numbers)
+    return _scalars(numbers)
 
 
 def zeros(*shape: int) -> np.ndarray:

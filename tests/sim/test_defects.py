@@ -1,0 +1,367 @@
+"""Wrong answers that were found in the compiled step, one by one, and what it refuses since."""
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+from evaluate import evaluate
+from test_random_models import c_data, c_step, compiled_step
+
+from torchrl_loco.config import SimConfig
+from torchrl_loco.sim.compiled import collision, lanes, step, unsupported
+from torchrl_loco.sim.compiled.constraints import Softness
+from torchrl_loco.sim.compiled.engine import Chain, _kernel
+from torchrl_loco.sim.compiled.symbols import array, names, scalar
+from torchrl_loco.sim.overflow import Overflow
+from torchrl_loco.sim.simulation import choose_engine
+
+LIMBS = """
+<mujoco>
+  <option timestep="0.004" iterations="100" ls_iterations="50"/>
+  <compiler angle="radian"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 .1"/>
+    <body name="a" pos="0 0 .35"><freejoint/><geom name="ga" type="sphere" size=".1" density="500"/>
+      <body name="b" pos=".15 0 0"><joint name="h1" axis="0 1 0" damping=".2" armature=".01"/>
+        <geom name="gb" type="capsule" size=".04 .1" pos=".1 0 0" euler="0 1.2 0" density="500"/>
+        <body name="c" pos=".25 0 0"><joint name="h2" axis="0 0.3 1" damping=".1" armature=".01"/>
+          <geom name="gc" type="sphere" size=".06" pos=".08 0 0" density="700"/></body></body></body>
+  </worldbody>
+  <actuator>
+    <motor name="m1" joint="h1" gear="2" ctrlrange="-1 1"/>
+    <position name="m2" joint="h2" kp="3" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+"""A sphere with a limb of two hinges over a floor."""
+
+
+@pytest.fixture(params=[31, 0], ids=["traced", "lanes"], autouse=True)
+def form(request, monkeypatch):
+    """Takes one of the two forms of the compiled step for any model; compiled without optimisation, it is quick."""
+    monkeypatch.setattr(step, "TRACED_DOFS", request.param)
+    monkeypatch.setattr(wp.config, "optimization_level", 0)
+    return "traced" if request.param else "lanes"
+
+
+def limbs(*replaced):
+    """Returns the model with some of its text replaced."""
+    xml = LIMBS
+    for old, new in replaced:
+        assert old in xml
+        xml = xml.replace(old, new)
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def falling(model, count=12, seed=0):
+    """Returns float32 states in which a model has been falling for a while: qpos, qvel, qacc_warmstart and ctrl."""
+    rng, data, rows = np.random.default_rng(seed), mujoco.MjData(model), []
+    for _ in range(count):
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_integratePos(model, data.qpos, 0.3 * rng.normal(size=model.nv), 1.0)
+        data.qvel[:] = rng.normal(size=model.nv)
+        data.ctrl[:] = rng.uniform(-1, 1, model.nu)
+        for _ in range(int(rng.integers(20, 120))):
+            mujoco.mj_step(model, data)
+        state = data.qpos, data.qvel, data.qacc_warmstart, data.ctrl
+        rows.append([x.astype(np.float32) for x in state])
+    return [np.array(column) for column in zip(*rows, strict=True)]
+
+
+def errors(model, states):
+    """Returns by how much the velocity of each state after a step differs from C MuJoCo's."""
+    assert unsupported(model) == []
+    reached = compiled_step(model, states).qvel.numpy()
+    expected = [c_step(model, *state) for state in zip(*states, strict=True)]
+    return np.abs(reached - np.array(expected)).max(axis=1)
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        '<pid name="m1" joint="h1" kp="2" ki="1"/>',
+        '<pid name="m1" joint="h1" kp="2"/>',
+        '<motor joint="h2"/><pid name="m1" joint="h1" kp="2" ki="1"/>',
+    ],
+)
+def test_an_actuator_with_several_controls_is_named(actuator):
+    """There are more controls than actuators."""
+    model = limbs(('<motor name="m1" joint="h1" gear="2" ctrlrange="-1 1"/>', actuator))
+    assert model.nu > model.nactuator
+    assert "actuator 'm1': other than one control" in unsupported(model)
+    config = SimConfig(
+        ctrl_dt=0.004,
+        sim_dt=0.004,
+        naconmax=64,
+        njmax=64,
+        iterations=10,
+        ls_iterations=10,
+        euler_damping=True,
+        engine="auto",
+    )
+    assert choose_engine(model, config)[0] == "mujoco_warp"
+
+
+def test_a_model_that_cannot_be_read_is_not_supported(monkeypatch):
+    monkeypatch.setattr("torchrl_loco.sim.compiled.support.pairs", lambda m: [][0])
+    assert unsupported(limbs()) == ["contacts of an unknown kind (IndexError: list index out of range)"]
+
+
+# What a step does.
+
+
+def test_actuators_of_a_disabled_group_do_not_act():
+    group = ('<motor name="m1"', '<motor name="m1" group="1"')
+    model = limbs(group, ('timestep="0.004"', 'timestep="0.004" actuatorgroupdisable="1"'))
+    states = falling(model)
+    assert np.median(errors(model, states)) < 1e-6
+    acting = [c_step(limbs(group), *state) for state in zip(*states, strict=True)]
+    assert np.abs(compiled_step(model, states).qvel.numpy() - np.array(acting)).max() > 0.1
+
+
+def test_a_light_body_is_moved():
+    """Its inertia is below what rounding leaves of one."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><option gravity="0 0 0"/><worldbody><body name="a"><joint name="h" axis="0 1 0" springref="1" '
+        'stiffness="1e-13"/><inertial pos="0 0 0" mass="1e-9" diaginertia="3e-15 3e-15 3e-15"/></body></worldbody>'
+        '<actuator><motor joint="h" gear="1e-13"/></actuator></mujoco>'
+    )
+    states = [np.array([[0.3], [-0.2]]), np.array([[0.0], [0.5]]), np.zeros((2, 1)), np.array([[0.0], [2.0]])]
+    states = [x.astype(np.float32) for x in states]
+    expected = np.array([c_step(model, *state) for state in zip(*states, strict=True)])
+    assert np.abs(expected).min() > 0.01
+    np.testing.assert_allclose(compiled_step(model, states).qvel.numpy(), expected, rtol=1e-5)
+
+
+def test_joints_that_do_the_same_are_traced():
+    """The mass matrix is singular, which is C MuJoCo's to warn of; constants of it are not divided by zero."""
+    joints = '<joint axis="0 0 1"/><joint axis="0 0 1"/>'
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><body name="a">{joints}<geom type="sphere" size="0.1"/></body></worldbody></mujoco>'
+    )
+    assert unsupported(model) == []
+    assert step.source(model, 1)
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder", "capsule", "ellipsoid", "sphere"])
+def test_a_site_beside_a_contact_feels_nothing(shape):
+    """The ray of a contact along an axis of the site runs beside it, as long as it may be."""
+    sites = [f'<site name="s{i}" type="{shape}" size=".12 .12 .12" pos="{i} 0 0"/>' for i in range(2)]
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body name="a" pos="0 0 .0999"><joint type="slide" '
+        f'axis="0 0 1"/><geom size=".1"/>{"".join(sites)}</body></worldbody><sensor><subtreelinvel body="a"/>'
+        '<touch site="s0"/><touch site="s1"/></sensor></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    assert data.sensordata[3] > 1.0
+    assert data.sensordata[4] == 0.0
+    sim = compiled_step(model, [np.zeros((1, size), np.float32) for size in (1, 1, 1, 0)])
+    np.testing.assert_allclose(sim.data.sensordata.numpy()[0, 3:], data.sensordata[3:], rtol=1e-3)
+
+
+def test_numbers_are_not_rounded_to_zero():
+    assert scalar(1e-15).constant == 1e-15
+    assert scalar(1 - 1e-15).constant == 1.0
+    assert (scalar(0.3) - scalar(0.1) - scalar(0.2)).constant == 0.0
+    assert [x.constant for x in array([1e-16, 3.0])] == [0.0, 3.0]
+    assert [x.constant for x in array([1e-16, 3e-15])] == [1e-16, 3e-15]
+    softness = Softness.make(limbs(), (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0))
+    assert float(evaluate(softness.row(1e-30, scalar(-0.1))[0], {})) == pytest.approx(1e15)
+
+
+@pytest.mark.parametrize("solref", [".05 -10", "-1000 1", "0 1", ".02 0", "0 0", "-500 0"])
+def test_a_solref_that_mixes_its_formats_is_the_default(solref):
+    """Of contacts, limits and dry friction."""
+    joint = f'<joint solreflimit="{solref}" solreffriction="{solref}" frictionloss=".1" range="-.2 .2" limited="true"/>'
+    model = limbs(("<worldbody>", f'<default><geom solref="{solref}"/>{joint}</default><worldbody>'))
+    states = falling(limbs())
+    states[0][:, 7] += 0.5
+    assert errors(model, states).max() < 1e-3
+
+
+def test_a_joint_may_be_near_both_its_limits():
+    """Each is a row of its own where the margin exceeds half the range. Other joints have one, whichever is nearer."""
+    near = '<joint name="h1" range="-.05 .05" limited="true" margin=".1"'
+    far = '<joint name="h2" range="-.2 .3" limited="true" margin=".1"'
+    model = limbs(('<joint name="h1"', near), ('<joint name="h2"', far))
+    states = falling(model, count=30)
+    kinds = []
+    for state in zip(*states, strict=True):
+        data = c_data(model, *state)
+        mujoco.mj_forward(model, data)
+        kinds.append(data.efc_id[data.efc_type == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT].tolist())
+    assert [1, 1] in kinds
+    assert [1, 1, 2] in kinds
+    assert errors(model, states).max() < 1e-3
+
+
+TILTED = """
+<mujoco>
+  <option timestep="0.002" iterations="100" ls_iterations="50"/>
+  <worldbody>
+    <geom type="plane" size="5 5 .1" euler="{plane}"/>
+    <body name="a" pos="0 0 .3"><freejoint/><geom type="capsule" size=".05 .2" euler="{capsule}"/></body>
+  </worldbody>
+</mujoco>
+"""
+"""A capsule on a plane, within 30 degrees of its normal in the first cases."""
+CASES = [
+    ("25 0 0", "35 5 0"),
+    ("50 0 0", "45 5 0"),
+    ("-40 20 0", "-30 20 0"),
+    ("90 0 0", "80 10 0"),
+    ("0 0 0", "20 15 0"),
+    ("0 0 0", "2 -1 0"),
+    ("0 0 0", "60 5 0"),
+    ("0 70 0", "0 10 20"),
+]
+
+
+def leaning(plane, capsule, count=8):
+    """Returns the model, and states in which an end of the capsule slides, pressed in by 1 mm."""
+    model, rng, rows = (
+        mujoco.MjModel.from_xml_string(TILTED.format(plane=plane, capsule=capsule)),
+        np.random.default_rng(0),
+        [],
+    )
+    for _ in range(count):
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        normal, axis = (x.reshape(3, 3)[:, 2] for x in data.geom_xmat)
+        lowest = min((data.geom_xpos[1] + end * axis) @ normal for end in (-0.2, 0.2)) - 0.05
+        data.qpos[:3] -= normal * (lowest + 0.001)
+        data.qvel[:] = 0.5 * rng.normal(size=6)
+        rows.append([x.astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)])
+    return model, [np.array(column) for column in zip(*rows, strict=True)]
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.0, -0.4, 0.9), (0.6, 0.7, -0.2), (0.0, 1.0, 0.0)])
+def test_tangents_are_normal_to_a_tilted_plane(normal):
+    """Of a capsule along the normal, which gives no direction."""
+    normal = np.array(normal) / np.linalg.norm(normal)
+    axis = normal + 1e-8 * np.array([1.0, -2.0, 3.0])
+    tangent = evaluate(
+        collision.frame(array(normal), np.array(names("axis", 3), dtype=object)),
+        {f"axis[{i}]": axis[i] for i in range(3)},
+    )
+    assert normal @ tangent == pytest.approx(0, abs=1e-12)
+    assert np.linalg.norm(tangent) == pytest.approx(1)
+
+
+# What fits the shared memory of a GPU.
+
+SIZES = range(17, 65)
+
+
+def bristly(dofs, condim=3, touch=0):
+    """Returns a sphere with limbs of up to three hinges, that touch each other and the floor."""
+    limbs, left = [], dofs - 6
+    while left > 0:
+        angle, limb = 0.3 * len(limbs), ""
+        for joint in reversed(range(min(3, left))):
+            place = "0.12 0 0" if joint else f"{0.14 * np.cos(angle):.4f} {0.14 * np.sin(angle):.4f} 0"
+            limb = (
+                f'<body pos="{place}"><joint axis="0 {joint % 2} {1 - joint % 2}" range="-1 1" limited="true"/>'
+                f'<geom type="capsule" size=".03" fromto="0 0 0 .1 0 0" condim="{condim}"/>{limb}</body>'
+            )
+        limbs.append(limb)
+        left -= 3
+    sensors = '<touch site="s"/>' * touch
+    return mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .5"><freejoint/><geom size=".12" '
+        f'condim="{condim}"/><site name="s"/>{"".join(limbs)}</body></worldbody><sensor>{sensors}</sensor></mujoco>'
+    )
+
+
+KINDS = [{}, {"condim": 1}, {"touch": 1}]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+def test_worlds_and_what_warp_adds_fit_a_block(kind):
+    """Warp takes 4 bytes for each thread."""
+    for dofs in SIZES:
+        description = lanes.Description(bristly(dofs, **kind))
+        worlds = description.worlds_per_block()
+        assert worlds * (description.layout.bytes + 4 * 32) <= 48 * 1024, dofs
+
+
+def wide(model):
+    """Returns the C++ in which the state of a world is declared, and its size checked."""
+    text = lanes.source(model, 1)
+    head, check = text.split("// ---- One substep")[0], 'static_assert(sizeof(World) == Model::WORLD_BYTES, "size");'
+    return (
+        f"{{\n{head}\n{check}\n}}\n#undef INLINE\n#undef ROLLED\n#undef UNROLLED\n#undef OWN_DOFS\n#undef SHARED_LOOP\n"
+    )
+
+
+@pytest.mark.parametrize("form", [0], indirect=True, ids=["lanes"])
+def test_the_size_of_a_world_is_what_its_layout_says(form):
+    """Of every number of degrees of freedom; what a model of lanes compiles to checks it too."""
+    models = [bristly(dofs, **KINDS[dofs % 3]) for dofs in SIZES]
+
+    @wp.func_native("\n".join(map(wide, [*models, limbs()])))
+    def declare(x: int): ...
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sizes():
+        declare(wp.tid())
+
+    wp.launch(sizes, dim=1, device="cpu")
+    assert "static_assert(sizeof(World)" in lanes.source(models[0], 1)
+
+
+@pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="Warp was built without NVRTC")
+@pytest.mark.parametrize("form", [0], indirect=True, ids=["lanes"])
+@pytest.mark.parametrize(
+    ("dofs", "kind"), [(18, {}), (30, {}), (30, {"condim": 1}), (52, {"touch": 1}), (64, {})], ids=str
+)
+def test_a_body_builds_for_a_gpu(form, dofs, kind, tmp_path, monkeypatch):
+    """NVRTC needs no GPU; ptxas counts the shared memory."""
+    monkeypatch.setattr(wp.config, "optimization_level", None)
+    model = bristly(dofs, **kind)
+    assert unsupported(model) == []
+    start, end = Chain(()), Chain(())
+    kernel = _kernel(step.source(model, 1), start.func, start.struct, end.func, end.struct)
+    kernel.module.options["block_dim"] = 32 * lanes.worlds_per_block(model)
+    (built,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=False, strip_hash=True)
+    assert built.suffix == ".cubin"
+
+
+@pytest.mark.parametrize(("friction", "most"), [(0.01, 5e-3), (0.001, 2e-3)])
+def test_a_slippery_floor_is_no_stiffer_than_single_precision(friction, most):
+    """Stiffness grows with the inverse square of friction."""
+    model = limbs(("<worldbody>", f'<default><geom friction="{friction}"/></default><worldbody>'))
+    found = errors(model, falling(model, count=60))
+    assert found.max() < most
+    assert np.quantile(found, 0.9) < 5e-4
+
+
+def test_the_limit_of_iterations_is_flagged_where_it_is_reached():
+    """One iteration fewer than a world needs is flagged, as many are not, and give what more of them give."""
+    model, reached, flags = limbs(), [], []
+    states = falling(model, count=40)
+    for iterations in [*range(1, 9), 100]:
+        model.opt.iterations = iterations
+        sim = compiled_step(model, states)
+        reached.append(sim.qacc_warmstart.numpy().copy())
+        flags.append((sim.overflow.numpy() & int(Overflow.ITERATIONS)) != 0)
+        assert not (sim.overflow.numpy() & ~int(Overflow.ITERATIONS)).any()
+    flags = np.array(flags)
+    assert not flags[-1].any()
+    assert (flags[1:] <= flags[:-1]).all()  # more of them suffice where fewer do
+    assert flags[0].sum() > flags[2].sum() > 0
+    final = [(rows == reached[-1]).all(axis=1) for rows in reached]
+    for flagged, same in zip(flags, final, strict=True):
+        assert same[~flagged].all()
+    assert not final[0][flags[0]].all()
+
+
+@pytest.mark.parametrize(("plane", "capsule"), CASES)
+def test_a_capsule_orients_the_frame_of_its_contact(plane, capsule, monkeypatch):
+    """However steep it is, and however tilted the plane."""
+    monkeypatch.setattr(collision, "UPRIGHT", 1e-6)  # C MuJoCo's rule
+    assert errors(*leaning(plane, capsule)).max() < 2e-5
