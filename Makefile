@@ -15,6 +15,7 @@ help:  ## this list
 
 train: $(VENV)/installed  ## train a policy; TASK=walker_walk ARGS="--seed 1" to change what
 	$(BIN)/torchrl-loco train $(TASK) $(ARGS)
+	@echo "next: see learning_curve.png and video.mp4 in that folder, or watch the policy: $(BIN)/torchrl-loco play FOLDER"
 
 test: lint tests  ## style, types and the tests, on real physics
 
@@ -55,9 +56,10 @@ notebooks: $(VENV)/installed  ## run the notebooks and store their output; NOTEB
 
 # PIP_ARGS can constrain versions, for example to a CPU build of torch: make test PIP_ARGS="torch==2.13.0"
 $(VENV)/installed: pyproject.toml
+	@echo "setting up $(VENV): pip downloads torch and others, with CUDA some gigabytes, and takes minutes"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --editable ".[dev]"
+	$(BIN)/python -m pip install $(PIP_ARGS) --editable ".[dev]"
 	touch $@
 
 $(VENV)/installed-ci: $(VENV)/installed

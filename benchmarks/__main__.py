@@ -9,7 +9,6 @@ from benchmarks.cases import CASES, INTERRUPTED, LEARNING, VARIANTS
 from benchmarks.results import save, show
 from benchmarks.tasks import TASKS
 from torchrl_loco import list_envs
-from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.policy import shipped_policies
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
@@ -63,53 +62,16 @@ spread.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_
 spread.add_argument("--gpus", type=int, nargs="+", default=[1, 2], help="numbers of GPUs, or of processes on the CPU")
 spread.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 spread.add_argument("--out", type=Path, help="file for the results as JSON")
-several = commands.add_parser("campaign", help="train tasks in protocols with seeds; call it again to continue")
-several.add_argument("--folder", type=Path, required=True, help="where everything is written, and continued")
-several.add_argument("--tasks", nargs="+", choices=list_envs(), help="default: those with a preset of their own")
-several.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
-several.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-several.add_argument("--minutes", type=float, help="time after which all must be written, from the process's start on")
-several.add_argument(
-    "--devices",
-    nargs="+",
-    help="cuda:0, cuda:1, ..., cpu: each trains one job at a time; name it twice for two; default: all GPUs",
-)
-several.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of train, for all jobs")
-several.add_argument("--pack", type=Path, metavar="FILE.tgz", help="write the folder as an archive every minute, too")
-table = commands.add_parser("table", help="a campaign's results beside marks and published returns")
-table.add_argument("folder", type=Path)
-draw = commands.add_parser("plot", help="draw throughput or return from the JSON, or returns from a campaign's folder")
+draw = commands.add_parser("plot", help="draw throughput or return from the JSON, or a folder of stored runs")
 draw.add_argument("results", type=Path)
 draw.add_argument("picture", type=Path)
 
 args = parser.parse_args()
-if args.command in ("campaign", "table", "plot"):
-    failed = False
-    try:
-        if args.command == "plot":
-            from benchmarks.plot import plot
+if args.command == "plot":
+    from benchmarks.plot import plot
 
-            plot(args.results, args.picture)
-            raise SystemExit
-        if args.command == "campaign":
-            from benchmarks.campaign import TUNED, campaign, parse_setting
-
-            failed = campaign(
-                args.folder,
-                args.tasks or TUNED,
-                args.protocols,
-                args.seeds,
-                dict(map(parse_setting, args.set)),
-                args.devices,
-                args.minutes,
-                args.pack,
-            )
-        from benchmarks.marks import COLUMNS, learning
-
-        show(learning(args.folder), COLUMNS)
-    except (ValueError, FileNotFoundError, BlockingIOError) as error:
-        parser.error(str(error))
-    raise SystemExit(failed)
+    plot(args.results, args.picture)
+    raise SystemExit
 if args.command == "throughput":
     from benchmarks.throughput import COLUMNS, PHASES, phases, throughput
 

@@ -11,7 +11,7 @@ matplotlib.use("agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
-from benchmarks.marks import MARKS, read
+from benchmarks.published import PUBLISHED, read
 from benchmarks.results import Row
 
 COLORS = {"playground": "C0", "dm_control": "C1"}
@@ -21,10 +21,10 @@ COLORS = {"playground": "C0", "dm_control": "C1"}
 def plot(results: Path, picture: Path) -> None:
     """Draws the rows of a results file, a panel for each body or task and a line for each case or trainer.
 
-    Of a campaign's folder it draws the returns, a panel for each task and a line for each seed.
+    Of a folder with an ``evaluations.csv`` it draws the returns, a panel for each task and a line for each seed.
     """
     if results.is_dir():
-        plot_campaign(results, picture)
+        plot_runs(results, picture)
         return
     data = json.loads(results.read_text())
     panel, draw = next((panel, draw) for key, panel, draw in KINDS if key in data["rows"][0])
@@ -79,13 +79,11 @@ KINDS = (("gpus", "task", draw_scaling), ("trainer", "task", draw_returns), ("wo
 """A key of the rows of each kind of results, what makes a panel, and what draws it."""
 
 
-def plot_campaign(folder: Path, picture: Path) -> None:
-    """Draws the return of every job's evaluations against training time, and published returns as dashed lines."""
+def plot_runs(folder: Path, picture: Path) -> None:
+    """Draws the return of every run's evaluations against training time, and published returns as dashed lines."""
     rows = read(folder, "evaluations.csv")
     found = distinct(rows, "task")
-    if not rows:
-        raise ValueError(f"there are no evaluations in {folder} yet")
-    tasks = [task for task in dict.fromkeys([*(task for task, _ in MARKS), *found]) if task in found]
+    tasks = [task for task in dict.fromkeys([*(task for task, _ in PUBLISHED), *found]) if task in found]
     columns = min(3, len(tasks))
     shape = (math.ceil(len(tasks) / columns), columns)
     figure, panels = plt.subplots(*shape, figsize=(4.5 * columns, 3.4 * shape[0]), squeeze=False, layout="constrained")
@@ -107,9 +105,9 @@ def draw_task(axes: Axes, task: str, rows: Sequence[Row]) -> None:
             found = [(float(row["seconds"]), float(row["mean"])) for row in of_protocol if row["seed"] == seed]
             label = f"{protocol}, seed {', '.join(seeds)}" if seed == seeds[0] else None
             axes.plot(*zip(*found, strict=True), "o-", markersize=2, linewidth=1, color=color, label=label)
-        mark = MARKS.get((task, protocol))
-        if mark is not None and mark.published is not None:
-            axes.axhline(mark.published, color=color, linestyle="--", linewidth=1, label=f"{mark.by} {mark.published}")
+        if (task, protocol) in PUBLISHED:
+            published, by = PUBLISHED[task, protocol]
+            axes.axhline(published, color=color, linestyle="--", linewidth=1, label=f"{by} {published}")
     axes.set_xlim(left=0)
     axes.legend(loc="lower right", fontsize="small")
 

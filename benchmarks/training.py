@@ -1,11 +1,10 @@
 """Time to a return, from the start of the process, beside Brax's PPO on Playground on the same device."""
 
-import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -48,8 +47,10 @@ def ours(task: str, device: torch.device, frames: int) -> list[Row]:
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as out:
         settings = {"device": device, "total_frames": frames, "eval_interval": frames // EVALUATIONS}
+        settings |= {"video_seconds": 0, "out": out}
+        options = [f"--{name}={value}" for name, value in settings.items()]
         started = time.time()
-        process = subprocess.Popen(train_command(task, {**settings, "video_seconds": 0, "out": out}), env=os.environ)
+        process = subprocess.Popen([sys.executable, "-m", "torchrl_loco", "train", task, *options])
         while process.poll() is None:
             time.sleep(0.05)
             for row in evaluations(Path(out))[len(rows) :]:
@@ -58,15 +59,6 @@ def ours(task: str, device: torch.device, frames: int) -> list[Row]:
         if process.returncode:
             raise MeasurementError(f"training {task} ended with status {process.returncode}")
     return rows
-
-
-def train_command(task: str, settings: Mapping[str, object]) -> list[str]:
-    """Returns the command that trains a task with these settings; blanks separate several values of one."""
-    command = [sys.executable, "-m", "torchrl_loco", "train", task]
-    for name, value in settings.items():
-        words = str(value).split()
-        command += [f"--{name}", *words] if len(words) > 1 else [f"--{name}={value}"]
-    return command
 
 
 def evaluations(out: Path) -> list[Row]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -102,8 +103,12 @@ def test_devices(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     assert checks.check_device(None) == checks.check_device(torch.device("cpu")) == torch.device("cpu")
     for value in ("cuda", "cuda:0", "tpu", "", 5, ["cpu"]):
-        with pytest.raises(ValueError, match=r"on this machine: choose one of cpu$"):
+        with pytest.raises(ValueError, match=r"on this machine.*: choose one of cpu$"):
             checks.check_device(value)
+    for version, why in ((None, "torch is built without CUDA"), ("12.8", "torch is built for CUDA 12.8, but")):
+        monkeypatch.setattr(torch.version, "cuda", version)
+        with pytest.raises(ValueError, match=re.escape(f"no device 'cuda' on this machine ({why}")):
+            checks.check_device("cuda")
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
     assert checks.check_device(None) == checks.check_device("cuda") == torch.device("cuda:1")

@@ -9,11 +9,25 @@ from torchrl_loco import cli, doctor
 
 
 def test_healthy(capsys):
+    """By default it compiles one body, and says so; another one can be named, by one of its tasks too."""
     assert cli.main(["doctor"]) == 0
     out = capsys.readouterr().out
-    for subject in ("torch ", "mujoco-warp", "kernel cache", "walker on cpu", "humanoid on cpu", "verdict: everything"):
+    for subject in (
+        "torch ",
+        "mujoco-warp",
+        "kernel cache",
+        "of walker: compiles",
+        "walker on cpu",
+        "verdict: every",
+    ):
         assert subject in out
     assert "problems" not in out
+    assert "humanoid" not in out
+    assert cli.main(["doctor", "walker_run"]) == 0
+    assert "walker_run on cpu" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["doctor", "humanoit"])
+    assert "unknown body or task 'humanoit', did you mean 'humanoid'" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -29,7 +43,7 @@ def test_wrong_physics(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "make", spoilt)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     with pytest.raises(SystemExit, match="1"):
-        cli.main(["doctor"])
+        cli.main(["doctor", "all"])
     out = capsys.readouterr().out
     assert out.count("WRONG: differs") == len(MODELS) + 1  # the dog of the tests is registered too
     assert "verdict: problems with cheetah on cpu, hopper on cpu" in out
@@ -42,7 +56,7 @@ def test_a_body_that_fails_does_not_hide_the_others(monkeypatch):
         return 0.0, 0.0, "compiled"
 
     monkeypatch.setattr(doctor, "self_test", self_test)
-    findings = {finding.subject: finding for finding in doctor.diagnose()}
+    findings = {finding.subject: finding for finding in doctor.diagnose("all")}
     assert findings["walker on cpu"].problem
     assert "no compiler" in findings["walker on cpu"].text
     assert not findings["humanoid on cpu"].problem

@@ -154,8 +154,18 @@ def check_device(device: "torch.device | str | None") -> "torch.device":
     if name == "cuda" and cuda:
         name = f"cuda:{torch.cuda.current_device()}"
     if name not in ("cpu", *cuda):
-        raise ValueError(f"no device {str(device)!r} on this machine: choose one of {', '.join(['cpu', *cuda])}")
+        why = "" if cuda or not name.startswith("cuda") else f" ({why_no_cuda()})"
+        raise ValueError(f"no device {str(device)!r} on this machine{why}: choose one of {', '.join(['cpu', *cuda])}")
     return torch.device(name)
+
+
+def why_no_cuda() -> str:
+    """Returns why torch finds no CUDA device."""
+    import torch
+
+    if torch.version.cuda is None:
+        return "torch is built without CUDA, pytorch.org has builds with it"
+    return f"torch is built for CUDA {torch.version.cuda}, but finds no driver or no device, nvidia-smi says more"
 
 
 def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> Path:

@@ -16,10 +16,12 @@ import warp as wp
 from tqdm.auto import trange
 
 import torchrl_loco
+from torchrl_loco.checks import check_choice, why_no_cuda
 from torchrl_loco.envs import State
 from torchrl_loco.registry import env_class, list_envs, make
 from torchrl_loco.sim.mujoco_warp import with_margin
 from torchrl_loco.sim.simulation import free_memory
+from torchrl_loco.sim.warp_init import init_warp
 
 PACKAGES = ("torch", "torchrl", "tensordict", "warp-lang", "mujoco-warp", "mujoco")
 TOLERANCE = 1e-4
@@ -35,15 +37,32 @@ class Finding:
     problem: bool = False
 
 
-def diagnose() -> Iterator[Finding]:
-    """Looks at versions, devices and the kernel cache, and tests the physics of each body on each device.
+def diagnose(body: str = "walker") -> Iterator[Finding]:
+    """Looks at versions, devices and the kernel cache, and tests the physics of a body on each device.
 
     The self-test of a body plays 20 random control steps in 4 worlds, each step also in C MuJoCo, which computes in
-    double precision, from the same state. Bodies of plug-ins are tested too.
+    double precision, from the same state.
+
+    Args:
+        body: the body, or a task; ``"all"`` takes every body, those of plug-ins too.
 
     Yields:
         What was found, line by line.
+
+    Raises:
+        ValueError: there is no such body or task.
     """
+    tasks: dict[str, str] = {}
+    broken = []
+    for task in list_envs():
+        try:
+            tasks.setdefault(env_class(task).body or task, task)  # one of a body is enough
+        except ImportError as error:
+            broken.append(Finding(task, str(error), problem=True))
+    if body in tasks:
+        tasks = {body: tasks[body]}
+    elif body != "all":
+        tasks = {body: check_choice("body or task", body, list_envs(), also=[*tasks, "all"])}
     yield Finding("python", f"{platform.python_version()} on {platform.platform()}")
     yield Finding("torchrl-loco", torchrl_loco.__version__)
     for name in PACKAGES:
@@ -55,19 +74,17 @@ def diagnose() -> Iterator[Finding]:
         free = _gib(free_memory(torch.device(device)))
         yield Finding(device, f"{name}, {free} free, CUDA {torch.version.cuda}")
     if len(devices) == 1:
-        why = "this torch is built without CUDA" if torch.version.cuda is None else "torch finds no driver or no device"
-        yield Finding("cuda", f"none: {why}")
+        yield Finding("cuda", f"none: {why_no_cuda()}")
     try:
         yield Finding("kernel cache", _describe_cache())
     except OSError as error:
         yield Finding("kernel cache", f"{error}: name a writable folder in WARP_CACHE_PATH", problem=True)
         return
-    tasks: dict[str, str] = {}
-    for task in list_envs():
-        try:
-            tasks.setdefault(env_class(task).body or task, task)  # one of a body is enough
-        except ImportError as error:
-            yield Finding(task, str(error), problem=True)
+    yield from broken
+    yield Finding(
+        "self-test",
+        f"of {', '.join(tasks)}: compiles what the kernel cache lacks, for up to half a minute a body and device",
+    )
     for device in devices:
         for body, task in tasks.items():
             try:
@@ -87,7 +104,7 @@ def _gib(size: float) -> str:
 
 
 def _describe_cache() -> str:
-    wp.init()  # else there is no folder yet
+    init_warp()  # else there is no folder yet
     folder = Path(wp.config.kernel_cache_dir)
     modules, size = set(), 0
     for name, _, files in os.walk(folder):

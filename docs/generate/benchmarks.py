@@ -5,8 +5,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from benchmarks.marks import COLUMNS, learning
 from benchmarks.plot import plot
+from benchmarks.published import COLUMNS, learning
 from generate.markdown import table
 
 Row = dict[str, Any]
@@ -19,7 +19,7 @@ def all_results(results: Path, pictures: Path) -> str:
 
     Args:
         results: the folder benchmarks/results.
-        pictures: a folder below docs/, into which the pictures of campaigns are drawn.
+        pictures: a folder below docs/, into which the pictures of training runs are drawn.
     """
     folders = sorted((path for path in results.iterdir() if path.is_dir()), reverse=True)
     return "\n".join(_folder(folder, results.parent.parent, pictures) for folder in folders)
@@ -28,9 +28,9 @@ def all_results(results: Path, pictures: Path) -> str:
 def _folder(folder: Path, root: Path, pictures: Path) -> str:
     date, device = folder.name[:10], folder.name[11:]
     parts = [f"## {device}, {date}\n"]
-    campaigns = sorted(path.parent for path in folder.rglob("about.json"))
-    parts += [_campaign(path, root, pictures / f"{folder.name}-{path.name}.png") for path in campaigns]
-    for path in sorted(path for path in folder.rglob("*") if path.parent not in campaigns):
+    trained = sorted(path.parent for path in folder.rglob("about.json"))
+    parts += [_runs(path, root, pictures / f"{folder.name}-{path.name}.png") for path in trained]
+    for path in sorted(path for path in folder.rglob("*") if path.parent not in trained):
         link = f"../{path.relative_to(root).as_posix()}"
         heading = f"### {path.relative_to(folder).with_suffix('').as_posix().replace('/', ', ')}\n"
         if path.suffix == ".json":
@@ -46,8 +46,8 @@ def _folder(folder: Path, root: Path, pictures: Path) -> str:
     return "\n".join(parts)
 
 
-def _campaign(folder: Path, root: Path, picture: Path) -> str:
-    """Returns table and picture of a campaign, and draws the picture."""
+def _runs(folder: Path, root: Path, picture: Path) -> str:
+    """Returns table and picture of a folder of training runs, and draws the picture."""
     calls = json.loads((folder / "about.json").read_text())
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot(folder, picture)
@@ -60,7 +60,7 @@ def _campaign(folder: Path, root: Path, picture: Path) -> str:
     how = "".join(f"`{call['command']}`: {call['devices']} x {call['device']}, {call['date']}\n\n" for call in calls)
     notes = "".join(f"{note}\n\n" for note in dict.fromkeys(call["note"] for call in calls if "note" in call))
     return (
-        f"### {folder.name}\n\nThe best policy of each seed in new episodes, beside marks and published returns:\n\n"
+        f"### {folder.name}\n\nThe best policy of each seed in new episodes, beside published returns:\n\n"
         f"{notes}{table(tuple(COLUMNS), lines)}\n"
         f"![Return against training time]({picture.relative_to(root / 'docs').as_posix()})\n\n"
         f"{how}All numbers: {links}.\n"

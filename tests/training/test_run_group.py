@@ -5,14 +5,12 @@ import re
 import signal
 
 import pytest
-import torch
 from compare import assert_same
 from small_runs import SMALL, networks, trained
 
 from torchrl_loco import cli
 from torchrl_loco.training import RunFolder, RunGroup, preset
 from torchrl_loco.training.algorithm import Algorithm
-from torchrl_loco.training.evaluation import Evaluator
 
 
 def group_of(out, *seeds, **settings):
@@ -132,15 +130,6 @@ def test_ctrl_c_stops_all_seeds_and_resume_continues_them(tmp_path, monkeypatch,
     assert runs[1].path == stopped[1].path
     assert all(run.read_metrics()["frames"] == [128, 256] for run in runs.values())
     assert content(runs[0]) == first
-
-
-@pytest.mark.slow
-def test_poor_seeds_are_named(tmp_path, monkeypatch, capsys):
-    means = iter([5.0, 950.0, 5.0, 10.0, 5.0, 970.0])
-    monkeypatch.setattr(Evaluator, "__call__", lambda self, policy: torch.full((3,), next(means)))
-    group_of(tmp_path, 7, 0, 4).train()
-    report = capsys.readouterr().out.split("mean of 3 seeds: ")[1]
-    assert report == "643.3, from 10.0 to 970.0\n1 of 3 seeds stayed poor: 0\n"
 
 
 def test_wrong_seeds(tmp_path, capsys):

@@ -135,10 +135,18 @@ def test_interrupted_at_the_very_end(tmp_path, monkeypatch):
         Trainer(run, resume=True)
 
 
-def test_a_second_interrupt_does_not_wait(tmp_path, monkeypatch):
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_second_interrupt_does_not_wait(turned, tmp_path, monkeypatch):
+    """Also where it arrives in code that turns it into an error, as tensordict's ``with`` does."""
+
     def press_twice(self, batch, progress):
         signal.raise_signal(signal.SIGINT)
-        signal.raise_signal(signal.SIGINT)
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            if turned:
+                raise RuntimeError("Converting a tensordict to boolean value is not permitted") from None
+            raise
         raise AssertionError("the second one was swallowed")
 
     monkeypatch.setattr(Algorithm, "update", press_twice)
@@ -198,9 +206,7 @@ def test_the_best_policy_is_kept(tmp_path, monkeypatch, capsys):
     assert seeds[0] == seeds[1] == seeds[2] != seeds[3]
     out = capsys.readouterr().out
     assert "best policy, in new episodes: return 25.0" in out
-    assert "The return fell from 30.0 after 512 frames to 20.0 at the end" in out
-    assert "This return is poor: the policy shipped for walker_stand earns 9" in out
-    assert "--seed 1" in out
+    assert "the policy shipped for walker_stand earns 9" in out
 
 
 def test_returns_that_the_critic_cannot_represent_are_said(tmp_path, capsys):

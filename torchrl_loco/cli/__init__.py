@@ -3,6 +3,7 @@
 Modules that take seconds to import are imported where they are used, so that help and errors appear at once.
 """
 
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from typing import Annotated
@@ -23,6 +24,8 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         _run(sys.argv[1:] if args is None else list(args))
     except KeyboardInterrupt:
+        if args is None:  # the process ends: another Ctrl-C must not disturb that
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         print(f"{process_name()}: interrupted", file=sys.stderr)
         return 130
     return 0

@@ -15,10 +15,17 @@ def list_tasks() -> None:
         print(f"{name:<16} {words}")
 
 
-def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None = None) -> None:
+def diagnose(
+    body: tyro.conf.Positional[str] = "walker",
+    /,
+    size: str | None = None,
+    num_envs: int = 2048,
+    device: str | None = None,
+) -> None:
     """Print versions, devices and the kernel cache, and test the physics of each device against C MuJoCo.
 
     Args:
+        body: the body whose physics is compiled and tested, or a task; all for every body.
         size: a task: measure its njmax and naconmax instead.
         num_envs: number of worlds to measure with.
         device: where to measure; default: CUDA if there is any.
@@ -31,10 +38,11 @@ def diagnose(size: str | None = None, num_envs: int = 2048, device: str | None =
                 print(f"{name:<9} up to {needed} needed under random actions, {advised} advised")
         return
     problems = []
-    for finding in doctor.diagnose():
-        print(f"{finding.subject:<20} {finding.text}", flush=True)
-        if finding.problem:
-            problems.append(finding.subject)
+    with user_errors(ValueError):
+        for finding in doctor.diagnose(body):
+            print(f"{finding.subject:<20} {finding.text}", flush=True)
+            if finding.problem:
+                problems.append(finding.subject)
     if problems:
         print(f"verdict: problems with {', '.join(problems)}")
         raise SystemExit(1)

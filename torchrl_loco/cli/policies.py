@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 import torchrl_loco
-from torchrl_loco.checks import SEED, check_device, check_float, check_int, check_output_file, is_run
+from torchrl_loco.checks import SEED, check_device, check_float, check_int, check_output_file, check_packages, is_run
 from torchrl_loco.cli.errors import user_errors
 
 CONTAINERS = (".mp4", ".mkv", ".mov")
@@ -126,6 +126,7 @@ class Video:
             check_device(self.device)
         if self.out is not None:
             check_output_file("out", self.out, CONTAINERS)
+        check_packages("a video", ("imageio", "av"), "train")
 
     def make(self, policy: "torchrl_loco.Policy", default: Path) -> None:
         """Records the policy into ``out``, or into ``default`` or a numbered sibling of it, and prints the path."""

@@ -15,6 +15,7 @@ from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import compiled, mjw, mujoco_warp
 from torchrl_loco.sim.compilation import compile_kernels
 from torchrl_loco.sim.graph import Graph, ScratchPool
+from torchrl_loco.sim.warp_init import init_warp
 from torchrl_loco.sim.world_func import WorldFunc, WorldKernel, fill
 
 SCRATCH = 1.4
@@ -119,6 +120,7 @@ class Simulation:
         check_memory(memory(name, mj_model, config, num_envs, device, len(geoms)), num_envs, device)
         self.mj_model, self.config = mj_model, config
         self.num_envs = num_envs
+        init_warp()
         self.device = wp.get_device(str(device))
         engines: dict[str, type] = {"compiled": compiled.CompiledEngine, "mujoco_warp": mujoco_warp.MujocoWarpEngine}
         self.engine = engines[name](mj_model, config, num_envs, self.device, geoms)

@@ -1,6 +1,6 @@
 """Evaluation: what a policy earns over full episodes, and what to say of it."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -13,9 +13,8 @@ from torchrl_loco.checks import SEED, check_int
 from torchrl_loco.policy import Policy, load_policy, shipped_policies
 from torchrl_loco.registry import make
 from torchrl_loco.training.algorithm import settings_for_small_networks
-from torchrl_loco.training.config import REPPOConfig, TrainingConfig
+from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.environments import make_for
-from torchrl_loco.training.presets import STEADY, tuned_settings
 from torchrl_loco.training.run_folder import RunFolder
 
 PolicyFunc = Callable[[TensorDictBase], TensorDictBase]
@@ -74,6 +73,8 @@ def summarize(returns: torch.Tensor) -> dict[str, float]:
 
 def describe(summary: dict[str, float]) -> str:
     """Returns the ``summary`` of an evaluation as a line of text."""
+    if summary["episodes"] > 1 and summary["min"] == summary["max"]:
+        return f"return {summary['mean']:.1f} in each of {summary['episodes']:.0f} episodes, which start and end alike"
     return (
         f"return {summary['mean']:.1f} +- {summary['std']:.1f} over {summary['episodes']:.0f} episodes "
         f"(min {summary['min']:.1f}, max {summary['max']:.1f})"
@@ -133,68 +134,12 @@ def evaluate_run(
     return evaluate_policy(run.load_policy(device or run.load_config().device), episodes, seed)
 
 
-POOR = 0.92
-"""Fraction of the shipped policy's return below which a return is called poor. Under ``dm_control`` walker_run's
-crouching gait earns 0.91 of what the upright one does."""
-FALLEN = 0.9
-"""Fraction of a run's best evaluation below which its last one is called fallen. Where returns are negative, it is one
-of what the run has gained up to its best evaluation."""
-
-
-def poor_return(config: TrainingConfig, summary: dict[str, float], seeds: Collection[int] = ()) -> str:
-    """Returns a note if the return of a run is poor, with what to try, else an empty string.
-
-    It is compared with the policy that is shipped for the same task and protocol, if there is one.
-
-    Args:
-        config: settings of the run.
-        summary: what :func:`summarize` returned.
-        seeds: further seeds that were tried.
-    """
+def shipped_return(config: TrainingConfig) -> str:
+    """Returns a line that says what the shipped policy of a run's task earns, an empty one if none is shipped."""
     if config.task not in shipped_policies(config.protocol):
         return ""
-    reference = load_policy(config.task, "cpu", config.protocol).info["mean"]
-    if summary["mean"] >= POOR * reference:
-        return ""
-    poor = f"This return is poor: the policy shipped for {config.task} earns {reference:.0f}."
-    tuned = tuned_settings(config.task, config.device.partition(":")[0], config.algorithm)["total_frames"]
-    if config.total_frames < tuned:
-        return f"{poor} The run had {config.total_frames:,} frames, and the settings for the task take {tuned:,}"
-    return (
-        f"{poor} Returns vary with seeds and processors. Try another seed (--seed {_next_seed(config, seeds)}) or "
-        f"twice the frames (--total_frames {2 * config.total_frames}); the learning curve shows whether it was still "
-        "rising"
-    )
-
-
-def fallen_return(
-    config: TrainingConfig, evaluations: Sequence[Mapping[str, float]], seeds: Collection[int] = ()
-) -> str:
-    """Returns a note if the return of a run fell far below its best evaluation, with what to try, else an empty string.
-
-    Args:
-        config: settings of the run.
-        evaluations: ``frames`` and ``mean`` of each, in their order.
-        seeds: further seeds that were tried.
-    """
-    best, last = max(evaluations, key=lambda row: row["mean"]), evaluations[-1]
-    least = min(row["mean"] for row in evaluations[: evaluations.index(best) + 1])
-    gained = best["mean"] - min(least, 0.0)
-    if gained <= 0.0 or last["mean"] >= best["mean"] - (1 - FALLEN) * gained:
-        return ""
-    remedy = f"shorter episodes (--episode_length {max(config.episode_length // 2, 1)})"
-    if isinstance(config, REPPOConfig) and config.min_kl_weight < STEADY["min_kl_weight"]:
-        options = " ".join(f"--{name} {value}" for name, value in STEADY.items() if getattr(config, name) < value)
-        remedy = f"a higher minimum of the KL weight ({options}), which holds the policy near that of the batch"
-    return (
-        f"The return fell from {best['mean']:.1f} after {best['frames']:.0f} frames to {last['mean']:.1f} at the end. "
-        "The policy of the best evaluation was kept. "
-        f"Try another seed (--seed {_next_seed(config, seeds)}) or {remedy}"
-    )
-
-
-def _next_seed(config: TrainingConfig, seeds: Collection[int]) -> int:
-    return max(config.seed, *seeds, -1) + 1
+    mean = load_policy(config.task, "cpu", config.protocol).info["mean"]
+    return f"the policy shipped for {config.task} earns {mean:.1f}"
 
 
 @torch.no_grad()

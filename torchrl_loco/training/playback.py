@@ -6,8 +6,6 @@ import time
 import warnings
 from pathlib import Path
 
-import imageio.v3 as imageio
-
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.evaluation import PolicyFunc, play
@@ -26,6 +24,8 @@ def record(
         action_repeat: frames for which an action is held.
         camera: ``"side"``, ``"back"`` or ``"egocentric"``.
     """
+    import imageio.v3 as imageio  # of the extra "train"
+
     frame_rate = round(1 / env.config.ctrl_dt)
     with settings_for_small_networks(), imageio.imopen(path, "w", plugin="pyav") as video:
         video.init_video_stream("h264", fps=frame_rate)
@@ -56,11 +56,14 @@ def view(policy: PolicyFunc, env: LocoEnv, action_repeat: int = 1) -> None:
 
     data = mujoco.MjData(env.mj_model)
     with mujoco.viewer.launch_passive(env.mj_model, data) as window:
+        with window.lock():  # a free camera would lose a body that runs
+            window.cam.type, window.cam.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, 1
         while window.is_running():
             due = time.perf_counter()
             for _ in play(policy, env, action_repeat, env.config.episode_length, "episode"):
                 data.qpos[:] = env.sim.qpos[0].cpu()
-                mujoco.mj_kinematics(env.mj_model, data)
+                for update in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):  # all that is seen
+                    update(env.mj_model, data)
                 window.sync()
                 due += env.config.ctrl_dt
                 time.sleep(max(0.0, due - time.perf_counter()))

@@ -7,9 +7,6 @@ import io
 import itertools
 import json
 import pickle
-import shutil
-import zipfile
-import zlib
 from collections.abc import Collection
 from datetime import datetime
 from pathlib import Path
@@ -18,20 +15,16 @@ from typing import Any
 import torch
 
 from torchrl_loco import storage
-from torchrl_loco.checks import check_device, check_run, is_run_group
+from torchrl_loco.checks import check_device, check_run
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import resolve
 from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig, check_loggers, config_from_json
+from torchrl_loco.training.lock import lock
 
 CHECKPOINT_VERSION = 6
-ROOM_NEEDED = 200 * 2**20
-"""Bytes that a run may need: checkpoints, video, metrics."""
 
-_UNREADABLE = (
-    *(zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, NotImplementedError),
-    *(RuntimeError, OSError, EOFError, LookupError, TypeError, ValueError),
-)
+_UNREADABLE = (pickle.UnpicklingError, RuntimeError, OSError, EOFError, LookupError, TypeError, ValueError)
 """Errors that reading a damaged checkpoint may raise."""
 
 
@@ -51,7 +44,7 @@ def new_folder(config: TrainingConfig, ending: str) -> Path:
     Raises:
         ValueError: this machine does not have the device.
         ImportError: the package of a logger is missing, or the module of the environment is broken.
-        OSError: the folder cannot be made, the disk has no room for a run, or the file of the environment is missing.
+        OSError: the folder cannot be made, or the file of the environment is missing.
     """
     check_device(config.device)
     resolve(config.task)
@@ -61,9 +54,6 @@ def new_folder(config: TrainingConfig, ending: str) -> Path:
         config.out.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise OSError(f"out must be a folder for runs, but {config.out} is a file or lies below one") from None
-    free = shutil.disk_usage(config.out).free
-    if free < ROOM_NEEDED:
-        raise OSError(f"{config.out} has {free / 2**20:.0f} MiB left, a run may need {ROOM_NEEDED / 2**20:.0f} MiB")
     while True:  # runs may start within the same second
         path = unused_path(config.out / f"{config.label}-{stamp}-{ending}")
         with contextlib.suppress(FileExistsError):
@@ -113,7 +103,7 @@ class RunFolder:
         Raises:
             ValueError: this machine does not have the device.
             ImportError: the package of a logger is missing, or the module of the environment is broken.
-            OSError: the folder cannot be made, the disk has no room, or the file of the environment is missing.
+            OSError: the folder cannot be made, or the file of the environment is missing.
         """
         path = new_folder(config, f"seed{config.seed}")
         (path / "config.json").write_bytes(_as_json(config))
@@ -148,7 +138,9 @@ class RunFolder:
 
         Raises:
             ValueError: the run has as many frames already.
+            BlockingIOError: another process is training it.
         """
+        lock(self.path)
         done = max((row["frames"] for row in self._read("metrics.csv")), default=0)
         if total_frames <= done:
             raise ValueError(f"total_frames must be more than the {done:.0f} frames of {self.path}, got {total_frames}")
@@ -199,14 +191,6 @@ class RunFolder:
     def has_metrics(self) -> bool:
         """Whether a batch was collected."""
         return bool(self._read("metrics.csv"))
-
-    @property
-    def seeds(self) -> tuple[int, ...]:
-        """Seeds of the group that the run belongs to; its own if it belongs to none."""
-        folder = self.path.parent
-        if is_run_group(folder):
-            return tuple(json.loads((folder / "group.json").read_text())["seeds"])
-        return (self.load_config().seed,)
 
     @property
     def is_finished(self) -> bool:
@@ -298,10 +282,6 @@ class RunFolder:
         if not self.has_checkpoint:
             raise FileNotFoundError(f"{self.path} has no checkpoint.pt: start a new run")
         try:
-            with zipfile.ZipFile(path) as archive:  # torch.load ignores the checksums
-                damaged = archive.testzip()
-            if damaged is not None:
-                raise ValueError(f"{damaged} is damaged")
             entries = torch.load(path, map_location=device, weights_only=True)
             version = entries["version"]
         except _UNREADABLE as error:

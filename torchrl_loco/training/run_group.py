@@ -10,7 +10,8 @@ from pathlib import Path
 from torchrl_loco.checks import SEED, check_device, check_int, is_run_group
 from torchrl_loco.policy import Policy
 from torchrl_loco.training.config import TrainingConfig, check_loggers, config_from_json
-from torchrl_loco.training.evaluation import describe, poor_return
+from torchrl_loco.training.evaluation import describe, shipped_return
+from torchrl_loco.training.lock import lock, unlock
 from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.run_folder import RunFolder, new_folder, unused_path
 from torchrl_loco.training.trainer import Trainer
@@ -59,7 +60,7 @@ class RunGroup:
             TypeError: a seed is no integer.
             ValueError: there are no seeds, one is out of range or named twice, or this machine lacks the device.
             ImportError: the package of a logger is missing, or the environment is a plug-in, which is broken.
-            OSError: the folder cannot be made, or the disk has no room for a run.
+            OSError: the folder cannot be made.
         """
         seeds = _check_seeds(seeds)
         path = new_folder(config, f"{len(seeds)}-seeds")
@@ -89,16 +90,18 @@ class RunGroup:
         return [seed for seed in self.seeds if seed not in runs or not runs[seed].is_finished]
 
     def check(self) -> None:
-        """Checks that there is something to train, and that it can be trained here.
+        """Checks that there is something to train, and that it can be trained here: from now on, by no other process.
 
         Raises:
             ValueError: there is nothing to train, or this machine lacks the device.
             ImportError: the package of a logger is missing.
+            BlockingIOError: another process is training it.
         """
         check_device(self.config.device)
         check_loggers(self.config.logger)
         if not self._missing:
             raise ValueError(f"{self.path} is complete: all of its {len(self.seeds)} seeds are trained")
+        lock(self.path)
 
     def train(self) -> dict[int, str]:
         """Trains what is missing, one seed after the other, and plots all of them as one curve.
@@ -114,17 +117,21 @@ class RunGroup:
             KeyboardInterrupt: Ctrl-C or SIGTERM; what is missing is trained by the next call.
             ValueError: there is nothing to train, or this machine lacks the device.
             ImportError: the package of a logger is missing.
+            BlockingIOError: another process is training it.
         """
         self.check()
         runs, failed = self.runs, {}
-        for seed in self._missing:
-            try:
-                self._train(seed, runs.get(seed))
-            except Exception as error:
-                failed[seed] = f"{type(error).__name__}: {error}"
-                print(f"seed {seed} failed: {failed[seed]}", file=sys.stderr)
-            finally:
-                self._plot()
+        try:
+            for seed in self._missing:
+                try:
+                    self._train(seed, runs.get(seed))
+                except Exception as error:
+                    failed[seed] = f"{type(error).__name__}: {error}"
+                    print(f"seed {seed} failed: {failed[seed]}", file=sys.stderr)
+                finally:
+                    self._plot()
+        finally:
+            unlock(self.path)
         print(self._report(failed))
         return failed
 
@@ -148,22 +155,20 @@ class RunGroup:
             plot_runs(runs, self.path / "learning_curve.png")
 
     def _report(self, failed: dict[int, str]) -> str:
-        """Returns the return of each seed, their mean, and a note if some are poor."""
-        lines, summaries, notes, runs = [], {}, {}, self.runs
+        """Returns the return of each seed, their mean, and what the shipped policy earns."""
+        lines, means, runs = [], [], self.runs
         for seed in self.seeds:
             if seed in runs and runs[seed].is_finished:
-                summaries[seed] = Policy.load(runs[seed].policy, "cpu").info
-                notes[seed] = poor_return(runs[seed].load_config(), summaries[seed], self.seeds)
-                lines.append(f"seed {seed}: {describe(summaries[seed])}")
+                summary = Policy.load(runs[seed].policy, "cpu").info
+                means.append(summary["mean"])
+                lines.append(f"seed {seed}: {describe(summary)}")
             else:
                 lines.append(f"seed {seed} failed: {failed[seed]}")
-        if means := [summary["mean"] for summary in summaries.values()]:
+        if means:
             mean = sum(means) / len(means)
             count = f"{len(means)} of {len(self.seeds)} seeds" if failed else f"{len(means)} seeds"
             lines.append(f"mean of {count}: {mean:.1f}, from {min(means):.1f} to {max(means):.1f}")
-        if poor := [seed for seed, note in notes.items() if note]:
-            lines.append(f"{len(poor)} of {len(means)} seeds stayed poor: {', '.join(map(str, poor))}")
-        return "\n".join(lines)
+        return "\n".join(filter(None, [*lines, shipped_return(self.config)]))
 
 
 def _check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:

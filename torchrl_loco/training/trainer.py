@@ -22,15 +22,9 @@ from torchrl_loco.training.config import check_loggers
 from torchrl_loco.training.environments import Environments, unwrapped
 from torchrl_loco.training.environments import make_env as make_env
 from torchrl_loco.training.episodes import Episodes
-from torchrl_loco.training.evaluation import (
-    Evaluator,
-    describe,
-    evaluation_seed,
-    fallen_return,
-    poor_return,
-    summarize,
-)
+from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, shipped_return, summarize
 from torchrl_loco.training.interrupts import interruptible
+from torchrl_loco.training.lock import lock, unlock
 from torchrl_loco.training.loggers import Loggers
 from torchrl_loco.training.playback import record
 from torchrl_loco.training.plots import plot_runs
@@ -107,11 +101,21 @@ class Trainer:
             running that another number of ranks or of frames does not fit; the run was begun with other objects.
         TypeError: the network has a part that a policy's file cannot hold.
         ImportError: the package of a logger is missing.
+        BlockingIOError: another process is training the run.
     """
 
     def __init__(self, run: RunFolder, resume: bool = False, given: Given | None = None) -> None:
         self.run = run
-        given = given or Given()
+        if distributed.is_first():
+            lock(run.path)
+        try:
+            self._make(given or Given(), resume)
+        except BaseException:
+            unlock(run.path)
+            raise
+
+    def _make(self, given: Given, resume: bool) -> None:
+        run = self.run
         if resume:
             given.check(run)
         config = run.load_config()
@@ -161,17 +165,22 @@ class Trainer:
 
         Raises:
             KeyboardInterrupt: Ctrl-C or SIGTERM.
-            OSError: a logger cannot be opened.
+            OSError: a logger cannot be opened, or another process is training the run.
         """
-        with settings_for_small_networks():
-            try:
-                self._train()
-            finally:
-                self.algorithm.release()
-            self.save()
-            if distributed.is_first():
-                self._finish()
-            distributed.wait_for_all()
+        if distributed.is_first():
+            lock(self.run.path)
+        try:
+            with settings_for_small_networks():
+                try:
+                    self._train()
+                finally:
+                    self.algorithm.release()
+                self.save()
+                if distributed.is_first():
+                    self._finish()
+                distributed.wait_for_all()
+        finally:
+            unlock(self.run.path)
 
     def _train(self) -> None:
         config, first, noted = self.config, distributed.is_first(), False
@@ -314,9 +323,7 @@ class Trainer:
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
         print(f"best policy, in new episodes: {describe(summary)}")
-        fallen = fallen_return(config, self.run.read_evaluations(), self.run.seeds)
-        of_all = self.algorithm.note(self.run.read_metrics())
-        for note in filter(None, (fallen, poor_return(config, summary, self.run.seeds), of_all)):
+        for note in filter(None, (shipped_return(config), self.algorithm.note(self.run.read_metrics()))):
             print(note)
 
     def save(self) -> None:
