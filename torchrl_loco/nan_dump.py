@@ -31,7 +31,7 @@ class NanDump:
         tensors: ``qpos`` ``(nq,)``, ``qvel`` ``(nv,)``, ``qacc_warmstart`` ``(nv,)``, ``act`` ``(na,)`` if there are
             activations, and ``action`` ``(nu,)``, before the step.
         settings: ``env`` (module and name of the class), ``file`` (of the module), ``protocol``, ``config``, ``seed``,
-            ``device``, ``num_envs``, ``world_offset``, and ``world``, ``episode`` and ``elapsed_steps`` before the step.
+            ``device``, ``num_envs``, ``world_offset``, and before the step ``world``, ``episode``, ``elapsed_steps``.
     """
 
     tensors: dict[str, torch.Tensor]
@@ -83,17 +83,27 @@ def _classes() -> dict[str, type[LocoEnv]]:
     return classes
 
 
+def controls(dump: NanDump) -> torch.Tensor:
+    """Returns the controls that the action of a dump became, ``(nu,)``; a task's memory is zero for that."""
+    env = dump.make_env("cpu")
+    env.reset(dump.state, set_state=True)
+    env.step(TensorDict({"action": dump.tensors["action"][None]}, batch_size=[1]))
+    return env.sim.ctrl[0].clone()
+
+
 def warp_trace(dump: NanDump, device: torch.device | str | None = None) -> np.ndarray:
     """Returns qpos and qvel after each substep in Warp, shape ``(substeps + 1, nq + nv)``, the start included."""
     config = SimConfig(**dump.settings["config"])
     env = dump.make_env(device, ctrl_dt=config.sim_dt)  # one substep per step, to see them all
+    sim, physics = env.sim, env.sim.capture(env.sim.step)  # without what the task does around it
     env.reset(dump.state.to(env.device), set_state=True)
-    action = TensorDict({"action": dump.tensors["action"][None]}, batch_size=[1]).to(env.device)
-    trace = [env.get_state()]
-    for _ in range(config.substeps):
-        env.step(action.clone())
-        trace.append(env.get_state())
-    return np.stack([torch.cat([state["qpos"][0], state["qvel"][0]]).cpu().numpy() for state in trace])
+    sim.ctrl.copy_(controls(dump))
+    trace = []
+    for substep in range(config.substeps + 1):
+        if substep:
+            physics.replay()
+        trace.append(torch.cat([sim.qpos[0], sim.qvel[0]]).cpu().numpy())
+    return np.stack(trace)
 
 
 def mujoco_trace(dump: NanDump) -> np.ndarray:
@@ -102,16 +112,13 @@ def mujoco_trace(dump: NanDump) -> np.ndarray:
     C MuJoCo resets a world that is not finite; from there on the trace is NaN.
     """
     config = SimConfig(**dump.settings["config"])
-    env = dump.make_env("cpu")
-    model = env.mj_model
+    model = dump.make_env("cpu").mj_model
     set_options(model, config)
     data = mujoco.MjData(model)
     for name, value in dump.state.items():
         getattr(data, name)[:] = value[0].numpy()
     trace = [np.concatenate([data.qpos, data.qvel])]
-    env.reset(dump.state, set_state=True)
-    env.step(TensorDict({"action": dump.tensors["action"][None]}, batch_size=[1]))
-    data.ctrl[:] = env.sim.ctrl[0]  # a task may compute them itself
+    data.ctrl[:] = controls(dump)
     mujoco.set_mju_user_warning(lambda message: None)  # else it prints, and writes a log into the working directory
     try:
         for _ in range(config.substeps):

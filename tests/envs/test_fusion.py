@@ -23,11 +23,11 @@ def copies(arrays):
     return {name: values.clone() for name, values in arrays.items()}
 
 
-def fused(work, arrays, n):
+def fused(work, arrays, n, fixed=()):
     """Returns ``work`` on arrays as a kernel; tracing runs it on copies."""
     with torch.no_grad():
         traced = constants_on(CPU, make_fx(lambda arrays: work(arrays))(copies(arrays)))
-    return fuse(traced, arrays, n, wp.get_device("cpu"))
+    return fuse(traced, arrays, n, wp.get_device("cpu"), fixed)
 
 
 def assert_same(found, expected):
@@ -67,7 +67,7 @@ def test_parts_of_tasks_do_what_plain_torch_does(cls):
             if name in ("qpos", "qvel", "xmat", "terms"):
                 arrays[name] = by_world(values)
         expected = copies(arrays)
-        launch = fused(part._work, arrays, 6)
+        launch = fused(part._work, arrays, 6, part._fixed)
         with torch.no_grad():
             part._work(expected)
         launch()

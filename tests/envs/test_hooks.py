@@ -351,6 +351,90 @@ class WalkBackwardsInNoise(WalkBackwards):
         return {"command": s.normal(2)}
 
 
+def test_rows_that_are_returned_together_are_those_of_before():
+    """Whatever their order: each may be what another entry was."""
+
+    class Swaps(WalkerWalk):
+        memory = {"a": (), "b": (), "was": 9}
+
+        def events(self, s):
+            return {"a": s.b, "b": s.a, "qpos": s.qpos + 0.1, "was": s.qpos}
+
+        def begin(self, s):
+            return {"b": s.a + 2, "a": torch.ones_like(s.a)}
+
+    for way in (True, False):
+        env = Swaps(2, "cpu", seed=0, compile_hooks=way)
+        env.step(env.reset().set("action", env.action_spec.zero()))
+        memory = env.get_state()["memory"]
+        assert memory["a"].tolist() == [2, 2]
+        assert memory["b"].tolist() == [1, 1]
+        torch.testing.assert_close(memory["was"] + 0.1, env.sim.qpos)
+
+
+@pytest.mark.parametrize("leave", [lambda x: torch.tensor(x.numpy()), lambda x: torch.tensor(x.tolist())])
+def test_a_hook_that_leaves_torch_is_not_frozen(leave, caplog):
+    class Leaves(WalkerWalk):
+        def reward(self, s):
+            return leave(s.qvel[:, 0].clone())
+
+        def terminated(self, s):
+            return leave(s.xpos("torso")[:, 2].clone()) < 1.25
+
+        def observation(self, s):
+            return leave(s.qpos.clone())
+
+    env = Leaves(2, "cpu", seed=0)
+    td = env.rollout(5, break_when_any_done=False)
+    assert torch.equal(td["next", "reward"][:, -1, 0], env.sim.qvel[:, 0])
+    assert torch.equal(td["next", "observation"][:, -1], env.sim.qpos)
+    assert "Leaves.judge is not compiled" in caplog.text
+    assert "Leaves.observe is not compiled" in caplog.text
+
+
+def test_a_tensor_that_is_an_index_can_change():
+    class Stages(WalkerWalk):
+        speeds, stage = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0])
+
+        def reward(self, s):
+            return s.time * 0 + self.speeds[self.stage]
+
+    env = Stages(2, "cpu", seed=0)
+    td = env.reset()
+    for stage in (0, 2):
+        env.stage.fill_(stage)
+        assert (env.step(td.set("action", env.action_spec.zero()))["next", "reward"] == stage + 1).all()
+
+
+def test_time_is_that_of_the_state():
+    """Also where worlds begin at a random point of their time limit."""
+
+    class Clock(WalkerWalk):
+        def observation(self, s):
+            return s.time.unsqueeze(-1)
+
+    env = Clock(4, "cpu", seed=0, stagger=True)
+    td = env.rollout(3, break_when_any_done=False)[:, -1]["next"]
+    again = env.reset(env.get_state(), set_state=True)
+    assert torch.equal(td["observation"], again["observation"])
+    assert td["observation"].std() > 0
+
+
+def test_numbers_of_memory_that_are_not_finite_end_their_world():
+    class Breaks(FollowVelocity):
+        def update(self, s):
+            return {"air_time": torch.where(s.qpos[:, :1] < 0, torch.nan, s.air_time)}
+
+    env = Breaks(4, "cpu", seed=0)
+    env.reset()
+    state = env.get_state()
+    state["qpos"][:, 0] = torch.tensor([1.0, -1.0, 1.0, 1.0])
+    td = env.reset(state, set_state=True)
+    current, _ = env.step_and_maybe_reset(td.set("action", env.action_spec.zero()))
+    assert current["next", "terminated"].squeeze(-1).tolist() == [False, True, False, False]
+    env.load_state_dict(env.state_dict())
+
+
 def test_a_hook_that_cannot_be_compiled_runs_as_it_is_and_says_why(caplog):
     class Looks(WalkerWalk):
         def reward(self, s):
@@ -387,6 +471,11 @@ BASE = {"model": DOG, "config": CONFIG, "reward": lambda self, s: s.time, "obser
         ({"action_range": (0, 1)}, ValueError, r"must be \(-1, 1\) or"),
         ({"action_range": (-math.inf, math.inf)}, TypeError, "must define control"),
         ({"reward": lambda self, s: s.xpos("trunc")[:, 0]}, KeyError, "did you mean 'trunk'"),
+        ({"reward": lambda self, s: s.qvel.add_(1.0)[:, 0]}, ValueError, r"reward writes to s\.qvel"),
+        ({"reward": lambda self, s: setattr(self, "last", s.time) or s.time}, ValueError, r"reward sets self\.last"),
+        ({"reward": lambda self, s: {}}, ValueError, "tensors by name"),
+        ({"observation": lambda self, s: {"memory": s.qpos}}, ValueError, "'memory' is no name"),
+        ({"memory": {"a": 4}, "begin": lambda self, s: {"a": s.time}}, ValueError, r"a of shape \(4, 4\)"),
         ({"reward": lambda self, s: s.comand}, AttributeError, "the memory has no entries"),
         ({"reward": lambda self, s: s.model("geom_fiction")}, AttributeError, "no array 'geom_fiction'"),
         ({"reward": lambda self, s: s.joint_qpos(".*")[:, 0]}, ValueError, "name a free or ball joint alone"),

@@ -186,6 +186,13 @@ def test_branches_are_copies(shared, body_task, actions):
         state.branch(0, 0)
 
 
+def test_a_file_is_read_without_executing_code(shared, tmp_path):
+    env = shared("dog_follow")
+    env.reset()
+    torch.save(env.get_state(), tmp_path / "state.pt")
+    assert (torch.load(tmp_path / "state.pt") == env.get_state()).all()
+
+
 def test_state_dict_goes_on_in_another_environment(shared, body_task, actions):
     """With the seed: what is drawn at the next resets is the same too."""
     first, second = (shared(body_task, 3, seed=seed, copy=seed, episode_length=4) for seed in (5, 6))

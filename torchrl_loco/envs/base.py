@@ -72,8 +72,8 @@ class LocoEnv(EnvBase):
             :meth:`health`.
         nan_dump: a file that does not exist yet. The state and action before the first step that made a world
             non-finite are written to it, within about 100 steps or at :meth:`close`; see ``torchrl-loco inspect``.
-        compile_hooks: whether hooks in torch become kernels. ``False`` runs them as they are at every step, to print
-            from them or to debug them.
+        compile_hooks: whether hooks in torch become kernels; what they read of Python is fixed then. ``False`` runs
+            them as they are at every step, to print from them or to debug them.
         config: fields of :class:`torchrl_loco.SimConfig` to override.
 
     Attributes:
@@ -84,6 +84,8 @@ class LocoEnv(EnvBase):
         engine: what steps the worlds, ``"compiled"`` or ``"mujoco_warp"``.
         engine_reason: why.
         mj_model: the model, a ``mujoco.MjModel``.
+        groups: shape of a row of each tensor of the observation, by name.
+        term_names: names of the reward's terms.
 
     Raises:
         ValueError: an argument is out of range or unknown; the message names the valid choices.

@@ -9,6 +9,7 @@ import torch
 
 from torchrl_loco.checks import suggestion
 from torchrl_loco.envs.episode import MAX_VALUE
+from torchrl_loco.envs.state import State
 from torchrl_loco.envs.view import Catalog, View, usable
 from torchrl_loco.sim import models
 
@@ -111,16 +112,31 @@ class Hooks:
         self.moves = False
         with torch.no_grad():
             self._probe(self._at_home())
+        self.catalog.complete = True
 
     def _call(self, hook: str, arrays: Arrays, *, steps: int = 0, args: tuple[Any, ...] = ()) -> Any:
         env = self._env()
         assert env is not None
-        return getattr(env, hook)(View(self.catalog, arrays, hook, steps), *args)
+        view = View(self.catalog, arrays, hook, steps)
+        if self.catalog.complete:
+            return getattr(env, hook)(view, *args)
+        before, own = {name: rows._version for name, rows in arrays.items()}, dict(vars(env))
+        returned = getattr(env, hook)(view, *args)
+        for name, version in before.items():
+            if arrays[name]._version != version:
+                raise ValueError(f"{self._title}.{hook} writes to s.{name.removeprefix('memory.')}: work on a clone")
+        for name, value in vars(env).items():
+            if own.get(name, own) is not value:
+                raise ValueError(
+                    f"{self._title}.{hook} sets self.{name}, but hooks are pure: declare it in memory, and return it "
+                    "from update() or events()"
+                )
+        return returned
 
     # Calling the hooks once.
 
     def _at_home(self) -> dict[str, torch.Tensor]:
-        """Returns arrays of worlds at rest in the home pose, which share one row."""
+        """Returns arrays of worlds at rest in the home pose."""
         catalog = self.catalog
         m, n, device = catalog.mj_model, catalog.num_envs, catalog.device
         data = mujoco.MjData(m)
@@ -131,7 +147,7 @@ class Hooks:
         rows |= {"time": 0.0, "contact_force": [[0.0] * 3], "in_contact": [0.0], "action": [0.0] * m.nu}
         rows |= {f"memory.{name}": torch.zeros(shape) for name, shape in catalog.memory.items()}
         arrays = {name: torch.as_tensor(row, dtype=torch.float32).to(device) for name, row in rows.items()}
-        arrays = {name: row.expand(n, *row.shape) for name, row in arrays.items()}
+        arrays = {name: row.repeat(n, *[1] * row.ndim) for name, row in arrays.items()}
         zeros = torch.zeros(n, dtype=torch.long, device=device)
         return {**arrays, "seed": zeros[:1], "world": zeros, "episode": zeros, "elapsed_steps": zeros}
 
@@ -144,6 +160,8 @@ class Hooks:
         arrays |= {f"memory.{name}": row.float() for name, row in rows.items()}
         if "reward" in self.own:
             terms = self._call("reward", arrays, steps=1)
+            if isinstance(terms, Mapping) and not (terms and all(isinstance(name, str) for name in terms)):
+                raise ValueError(f"{self._title}.reward must return a tensor, or tensors by name, got {terms!r}")
             for name, term in terms.items() if isinstance(terms, Mapping) else [("", terms)]:
                 self._check("reward", term, (n,), name)
             self.term_names = tuple(terms) if isinstance(terms, Mapping) else ()
@@ -254,7 +272,8 @@ class Hooks:
         for name, values in groups.items():
             a[f"out.{name}"].copy_(values)
         outputs = [a[name] for name in a if name.startswith("out.")]
-        wrong = a["non_finite"] | _beyond(a["reward"], a["qpos"], a["qvel"], *outputs)
+        memory = [a[f"memory.{name}"] for name in self.catalog.memory]
+        wrong = a["non_finite"] | _beyond(a["reward"], a["qpos"], a["qvel"], *memory, *outputs)
         a["non_finite"].copy_(wrong)
         for values in (*outputs, a["reward"], a["terms"]):
             values.masked_fill_(_rows(wrong, values), 0.0)
@@ -279,16 +298,20 @@ class Hooks:
             target.copy_(torch.where(_rows(a["mask"], target), values, target))
 
     def _remember(self, a: Arrays, rows: Mapping[str, torch.Tensor], mask: torch.Tensor | None = None) -> None:
+        new = {}  # all of them before the first is written: a row may be a view of another entry
         for name, row in rows.items():
             target = a[f"memory.{name}"] if name in self.catalog.memory else a[name]
             row = unit_quaternions(self.catalog.mj_model, row) if name == "qpos" else row
-            if mask is not None:
-                row = torch.where(_rows(mask, target), row.to(target.dtype), target)
-            target.copy_(row)
+            new[name] = row.clone() if mask is None else torch.where(_rows(mask, target), row.to(target.dtype), target)
+        for name, row in new.items():
+            (a[f"memory.{name}"] if name in self.catalog.memory else a[name]).copy_(row)
 
 
-NO_GROUPS = ("reward", "done", "terminated", "truncated", "action", "next", "reward_terms")
-"""Names that a tensor of the observation cannot have: those of a step's other entries."""
+NO_GROUPS = (
+    *("reward", "done", "terminated", "truncated", "action", "next", "reward_terms", "_reset", "_step"),
+    *State.KEYS,
+)
+"""Names that a tensor of the observation cannot have: those of a step's other entries, and of a state."""
 
 
 def _beyond(*arrays: torch.Tensor) -> torch.Tensor:
@@ -312,10 +335,8 @@ def unit_quaternions(m: mujoco.MjModel, qpos: torch.Tensor) -> torch.Tensor:
 
 
 def _broadcasts(shape: torch.Size, target: tuple[int, ...]) -> bool:
-    try:
-        return tuple(torch.broadcast_shapes(shape, target)) == tuple(target)
-    except RuntimeError:
-        return False
+    """Returns whether rows have the dimensions that they must, each of the right size or 1."""
+    return len(shape) == len(target) and all(one in (1, other) for one, other in zip(shape, target, strict=True))
 
 
 def _kind(value: Any) -> str:

@@ -1,8 +1,10 @@
 """A part of the control step that hooks make: as one kernel, by torch.compile, or as plain torch."""
 
+import contextlib
+import gc
 import logging
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import torch
 import warp as wp
@@ -24,12 +26,20 @@ class Part:
         work: the function.
         arrays: the arrays, by name, at addresses that stay.
         title: name of the task, for messages.
+        fixed: tensors that it uses and that never change.
 
     Attributes:
         kind: how it runs, ``"kernel"``, ``"torch.compile"`` or ``"plain torch"``.
     """
 
-    def __init__(self, work: Callable[[Arrays], None], arrays: dict[str, torch.Tensor], title: str) -> None:
+    def __init__(
+        self,
+        work: Callable[[Arrays], None],
+        arrays: dict[str, torch.Tensor],
+        title: str,
+        fixed: Sequence[torch.Tensor] = (),
+    ) -> None:
+        self._fixed = fixed
         self._work, self._arrays, self._title = work, arrays, f"{title}.{work.__name__}"
         self._launch: Callable[[], None] | None = None
         self._run: Callable[[], None] = lambda: work(arrays)
@@ -54,18 +64,45 @@ class Part:
         """
         on = torch.device(wp.device_to_torch(device))
         try:
-            traced = constants_on(on, make_fx(lambda arrays: self._work(arrays))(self._arrays))
+            with no_collection():
+                traced = constants_on(on, make_fx(lambda arrays: self._work(arrays))(self._arrays))
+            self._check_on_other_numbers(traced)
         except Exception as error:  # whatever hooks and tracing raise
             self._stays_plain(error)
             return False
         try:
-            self._launch, self.kind = fuse(traced, self._arrays, num_envs, device), "kernel"
+            with no_collection():
+                self._launch = fuse(traced, self._arrays, num_envs, device, self._fixed)
+            self.kind = "kernel"
         except CannotFuse as error:
             if device.is_cuda:
                 self._compile_by_torch(traced)
             else:
                 self._stays_plain(error)
         return self._launch is not None
+
+    def _check_on_other_numbers(self, traced: torch.fx.GraphModule) -> None:
+        """Compares the trace with the hooks themselves, on numbers that they were not traced with.
+
+        Raises:
+            ValueError: they differ.
+        """
+        generator = torch.Generator(self._arrays["qpos"].device).manual_seed(0)
+        for attempt in range(4):
+            flags = attempt % 2 == 1  # of worlds that are masked, or not finite
+            ours = {name: changed(rows, generator, flags) for name, rows in self._arrays.items()}
+            theirs = {name: rows.clone() for name, rows in ours.items()}
+            self._work(ours)
+            traced(theirs)
+            self._compare(ours, theirs)
+
+    def _compare(self, ours: Arrays, theirs: Arrays) -> None:
+        for name, rows in ours.items():
+            if not torch.allclose(rows.double(), theirs[name].double(), rtol=1e-4, atol=1e-5, equal_nan=True):
+                raise ValueError(
+                    f"its trace gives another {name} for other numbers: a hook takes numbers out of torch (numpy, "
+                    "tolist), or changes something of its own at each call"
+                )
 
     def record(self, sim: Simulation) -> None:
         """Records its launch."""
@@ -84,9 +121,31 @@ class Part:
 
     def _stays_plain(self, error: Exception) -> None:
         message = " ".join(str(error).split("\n")[:3]).strip()
+        if "get value out of a tracing tensor" in message:
+            message = "a hook reads a number out of a tensor (if, .item(), float())"
         logging.getLogger("torchrl_loco").warning(
             "%s is not compiled and runs as plain torch: %s", self._title, message
         )
+
+
+def changed(rows: torch.Tensor, generator: torch.Generator, flags: bool) -> torch.Tensor:
+    """Returns a copy of an array with other numbers of the same kind; booleans are all ``flags``."""
+    if rows.dtype == torch.bool:
+        return torch.full_like(rows, flags)
+    noise = torch.rand(rows.shape, generator=generator, device=rows.device)
+    return rows.clone() + (4 * noise - 2 if rows.is_floating_point() else (10 * noise).to(rows.dtype))
+
+
+@contextlib.contextmanager
+def no_collection() -> Iterator[None]:
+    """Keeps garbage from being collected: an environment that is dropped computes, which would be traced too."""
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
 
 
 def constants_on(device: torch.device, traced: torch.fx.GraphModule) -> torch.fx.GraphModule:

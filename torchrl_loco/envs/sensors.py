@@ -158,9 +158,9 @@ def _evaluate(s: "View", kind: int, sensor: int) -> torch.Tensor | None:
         return None
     frame = Frame(s, of, index)
     if kind == Sensor.mjSENS_GYRO:
-        return _into(frame.axes, frame.rotation)
+        return into_frame(frame.axes, frame.rotation)
     if kind == Sensor.mjSENS_VELOCIMETER:
-        return _into(frame.axes, frame.velocity)
+        return into_frame(frame.axes, frame.velocity)
     reference = int(m.sensor_refid[sensor])
     if reference >= 0 and int(m.sensor_reftype[sensor]) not in FRAMES:
         return None
@@ -170,7 +170,7 @@ def _evaluate(s: "View", kind: int, sensor: int) -> torch.Tensor | None:
 
 def _of_frames(kind: int, frame: Frame, base: Frame | None) -> torch.Tensor | None:
     def seen(vector: torch.Tensor) -> torch.Tensor:
-        return vector if base is None else _into(base.axes, vector)
+        return vector if base is None else into_frame(base.axes, vector)
 
     if kind == Sensor.mjSENS_FRAMEPOS:
         return seen(frame.position if base is None else frame.position - base.position)
@@ -189,8 +189,11 @@ def _of_frames(kind: int, frame: Frame, base: Frame | None) -> torch.Tensor | No
     return None
 
 
-def _into(axes: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    return (axes * vector.unsqueeze(-1)).sum(-2)
+def into_frame(xmat: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """Returns vectors of the world ``(num_envs, ..., 3)`` in frames with the axes ``xmat`` ``(num_envs, 3, 3)``."""
+    between = vectors.ndim - 2
+    axes = xmat.view(xmat.shape[0], *[1] * between, 3, 3)
+    return (axes * vectors.unsqueeze(-1)).sum(-2)
 
 
 def to_quaternion(axes: torch.Tensor) -> torch.Tensor:

@@ -70,6 +70,9 @@ class State(TensorDict):
         return super().select(*keys, *state, inplace=inplace, strict=strict)
 
 
+torch.serialization.add_safe_globals([State])  # a file of tensors: torch.load reads it without weights_only=False
+
+
 def without_state(tensordict: TensorDictBase | None, device: torch.device | None) -> TensorDictBase | None:
     """Returns a TensorDict itself, or if it has entries of a state, a new one on ``device`` with its others."""
     if tensordict is None or not any(key in tensordict for key in State.KEYS):

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from torchrl_loco.envs import draws, sensors
+from torchrl_loco.sim import models
 
 Names = str | Sequence[str]
 """A name, several names, or a regular expression that matches whole names."""
@@ -38,6 +39,7 @@ class Catalog:
         sensors: ids of the sensors that only an engine can evaluate.
         contact_geoms: ids of the geoms whose contacts were asked for, in the order of the engine's columns.
         sensor_address: where a sensor's numbers begin in ``sensordata``, by its id.
+        complete: whether all that hooks ask for is known: what else they ask for later is refused.
         home: home pose, ``(nq,)``: the keyframe ``home`` if there is one, else ``qpos0``.
     """
 
@@ -56,8 +58,9 @@ class Catalog:
         self.arrays: set[str] = set()
         self.sensors: set[int] = set()
         self.contact_geoms: list[int] = []
+        self.complete = False
         self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}
-        self.home = self._tensor(home_pose(mj_model))
+        self.home = self._tensor(models.home_pose(mj_model))
         self._names: dict[str, list[str]] = {}
         self._found: dict[tuple[str, Any], tuple[list[int], bool]] = {}
         self._index: dict[tuple[int, ...], torch.Tensor] = {}
@@ -78,6 +81,8 @@ class Catalog:
             KeyError: a name or pattern matches none; the message names the nearest.
         """
         key = kind, names if isinstance(names, str) else tuple(names)
+        if not key[1]:
+            raise KeyError(f"name a {kind}, several, or a regular expression, got {names!r}")
         if key not in self._found:
             known = self.names(kind)
             if isinstance(names, str) and names in known:
@@ -117,8 +122,12 @@ class Catalog:
             self._constants[key] = self._tensor(values if ids is None else values[list(ids)])
         return self._constants[key]
 
+    def fixed(self) -> list[torch.Tensor]:
+        """Returns the tensors of indices, which never change."""
+        return list(self._index.values())
+
     def places(self, first: int, count: int) -> torch.Tensor:
-        """Returns places of random streams, which a compiler would compute wrongly: they wrap around 64 bits."""
+        """Returns places of random streams, which torch.compile would compute wrongly: they wrap around 64 bits."""
         if (first, count) not in self._places:
             self._places[first, count] = draws.places(first, count, self.device)
         return self._places[first, count]
@@ -135,12 +144,6 @@ class Catalog:
 
 def _several(names: Names) -> list[str]:
     return [names] if isinstance(names, str) else list(names)
-
-
-def home_pose(mj_model: mujoco.MjModel) -> Any:
-    """Returns the pose of the keyframe ``home`` of a model, or else its ``qpos0``, ``(nq,)``."""
-    keys = [mj_model.key(i).name for i in range(mj_model.nkey)]
-    return mj_model.key_qpos[keys.index("home")] if "home" in keys else mj_model.qpos0
 
 
 class View:
@@ -169,6 +172,8 @@ class View:
                 f"keep what you need of it in memory, by returning it from events()"
             )
         self._catalog.arrays.add(name)
+        if name not in self._arrays:
+            raise ValueError(f"{name} was not asked for when the hooks were first called, so it is not computed")
         return self._arrays[name]
 
     @property
@@ -196,8 +201,8 @@ class View:
 
     @property
     def time(self) -> torch.Tensor:
-        """Time since the world's reset (s), ``(num_envs,)``."""
-        return self._array("time")
+        """Time since the episode's start (s), ``(num_envs,)``: control steps times :attr:`dt`."""
+        return (self._arrays["elapsed_steps"] + self._steps).float() * self._catalog.ctrl_dt
 
     @property
     def dt(self) -> float:
@@ -311,7 +316,7 @@ class View:
 
     def to_body(self, body: str, vectors: torch.Tensor) -> torch.Tensor:
         """Returns vectors of the world's frame, ``(num_envs, ..., 3)``, in the frame of a body."""
-        return into_frame(self.xmat(body), vectors)
+        return sensors.into_frame(self.xmat(body), vectors)
 
     def projected_gravity(self, body: str) -> torch.Tensor:
         """Returns the direction of gravity in the frame of a body, ``(num_envs, 3)``: (0, 0, -1) if it is upright."""
@@ -347,9 +352,13 @@ class View:
     def _of_contacts(self, array: str, geoms: Names) -> torch.Tensor:
         ids, one = self._catalog.ids("geom", geoms)
         columns = self._catalog.contact_geoms
-        columns += [geom for geom in ids if geom not in columns]
+        new = [geom for geom in ids if geom not in columns]
+        if new and self._catalog.complete:
+            names = ", ".join(self._catalog.names("geom")[geom] for geom in new)
+            raise ValueError(f"contacts of {names} were not asked for when the hooks were first called")
+        columns += new
         values = self._array(array)
-        if len(columns) > values.shape[1]:  # being asked for the first time
+        if not self._catalog.complete:
             values = values[:, :1].expand(-1, len(columns), *values.shape[2:])
         return self._catalog.pick(values, [columns.index(geom) for geom in ids], one)
 
@@ -389,10 +398,3 @@ def usable(action: torch.Tensor, bounded: bool) -> torch.Tensor:
     finite = action.isfinite().all(dim=-1, keepdim=True)
     action = torch.where(finite, action, 0.0)
     return action.clamp(-1.0, 1.0) if bounded else action
-
-
-def into_frame(xmat: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """Returns vectors of the world ``(num_envs, ..., 3)`` in frames with the axes ``xmat`` ``(num_envs, 3, 3)``."""
-    between = vectors.ndim - 2
-    axes = xmat.view(xmat.shape[0], *[1] * between, 3, 3)
-    return (axes * vectors.unsqueeze(-1)).sum(-2)

@@ -129,7 +129,7 @@ class World:
             self.reward, self.terms = Buffer.around(reward), Buffer.around(terms.view(n, -1))
             self.done, self.terminated, self.truncated = map(Buffer.around, flags.view(3, n))
             self.memory = {
-                name: torch.zeros(n, *shape, device=task.device)
+                name: torch.zeros(n, *shape, dtype=torch.float32, device=task.device)
                 for name, shape in (hooks.catalog.memory if hooks else {}).items()
             }
             self.mask = Buffer(n, bool, device)
@@ -161,7 +161,7 @@ class World:
         self._pid, self._closed = os.getpid(), False
         _WORLDS.add(self)
 
-    # The control step and the reset, from top to bottom. Warp's launches are recorded; the parts of hooks are torch.
+    # The control step and the reset, from top to bottom. Each line is a recorded launch, a part of hooks, or nothing.
 
     def _take_step(self, *action: wp.array) -> None:
         """The control step: under the actions in the buffer, unless torch records it with others."""
@@ -291,7 +291,7 @@ class World:
         def part(name: str, *needed: str) -> Callable[[], None]:
             if hooks is None or not own & set(needed):
                 return _nothing
-            parts.append(Part(getattr(hooks, name), arrays, self._title))
+            parts.append(Part(getattr(hooks, name), arrays, self._title, hooks.catalog.fixed()))
             return parts[-1]
 
         self._control = part("control", "control")
@@ -310,7 +310,7 @@ class World:
         self._physics, self._settle = self._record(self._launch_step), self._record(self._launch_reset)
         self._rest = self._record(self._launch_rest) if own else _nothing
         self._conclude = self._record(self._launch_conclude) if own else _nothing
-        self._move = self._keeping_reward(self._record(self._launch_move)) if moves else _nothing
+        self._move = self._keeping_what_was(self._record(self._launch_move)) if moves else _nothing
         self._refresh_graph: Graph | None = None  # most environments never need it
         self._run_step, self._run_reset = self._as_graph("_take_step"), self._as_graph("_begin_masked")
 
@@ -345,16 +345,16 @@ class World:
     def _record(self, launch: Callable[..., None]) -> Recorded:
         return Recorded(launch, self.sim.capture(launch), self.sim.device)
 
-    def _keeping_reward(self, move: Callable[[], None]) -> Callable[[], None]:
-        """Returns ``move`` such that a fused function, which runs again, leaves the reward of the step as it was."""
-        if not self._fused:
-            return move
-        rewards = self.reward.torch, self.terms.torch
+    def _keeping_what_was(self, move: Callable[[], None]) -> Callable[[], None]:
+        """Returns ``move`` such that what belongs to the step stays: a fused function's reward, the contact forces."""
+        rows = [self.reward.torch, self.terms.torch] if self._fused else []
+        if self.sim.contact_force.shape[1]:
+            rows += [self.sim.contact_force, self.sim.in_contact]
 
         def moved() -> None:
-            kept = [values.clone() for values in rewards]
+            kept = [values.clone() for values in rows]
             move()
-            for values, value in zip(rewards, kept, strict=True):
+            for values, value in zip(rows, kept, strict=True):
                 values.copy_(value)
 
         return moved
@@ -498,7 +498,11 @@ class World:
         if self._closed or os.getpid() != self._pid:  # in a forked process: the parent reports
             return
         self._closed = True
-        with contextlib.ExitStack() as stack:  # if one monitor raises, the others report all the same
+        # A mode of torch may be active where this world is collected: what it does is not to be traced.
+        with (
+            torch.utils._python_dispatch._disable_current_modes(),
+            contextlib.ExitStack() as stack,
+        ):  # if one monitor raises, the others report all the same
             stack.callback(self.__dict__.update, {"_closed": True})
             stack.callback(self.__dict__.clear)  # an exception may keep a reference to this world
             for monitor in self._monitors:

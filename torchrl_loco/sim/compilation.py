@@ -72,7 +72,7 @@ def _collect() -> Iterator[dict[tuple[wp.Module, int], None]]:
         if callable(while_body):
             while_body(**kwargs)
 
-    def block_size(kernel: wp.Kernel, device: Any) -> tuple[int, int]:
+    def block_size(kernel: wp.Kernel, device: Any = None) -> tuple[int, int]:
         if threading.get_ident() != thread:
             return suggested_block_size(kernel, device)
         variants[kernel.module, kernel.module.options["block_dim"]] = None

@@ -49,7 +49,8 @@ def load(
         return model
     distance = 3.0 * max(np.linalg.norm(model.body_ipos, axis=1).max() + model.geom_rbound[1:].max(initial=0.1), 0.3)
     camera = spec.bodies[1].add_camera(name="side", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
-    camera.pos, camera.alt.xyaxes = [0, -2 * distance, 0.5 * distance], [1, 0, 0, 0, 0.25, 1]
+    tilt = 0.5 * (0.5 * np.pi - np.arctan(0.25))  # it looks along y, and down to the body
+    camera.pos, camera.quat = [0, -2 * distance, 0.5 * distance], [np.cos(tilt), np.sin(tilt), 0, 0]
     return spec.compile()
 
 
@@ -75,6 +76,11 @@ def specification(source: Path | str | mujoco.MjSpec, folder: Path | None = None
 def has_home(mj_model: mujoco.MjModel) -> bool:
     """Returns whether a model has a keyframe named ``home``."""
     return "home" in [mj_model.key(i).name for i in range(mj_model.nkey)]
+
+
+def home_pose(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Returns the pose of the keyframe ``home`` of a model, or else its ``qpos0``, ``(nq,)``."""
+    return mj_model.key("home").qpos if has_home(mj_model) else mj_model.qpos0
 
 
 def control(mj_model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import functools
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ class Environments:
         self.transforms: tuple[Transform, ...] = ()
         if given is not None:
             self._base, self.transforms = unwrapped(given)
+            _refuse_further_arguments(type(self._base))
         self.full_length = length_of(resolve(config.task)) if self._base is None else self._base.config.episode_length
 
     @property
@@ -66,6 +68,22 @@ class Environments:
         for transform in self.transforms:
             env = TransformedEnv(env, copy.deepcopy(transform.clone()))  # that it learns in evaluations stays apart
         return env
+
+
+def _refuse_further_arguments(cls: type[LocoEnv]) -> None:
+    """Refuses a class that takes arguments of its own: worlds for evaluations are made anew, without their values.
+
+    Raises:
+        ValueError: it does.
+    """
+    known = inspect.signature(LocoEnv.__init__).parameters
+    kinds = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    parameters = inspect.signature(cls.__init__).parameters.values()
+    if own := [each.name for each in parameters if each.name not in known and each.kind not in kinds]:
+        raise ValueError(
+            f"{cls.__name__} takes {', '.join(own)}, which evaluations in worlds of their own do not know: make a "
+            "subclass with these values as attributes, and pass that"
+        )
 
 
 def length_of(task: type[LocoEnv]) -> int:

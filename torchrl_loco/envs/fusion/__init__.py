@@ -11,7 +11,7 @@ What a world does depends on no other world: on neither their number nor their n
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -26,7 +26,11 @@ from torchrl_loco.sim.world_func import BLOCK_DIM, fill
 
 
 def _written(
-    traced: torch.fx.GraphModule, arrays: dict[str, torch.Tensor], num_envs: int, device: torch.device
+    traced: torch.fx.GraphModule,
+    arrays: dict[str, torch.Tensor],
+    num_envs: int,
+    device: torch.device,
+    fixed: Sequence[torch.Tensor],
 ) -> tuple[Program, str]:
     """Returns a graph as C++; operators without a rule are decomposed as torch does it for its compilers.
 
@@ -35,7 +39,7 @@ def _written(
     """
     missing, graph = dict[Any, Any](), traced
     while True:
-        program = Program(arrays, num_envs, device, RULES)
+        program = Program(arrays, num_envs, device, RULES, fixed)
         try:
             return program, program.run(graph.graph, functools.partial(getattr, graph))
         except NoRule as error:
@@ -59,24 +63,29 @@ def _kernel(text: str, Args: Any) -> wp.Kernel:  # noqa: N803
 
 
 def fuse(
-    traced: torch.fx.GraphModule, arrays: dict[str, torch.Tensor], num_envs: int, device: wp.Device
+    traced: torch.fx.GraphModule,
+    arrays: dict[str, torch.Tensor],
+    num_envs: int,
+    device: wp.Device,
+    fixed: Sequence[torch.Tensor] = (),
 ) -> Callable[[], None]:
     """Returns a function that does what a traced one does to arrays, in one launch on Warp's current stream.
 
-    Tensors that it uses are read from memory at each launch, so what is changed in place is seen, but for
-    indices, which are those of now. The tensors live as long as the returned function.
+    Tensors that it uses are read from memory at each launch, so what is changed in place is seen. The tensors live as
+    long as the returned function.
 
     Args:
         traced: of a function of ``arrays`` that changes them in place, by ``make_fx``.
         arrays: tensors by name, ``(num_envs, ...)`` in any order of memory; others are read only, and so is ``seed``.
         num_envs: number of worlds.
         device: where they live.
+        fixed: further tensors that it uses and that never change: they alone can be indices.
 
     Raises:
         CannotFuse: the graph has an operator, type or shape that cannot be written as the code of one world.
     """
     with torch.no_grad():
-        program, text = _written(traced, arrays, num_envs, torch.device(wp.device_to_torch(device)))
+        program, text = _written(traced, arrays, num_envs, torch.device(wp.device_to_torch(device)), fixed)
     names = [f"p{index}" for index in program.used]
     struct = wp.struct(type("Pointers", (), {"__annotations__": dict.fromkeys(names, wp.uint64)}))
     tensors = [program.tensors[index] for index in program.used]

@@ -115,6 +115,7 @@ class Program:
         num_envs: number of worlds.
         device: where they live.
         rules: by operator's name without overload, a function of the program and the operator's arguments.
+        fixed: tensors that never change, which can be indices.
 
     Attributes:
         tensors: what it reads and writes.
@@ -126,7 +127,9 @@ class Program:
         num_envs: int,
         device: torch.device,
         rules: dict[str, Callable[..., Any]],
+        fixed: Iterable[torch.Tensor] = (),
     ) -> None:
+        self._fixed = {tensor.data_ptr() for tensor in fixed}
         self._arrays, self._n, self._device, self._rules = arrays, num_envs, device, rules
         self.tensors: list[torch.Tensor] = []
         self._nodes: dict[Any, Node] = {}
@@ -318,6 +321,8 @@ class Program:
                 raise CannotFuse("{op} has indices that depend on the state")
             if node.number is None and node.place[0] not in memory:
                 tensor = self.tensors[node.place[0]]
+                if tensor.data_ptr() not in self._fixed:
+                    raise CannotFuse("{op} has indices in a tensor that may change: index with numbers, or by names")
                 memory[node.place[0]] = torch.as_strided(tensor, (_span(tensor),), (1,)).cpu()
             values[at] = node.number if node.number is not None else memory[node.place[0]][node.place[1]]
         return values
