@@ -29,7 +29,7 @@ def load(
 ) -> mujoco.MjModel:
     """Returns a model. MJCF may include ``scene.xml``, which is ours unless one lies beside it.
 
-    A model without a camera ``side`` gets one that follows its first body, so that videos show something.
+    A model without a camera ``side`` gets one that follows its first body, and a light if it has none: videos show it.
 
     Args:
         source: path of an MJCF file, MJCF text, or a ``mujoco.MjSpec``, which stays as it is.
@@ -51,6 +51,8 @@ def load(
     camera = spec.bodies[1].add_camera(name="side", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
     tilt = 0.5 * (0.5 * np.pi - np.arctan(0.25))  # it looks along y, and down to the body
     camera.pos, camera.quat = [0, -2 * distance, 0.5 * distance], [np.cos(tilt), np.sin(tilt), 0, 0]
+    if model.nlight == 0:
+        spec.worldbody.add_light(pos=[0, -distance, 4 * distance], dir=[0, 0.25, -1], diffuse=[0.8, 0.8, 0.8])
     return spec.compile()
 
 
