@@ -276,7 +276,7 @@ class Hooks:
         wrong = a["non_finite"] | _beyond(a["reward"], a["qpos"], a["qvel"], *memory, *outputs)
         a["non_finite"].copy_(wrong)
         for values in (*outputs, a["reward"], a["terms"]):
-            values.masked_fill_(_rows(wrong, values), 0.0)
+            values.masked_fill_(_by_world(wrong, values), 0.0)
 
     def begin(self, a: Arrays) -> None:
         """At a reset, in the masked worlds, which are at rest: writes pose and memory."""
@@ -294,15 +294,17 @@ class Hooks:
         wrong = _beyond(a["qpos"], a["qvel"], *groups.values()) & a["mask"]
         a["non_finite"].copy_(a["non_finite"] | wrong)
         for name, values in groups.items():
-            target, values = a[f"out.{name}"], values.masked_fill(_rows(wrong, values), 0.0)
-            target.copy_(torch.where(_rows(a["mask"], target), values, target))
+            target, values = a[f"out.{name}"], values.masked_fill(_by_world(wrong, values), 0.0)
+            target.copy_(torch.where(_by_world(a["mask"], target), values, target))
 
     def _remember(self, a: Arrays, rows: Mapping[str, torch.Tensor], mask: torch.Tensor | None = None) -> None:
         new = {}  # all of them before the first is written: a row may be a view of another entry
         for name, row in rows.items():
             target = a[f"memory.{name}"] if name in self.catalog.memory else a[name]
             row = unit_quaternions(self.catalog.mj_model, row) if name == "qpos" else row
-            new[name] = row.clone() if mask is None else torch.where(_rows(mask, target), row.to(target.dtype), target)
+            new[name] = (
+                row.clone() if mask is None else torch.where(_by_world(mask, target), row.to(target.dtype), target)
+            )
         for name, row in new.items():
             (a[f"memory.{name}"] if name in self.catalog.memory else a[name]).copy_(row)
 
@@ -320,7 +322,7 @@ def _beyond(*arrays: torch.Tensor) -> torch.Tensor:
     return ~torch.stack([part.all(-1) for part in finite]).all(0)
 
 
-def _rows(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+def _by_world(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """Returns a mask of worlds in a shape that broadcasts with ``(num_envs, ...)``."""
     return mask.view(-1, *[1] * (values.ndim - 1))
 

@@ -4,16 +4,15 @@ import contextlib
 import gc
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 import warp as wp
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from torchrl_loco.envs.fusion import CannotFuse, fuse
+from torchrl_loco.envs.hooks import Arrays
 from torchrl_loco.sim import Recorded, Simulation
-
-Arrays = Mapping[str, torch.Tensor]
 
 
 class Part:
