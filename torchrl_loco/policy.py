@@ -84,7 +84,7 @@ class Policy(TensorDictModule):
 
     Args:
         network: an :class:`~torchrl_loco.policy.ObservationNorm`, then linear layers, layer norms and activations; the
-            last is a tanh where actions are bounded by [-1, 1]. :func:`layers_of` says what a file can hold.
+            last is a tanh where actions are bounded by [-1, 1]. ``layers_of`` says what a file can hold.
         info: ``task``, ``protocol``, ``action_repeat``, and further information such as the return.
     """
 
@@ -190,7 +190,7 @@ def layers_of(network: nn.Module) -> list[nn.Module]:
 
 
 def copied(layer: nn.Module) -> nn.Module:
-    """Returns a copy of one of :func:`layers_of` with tensors of its own; a layer norm without weights gets them."""
+    """Returns a copy of one of ``layers_of`` with tensors of its own; a layer norm without weights gets them."""
     if not isinstance(layer, nn.LayerNorm) or (layer.weight is not None and layer.bias is not None):
         return copy.deepcopy(layer)
     (size,) = layer.normalized_shape

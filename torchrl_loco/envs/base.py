@@ -94,11 +94,11 @@ class LocoEnv(EnvBase):
     """
 
     model: ClassVar[Path | str | mujoco.MjSpec]
-    """The body: path of an MJCF file (relative to the file of the class), MJCF text, or a ``mujoco.MjSpec``."""
+    """Path of an MJCF file (relative to the file of the class), MJCF text, or a ``mujoco.MjSpec``."""
     config: SimConfig
     """Settings of the simulation under ``playground``. An instance's has all that was overridden."""
     memory: ClassVar[Mapping[str, int | tuple[int, ...]]] = {}
-    """What a world remembers from step to step, by name: the shape of its row, as in ``{"command": 3, "air_time": 4}``.
+    """What a world remembers, as names and shapes of its rows, such as ``{"command": 3, "air_time": 4}``.
     ``s.command`` reads it; :meth:`update`, :meth:`events` and :meth:`begin` return new rows. The state holds it."""
     episode_length: ClassVar[int | None] = None
     """Control steps after which an episode is truncated; ``None`` takes that of :attr:`config`."""

@@ -37,7 +37,7 @@ def tolerance(
         bounds: lower and upper bound, in the unit of ``x``; may be infinite.
         margin: distance from the nearer bound at which the result is ``value_at_margin``, in the unit of ``x``; 0 makes
             it 0 everywhere outside.
-        sigmoid: shape of the fall-off, one of :data:`SIGMOIDS`.
+        sigmoid: shape of the fall-off, one of ``SIGMOIDS``.
         value_at_margin: result at the margin, in (0, 1); 0 too for the sigmoids ``linear``, ``cosine`` and
             ``quadratic``.
 

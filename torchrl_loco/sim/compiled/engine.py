@@ -148,7 +148,7 @@ class Data:
         )
 
     def outputs(self) -> dict[str, wp.array | None]:
-        """Returns what the kernels write, by name; ``None`` for those of :data:`LATER` that nothing has asked for."""
+        """Returns what the kernels write, by name; ``None`` for those of ``LATER`` that nothing has asked for."""
         self._make = None
         written = {name: self._later.get(name) if name in LATER else getattr(self, name) for name in ROWS}
         del written["ctrl"]
