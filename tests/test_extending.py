@@ -130,7 +130,7 @@ def test_doctor(inchworm, monkeypatch):
     assert engine == "compiled"
     tested = []
     monkeypatch.setattr(doctor, "self_test", lambda *args: tested.append(args) or (0.0, 0.0, "compiled"))
-    assert "inchworm on cpu" in [finding.subject for finding in doctor.diagnose()]
+    assert "inchworm on cpu" in [finding.subject for finding in doctor.diagnose("all")]
     assert ("inchworm_crawl", "cpu") in tested
 
 
