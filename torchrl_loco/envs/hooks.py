@@ -144,7 +144,7 @@ class Hooks:
         mujoco.mj_forward(m, data)
         rows: dict[str, Any] = {name: getattr(data, name) for name in ("qpos", "qvel", "ctrl", "xpos", "cvel")}
         rows |= {"xmat": data.xmat.reshape(-1, 3, 3), "subtree_com": data.subtree_com, "sensordata": data.sensordata}
-        rows |= {"time": 0.0, "contact_force": [[0.0] * 3], "in_contact": [0.0], "action": [0.0] * m.nu}
+        rows |= {"contact_force": [[0.0] * 3], "in_contact": [0.0], "action": [0.0] * m.nu}
         rows |= {f"memory.{name}": torch.zeros(shape) for name, shape in catalog.memory.items()}
         arrays = {name: torch.as_tensor(row, dtype=torch.float32).to(device) for name, row in rows.items()}
         arrays = {name: row.repeat(n, *[1] * row.ndim) for name, row in arrays.items()}

@@ -225,7 +225,7 @@ class World:
             flags=flags,
         )
         self._start = [WorldFunc(begin_episode, start)]
-        self._starts_at_rest = "begin" not in self._own
+        self._starts_at_rest = True
         pose = task.pose_func(self) if "begin" not in self._own else None
         if pose is not None:
             func, inputs = check_pair("pose_func", pose)
@@ -235,9 +235,10 @@ class World:
     def _fused_outputs(self, task: Task) -> tuple[Any, int, int]:
         """Returns where a fused function writes, and the sizes of its rows; what a hook returns instead is not used."""
         cls, n, device = type(task), task.num_envs, self.sim.device
-        observation = Buffer.around(self.groups["observation"]) if "observation" not in self._own else None
-        if observation is None:
+        if "observation" in self._own:
             observation = Buffer((n, cls.observation_size), float, device)
+        else:
+            observation = Buffer.around(self.groups["observation"])
         reward, terms = self.reward, self.terms
         if "reward" in self._own:
             reward, terms = Buffer(n, float, device), Buffer((n, len(cls.term_names)), float, device)
@@ -319,7 +320,7 @@ class World:
         sim = self.sim
         assert task.hooks is not None
         catalog = task.hooks.catalog
-        arrays = {name: getattr(sim, name) for name in ("qpos", "qvel", "ctrl", "time", "xpos", "xmat")}
+        arrays = {name: getattr(sim, name) for name in ("qpos", "qvel", "ctrl", "xpos", "xmat")}
         arrays |= {name: getattr(sim, name) for name in catalog.arrays & {"cvel", "subtree_com"}}
         if "sensordata" in catalog.arrays:
             arrays["sensordata"] = wp.to_torch(sim.data.sensordata)
