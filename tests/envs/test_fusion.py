@@ -23,11 +23,11 @@ def copies(arrays):
     return {name: values.clone() for name, values in arrays.items()}
 
 
-def fused(work, arrays, n, fixed=()):
+def fused(work, arrays, n, fixed=(), device=CPU):
     """Returns ``work`` on arrays as a kernel; tracing runs it on copies."""
     with torch.no_grad():
-        traced = constants_on(CPU, make_fx(lambda arrays: work(arrays))(copies(arrays)))
-    return fuse(traced, arrays, n, wp.get_device("cpu"), fixed)
+        traced = constants_on(device, make_fx(lambda arrays: work(arrays))(copies(arrays)))
+    return fuse(traced, arrays, n, wp.get_device(str(device)), fixed)
 
 
 def assert_same(found, expected):
@@ -49,28 +49,34 @@ def by_world(values):
 
 
 @pytest.mark.parametrize("cls", [FollowVelocity, WalkBackwards, WalkBlindly])
-def test_parts_of_tasks_do_what_plain_torch_does(cls):
-    env = cls(6)
+@pytest.mark.parametrize(
+    ("device", "n"), [("cpu", 6), pytest.param("cuda:0", 75, marks=pytest.mark.gpu)], ids=["cpu", "cuda"]
+)  # of 75 worlds some fill warps, which write their rows together
+def test_parts_of_tasks_do_what_plain_torch_does(cls, device, n):
+    env = cls(n, device=device)
     env.reset()
     env.rand_step()
-    world, generator = env.world, torch.Generator().manual_seed(0)
+    wait = torch.cuda.synchronize if device != "cpu" else wp.synchronize
+    world, generator = env.world, torch.Generator(device).manual_seed(0)
     parts = [part for name in PARTS if isinstance(part := getattr(world, f"_{name}"), Part)]
     assert parts
     for part in parts:
         arrays = copies(part._arrays)
         for name, values in arrays.items():
             if values.dtype == torch.float32:
-                values += 0.3 * torch.randn(values.shape, generator=generator)
+                values += 0.3 * torch.randn(values.shape, generator=generator, device=device)
                 values[1], values[2] = torch.nan, torch.inf
             elif values.dtype == torch.bool:
-                values.copy_(torch.rand(values.shape, generator=generator) < 0.5)
+                values.copy_(torch.rand(values.shape, generator=generator, device=device) < 0.5)
             if name in ("qpos", "qvel", "xmat", "terms"):
                 arrays[name] = by_world(values)
         expected = copies(arrays)
-        launch = fused(part._work, arrays, 6, part._fixed)
+        launch = fused(part._work, arrays, n, part._fixed, torch.device(device))
         with torch.no_grad():
             part._work(expected)
+        wait()  # the kernel runs on Warp's stream
         launch()
+        wp.synchronize()
         assert_same(arrays, expected)
 
 

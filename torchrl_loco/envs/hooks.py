@@ -291,8 +291,8 @@ class Hooks:
     def observe_begun(self, a: Arrays) -> None:
         """After a reset, or after a state was written: writes the observation of the masked worlds."""
         groups = self._groups(a)
-        wrong = _beyond(a["qpos"], a["qvel"], *groups.values()) & a["mask"]
-        a["non_finite"].copy_(a["non_finite"] | wrong)
+        wrong = _beyond(a["qpos"], a["qvel"], *groups.values())
+        a["non_finite"].copy_(torch.where(a["mask"], a["non_finite"] | wrong, a["non_finite"]))
         for name, values in groups.items():
             target, values = a[f"out.{name}"], values.masked_fill(_by_world(wrong, values), 0.0)
             target.copy_(torch.where(_by_world(a["mask"], target), values, target))

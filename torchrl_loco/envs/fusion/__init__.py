@@ -4,10 +4,12 @@ The traced graph is interpreted once on symbols. A tensor of all worlds becomes 
 dimension of the worlds has size 1; views of tensors are views of such arrays, so that writing to one changes the other.
 What a world does depends on no other world: on neither their number nor their numbers, bit for bit.
 
-===========  ==========================================================
-``program``  the interpreter: nodes, tensors of them, and C++ of both
+===========  =========================================
+``nodes``    numbers of a world, and operators on them
+``program``  the interpreter: tensors of nodes
 ``rules``    what each operator of torch does, as data
-===========  ==========================================================
+``source``   the C++ of nodes that are stored
+===========  =========================================
 """
 
 import functools
@@ -19,9 +21,10 @@ import warp as wp
 from torch._decomp import decomposition_table
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from torchrl_loco.envs.fusion.program import CannotFuse as CannotFuse
+from torchrl_loco.envs.fusion.nodes import CannotFuse as CannotFuse
 from torchrl_loco.envs.fusion.program import NoRule, Program
 from torchrl_loco.envs.fusion.rules import RULES
+from torchrl_loco.envs.fusion.source import Source
 from torchrl_loco.sim.world_func import BLOCK_DIM, fill
 
 
@@ -31,7 +34,7 @@ def _written(
     num_envs: int,
     device: torch.device,
     fixed: Sequence[torch.Tensor],
-) -> tuple[Program, str]:
+) -> tuple[Program, Source]:
     """Returns a graph as C++; operators without a rule are decomposed as torch does it for its compilers.
 
     Raises:
@@ -85,12 +88,12 @@ def fuse(
         CannotFuse: the graph has an operator, type or shape that cannot be written as the code of one world.
     """
     with torch.no_grad():
-        program, text = _written(traced, arrays, num_envs, torch.device(wp.device_to_torch(device)), fixed)
-    names = [f"p{index}" for index in program.used]
+        program, source = _written(traced, arrays, num_envs, torch.device(wp.device_to_torch(device)), fixed)
+    names = [f"p{index}" for index in source.used]
     struct = wp.struct(type("Pointers", (), {"__annotations__": dict.fromkeys(names, wp.uint64)}))
-    tensors = [program.tensors[index] for index in program.used]
+    tensors = [program.tensors[index] for index in source.used]
     pointers = fill(struct, **{name: tensor.data_ptr() for name, tensor in zip(names, tensors, strict=True)})
-    kernel = _kernel(text, struct)
+    kernel = _kernel(source.text, struct)
 
     def launch(kept: Any = tensors) -> None:
         wp.launch(kernel, num_envs, [pointers], device=device, block_dim=BLOCK_DIM)

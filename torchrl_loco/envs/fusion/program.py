@@ -10,28 +10,18 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchrl_loco.envs.fusion.nodes import MOST_NUMBERS, TYPES, WHERE, WRAPPING, CannotFuse, Node
+from torchrl_loco.envs.fusion.source import Source, span
 from torchrl_loco.sim.compiled.symbols import literal
 
-TYPES = {torch.float32: "float", torch.int64: "long long", torch.int32: "int", torch.bool: "bool"}
-MOST_NUMBERS = 100_000
-"""Numbers of a tensor, or of a part, that are still worth writing out one by one."""
 LONG = 64
 """Rows of a user's tensor that are taken for those of the worlds, if there are as many worlds; fewer may be chance."""
 
-ADD, SUB, MUL, NEG, SHL, DIV = "{0} + {1}", "{0} - {1}", "{0} * {1}", "-{0}", "{0} << {1}", "{0} / {1}"
-WRAPPING = (ADD, SUB, MUL, NEG, SHL)
-"""Operators that wrap around for integers: C++ defines that for unsigned ones only."""
-WHERE, AND, OR, EQUAL = "{0} ? {1} : {2}", "{0} & {1}", "{0} | {1}", "{0} == {1}"
-LEAST, MOST = "{0} < {1} || {0} != {0} ? {0} : {1}", "{0} > {1} || {0} != {0} ? {0} : {1}"  # NaN wins, as in torch
 VIEWS = ("view", "reshape", "_unsafe_view", "flatten", "unflatten")
 INFINITE = "(1e30f * 1e30f)"
 FORMS = ("{}", "{}_like", "new_{}")
 FILLERS = ("empty_strided", *(form.format(name) for name in ("zeros", "ones", "empty", "full") for form in FORMS))
 """Operators that make tensors, which may have a row for each world."""
-
-
-class CannotFuse(Exception):  # noqa: N818
-    """A graph that is no straight-line code of each world; the message tells which operator or shape."""
 
 
 class NoRule(CannotFuse):
@@ -44,26 +34,6 @@ class NoRule(CannotFuse):
     def __init__(self, target: Any) -> None:
         super().__init__(f"{target} has no rule")
         self.target = target
-
-
-class Node:
-    """A number of a world.
-
-    Args:
-        text: C++ of it, in which ``{0}`` is its first part; of a constant, a literal.
-        dtype: its type.
-        args: its parts.
-        varies: whether it may differ from world to world.
-        number: value of a constant.
-        place: of what is read from memory, the index of the tensor, and how many elements the world's begins later
-            than that of the first, and how many each world's later than that of the last.
-    """
-
-    __slots__ = ("args", "dtype", "number", "place", "text", "varies")
-
-    def __init__(self, text: str, dtype: torch.dtype, args: tuple["Node", ...], number: Any, place: Any) -> None:
-        self.text, self.dtype, self.args, self.number, self.place = text, dtype, args, number, place
-        self.varies: bool = any(arg.varies for arg in args) or bool(place and place[2])
 
 
 @dataclass
@@ -323,13 +293,13 @@ class Program:
                 tensor = self.tensors[node.place[0]]
                 if tensor.data_ptr() not in self._fixed:
                     raise CannotFuse("{op} has indices in a tensor that may change: index with numbers, or by names")
-                memory[node.place[0]] = torch.as_strided(tensor, (_span(tensor),), (1,)).cpu()
+                memory[node.place[0]] = torch.as_strided(tensor, (span(tensor),), (1,)).cpu()
             values[at] = node.number if node.number is not None else memory[node.place[0]][node.place[1]]
         return values
 
     # The graph.
 
-    def run(self, graph: torch.fx.Graph, constants: Callable[[str], torch.Tensor]) -> str:
+    def run(self, graph: torch.fx.Graph, constants: Callable[[str], torch.Tensor]) -> Source:
         """Returns the C++ of a graph whose operators all have a rule.
 
         Args:
@@ -355,7 +325,7 @@ class Program:
                     raise
                 except CannotFuse as error:
                     raise CannotFuse(str(error).replace("{op}", _title(node.target))) from None
-        return self._text()
+        return self._source()
 
     def _constant(self, node: torch.fx.Node, tensor: torch.Tensor) -> Any:
         fresh = all(user.target is torch.ops.aten.lift_fresh_copy.default for user in node.users)
@@ -411,10 +381,8 @@ class Program:
             raise CannotFuse("{op} mixes worlds")
         target.array[...] = source.array
 
-    # The C++.
-
-    def _text(self) -> str:
-        """Returns statements that compute what has changed, and write it.
+    def _source(self) -> Source:
+        """Returns the C++ that computes what has changed, and writes it.
 
         Raises:
             CannotFuse: it cannot be written by one thread a world.
@@ -426,68 +394,11 @@ class Program:
                     if value.world is None:
                         raise CannotFuse("a tensor that has no worlds is changed")
                     stores.append((before[at], value.array[at]))
-        needed, stack = set[Node](), [node for _, node in stores]
-        while stack:
-            node = stack.pop()
-            if node not in needed:
-                needed.add(node)
-                stack += node.args
-        if len(needed) > MOST_NUMBERS:
-            raise CannotFuse(f"it has {len(needed)} numbers")
-        names: dict[Node, str] = {}
-        lines: list[str] = []
-        for target, node in stores:
-            _write(node, names, lines)
-            if target in needed:  # of the old value, which is used later
-                _write(target, names, lines)
-            lines.append(f"{target.text} = {names[node]};")
-        places = {node.place for pair in stores for node in pair} | {node.place for node in needed}
-        used = sorted({(place[0], place[2]) for place in places if place})
-        pointers = [
-            f"{TYPES[self.tensors[index].dtype]}* const p{index}_{step} = "
-            f"reinterpret_cast<{TYPES[self.tensors[index].dtype]}*>(args.p{index}) + world * {step}LL;"
-            for index, step in used
-        ]
-        self.used = sorted({index for index, _ in used})
-        for written in {target.place[0] for target, _ in stores}:
-            first, last = _ends(self.tensors[written])
-            others = [_ends(self.tensors[index]) for index in self.used if index != written]
-            if any(start < last and first < end for start, end in others):
-                raise CannotFuse("a tensor that is written shares memory with another")
-        return "\n".join([*pointers, *lines])
-
-
-def _write(node: Node, names: dict[Node, str], lines: list[str]) -> None:
-    """Appends statements for a node and its parts, each once."""
-    stack = [node]
-    while stack:
-        node = stack[-1]
-        waiting = [arg for arg in node.args if arg not in names]
-        if node in names or waiting:
-            stack += reversed(waiting)
-            if not waiting:
-                stack.pop()
-            continue
-        stack.pop()
-        if node.number is not None:
-            names[node] = node.text
-            continue
-        text = node.text.format(*(names[arg] for arg in node.args)) if node.args else node.text
-        names[node] = f"t{len(names)}"
-        lines.append(f"const {TYPES[node.dtype]} {names[node]} = {text};")
+        return Source(stores, self.tensors)
 
 
 def _varies(x: Value) -> bool:
     return any(node.varies for node in x.array.flat)
-
-
-def _span(tensor: torch.Tensor) -> int:
-    """Returns over how many elements a tensor extends in memory."""
-    return 1 + sum((size - 1) * step for size, step in zip(tensor.shape, tensor.stride(), strict=True))
-
-
-def _ends(tensor: torch.Tensor) -> tuple[int, int]:
-    return tensor.data_ptr(), tensor.data_ptr() + _span(tensor) * tensor.element_size() * bool(tensor.numel())
 
 
 def _name(target: Any) -> str:

@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchrl_loco.envs.fusion.program import (
+from torchrl_loco.envs.fusion.nodes import (
     ADD,
     AND,
     DIV,
     EQUAL,
-    FILLERS,
     LEAST,
-    LONG,
     MOST,
     MUL,
     NEG,
@@ -23,15 +21,10 @@ from torchrl_loco.envs.fusion.program import (
     SHL,
     SUB,
     TYPES,
-    VIEWS,
     WHERE,
     CannotFuse,
-    Program,
-    Value,
-    Worldwise,
-    _shifted,
-    _varies,
 )
+from torchrl_loco.envs.fusion.program import FILLERS, LONG, VIEWS, Program, Value, Worldwise, _shifted, _varies
 
 BEATS = {"max": "{0} > {1} || ({0} != {0} && {1} == {1})", "min": "{0} < {1} || ({0} != {0} && {1} == {1})"}
 REMAINDER = "{0} != 0 && ({0} < 0) != ({1} < 0) ? {0} + {1} : {0}"

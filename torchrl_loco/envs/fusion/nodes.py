@@ -1,0 +1,39 @@
+"""The numbers of a world as nodes of a graph, and the C++ of operators on them."""
+
+from typing import Any
+
+import torch
+
+TYPES = {torch.float32: "float", torch.int64: "long long", torch.int32: "int", torch.bool: "bool"}
+MOST_NUMBERS = 100_000
+"""Numbers of a tensor, or of a part, that are still worth writing out one by one."""
+
+ADD, SUB, MUL, NEG, SHL, DIV = "{0} + {1}", "{0} - {1}", "{0} * {1}", "-{0}", "{0} << {1}", "{0} / {1}"
+WRAPPING = (ADD, SUB, MUL, NEG, SHL)
+"""Operators that wrap around for integers: C++ defines that for unsigned ones only."""
+WHERE, AND, OR, EQUAL = "{0} ? {1} : {2}", "{0} & {1}", "{0} | {1}", "{0} == {1}"
+LEAST, MOST = "{0} < {1} || {0} != {0} ? {0} : {1}", "{0} > {1} || {0} != {0} ? {0} : {1}"  # NaN wins, as in torch
+
+
+class CannotFuse(Exception):  # noqa: N818
+    """A graph that is no straight-line code of each world; the message tells which operator or shape."""
+
+
+class Node:
+    """A number of a world.
+
+    Args:
+        text: C++ of it, in which ``{0}`` is its first part; of a constant, a literal.
+        dtype: its type.
+        args: its parts.
+        varies: whether it may differ from world to world.
+        number: value of a constant.
+        place: of what is read from memory, the index of the tensor, and how many elements the world's begins later
+            than that of the first, and how many each world's later than that of the last.
+    """
+
+    __slots__ = ("args", "dtype", "number", "place", "text", "varies")
+
+    def __init__(self, text: str, dtype: torch.dtype, args: tuple["Node", ...], number: Any, place: Any) -> None:
+        self.text, self.dtype, self.args, self.number, self.place = text, dtype, args, number, place
+        self.varies: bool = any(arg.varies for arg in args) or bool(place and place[2])
