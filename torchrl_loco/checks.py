@@ -1,6 +1,6 @@
 """Checks of user input, one function per kind of argument. Each returns the value in its canonical type.
 
-A message says what is wrong and what is valid. Intervals are written as in mathematics: ``"(0, 1]"``.
+A message says what is wrong and what is valid.
 """
 
 import dataclasses
@@ -12,20 +12,46 @@ import operator
 import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
     import torch
 
-POSITIVE_INT = "[1, 2**31)"
+
+class Interval(NamedTuple):
+    """Numbers between two bounds, of which each may belong to them: by default ``low``, but not ``high``."""
+
+    low: float
+    high: float
+    with_low: bool = True
+    with_high: bool = False
+
+    def __contains__(self, value: Any) -> bool:
+        """Returns whether a number lies in it; NaN never does."""
+        above = value >= self.low if self.with_low else value > self.low
+        return above and (value <= self.high if self.with_high else value < self.high)
+
+    def __str__(self) -> str:
+        """Returns it as in mathematics, such as ``"(0, 1]"``."""
+        high = {2**31: "2**31", 2**32: "2**32"}.get(int(self.high) if math.isfinite(self.high) else 0, f"{self.high:g}")
+        return f"{'[' if self.with_low else '('}{self.low:g}, {high}{']' if self.with_high else ')'}"
+
+
+POSITIVE_INT = Interval(1, 2**31)
 """Counts: kernels index with 32 bits."""
-POSITIVE = "(0, inf)"
-SEED = "[0, 2**32)"
+COUNT = Interval(0, 2**31)
+"""Counts that may be zero."""
+SEED = Interval(0, 2**32)
+POSITIVE = Interval(0, math.inf, with_low=False)
+NOT_NEGATIVE = Interval(0, math.inf)
+FRACTION = Interval(0, 1, with_high=True)
+ANY = Interval(-math.inf, math.inf, with_low=False)
+"""All finite numbers."""
 
 
-def check_int(name: str, value: Any, interval: str = POSITIVE_INT) -> int:
+def check_int(name: str, value: Any, interval: Interval = POSITIVE_INT) -> int:
     """Returns ``value`` as an int.
 
     Raises:
@@ -42,7 +68,7 @@ def check_int(name: str, value: Any, interval: str = POSITIVE_INT) -> int:
     return number
 
 
-def check_float(name: str, value: Any, interval: str = POSITIVE) -> float:
+def check_float(name: str, value: Any, interval: Interval = POSITIVE) -> float:
     """Returns ``value`` as a float.
 
     Raises:
@@ -55,17 +81,9 @@ def check_float(name: str, value: Any, interval: str = POSITIVE) -> float:
     return float(value)
 
 
-def _check_interval(name: str, value: float, interval: str) -> None:
-    low, high = (_bound(text) for text in interval[1:-1].split(", "))
-    above = value >= low if interval[0] == "[" else value > low
-    below = value <= high if interval[-1] == "]" else value < high
-    if not (above and below):  # false for NaN too
+def _check_interval(name: str, value: float, interval: Interval) -> None:
+    if value not in interval:
         raise ValueError(f"{name} must lie in {interval}, got {value!r}")
-
-
-def _bound(text: str) -> float:
-    base, _, power = text.partition("**")
-    return float(base) ** float(power) if power else float(base)
 
 
 def check_bool(name: str, value: Any) -> bool:
@@ -103,7 +121,7 @@ def suggestion(word: str, choices: Collection[str]) -> str:
     return f", did you mean {near[0]!r}?" if near else ""
 
 
-def check_fields(config: Any, intervals: Mapping[str, str]) -> None:
+def check_fields(config: Any, intervals: Mapping[str, Interval]) -> None:
     """Checks the fields of a dataclass that are numbers or flags, and stores them in their canonical type.
 
     Args:

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -13,7 +14,7 @@ from torchrl.envs import EnvBase, Transform
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_loco.checks import check_int
+from torchrl_loco.checks import ANY, Interval, check_int
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.state import State
 from torchrl_loco.envs.transforms import PLAIN_TRANSFORMS
@@ -60,8 +61,8 @@ class RolloutCollector:
         worlds = env.batch_size.numel()
         if not callable(policy):
             raise TypeError(f"policy must be a function or module from TensorDict to TensorDict, got {policy!r}")
-        check_int("total_frames", total_frames, "[-1, inf)")
-        if check_int("frames_per_batch", frames_per_batch, "(-inf, inf)") < 1 or frames_per_batch % worlds:
+        check_int("total_frames", total_frames, Interval(-1, math.inf))
+        if check_int("frames_per_batch", frames_per_batch, ANY) < 1 or frames_per_batch % worlds:
             raise ValueError(
                 f"frames_per_batch must be a positive multiple of the {worlds} worlds, got {frames_per_batch}"
             )

@@ -159,18 +159,19 @@ def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, st
     env = make(task, 4, device, seed=0, protocol="dm_control", world_offset=0)
     seconds = time.perf_counter() - start
     engine = env.engine if env.engine == "compiled" else f"{env.engine}: {env.engine_reason}"
-    errors, data = [], mujoco.MjData(env.mj_model)
     td = env.reset()
+    models = [env.mujoco_model(world) for world in range(env.num_envs)]
+    errors, worlds = [], [mujoco.MjData(model) for model in models]
     for action in random_actions(env, range(steps)):
         before = env.get_state().cpu().numpy()
         td = env.step(td.set("action", action.to(env.device)))["next"]
         after = env.get_state()["qpos"].cpu().numpy()
         if env.world.non_finite.torch.any():
             return seconds, float("nan"), engine
-        for world in range(env.num_envs):
+        for world, (model, data) in enumerate(zip(models, worlds, strict=True)):
             for name in State.PHYSICS:
                 getattr(data, name)[:] = before.get(name, {world: ()})[world]
             data.ctrl[:] = env.sim.ctrl[world].cpu()
-            mujoco.mj_step(env.mj_model, data, env.config.substeps)
+            mujoco.mj_step(model, data, env.config.substeps)
             errors.append(np.abs(data.qpos - after[world]).max())
     return seconds, float(np.median(errors)), engine

@@ -16,6 +16,7 @@ from torchrl_loco.config import SimConfig
 from torchrl_loco.envs import LocoEnv, State
 from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.monitors import NAN_DUMP
+from torchrl_loco.envs.vary import Vary
 from torchrl_loco.registry import env_class, list_envs, resolve
 from torchrl_loco.sim.simulation import set_options
 
@@ -29,9 +30,11 @@ class NanDump:
 
     Attributes:
         tensors: ``qpos`` ``(nq,)``, ``qvel`` ``(nv,)``, ``qacc_warmstart`` ``(nv,)``, ``act`` ``(na,)`` if there are
-            activations, and ``action`` ``(nu,)``, before the step.
-        settings: ``env`` (module and name of the class), ``file`` (of the module), ``protocol``, ``config``, ``seed``,
-            ``device``, ``num_envs``, ``world_offset``, and before the step ``world``, ``episode``, ``elapsed_steps``.
+            activations, ``model.<field>`` (numbers that vary,) if ``randomize`` names any, and ``action`` ``(nu,)``,
+            before the step.
+        settings: ``env`` (module and name of the class), ``file`` (of the module), ``protocol``, ``config``,
+            ``randomize``, ``seed``, ``device``, ``num_envs``, ``world_offset``, and before the step ``world``,
+            ``episode``, ``elapsed_steps``.
     """
 
     tensors: dict[str, torch.Tensor]
@@ -41,12 +44,22 @@ class NanDump:
         """Returns an environment of one world with the settings of the dump, and ``config`` on top."""
         env, settings = _class_of(self.settings), {**self.settings["config"], **config}
         arguments = (1, device, self.settings["seed"], self.settings["protocol"])
-        return env(*arguments, world_offset=0, on_overflow="ignore", **settings)
+        varys = [Vary(**vary) for vary in self.settings.get("randomize", [])]
+        return env(*arguments, world_offset=0, on_overflow="ignore", randomize=varys, **settings)
 
     @property
     def state(self) -> State:
         """The state before the step, of one world."""
-        return State({name: self.tensors[name][None] for name in State.PHYSICS if name in self.tensors}, batch_size=[1])
+        state = State({name: row[None] for name, row in self.physics.items()}, batch_size=[1])
+        for name, numbers in self.tensors.items():
+            if name.startswith("model."):
+                state["model", name.removeprefix("model.")] = numbers[None]
+        return state
+
+    @property
+    def physics(self) -> dict[str, torch.Tensor]:
+        """What of the state C MuJoCo's ``mjData`` holds, by name, without a dimension of worlds."""
+        return {name: self.tensors[name] for name in State.PHYSICS if name in self.tensors}
 
 
 def load(path: Path) -> NanDump:
@@ -112,11 +125,13 @@ def mujoco_trace(dump: NanDump) -> np.ndarray:
     C MuJoCo resets a world that is not finite; from there on the trace is NaN.
     """
     config = SimConfig(**dump.settings["config"])
-    model = dump.make_env("cpu").mj_model
+    env = dump.make_env("cpu")
+    env.reset(dump.state, set_state=True)
+    model = env.mujoco_model()
     set_options(model, config)
     data = mujoco.MjData(model)
-    for name, value in dump.state.items():
-        getattr(data, name)[:] = value[0].numpy()
+    for name, value in dump.physics.items():
+        getattr(data, name)[:] = value.numpy()
     trace = [np.concatenate([data.qpos, data.qvel])]
     data.ctrl[:] = controls(dump)
     mujoco.set_mju_user_warning(lambda message: None)  # else it prints, and writes a log into the working directory
@@ -143,7 +158,9 @@ def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterato
         f"{settings['num_envs']} on {settings['device']}, episode {settings['episode']}, "
         f"after {settings['elapsed_steps']} steps"
     )
-    bad = {name: ~(value[0].abs() < MAX_VALUE) for name, value in dump.state.items()}
+    if varied := [name.removeprefix("model.") for name in dump.tensors if name.startswith("model.")]:
+        yield f"with numbers of its own of {', '.join(varied)}"
+    bad = {name: ~(value.abs() < MAX_VALUE) for name, value in dump.physics.items()}
     bad["action"] = ~dump.tensors["action"].isfinite()  # finite ones are clipped
     wrong = [name for name in bad if bad[name].any()]
     for name in wrong:

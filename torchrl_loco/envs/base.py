@@ -1,5 +1,6 @@
 """LocoEnv, the base of all environments: TorchRL's specs, step, reset, seeding and state."""
 
+import copy
 import dataclasses
 import inspect
 import math
@@ -7,7 +8,7 @@ import multiprocessing
 import os
 import secrets
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,6 +21,8 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_loco.checks import (
+    ANY,
+    COUNT,
     SEED,
     check_bool,
     check_choice,
@@ -31,6 +34,8 @@ from torchrl_loco.config import SimConfig, sim_config
 from torchrl_loco.envs.hooks import Hooks, memory_shapes, own_hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.state import State, without_state, write_state
+from torchrl_loco.envs.variation import Variation, constant_of
+from torchrl_loco.envs.vary import Vary, check_randomize
 from torchrl_loco.envs.world import World
 from torchrl_loco.sim import Simulation, fill, models
 from torchrl_loco.sim.sampling import Table, draw_from_table
@@ -72,6 +77,8 @@ class LocoEnv(EnvBase):
             :meth:`health`.
         nan_dump: a file that does not exist yet. The state and action before the first step that made a world
             non-finite are written to it, within about 100 steps or at :meth:`close`; see ``torchrl-loco inspect``.
+        randomize: a list of :class:`torchrl_loco.Vary`, the numbers of the model that differ from world to world;
+            ``None`` takes the class's, ``[]`` is none.
         compile_hooks: whether hooks in torch become kernels; what they read of Python is fixed then. ``False`` runs
             them as they are at every step, to print from them or to debug them.
         config: fields of :class:`torchrl_loco.SimConfig` to override.
@@ -100,6 +107,8 @@ class LocoEnv(EnvBase):
     memory: ClassVar[Mapping[str, int | tuple[int, ...]]] = {}
     """What a world remembers, as names and shapes of its rows, such as ``{"command": 3, "air_time": 4}``.
     ``s.command`` reads it; :meth:`update`, :meth:`events` and :meth:`begin` return new rows. The state holds it."""
+    randomize: Sequence[Vary] = ()
+    """Numbers of the model that each world draws at its resets; see :class:`torchrl_loco.Vary`."""
     episode_length: ClassVar[int | None] = None
     """Control steps after which an episode is truncated; ``None`` takes that of :attr:`config`."""
     action_range: ClassVar[tuple[float, float]] = BOUNDED
@@ -128,6 +137,7 @@ class LocoEnv(EnvBase):
         stagger: bool = False,
         on_overflow: str = "warn",
         nan_dump: Path | str | None = None,
+        randomize: Sequence[Vary] | None = None,
         compile_hooks: bool = True,
         **config: Any,
     ) -> None:
@@ -141,7 +151,7 @@ class LocoEnv(EnvBase):
             of_class = dataclasses.replace(of_class, episode_length=self.episode_length)
         sim_settings = sim_config(of_class, protocol, worlds, config, arguments)
         if world_offset is not None:
-            world_offset = check_int("world_offset", world_offset, "[0, 2**31)")
+            world_offset = check_int("world_offset", world_offset, COUNT)
             check_int("world_offset + num_envs", world_offset + worlds)
         elif seed is not None:
             _warn_if_worlds_repeat()
@@ -149,13 +159,16 @@ class LocoEnv(EnvBase):
         compile_hooks = check_bool("compile_hooks", compile_hooks)
         check_choice("on_overflow", on_overflow, ON_OVERFLOW)
         nan_dump = None if nan_dump is None else check_output_file("nan_dump", nan_dump)
+        varys = check_randomize("randomize", self.randomize if randomize is None else randomize)
         mj_model = models.load(self.model, _folder_of(type(self)))
+        variation = Variation(varys, mj_model, device) if varys else None
 
         super().__init__(device=device, batch_size=[] if num_envs is None else [worlds])
         self.num_envs, self.world_offset = worlds, world_offset
         self.seed = secrets.randbits(32) if seed is None else seed
         self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
         self.stagger, self.compile_hooks = stagger, compile_hooks
+        self.randomize, self.variation = varys, variation
         self.on_overflow, self.nan_dump = on_overflow, nan_dump
         self._action_shape = torch.Size([*self.batch_size, mj_model.nu])
         self._pid = os.getpid()
@@ -221,6 +234,7 @@ class LocoEnv(EnvBase):
         if tuple(cls.action_range) == UNBOUNDED and "control" not in own:
             raise TypeError(f"{name} has actions without bounds, so it must define control(self, s, action)")
         memory_shapes(cls)
+        check_randomize(f"{name}.randomize", cls.randomize)
         # Of the package's own functions only LocoEnv's reads the table.
         if cls.pose_func is not LocoEnv.pose_func and cls.pose_func.__module__.startswith("torchrl_loco."):
             table = next(base for base in cls.__mro__ if {"pose_func", "initial_states"} & vars(base).keys())
@@ -234,7 +248,8 @@ class LocoEnv(EnvBase):
         num_envs = self.num_envs if self.batch_size else None
         device, protocol, seed = str(self.device), self.protocol, self.seed
         engine = self.engine if self.engine == "compiled" else f"{self.engine} ({self.engine_reason})"
-        return f"{type(self).__name__}({num_envs=}, {device=}, {seed=}, {protocol=}, {engine=})"
+        randomize = f", randomize={list(self.randomize)}" if self.randomize else ""
+        return f"{type(self).__name__}({num_envs=}, {device=}, {seed=}, {protocol=}, {engine=}{randomize})"
 
     # The hooks of a task, in plain torch, in the order in which they are called.
 
@@ -566,7 +581,8 @@ class LocoEnv(EnvBase):
         """Ray-traces every world, on the CPU or CUDA, without OpenGL.
 
         Args:
-            camera: ``"side"``, ``"back"`` or ``"egocentric"``.
+            camera: name of one of the model's cameras; those of the package have ``"side"``, ``"back"`` and
+                ``"egocentric"``.
             width: pixels in a row.
             height: rows.
 
@@ -600,6 +616,39 @@ class LocoEnv(EnvBase):
         """
         return self.world.health.summary()
 
+    # The numbers of the model.
+
+    def model_value(self, field: str) -> torch.Tensor:
+        """Returns a copy of a field of the model in all worlds, ``(num_envs, *shape)``, such as ``"geom_friction"``.
+
+        What ``randomize`` varies is each world's own, and the model's before its first reset; everything else is the
+        same in all of them. ``"gravity"`` is that of the model's options.
+
+        Raises:
+            AttributeError: ``MjModel`` has no such field, or it is no array of numbers.
+        """
+        if self.variation is not None and field in self.variation.varied.places:
+            return self._batched(self.variation.field(field, self.sim.numbers))
+        numbers = torch.tensor(constant_of(self.mj_model, field), dtype=torch.float32, device=self.device)
+        return self._batched(numbers.expand(self.num_envs, *numbers.shape))
+
+    def mujoco_model(self, world: int = 0) -> mujoco.MjModel:
+        """Returns a copy of the model with the present numbers of a world, for C MuJoCo.
+
+        Args:
+            world: index of the world, negative from the end.
+
+        Raises:
+            IndexError: there is no such world.
+            TypeError: ``world`` is no integer.
+        """
+        world = check_int("world", world, ANY)
+        if not -self.num_envs <= world < self.num_envs:
+            raise IndexError(f"there is no world {world}: these are the worlds 0 to {self.num_envs - 1}")
+        if self.variation is None:
+            return copy.copy(self.mj_model)
+        return self.variation.varied.edited(self.sim.numbers[world].cpu().numpy())
+
     # State.
 
     def get_state(self) -> State:
@@ -629,6 +678,7 @@ class LocoEnv(EnvBase):
             "world_offset": self.world_offset or 0,
             "device": str(self.device),
             "config": dataclasses.asdict(self.config),
+            "randomize": [dataclasses.asdict(vary) for vary in self.randomize],
         }
 
     def get_extra_state(self) -> dict[str, Any]:

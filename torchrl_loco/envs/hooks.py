@@ -21,6 +21,15 @@ Arrays = Mapping[str, torch.Tensor]
 
 HOOKS = ("control", "update", "reward", "terminated", "events", "observation", "begin")
 
+PARTS = {
+    "control": ("control",),
+    "judge": ("update", "reward", "terminated", "events"),
+    "observe": ("observation",),
+    "begin": ("begin",),
+    "observe_begun": ("observation",),
+}
+"""The hooks that each part of a step or reset calls, in their order."""
+
 FUSED = {
     "reward": ("observation_func",),
     "observation": ("observation_func",),
@@ -106,7 +115,8 @@ class Hooks:
             self.own |= {"begin"}
         bounded = env.action_range != (-float("inf"), float("inf"))
         shapes = memory_shapes(type(env))
-        self.catalog = Catalog(mj_model, env.num_envs, env.device, shapes, env.config.ctrl_dt, bounded=bounded)
+        settings = env.num_envs, env.device, shapes, env.config.ctrl_dt
+        self.catalog = Catalog(mj_model, *settings, bounded=bounded, variation=env.variation)
         self.groups: dict[str, tuple[int, ...]] = {}
         self.term_names: tuple[str, ...] | None = None
         self.moves = False
@@ -145,6 +155,7 @@ class Hooks:
         rows: dict[str, Any] = {name: getattr(data, name) for name in ("qpos", "qvel", "ctrl", "xpos", "cvel")}
         rows |= {"xmat": data.xmat.reshape(-1, 3, 3), "subtree_com": data.subtree_com, "sensordata": data.sensordata}
         rows |= {"contact_force": [[0.0] * 3], "in_contact": [0.0], "action": [0.0] * m.nu}
+        rows |= {"numbers": catalog.variation.varied.nominal()} if catalog.variation else {}
         rows |= {f"memory.{name}": torch.zeros(shape) for name, shape in catalog.memory.items()}
         arrays = {name: torch.as_tensor(row, dtype=torch.float32).to(device) for name, row in rows.items()}
         arrays = {name: row.repeat(n, *[1] * row.ndim) for name, row in arrays.items()}

@@ -218,6 +218,7 @@ class StepInputs:
     qvel: wp.array2d[float]
     qacc_warmstart: wp.array2d[float]
     act: wp.array2d[float]
+    numbers: wp.array2d[float]
 
 
 @wp.struct
@@ -260,6 +261,7 @@ def keep_inputs(world: int, args: Keeper):
     copy_row(args.present.qvel[world], args.kept.qvel[world])
     copy_row(args.present.qacc_warmstart[world], args.kept.qacc_warmstart[world])
     copy_row(args.present.act[world], args.kept.act[world])
+    copy_row(args.present.numbers[world], args.kept.numbers[world])
 
 
 @wp.func
@@ -294,7 +296,8 @@ class NanGuard(Monitor):
         data = sim.data
         episode, elapsed_steps = (buffer.warp for buffer in inputs)
         physics = {name: getattr(data, name) for name in State.PHYSICS}
-        self._inputs = {"episode": episode, "elapsed_steps": elapsed_steps, **physics}
+        numbers = {"numbers": wp.from_torch(sim.numbers)}
+        self._inputs = {"episode": episode, "elapsed_steps": elapsed_steps, **physics, **numbers}
         self._kept = {name: wp.zeros_like(array) for name, array in {"action": data.ctrl, **self._inputs}.items()}
         self._first = Buffer(1, int, sim.device)
         self._found = Buffer(1, bool, sim.device)
@@ -331,6 +334,9 @@ class NanGuard(Monitor):
         arrays = self._kept.items()
         kept = {name: wp.to_torch(array)[world].clone() for name, array in arrays if array.size}  # act may be empty
         counters = {name: int(kept.pop(name)) for name in ("episode", "elapsed_steps")}
+        if self._sim.varied is not None:
+            row, columns = kept.pop("numbers"), self._sim.varied.columns
+            kept |= {f"model.{name}": row[which].clone() for name, which in columns.items()}
         settings = {**self._settings, "seed": int(self._seed.torch[0]), "world": world, **counters}
         try:
             self._path.open("x").close()  # nothing is overwritten

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from torchrl_loco.checks import check_int
+from torchrl_loco.checks import ANY, check_int
 
 
 class State(TensorDict):
@@ -20,6 +20,7 @@ class State(TensorDict):
     ``qacc_warmstart``  ``(N, nv)``  initial guess of the constraint solver
     ``act``             ``(N, na)``  activations of the actuators, if the model has any
     ``memory``          nested       entries of the task's memory by name, if it has any
+    ``model``           nested       by field, ``(N, numbers that vary)``, if ``randomize`` names any
     ``elapsed_steps``   ``(N,)``     control steps since the world's reset
     ``episode``         ``(N,)``     episodes begun: index of the next random stream
     ==================  ===========  =====================================================
@@ -33,7 +34,7 @@ class State(TensorDict):
     """
 
     PHYSICS = ("qpos", "qvel", "qacc_warmstart", "act")
-    KEYS = (*PHYSICS, "memory", "elapsed_steps", "episode")
+    KEYS = (*PHYSICS, "memory", "model", "elapsed_steps", "episode")
 
     def branch(self, world: int, num_envs: int | None = None) -> "State":
         """Returns a state in which every world is a copy of one, to try different futures from the same moment.
@@ -47,7 +48,7 @@ class State(TensorDict):
             TypeError: ``world`` or ``num_envs`` is no integer.
             ValueError: ``num_envs`` is less than 1.
         """
-        worlds, world = self.batch_size.numel(), check_int("world", world, "(-inf, inf)")
+        worlds, world = self.batch_size.numel(), check_int("world", world, ANY)
         count = worlds if num_envs is None else check_int("num_envs", num_envs)
         if self.batch_size and not -worlds <= world < worlds:
             raise IndexError(f"there is no world {world}: this state has the worlds 0 to {worlds - 1}")
@@ -84,7 +85,7 @@ def without_state(tensordict: TensorDictBase | None, device: torch.device | None
 def write_state(
     state: TensorDictBase | None, targets: Mapping[str | tuple[str, str], torch.Tensor], mask: torch.Tensor
 ) -> None:
-    """Writes a state into the worlds of a mask. Missing entries become zero; a missing episode is left as it is.
+    """Writes a state into the worlds of a mask. Missing entries become zero, but episode and model stay as they are.
 
     Args:
         state: the state; a plain TensorDict with the same keys works too.
@@ -95,12 +96,12 @@ def write_state(
         ValueError: qpos or qvel is missing, a shape is wrong, or a value is not finite. Then nothing is written.
     """
     given: dict[Any, Any] = {key: None if state is None else state.get(key, None) for key in targets}
-    memory = None if state is None else state.get("memory", None)
-    if memory is not None:
-        known = [key[1] for key in targets if isinstance(key, tuple)]
-        for name in memory.keys():  # noqa: SIM118, of a TensorDict
+    for group, owner in (("memory", "the task"), ("model", "randomize")):
+        entries = None if state is None else state.get(group, None)
+        known = [key[1] for key in targets if key[0] == group]
+        for name in [] if entries is None else entries.keys():
             if name not in known:
-                raise ValueError(f"the state has memory {name!r}, the task {', '.join(known) or 'has none'}")
+                raise ValueError(f"the state has {group} {name!r}, {owner} {', '.join(known) or 'has none'}")
     new = {key: value.detach().to(mask.device) for key, value in given.items() if value is not None}
     if not {"qpos", "qvel"} <= new.keys():
         raise ValueError(
@@ -116,8 +117,8 @@ def write_state(
         elif not ((value[mask].long() >= 0) & (value[mask].long() < 2**31 - 1)).all():  # it will be counted up
             raise ValueError(f"{key} must lie in [0, 2**31 - 1)")
     for key, target in targets.items():
-        if key == "episode" and key not in new:
-            continue  # the world's random stream goes on
+        if (key == "episode" or key[0] == "model") and key not in new:
+            continue  # the world's random stream goes on, and its numbers stay
         value = new.get(key, torch.zeros_like(target))
         rows = mask.view(-1, *[1] * (target.ndim - 1))
         target.copy_(torch.where(rows, value.to(target.dtype), target))

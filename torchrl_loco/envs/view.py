@@ -2,7 +2,6 @@
 
 import difflib
 import math
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,19 +10,15 @@ import numpy as np
 import torch
 
 from torchrl_loco.envs import draws, sensors
+from torchrl_loco.envs.names import Elements, Names
+from torchrl_loco.envs.variation import Variation, constant_of
 from torchrl_loco.sim import models
-
-Names = str | Sequence[str]
-"""A name, several names, or a regular expression that matches whole names."""
-
-KINDS = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "site": "nsite", "sensor": "nsensor", "actuator": "nu"}
-"""What has names in a model, and how many there are."""
 
 OF_A_STEP = frozenset({"action", "ctrl"})
 """What belongs to a step: an observation is also made after a reset, where there was none."""
 
 
-class Catalog:
+class Catalog(Elements):
     """What is the same at every step: the model's names, its numbers as tensors, and what hooks have asked for.
 
     Args:
@@ -33,6 +28,7 @@ class Catalog:
         memory: shape of a row of each entry of the memory, by name.
         ctrl_dt: time of a control step (s).
         bounded: whether actions are clipped to [-1, 1].
+        variation: which numbers of the model differ from world to world, if any do.
 
     Attributes:
         arrays: names of the arrays that hooks have read.
@@ -52,58 +48,20 @@ class Catalog:
         ctrl_dt: float,
         *,
         bounded: bool,
+        variation: Variation | None = None,
     ) -> None:
-        self.mj_model, self.num_envs, self.device = mj_model, num_envs, device
-        self.memory, self.ctrl_dt, self.bounded = dict(memory), ctrl_dt, bounded
+        super().__init__(mj_model)
+        self.num_envs, self.device = num_envs, device
+        self.memory, self.ctrl_dt, self.bounded, self.variation = dict(memory), ctrl_dt, bounded, variation
         self.arrays: set[str] = set()
         self.sensors: set[int] = set()
         self.contact_geoms: list[int] = []
         self.complete = False
         self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}
         self.home = self._tensor(models.home_pose(mj_model))
-        self._names: dict[str, list[str]] = {}
-        self._found: dict[tuple[str, Any], tuple[list[int], bool]] = {}
         self._index: dict[tuple[int, ...], torch.Tensor] = {}
         self._constants: dict[Any, torch.Tensor] = {}
         self._places: dict[tuple[int, int], torch.Tensor] = {}
-
-    def names(self, kind: str) -> list[str]:
-        """Returns the names of all elements of a kind, by their ids."""
-        if kind not in self._names:
-            element = getattr(self.mj_model, kind)
-            self._names[kind] = [element(i).name for i in range(getattr(self.mj_model, KINDS[kind]))]
-        return self._names[kind]
-
-    def ids(self, kind: str, names: Names) -> tuple[list[int], bool]:
-        """Returns the ids of elements, and whether one was named, so that results need no dimension for several.
-
-        Raises:
-            KeyError: a name or pattern matches none; the message names the nearest.
-        """
-        key = kind, names if isinstance(names, str) else tuple(names)
-        if not key[1]:
-            raise KeyError(f"name a {kind}, several, or a regular expression, got {names!r}")
-        if key not in self._found:
-            known = self.names(kind)
-            if isinstance(names, str) and names in known:
-                self._found[key] = [known.index(names)], True
-            else:
-                self._found[key] = [i for name in _several(names) for i in self._matches(kind, name)], False
-        return self._found[key]
-
-    def _matches(self, kind: str, pattern: str) -> list[int]:
-        known = self.names(kind)
-        if pattern in known:
-            return [known.index(pattern)]
-        try:
-            found = [i for i, name in enumerate(known) if name and re.fullmatch(pattern, name)]
-        except re.error as error:
-            raise KeyError(f"{pattern!r} is neither the name of a {kind} nor a regular expression: {error}") from None
-        if not found:
-            near = difflib.get_close_matches(pattern, known, n=1)
-            hint = f", did you mean {near[0]!r}?" if near else ""
-            raise KeyError(f"the model has no {kind} {pattern!r}{hint}: it has {', '.join(filter(None, known))}")
-        return found
 
     def pick(self, values: torch.Tensor, ids: list[int], one: bool) -> torch.Tensor:
         """Returns the columns ``ids`` of an array ``(num_envs, count, ...)``, without their dimension for one."""
@@ -118,13 +76,13 @@ class Catalog:
         """Returns numbers of a field of the model, float32, of the elements ``ids`` or of all."""
         key = field, None if ids is None else tuple(ids)
         if key not in self._constants:
-            values = getattr(self.mj_model, field)
+            values = constant_of(self.mj_model, field)
             self._constants[key] = self._tensor(values if ids is None else values[list(ids)])
         return self._constants[key]
 
     def fixed(self) -> list[torch.Tensor]:
         """Returns the tensors of indices, which never change."""
-        return list(self._index.values())
+        return [*self._index.values(), *(self.variation.fixed() if self.variation else [])]
 
     def places(self, first: int, count: int) -> torch.Tensor:
         """Returns places of random streams, which torch.compile would compute wrongly: they wrap around 64 bits."""
@@ -140,10 +98,6 @@ class Catalog:
 
     def _tensor(self, values: Any) -> torch.Tensor:
         return torch.tensor(np.array(values), dtype=torch.float32, device=self.device)
-
-
-def _several(names: Names) -> list[str]:
-    return [names] if isinstance(names, str) else list(names)
 
 
 class View:
@@ -227,12 +181,14 @@ class View:
     def model(self, field: str) -> torch.Tensor:
         """Returns a field of the model, such as ``"geom_friction"``: ``(num_envs, *shape)``, float32.
 
+        What ``randomize`` varies is each world's own; ``"gravity"`` is that of the model's options.
+
         Raises:
-            AttributeError: ``MjModel`` has no such field, or it is no array.
+            AttributeError: ``MjModel`` has no such field, or it is no array of numbers.
         """
-        values = getattr(self._catalog.mj_model, field, None)
-        if not hasattr(values, "shape"):
-            raise AttributeError(f"MjModel has no array {field!r}")
+        variation = self._catalog.variation
+        if variation is not None and field in variation.varied.places:
+            return variation.field(field, self._array("numbers"))
         numbers = self._catalog.constant(field)
         return numbers.expand(self._catalog.num_envs, *numbers.shape)
 

@@ -30,9 +30,10 @@ from torchrl_loco.envs.episode import (
     poser,
     zero_non_finite,
 )
-from torchrl_loco.envs.hooks import Hooks
+from torchrl_loco.envs.hooks import PARTS, Hooks
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
+from torchrl_loco.envs.variation import Variation
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import (
     EXCLUSIVE,
@@ -64,6 +65,7 @@ class Task(Protocol):
     nan_dump: Path | None
     observation_size: int
     hooks: Hooks | None
+    variation: Variation | None
     compile_hooks: bool
 
     def observation_func(self, world: "World") -> tuple[wp.Function, Any]:
@@ -113,12 +115,17 @@ class World:
         self._closed = True  # until it is made in full
         n, nu, hooks = task.num_envs, mj_model.nu, task.hooks
         self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own if hooks else frozenset()
-        self._title = type(task).__name__
+        self._title, self._variation = type(task).__name__, task.variation
         # Buffers made in inference mode could not be written outside it; without the device, torch's views would be on
         # the caller's default device.
         with torch.inference_mode(False), EXCLUSIVE, task.device:
-            asked = {"contact_geoms": hooks.catalog.contact_geoms} if hooks and hooks.catalog.contact_geoms else {}
+            asked: dict[str, Any] = {}
+            if hooks and hooks.catalog.contact_geoms:
+                asked["contact_geoms"] = hooks.catalog.contact_geoms
+            if self._variation is not None:
+                asked["varied"] = self._variation.varied
             self.sim = Simulation(mj_model, task.config, n, task.device, **asked)
+            nominal = self.sim.numbers.clone()
             device = self.sim.device
             self.action = Buffer((n, nu), float, device)
             shapes = task.groups
@@ -154,6 +161,7 @@ class World:
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
             for rows in self.memory.values():
                 rows.zero_()  # recording wrote into it
+            self.sim.numbers.copy_(nominal)
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
             for monitor in self._monitors:
                 monitor.restart()
@@ -175,6 +183,7 @@ class World:
     def _begin_masked(self) -> None:
         """A new episode in the worlds of the mask."""
         self._rest()  # home pose, random stream, clock; fused begin
+        self._vary()  # numbers of the model, if randomize names any
         self._begin()  # begin(): pose and memory
         self._settle()  # poses and sensors; fused observation
         self._observe_begun()  # observation()
@@ -268,8 +277,8 @@ class World:
         self.sim.rest(self.mask.warp, self._start)
 
     def _launch_reset(self) -> None:
-        """A reset as one launch, or what follows the begin of hooks."""
-        if self._own:
+        """A reset as one launch, or what follows the draws of numbers and the begin of hooks."""
+        if self._own or self._variation is not None:
             self.sim.forward(self.mask.warp, after=self._fused)
         else:
             self.sim.reset(self.mask.warp, before=self._start, after=self._fused, at_rest=self._starts_at_rest)
@@ -283,17 +292,25 @@ class World:
     # The parts of the step, and what they become on the device.
 
     def _make_parts(self, task: Task) -> None:
-        sim, hooks, own = self.sim, task.hooks, self._own
+        sim, hooks, own, variation = self.sim, task.hooks, self._own, self._variation
         self._moved = Buffer(task.num_envs, bool, sim.device)
-        arrays = self._arrays(task) if hooks else {}
+        streams = self._streams(task) if hooks or variation else {}
+        arrays = {**streams, **self._arrays(task.hooks)} if task.hooks else {}
 
         parts: list[Part] = []
 
         def part(name: str, *needed: str) -> Callable[[], None]:
             if hooks is None or not own & set(needed):
                 return _nothing
-            parts.append(Part(getattr(hooks, name), arrays, self._title, hooks.catalog.fixed()))
+            called = [hook for hook in PARTS[name] if hook in own] or [name]
+            title = f"{self._title}: {', '.join(called)}"
+            parts.append(Part(getattr(hooks, name), arrays, title, hooks.catalog.fixed()))
             return parts[-1]
+
+        self._vary: Callable[[], None] = _nothing
+        if variation is not None:
+            parts.append(Part(variation.vary, streams, f"{self._title}: randomize", variation.fixed()))
+            self._vary = parts[-1]
 
         self._control = part("control", "control")
         self._judge = part("judge", "update", "reward", "terminated", "events")
@@ -304,36 +321,44 @@ class World:
 
         moves = hooks is not None and hooks.moves
         launches = [self._launch_step, self._launch_reset, *(each.launch for each in kernels)]
-        launches += [self._launch_rest, self._launch_conclude] if own else []
+        launches += [self._launch_rest] if own or variation else []
+        launches += [self._launch_conclude] if own else []
         sim.compile(*launches, *([self._launch_move] if moves else []))
         for each in kernels:
             each.record(sim)
         self._physics, self._settle = self._record(self._launch_step), self._record(self._launch_reset)
-        self._rest = self._record(self._launch_rest) if own else _nothing
+        self._rest = self._record(self._launch_rest) if own or variation else _nothing
         self._conclude = self._record(self._launch_conclude) if own else _nothing
         self._move = self._keeping_what_was(self._record(self._launch_move)) if moves else _nothing
         self._refresh_graph: Graph | None = None  # most environments never need it
-        self._run_step, self._run_reset = self._as_graph("_take_step"), self._as_graph("_begin_masked")
+        self._run_step = self._as_graph("_take_step", several=bool(own))
+        self._run_reset = self._as_graph("_begin_masked", several=bool(own) or variation is not None)
 
-    def _arrays(self, task: Task) -> dict[str, torch.Tensor]:
-        """Returns the arrays that hooks read and write, by name."""
-        sim = self.sim
-        assert task.hooks is not None
-        catalog = task.hooks.catalog
-        arrays = {name: getattr(sim, name) for name in ("qpos", "qvel", "ctrl", "xpos", "xmat")}
+    def _streams(self, task: Task) -> dict[str, torch.Tensor]:
+        """Returns the arrays that tell where random streams begin, and the numbers of the model that vary."""
+        first = task.world_offset or 0
+        numbers = {"numbers": self.sim.numbers} if self._variation is not None else {}
+        return {
+            **numbers,
+            "qpos": self.sim.qpos,
+            "seed": self._seed_of_hooks,
+            "world": torch.arange(first, first + task.num_envs, device=task.device),
+            "episode": self.episode.torch,
+            "mask": self.mask.torch,
+        }
+
+    def _arrays(self, hooks: Hooks) -> dict[str, torch.Tensor]:
+        """Returns the other arrays that hooks read and write, by name."""
+        sim, catalog = self.sim, hooks.catalog
+        arrays = {name: getattr(sim, name) for name in ("qvel", "ctrl", "xpos", "xmat")}
         arrays |= {name: getattr(sim, name) for name in catalog.arrays & {"cvel", "subtree_com"}}
         if "sensordata" in catalog.arrays:
             arrays["sensordata"] = wp.to_torch(sim.data.sensordata)
         if catalog.contact_geoms:
             arrays |= {"contact_force": sim.contact_force, "in_contact": sim.in_contact}
-        first = task.world_offset or 0
         arrays |= {
             "action": self.action.torch,
-            "seed": self._seed_of_hooks,
-            "world": torch.arange(first, first + task.num_envs, device=task.device),
-            "episode": self.episode.torch,
             "elapsed_steps": self.elapsed_steps.torch,
-            "mask": self.mask.torch,
             "moved": self._moved.torch,
             "non_finite": self.non_finite.torch,
             "ended": self.ended.torch,
@@ -360,8 +385,8 @@ class World:
 
         return moved
 
-    def _as_graph(self, name: str) -> Callable[[], None]:
-        """Returns a method of this world as one CUDA graph, where hooks take part in it; else as it is."""
+    def _as_graph(self, name: str, *, several: bool) -> Callable[[], None]:
+        """Returns a method of this world as one CUDA graph, where it is several parts; else as it is."""
         this = weakref.ref(self)
 
         def work() -> None:
@@ -369,7 +394,7 @@ class World:
             assert world is not None
             getattr(world, name)()
 
-        if not self._own or not self.sim.device.is_cuda:
+        if not several or not self.sim.device.is_cuda:
             return work
         graph, recorded = TorchGraph(work, self.sim.qpos.device, warmup=1), True
 
@@ -441,6 +466,9 @@ class World:
         if sim.mj_model.na:
             physics["act"] = sim.act
         physics |= {("memory", name): rows for name, rows in self.memory.items()}
+        if self._variation is not None:
+            columns = self._variation.varied.columns
+            physics |= {("model", name): sim.numbers[:, which] for name, which in columns.items()}
         return {**physics, "elapsed_steps": self.elapsed_steps.torch, "episode": self.episode.torch}
 
     def refresh(self, mask: torch.Tensor) -> None:

@@ -11,11 +11,13 @@ import warp as wp
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
+from torchrl_loco.sim.batched_model import BatchedModel, batched_bytes, nominal_numbers, with_every_row
 from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.contact_forces import ContactForces, contact_forces_bytes
 from torchrl_loco.sim.graph import torch_is_recording
 from torchrl_loco.sim.models import FORCE_SENSORS
 from torchrl_loco.sim.row_order import RowOrder
+from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.world_func import WorldFunc, holds, launch_together
 
 UNROLLED_ITERATIONS = 10
@@ -129,10 +131,12 @@ class MujocoWarpEngine:
         num_envs: number of worlds.
         device: where they live.
         contact_geoms: geoms whose contact forces are computed.
+        varied: which numbers of the model differ from world to world.
 
     Attributes:
         model: the model on the device.
         data: the state of all worlds.
+        numbers: the numbers that differ, ``(nworld, varied.count)``; none without ``varied``.
         contact_forces: what is computed of them, if any were asked for.
         with_subtree_com: whether ``data.subtree_com`` is up to date in a world at rest too.
         peak_constraints: most constraint rows that a substep needed, by world, ``(nworld,)``.
@@ -149,12 +153,20 @@ class MujocoWarpEngine:
         num_envs: int,
         device: wp.Device,
         contact_geoms: Sequence[int] = (),
+        varied: Varied | None = None,
     ) -> None:
         self._num_envs, self._device = num_envs, device
         self._substeps = config.substeps
         with wp.ScopedDevice(device):
             self.model = mjw.put_model(mj_model)
-            self.data = mjw.make_data(mj_model, nworld=num_envs, naconmax=config.naconmax, njmax=config.njmax)
+            self.data = mjw.make_data(
+                with_every_row(mj_model, varied), nworld=num_envs, naconmax=config.naconmax, njmax=config.njmax
+            )
+        self.numbers = wp.zeros((num_envs, 0), dtype=float, device=device)
+        self._batched: BatchedModel | None = None
+        if varied is not None:
+            self.numbers = wp.array(nominal_numbers(varied, num_envs), dtype=float, device=device)
+            self._batched = BatchedModel(self.model, varied, self.numbers)
         option = self.model.opt
         # Printing from kernels costs more than the physics; ``data.overflow`` holds the same information.
         option.warn_overflow = 0
@@ -265,6 +277,8 @@ class MujocoWarpEngine:
     ) -> None:
         """Updates poses and sensors where ``mask`` ``(nworld,)`` is set. It costs almost nothing if none is.
 
+        Numbers of the model that were changed there count from now on.
+
         Args:
             mask: the worlds.
             before: what each of them does first.
@@ -274,6 +288,8 @@ class MujocoWarpEngine:
 
         def update() -> None:
             launch_together(before, mask)
+            if self._batched is not None:
+                self._batched.update(mask)
             self._clear_constraints(mask)
             if self._kept_sensors is not None:  # forces act at rest too
                 self._evaluate_forces(mask, *self._kept_sensors)
@@ -344,7 +360,13 @@ class MujocoWarpEngine:
         )
 
 
-def data_bytes(mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, contact_geoms: int = 0) -> int:
+def data_bytes(
+    mj_model: mujoco.MjModel,
+    config: SimConfig,
+    num_envs: int,
+    contact_geoms: int = 0,
+    varied: Varied | None = None,
+) -> int:
     """Returns the memory that ``mjData`` of so many worlds takes (bytes), without allocating it.
 
     Its size is linear in the number of worlds and in ``naconmax``; three small instances give the coefficients.
@@ -354,14 +376,17 @@ def data_bytes(mj_model: mujoco.MjModel, config: SimConfig, num_envs: int, conta
         config: settings of the simulation.
         num_envs: number of worlds.
         contact_geoms: number of geoms whose contact forces are asked for.
+        varied: which numbers of the model differ from world to world; their memory is counted too.
     """
+    with_rows = with_every_row(mj_model, varied)
 
     def size(worlds: int, contacts: int) -> int:
         with wp.ScopedDevice("cpu"):
-            return _array_bytes(mjw.make_data(mj_model, nworld=worlds, naconmax=contacts, njmax=config.njmax))
+            return _array_bytes(mjw.make_data(with_rows, nworld=worlds, naconmax=contacts, njmax=config.njmax))
 
     base, forces = size(1, 1), contact_forces_bytes(mj_model, contact_geoms, num_envs, config.naconmax)
-    return base + (num_envs - 1) * (size(2, 1) - base) + (config.naconmax - 1) * (size(1, 2) - base) + forces
+    data = base + (num_envs - 1) * (size(2, 1) - base) + (config.naconmax - 1) * (size(1, 2) - base)
+    return data + forces + batched_bytes(mj_model, varied, num_envs)
 
 
 def _array_bytes(thing: Any) -> int:

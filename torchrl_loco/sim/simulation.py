@@ -13,8 +13,10 @@ import warp as wp
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import compiled, mjw, mujoco_warp
+from torchrl_loco.sim.batched_model import BatchedModel, with_every_row
 from torchrl_loco.sim.compilation import compile_kernels
 from torchrl_loco.sim.graph import Graph, ScratchPool
+from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.warp_init import init_warp
 from torchrl_loco.sim.world_func import WorldFunc, WorldKernel, fill
 
@@ -80,10 +82,15 @@ class Simulation:
     ``cvel``            ``(nworld, nbody, 6)``     velocities of the bodies about their tree's center of mass (rad/s,
                                                    m/s); ask for them before the first step
     ``subtree_com``     ``(nworld, nbody, 3)``     that center of mass (m), in the row of each tree's root; likewise
+    ``numbers``         ``(nworld, count)``        numbers of the model that differ from world to world: ``varied``
     ==================  =========================  ========================================================
 
     Contact forces are those of the last substep, which is one behind the pose, as with touch sensors; after ``reset``
     and ``forward`` those of the present state without control. MuJoCo's ``mj_contactForce`` has them by contact.
+
+    ``numbers`` are those of the model at first. Write rows of them in place, and call :meth:`forward` or :meth:`reset`
+    for these worlds before they step again: only then do they count in full. They are not contiguous under
+    ``compiled``.
 
     Args:
         mj_model: the compiled model; its options are set from ``config``.
@@ -91,6 +98,7 @@ class Simulation:
         num_envs: number of worlds.
         device: where they live.
         contact_geoms: ids of the geoms whose contact forces are computed.
+        varied: which numbers of this model differ from world to world.
 
     Attributes:
         engine: what advances the worlds.
@@ -112,20 +120,23 @@ class Simulation:
         device: torch.device,
         *,
         contact_geoms: Sequence[int] = (),
+        varied: Varied | None = None,
     ) -> None:
         warn_of_integrator(mj_model, config)
         set_options(mj_model, config)
         geoms = check_geoms(mj_model, contact_geoms)
-        self.engine_choice = name, _ = choose_engine(mj_model, config)
-        check_memory(memory(name, mj_model, config, num_envs, device, len(geoms)), num_envs, device)
-        self.mj_model, self.config = mj_model, config
+        differing = varied if varied is not None and varied.count else None
+        self.engine_choice = name, _ = choose_engine(mj_model, config, differing)
+        check_memory(memory(name, mj_model, config, num_envs, device, len(geoms), differing), num_envs, device)
+        self.mj_model, self.config, self.varied = mj_model, config, varied
         self.num_envs = num_envs
         init_warp()
         self.device = wp.get_device(str(device))
         engines: dict[str, type] = {"compiled": compiled.CompiledEngine, "mujoco_warp": mujoco_warp.MujocoWarpEngine}
-        self.engine = engines[name](mj_model, config, num_envs, self.device, geoms)
+        self.engine = engines[name](mj_model, config, num_envs, self.device, geoms, differing)
         self.model, self.data = self.engine.model, self.engine.data
         self._mujoco_data: mjw.Data | None = None
+        self._batched: BatchedModel | None = None
         self._every = wp.ones(num_envs, dtype=bool, device=self.device)
         self._kernels: dict[tuple[wp.Function, ...], WorldKernel] = {}
         self._scratch = ScratchPool(self.device) if self.device.is_cuda else None
@@ -139,6 +150,9 @@ class Simulation:
         self.xmat = wp.to_torch(self.data.xmat)
         self.time = wp.to_torch(self.data.time)
         self.overflow = wp.to_torch(self.data.overflow)
+        self.numbers = torch.empty((num_envs, 0), device=device)
+        if differing is not None:
+            self.numbers = wp.to_torch(self.engine.numbers)
         self.contact_force = torch.empty((num_envs, 0, 3), device=device)
         self.in_contact = torch.empty((num_envs, 0), dtype=torch.bool, device=device)
         if geoms:
@@ -214,7 +228,7 @@ class Simulation:
         self._kernels[key].launch(funcs, mask)
 
     def forward(self, mask: wp.array, after: Sequence[WorldFunc] = ()) -> None:
-        """Updates poses and sensors after ``qpos`` and ``qvel`` were changed.
+        """Updates poses and sensors after ``qpos``, ``qvel`` or ``numbers`` were changed.
 
         Args:
             mask: the worlds, bool ``(nworld,)``.
@@ -237,16 +251,30 @@ class Simulation:
             if self._mujoco_data is None:
                 with wp.ScopedDevice(self.device):
                     self._mujoco_data = mjw.make_data(
-                        self.mj_model, nworld=self.num_envs, naconmax=self.config.naconmax, njmax=self.config.njmax
+                        with_every_row(self.mj_model, self.varied),
+                        nworld=self.num_envs,
+                        naconmax=self.config.naconmax,
+                        njmax=self.config.njmax,
                     )
             data = self._mujoco_data
             for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time"):
                 wp.copy(getattr(data, name), getattr(self.data, name))
-            mjw.kinematics(self.model, data)
-            mjw.com_pos(self.model, data)
+            model = self._model_of_each_world()
+            mjw.kinematics(model, data)
+            mjw.com_pos(model, data)
         if contacts:
-            mjw.fwd_position(self.model, data)
+            mjw.fwd_position(self._model_of_each_world(), data)
         return data
+
+    def _model_of_each_world(self) -> "mjw.Model":
+        """Returns MuJoCo-Warp's model with the present numbers of each world."""
+        if self.varied is None or isinstance(self.data, mjw.Data):
+            return self.model
+        if self._batched is None:
+            with wp.ScopedDevice(self.device):
+                self._batched = BatchedModel(mjw.put_model(self.mj_model), self.varied, self.engine.numbers)
+        self._batched.update(self._every)
+        return self._batched.model
 
     def compile(self, *launches: Callable[[], None]) -> None:
         """Compiles the kernels that ``launches`` would launch, in parallel and with a progress bar."""
@@ -302,15 +330,20 @@ def check_geoms(mj_model: mujoco.MjModel, geoms: Sequence[int]) -> tuple[int, ..
     return ids
 
 
-def choose_engine(mj_model: mujoco.MjModel, config: SimConfig) -> tuple[str, str]:
+def choose_engine(mj_model: mujoco.MjModel, config: SimConfig, varied: Varied | None = None) -> tuple[str, str]:
     """Returns the name of the engine that steps a model, and why.
+
+    Args:
+        mj_model: the model.
+        config: settings of the simulation.
+        varied: which numbers of the model differ from world to world.
 
     Raises:
         ValueError: ``config.engine`` is "compiled", and the model needs something that it does not have.
     """
     if config.engine == "mujoco_warp":
         return config.engine, "as asked"
-    missing = compiled.unsupported(mj_model)
+    missing = compiled.unsupported(mj_model, varied)
     if not missing:
         return "compiled", "it has all that the model needs"
     if config.engine == "compiled":
@@ -329,12 +362,13 @@ def memory(
     num_envs: int,
     device: torch.device,
     contact_geoms: int = 0,
+    varied: Varied | None = None,
 ) -> int:
     """Returns the memory that a simulation takes (bytes)."""
     if engine == "compiled":
-        return compiled.data_bytes(mj_model, num_envs, contact_geoms)
+        return compiled.data_bytes(mj_model, num_envs, contact_geoms, varied)
     scratch = DETERMINISTIC_SCRATCH if config.deterministic and device.type == "cuda" else SCRATCH
-    return int(scratch * mujoco_warp.data_bytes(mj_model, config, num_envs, contact_geoms))
+    return int(scratch * mujoco_warp.data_bytes(mj_model, config, num_envs, contact_geoms, varied))
 
 
 def check_memory(needed: int, num_envs: int, device: torch.device) -> None:

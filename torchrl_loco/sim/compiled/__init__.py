@@ -20,6 +20,7 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 ``sensors``          velocities of subtrees, touch, and contact forces of geoms
 ``lanes``            a group of lanes a world: what ``lanes.h`` has to know about a model
 ``links``            bodies that are welded together
+``parameters``       numbers of the model that differ from world to world
 ``tables``           constants and tables as C++
 ``read_only``        the model that environments see
 ===================  =====================================================================

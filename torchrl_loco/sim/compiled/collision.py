@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.dynamics import MINVAL, Poses, constant_matrix
-from torchrl_loco.sim.compiled.symbols import array, dot, select, sqrt
+from torchrl_loco.sim.compiled.parameters import Number, largest
+from torchrl_loco.sim.compiled.symbols import Scalar, array, dot, select, sqrt
 
 PLANE, SPHERE, CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("PLANE", "SPHERE", "CAPSULE"))
 MINMU = 1e-5
@@ -42,7 +43,7 @@ class Pair:
 
     geoms: tuple[int, int]
     condim: int
-    friction: float
+    friction: Number
     margin: float
     solref: tuple[float, ...]
     solimp: tuple[float, ...]
@@ -69,23 +70,27 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
     return found
 
 
-def contact_weight(m: mujoco.MjModel, pair: Pair) -> float:
+def contact_weight(m: mujoco.MjModel, pair: Pair) -> Number:
     """Returns the approximate inverse inertia along a row of a contact."""
     if pair.condim == 1:
         return pair.weight
-    return pair.weight * (1 + pair.friction**2) * 2 * pair.friction**2 / m.opt.impratio
+    squared = pair.friction * pair.friction
+    return pair.weight * (1 + squared) * 2 * squared / m.opt.impratio
 
 
-def least_regularisation(pair: Pair) -> float:
+def least_regularisation(pair: Pair) -> Number:
     """Returns what the regularisation of a row of a contact is at least.
 
     MuJoCo makes a pyramid of little friction stiffer than its bodies by the inverse square of the friction, 5e5 at
     0.001: in single precision nothing would be left of the bodies beside it. There it ends where the acceleration
     along the normal is off by some 1e-4 of itself.
     """
-    if pair.condim == 1 or pair.friction > SLIPPERY:
+    least = max(MINVAL, LEAST * pair.weight)
+    if pair.condim == 1:
         return MINVAL
-    return max(MINVAL, LEAST * pair.weight)
+    if isinstance(pair.friction, Scalar):
+        return select(pair.friction, "<=", SLIPPERY, least, MINVAL)
+    return least if pair.friction <= SLIPPERY else MINVAL
 
 
 def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
@@ -100,7 +105,7 @@ def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
         large = mix >= MINVAL
         first = mix[0] / mix.sum() if large.all() else (0.5 if not large.any() else float(large[0]))
         condim = max(m.geom_condim[a], m.geom_condim[b])
-        friction = max(m.geom_friction[a, 0], m.geom_friction[b, 0])
+        friction = largest(m.geom_friction[a, 0], m.geom_friction[b, 0])
     solref = m.geom_solref[[a, b]]
     if one_decides or (solref[:, 0] > 0).all():
         solref = first * solref[0] + (1 - first) * solref[1]
@@ -109,7 +114,7 @@ def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
     solimp = first * m.geom_solimp[a] + (1 - first) * m.geom_solimp[b]
     weight = m.body_invweight0[m.geom_bodyid[[a, b]], 0].sum()
     margin = m.geom_margin[a] + m.geom_margin[b]
-    friction = max(float(friction), MINMU) if condim > 1 else 0.0
+    friction = largest(friction, MINMU) if condim > 1 else 0.0
     return Pair((a, b), int(condim), friction, float(margin), tuple(solref), tuple(solimp), float(weight))
 
 

@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, MINVAL
+from torchrl_loco.sim.compiled.parameters import Number, constant, varies
 from torchrl_loco.sim.compiled.symbols import (
     Block,
     Scalar,
@@ -152,12 +153,21 @@ class Table:
     def __init__(self, block: Block, prefix: str, index: str) -> None:
         self.block, self.prefix, self.index = block, prefix, index
 
-    def column(self, title: str, values: Sequence[float]) -> Scalar:
+    def column(self, title: str, values: Sequence[Number]) -> Scalar:
         """Returns the number of the current row."""
-        if len({float(x) for x in values}) == 1:
+        if any(map(varies, values)):
+            return self._varying(title, [scalar(x) for x in values])
+        if len({constant(x) for x in values}) == 1:
             return scalar(values[0])
-        listed = ", ".join(literal(x) for x in values)
+        listed = ", ".join(literal(constant(x)) for x in values)
         self.block(f"static const float {self.prefix}_{title}[{len(values)}] = {{{listed}}};")
+        return name(f"{self.prefix}_{title}[{self.index}]")
+
+    def _varying(self, title: str, values: list[Scalar]) -> Scalar:
+        if len(set(values)) == 1:
+            return values[0]
+        listed = ", ".join([self.block.value(x) for x in values])
+        self.block(f"const float {self.prefix}_{title}[{len(values)}] = {{{listed}}};")
         return name(f"{self.prefix}_{title}[{self.index}]")
 
     def integers(self, title: str, values: Sequence[int]) -> str:
@@ -245,18 +255,23 @@ class DryFriction:
 
     def __init__(self, m: mujoco.MjModel) -> None:
         self.m = m
-        self.dofs = [d for d in range(m.nv) if m.dof_frictionloss[d] > 0]
+        losses = m.dof_frictionloss
+        self.dofs = [d for d in range(m.nv) if varies(losses[d]) or losses[d] > 0]
         self.count = len(self.dofs)
         self.arrays = {f"friction_{field}": self.count for field in ("x", "v")}
         self.softness = [Softness.make(m, m.dof_solref[d], m.dof_solimp[d]) for d in self.dofs]
         weights = m.dof_invweight0[self.dofs]
         rows = zip(weights, self.softness, strict=True)
         self.weight = [1 / max(w * (1 - softness.dmin) / softness.dmin, MINVAL) for w, softness in rows]
-        self.limit = [float(m.dof_frictionloss[d]) for d in self.dofs]
+        self.limit: list[Number] = [losses[d] if varies(losses[d]) else float(losses[d]) for d in self.dofs]
+        self.bound = [limit / weight for limit, weight in zip(self.limit, self.weight, strict=True)]
+        self._kept = "const" if any(map(varies, self.limit)) else "static const"
 
     def create(self, block: Block, variables: Variables) -> None:
         """Sets the residuals."""
         _, qvel, qacc = variables
+        self.limit = [block.keep(limit) if varies(limit) else limit for limit in self.limit]
+        self.bound = [block.keep(bound) if varies(bound) else bound for bound in self.bound]
         for i, d in enumerate(self.dofs):
             block.set(f"friction_x[{i}]", qacc[d] + self.softness[i].damping * qvel[d])
 
@@ -270,13 +285,13 @@ class DryFriction:
         for i, d in enumerate(self.dofs):
             weight, limit, x = self.weight[i], self.limit[i], cell(f"friction_x[{i}]")
             gradient[d] = gradient[d] + maximum(minimum(weight * x, limit), -limit)
-            diagonal[d] = diagonal[d] + select(absolute(x), "<", limit / weight, weight, 0)
+            diagonal[d] = diagonal[d] + select(absolute(x), "<", self.bound[i], weight, 0)
 
     def loop(self, body: str) -> str:
         """Returns a C++ loop over the rows, with x, v, D and the largest force."""
-        listed = [", ".join(map(literal, values)) for values in (self.weight, self.limit)]
+        listed = [", ".join(map(constant_text, values)) for values in (self.weight, self.limit)]
         return (
-            f"static const float friction_D[] = {{{listed[0]}}}, friction_limit[] = {{{listed[1]}}};\n"
+            f"{self._kept} float friction_D[] = {{{listed[0]}}}, friction_limit[] = {{{listed[1]}}};\n"
             f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ const float x = friction_x[i], "
             f"v = friction_v[i], D = friction_D[i], limit = friction_limit[i]; {body} }}"
         )
@@ -285,10 +300,17 @@ class DryFriction:
         """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides."""
         if not self.count:
             return ""
-        bounds = ", ".join(literal(limit / weight) for limit, weight in zip(self.limit, self.weight, strict=True))
+        sides = "(x < b) != (old < b) || (x > -b) != (old > -b)"
+        if any(map(varies, self.limit)):  # a force of zero has no sides
+            sides = f"b > 0.0f && ({sides})"
         return (
-            f"static const float friction_bound[] = {{{bounds}}};\n"
+            f"{self._kept} float friction_bound[] = {{{', '.join(map(constant_text, self.bound))}}};\n"
             f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ const float b = friction_bound[i], "
             "old = friction_x[i], x = old + alpha * friction_v[i]; "
-            "changed |= (x < b) != (old < b) || (x > -b) != (old > -b); friction_x[i] = x; }"
+            f"changed |= {sides}; friction_x[i] = x; }}"
         )
+
+
+def constant_text(x: Number) -> str:
+    """Returns the C++ of a constant, or of a name."""
+    return x.args[0] if varies(x) else literal(constant(x))

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.links import matrix
+from torchrl_loco.sim.compiled.parameters import nominal, present, varies
 from torchrl_loco.sim.compiled.symbols import (
     Block,
     Scalar,
@@ -226,7 +227,7 @@ class Dynamics:
         trees = {root: np.flatnonzero(m.body_rootid == root) for root in set(m.body_rootid)}
         com = {
             root: total(m.body_mass[b] * centers[b] for b in bodies) / m.body_mass[bodies].sum()
-            if m.body_mass[bodies].sum() > 0
+            if present(m.body_mass[bodies])
             else poses.xpos[root]
             for root, bodies in trees.items()
         }
@@ -238,10 +239,11 @@ class Dynamics:
         axes = self.poses.xmat[body] @ constant_matrix(m.body_iquat[body])
         moments, mass, d = m.body_inertia[body], m.body_mass[body], self.xipos[body] - self.com[body]
         # R diag(I) R' = I_k 1 + sum over the axes whose moment differs from I_k: a body of revolution needs one.
-        k = max(range(3), key=lambda i: sum(np.isclose(moments, moments[i], rtol=SAME, atol=0)))
+        same = _same_moments(moments, nominal(m).body_inertia[body])
+        k = max(range(3), key=lambda i: sum(same[i]))
         rotational = identity(3) * moments[k]
         for i in range(3):
-            if not np.isclose(moments[i], moments[k], rtol=SAME, atol=0):
+            if not same[i][k]:
                 rotational = rotational + (moments[i] - moments[k]) * outer(axes[:, i])
         rotational = rotational + mass * (identity(3) * dot(d, d) - outer(d))
         return Inertia(rotational, mass * d, scalar(mass))
@@ -385,6 +387,13 @@ class ArticulatedFactor:
                 result[d] = reduced[d] - dot(self.projected[d], acceleration[body]) * self.inverse[d]
                 acceleration[body] = acceleration[body] + tree.cdof[d] * result[d]
         return result
+
+
+def _same_moments(moments: np.ndarray, at_nominal: np.ndarray) -> np.ndarray:
+    """Returns which moments of inertia equal each other, ``(3, 3)``; one that varies equals itself alone."""
+    same = np.array([np.isclose(at_nominal, moment, rtol=SAME, atol=0) for moment in at_nominal])
+    varying = np.array([varies(moment) for moment in moments])
+    return np.where(varying[:, None] | varying, np.eye(3, dtype=bool), same)
 
 
 def outer(a: np.ndarray, b: np.ndarray | None = None) -> np.ndarray:

@@ -12,8 +12,17 @@ import warp as wp
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.buffer import Buffer
+from torchrl_loco.sim.compiled.parameters import VariedModel
 from torchrl_loco.sim.compiled.read_only import ReadOnly, read_only
-from torchrl_loco.sim.compiled.step import WARP, check_worlds, launch_size, source, structure_of_arrays
+from torchrl_loco.sim.compiled.step import (
+    WARP,
+    check_worlds,
+    launch_size,
+    nominal_row,
+    source,
+    structure_of_arrays,
+)
+from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.world_func import Chain, WorldFunc, WorldKernel
 
 ROWS = {
@@ -86,10 +95,8 @@ class Data:
         contact_geoms: int = 0,
     ) -> None:
         def make(name: str) -> wp.array:
-            shape, dtype = _shape(m, nworld, name, contact_geoms), ROWS[name][1]
-            if structure_of_arrays:
-                return wp.zeros(shape[::-1], dtype=dtype, device=device).transpose()
-            return wp.zeros(shape, dtype=dtype, device=device)
+            shape = _shape(m, nworld, name, contact_geoms)
+            return _zeros(shape, ROWS[name][1], device, structure_of_arrays=structure_of_arrays)
 
         self.act = wp.zeros((nworld, 0), dtype=float, device=device)
         self._make: Callable[[str], wp.array] | None = make
@@ -155,6 +162,12 @@ class Data:
         return written
 
 
+def _zeros(shape: tuple[int, ...], dtype: Any, device: wp.Device, *, structure_of_arrays: bool) -> wp.array:
+    if structure_of_arrays:
+        return wp.zeros(shape[::-1], dtype=dtype, device=device).transpose()
+    return wp.zeros(shape, dtype=dtype, device=device)
+
+
 def _fill_rows(array: wp.array, row: np.ndarray) -> None:
     """Writes the same row into all worlds."""
     shape = array.numpy().shape
@@ -171,19 +184,21 @@ def _shape(m: mujoco.MjModel, nworld: int, name: str, contact_geoms: int) -> tup
             return nworld, getattr(m, size)
 
 
-def data_bytes(m: mujoco.MjModel, num_envs: int, contact_geoms: int = 0) -> int:
+def data_bytes(m: mujoco.MjModel, num_envs: int, contact_geoms: int = 0, varied: Varied | None = None) -> int:
     """Returns the memory that the state of so many worlds takes, without what is asked for later (bytes).
 
     Args:
         m: the model.
         num_envs: number of worlds.
         contact_geoms: number of geoms whose contact forces are asked for.
+        varied: which numbers of the model differ from world to world; their memory is counted too.
     """
-    return sum(
+    rows = sum(
         math.prod(_shape(m, num_envs, name, contact_geoms)) * wp.types.type_size_in_bytes(dtype)
         for name, (_, dtype) in ROWS.items()
         if name not in LATER
     )
+    return rows + (4 * num_envs * nominal_row(VariedModel(m, varied)).size if varied is not None else 0)
 
 
 class Model(ReadOnly):
@@ -228,10 +243,12 @@ class CompiledEngine:
         num_envs: number of worlds.
         device: where they live.
         contact_geoms: geoms whose contact forces are computed.
+        varied: which numbers of the model differ from world to world.
 
     Attributes:
-        model: the model on the device.
+        model: the model on the device, with nominal numbers.
         data: the state of all worlds.
+        numbers: the numbers that differ, ``(nworld, varied.count)``; none without ``varied``.
         peak_constraints: zero: no row of constraints needs room, ``(nworld,)``.
         peak_contacts: zero likewise, ``(1,)``.
         coalesced: whether functions of a world have kernels of their own, in which the threads of a warp take
@@ -248,15 +265,23 @@ class CompiledEngine:
         num_envs: int,
         device: wp.Device,
         contact_geoms: Sequence[int] = (),
+        varied: Varied | None = None,
     ) -> None:
-        self._mj_model, self._substeps, self._device = mj_model, config.substeps, device
+        self._mj_model = mj_model if varied is None else VariedModel(mj_model, varied)
+        self._substeps, self._device = config.substeps, device
         self._contact_geoms = tuple(contact_geoms)
         check_worlds(mj_model, num_envs, device)
         self.model = Model(mj_model, device)
-        self._launch_size = launch_size(mj_model, num_envs, device)
+        self._launch_size = launch_size(self._mj_model, num_envs, device)
         by_world = structure_of_arrays(mj_model, device)
         count = len(self._contact_geoms)
         self.data = Data(mj_model, num_envs, device, structure_of_arrays=by_world, contact_geoms=count)
+        self._rows = self.numbers = wp.zeros((num_envs, 0), dtype=float, device=device)
+        if isinstance(self._mj_model, VariedModel):
+            row = nominal_row(self._mj_model)
+            self._rows = _zeros((num_envs, row.size), wp.float32, device, structure_of_arrays=by_world)
+            _fill_rows(self._rows, row)
+            self.numbers = self._rows[:, : self._mj_model.varied.count]
         self.coalesced = by_world and not self._launch_size.one_kernel
         self._kernels: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
         self._kernels_apart: dict[tuple, WorldKernel] = {}
@@ -338,7 +363,7 @@ class CompiledEngine:
             kernel,
             dim=size.threads,
             inputs=[size.worlds_per_warp, size.lanes, mask, start.args(before), end.args(after), self.data.ctrl],
-            outputs=list(outputs.values()),
+            outputs=[self._rows, *outputs.values()],
             device=self._device,
             block_dim=size.block,
         )
@@ -361,6 +386,7 @@ def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, Aft
         lane: int,
         live: bool,
         ctrl_in: wp.array2d[float],
+        numbers_out: wp.array2d[float],
         qpos_out: wp.array2d[float],
         qvel_out: wp.array2d[float],
         qacc_warmstart_out: wp.array2d[float],
@@ -385,6 +411,8 @@ def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, Aft
         after_args: After,
         # Data in:
         ctrl_in: wp.array2d[float],
+        # Model out:
+        numbers_out: wp.array2d[float],
         # Data out:
         qpos_out: wp.array2d[float],
         qvel_out: wp.array2d[float],
@@ -412,6 +440,7 @@ def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, Aft
             lane,
             live,  # lanes of a block may wait for those that are not
             ctrl_in,
+            numbers_out,
             qpos_out,
             qvel_out,
             qacc_warmstart_out,

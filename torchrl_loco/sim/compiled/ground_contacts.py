@@ -16,6 +16,7 @@ from torchrl_loco.sim.compiled.collision import (
 )
 from torchrl_loco.sim.compiled.constraints import Softness, Table, Variables
 from torchrl_loco.sim.compiled.dynamics import Dynamics
+from torchrl_loco.sim.compiled.parameters import is_of_model
 from torchrl_loco.sim.compiled.pyramid import FLAT, FRICTIONLESS, FULL
 from torchrl_loco.sim.compiled.sensors import TouchSensors
 from torchrl_loco.sim.compiled.symbols import Block, Scalar, cell, cross, dot, literal, names, scalar, total, zeros
@@ -95,12 +96,12 @@ class GroundContacts:
         return normal, frame(normal, axis) * pair.friction
 
     def _varying(self, title: str, vectors: list[np.ndarray]) -> np.ndarray:
-        """Returns a vector of contact ``k``: constants where all contacts agree, else what is stored."""
+        """Returns a vector of contact ``k``: numbers of the model where all contacts agree, else what is stored."""
 
         def component(i: int) -> Scalar:
             values = {scalar(vector[i]) for vector in vectors}
             agreed = values.pop() if len(values) == 1 else None
-            return agreed if agreed is not None and agreed.constant is not None else cell(f"contact_{title}{i}[k]")
+            return agreed if agreed is not None and is_of_model(agreed) else cell(f"contact_{title}{i}[k]")
 
         return np.array([component(i) for i in range(3)], dtype=object)
 

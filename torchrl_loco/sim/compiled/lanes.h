@@ -169,6 +169,21 @@ enum Shape { SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX };
 enum Dof { TRANSLATION, ROTATION, SLIDE, HINGE };  // of a free joint; of a free or ball joint; the two others
 
 //MODEL
+//IF VARIED
+
+// The numbers of the model of a world, and what follows from them.
+struct Row {
+  const float* const data;
+  INLINE float operator[](int i) const {
+#ifdef __CUDA_ARCH__
+    if (Model::SUBSTEPS > 0) return __ldg(data + i);  // a step only reads them
+#endif
+    return data[i];
+  }
+};
+
+//VARYING
+//END
 
 // ---- The state of a world ------------------------------------------------------------------------------------------
 
@@ -239,14 +254,22 @@ struct Step : Math {
   int frictional, frictionless;  // contacts
   int limits;                    // violated limits of hinges and slides
   int limit_row[Model::LIMIT_SIDES][SLOTS];  // the row of the limit of each own degree of freedom, or -1
+//IF VARIED
+  const Varied varied;
+//END
 //IF CONTACT_GEOMS
   // What the solver overwrites of the contacts that this lane adds up: number lane, lane + LANES, ...
   enum { OWN_CONTACTS = (CONTACTS + LANES - 1) / LANES };
   struct OwnContact { Vec normal, tangent; int pair; } own_contacts[OWN_CONTACTS];
 //END
 
+//IF VARIED
+  INLINE Step(World& w, int lane, const float* ctrl, int* overflow, int world, const float* row)
+      : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world), varied{{row}} {}
+//ELSE
   INLINE Step(World& w, int lane, const float* ctrl, int* overflow, int world)
       : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world) {}
+//END
 
   // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for its normal and
   // two for its tangents (times the friction coefficient), and a constraint row for each of the four edges of its
@@ -1416,7 +1439,19 @@ World& w = storage;
 #define LOCKSTEP()
 #endif
 float* const sensors = sensordata_out.data + (live ? world : 0) * Model::SENSOR_VALUES;
+//IF VARIED
+float* const row = numbers_out.data + static_cast<size_t>(live ? world : 0) * numbers_out.shape[1];
+Step step(w, lane, ctrl_in.data, overflow_out.data, world, row);
+//ELSE
 Step step(w, lane, ctrl_in.data, overflow_out.data, world);
+//END
+//IF DERIVED
+if (live && lane == 0) {  // numbers may have changed
+#define DIV(a, b) Math::divide(a, b)
+//DERIVE
+#undef DIV
+}
+//END
 if (live) {
   step.sync();  // the first lane may have written the state
   SHARED_LOOP(i, Model::POSITIONS) w.qpos[i] = qpos_out.data[world * Model::POSITIONS + i];

@@ -1,7 +1,9 @@
 """One world stepped by a group of lanes: the text of a compiled control step for bodies of more than a few joints.
 
 :func:`source` puts a model's sizes, constants and tables in front of the algorithm in ``lanes.h``, as functions of a
-struct ``Model``: a parameter that is the same everywhere is a constant there, any other a table.
+struct ``Model``: a parameter that is the same everywhere is a constant there, any other a table. Those that differ from
+world to world are functions of struct ``Varied``, which read the row of the world: its numbers, and what follows from
+them, which is computed when the state is evaluated without stepping.
 """
 
 import dataclasses
@@ -18,6 +20,7 @@ from torchrl_loco.sim.compiled.collision import CAPSULE, PLANE, Pair, contact_we
 from torchrl_loco.sim.compiled.constraints import Softness, both_sides, tolerance
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, MINVAL, SLIDE, acting
 from torchrl_loco.sim.compiled.links import Mass, matrix, moving_bodies, places
+from torchrl_loco.sim.compiled.parameters import VariedModel, present, varies
 from torchrl_loco.sim.compiled.tables import Tables
 from torchrl_loco.sim.overflow import Overflow
 
@@ -121,7 +124,8 @@ class Description:
         self.limited = [j for j in limited if m.jnt_type[j] in (SLIDE, HINGE)]
         self.limit_sides = 2 if any(both_sides(m, j) for j in self.limited) else 1
         self.limited_balls = [j for j in limited if m.jnt_type[j] == BALL]
-        self.losses = [d for d in range(m.nv) if m.dof_frictionloss[d] > 0]
+        losses = m.dof_frictionloss
+        self.losses = [d for d in range(m.nv) if varies(losses[d]) or losses[d] > 0]
         sensors = [(int(m.sensor_type[i]), int(m.sensor_objid[i]), int(m.sensor_adr[i])) for i in range(m.nsensor)]
         self.subtrees = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL)]
         self.touch = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_TOUCH)]
@@ -186,9 +190,10 @@ class Description:
         more = max(r for r in range(frictionless + 1) if sized(count, r).bytes <= budget)
         return sized(count, more)
 
-    def tables(self, substeps: int, *, with_subtree_com: bool = False, contact_geoms: Sequence[int] = ()) -> str:
-        """Returns struct ``Model``."""
-        m, layout, tables = self.m, self.layout, Tables()
+    def tables(self, substeps: int, *, with_subtree_com: bool = False, contact_geoms: Sequence[int] = ()) -> Tables:
+        """Returns structs ``Model`` and ``Varied``."""
+        m, layout = self.m, self.layout
+        tables = Tables(m.varied.count if isinstance(m, VariedModel) else 0)
         mask = "unsigned" if m.nv <= 32 else "unsigned long long"
         tables.lines.append(f"  typedef {mask} Dofs;  // a bit for each degree of freedom")
         tables.size(
@@ -235,7 +240,7 @@ class Description:
             tables.integers("root_body", self.roots)
         if contact_geoms:
             self._add_contact_geoms(tables, contact_geoms)
-        return tables.text()
+        return tables
 
     def _add_links(self, tables: Tables) -> None:
         m, moving = self.m, self.moving
@@ -292,7 +297,7 @@ class Description:
         m = self.m
         stiffness, damping = m.jnt_stiffness[m.dof_jntid], m.dof_damping
         explicit = m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-        tables.size(HAS_SPRINGS=stiffness.any(), IMPLICIT_DAMPING=damping.any() and not explicit)
+        tables.size(HAS_SPRINGS=present(stiffness), IMPLICIT_DAMPING=present(damping) and not explicit)
         tables.floats("stiffness", stiffness)
         tables.floats("spring", m.qpos_spring)
         tables.floats("damping", damping)
@@ -306,7 +311,7 @@ class Description:
         limited = m.actuator_forcelimited.astype(bool)
         limits = np.where(clamped[:, None], m.actuator_ctrlrange, [-UNLIMITED, UNLIMITED])[used]
         forces = np.where(limited[:, None], m.actuator_forcerange, [-UNLIMITED, UNLIMITED])[used]
-        tables.size(HAS_ACTUATOR_BIAS=bool(bias.any()), HAS_FORCE_LIMITS=limited[used].any())
+        tables.size(HAS_ACTUATOR_BIAS=present(bias), HAS_FORCE_LIMITS=limited[used].any())
         tables.integers("first_actuator", [sum(d < k for d in dofs[used]) for k in range(m.nv + 1)])
         tables.integers("control", used)
         tables.floats("gear", m.actuator_gear[used, 0])
@@ -468,15 +473,27 @@ def source(
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 
     Args:
-        m: the model.
+        m: the model, or a ``VariedModel``.
         substeps: physics steps; 0 evaluates the state without stepping.
         with_subtree_com: whether the centers of mass of the trees are written.
         contact_geoms: geoms whose contact forces are written.
     """
     description = Description(m)
-    text = _parts(TEMPLATE.read_text(), {"SUBTREE_COM": with_subtree_com, "CONTACT_GEOMS": len(contact_geoms) > 0})
     tables = description.tables(substeps, with_subtree_com=with_subtree_com, contact_geoms=contact_geoms)
-    return text.replace("//MODEL", tables).replace("//ELIMINATE", description.elimination())
+    asked = {
+        "SUBTREE_COM": with_subtree_com,
+        "CONTACT_GEOMS": len(contact_geoms) > 0,
+        "VARIED": tables.row.numbers > 0,
+        "DERIVED": tables.row.numbers > 0 and substeps == 0,
+    }
+    text = tables.use(_parts(TEMPLATE.read_text(), asked))
+    text = text.replace("//MODEL", tables.text()).replace("//ELIMINATE", description.elimination())
+    return text.replace("//VARYING", tables.varied_text()).replace("//DERIVE", tables.row.derive())
+
+
+def nominal_row(m: VariedModel) -> np.ndarray:
+    """Returns what the lanes read of the model itself: its numbers, then what follows from them."""
+    return Description(m).tables(0).row.nominal(m.varied)
 
 
 def _parts(text: str, asked: dict[str, bool]) -> str:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from torchrl_loco.sim.compiled.parameters import Number, present, varies
+
 
 @dataclasses.dataclass(frozen=True)
 class Place:
@@ -32,9 +34,9 @@ class Place:
 
 @dataclasses.dataclass
 class Mass:
-    """Mass, center and moments of inertia of a part of a link, in its frame."""
+    """Mass, center and moments of inertia of a part of a link, in its frame: constants, or scalars where they vary."""
 
-    mass: float
+    mass: Number
     center: np.ndarray
     moments: np.ndarray
 
@@ -44,13 +46,13 @@ class Mass:
         masses = m.body_mass[bodies]
         centers = np.array([places[b].point(m.body_ipos[b]) for b in bodies])
         mass = masses.sum()
-        center = masses @ centers / mass if mass > 0 else centers[0]
+        center = masses @ centers / mass if len(bodies) > 1 and present(masses) else centers[0]
         moments = np.zeros((3, 3))
         for b, d in zip(bodies, centers - center, strict=True):
             axes = matrix(places[b].turn(m.body_iquat[b]))
-            moments += axes @ np.diag(m.body_inertia[b]) @ axes.T
-            moments += m.body_mass[b] * (d @ d * np.eye(3) - np.outer(d, d))
-        return cls(float(mass), center, moments)
+            moments = moments + axes @ np.diag(m.body_inertia[b]) @ axes.T
+            moments = moments + m.body_mass[b] * (d @ d * np.eye(3) - np.outer(d, d))
+        return cls(mass if varies(mass) else float(mass), center, moments)
 
 
 def matrix(quaternion: np.ndarray) -> np.ndarray:

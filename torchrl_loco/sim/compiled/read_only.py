@@ -7,8 +7,8 @@ import numpy as np
 import warp as wp
 
 REMEDY = (
-    "the compiled step has the numbers of the model as constants. Edit the model before the simulation is made "
-    "(a mujoco.MjSpec), or pass engine='mujoco_warp'"
+    "the compiled step has the numbers of the model as constants. Pass randomize=[Vary(...)] for numbers that differ "
+    "from world to world, or edit the model before the simulation is made (a mujoco.MjSpec)"
 )
 
 

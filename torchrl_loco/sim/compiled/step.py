@@ -5,9 +5,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
+import numpy as np
 import warp as wp
 
 from torchrl_loco.sim.compiled import lanes, traced
+from torchrl_loco.sim.compiled.parameters import VariedModel
 
 TRACED_DOFS = 16
 """Most degrees of freedom of a body that is traced. A thread holds its state; for the humanoid that would be 12 KiB and
@@ -61,7 +63,7 @@ def source(
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 
     Args:
-        m: the model.
+        m: the model, or a ``VariedModel``.
         substeps: physics steps; 0 evaluates the state without stepping.
         with_cvel: whether the velocities of the bodies are written.
         with_subtree_com: whether the centers of mass of the trees are written.
@@ -72,6 +74,11 @@ def source(
     return traced.source(
         m, substeps, with_cvel=with_cvel, with_subtree_com=with_subtree_com, contact_geoms=contact_geoms
     )
+
+
+def nominal_row(m: VariedModel) -> np.ndarray:
+    """Returns what the step reads of the model itself: the numbers that vary, then what follows from them."""
+    return m.varied.nominal() if is_traced(m) else lanes.nominal_row(m)
 
 
 class LaunchSize(NamedTuple):

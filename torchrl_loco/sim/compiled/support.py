@@ -5,8 +5,10 @@ import mujoco
 from torchrl_loco.sim.compiled import lanes
 from torchrl_loco.sim.compiled.collision import CAPSULE, PLANE, SPHERE, Pair, pairs
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE
+from torchrl_loco.sim.compiled.parameters import VariedModel
 from torchrl_loco.sim.compiled.sensors import SUBTREE_VELOCITY, TOUCH
 from torchrl_loco.sim.compiled.step import is_traced
+from torchrl_loco.sim.varied import Varied
 
 IGNORED_FLAGS = ("EULERDAMP", "FILTERPARENT", "REFSAFE", "MIDPHASE", "NATIVECCD", "ISLAND", "AUTORESET")
 """Flags that may be set: the compiled step follows them, or they change nothing in it."""
@@ -21,11 +23,16 @@ Found = dict[str, list[str]]
 """Names of the elements that need something, by what it is."""
 
 
-def unsupported(m: mujoco.MjModel) -> list[str]:
+def unsupported(mj_model: mujoco.MjModel, varied: Varied | None = None) -> list[str]:
     """Returns what a model needs that the compiled step does not have, in words; an empty list if nothing.
 
     It raises nothing: what cannot be read is not supported.
+
+    Args:
+        mj_model: the model.
+        varied: which of its numbers differ from world to world.
     """
+    m = mj_model if varied is None else VariedModel(mj_model, varied)
     found: list[str] = []
     for part in (_options, _elements, _joints, _actuators, _contacts, _sensors):
         try:

@@ -13,7 +13,7 @@ import numpy as np
 
 Vector = Sequence[Any] | np.ndarray
 
-LEAVES = ("const", "name", "cell")
+LEAVES = ("const", "name", "cell", "number")
 """What has no parts."""
 
 
@@ -21,7 +21,7 @@ class Scalar:
     """A node of an expression. Nodes are unique: equal expressions are the same object.
 
     Args:
-        op: "const", "name", "cell", "+", "-", "*", "/", "neg", "call", "select", or "sin" and "cos".
+        op: "const", "name", "cell", "number", "+", "-", "*", "/", "neg", "call", "select", or "sin" and "cos".
         args: numbers, names or other scalars.
     """
 
@@ -223,6 +223,8 @@ _scalars: Callable[..., np.ndarray] = np.vectorize(scalar, otypes=[object])
 def array(x: Any) -> np.ndarray:
     """Returns numbers as an array of scalars, zero where rounding left something else beside the largest of them."""
     numbers = np.asarray(x)
+    if numbers.dtype == object and not any(isinstance(number, Scalar) for number in numbers.flat):
+        numbers = numbers.astype(float)
     if numbers.dtype != object and numbers.size:
         numbers = np.where(np.abs(numbers) < ROUNDING * np.abs(numbers).max(), 0.0, numbers)
     return _scalars(numbers)

@@ -6,16 +6,69 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchrl_loco.sim.compiled.symbols import literal
+from torchrl_loco.sim.compiled.parameters import Number, constant, evaluate, numbers_in, varies
+from torchrl_loco.sim.compiled.symbols import Block, Scalar, literal, scalar
+from torchrl_loco.sim.varied import Varied
+
+
+class Row:
+    """What the lanes read of a world's model: its numbers, then what follows from them.
+
+    Args:
+        numbers: how many numbers vary.
+
+    Attributes:
+        derived: what follows, at the places from ``numbers`` on.
+    """
+
+    def __init__(self, numbers: int) -> None:
+        self.numbers = numbers
+        self.derived: list[Scalar] = []
+        self._places: dict[Scalar, int] = {}
+
+    def place(self, x: Number) -> int:
+        """Returns where a number of the model is, or what is made of such numbers."""
+        node = scalar(x)
+        if node.op == "number":
+            return node.args[1]
+        if node not in self._places:
+            self._places[node] = self.numbers + len(self.derived)
+            self.derived.append(node)
+        return self._places[node]
+
+    def nominal(self, varied: Varied) -> np.ndarray:
+        """Returns the row of the model itself."""
+        numbers = varied.nominal()
+        return np.concatenate([numbers, [evaluate(x, numbers) for x in self.derived]])
+
+    def derive(self) -> str:
+        """Returns C++ that sets what follows from the numbers of a ``row``."""
+        block = Block()
+        for x in numbers_in(self.derived):
+            block(f"const float {x.args[0]} = row[{x.args[1]}];")
+        for place, x in enumerate(self.derived, self.numbers):
+            if varies(x):  # constants are there from the start
+                block.set(f"row[{place}]", x)
+        return block.text()
 
 
 class Tables:
-    """The members of struct ``Model``."""
+    """The members of struct ``Model``, and of ``Varied``, whose functions read the row of a world.
+
+    Args:
+        numbers: how many numbers of the model vary.
+
+    Attributes:
+        lines: the members of ``Model``.
+        row: what the functions of ``Varied`` read.
+    """
 
     COMPONENTS: ClassVar = {"Vec": 3, "Quat": 4, "Symmetric": 6, "Mat": 9, "Softness": 9}
 
-    def __init__(self) -> None:
+    def __init__(self, numbers: int = 0) -> None:
         self.lines: list[str] = []
+        self.row = Row(numbers)
+        self._varied: dict[str, str] = {}
 
     def size(self, **values: int) -> None:
         """Adds integer constants."""
@@ -28,15 +81,21 @@ class Tables:
 
     def vector(self, name: str, value: ArrayLike) -> None:
         """Adds a function that returns a vector."""
+        if any(map(varies, np.asarray(value))):
+            self._read("Vec", name, list(np.asarray(value)), parameter="")
+            return
         self._function("Vec", name, [f"return {{{', '.join(map(literal, np.asarray(value, float)))}}};"], parameter="")
 
     def procedure(self, name: str, parameter: str, statements: list[str]) -> None:
         """Adds a function that returns nothing."""
         self._function("void", name, statements, parameter)
 
-    def floats(self, name: str, values: Sequence[float] | np.ndarray) -> None:
+    def floats(self, name: str, values: Sequence[Number] | np.ndarray) -> None:
         """Adds a function from an index to a number."""
-        statements, result = column([literal(x) for x in values], "float", "table")
+        if any(map(varies, values)):
+            self._read("float", name, list(values))
+            return
+        statements, result = column([literal(constant(x)) for x in values], "float", "table")
         self._function("float", name, [*statements, f"return {result};"])
 
     def integers(self, name: str, values: Sequence[int] | np.ndarray, type_: str = "int") -> None:
@@ -54,7 +113,11 @@ class Tables:
     def structs(self, type_: str, name: str, values: Sequence[ArrayLike] | np.ndarray) -> None:
         """Adds a function from an index to a struct of numbers."""
         count = self.COMPONENTS[type_]
-        rows = [[literal(x) for x in row] for row in np.asarray(values, float).reshape(-1, count)]
+        flat = [x for row in values for x in np.ravel(np.asarray(row))]
+        if any(map(varies, flat)):
+            self._read(type_, name, flat)
+            return
+        rows = [[literal(x) for x in row] for row in np.reshape([constant(x) for x in flat], (-1, count))]
         if type_ == "Softness":  # member by member, since constraints often share all but one
             columns = [column([row[k] for row in rows], "float", f"table{k}") for k in range(count)]
             statements, parts = [s for c in columns for s in c[0]], [c[1] for c in columns]
@@ -74,9 +137,36 @@ class Tables:
         else:
             self.lines += [head, *(f"    {s}" for s in statements), "  }"]
 
+    def _read(self, type_: str, name: str, values: list[Number], parameter: str = "int i") -> None:
+        """Adds a function that reads the row of a world."""
+        count, places = self.COMPONENTS.get(type_, 1), [self.row.place(x) for x in values]
+        parts: list[str] = []
+        statements: list[str] = []
+        for k in range(count):
+            own = places[k::count]
+            if own == list(range(own[0], own[0] + count * len(own), count)):
+                index = f"{own[0]}" if len(own) == 1 else f"{own[0]} + {count} * i"
+            else:
+                found, index = column(list(map(str, own)), "short", f"places{k}")
+                statements += found
+            parts.append(f"row[{index}]")
+        result = parts[0] if type_ == "float" else f"{{{', '.join(parts)}}}"
+        body = " ".join([*statements, f"return {result};"])
+        self._varied[name] = f"  INLINE {type_} {name}({parameter}) const {{ {body} }}"
+
     def text(self) -> str:
-        """Returns the struct."""
+        """Returns struct ``Model``."""
         return "\n".join(["struct Model {", *self.lines, "};"])
+
+    def varied_text(self) -> str:
+        """Returns struct ``Varied``."""
+        return "\n".join(["struct Varied {", "  const Row row;", *self._varied.values(), "};"])
+
+    def use(self, text: str) -> str:
+        """Returns C++ whose calls of functions that vary are those of an object ``varied``."""
+        for name in self._varied:
+            text = text.replace(f"Model::{name}(", f"varied.{name}(")
+        return text
 
 
 def column(values: list[str], type_: str, table: str) -> tuple[list[str], str]:

@@ -7,6 +7,7 @@ import mujoco
 from torchrl_loco.sim.compiled import sensors
 from torchrl_loco.sim.compiled.collision import pairs
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, Dynamics
+from torchrl_loco.sim.compiled.parameters import VariedModel, number, present
 from torchrl_loco.sim.compiled.sensors import TOUCH, TouchSensors
 from torchrl_loco.sim.compiled.solver import NewtonSolver
 from torchrl_loco.sim.compiled.symbols import (
@@ -80,7 +81,7 @@ def source(
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 
     Args:
-        m: the model.
+        m: the model, or a ``VariedModel``.
         substeps: physics steps; 0 evaluates the state without stepping.
         with_cvel: whether the velocities of the bodies are written.
         with_subtree_com: whether the centers of mass of the trees are written.
@@ -88,6 +89,10 @@ def source(
     """
     world = Block()
     world("if (!live) return;")
+    if isinstance(m, VariedModel):
+        world("// Numbers of the model.")
+        for column in range(m.varied.count):
+            world(f"const float {number(column).args[0]} = wp::index(numbers_out, world, {column});")
     for title, size in INPUTS.items():
         argument, count = _argument(title), getattr(m, size)
         world(f"float {title}[{max(count, 1)}];")
@@ -151,7 +156,7 @@ def _integrate(block: Block, m: mujoco.MjModel, tree: Dynamics) -> None:
     """
     h, qacc = m.opt.timestep, cells("qacc", m.nv)
     implicit = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-    if implicit and m.dof_damping.any():
+    if implicit and present(m.dof_damping):
         diagonal = [scalar(h * damping) for damping in m.dof_damping]
         factor = tree.factor([zeros(6, 6) for _ in range(m.nbody)], diagonal)
         qacc = [block.keep(a) for a in factor.solve(cells("M_qacc", m.nv))]

@@ -1,0 +1,68 @@
+"""Elements of a model by their names."""
+
+import difflib
+import re
+from collections.abc import Sequence
+
+import mujoco
+
+Names = str | Sequence[str]
+"""A name, several names, or a regular expression that matches whole names."""
+
+KINDS = {
+    **{"body": "nbody", "joint": "njnt", "geom": "ngeom", "site": "nsite", "sensor": "nsensor", "actuator": "nu"},
+    "pair": "npair",
+}
+"""What has names in a model, and how many there are."""
+
+
+class Elements:
+    """The elements of a model by name.
+
+    Args:
+        mj_model: the model.
+    """
+
+    def __init__(self, mj_model: mujoco.MjModel) -> None:
+        self.mj_model = mj_model
+        self._names: dict[str, list[str]] = {}
+        self._found: dict[tuple[str, str | tuple[str, ...]], tuple[list[int], bool]] = {}
+
+    def names(self, kind: str) -> list[str]:
+        """Returns the names of all elements of a kind, by their ids."""
+        if kind not in self._names:
+            element = getattr(self.mj_model, kind)
+            self._names[kind] = [element(i).name for i in range(getattr(self.mj_model, KINDS[kind]))]
+        return self._names[kind]
+
+    def ids(self, kind: str, names: Names) -> tuple[list[int], bool]:
+        """Returns the ids of elements, and whether one was named, so that results need no dimension for several.
+
+        Raises:
+            KeyError: a name or pattern matches none; the message names the nearest.
+        """
+        key = kind, names if isinstance(names, str) else tuple(names)
+        if not key[1]:
+            raise KeyError(f"name a {kind}, several, or a regular expression, got {names!r}")
+        if key not in self._found:
+            known = self.names(kind)
+            if isinstance(names, str) and names in known:
+                self._found[key] = [known.index(names)], True
+            else:
+                several = [names] if isinstance(names, str) else names
+                self._found[key] = [i for name in several for i in self._matches(kind, name)], False
+        return self._found[key]
+
+    def _matches(self, kind: str, pattern: str) -> list[int]:
+        known = self.names(kind)
+        if pattern in known:
+            return [known.index(pattern)]
+        try:
+            found = [i for i, name in enumerate(known) if name and re.fullmatch(pattern, name)]
+        except re.error as error:
+            raise KeyError(f"{pattern!r} is neither the name of a {kind} nor a regular expression: {error}") from None
+        if not found:
+            near = difflib.get_close_matches(pattern, known, n=1)
+            hint = f", did you mean {near[0]!r}?" if near else ""
+            raise KeyError(f"the model has no {kind} {pattern!r}{hint}: it has {', '.join(filter(None, known))}")
+        return found

@@ -1,0 +1,217 @@
+"""What an environment's ``randomize`` means for its model: which numbers vary, their draws, and whether they can be."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+import torch
+
+from torchrl_loco.envs import draws
+from torchrl_loco.envs.changes import Change, change_of
+from torchrl_loco.envs.names import Elements
+from torchrl_loco.envs.vary import FIELDS, Vary
+from torchrl_loco.sim.varied import Varied
+from torchrl_loco.sim.varied import field as array_of
+
+VALID = {
+    "positive": "must be positive",
+    "not negative": "must not be negative",
+    "rising": "must have its lower limit below the upper one",
+    "inertia": "must be positive, and none greater than the sum of the other two",
+}
+"""What must be true of a field's numbers, for messages."""
+
+MOST_BITS = 12
+"""Draws on which the numbers of an element may depend: all combinations are checked."""
+
+
+class Variation:
+    """The numbers of a model that differ from world to world.
+
+    Args:
+        varys: how, in this order.
+        mj_model: the model.
+        device: where the worlds live.
+
+    Attributes:
+        varied: which numbers vary.
+
+    Raises:
+        ValueError: a name is not in the model, nothing is left that varies, or a number could become impossible.
+    """
+
+    def __init__(self, varys: Sequence[Vary], mj_model: mujoco.MjModel, device: torch.device) -> None:
+        self._mj_model, self._device, self._elements = mj_model, device, Elements(mj_model)
+        labels = [f"{vary.field} of {vary.of}, {vary.component}" for vary in varys]
+        self._changes = [
+            change_of(vary, self._elements, f"{label}, {labels[:i].count(label)}")
+            for i, (vary, label) in enumerate(zip(varys, labels, strict=True))
+        ]
+        places: dict[str, set[int]] = {}
+        for change in self._changes:
+            for name, index in change.places:
+                places.setdefault(name, set()).add(index)
+        self.varied = Varied(mj_model, {name: sorted(indices) for name, indices in places.items()})
+        self._columns = {
+            (name, int(index)): self.varied.columns[name].start + i
+            for name, indices in self.varied.places.items()
+            for i, index in enumerate(indices)
+        }
+        self._indices: list[torch.Tensor] = []
+        self._plan(device)
+        self._check()
+        self._shown: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
+
+    # Their draws.
+
+    def _plan(self, device: torch.device) -> None:
+        """Makes the tensors that :meth:`_numbers` works with.
+
+        They have a first dimension of 1: a row for each world would be taken for the worlds' when it is fused.
+        """
+        self._nominal = torch.tensor(self.varied.nominal()[None], dtype=torch.float32, device=device)
+        self._steps: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]] = []
+        latest = list(range(self.varied.count))  # where each number is among those that were made so far
+        made = self.varied.count
+        for change in self._changes:
+            columns = [self._columns[place] for place in change.places]
+            bounds = [change.vary.bounds[group] for group in change.group_of]
+            ends = torch.tensor(bounds, dtype=torch.float64, device=device).T
+            low, high = (ends.log() if change.vary.log else ends)[:, None]
+            signs = torch.tensor([change.signs], device=device)
+            sources = self._index([latest[column] for column in columns])
+            self._steps.append((sources, self._index(change.which), low.float(), (high - low).float(), signs))
+            for i, column in enumerate(columns):
+                latest[column] = made + i
+            made += len(columns)
+        self._last = self._index(latest)
+        self._draws_at = [draws.places(0, len(change.group_of), device)[None] for change in self._changes]
+
+    def _index(self, values: Sequence[int]) -> torch.Tensor:
+        self._indices.append(torch.tensor([list(values)], device=self._device))
+        return self._indices[-1]
+
+    def fixed(self) -> list[torch.Tensor]:
+        """Returns the tensors of indices, which never change."""
+        return list(self._indices)
+
+    def _numbers(self, units: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Returns the numbers of worlds ``(n, count)`` from draws in [0, 1), of each Vary ``(n, its draws)``."""
+        made = self._nominal.expand(units[0].shape[0], -1)
+        for change, unit, (sources, which, low, width, signs) in zip(self._changes, units, self._steps, strict=True):
+            drawn = low + width * unit
+            drawn = (drawn.exp() if change.vary.log else drawn).index_select(1, which[0])
+            before = made.index_select(1, sources[0])
+            how = change.vary.how
+            after = before * drawn if how == "scale" else before + drawn * signs if how == "add" else drawn * signs
+            made = torch.cat([made, after], dim=1)
+        return made.index_select(1, self._last[0])
+
+    def vary(self, a: Mapping[str, torch.Tensor]) -> None:
+        """At a reset, in the masked worlds, whose next episode is counted: draws ``numbers``."""
+        units = []
+        for change, at in zip(self._changes, self._draws_at, strict=True):
+            zero = torch.zeros_like(a["episode"])
+            episode = zero if change.vary.once else a["episode"]
+            stream = draws.stream(a["seed"], a["world"], episode, zero, f"vary {change.label}")
+            units.append(draws.to_unit(draws.draw(stream, at)))
+        a["numbers"].copy_(torch.where(a["mask"].unsqueeze(1), self._numbers(units), a["numbers"]))
+
+    # What they may become.
+
+    def _check(self) -> None:
+        """Checks the numbers at all combinations of least and greatest draws, between which they lie.
+
+        Raises:
+            ValueError: one is impossible.
+        """
+        bits: list[list[int]] = []  # of each draw, which bit of a combination it takes
+        for i, change in enumerate(self._changes):
+            touched = self._touched(change)
+            before = [b for b, other in zip(bits, self._changes[:i], strict=True) if touched & self._touched(other)]
+            first = max((max(b) + 1 for b in before), default=0)
+            bits.append([first + group for group in change.group_of])
+        count = max(max(b) for b in bits) + 1
+        if count > MOST_BITS:
+            raise ValueError(f"randomize names the same elements too often: {count} draws for one, {MOST_BITS} at most")
+        corners = torch.tensor(np.arange(2**count)[:, None] >> np.arange(count) & 1, dtype=torch.float32)
+        numbers = self._numbers([corners[:, b].to(self._device) for b in bits]).cpu().double().numpy()
+        for change in self._changes:
+            self._check_change(change, numbers)
+
+    def _touched(self, change: Change) -> set[tuple[str, int]]:
+        """Returns the elements that a change is about; gain and bias of an actuator belong together."""
+        return {(name.replace("biasprm", "gainprm"), index // FIELDS[name].size) for name, index in change.places}
+
+    def _check_change(self, change: Change, numbers: np.ndarray) -> None:
+        """Checks the numbers ``(combinations, count)`` of what a Vary changes.
+
+        Raises:
+            ValueError: one is impossible.
+        """
+        valid = FIELDS[change.vary.field].valid
+        if valid in ("rising", "inertia"):
+            name = change.vary.field
+            size = FIELDS[name].size
+            for element in sorted({index // size for _, index in change.places}):
+                rows = np.stack([self._column(numbers, name, size * element + k) for k in range(size)], axis=1)
+                if valid == "rising":
+                    wrong = rows[:, 0] >= rows[:, 1]
+                else:
+                    had = self._mj_model.body_inertia[element] > 0
+                    wrong = ((rows < 0) | (rows == 0) & had).any(1) | (2 * rows.max(1) > rows.sum(1) * (1 + 1e-6))
+                self._refuse(change, name, element, rows, wrong)
+        elif valid != "finite":
+            for (name, index), sign in zip(change.places, change.signs, strict=True):
+                rows, positive = sign * self._column(numbers, name, index), valid == "positive"
+                had = sign * float(array_of(self._mj_model, name).flat[index]) > 0
+                wrong = rows <= 0 if positive and had else rows < 0
+                self._refuse(change, name, index // FIELDS[name].size, rows, wrong)
+
+    def _column(self, numbers: np.ndarray, name: str, index: int) -> np.ndarray:
+        """Returns a number of the model in all rows."""
+        if (name, index) in self._columns:
+            return numbers[:, self._columns[name, index]]
+        return np.full(len(numbers), array_of(self._mj_model, name).flat[index])
+
+    def _refuse(self, change: Change, name: str, element: int, rows: np.ndarray, wrong: np.ndarray) -> None:
+        if not wrong.any():
+            return
+        vary = change.vary
+        kind = FIELDS[vary.field].of
+        element = int(self._mj_model.dof_jntid[element]) if name.startswith("dof_") else element
+        values = ", ".join(f"{value:.3g}" for value in np.atleast_1d(rows[np.flatnonzero(wrong)[0]]))
+        raise ValueError(
+            f"{vary}: {vary.field} of {self._elements.names(kind)[element] or f'{kind} {element}'} could become "
+            f"{values}, but it {VALID[FIELDS[vary.field].valid]}: choose other low and high"
+        )
+
+    # What is shown of them.
+
+    def field(self, name: str, numbers: torch.Tensor) -> torch.Tensor:
+        """Returns a field that varies in all worlds, ``(n, *shape)``, from their numbers ``(n, count)``."""
+        nominal = array_of(self._mj_model, name)
+        if name not in self._shown:
+            where = [self._columns.get((name, i), self.varied.count + i) for i in range(nominal.size)]
+            constants = torch.tensor(np.ravel(nominal)[None], dtype=torch.float32, device=self._device)
+            self._shown[name] = self._index(where), constants
+        columns, constants = self._shown[name]
+        everything = torch.cat([numbers, constants.expand(len(numbers), -1)], dim=1)
+        return everything.index_select(1, columns[0]).view(len(numbers), *nominal.shape)
+
+
+def constant_of(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Returns a field of a model, or the gravity of its options.
+
+    Raises:
+        AttributeError: there is no such field, or it is no array of numbers.
+    """
+    values = mj_model.opt.gravity if name == "gravity" else getattr(mj_model, name, None)
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "biuf":
+        arrays = [key for key in dir(mj_model) if isinstance(getattr(mj_model, key, None), np.ndarray)]
+        near = difflib.get_close_matches(name, [*arrays, "gravity"], n=3)
+        raise AttributeError(
+            f"MjModel has no array {name!r}" + (f": did you mean {' or '.join(near)}?" if near else "")
+        )
+    return values

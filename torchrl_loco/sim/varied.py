@@ -1,0 +1,118 @@
+"""Which numbers of a model differ from world to world."""
+
+import copy
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+FIELDS = (
+    *("geom_friction", "pair_friction", "body_mass", "body_inertia", "body_ipos"),
+    *("dof_damping", "dof_armature", "dof_frictionloss", "jnt_stiffness"),
+    *("actuator_gear", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "gravity"),
+)
+"""Fields of ``mujoco.MjModel`` whose numbers can vary; ``gravity`` is that of its options."""
+
+
+class Varied:
+    """Which numbers of a model differ from world to world.
+
+    A world has a row of them, ``(count,)``: field by field, each in the order of its flattened array.
+
+    Args:
+        mj_model: the model; its own numbers are the nominal ones.
+        places: by field, which of its numbers vary: indices of the flattened array.
+
+    Attributes:
+        places: the same, sorted.
+        columns: by field, where its numbers are in a row.
+        count: length of a row.
+
+    Raises:
+        ValueError: there is no such field, or no such number in it; or the model cannot follow it: limits of a force
+            that is not limited, or the center of mass of a body whose mass matrix is diagonal.
+    """
+
+    def __init__(self, mj_model: mujoco.MjModel, places: Mapping[str, ArrayLike]) -> None:
+        self._mj_model = mj_model
+        self.places: dict[str, np.ndarray] = {}
+        self.columns: dict[str, slice] = {}
+        self.count = 0
+        for name, given in places.items():
+            if name not in FIELDS:
+                raise ValueError(f"{name!r} cannot vary: choose of {', '.join(FIELDS)}")
+            indices, size = np.unique(np.asarray(given, dtype=int)), field(mj_model, name).size
+            if indices.size and not 0 <= indices[0] <= indices[-1] < size:
+                raise ValueError(f"{name} has {size} numbers, but the number {indices[-1]} was to vary")
+            check(mj_model, name, indices)
+            self.places[name] = indices
+            self.columns[name] = slice(self.count, self.count + indices.size)
+            self.count += indices.size
+
+    def nominal(self) -> np.ndarray:
+        """Returns the row of the model itself, ``(count,)``."""
+        rows = [field(self._mj_model, name).ravel()[places] for name, places in self.places.items()]
+        return np.concatenate([np.zeros(0), *rows])
+
+    def full(self, name: str, row: np.ndarray) -> np.ndarray:
+        """Returns a field of a world with this row, in MjModel's shape."""
+        nominal = field(self._mj_model, name)
+        values = nominal.ravel().copy()
+        if name in self.places:
+            values[self.places[name]] = row[self.columns[name]]
+        return values.reshape(nominal.shape)
+
+    def edited(self, row: ArrayLike) -> mujoco.MjModel:
+        """Returns a copy of the model with the numbers of a world's row, for C MuJoCo.
+
+        ``body_subtreemass`` follows the masses. ``body_invweight0``, ``dof_invweight0`` and ``stat.meaninertia`` stay
+        nominal, as they do in both engines.
+        """
+        m, numbers = copy.copy(self._mj_model), np.asarray(row, dtype=float)
+        for name in self.places:
+            field(m, name)[...] = self.full(name, numbers)
+        if "body_ipos" in self.places:
+            self._move_inertial_frames(m)
+        if "body_mass" in self.places:
+            m.body_subtreemass[:] = m.body_mass
+            for body in reversed(range(1, m.nbody)):
+                m.body_subtreemass[m.body_parentid[body]] += m.body_subtreemass[body]
+        return m
+
+    def _move_inertial_frames(self, m: mujoco.MjModel) -> None:
+        """Updates what a model has in the inertial frames of its bodies."""
+        for frames in (m.body_sameframe, m.geom_sameframe, m.site_sameframe):
+            frames[:] = 0  # some were the same, which MuJoCo would go by
+        for body in range(1, m.nbody):
+            axes, offset = np.zeros(9), self._mj_model.body_ipos[body] - m.body_ipos[body]
+            mujoco.mju_quat2Mat(axes, m.body_iquat[body])
+            boxes = slice(m.body_bvhadr[body], m.body_bvhadr[body] + m.body_bvhnum[body])
+            m.bvh_aabb[boxes, :3] += offset @ axes.reshape(3, 3)
+
+
+def check(mj_model: mujoco.MjModel, name: str, indices: np.ndarray) -> None:
+    """Checks that a model can follow numbers of a field.
+
+    Raises:
+        ValueError: it cannot: the message names the element, and what to do.
+    """
+    if name == "actuator_forcerange":
+        for i in indices // 2:
+            if not mj_model.actuator_forcelimited[i]:
+                raise ValueError(
+                    f"actuator_forcerange of actuator {mj_model.actuator(i).name!r} cannot vary, since its "
+                    "force has no limits: give it a forcerange in the model"
+                )
+    if name == "body_ipos":
+        for body in indices // 3:
+            if mj_model.body_simple[body] == 1:
+                raise ValueError(
+                    f"body_ipos of body {mj_model.body(body).name!r} cannot vary, since MuJoCo takes its mass "
+                    "matrix for diagonal: in the model, move its center of mass a little off its joints (inertial)"
+                )
+
+
+def field(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Returns a field of :data:`FIELDS`, a view of the model's own array."""
+    return mj_model.opt.gravity if name == "gravity" else getattr(mj_model, name)
