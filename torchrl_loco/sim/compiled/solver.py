@@ -26,19 +26,20 @@ auto smooth = [&](float step) {
   const float cost = step * (slope_smooth + 0.5f * step * curvature_smooth);
   return Point{step, cost, slope_smooth + step * curvature_smooth, curvature_smooth};
 };
-// A row whose residual is x + step * v. It costs something where that is negative: its cost grows by D / 2 (y^2 - x^2),
-// with both cut off at zero.
+// A row whose residual y is x + step * v costs D / 2 y^2 where that is negative. Its change of cost is no difference of
+// costs where it stays negative: beside what a deep contact costs, a single number has no room for what is gained.
 #define ROW const float slope = D * v, curvature = slope * v, half = 0.5f * D, at_zero = wp::min(x, 0.0f);
 #define ADD_ROW(p) { \\
   const float y = wp::min(fmaf(p.step, v, x), 0.0f); \\
-  p.cost = fmaf(half * y, y, p.cost - half * at_zero * at_zero); \\
+  const float moved = y < 0.0f && x < 0.0f ? p.step * v : y - at_zero; \\
+  p.cost = fmaf(half * (y + at_zero), moved, p.cost); \\
   p.slope = fmaf(slope, y, p.slope); \\
   p.curvature += y < 0.0f ? curvature : 0.0f; }
 // A row of dry friction: quadratic up to the largest force, linear beyond.
 #define FRICTION_COST(y) (fabsf(y) < bound ? 0.5f * D * (y) * (y) : limit * (fabsf(y) - 0.5f * bound))
 #define ADD_FRICTION(p) { \\
   const float y = fmaf(p.step, v, x); const bool inside = fabsf(y) < bound; \\
-  p.cost += FRICTION_COST(y) - FRICTION_COST(x); \\
+  p.cost += inside && fabsf(x) < bound ? 0.5f * D * (x + y) * (p.step * v) : FRICTION_COST(y) - FRICTION_COST(x); \\
   p.slope += v * (inside ? D * y : y < 0.0f ? -limit : limit); \\
   p.curvature += inside ? D * v * v : 0.0f; }
 
