@@ -109,8 +109,8 @@ class Video:
 
     seconds: float = 10.0
     """Length of the video (s)."""
-    camera: Literal["side", "back", "egocentric"] = "side"
-    """Which of the model's cameras."""
+    camera: str = "side"
+    """Name of one of the model's cameras."""
     seed: int = 0
     """Seed of the episode."""
     device: str | None = None

@@ -61,6 +61,7 @@ def specification(source: Path | str | mujoco.MjSpec, folder: Path | None = None
 
     Raises:
         FileNotFoundError: there is no such file.
+        ValueError: it is no valid MJCF.
     """
     if isinstance(source, mujoco.MjSpec):
         return source.copy()
@@ -72,7 +73,10 @@ def specification(source: Path | str | mujoco.MjSpec, folder: Path | None = None
         where = " and ".join(dict.fromkeys(str(path.absolute()) for path in tried))
         raise FileNotFoundError(f"there is no model {str(source)!r}: looked for {where}")
     own = path.with_name(SCENE.name).exists()
-    return mujoco.MjSpec.from_file(str(path), {} if own else {SCENE.name: SCENE.read_bytes()})
+    try:
+        return mujoco.MjSpec.from_file(str(path), {} if own else {SCENE.name: SCENE.read_bytes()})
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def has_home(mj_model: mujoco.MjModel) -> bool:

@@ -22,7 +22,7 @@ def record(
         path: the video file; its suffix chooses the container, the codec is H.264.
         seconds: length of the video (s).
         action_repeat: frames for which an action is held.
-        camera: ``"side"``, ``"back"`` or ``"egocentric"``.
+        camera: name of one of the model's cameras.
     """
     import imageio.v3 as imageio  # of the extra "train"
 
