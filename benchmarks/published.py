@@ -1,4 +1,4 @@
-"""Published returns, and the table of stored training runs beside them.
+"""Published returns.
 
 They are means over seeds, recomputed from the result files in the repositories nicklashansen/tdmpc2, wertyuilife2/bmpc
 (``data_dmc_hard_4M.json``), molumitu/BOOM_MBRL (``results_dmc_2M.pkl``), cvoelcker/reppo and
@@ -8,10 +8,7 @@ million steps and 3 seeds. BRO's, of 1 million and 10 seeds: cheetah_run 825.4, 
 """
 
 import csv
-import statistics
 from pathlib import Path
-
-from benchmarks.results import Row
 
 PUBLISHED: dict[tuple[str, str], tuple[float, str]] = {
     ("walker_stand", "playground"): (992.4, "FastTD3"),
@@ -33,49 +30,6 @@ PUBLISHED: dict[tuple[str, str], tuple[float, str]] = {
     ("quadruped_run", "dm_control"): (953.8, "TD-MPC2"),
 }
 """The best published mean return and the method that earned it, by task and protocol."""
-
-COLUMNS = {
-    **{"task": "", "protocol": "", "seeds": "d", "mean": ".1f", "worst": ".1f", "training (s)": ".0f"},
-    **{"threshold": ".0f", "passed after (s)": ".0f", "from start (s)": ".0f", "published": ".1f", "by": ""},
-}
-"""Columns of :func:`learning`, and how their values are formatted."""
-
-
-def learning(folder: Path) -> list[Row]:
-    """Returns a row for each task and protocol in a folder's ``results.csv``: all seeds, and the published return.
-
-    The time of training is the mean over seeds. The times to the threshold, of training and from the start of the
-    process, are those of the slowest seed, and empty if a seed did not pass it.
-    """
-    groups: dict[tuple[str, str], list[dict[str, str]]] = {}
-    for row in read(folder, "results.csv"):
-        groups.setdefault((row["task"], row["protocol"]), []).append(row)
-    return [_row(*key, groups[key]) for key in dict.fromkeys([*PUBLISHED, *groups]) if key in groups]
-
-
-def _row(task: str, protocol: str, seeds: list[dict[str, str]]) -> Row:
-    """Returns the row of the results of all seeds."""
-    means = [float(seed["mean"]) for seed in seeds]
-    threshold = seeds[0]["threshold"]
-    published, by = PUBLISHED.get((task, protocol), (None, ""))
-    return {
-        **{
-            "task": task,
-            "protocol": protocol,
-            "seeds": len(seeds),
-            "mean": statistics.mean(means),
-            "worst": min(means),
-        },
-        "training (s)": statistics.mean(float(seed["seconds"]) for seed in seeds),
-        "threshold": float(threshold) if threshold else None,
-        "passed after (s)": _slowest([seed["seconds_to_threshold"] for seed in seeds]),
-        "from start (s)": _slowest([seed["wall_to_threshold"] for seed in seeds]),
-        **{"published": published, "by": by},
-    }
-
-
-def _slowest(times: list[str]) -> float | None:
-    return max(map(float, times)) if all(times) else None
 
 
 def read(folder: Path, name: str) -> list[dict[str, str]]:

@@ -61,7 +61,7 @@ def scaling(
 def compared(row: Row, first: Row) -> Row:
     """Returns a row's ratios to the first, and the ratio of training that the cost model predicts.
 
-    The model (docs/guides/beyond-one-gpu.md): N ranks take as long as one for an iteration, and for the exchange of
+    The model (docs/guides/several-gpus.md): N ranks take as long as one for an iteration, and for the exchange of
     gradients, as often as there are gradient steps.
     """
     ratios = {f"{what}, ratio": row[what] / first[what] for what in ("collection", "training")}

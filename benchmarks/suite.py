@@ -12,8 +12,7 @@ from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import Row
 from torchrl_loco import load_policy
 from torchrl_loco.export import export_policy
-from torchrl_loco.training.algorithm import settings_for_small_networks
-from torchrl_loco.training.evaluation import Evaluator, summarize
+from torchrl_loco.training import evaluate_policy
 
 PROTOCOL = "dm_control"
 SEED = 100
@@ -32,7 +31,7 @@ def suite(tasks: Sequence[str], episodes: int, device: torch.device, path: Path 
         path: folder with dm_control and its MuJoCo.
     """
     rows: list[Row] = []
-    with tempfile.TemporaryDirectory() as folder, settings_for_small_networks():
+    with tempfile.TemporaryDirectory() as folder:
         for task in until_interrupted(tasks, "suite"):
             policy, program = load_policy(task, device, PROTOCOL), Path(folder, f"{task}.pt2")
             export_policy(policy, program)
@@ -44,6 +43,5 @@ def suite(tasks: Sequence[str], episodes: int, device: torch.device, path: Path 
                 )
             except MeasurementError as error:
                 theirs["error"] = str(error)
-            evaluator = Evaluator(task, episodes, str(device), SEED, PROTOCOL, held)
-            rows += [theirs, {"task": task, "where": "torchrl_loco", **summarize(evaluator(policy))}]
+            rows += [theirs, {"task": task, "where": "torchrl_loco", **evaluate_policy(policy, episodes, SEED)}]
     return rows

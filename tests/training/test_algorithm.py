@@ -97,7 +97,7 @@ def test_gradients_of_one_minibatch_do_not_reach_the_next(trainer):
 def test_learning_rate_falls_while_a_run_goes_on(tmp_path):
     trainer = Trainer(made(tmp_path, lr=1e-3, final_lr_fraction=0.2))
     for lr in (1e-3, 6e-4):  # two batches in all
-        trainer._iterate()
+        trainer.iterate()
         torch.testing.assert_close(trainer.algorithm.optimizer.param_groups[0]["lr"], torch.tensor(lr))
 
 

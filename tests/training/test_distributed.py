@@ -91,7 +91,7 @@ def test_another_number_of_ranks(ranks, tmp_path, capsys, monkeypatch):
     trainer = Trainer(run, resume=True)
     assert_same(trainer.algorithm.networks.state_dict(), before["algorithm"]["networks"])
     said = " ".join(capsys.readouterr().err.split())
-    assert "ranks: 2 so far, 1 from here on. A batch has 4 worlds instead of 8, a gradient step 16 steps" in said
+    assert "ranks: 2 so far, 1 from here on, each with 4 worlds and minibatches of 16" in said
     trainer.train()
     assert run.read_metrics()["frames"][-4:] == [8 * BATCH, 9 * BATCH, 10 * BATCH, 11 * BATCH]
     assert run.load_checkpoint("cpu")["further_ranks"] == []

@@ -37,15 +37,6 @@ def test_sums_are_those_of_a_loop(from_start):
     torch.testing.assert_close(sums, torch.tensor(expected))
 
 
-def test_the_return_of_a_fall_is_what_was_earned_and_that_of_a_time_limit_what_the_whole_would_have_earned():
-    """Two worlds that earn 2 in each of four steps; the task's own episodes have ten."""
-    ends = torch.tensor([[False, False, False, True]] * 2)
-    episodes = Episodes(2, "cpu", action_repeat=1, full_length=10, from_start=True)
-    falls = ends & torch.tensor([[True], [False]])
-    episodes.take(*episodes.add(torch.full((2, 4), 2.0), ends, falls).tolist())
-    assert (episodes.count, episodes.mean_return, episodes.mean_length) == (2, (8.0 + 20.0) / 2, 4.0)
-
-
 def test_means_are_over_the_last_hundred_episodes_in_whole_batches():
     episodes = Episodes(1, "cpu", 1, 10, from_start=True)
     for value in range(10):
@@ -55,29 +46,3 @@ def test_means_are_over_the_last_hundred_episodes_in_whole_batches():
     assert episodes.mean_return == (7 + 8 + 9) / 3
     episodes.take(1000, 5000.0, 1000.0)
     assert (episodes.count, episodes.mean_return) == (1000, 5.0)
-
-
-def test_another_policy_begins_with_whole_episodes_of_its_own():
-    episodes = Episodes(1, "cpu", 1, 2, from_start=True)
-    episodes.take(3, 3.0, 3.0)
-    reward, end = torch.ones(1, 2), torch.tensor([[False, True]])
-    episodes.restart()
-    assert episodes.count == 0
-    assert [episodes.add(reward, end, end)[0].item() for _ in range(2)] == [0.0, 1.0]  # the first was another's
-
-
-def test_sums_continue_from_a_state():
-    torch.manual_seed(0)
-    batches = [(torch.randn(3, 4), torch.rand(3, 4) < 0.3) for _ in range(4)]
-
-    def after(episodes, some):
-        for reward, done in some:
-            episodes.take(*episodes.add(reward, done, done).tolist())
-        return episodes
-
-    whole = after(Episodes(3, "cpu", 1, 9, from_start=True), batches)
-    first = after(Episodes(3, "cpu", 1, 9, from_start=True), batches[:2])
-    second = Episodes(3, "cpu", 1, 9, from_start=False)
-    second.load_state_dict(first.state_dict(), running=True)
-    after(second, batches[2:])
-    assert (second.count, second.mean_return, second.mean_length) == (whole.count, whole.mean_return, whole.mean_length)

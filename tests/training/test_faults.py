@@ -13,8 +13,16 @@ import pytest
 from torchrl_loco.training import RunFolder, distributed
 
 SMALL = {
-    **{"num_envs": 8, "num_steps": 8, "minibatch_size": 64, "epochs": 1, "hidden": 16, "action_repeat": 2},
-    **{"eval_episodes": 2, "video_seconds": 0, "checkpoint_seconds": 0.1, "logger": "csv"},
+    "num_envs": 8,
+    "num_steps": 8,
+    "minibatch_size": 64,
+    "epochs": 1,
+    "hidden": 16,
+    "action_repeat": 2,
+    "eval_episodes": 2,
+    "video_seconds": 0,
+    "checkpoint_seconds": 0.1,
+    "logger": "csv",
 }
 
 

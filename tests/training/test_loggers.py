@@ -56,7 +56,7 @@ def test_a_missing_package_is_named_before_anything_is_made(tmp_path, monkeypatc
     run = made(tmp_path / "elsewhere", logger=())  # trained on a machine that has the package
     text = (run.path / "config.json").read_text()
     (run.path / "config.json").write_text(text.replace('"logger": []', '"logger": ["wandb"]'))
-    monkeypatch.setattr("torchrl_loco.training.trainer.make_env", None)
+    monkeypatch.setattr("torchrl_loco.training.environments.make_env", None)
     for name, extra in {"wandb": "wandb", "mlflow": "mlflow", "tensorboard": "train"}.items():
         monkeypatch.setitem(sys.modules, name, None)
         command = ["train", "walker_stand", "--device=cpu", f"--out={tmp_path / 'runs'}", "--logger", "csv", name]
@@ -91,8 +91,8 @@ def test_a_logger_that_fails_does_not_end_the_run(tmp_path, monkeypatch):
             raise ConnectionError("no answer")
 
     opened = {"wandb": Fails, "mlflow": FailsToClose}
-    openers = {name: lambda folder, *_, of=of: (of(of.__name__, str(folder)), "id") for name, of in opened.items()}
-    monkeypatch.setattr(loggers, "_OPEN", openers)
+    openers = {name: lambda folder, *_, of=of: of(of.__name__, str(folder)) for name, of in opened.items()}
+    monkeypatch.setattr(loggers, "OPENERS", openers)
     monkeypatch.setattr(config, "check_packages", lambda *_: None)
     with (
         pytest.warns(RuntimeWarning, match="wandb failed and is left out .*: the server is away"),
@@ -107,7 +107,6 @@ def test_a_logger_that_fails_does_not_end_the_run(tmp_path, monkeypatch):
         if name.startswith("Fails")
     }
     assert {name: len(lines) for name, lines in logged.items()} == {"Fails": 1, "FailsToClose": 2}
-    assert run.read_logger_ids() == {"wandb": "id", "mlflow": "id"}
 
 
 def test_a_logger_that_cannot_be_opened_is_said_in_a_line(tmp_path, monkeypatch, capsys):
@@ -120,8 +119,8 @@ def test_a_logger_that_cannot_be_opened_is_said_in_a_line(tmp_path, monkeypatch,
     def no_login(*_):
         raise RuntimeError("no login")
 
-    openers = {"wandb": lambda folder, *_: (Closes("first", str(folder)), None), "mlflow": no_login}
-    monkeypatch.setattr(loggers, "_OPEN", openers)
+    openers = {"wandb": lambda folder, *_: Closes("first", str(folder)), "mlflow": no_login}
+    monkeypatch.setattr(loggers, "OPENERS", openers)
     monkeypatch.setattr(config, "check_packages", lambda *_: None)
     with pytest.raises(SystemExit, match="2"):
         cli.runs.train_to_end(Trainer(made(tmp_path, logger=("wandb", "mlflow"))))
@@ -161,7 +160,7 @@ def test_a_failure_of_one_seed_leaves_the_others_alone(tmp_path, monkeypatch, na
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    owner, method = {"wandb": loggers.WandbLogger, "mlflow": loggers._MLflow}[name], fails
+    owner, method = {"wandb": loggers.WandbLogger, "mlflow": loggers.MLflow}[name], fails
     if (name, fails) == ("mlflow", "log_hparams"):
         owner, method = module, "log_params"
     works, calls = getattr(owner, method), []
@@ -194,7 +193,7 @@ def test_wandb(tmp_path, monkeypatch):
     assert run.read_logger_ids() == ids
     parts = [path.name for path in (run.path / "wandb").iterdir() if path.is_dir() and not path.is_symlink()]
     assert len(parts) == 2
-    assert all(part.endswith(ids["wandb"]) for part in parts)
+    assert all(ids["wandb"] in part for part in parts)
     assert "tensorboard" not in files(run)
 
 

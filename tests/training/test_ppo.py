@@ -205,27 +205,3 @@ def test_gradients_are_clipped_to_a_norm():
         parameter.grad = torch.full((4,), length / 2)
         torch.testing.assert_close(clip_and_step(optimizer, 1.5), torch.tensor(length))
         torch.testing.assert_close(parameter.norm(), torch.tensor(step), rtol=1e-4, atol=0)
-
-
-def test_learning_rate_falls_to_a_fraction():
-    ppo = made(num_envs=2, num_steps=8, minibatch_size=16, lr=1e-3, final_lr_fraction=0.2)
-    for progress, lr in ((0.0, 1e-3), (0.5, 6e-4), (1.0, 2e-4)):
-        ppo.update(collected(ppo, 2), progress)
-        torch.testing.assert_close(ppo.optimizer.param_groups[0]["lr"], torch.tensor(lr))
-
-
-def test_nothing_is_learned_at_a_learning_rate_of_zero():
-    ppo = made(num_envs=2, num_steps=8, minibatch_size=16)
-    before = [p.clone() for p in ppo.actor.parameters()]
-    ppo.update(collected(ppo, 2), progress=1.0)
-    assert all(torch.equal(p, q) for p, q in zip(before, ppo.actor.parameters(), strict=True))
-
-
-def test_same_seed_same_parameters():
-    results = []
-    for _ in range(2):
-        ppo = made(num_envs=8, num_steps=8, minibatch_size=16, epochs=2)
-        torch.manual_seed(1)
-        ppo.update(collected(ppo, 8), progress=0.0)
-        results.append(torch.cat([p.detach().flatten() for p in ppo.networks.parameters()]))
-    assert torch.equal(*results)

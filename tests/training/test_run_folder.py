@@ -148,7 +148,7 @@ def test_a_disk_that_fills_up_while_training(tmp_path, capsys):
     """The previous checkpoint is kept, and the command says how to continue from it."""
     run = made(tmp_path, hidden=(128,), checkpoint_seconds=1e-9)
     trainer = Trainer(run)
-    trainer._iterate()
+    trainer.iterate()
     trainer.save()
     before = networks(run)
     with full_disk(2**16), pytest.raises(SystemExit, match="2"):

@@ -45,10 +45,8 @@ def test_each_seed_is_as_if_it_were_alone(tmp_path, capsys):
     assert group.train() == {}
     runs = RunGroup(group.path).runs
     assert {seed: run.load_config().seed for seed, run in runs.items()} == {3: 3, 1: 1}
-    assert {path.name for path in group.path.iterdir()} == {
-        *("group.json", "learning_curve.png"),
-        *(run.path.name for run in runs.values()),
-    }
+    folders = {run.path.name for run in runs.values()}
+    assert {path.name for path in group.path.iterdir()} == {"group.json", "learning_curve.png"} | folders
     alone = trained(tmp_path / "alone", seed=1)
     assert_same(networks(runs[1]), networks(alone))
     other = networks(runs[3])
@@ -71,14 +69,9 @@ def test_a_seed_that_fails_loses_no_other(tmp_path, monkeypatch, capsys):
                 [
                     "train",
                     "walker_stand",
-                    "--device=cpu",
                     *small,
-                    "--hidden=16",
                     f"--out={tmp_path}",
-                    "--seeds",
-                    "0",
-                    "1",
-                    "2",
+                    *["--device=cpu", "--hidden=16", "--seeds", "0", "1", "2"],
                 ]
             )
     (path,) = tmp_path.iterdir()

@@ -6,7 +6,7 @@ import sys
 import pytest
 from compare import assert_same
 from hook_tasks import FollowVelocity
-from small_runs import SMALL, WALKER, made, networks, trained
+from small_runs import SMALL, made, networks, trained
 from torch import nn
 from torchrl.envs import ObservationNorm, StepCounter
 
@@ -86,6 +86,25 @@ def test_a_network_that_cannot_be_saved_is_refused_before_the_first_frame(tmp_pa
     ends = lambda i, o: nn.Sequential(nn.Linear(i, o), nn.ELU())  # noqa: E731
     with pytest.raises(TypeError, match="must end in a Linear"):
         train("walker_stand", network=ends, algorithm="reppo", device="cpu", out=tmp_path, **QUICK)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+def test_a_wrong_network(algorithm, tmp_path):
+    cases = [
+        (elu(24, 6), TypeError, "must be a function of the numbers of inputs and outputs .* got Sequential"),
+        (lambda inputs: elu(inputs, 6), TypeError, "cannot be called with two numbers: too many"),
+        (lambda inputs, outputs: None, TypeError, "but returned NoneType"),
+        (
+            lambda inputs, outputs: elu(inputs + 1, outputs),
+            ValueError,
+            r"network\(24, .*\) must take rows of 24 numbers",
+        ),
+        (lambda inputs, outputs: elu(inputs, 5), ValueError, r"must give (6|12) numbers for each row, but gave \(5,\)"),
+    ]
+    for network, error, message in cases:
+        with pytest.raises(error, match=message):
+            train("walker_stand", network=network, algorithm=algorithm, device="cpu", out=tmp_path, **QUICK)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -182,6 +201,11 @@ def test_a_class_in_a_file(tmp_path, monkeypatch, capsys):
     assert run.load_policy("cpu").info["task"] == f"{file}:StandShaky"
     assert "reward/height" in run.read_metrics()
     assert cli.main(["resume", str(path), "--total_frames=384"]) == 0
+    assert "was edited" not in capsys.readouterr().err
+    file.write_text(TASK + "# edited")
+    for frames, said in ((512, True), (640, False)):  # by the second time the checkpoint is of the new one
+        assert cli.main(["resume", str(path), f"--total_frames={frames}"]) == 0
+        assert (f"{file}:StandShaky was edited since the checkpoint" in capsys.readouterr().err) == said
     assert cli.main(["eval", str(path), "--device=cpu"]) == 0
     capsys.readouterr()
     for command in (
@@ -201,7 +225,7 @@ def test_a_class_in_a_file(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(registry, "_named", {})  # as in another process
     for name in [name for name in sys.modules if name.startswith("shaky")]:
         monkeypatch.delitem(sys.modules, name)
-    for command in (["eval", str(path), "--device=cpu"], ["resume", str(path), "--total_frames=512"]):
+    for command in (["eval", str(path), "--device=cpu"], ["resume", str(path), "--total_frames=768"]):
         with pytest.raises(SystemExit, match="2"):
             cli.main(command)
         assert f"there is no file {file}" in capsys.readouterr().err
@@ -209,8 +233,14 @@ def test_a_class_in_a_file(tmp_path, monkeypatch, capsys):
 
 
 HOOKS = {
-    **{"num_envs": 8, "num_steps": 16, "minibatch_size": 64, "epochs": 2, "hidden": (16,), "action_repeat": 1},
-    **{"episode_length": 60, "eval_episodes": 2, "video_seconds": 0.0, "logger": ("csv",), "total_frames": 512},
+    **QUICK,
+    "num_envs": 8,
+    "num_steps": 16,
+    "minibatch_size": 64,
+    "action_repeat": 1,
+    "episode_length": 60,
+    "eval_episodes": 2,
+    "total_frames": 512,
 }
 
 
@@ -218,7 +248,7 @@ def in_parts(task, out, settings):
     """Returns a run that was stopped after two batches, and resumed."""
     trainer = Trainer(RunFolder.create(preset(task, out=out, **settings)))
     for _ in range(2):
-        trainer.run.append_metrics(trainer._iterate())
+        trainer.run.append_metrics(trainer.iterate())
     trainer.save()
     Trainer(trainer.run, resume=True).train()
     return trainer.run
@@ -248,17 +278,3 @@ def test_a_task_with_memory_falls_and_what_the_critic_alone_reads(algorithm, tmp
     for name in ("return", "episode_length", "episodes", "reward/track"):
         assert parts.read_metrics()[name] == metrics[name]
     assert_same(networks(parts), networks(whole))
-
-
-def test_metrics_of_episodes_survive_a_stop(tmp_path):
-    trainer = Trainer(made(tmp_path, episode_length=8, total_frames=10_000))
-    for _ in range(4):
-        trainer._iterate()
-    assert trainer.episodes.count > 0
-    trainer.save()
-    rows = [trainer._iterate() for _ in range(3)]
-    again = Trainer(trainer.run, resume=True)
-    for row, other in zip(rows, [again._iterate() for _ in range(3)], strict=True):
-        for name in ("return", "episode_length", "episodes"):
-            assert row[name] == other[name]
-    assert again.algorithm.spaces == WALKER

@@ -24,8 +24,14 @@ from torchrl_loco.training.interrupts import interruptible
 from torchrl_loco.training.trainer import ALGORITHMS
 
 FILES = {
-    *("config.json", "metrics.csv", "evaluations.csv", "checkpoint.pt", "policy.safetensors"),
-    *("learning_curve.png", "video.mp4", "tensorboard"),
+    "config.json",
+    "metrics.csv",
+    "evaluations.csv",
+    "checkpoint.pt",
+    "policy.safetensors",
+    "learning_curve.png",
+    "video.mp4",
+    "tensorboard",
 }
 
 
@@ -66,20 +72,11 @@ def test_policy_of_a_run_is_its_actor(run):
     assert expected.std() > 1e-3
 
 
-def test_same_seed_same_run(run, tmp_path):
-    twin = trained(tmp_path, run.load_config().algorithm)
-    assert_same(networks(run), networks(twin))
-    assert not twin.video.exists()
-
-
 @pytest.mark.parametrize(
     ("algorithm", "action_repeat", "trials"),
     [
         ("ppo", 4, 1),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (("ppo", 1, 1), ("reppo", 1, 1), ("reppo", 4, 1), ("ppo", 4, 3), ("reppo", 1, 3))
-        ),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("reppo", 1, 1), ("ppo", 4, 3))),
     ],
 )
 def test_resumed_equals_uninterrupted(algorithm, action_repeat, trials, tmp_path, monkeypatch):
@@ -135,8 +132,7 @@ def test_interrupted_at_the_very_end(tmp_path, monkeypatch):
         Trainer(run, resume=True)
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_a_second_interrupt_does_not_wait(turned, tmp_path, monkeypatch):
+def test_a_second_interrupt_does_not_wait(tmp_path, monkeypatch):
     """Also where it arrives in code that turns it into an error, as tensordict's ``with`` does."""
 
     def press_twice(self, batch, progress):
@@ -144,9 +140,7 @@ def test_a_second_interrupt_does_not_wait(turned, tmp_path, monkeypatch):
         try:
             signal.raise_signal(signal.SIGINT)
         except KeyboardInterrupt:
-            if turned:
-                raise RuntimeError("Converting a tensordict to boolean value is not permitted") from None
-            raise
+            raise RuntimeError("Converting a tensordict to boolean value is not permitted") from None
         raise AssertionError("the second one was swallowed")
 
     monkeypatch.setattr(Algorithm, "update", press_twice)
@@ -229,15 +223,15 @@ def test_a_resumed_run_keeps_the_policy_of_a_better_evaluation_after_the_checkpo
     run = made(tmp_path, total_frames=768, eval_interval=256)
     first = Trainer(run)
     for save in (True, False):
-        first._iterate()
-        first._evaluate()
+        first.iterate()
+        first.evaluate()
         if save:
             first.save()
     again = Trainer(run, resume=True)
     assert (again.frames, again.iteration) == (128, 1)
     assert 0.0 < again.seconds < first.seconds
-    again._iterate()
-    again._evaluate()
+    again.iterate()
+    again.evaluate()
     assert [row["mean"] for row in run.read_evaluations()] == [10.0, 20.0]
     assert Policy.load(run.policy, "cpu").info["selected_by"] == 30.0
 
@@ -288,12 +282,28 @@ def test_a_run_keeps_its_first_nan_dump(tmp_path):
     assert nan_dump.load(run.nan_dump).settings["num_envs"] == 4
 
 
+class Undefined(torchrl_loco.WalkerStand):
+    """Earns NaN after a tenth of a second."""
+
+    def reward(self, s):
+        return torch.where(s.time > 0.1, torch.nan, 1.0)
+
+
+@pytest.mark.filterwarnings("ignore::torchrl_loco.NonFiniteWarning")
+def test_episodes_that_a_reward_has_ended_are_said_once(tmp_path, capsys):
+    run = RunFolder.create(preset(Undefined, "cpu", out=tmp_path, **SMALL))
+    Trainer(run).train()
+    said = capsys.readouterr()
+    assert (said.out + said.err).count("because a state, an observation or a reward was not finite") == 1
+    assert run.read_metrics()["episode_length"][-1] == 8
+
+
 def test_torchs_settings_are_restored(tmp_path, monkeypatch):
     threads, seen = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:
         trainer = Trainer(made(tmp_path))
-        monkeypatch.setattr(trainer, "_iterate", lambda: seen.append(torch.get_num_threads()) or 1 / 0)
+        monkeypatch.setattr(trainer, "iterate", lambda: seen.append(torch.get_num_threads()) or 1 / 0)
         with pytest.raises(ZeroDivisionError):
             trainer.train()
         assert (seen, torch.get_num_threads(), torch.get_float32_matmul_precision()) == ([1], 2, "highest")
@@ -302,15 +312,16 @@ def test_torchs_settings_are_restored(tmp_path, monkeypatch):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
-def test_a_run_on_cuda(algorithm, tmp_path):
+@pytest.mark.parametrize(("algorithm", "compiled"), [("ppo", False), ("ppo", True), ("reppo", False), ("reppo", True)])
+def test_a_run_on_cuda(algorithm, compiled, tmp_path):
     """Recorded gradient steps learn, the run can be stopped and resumed, and its policy plays on the CPU."""
-    config = preset("walker_stand", "cuda", algorithm, out=tmp_path, **{**SMALL, "total_frames": 640, "hidden": (32,)})
+    settings = {**SMALL, "total_frames": 640, "hidden": (32,), "compile": compiled, "bf16": compiled}
+    config = preset("walker_stand", "cuda", algorithm, out=tmp_path, **settings)
     run = RunFolder.create(config)
     first = Trainer(run)
     before = {name: value.clone() for name, value in first.algorithm.networks.state_dict().items()}
     for _ in range(3):
-        first._iterate()
+        first.iterate()
     first.save()
     second = Trainer(run, resume=True)
     assert_same(first.algorithm.networks.state_dict(), second.algorithm.networks.state_dict())

@@ -42,17 +42,16 @@ def test_the_return_of_a_trial_is_of_its_own_episodes(tmp_path):
     assert min(episodes[1::2][:3]) > 0
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
-@pytest.mark.parametrize("best", [0, 1, 2])
+@pytest.mark.parametrize(("algorithm", "best"), [("ppo", 0), ("reppo", 1), ("ppo", 2)])
 def test_the_best_goes_on(algorithm, best, tmp_path):
     trainer = Trainer(made(tmp_path, algorithm, **THREE))
     trials, ended = trainer.trials, []
     begun = [knowledge(trainer)]
     for number in range(3):
         assert trials.progress(trainer.frames) == 0.0
-        trainer._iterate()
+        trainer.iterate()
         assert not trials.is_over(trainer.frames)
-        trainer._iterate()
+        trainer.iterate()
         assert trials.is_over(trainer.frames)
         ended.append(knowledge(trainer))
         before = addresses(trainer)
@@ -69,7 +68,7 @@ def test_the_best_goes_on(algorithm, best, tmp_path):
         assert matrices
         assert all((first != second).any() for first, second in matrices)
     assert trials.progress(trainer.frames) == 0.5  # two of its four batches
-    trainer._iterate()
+    trainer.iterate()
     for name, parameter in trainer.algorithm.networks.named_parameters():
         assert (parameter != ended[best]["networks"][name]).any(), name
     assert trials.state_dict()["best"] is None
@@ -88,31 +87,26 @@ def test_a_run_with_trials(tmp_path, capsys):
         assert f"trial {number} of 2: {row['mean']:.1f} after 256 frames" in out.out + out.err
     assert run.load_policy("cpu").info["selected_by"] == max(row["mean"] for row in rows)
     assert run.load_checkpoint("cpu")["trials"] == {
-        **{"ended": 2, "began": 2 * BATCH, "length": 2 * BATCH, "batch": BATCH},
+        **{"ended": 2, "began": 2 * BATCH, "length": 2 * BATCH},
         **{"mean": rows[0]["mean"], "best": None},
     }
     for name in ("return", "grad_norm", "kl_approx"):
         assert run.read_metrics()[name][:2] == alone.read_metrics()[name][:2]
 
 
-def test_resumed_while_trials_run(tmp_path, monkeypatch):
+def test_resumed_while_trials_run(tmp_path):
     """A trial keeps its length, whatever becomes of the run; all are compared after the same number of frames."""
     run = made(tmp_path, total_frames=10 * BATCH, trials=3, trial_fraction=0.2)
     trainer = Trainer(run)
     for _ in range(2):
-        trainer._iterate()
+        trainer.iterate()
     trainer.trials.end(trainer.frames, 500.0)
-    trainer._iterate()
+    trainer.iterate()
     trainer.save()
     run.extend(20 * BATCH)
     longer = Trainer(run, resume=True)
-    longer._iterate()
+    longer.iterate()
     assert longer.trials.is_over(longer.frames)
     assert longer.trials.progress(longer.frames) == 2 / 16
-    run.extend(6 * BATCH)
-    with pytest.raises(ValueError, match=rf"\({6 * BATCH}\) must be more than the {6 * BATCH} frames of the 3 trials"):
-        Trainer(run, resume=True)
-    run.extend(20 * BATCH)
-    monkeypatch.setattr(Trainer, "frames_per_iteration", 2 * BATCH)
-    with pytest.raises(ValueError, match=r"trial 2 of 3 is running, .* continue with as many ranks as before"):
-        Trainer(run, resume=True)
+    run.extend(5 * BATCH)
+    assert Trainer(run, resume=True).trials.progress(5 * BATCH) == 1.0

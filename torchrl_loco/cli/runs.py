@@ -52,7 +52,7 @@ def resume(run: tyro.conf.Positional[Path], /, gpus: int | None = None, total_fr
 
     Args:
         run: folder of the run, or of the runs of several seeds, of which all that is missing is trained.
-        gpus: as in train: pass the same number to continue exactly. While trials run, another number is refused.
+        gpus: as in train: pass the same number to continue exactly.
         total_frames: train one run to another number of frames, also if it is complete. The learning rate follows the
             new number from here on. Trials keep the length with which they began.
     """

@@ -6,6 +6,7 @@ from .config import TrainingConfig as TrainingConfig
 from .evaluation import describe as describe
 from .evaluation import evaluate_policy as evaluate_policy
 from .evaluation import evaluate_run as evaluate_run
+from .given import Given as Given
 from .playback import has_display as has_display
 from .playback import record as record
 from .playback import view as view
@@ -20,5 +21,4 @@ from .run_group import RunGroup as RunGroup
 from .spaces import Spaces as Spaces
 from .start import begin as begin
 from .start import train as train
-from .trainer import Given as Given
 from .trainer import Trainer as Trainer

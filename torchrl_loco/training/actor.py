@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import inspect
 import math
 from collections.abc import Callable
 from typing import Any
@@ -74,6 +75,34 @@ class StateIndependentScale(nn.Module):
     def forward(self, loc: torch.Tensor) -> torch.Tensor:
         """Returns means of shape ``(..., size)`` with the log deviations behind them, ``(..., 2 size)``."""
         return torch.cat([loc, self.log_std.expand_as(loc)], dim=-1)
+
+
+def network_of(make: Network, inputs: int, outputs: int) -> nn.Module:
+    """Returns the network that a function of a user makes.
+
+    Raises:
+        TypeError: ``make`` is no such function, or does not return a module.
+        ValueError: what it returns does not take so many inputs, or give so many outputs.
+    """
+    wanted = "a function of the numbers of inputs and outputs that returns an nn.Sequential"
+    if isinstance(make, nn.Module) or not callable(make):
+        raise TypeError(f"network must be {wanted}, got {type(make).__name__}")
+    try:
+        inspect.signature(make).bind(inputs, outputs)
+    except TypeError as error:
+        raise TypeError(f"network must be {wanted}, but cannot be called with two numbers: {error}") from None
+    network = make(inputs, outputs)
+    if not isinstance(network, nn.Module):
+        raise TypeError(f"network must be {wanted}, but returned {type(network).__name__}")
+    device = next((parameter.device for parameter in network.parameters()), None)
+    try:
+        with torch.no_grad():
+            shape = tuple(network(torch.zeros(2, inputs, device=device)).shape)
+    except RuntimeError as error:
+        raise ValueError(f"network({inputs}, {outputs}) must take rows of {inputs} numbers: {error}") from error
+    if shape != (2, outputs):
+        raise ValueError(f"network({inputs}, {outputs}) must give {outputs} numbers for each row, but gave {shape[1:]}")
+    return network
 
 
 def make_actor(spaces: Spaces, device: torch.device | str, network: nn.Module, log_prob: bool) -> ProbabilisticActor:

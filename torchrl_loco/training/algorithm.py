@@ -2,7 +2,7 @@
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -86,6 +86,25 @@ class Algorithm(ABC):
         """Returns what a user should know of ``metrics``, by name from one batch or several, or an empty string."""
         return ""
 
+    def fused(self, function: Callable[..., Any], bf16: bool = False) -> Callable[..., Any]:
+        """Returns a function of tensors as kernels of torch.compile on CUDA, if the settings ask for that.
+
+        Between the matrix products of small networks, torch spends most of a step reading and writing activations.
+
+        Args:
+            function: the function.
+            bf16: whether its matrix products are in bfloat16 on CUDA.
+        """
+
+        def in_bf16(*args: Any) -> Any:
+            with torch.autocast("cuda", torch.bfloat16):
+                return function(*args)
+
+        if self.device.type != "cuda":
+            return function
+        chosen = in_bf16 if bf16 else function
+        return torch.compile(chosen, fullgraph=True, dynamic=False) if self.config.compile else chosen
+
     def make_optimizer(self, name: str, parameters: Iterable[Any]) -> torch.optim.Adam:
         """Makes an optimizer of ``parameters`` or groups, whose learning rate recorded steps follow.
 
@@ -145,11 +164,7 @@ class Algorithm(ABC):
 
     def begin_anew(self) -> None:
         """Draws parameters as at the start of a run, in place, so that what was recorded stays valid."""
-        self.networks.load_state_dict(type(self)(self.config, self.spaces, self.network).networks.state_dict())
-        for optimizer in self.optimizers.values():
-            for moments_of_one in optimizer.state.values():
-                for value in moments_of_one.values():
-                    value.zero_()
+        self.restore(type(self)(self.config, self.spaces, self.network).state_dict())
 
     @torch.no_grad()
     def restore(self, state: dict[str, Any]) -> None:
@@ -162,7 +177,7 @@ class Algorithm(ABC):
             kept = state["optimizers"][name]["state"]
             for index, moments_of_one in optimizer.state_dict()["state"].items():
                 for key, value in moments_of_one.items():
-                    value.copy_(kept[index][key])
+                    value.copy_(kept[index][key]) if index in kept else value.zero_()
 
     def state_dict(self) -> dict[str, Any]:
         """Returns all that an exact continuation needs, as it is: not as a copy."""

@@ -7,30 +7,45 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
-from torchrl_loco.checks import SEED, check_choice, check_fields, check_int, check_packages
+from torchrl_loco.checks import (
+    ANY,
+    COUNT,
+    FRACTION,
+    NOT_NEGATIVE,
+    SEED,
+    Interval,
+    check_choice,
+    check_fields,
+    check_int,
+    check_packages,
+)
 from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.registry import task_name
 
 LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow"]
 INTERVALS = {
     "seed": SEED,
-    "eval_interval": "[0, 2**31)",
-    "gamma": "(0, 1]",
-    "lmbda": "[0, 1]",
-    "trial_fraction": "(0, 1)",
-    "final_lr_fraction": "[0, 1]",
-    "video_seconds": "[0, inf)",
-    "checkpoint_seconds": "[0, inf)",
-    "clip_epsilon": "(0, 1]",
-    "entropy_coeff": "[0, inf)",
-    "target_entropy": "(-inf, inf)",
-    "aux_coeff": "[0, inf)",
-    "num_bins": "[2, 2**31)",
-    "min_value": "(-inf, inf)",
-    "max_value": "(-inf, inf)",
-    "episode_length": "[0, 2**31)",
+    "eval_interval": COUNT,
+    "gamma": Interval(0, 1, with_low=False, with_high=True),
+    "lmbda": FRACTION,
+    "trial_fraction": Interval(0, 1, with_low=False),
+    "final_lr_fraction": FRACTION,
+    "video_seconds": NOT_NEGATIVE,
+    "checkpoint_seconds": NOT_NEGATIVE,
+    "clip_epsilon": Interval(0, 1, with_low=False, with_high=True),
+    "entropy_coeff": NOT_NEGATIVE,
+    "target_entropy": ANY,
+    "aux_coeff": NOT_NEGATIVE,
+    "num_bins": Interval(2, 2**31),
+    "min_value": ANY,
+    "max_value": ANY,
+    "episode_length": COUNT,
 }
 """Intervals of the fields that are not simply positive."""
+
+
+Settings = dict[str, Any]
+"""Fields of a config, by name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +60,10 @@ class TrainingConfig:
     """
 
     algorithm: ClassVar[str]
+    presets: ClassVar[dict[str, Settings]] = {"cpu": {}, "cuda": {}}
+    """What differs from the defaults, by kind of device."""
+    of_others: ClassVar[Settings] = {"action_repeat": 1, "episode_length": 0}
+    """What differs for tasks other than dm_control's runners: their own episodes."""
 
     task: str
     """The task, an id or the file or module of a class and its name, with a colon between."""
@@ -92,6 +111,11 @@ class TrainingConfig:
     """Norm to which gradients are clipped."""
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers of actor and critic."""
+    compile: bool = False
+    """Whether torch.compile makes kernels of the losses on CUDA. Gradient steps are up to twice as fast then, after
+    half a minute at the first start on a machine."""
+    bf16: bool = False
+    """Whether networks compute in bfloat16 on CUDA."""
 
     eval_interval: int = 0
     """Frames between two evaluations during training; 0 evaluates at the end only, and at that of each trial."""
@@ -177,16 +201,31 @@ class PPOConfig(TrainingConfig):
     """Settings of proximal policy optimization."""
 
     algorithm: ClassVar[str] = "ppo"
+    presets: ClassVar[dict[str, Settings]] = {
+        "cpu": {
+            "num_envs": 128,
+            "total_frames": 3_000_000,
+            "action_repeat": 2,
+            "epochs": 6,
+            "minibatch_size": 1024,
+            "video_seconds": 5.0,
+        },
+        "cuda": {
+            "num_envs": 4096,
+            "num_steps": 16,
+            "total_frames": 40_000_000,
+            "minibatch_size": 8192,
+            "epochs": 5,
+            "lr": 5e-4,
+            "episode_length": 1000,
+            "eval_episodes": 128,
+        },
+    }
 
     clip_epsilon: float = 0.2
     """Range of the probability ratio that is not clipped."""
     entropy_coeff: float = 1e-3
     """Weight of the entropy bonus."""
-    compile: bool = False
-    """Whether torch.compile makes kernels of the loss on CUDA. It is up to twice as fast then, after half a minute at
-    the first start on a machine."""
-    bf16: bool = False
-    """Whether networks compute in bfloat16 on CUDA."""
     init_std: float = 1.0
     """Standard deviation of an action at the start; before tanh, if actions are bounded."""
 
@@ -201,7 +240,45 @@ class REPPOConfig(TrainingConfig):
     """
 
     algorithm: ClassVar[str] = "reppo"
+    presets: ClassVar[dict[str, Settings]] = {
+        "cpu": {
+            "num_steps": 32,
+            "action_repeat": 2,
+            "episode_length": 1000,
+            "total_frames": 1_228_800,
+            "reward_scale": 0.5,
+            "gamma": 0.98,
+            "lr": 3e-4,
+            "final_lr_fraction": 1.0,
+            "epochs": 4,
+            "minibatch_size": 256,
+            "max_grad_norm": 0.5,
+            "hidden": (256, 256),
+            "max_value": 50.0,
+        },
+        "cuda": {
+            "num_envs": 8192,
+            "num_steps": 16,
+            "total_frames": 100_000_000,
+            "action_repeat": 1,
+            "episode_length": 1000,
+            "reward_scale": 1.0,
+            "gamma": 0.99,
+            "lr": 6e-4,
+            "final_lr_fraction": 0.1,
+            "epochs": 4,
+            "minibatch_size": 8192,
+            "max_grad_norm": 0.5,
+            "hidden": (512, 512),
+            "eval_interval": 5_000_000,
+            "eval_episodes": 128,
+        },
+    }
+    of_others: ClassVar[Settings] = {**TrainingConfig.of_others, "num_bins": 301}
 
+    compile: bool = True
+    """Whether torch.compile makes kernels of the losses on CUDA; the first start on a machine takes half a minute
+    longer then."""
     kl_bound: float = 0.1
     """Bound of the KL divergence from the policy that collected the batch, in one state (nats)."""
     init_kl_weight: float = 0.01

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import functools
+import hashlib
 import inspect
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
 from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig
-from torchrl_loco.training.presets import is_ours
+from torchrl_loco.training.presets import is_runner
 
 
 class Environments:
@@ -63,6 +64,7 @@ class Environments:
             return make(config.task, episodes, config.device, seed, config.protocol, world_offset=0)
         settings = {**dataclasses.asdict(base.config)}
         del settings["naconmax"]  # which is for the number of its worlds
+        settings["randomize"] = base.randomize
         worlds = base.num_envs if self.transforms else episodes
         env: EnvBase = type(base)(worlds, base.device, seed, base.protocol, world_offset=0, **settings)
         for transform in self.transforms:
@@ -84,6 +86,17 @@ def _refuse_further_arguments(cls: type[LocoEnv]) -> None:
             f"{cls.__name__} takes {', '.join(own)}, which evaluations in worlds of their own do not know: make a "
             "subclass with these values as attributes, and pass that"
         )
+
+
+def source_of(task: str) -> str:
+    """Returns a hash of the file that the class of a task is in; an empty string for an id, or if there is no file."""
+    if ":" not in task:
+        return ""
+    try:
+        file = inspect.getsourcefile(resolve(task))
+    except (TypeError, OSError):  # of a notebook
+        file = None
+    return "" if file is None or not Path(file).is_file() else hashlib.sha256(Path(file).read_bytes()).hexdigest()
 
 
 def length_of(task: type[LocoEnv]) -> int:
@@ -113,7 +126,7 @@ def make_env(config: TrainingConfig, nan_dump: Path) -> EnvBase:
     """Returns the environment of a run: each action is held for ``config.action_repeat`` frames, rewards are summed.
 
     Its worlds are those of this rank: world k of rank r is world ``r * num_envs + k`` of the whole. It returns the
-    terms of its reward, unless the task is one of the package.
+    terms of its reward, unless the task is one of dm_control's runners.
 
     If a world becomes non-finite, a NaN dump is written to ``nan_dump``, unless one is already there.
     """
@@ -129,14 +142,14 @@ def make_env(config: TrainingConfig, nan_dump: Path) -> EnvBase:
         nan_dump=None if nan_dump.exists() else nan_dump,
         episode_length=config.episode_length or length_of(resolve(config.task)),
     )
-    return _holding(new(reward_terms=not is_ours(config.task)), config)
+    return _holding(new(reward_terms=not is_runner(config.task)), config)
 
 
 def _holding(env: EnvBase, config: TrainingConfig) -> EnvBase:
     if config.action_repeat == 1:
         return env
-    # Our tasks end at the time limit alone, and TorchRL's transform has less to do.
-    kind = FrameSkipTransform if is_ours(config.task) else ActionRepeat
+    # The runners' tasks end at the time limit alone, and TorchRL's transform has less to do.
+    kind = FrameSkipTransform if is_runner(config.task) else ActionRepeat
     return TransformedEnv(env, kind(config.action_repeat))
 
 

@@ -11,7 +11,6 @@ from tqdm.auto import trange
 
 from torchrl_loco.checks import SEED, check_int
 from torchrl_loco.policy import Policy, load_policy, shipped_policies
-from torchrl_loco.registry import make
 from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.environments import make_for
@@ -22,31 +21,16 @@ PolicyFunc = Callable[[TensorDictBase], TensorDictBase]
 
 
 class Evaluator:
-    """Plays full episodes of a task in worlds of its own, without exploration; the same episodes every time.
+    """Plays full episodes without exploration; the same episodes every time.
 
     Args:
-        task: id of the environment, or where its class is.
-        episodes: number of episodes, one per world.
-        device: where to play.
+        env: the worlds, one for each episode.
         seed: decides their initial states.
-        protocol: settings of the solver and of the reset.
         action_repeat: frames for which an action is held.
-        env: the worlds, one for each episode; ``None`` makes them from the arguments before.
     """
 
-    def __init__(
-        self,
-        task: str,
-        episodes: int,
-        device: str,
-        seed: int,
-        protocol: str = "playground",
-        action_repeat: int = 1,
-        env: EnvBase | None = None,
-    ) -> None:
-        self._env: Any = make(task, episodes, device, seed, protocol, world_offset=0) if env is None else env
-        self._seed = seed
-        self._action_repeat = action_repeat
+    def __init__(self, env: Any, seed: int, action_repeat: int = 1) -> None:
+        self._env, self._seed, self._action_repeat = env, seed, action_repeat
 
     def __call__(self, policy: PolicyFunc) -> torch.Tensor:
         """Returns the return of each episode, shape ``(episodes,)``."""
@@ -108,8 +92,7 @@ def evaluate_policy(policy: Policy, episodes: int | None = None, seed: int | Non
     seed = evaluation_seed(info["seed"], final=True) if seed is None else check_int("seed", seed, SEED)
     device = str(next(policy.parameters()).device)
     with settings_for_small_networks():
-        env = make_for(policy, episodes, device, seed)
-        evaluator = Evaluator(info["task"], episodes, device, seed, info["protocol"], info["action_repeat"], env)
+        evaluator = Evaluator(make_for(policy, episodes, device, seed), seed, info["action_repeat"])
         return summarize(evaluator(policy))
 
 

@@ -3,7 +3,7 @@
 import contextlib
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -42,37 +42,37 @@ class Loggers:
             OSError: one cannot be opened.
         """
         config = self._run.load_config()
-        settings = config.to_json()
-        ids: dict[str, str | None] = {**self._run.read_logger_ids()}
+        ids = self._run.read_logger_ids()
         for name in config.logger:
             if name == "csv":
                 continue
             try:
-                self._open[name], ids[name] = _OPEN[name](self._run.path, self._frames, ids.get(name), settings)
+                self._open[name] = OPENERS[name](self._run.path, self._frames, ids.get(name))
+                if (id := _begin(self._open[name], config.to_json())) is not None:
+                    ids[name] = id
             except Exception as error:  # each has errors of its own
                 self.__exit__(type(error), error, None)
                 raise OSError(f"the logger {name} cannot be opened: {error}") from error
-        self._run.write_logger_ids({name: of for name, of in ids.items() if of is not None})
+        self._run.write_logger_ids(ids)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         """Closes all of them; W&B and MLflow show whether the run came to its end."""
-        for name, logger in self._open.items():
+        for name in list(self._open):
             try:
-                _close(logger, kind)
+                _close(self._open.pop(name), kind)
             except Exception as problem:
                 _report(name, problem)
-        self._open.clear()
 
     def log(self, row: dict[str, float], frames: int) -> None:
         """Logs a row of metrics at a number of frames."""
         for name, logger in list(self._open.items()):
             try:
-                with _closed_at_errors(logger):
-                    logger.log_metrics(row, step=frames)
+                logger.log_metrics(row, step=frames)
             except Exception as error:
                 _report(name, error)
-                del self._open[name]
+                with contextlib.suppress(Exception):  # open, it would get what the next run of this process logs
+                    _close(self._open.pop(name), type(error))
 
 
 def _report(name: str, error: Exception) -> None:
@@ -81,10 +81,6 @@ def _report(name: str, error: Exception) -> None:
         RuntimeWarning,
         stacklevel=3,
     )
-
-
-Opened = tuple[Logger, str | None]
-"""A logger, and the id by which it finds the run again."""
 
 
 class _Tensorboard(TensorboardLogger):
@@ -100,26 +96,19 @@ class _Tensorboard(TensorboardLogger):
         return SummaryWriter(os.path.join(self.log_dir, self.exp_name), purge_step=self._first)
 
 
-def _open_tensorboard(folder: Path, frames: int, _: str | None, settings: dict[str, Any]) -> Opened:
-    return _Tensorboard(folder, frames), None
-
-
-def _open_wandb(folder: Path, _: int, of: str | None, settings: dict[str, Any]) -> Opened:
+def _open_wandb(folder: Path, frames: int, id: str | None) -> Logger:
     project = os.environ.get("WANDB_PROJECT", PROJECT)
     group = folder.absolute().parent.name if is_run_group(folder.parent) else None
-    logger = WandbLogger(folder.name, save_dir=str(folder), project=project, id=of, group=group)
-    with _closed_at_errors(logger):
-        logger.log_hparams(settings)
-        return logger, logger.experiment.id
+    return WandbLogger(folder.name, save_dir=str(folder), project=project, id=id, group=group)
 
 
-class _MLflow(MLFlowLogger):
+class MLflow(MLFlowLogger):
     """As TorchRL's, but the run has the name of its folder and can be continued."""
 
-    def __init__(self, folder: Path, of: str | None) -> None:
+    def __init__(self, folder: Path, id: str | None) -> None:
         import mlflow
 
-        self._name, self._of, self._begun = folder.name, of, False
+        self._name, self._id, self._begun = folder.name, id, False
         self.tracking_before = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else None
         local = f"sqlite:///{folder.absolute() / 'mlflow.db'}"
         artifacts = None if self.tracking_before else (folder.absolute() / "mlflow").as_uri()
@@ -143,36 +132,38 @@ class _MLflow(MLFlowLogger):
     def _create_experiment(self) -> Any:
         import mlflow
 
-        run = super()._create_experiment() if self._of is None else mlflow.start_run(run_id=self._of)
+        run = super()._create_experiment() if self._id is None else mlflow.start_run(run_id=self._id)
         self._begun = True
-        if self._of is None:
+        if self._id is None:
             mlflow.set_tag("mlflow.runName", self._name)
         else:
             self.id = run.info.experiment_id
         return run
 
 
-def _open_mlflow(folder: Path, _: int, of: str | None, settings: dict[str, Any]) -> Opened:
-    import mlflow
+OPENERS: dict[str, Callable[[Path, int, str | None], Logger]] = {
+    "tensorboard": lambda folder, frames, _: _Tensorboard(folder, frames),
+    "wandb": _open_wandb,
+    "mlflow": lambda folder, _, id: MLflow(folder, id),
+}
+"""Functions of the run's folder, its frames so far, and the id by which the logger knows a run that it continues."""
 
-    logger = _MLflow(folder, of)
-    with _closed_at_errors(logger):
+
+def _begin(logger: Logger, settings: dict[str, Any]) -> str | None:
+    """Logs the settings.
+
+    Returns:
+        The id by which the logger finds the run again, if it has one.
+    """
+    if isinstance(logger, WandbLogger):
+        logger.log_hparams(settings)
+        return logger.experiment.id
+    if isinstance(logger, MLflow):
+        import mlflow
+
         mlflow.log_params(settings)  # TorchRL's log_hparams needs omegaconf
-        return logger, logger.experiment.info.run_id
-
-
-_OPEN = {"tensorboard": _open_tensorboard, "wandb": _open_wandb, "mlflow": _open_mlflow}
-
-
-@contextlib.contextmanager
-def _closed_at_errors(logger: Logger) -> Iterator[None]:
-    """Closes a logger if a call of it fails: else the next run of this process would be written into this one."""
-    try:
-        yield
-    except Exception as error:
-        with contextlib.suppress(Exception):
-            _close(logger, type(error))
-        raise
+        return logger.experiment.info.run_id
+    return None
 
 
 def _close(logger: Logger, kind: type[BaseException] | None) -> None:
@@ -181,6 +172,6 @@ def _close(logger: Logger, kind: type[BaseException] | None) -> None:
             logger.experiment.finish(exit_code=1)
         logger.close()
     finally:
-        if isinstance(logger, _MLflow):
+        if isinstance(logger, MLflow):
             stopped = "KILLED" if kind is KeyboardInterrupt else "FAILED"
             logger.end("FINISHED" if kind is None else stopped)

@@ -14,8 +14,14 @@ from torchrl_loco.training.run_folder import RunFolder
 check_packages("a plot", ["matplotlib"], "train")  # so that a run fails at its start, though it imports it at its end
 
 IRRELEVANT: dict[str, Any] = {
-    **{"seed": 0, "out": Path(), "device": "cpu"},
-    **{"eval_interval": 0, "eval_episodes": 1, "video_seconds": 0.0, "checkpoint_seconds": 0.0, "logger": ()},
+    "seed": 0,
+    "out": Path(),
+    "device": "cpu",
+    "eval_interval": 0,
+    "eval_episodes": 1,
+    "video_seconds": 0.0,
+    "checkpoint_seconds": 0.0,
+    "logger": (),
 }
 """Settings that do not affect learning, each with a fixed value, so that runs can be grouped without them."""
 

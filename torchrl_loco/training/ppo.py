@@ -1,4 +1,4 @@
-"""Proximal policy optimization (Schulman et al., 2017), by TorchRL's ClipPPOLoss and GAE."""
+"""Proximal policy optimization (Schulman et al., 2017), by TorchRL's ClipPPOLoss."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -9,10 +9,9 @@ from tensordict.nn import NormalParamExtractor
 from torch import nn
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
 
 from torchrl_loco.policy import ObservationNorm
-from torchrl_loco.training.actor import Network, StateIndependentScale, make_actor
+from torchrl_loco.training.actor import Network, StateIndependentScale, make_actor, network_of
 from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import PPOConfig
 from torchrl_loco.training.spaces import Spaces
@@ -29,8 +28,6 @@ class PPO(Algorithm):
         super().__init__(config, spaces, network)
         self.actor, self.critic, self.norms = make_actor_critic(config, spaces, network)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic})
-        # At a time limit the value of the true terminal observation is bootstrapped; termination ends the return.
-        self.gae = GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=self.critic, average_gae=False)
         self.loss = ClipPPOLoss(
             self.actor,
             self.critic,
@@ -41,18 +38,42 @@ class PPO(Algorithm):
             normalize_advantage=True,
         )
         self.optimizer = self.make_optimizer("actor and critic", self.loss.parameters())
-        on_cuda = self.device.type == "cuda"
-        self._losses = torch.compile(self.loss, fullgraph=True) if config.compile and on_cuda else self.loss
+        self._compiled_losses, self._compiled_estimates = self.fused(self.loss), self.fused(self._estimates)
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """Returns the ``batch``, of shape ``(num_envs, num_steps)``, with advantages and value targets."""
-        scaled = batch.copy().set(("next", "reward"), batch["next", "reward"] * self.config.reward_scale)
-        self.gae(scaled)
-        return scaled.select(*self.loss.in_keys, "advantage", "value_target", "state_value", strict=False)
+        """Returns what the loss reads, of shape ``(num_envs, num_steps)``, with advantages and value targets."""
+        key, after = self.spaces.critic_key, batch["next"]
+        ends = after["done"], after["terminated"]
+        advantage, target = self._compiled_estimates(batch[key], after[key], after["reward"], *ends)
+        read = batch.select(*{"observation", key}, "action", "action_log_prob")
+        return read.update({"advantage": advantage, "value_target": target})
+
+    def _estimates(
+        self,
+        observation: torch.Tensor,
+        later: torch.Tensor,
+        reward: torch.Tensor,
+        done: torch.Tensor,
+        terminated: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns generalised advantage estimates and the critic's targets, of shape ``(num_envs, num_steps, 1)``.
+
+        At a time limit the value of the true terminal observation is bootstrapped; termination ends the return.
+        """
+        config, value = self.config, self.critic.module(observation)
+        next_value = self.critic.module(later) * ~terminated
+        errors = config.reward_scale * reward + config.gamma * next_value - value
+        decay = config.gamma * config.lmbda * ~done
+        advantage, advantages = torch.zeros_like(errors[:, 0]), []
+        for error, factor in zip(reversed(errors.unbind(1)), reversed(decay.unbind(1)), strict=True):
+            advantage = error + factor * advantage
+            advantages.append(advantage)
+        whole = torch.stack(advantages[::-1], dim=1)
+        return whole, whole + value
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
         """Returns the metrics, a scalar each, of a step down the clipped loss, the critic's and the entropy's."""
-        losses = self._losses(minibatch)
+        losses = self._compiled_losses(minibatch)
         self.optimizer.zero_grad()
         (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
         grad_norm = clip_and_step(self.optimizer, self.config.max_grad_norm)
@@ -82,7 +103,9 @@ def make_actor_critic(
     def mlp(inputs: int, outputs: int) -> nn.Sequential:
         return MLP(inputs, outputs, num_cells=list(config.hidden), activation_class=nn.SiLU)
 
-    make = network or mlp
+    def make(inputs: int, outputs: int) -> nn.Module:
+        return mlp(inputs, outputs) if network is None else network_of(network, inputs, outputs)
+
     norms = {"observation": ObservationNorm(spaces.observation)}
     mean: Any = make(spaces.observation, spaces.action)
     if network is None:

@@ -19,10 +19,9 @@ from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
-from torchrl_loco.training.actor import Network, make_actor
+from torchrl_loco.training.actor import Network, make_actor, network_of
 from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import REPPOConfig
-from torchrl_loco.training.norm_silu import Layers
 from torchrl_loco.training.spaces import Spaces
 from torchrl_loco.training.squashed_normal import kl, sample
 from torchrl_loco.training.value_bins import ValueBins
@@ -37,8 +36,17 @@ class REPPO(Algorithm):
 
     config_type = REPPOConfig
     metric_names = (
-        *("loss_critic", "loss_aux", "value", "grad_norm_critic"),
-        *("loss_actor", "kl", "kl_exceeded", "entropy", "temperature", "kl_weight", "grad_norm_actor"),
+        "loss_critic",
+        "loss_aux",
+        "value",
+        "grad_norm_critic",
+        "loss_actor",
+        "kl",
+        "kl_exceeded",
+        "entropy",
+        "temperature",
+        "kl_weight",
+        "grad_norm_actor",
     )
     batch_metric_names = ("return_min", "return_max", "return_clipped")
     config: REPPOConfig
@@ -60,6 +68,9 @@ class REPPO(Algorithm):
         # The gradient of a dual variable's logarithm shrinks with the variable: an eps of 1e-5 would keep it small.
         groups = [{"params": list(self.actor.parameters())}, {"params": list(self.dual.parameters()), "eps": 1e-8}]
         self.actor_optimizer = self.make_optimizer("actor", groups)
+        self._compiled_values = self.fused(self._values, config.bf16)
+        self._compiled_critic_losses = self.fused(self._critic_losses, config.bf16)
+        self._compiled_actor_losses = self.fused(self._actor_losses, config.bf16)
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns soft lambda-returns, ``(num_envs, num_steps)``, the features to predict, and normalised observations.
@@ -69,8 +80,9 @@ class REPPO(Algorithm):
         """
         config, after = self.config, batch["next"]
         now, later = ({key: norm(td[key]) for key, norm in self.norms.items()} for td in (batch, after))
-        action, log_prob = sample(*self.distribution(later["observation"]))
-        value, features = self.critic.value_and_features(later[self.spaces.critic_key], action)
+        noise = torch.randn_like(batch["action"])
+        observed = later["observation"], later[self.spaces.critic_key]
+        log_prob, value, features = self._compiled_values(*observed, noise)
         alive = ~after["terminated"]
         reward = after["reward"] * config.reward_scale
         reward = reward - config.gamma * self.dual.temperature * log_prob.unsqueeze(-1) * alive
@@ -106,46 +118,91 @@ class REPPO(Algorithm):
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
         """Returns the metrics, a scalar each, of a step of the critic, then one of the actor and the dual variables."""
-        return [*self._critic_step(minibatch), *self._actor_step(minibatch)]
+        return [*self.critic_step(minibatch), *self.actor_step(minibatch)]
 
-    def _critic_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
+    def _values(
+        self, observation: torch.Tensor, of_critic: torch.Tensor, noise: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Returns log-probability, value and features of one action in each state.
+
+        Args:
+            observation: what the actor reads, normalised, shape ``(..., n)``.
+            of_critic: what the critic reads, normalised, shape ``(..., m)``.
+            noise: from which the actions are made, standard normal, shape ``(..., nu)``.
+        """
+        loc, scale = self.distribution(observation)
+        action, log_prob = sample(loc, scale, noise)
+        return log_prob, *self.critic.value_and_features(of_critic, action)
+
+    def critic_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
         """The critic learns the distribution of returns, and to predict its own features of the next step.
 
         Returns:
             Its metrics.
         """
-        logits, predicted = self.critic(minibatch[self.spaces.critic_key], minibatch["action"])
-        loss = self.critic.bins.cross_entropy(logits, minibatch["returns"])
-        aux = (mse_loss(predicted, minibatch["features"], reduction="none").mean(-1) * minibatch["alive"]).mean()
+        names = self.spaces.critic_key, "action", "returns", "features", "alive"
+        loss, aux = self._compiled_critic_losses(*(minibatch[name] for name in names))
         self.critic_optimizer.zero_grad()
         (loss + self.config.aux_coeff * aux).backward()
         grad_norm = clip_and_step(self.critic_optimizer, self.config.max_grad_norm)
         return [loss, aux, minibatch["returns"].mean(), grad_norm]
 
-    def _actor_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
+    def _critic_losses(
+        self,
+        observation: torch.Tensor,
+        action: torch.Tensor,
+        returns: torch.Tensor,
+        features: torch.Tensor,
+        alive: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the losses of the returns and of the features, of ``n`` steps: scalars."""
+        logits, predicted = self.critic(observation, action)
+        aux = (mse_loss(predicted, features, reduction="none").mean(-1) * alive).mean()
+        return self.critic.bins.cross_entropy(logits, returns), aux
+
+    def actor_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
         """The actor ascends value and entropy where it is near the old policy, and returns to it where it is not.
 
         Returns:
             Its metrics.
         """
         config, temperature, kl_weight = self.config, self.dual.temperature, self.dual.kl_weight
-        loc, scale = self.distribution(minibatch["observation"])
-        action, log_prob = sample(loc, scale)
+        names = "observation", self.spaces.critic_key, "loc", "scale"
+        noise = torch.randn_like(minibatch["loc"])
         with frozen(self.critic):
-            value, _ = self.critic.value_and_features(minibatch[self.spaces.critic_key], action)
-        divergence = kl(minibatch["loc"], minibatch["scale"], loc, scale)
-        exceeded = divergence >= config.kl_bound
-        objective = temperature.detach() * log_prob - value
-        loss = torch.where(exceeded, kl_weight.detach() * divergence, objective).mean()
+            loss, entropy, divergence, exceeded = self._compiled_actor_losses(
+                *(minibatch[name] for name in names), noise, temperature.detach(), kl_weight.detach()
+            )
         # The dual variables rise while their constraint is violated: too little entropy, too much divergence.
-        entropy, mean_divergence = -log_prob.detach().mean(), divergence.detach().mean()
-        excess_entropy = entropy - config.target_entropy * action.shape[-1]
-        dual_loss = temperature * excess_entropy - kl_weight * (mean_divergence - config.kl_bound)
+        excess_entropy = entropy - config.target_entropy * noise.shape[-1]
+        dual_loss = temperature * excess_entropy - kl_weight * (divergence - config.kl_bound)
         self.actor_optimizer.zero_grad()
         (loss + dual_loss).backward()
         grad_norm = clip_and_step(self.actor_optimizer, config.max_grad_norm)
         self.dual.clamp_()
-        return [loss, mean_divergence, exceeded.float().mean(), entropy, temperature, kl_weight, grad_norm]
+        return [loss, divergence, exceeded, entropy, temperature, kl_weight, grad_norm]
+
+    def _actor_losses(
+        self,
+        observation: torch.Tensor,
+        of_critic: torch.Tensor,
+        old_loc: torch.Tensor,
+        old_scale: torch.Tensor,
+        noise: torch.Tensor,
+        temperature: torch.Tensor,
+        kl_weight: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Returns the actor's loss, and without gradients mean entropy, mean divergence and how often it is too large.
+
+        All are scalars, of ``n`` steps; the last one is a fraction of them.
+        """
+        loc, scale = self.distribution(observation)
+        action, log_prob = sample(loc, scale, noise)
+        value, _ = self.critic.value_and_features(of_critic, action)
+        divergence = kl(old_loc, old_scale, loc, scale)
+        exceeded = divergence >= self.config.kl_bound
+        loss = torch.where(exceeded, kl_weight * divergence, temperature * log_prob - value).mean()
+        return loss, -log_prob.detach().mean(), divergence.detach().mean(), exceeded.float().mean()
 
 
 @contextlib.contextmanager
@@ -206,12 +263,12 @@ class DistributionalQ(nn.Module):
         super().__init__()
         self.bins = bins
         width = hidden[-1]
-        self.encoder = Layers(*normed_layers(sum(sizes), hidden), nn.Linear(width, width))
+        self.encoder = nn.Sequential(*normed_layers(sum(sizes), hidden), nn.Linear(width, width))
         last = nn.Linear(width, len(bins.centers))
         with torch.no_grad():  # the initial prediction is a return of zero
             last.bias.add_(40.0 * bins.encode(torch.zeros(())))
-        self.value_head = Layers(nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), last)
-        self.predictor = Layers(
+        self.value_head = nn.Sequential(nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), last)
+        self.predictor = nn.Sequential(
             nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), nn.Linear(width, width)
         )
 
@@ -250,8 +307,8 @@ def make_actor_q(
         head = nn.Linear(config.hidden[-1], outputs)
         layers = [*normed_layers(spaces.observation, config.hidden), head]
     else:
-        layers = layers_of(network(spaces.observation, outputs))
-    whole = Layers(norms["observation"], *layers, NormalParamExtractor("exp"))
+        layers = layers_of(network_of(network, spaces.observation, outputs))
+    whole = nn.Sequential(norms["observation"], *layers, NormalParamExtractor("exp"))
     actor = make_actor(spaces, config.device, whole, log_prob=False)
     if spaces.privileged is not None:
         norms["privileged"] = ObservationNorm(spaces.privileged).to(config.device)

@@ -10,7 +10,6 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
-from torchrl_loco.checks import check_choice
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.registry import task_name
 from torchrl_loco.training import distributed
@@ -18,9 +17,10 @@ from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.config import CONFIGS, TrainingConfig
 from torchrl_loco.training.environments import unwrapped
-from torchrl_loco.training.presets import preset, tuning_note
+from torchrl_loco.training.given import Given
+from torchrl_loco.training.presets import check_setting, preset, tuning_note
 from torchrl_loco.training.run_folder import RunFolder
-from torchrl_loco.training.trainer import ALGORITHMS, Given, Trainer
+from torchrl_loco.training.trainer import Trainer
 
 
 def train(
@@ -92,18 +92,15 @@ def _config(
     Raises:
         ValueError: ``config`` is of another task or algorithm, or ``settings`` names something else.
     """
-    kind = algorithm.config_type if isinstance(algorithm, type) else None
     name = algorithm.config_type.algorithm if isinstance(algorithm, type) else algorithm
     if config is None:
-        if kind is not None and name not in ALGORITHMS:  # which has no presets
-            return kind(task_name(task), **settings)
         return preset(task, settings.pop("device", None), name, **settings)
     if name is not None and name != config.algorithm:
         raise ValueError(f"config is of {config.algorithm}, but algorithm is {name}: pass one of them")
     if task_name(task) != config.task:
         raise ValueError(f"config is for {config.task}, but task is {task_name(task)}")
     for setting in settings:
-        check_choice("setting", setting, [field.name for field in dataclasses.fields(config)])
+        check_setting("setting", setting, type(config))
     return dataclasses.replace(config, **settings)
 
 
@@ -137,7 +134,7 @@ def _resumed(resume: RunFolder | Path | str, task: Any, settings: dict[str, Any]
     return run
 
 
-def _train(what: TrainingConfig | RunFolder, given: "Given") -> RunFolder:
+def _train(what: TrainingConfig | RunFolder, given: Given) -> RunFolder:
     """Trains a new run, or goes on with one.
 
     Returns:
@@ -152,7 +149,7 @@ def _train(what: TrainingConfig | RunFolder, given: "Given") -> RunFolder:
 
 
 @contextlib.contextmanager
-def _closed_after(trainer: Trainer, given: "Given") -> Iterator[None]:
+def _closed_after(trainer: Trainer, given: Given) -> Iterator[None]:
     """Closes the environment of a run at the end, unless it was handed in.
 
     Raises:

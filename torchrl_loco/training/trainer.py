@@ -5,24 +5,22 @@ import dataclasses
 import math
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
 from torchrl_loco.checks import check_device
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import distributed
-from torchrl_loco.training.actor import Network, deterministic_policy
+from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.config import check_loggers
-from torchrl_loco.training.environments import Environments, unwrapped
-from torchrl_loco.training.environments import make_env as make_env
+from torchrl_loco.training.environments import Environments, source_of, unwrapped
 from torchrl_loco.training.episodes import Episodes
 from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, shipped_return, summarize
+from torchrl_loco.training.given import Given
 from torchrl_loco.training.interrupts import interruptible
 from torchrl_loco.training.lock import lock, unlock
 from torchrl_loco.training.loggers import Loggers
@@ -35,50 +33,6 @@ from torchrl_loco.training.spaces import Spaces
 from torchrl_loco.training.trials import Trials
 
 ALGORITHMS: dict[str, type[Algorithm]] = {"ppo": PPO, "reppo": REPPO}
-
-
-@dataclasses.dataclass(frozen=True)
-class Given:
-    """What is handed to a trainer as objects, instead of being made from the settings of the run.
-
-    Attributes:
-        env: the environment in which it trains.
-        network: makes the networks.
-        algorithm: the class of the algorithm.
-    """
-
-    env: EnvBase | None = None
-    network: Network | None = None
-    algorithm: type[Algorithm] | None = None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of what is handed in."""
-        return tuple(name for name in ("env", "network", "algorithm") if getattr(self, name) is not None)
-
-    def check(self, run: RunFolder) -> None:
-        """Checks that a run that is continued is handed what it was begun with.
-
-        Raises:
-            ValueError: it is not.
-        """
-        if self.names == run.given:
-            return
-        if extra := [name for name in self.names if name not in run.given]:
-            raise ValueError(f"{run.path} was begun without {' and '.join(extra)} of yours: leave that out")
-        raise ValueError(
-            f"{run.path} was begun with {' and '.join(run.given)} of your own, which the folder does not hold: "
-            f"continue it in Python with {_call_to_resume(run.path, run.given)}"
-        )
-
-    def way_to_resume(self, run: Path) -> str:
-        """Returns the call or the command that continues a run."""
-        return _call_to_resume(run, self.names) if self.names else f"torchrl-loco resume {run}"
-
-
-def _call_to_resume(run: Path, given: tuple[str, ...]) -> str:
-    arguments = ["env" if "env" in given else "task", *(f"{name}=..." for name in given if name != "env")]
-    return f"torchrl_loco.training.train({', '.join(arguments)}, resume={str(run)!r})"
 
 
 class Trainer:
@@ -137,15 +91,17 @@ class Trainer:
         make_algorithm = given.algorithm or ALGORITHMS[config.algorithm]
         self.algorithm = make_algorithm(config, Spaces.of(self.env), given.network)
         deterministic_policy(self.algorithm.actor, config, {})  # raises an error where it could not be saved
-        base, _ = unwrapped(self.env)
-        length, from_start = self.environments.full_length, not base.stagger
+        self._base, _ = unwrapped(self.env)
+        length, from_start = self.environments.full_length, not self._base.stagger
         self.episodes = Episodes(config.num_envs, config.device, config.action_repeat, length, from_start)
-        self._training_length = base.config.episode_length
+        self._training_length = self._base.config.episode_length
         terms = self.env.observation_spec.get("reward_terms", None)
         self._terms = () if terms is None else tuple(terms.keys())
+        self._source = source_of(config.task)
         self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
         self.collector = RolloutCollector(self.env, self.algorithm.actor, frames_per_batch=config.batch_size)
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
+        self._non_finite, self._said = 0, set[str]()
         self._best = -math.inf  # the evaluation that selected the policy
         if not first:  # the networks began alike, from here on each rank draws actions of its own
             torch.manual_seed(distributed.own_seed(config.seed))
@@ -183,7 +139,7 @@ class Trainer:
             unlock(self.run.path)
 
     def _train(self) -> None:
-        config, first, noted = self.config, distributed.is_first(), False
+        config, first = self.config, distributed.is_first()
         saved, frames = time.perf_counter(), {"total": self.last_frame, "initial": self.frames}
         with (
             Loggers(self.run, self.frames) if first else contextlib.nullcontext() as loggers,
@@ -193,21 +149,20 @@ class Trainer:
             ) as interrupted,
         ):
             while self.frames < self.last_frame:
-                row = self._iterate()
+                row = self.iterate()
                 if loggers is not None:
                     self.run.append_metrics(row)
                     loggers.log(row, self.frames)
                 trial = {"trial": self.trials.label} if self.trials.running else {}
                 bar.set_postfix({**trial, "return": _rounded(row["return"])}, refresh=False)
                 bar.update(self.frames_per_iteration)
-                if first and not noted and (note := self.algorithm.note({key: [row[key]] for key in row})):
-                    noted = True
-                    tqdm.write(f"after {self.frames:,} frames: {note}")
+                if first:
+                    self._say_once(row)
                 trial_is_over = self.trials.is_over(self.frames)
                 if trial_is_over or self.frames >= self.last_frame or self._evaluation_is_due():
                     mean = None
                     if loggers is not None:
-                        mean = self._evaluate()["mean"]
+                        mean = self.evaluate()["mean"]
                         loggers.log({"evaluation": mean}, self.frames)
                     distributed.wait_for_all()
                     if trial_is_over:
@@ -222,6 +177,18 @@ class Trainer:
                     if first:
                         plot_runs([self.run], self.run.path / "learning_curve.png")
                     raise KeyboardInterrupt
+
+    def _say_once(self, row: dict[str, float]) -> None:
+        """Prints what a user should know after a batch with these metrics, each thing once in a run."""
+        ended = f"{self._non_finite} episodes have ended because a state, an observation or a reward was not finite"
+        notes = {
+            "non_finite": ended if self._non_finite else "",
+            "algorithm": self.algorithm.note({key: [row[key]] for key in row}),
+        }
+        for kind, note in notes.items():
+            if note and kind not in self._said:
+                self._said.add(kind)
+                tqdm.write(f"after {self.frames:,} frames: {note}")
 
     @property
     def device_name(self) -> str:
@@ -241,7 +208,7 @@ class Trainer:
         batches = (self.config.total_frames - self.frames) // self.frames_per_iteration
         return self.frames + batches * self.frames_per_iteration
 
-    def _iterate(self) -> dict[str, float]:
+    def iterate(self) -> dict[str, float]:
         """Returns the metrics of collecting a batch and updating on it; reads from the device once."""
         config, algorithm, start = self.config, self.algorithm, time.perf_counter()
         batch = self.collector.rollout()
@@ -251,8 +218,10 @@ class Trainer:
         ended = self.episodes.add(after["reward"].squeeze(-1), *flags)
         terms = [after["reward_terms", name].mean() / config.action_repeat for name in self._terms]
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
-        numbers = torch.cat([torch.stack([reward, *terms]), ended, metrics])
-        mean_reward, *means = distributed.mean_of_ranks(numbers).tolist()
+        non_finite = self._base.health()["total", "non_finite"]
+        numbers = torch.cat([torch.stack([non_finite, reward, *terms]), ended, metrics])
+        non_finite, mean_reward, *means = distributed.mean_of_ranks(numbers).tolist()
+        self._non_finite = round(non_finite * distributed.ranks())
         of_terms = [means.pop(0) for _ in self._terms]
         self.episodes.take(*(means.pop(0) * distributed.ranks() for _ in ended))
         self.frames += self.frames_per_iteration
@@ -287,13 +256,12 @@ class Trainer:
         interval = self.config.eval_interval
         return interval > 0 and self.trials.own_frames(self.frames) % interval < self.frames_per_iteration
 
-    def _evaluate(self) -> dict[str, float]:
+    def evaluate(self) -> dict[str, float]:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""
         if self._evaluator is None:
             self._evaluator = self._make_evaluator(evaluation_seed(self.config.seed, final=False))
         when = {"frames": self.frames, "seconds": round(self.seconds, 3)}
-        base, _ = unwrapped(self.env)
-        of_env: dict[str, Any] = {"trained_on": self.device_name, "control_timestep": base.config.ctrl_dt}
+        of_env: dict[str, Any] = {"trained_on": self.device_name, "control_timestep": self._base.config.ctrl_dt}
         if self.environments.transforms:
             of_env["transforms"] = self.environments.names_of_transforms
         policy = deterministic_policy(self.algorithm.actor, self.config, {**when, **of_env})
@@ -308,8 +276,7 @@ class Trainer:
         """Returns what evaluates policies of this run in episodes that begin as the seed says."""
         config = self.config
         env = self.environments.evaluation(config.eval_episodes, seed)
-        args = (config.task, config.eval_episodes, config.device, seed, config.protocol, config.action_repeat)
-        return Evaluator(*args, env=env)
+        return Evaluator(env, seed, config.action_repeat)
 
     def _finish(self) -> None:
         """Evaluates the best policy in episodes that did not select it, plots the learning curve, records a video."""
@@ -342,6 +309,7 @@ class Trainer:
             counters = {"frames": self.frames, "iteration": self.iteration, "seconds": self.seconds}
             of = {
                 "settings": self._identity(),
+                "source": self._source,
                 "algorithm": self.algorithm.state_dict(),
                 "trials": self.trials.state_dict(),
             }
@@ -364,6 +332,8 @@ class Trainer:
             raise ValueError(
                 f"{self.run.path} is complete: it has all of its {self.frames} frames. Pass --total_frames to train on"
             )
+        if checkpoint.get("source", self._source) != self._source and distributed.is_first():
+            print(f"{self.config.task} was edited since the checkpoint: the run goes on as it is now", file=sys.stderr)
         rank = distributed.rank()
         generator = self.algorithm.generator.get_state()
         self.algorithm.load_state_dict(checkpoint["algorithm"])
@@ -401,12 +371,10 @@ class Trainer:
                 f"{distributed.ranks()} ranks ({self.frames_per_iteration}): continue with {ranks_before}, as before"
             )
         if distributed.is_first():
-            config, now = self.config, distributed.ranks()
             print(
-                f"ranks: {ranks_before} so far, {now} from here on. A batch has {now * config.num_envs} worlds instead "
-                f"of {ranks_before * config.num_envs}, a gradient step {now * config.minibatch_size} steps instead of "
-                f"{ranks_before * config.minibatch_size}. All worlds start anew; networks, optimizers and counters "
-                "continue",
+                f"ranks: {ranks_before} so far, {distributed.ranks()} from here on, each with {self.config.num_envs} "
+                f"worlds and minibatches of {self.config.minibatch_size}. All worlds start anew; networks, optimizers "
+                "and counters continue",
                 file=sys.stderr,
             )
 

@@ -24,7 +24,7 @@ class Trials:
 
     def __init__(self, config: TrainingConfig, algorithm: Algorithm, frames_per_iteration: int) -> None:
         self._algorithm = algorithm
-        self._count, self._total, self._batch = config.trials, config.total_frames, frames_per_iteration
+        self._count, self._total = config.trials, config.total_frames
         self._length = config.trial_frames // frames_per_iteration * frames_per_iteration
         self._ended = 0
         self._began = 0  # frames of the run at which the policy in training had none
@@ -48,7 +48,7 @@ class Trials:
     def progress(self, frames: int) -> float:
         """Returns the fraction of the policy's training that is done, in [0, 1], after ``frames`` frames of the run."""
         dropped = (self._count - 1) * self._length if self.running else self._began
-        return self.own_frames(frames) / (self._total - dropped)
+        return min(1.0, self.own_frames(frames) / max(1, self._total - dropped))
 
     def is_over(self, frames: int) -> bool:
         """Returns whether a trial is running that is complete after ``frames`` frames of the run."""
@@ -79,24 +79,10 @@ class Trials:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns all that an exact continuation needs."""
-        when = {"ended": self._ended, "began": self._began, "length": self._length, "batch": self._batch}
+        when = {"ended": self._ended, "began": self._began, "length": self._length}
         return {**when, "mean": self._mean, "best": self._best}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from a ``state`` that :meth:`state_dict` returned; a trial keeps the length with which it began.
-
-        Raises:
-            ValueError: trials are running, and another number of ranks or of frames does not fit them.
-        """
+        """Continues from a ``state`` that :meth:`state_dict` returned; a trial keeps the length with which it began."""
         self._ended, self._began, self._length = state["ended"], state["began"], state["length"]
         self._mean, self._best = state["mean"], state["best"]
-        if self.running and state["batch"] != self._batch:
-            raise ValueError(
-                f"trial {self.label} is running, with {state['batch']} frames in a batch of all ranks, now it would be "
-                f"{self._batch}: continue with as many ranks as before until the trials are over"
-            )
-        if self.running and self._count * self._length >= self._total:
-            raise ValueError(
-                f"total_frames ({self._total}) must be more than the {self._count * self._length} frames of the "
-                f"{self._count} trials, of which {self.label} is running"
-            )

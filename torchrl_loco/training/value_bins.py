@@ -1,63 +1,10 @@
-"""Returns as distributions over bins (HL-Gauss: Imani and White, 2018; Farebrother et al., 2024), and their loss.
+"""Returns as distributions over bins (HL-Gauss: Imani and White, 2018; Farebrother et al., 2024)."""
 
-The loss and its gradient are one kernel, whose C++ Warp compiles for a number of bins.
-"""
-
-import functools
 import math
-from typing import Any
 
 import torch
-import warp as wp
 from torch import nn
-
-from torchrl_loco.sim import launch_on_tensors
-from torchrl_loco.training.norm_silu import lanes
-
-BLOCK = 128
-"""Threads of a block on CUDA."""
-
-CROSS_ENTROPY = """
-  enum { BINS = %(bins)d };
-#ifdef __CUDA_ARCH__
-  enum { LANES = 32 };
-#else
-  enum { LANES = 1 };
-#endif
-  struct Lane {
-    static CUDA_CALLABLE float larger(float x, float y) { return x > y ? x : y; }
-    static CUDA_CALLABLE float sum(float x) {
-#ifdef __CUDA_ARCH__
-      for (int o = 16; o; o >>= 1) x += __shfl_xor_sync(~0u, x, o);
-#endif
-      return x;
-    }
-    static CUDA_CALLABLE float max(float x) {
-#ifdef __CUDA_ARCH__
-      for (int o = 16; o; o >>= 1) x = larger(x, __shfl_xor_sync(~0u, x, o));
-#endif
-      return x;
-    }
-  };
-  const int lane = thread %% LANES, row = thread / LANES;
-  const float* logit = &logits.data[size_t(row) * BINS];
-  float most = logit[0], total = 0.0f, loss = 0.0f;
-  for (int bin = lane; bin < BINS; bin += LANES) most = Lane::larger(most, logit[bin]);
-  most = Lane::max(most);
-  for (int bin = lane; bin < BINS; bin += LANES) total += expf(logit[bin] - most);
-  const float log_total = most + logf(Lane::sum(total));
-  // The target: the share of a Gaussian about the return that lies in each bin, of what lies in any.
-  const float given = returns.data[row], mean = given < low ? low : given > high ? high : given;
-  const float mass = erff((edges.data[BINS] - mean) * slope) - erff((edges.data[0] - mean) * slope);
-  for (int bin = lane; bin < BINS; bin += LANES) {
-    const float below = erff((edges.data[bin] - mean) * slope), above = erff((edges.data[bin + 1] - mean) * slope);
-    const float target = (above - below) / mass, log_probability = logit[bin] - log_total;
-    loss -= target * log_probability;
-    gradient.data[size_t(row) * BINS + bin] = expf(log_probability) - target;
-  }
-  loss = Lane::sum(loss);
-  if (lane == 0) losses.data[row] = loss;
-"""
+from torch.nn.functional import cross_entropy
 
 
 class ValueBins(nn.Module):
@@ -97,66 +44,13 @@ class ValueBins(nn.Module):
 
     def decode(self, logits: torch.Tensor) -> torch.Tensor:
         """Returns the mean, shape ``(...)``, of distributions given as logits of shape ``(..., count)``."""
-        return logits.softmax(-1) @ self.centers
+        return (logits.softmax(-1) * self.centers).sum(-1)
 
     def cross_entropy(self, logits: torch.Tensor, returns: torch.Tensor) -> torch.Tensor:
         """Returns the mean cross entropy of distributions to the Gaussians about returns, a scalar.
 
-        It has a first derivative only, by the logits.
-
         Args:
-            logits: float32, shape ``(n, count)``.
-            returns: float32, shape ``(n,)``.
+            logits: shape ``(n, count)``.
+            returns: shape ``(n,)``.
         """
-        return _CrossEntropy.apply(logits, returns, self).mean()
-
-
-class _CrossEntropy(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, logits: torch.Tensor, returns: torch.Tensor, bins: ValueBins) -> torch.Tensor:
-        logits, returns = logits.contiguous(), returns.contiguous()
-        losses, gradient = torch.empty_like(returns), torch.empty_like(logits)
-        inputs = (logits, returns, bins.edges, bins.low, bins.high, 1.0 / (math.sqrt(2.0) * bins.sigma))
-        launch_on_tensors(_kernel(logits.shape[-1]), lanes(logits) * len(logits), inputs, (losses, gradient), BLOCK)
-        ctx.save_for_backward(gradient)
-        return losses
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_losses: torch.Tensor) -> tuple[torch.Tensor, None, None]:
-        return ctx.saved_tensors[0] * grad_losses.unsqueeze(-1), None, None
-
-
-@functools.cache
-def _kernel(bins: int) -> wp.Kernel:
-    """Returns the kernel for a number of bins."""
-
-    @wp.func_native(CROSS_ENTROPY % {"bins": bins})
-    def row_of(
-        thread: int,
-        logits: wp.array2d[float],
-        returns: wp.array[float],
-        edges: wp.array[float],
-        low: float,
-        high: float,
-        slope: float,
-        losses: wp.array[float],
-        gradient: wp.array2d[float],
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def cross_entropy(
-        # In:
-        logits_in: wp.array2d[float],
-        returns_in: wp.array[float],
-        edges_in: wp.array[float],
-        low: float,
-        high: float,
-        slope: float,
-        # Out:
-        losses_out: wp.array[float],
-        gradient_out: wp.array2d[float],
-    ):
-        row_of(wp.tid(), logits_in, returns_in, edges_in, low, high, slope, losses_out, gradient_out)
-
-    return cross_entropy
+        return cross_entropy(logits, self.encode(returns))
