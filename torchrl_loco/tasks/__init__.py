@@ -1,6 +1,7 @@
 """The tasks: a folder for each body, with its model, its tasks and their settings, and its page of the documentation.
 
-A task is a class whose name begins with that of its folder: ``WalkerWalk`` in ``walker`` has the id ``walker_walk``.
+A task is a class whose name begins or ends with that of its folder: ``WalkerWalk`` in ``walker`` has the id
+``walker_walk``, ``Go1Velocity`` in ``velocity`` the id ``go1_velocity``.
 """
 
 import ast
@@ -37,8 +38,8 @@ def found() -> dict[str, Task]:
                 base.id for base in node.bases if isinstance(base, ast.Name)
             }:
                 environments.add(node.name)
-                if node.name.startswith(body) and node.name != body:
-                    id = f"{folder}{re.sub('(?=[A-Z])', '_', node.name.removeprefix(body)).lower()}"
+                if node.name != body and (node.name.startswith(body) or node.name.endswith(body)):
+                    id = re.sub("(?<!^)(?=[A-Z])", "_", node.name).lower()
                     summary = (ast.get_docstring(node) or "").partition("\n")[0]
                     tasks[id] = Task(f"{__name__}.{folder}", node.name, summary)
     return tasks

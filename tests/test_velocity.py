@@ -1,0 +1,453 @@
+"""Robots that follow a velocity command: models by their figures, physics by C MuJoCo, the task by formula."""
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from oracle import DATA, reference_model
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_loco import registry
+from torchrl_loco.sim import Simulation, models
+from torchrl_loco.tasks import velocity
+
+ROBOTS = {
+    "go1": velocity.Go1Velocity,
+    "go2": velocity.Go2Velocity,
+    "g1": velocity.G1Velocity,
+    "h1": velocity.H1Velocity,
+}
+ENGINES = [*((name, "mujoco_warp") for name in ROBOTS), ("h1", "compiled")]
+JOINTS = {"go1": 12, "go2": 12, "g1": 29, "h1": 19}
+FEET = {"go1": 4, "go2": 4, "g1": 2, "h1": 2}
+WORLDS = 16
+
+FIELDS = {
+    "body": "parentid pos quat mass inertia ipos iquat gravcomp",
+    "jnt": "bodyid type axis pos range limited stiffness solref solimp margin actfrclimited actfrcrange",
+    "dof": "armature damping frictionloss solref solimp",
+    "actuator": "trnid trntype gaintype biastype dyntype gainprm biasprm gear forcelimited forcerange ctrllimited "
+    "ctrlrange",
+    "site": "bodyid pos quat",
+    "geom": "bodyid type pos contype conaffinity condim priority friction solref solimp solmix margin gap",
+}
+OPTIONS = ("timestep", "iterations", "ls_iterations", "integrator", "cone", "impratio", "gravity", "disableflags")
+USED = {2: 1, 3: 2, 6: 3}
+"""Numbers of the size of spheres, capsules and boxes."""
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_robot_has_an_id(name):
+    assert registry.env_class(f"{name}_velocity") is ROBOTS[name]
+    assert registry.task_name(ROBOTS[name]) == f"{name}_velocity"
+
+
+# The models.
+
+
+def colliding(contype, conaffinity):
+    return np.flatnonzero(np.array(contype) | np.array(conaffinity))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_model_has_the_figures_of_the_robot(name):
+    m, expected = models.load(ROBOTS[name].model), reference_model(name)
+    ours = colliding(m.geom_contype, m.geom_conaffinity)
+    theirs = colliding(expected["geom_contype"], expected["geom_conaffinity"])
+    for kind, fields in FIELDS.items():
+        rows = (ours, theirs) if kind == "geom" else (slice(None), slice(None))
+        for field in (f"{kind}_{part}" for part in fields.split()):
+            got, figure = np.array(getattr(m, field))[rows[0]], np.array(expected[field])[rows[1]]
+            np.testing.assert_allclose(got, figure, rtol=1e-5, atol=2e-6, err_msg=field)
+    for kind in ("body", "joint", "site", "actuator", "geom"):
+        indices = zip(ours, theirs, strict=True) if kind == "geom" else enumerate(range(len(expected["names"][kind])))
+        for i, j in indices:
+            assert getattr(m, kind)(i).name == expected["names"][kind][j] or not expected["names"][kind][j]
+    for i, j in zip(ours, theirs, strict=True):
+        shape, quat = int(m.geom_type[i]), np.array(expected["geom_quat"][j])
+        used = USED.get(shape, 0)
+        np.testing.assert_allclose(m.geom_size[i, :used], expected["geom_size"][j][:used], rtol=1e-5)
+        axes, turned = np.zeros(9), np.zeros(9)
+        mujoco.mju_quat2Mat(axes, m.geom_quat[i])
+        mujoco.mju_quat2Mat(turned, quat / np.linalg.norm(quat))
+        along = (axes * turned).reshape(3, 3).sum(0)  # cosines between their axes
+        assert shape == 2 or abs(along[2]) > 1 - 1e-9  # a capsule has no front and no head
+        assert shape != 6 or (along > 1 - 1e-9).all()
+    for option in OPTIONS:
+        np.testing.assert_allclose(getattr(m.opt, option), expected["option"][option], err_msg=option)
+    np.testing.assert_allclose(m.qpos0, expected["qpos0"])
+    np.testing.assert_allclose(m.key("home").qpos, expected["home"])
+    assert sorted(m.exclude_signature) == sorted(expected["exclude_signature"])
+    assert (m.nmesh, m.nsensor) == (0, 0)
+
+
+@pytest.mark.parametrize(("name", "engine"), ENGINES)
+def test_a_control_step_ends_where_c_mujoco_does(name, engine):
+    cls, steps = ROBOTS[name], np.load(DATA / f"{name}_steps.npz")
+    m = models.load(cls.model)
+    m.opt.tolerance = 1e-12
+    config = dataclasses.replace(cls.config, iterations=200, ls_iterations=100, engine=engine)
+    sim = Simulation(m, config, len(steps["qpos"]), torch.device("cpu"))
+    for ours, theirs in {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart", "ctrl": "ctrl"}.items():
+        getattr(sim, ours).copy_(torch.tensor(steps[theirs]))
+    sim.step()
+    error = np.abs(sim.qpos.numpy() - steps["next_qpos"]).max(axis=1)
+    assert np.median(error) < 1e-5
+    assert np.quantile(error, 0.9) < 1e-3
+
+
+# The task.
+
+
+@pytest.fixture(scope="module")
+def robot():
+    """Makes the environment of each robot once."""
+    made = {}
+
+    def get(name):
+        if name not in made:
+            made[name] = ROBOTS[name](WORLDS, "cpu", 0, reward_terms=True)
+        made[name].set_seed(0)
+        return made[name]
+
+    return get
+
+
+@pytest.fixture(scope="module")
+def many():
+    """Many worlds of the robot that the compiled step does, for what is counted."""
+    return velocity.H1Velocity(2000, "cpu", 0)
+
+
+@pytest.fixture(scope="module")
+def play():
+    """A robot to play with."""
+    return velocity.H1Velocity(WORLDS, "cpu", 0, play=True)
+
+
+def with_memory(state, **rows):
+    state = state.clone()
+    for key, value in rows.items():
+        state["memory", key] = torch.full_like(state["memory", key], value)
+    return state
+
+
+def stepped(env, state, action):
+    """Steps once from a state, with one action for all worlds and joints or with one each."""
+    td = env.reset(state, set_state=True)
+    td["action"] = torch.as_tensor(action).expand(env.action_spec.shape).clone()
+    return env.step(td)["next"], env.get_state()
+
+
+def yaw_of(qpos):
+    w, x, y, z = qpos[:, 3:7].unbind(-1)
+    return torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def wrapped(angle):
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_random_steps_stay_finite_and_have_the_shapes_of_the_specs(robot, name, caplog):
+    env, joints, feet = robot(name), JOINTS[name], FEET[name]
+    td = env.rollout(100, break_when_any_done=False)
+    assert td["next", "observation"].shape == (WORLDS, 100, 12 + 3 * joints)
+    assert td["next", "privileged"].shape == (WORLDS, 100, 12 + 3 * joints + 6 * feet)
+    assert td["action"].shape == (WORLDS, 100, joints)
+    for key in ("observation", "privileged", "reward"):
+        assert td["next", key].isfinite().all()
+    assert "not compiled" not in caplog.text  # all hooks became kernels
+
+
+def test_specs_are_those_of_torchrl(caplog):
+    check_env_specs(velocity.H1Velocity(3, "cpu", 0, play=True))
+    assert "not compiled" not in caplog.text
+
+
+def spread(joints, command, stand, walk, run):
+    speed = np.linalg.norm(command[:2]) + abs(command[2])
+    table = stand if speed < 0.05 else walk if speed < 1.5 else run
+    return np.array([next(value for part, value in table if part in joint) for joint in joints])
+
+
+GO1 = ([("calf", 0.1), ("", 0.05)], [("calf", 0.6), ("", 0.3)], [("calf", 0.6), ("", 0.3)])
+COMMON = [("waist_roll", 0.08), ("wrist", 0.3)]
+G1 = (
+    [("", 0.05)],
+    [
+        *[("hip_pitch", 0.3), ("hip", 0.15), ("knee", 0.35), ("ankle_pitch", 0.25), ("ankle_roll", 0.1)],
+        *[("waist_yaw", 0.2), ("waist_pitch", 0.1), ("shoulder_yaw", 0.1), ("shoulder", 0.15), ("elbow", 0.15)],
+        *COMMON,
+    ],
+    [
+        *[("hip_pitch", 0.5), ("hip", 0.2), ("knee", 0.6), ("ankle_pitch", 0.35), ("ankle_roll", 0.15)],
+        *[("waist_yaw", 0.3), ("waist_pitch", 0.2), ("shoulder_pitch", 0.5), ("shoulder_roll", 0.2)],
+        *[("shoulder_yaw", 0.15), ("elbow", 0.35), *COMMON],
+    ],
+)
+EXPECTED = {"go1": ("trunk", ["FR", "FL", "RR", "RL"], GO1), "g1": ("torso_link", ["left_foot", "right_foot"], G1)}
+
+
+def expected_terms(m, name, row):
+    """The terms of one world by VELOCITY's formulas, from C MuJoCo's kinematics in float64."""
+    trunk, sites, tables = EXPECTED[name]
+    d = mujoco.MjData(m)
+    d.qpos[:], d.qvel[:] = row["qpos"], row["qvel"]
+    mujoco.mj_forward(m, d)
+    mujoco.mj_subtreeVel(m, d)
+    base = d.xmat[1].reshape(3, 3)
+    v, w, up = base.T @ d.qvel[:3], d.qvel[3:6], d.body(trunk).xmat.reshape(3, 3)[2]
+    command = row["command"]
+    names = [m.actuator(i).name for i in range(m.nu)]
+    q, q_home = d.qpos[7:], m.key("home").qpos[7:]
+    low, high = m.jnt_range[1:].T
+    heights, slides = [], []
+    for site in sites:
+        velocity_of_site = np.zeros(6)
+        mujoco.mj_objectVelocity(m, d, mujoco.mjtObj.mjOBJ_SITE, m.site(site).id, velocity_of_site, 0)
+        heights.append(d.site(site).xpos[2])
+        slides.append(np.linalg.norm(velocity_of_site[3:5]))
+    heights, slides, contacts = np.array(heights), np.array(slides), row["contacts"]
+    landed = contacts * (row["air_time"] > 0)
+    peak = np.where(contacts > 0, row["peak"], np.maximum(row["peak"], heights))
+    moves = np.linalg.norm(command[:2]) + abs(command[2]) > 0.05
+    middle, reach = (low + high) / 2, 0.9 * (high - low) / 2
+    rotation = d.body(trunk).xmat.reshape(3, 3).T @ d.cvel[m.body(trunk).id, :3]
+    terms = {
+        "track_linear": 2 * np.exp(-(np.sum((v[:2] - command[:2]) ** 2) + v[2] ** 2) / 0.25),
+        "track_angular": 2 * np.exp(-((w[2] - command[2]) ** 2 + w[0] ** 2 + w[1] ** 2) / 0.5),
+        "upright": np.exp(-(up[0] ** 2 + up[1] ** 2) / 0.2),
+        "pose": np.exp(-np.mean(((q - q_home) / spread(names, command, *tables)) ** 2)),
+        "joint_limits": -np.sum(np.maximum(np.maximum(middle - reach - q, q - middle - reach), 0)),
+        "action_rate": -0.1 * np.sum((row["action"] - row["last_action"]) ** 2),
+        "foot_clearance": -2 * moves * np.sum(np.abs(heights - 0.1) * slides),
+        "foot_swing_height": -0.25 * moves * np.sum(landed * (peak / 0.1 - 1) ** 2),
+        "foot_slip": -0.1 * moves * np.sum(contacts * slides**2),
+        "soft_landing": -1e-5 * moves * np.sum(landed * np.linalg.norm(row["forces"], axis=1)),
+    }
+    if name == "g1":
+        terms["trunk_rotation"] = -0.05 * (rotation[0] ** 2 + rotation[1] ** 2)
+        terms["angular_momentum"] = -0.02 * np.sum(d.subtree_angmom[1] ** 2)
+    return {key: 0.02 * value for key, value in terms.items()}
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_reward_is_the_sum_of_its_terms_by_formula(robot, name):
+    env, joints, feet, seen = robot(name), JOINTS[name], FEET[name], set()
+    env.rollout(12, break_when_any_done=False)
+    centers = env.model_value("body_ipos").numpy()
+    for _ in range(4):
+        before, action = with_memory(env.get_state(), until_push=9.0), 0.7 * torch.randn(env.action_spec.shape)
+        after, state = stepped(env, before, action)
+        privileged = after["privileged"].double().numpy()[:, 12 + 3 * joints :]
+        contacts, forces = privileged[:, 2 * feet : 3 * feet], privileged[:, 3 * feet :].reshape(WORLDS, feet, 3)
+        for world in range(WORLDS):
+            row = {key: before["memory", key][world].double().numpy() for key in ("command", "last_action", "air_time")}
+            row |= {key: state[key][world].double().numpy() for key in ("qpos", "qvel")}
+            row |= {"peak": before["memory", "peak"][world].double().numpy(), "action": action[world].double().numpy()}
+            row |= {"contacts": contacts[world], "forces": np.sign(forces[world]) * np.expm1(np.abs(forces[world]))}
+            m = env.mj_model
+            nominal = m.body_ipos.copy()
+            m.body_ipos[:] = centers[world]
+            expected = expected_terms(m, name, row)
+            m.body_ipos[:] = nominal
+            terms = {key: values[world].item() for key, values in after["reward_terms"].items()}
+            if name == "g1":
+                assert terms.pop("self_collision") in (0.0, pytest.approx(-0.08))
+            assert terms == pytest.approx(expected, rel=2e-3, abs=2e-6)
+            seen |= {key for key, value in terms.items() if value != 0.0}
+        total = sum(after["reward_terms"].values())
+        torch.testing.assert_close(after["reward"], total)
+    assert seen >= expected.keys() - {"joint_limits"}
+
+
+def test_a_hard_contact_of_the_robot_with_itself_costs_each_physics_step(robot):
+    env = robot("g1")
+    env.reset()
+    state = env.get_state()
+    elbows = [env.mj_model.joint(f"{side}_shoulder_roll_joint").qposadr[0] for side in ("left", "right")]
+    state["qpos"][:, 2] += 1.0  # far above the ground
+    state["qpos"][1::2, elbows] = torch.tensor([-0.6, 0.6])  # into the torso, in every other world
+    after, _ = stepped(env, state, 0.0)
+    cost = after["reward_terms", "self_collision"].squeeze(-1)
+    torch.testing.assert_close(cost[::2], torch.zeros(WORLDS // 2))
+    torch.testing.assert_close(cost[1::2], torch.full((WORLDS // 2,), -0.08))
+
+
+@pytest.mark.parametrize(("tilt", "ends"), [(65, False), (75, True)])
+def test_an_episode_ends_when_the_trunk_is_tilted_by_70_degrees(robot, tilt, ends):
+    env = robot("go1")
+    env.reset()
+    state = env.get_state()
+    half = math.radians(tilt) / 2
+    state["qpos"][:, 2:7] = torch.tensor([1.0, math.cos(half), 0.0, math.sin(half), 0.0])
+    assert (stepped(env, state, 0.0)[0]["terminated"] == ends).all()
+
+
+def test_actions_are_targets_around_home(robot):
+    for name, scale in {"go1": 0.25 * 35.55 / 35.7643, "go2": 0.3}.items():
+        env = robot(name)
+        env.reset()
+        action = torch.zeros(env.action_spec.shape)
+        action[:, 2] = 2.0
+        stepped(env, env.get_state(), action)
+        target = torch.tensor(env.mj_model.key("home").qpos[7:], dtype=torch.float32).repeat(WORLDS, 1)
+        target[:, 2] += 2.0 * scale
+        torch.testing.assert_close(env.sim.ctrl, target)
+
+
+# Commands.
+
+
+def share(flags):
+    return flags.float().mean().item()
+
+
+def test_commands_have_their_shares_and_ranges(many):
+    many.set_seed(0)
+    many.reset()
+    state = many.get_state()
+    command, memory = state["memory", "command"], state["memory"]
+    stands = (command == 0).all(-1)
+    holds, straight = memory["holds_heading"] > 0, (command[:, 1:] == 0).all(-1) & ~stands
+    free = ~(stands | holds | straight)
+    assert share(stands) == pytest.approx(0.1, abs=0.025)
+    assert share(straight) == pytest.approx(0.9 * 0.2, abs=0.03)
+    assert share(holds) == pytest.approx(0.9 * 0.8 * 0.3, abs=0.03)
+    assert command[straight, 0].min() >= 0.3
+    assert share(command[straight, 0] == 0.3) == pytest.approx(0.3, abs=0.08)
+    for column, most in enumerate((1.0, 1.0, 0.5)):
+        values = command[free, column]
+        assert values.abs().max() == pytest.approx(most, abs=0.02)
+        assert values.std() == pytest.approx(most / math.sqrt(3), rel=0.06)
+    turn = (0.5 * wrapped(memory["heading"] - yaw_of(state["qpos"]))).clamp(-0.5, 0.5)
+    torch.testing.assert_close(command[holds, 2], turn[holds], rtol=1e-3, atol=1e-3)
+    assert memory["until_command"].min() >= 3.0
+    assert memory["until_command"].max() == pytest.approx(8.0, abs=0.05)
+
+
+def test_commands_are_drawn_anew_when_they_are_due(many):
+    many.reset()
+    state = with_memory(many.get_state(), until_command=1.0, holds_heading=0.0)
+    _, kept = stepped(many, state, 0.1)
+    torch.testing.assert_close(kept["memory", "command"], state["memory", "command"])
+    torch.testing.assert_close(kept["memory", "until_command"], torch.full((2000,), 1.0 - 0.02))
+    _, after = stepped(many, with_memory(state, until_command=0.0), 0.1)
+    command = after["memory", "command"]
+    assert share((command != state["memory", "command"]).any(-1)) > 0.97  # some stand again
+    assert share((command == 0).all(-1)) == pytest.approx(0.1, abs=0.025)
+    assert after["memory", "until_command"].min() >= 3.0
+
+
+@pytest.mark.parametrize(
+    ("trained", "low", "high"),
+    [
+        (119_000, (-1, -1, -0.5), (1, 1, 0.5)),
+        (120_000, (-1.5, -1, -0.7), (2, 1, 0.7)),
+        (240_000, (-2, -1, -0.7), (3, 1, 0.7)),
+    ],
+)
+def test_ranges_of_commands_widen_with_training(many, trained, low, high):
+    many.reset()
+    _, after = stepped(many, with_memory(many.get_state(), until_command=0.0, trained=trained), 0.1)
+    assert (after["memory", "trained"] == trained + 1).all()
+    command = after["memory", "command"]
+    for column in range(3):
+        assert command[:, column].min().item() == pytest.approx(low[column], abs=0.03)
+        assert command[:, column].max().item() == pytest.approx(high[column], abs=0.03)
+    many.reset()
+    assert (many.get_state()["memory", "trained"] == trained + 1).all()  # it counts on in the next episode
+
+
+# What is random.
+
+
+def test_pushes_change_the_velocity_of_the_base_alone(many):
+    many.reset()
+    state, action = many.get_state(), 0.1 * torch.randn(many.action_spec.shape)
+    _, calm = stepped(many, with_memory(state, until_push=0.5), action)
+    _, pushed = stepped(many, with_memory(state, until_push=0.0), action)
+    change = pushed["qvel"] - calm["qvel"]
+    for column, most in enumerate((0.5, 0.5, 0.4, 0.52, 0.52, 0.78)):
+        assert change[:, column].abs().max().item() == pytest.approx(most, abs=0.01)
+        assert change[:, column].std().item() == pytest.approx(most / math.sqrt(3), rel=0.06)
+    assert (change[:, 6:] == 0).all()
+    torch.testing.assert_close(calm["memory", "until_push"], torch.full((2000,), 0.48))
+    wait = pushed["memory", "until_push"]
+    assert wait.min() >= 1.0
+    assert wait.max() == pytest.approx(3.0, abs=0.03)
+
+
+def test_the_policy_sees_noise_and_a_bias_that_the_critic_does_not(many):
+    td = many.reset()
+    joints = JOINTS["h1"]
+    bias = many.get_state()["memory", "bias"]
+    assert bias.abs().max().item() == pytest.approx(0.015, abs=1e-3)
+    error = td["observation"] - td["privileged"][:, : 12 + 3 * joints]
+    error[:, 9 : 9 + joints] -= bias
+    first = 0
+    for most, size in ((0.5, 3), (0.2, 3), (0.05, 3), (0.01, joints), (1.5, joints)):
+        noise = error[:, first : first + size]
+        assert noise.abs().max().item() == pytest.approx(most, rel=0.01)
+        assert noise.std().item() == pytest.approx(most / math.sqrt(3), rel=0.03)
+        first += size
+    assert (error[:, first:] == 0).all()
+
+
+def test_episodes_start_near_home_above_the_ground(many):
+    many.reset()
+    state = many.get_state()
+    qpos, home = state["qpos"], torch.tensor(many.mj_model.key("home").qpos, dtype=torch.float32)
+    assert (state["qvel"] == 0).all()
+    assert qpos[:, :2].abs().max().item() == pytest.approx(0.5, abs=0.01)
+    assert (qpos[:, 2] - home[2]).aminmax().min.item() == pytest.approx(0.01, abs=1e-3)
+    assert (qpos[:, 2] - home[2]).aminmax().max.item() == pytest.approx(0.05, abs=1e-3)
+    torch.testing.assert_close(qpos[:, 7:], home[7:].expand(2000, -1))
+    assert yaw_of(qpos).std().item() == pytest.approx(math.pi / math.sqrt(3), rel=0.06)
+    assert (state["memory", "last_action"] == 0).all()
+
+
+@pytest.mark.parametrize(("name", "low", "high"), [("go1", 0.3, 1.5), ("g1", 0.3, 1.2), ("h1", 0.3, 1.2)])
+def test_worlds_differ_in_friction_and_mass(robot, name, low, high):
+    env = robot(name)
+    friction, ipos, m = env.model_value("geom_friction"), env.model_value("body_ipos"), env.mj_model
+    feet = [geom for geom in range(m.ngeom) if "_foot" in m.geom(geom).name]
+    sliding = friction[:, feet, 0]
+    assert (sliding == sliding[:, :1]).all()
+    assert low <= sliding.min() < sliding.max() <= high
+    assert len(sliding[:, 0].unique()) == WORLDS
+    trunk = m.body(type(env).trunk).id
+    moved = ipos[:, trunk] - torch.tensor(m.body_ipos[trunk], dtype=torch.float32)
+    assert 0 < moved.abs().max() <= 0.03
+    assert (moved.abs() <= torch.tensor([0.025, 0.025, 0.03]) + 1e-7).all()
+
+
+# Play.
+
+
+def test_play_has_no_noise_no_pushes_no_variation_and_a_command_that_is_set(play):
+    assert play.randomize == ()
+    play.set_command(None)
+    size = play.reset()["observation"].shape[-1]
+    assert len(play.get_state()["memory", "command"].unique(dim=0)) > WORLDS // 2
+    play.set_command((0.5, 0.0, 0.2))
+    state = with_memory(play.get_state(), until_push=0.0, until_command=0.0)
+    after, pushed = stepped(play, state, 0.1)
+    torch.testing.assert_close(after["observation"], after["privileged"][:, :size])
+    torch.testing.assert_close(after["observation"][:, -3:], torch.tensor([[0.5, 0.0, 0.2]]).expand(WORLDS, 3))
+    _, calm = stepped(play, with_memory(state, until_push=9.0), 0.1)
+    assert torch.equal(pushed["qvel"], calm["qvel"])
+    each = torch.rand(WORLDS, 3)
+    play.set_command(each)
+    torch.testing.assert_close(play.reset()["observation"][:, -3:], each)
+
+
+def test_commands_are_set_in_play_alone_and_have_three_numbers(play, many):
+    with pytest.raises(ValueError, match="play=True"):
+        many.set_command((1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match=r"\(3,\) or \(16, 3\)"):
+        play.set_command((1.0, 0.0))

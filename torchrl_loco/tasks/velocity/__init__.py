@@ -1,0 +1,463 @@
+"""Velocity: robots that follow a velocity command on flat ground. One recipe, and a table for each robot."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import mujoco
+import torch
+
+from torchrl_loco.checks import check_bool, check_device, check_int
+from torchrl_loco.config import SimConfig
+from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.envs.vary import Vary
+from torchrl_loco.tasks.velocity import commands
+from torchrl_loco.tasks.velocity.momentum import angular_momentum
+
+if TYPE_CHECKING:
+    from torchrl_loco.envs.view import View
+
+FOLDER = Path(__file__).parent
+LEGS = ("FR", "FL", "RR", "RL")
+
+CURRICULUM: dict[int, commands.Ranges] = {
+    0: ((-1.0, 1.0), (-1.0, 1.0), (-0.5, 0.5)),
+    120_000: ((-1.5, 2.0), (-1.0, 1.0), (-0.7, 0.7)),
+    240_000: ((-2.0, 3.0), (-1.0, 1.0), (-0.7, 0.7)),
+}
+"""Ranges of the commands by the control step of training from which they hold."""
+NOISE = (0.5, 0.2, 0.05, 0.01, 1.5)
+"""Uniform noise, either way, of the policy's observation: velocity (m/s), rotation (rad/s), gravity, joint positions
+(rad) and joint velocities (rad/s)."""
+BIAS = 0.015
+"""Greatest error of a joint's encoder in an episode (rad)."""
+PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
+"""Greatest change of the base's velocity by a push (m/s, rad/s)."""
+STANDS, RUNS = 0.05, 1.5
+"""Speed of a command (m/s + rad/s) up to which a robot stands, and from which it runs."""
+STEP_HEIGHT = 0.1
+"""Height of a foot in mid-swing (m)."""
+UPSIDE = math.cos(math.radians(70.0))
+"""Cosine of the tilt at which a trunk has fallen."""
+HARD_CONTACT = 10.0
+"""Force from which a contact of the robot with itself counts (N)."""
+
+WEIGHTS = {
+    "track_linear": 2.0,
+    "track_angular": 2.0,
+    "upright": 1.0,
+    "pose": 1.0,
+    "joint_limits": -1.0,
+    "action_rate": -0.1,
+    "foot_clearance": -2.0,
+    "foot_swing_height": -0.25,
+    "foot_slip": -0.1,
+    "soft_landing": -1e-5,
+}
+"""Weights of the reward's terms by name."""
+
+
+def memory(joints: int, feet: int) -> dict[str, int | tuple[int, ...]]:
+    """Returns what a robot with so many actuated joints and feet remembers."""
+    return {
+        **commands.ROWS,
+        **{"until_push": (), "last_action": joints, "bias": joints},  # time until it (s); rad
+        **{"air_time": feet, "peak": feet},  # s; m
+    }
+
+
+def com(trunk: str) -> Vary:
+    """Returns how the center of mass of a trunk differs from world to world (m)."""
+    return Vary("body_ipos", (-0.025, -0.025, -0.03), (0.025, 0.025, 0.03), of=trunk, how="add", once=True)
+
+
+def sliding(geoms: str, low: float = 0.3, high: float = 1.2) -> Vary:
+    """Returns how the sliding friction of geoms, alike for all of them, differs from world to world."""
+    return Vary("geom_friction", low, high, of=geoms, how="set", once=True)
+
+
+def soft(geoms: str) -> list[Vary]:
+    """Returns how torsional and rolling friction of round feet (m) differ from world to world."""
+    ranges = {1: (1e-4, 2e-2), 2: (1e-5, 5e-3)}
+    settings: dict[str, Any] = {"of": geoms, "how": "set", "log": True, "once": True}
+    return [Vary("geom_friction", *bounds, component=k, **settings) for k, bounds in ranges.items()]
+
+
+class Velocity(LocoEnv):
+    """What robots that follow a velocity command share; a robot sets the attributes without a value.
+
+    The command is a velocity forward and to the left (m/s) and a yaw rate (rad/s), drawn anew every 3 to 8 s.
+
+    Args:
+        num_envs: as for :class:`~torchrl_loco.LocoEnv`, like all arguments but ``play``.
+        device: likewise.
+        seed: likewise.
+        protocol: likewise.
+        play: whether to leave out noise, pushes and variation; commands can then be set with :meth:`set_command`.
+        randomize: as for :class:`~torchrl_loco.LocoEnv`.
+        settings: likewise.
+
+    Observation:
+        ``observation``: linear and angular velocity of the base and gravity in its frame (9), joint positions relative
+        to home, joint velocities, last action, command (3); with noise. ``privileged``: the same without noise, then
+        height, time in the air, contact and contact force of the feet.
+
+    Action:
+        Changes of the joints' targets from home, scaled, without bounds.
+
+    Reward:
+        :meth:`terms` times :attr:`weights` and the control step.
+
+    Start:
+        At rest in the home pose, just above the ground, with any yaw.
+
+    Termination:
+        When the trunk is tilted by more than 70 degrees; truncation after 1000 steps.
+
+    Source:
+        mjlab 1.6.0, flat velocity task.
+    """
+
+    config = SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=10, ls_iterations=20)
+    episode_length = 1000
+    action_range = (-math.inf, math.inf)
+
+    base: ClassVar[str]
+    """Body that floats."""
+    trunk: ClassVar[str]
+    """Body that is to stay upright."""
+    feet: ClassVar[Mapping[str, str]]
+    """Sites of the feet, and a regular expression of the geoms of each."""
+    stand: ClassVar[Mapping[str, float]]
+    """How far joints may stray from home while the robot stands (rad), by regular expressions of their names."""
+    walk: ClassVar[Mapping[str, float]]
+    """The same while it walks."""
+    run: ClassVar[Mapping[str, float]]
+    """The same while it runs."""
+    action_scale: ClassVar[float | None] = None
+    """Change of a joint's target by an action of 1 (rad); ``None`` is a quarter of what needs the greatest torque."""
+    weights: ClassVar[Mapping[str, float]] = WEIGHTS
+    """Weights of the reward's terms."""
+    curriculum: ClassVar[dict[int, commands.Ranges]] = CURRICULUM
+    """Ranges of the commands by the control step of training from which they hold."""
+    own_geoms: ClassVar[str] = ""
+    """Regular expression of the geoms of which ``self_collision`` counts the contacts."""
+
+    def __init__(
+        self,
+        num_envs: int | None = 1,
+        device: torch.device | str | None = None,
+        seed: int | None = None,
+        protocol: str = "playground",
+        *,
+        play: bool = False,
+        randomize: Sequence[Vary] | None = None,
+        **settings: Any,
+    ) -> None:
+        self.play = check_bool("play", play)
+        if play:
+            randomize = [] if randomize is None else randomize
+            worlds = 1 if num_envs is None else check_int("num_envs", num_envs)
+            self._set = torch.zeros((worlds, 3), device=check_device(device))
+            self._is_set = torch.zeros((worlds, 1), dtype=torch.bool, device=check_device(device))
+        super().__init__(num_envs, device, seed, protocol, randomize=randomize, **settings)
+
+    def set_command(self, command: Sequence[float] | torch.Tensor | None) -> None:
+        """Sets the command that the worlds follow from their next step or reset on.
+
+        Args:
+            command: velocity forward and to the left (m/s) and yaw rate (rad/s), ``(3,)`` or ``(num_envs, 3)``;
+                ``None`` lets the worlds draw commands again, as they do at first.
+
+        Raises:
+            ValueError: the environment was made without ``play=True``, or the shape is another one.
+        """
+        if not self.play:
+            raise ValueError("commands are drawn in training: make the environment with play=True to set them")
+        rows = torch.as_tensor([0.0] * 3 if command is None else command, dtype=torch.float32)
+        if rows.shape not in ((3,), (self.num_envs, 3)):
+            raise ValueError(f"command must have shape (3,) or ({self.num_envs}, 3), got {tuple(rows.shape)}")
+        self._set.copy_(rows)
+        self._is_set.fill_(command is not None)
+
+    # What hooks share.
+
+    @property
+    def joints(self) -> list[str]:
+        """Names of the actuated joints, in the order of the actuators."""
+        m: mujoco.MjModel = self.mj_model
+        return [m.joint(int(joint)).name for joint in m.actuator_trnid[:, 0]]
+
+    def home(self, s: "View") -> torch.Tensor:
+        """Returns the joint positions of the home pose (rad), ``(num_envs, joints)``."""
+        return s.home[:, [int(self.mj_model.joint(name).qposadr[0]) for name in self.joints]]
+
+    def stray(self, s: "View", table: Mapping[str, float]) -> torch.Tensor:
+        """Returns how far each joint may stray by a table of the class (rad), ``(joints,)``."""
+        return torch.tensor([find(table, name) for name in self.joints], device=s.device)
+
+    def touching(self, s: "View") -> torch.Tensor:
+        """Returns whether each foot touches something, bool ``(num_envs, feet)``."""
+        return torch.stack([s.in_contact([geoms]).any(-1) for geoms in self.feet.values()], dim=-1)
+
+    def forces(self, s: "View") -> torch.Tensor:
+        """Returns the contact force on each foot, world frame (N), ``(num_envs, feet, 3)``."""
+        return torch.stack([s.contact_force([geoms]).sum(1) for geoms in self.feet.values()], dim=1)
+
+    def heights(self, s: "View") -> torch.Tensor:
+        """Returns the heights of the feet (m), ``(num_envs, feet)``."""
+        return s.site_xpos(list(self.feet))[..., 2]
+
+    def seen(self, s: "View") -> list[torch.Tensor]:
+        """Returns what a policy sees, without noise, each part ``(num_envs, n)``.
+
+        Velocity and rotation of the base and gravity in the base's frame, joint positions relative to home, joint
+        velocities, last action, command.
+        """
+        moves = [s.to_body(self.base, s.linvel(self.base)), s.to_body(self.base, s.angvel(self.base))]
+        joints = [s.joint_qpos(self.joints) - self.home(s), s.joint_qvel(self.joints)]
+        return [*moves, s.projected_gravity(self.base), *joints, s.last_action, s.command]
+
+    # The hooks, in the order in which they are called.
+
+    def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
+        """Returns the targets of the joints (rad): the home pose and a multiple of the action."""
+        if self.action_scale is not None:
+            return self.home(s) + self.action_scale * action
+        greatest, stiffness = s.model("actuator_forcerange")[..., 1], s.model("actuator_gainprm")[..., 0]
+        return self.home(s) + 0.25 * greatest / stiffness * action
+
+    def update(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns the greatest height of each foot since it left the ground."""
+        peak = torch.maximum(s.peak, self.heights(s))
+        return {"peak": torch.where(self.touching(s), s.peak, peak)}
+
+    def reward(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns the terms of the reward: :meth:`terms` times their weights and the control step."""
+        return {name: self.weights[name] * s.dt * term for name, term in self.terms(s).items()}
+
+    def terms(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns the terms of the reward by name, each ``(num_envs,)``, before they are weighted."""
+        linear, angular, _, stray, _, _, command = self.seen(s)
+        speed = command[:, :2].norm(dim=-1) + command[:, 2].abs()
+        moves, stands, runs = speed > STANDS, (speed < STANDS).unsqueeze(-1), (speed >= RUNS).unsqueeze(-1)
+        walking = torch.where(runs, self.stray(s, self.run), self.stray(s, self.walk))
+        spread = torch.where(stands, self.stray(s, self.stand), walking)
+        low, high = s.model("jnt_range")[:, [self.mj_model.joint(name).id for name in self.joints]].unbind(-1)
+        beyond = (s.joint_qpos(self.joints) - 0.5 * (low + high)).abs() - 0.45 * (high - low)
+
+        touching, heights = self.touching(s), self.heights(s)
+        landed = touching & (s.air_time > 0.0)
+        slides = s.site_linvel(list(self.feet))[..., :2].square().sum(-1)
+        terms = {
+            "track_linear": torch.exp(-(squares((command - linear)[:, :2]) + linear[:, 2].square()) / 0.25),
+            "track_angular": torch.exp(-((command - angular)[:, 2].square() + squares(angular[:, :2])) / 0.5),
+            "upright": torch.exp(-squares(s.projected_gravity(self.trunk)[:, :2]) / 0.2),
+            "pose": torch.exp(-(stray / spread).square().mean(-1)),
+            "joint_limits": beyond.clamp(min=0.0).sum(-1),
+            "action_rate": squares(s.action - s.last_action),
+            "foot_clearance": moves * ((heights - STEP_HEIGHT).abs() * slides.sqrt()).sum(-1),
+            "foot_swing_height": moves * (landed * (s.peak / STEP_HEIGHT - 1.0).square()).sum(-1),
+            "foot_slip": moves * (touching * slides).sum(-1),
+            "soft_landing": moves * (landed * self.forces(s).norm(dim=-1)).sum(-1),
+        }
+        if "trunk_rotation" in self.weights:
+            terms["trunk_rotation"] = squares(s.to_body(self.trunk, s.angvel(self.trunk))[:, :2])
+        if "angular_momentum" in self.weights:
+            terms["angular_momentum"] = squares(angular_momentum(s))
+        if "self_collision" in self.weights:
+            hard = s.contact_force([self.own_geoms]).norm(dim=-1) > HARD_CONTACT
+            terms["self_collision"] = self.config.substeps * hard.any(-1).float()
+        return terms
+
+    def terminated(self, s: "View") -> torch.Tensor:
+        """Returns whether the trunk is tilted by more than 70 degrees."""
+        return s.projected_gravity(self.trunk)[:, 2] > -UPSIDE
+
+    def events(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns the command that holds next, the last action, how long feet are in the air, and pushes."""
+        due, forward, touching = s.until_command <= 0.0, s.xmat(self.base)[:, :2, 0], self.touching(s)
+        goes_on = {name: getattr(s, name) for name in ("command", "heading", "holds_heading")}
+        goes_on["until_command"] = s.until_command - s.dt
+        rows = {
+            name: torch.where(due.view(-1, *[1] * (new.ndim - 1)), new, goes_on[name])
+            for name, new in commands.draw(s, self.curriculum).items()
+        }
+        return {
+            **self.commanded(s, rows, torch.atan2(forward[:, 1], forward[:, 0])),
+            **({} if self.play else self.pushed(s)),
+            "trained": s.trained + 1.0,
+            "last_action": s.action,
+            "air_time": torch.where(touching, 0.0, s.air_time + s.dt),
+            "peak": torch.where(touching, 0.0, s.peak),
+        }
+
+    def commanded(self, s: "View", rows: dict[str, torch.Tensor], yaw: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Returns the rows of a command for robots that look toward ``yaw`` (rad): turned, or as it was set."""
+        rows = commands.turned(rows, yaw, *commands.limits(s, self.curriculum))
+        if self.play:
+            rows["command"] = torch.where(self._is_set, self._set, rows["command"])
+        return rows
+
+    def pushed(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns velocities, which a push changes every 1 to 3 s, and the time until the next."""
+        push = s.until_push <= 0.0
+        change = s.uniform(-1.0, 1.0, 6) * torch.tensor(PUSH, device=s.device)
+        base = s.qvel[:, :6] + torch.where(push.unsqueeze(-1), change, 0.0)
+        until_push = torch.where(push, s.uniform(1.0, 3.0), s.until_push - s.dt)
+        return {"qvel": torch.cat([base, s.qvel[:, 6:]], dim=-1), "until_push": until_push}
+
+    def observation(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns what the policy sees, and for the critic the same without noise and the feet."""
+        parts = self.seen(s)
+        clean = noisy = torch.cat(parts, dim=-1)
+        if not self.play:
+            sizes = [part.shape[-1] for part in parts[: len(NOISE)]]
+            noise = [s.uniform(-most, most, size) for most, size in zip(NOISE, sizes, strict=True)]
+            noise[3] = noise[3] + s.bias
+            noisy = torch.cat([clean[:, : sum(sizes)] + torch.cat(noise, dim=-1), clean[:, sum(sizes) :]], dim=-1)
+        forces = self.forces(s).flatten(1)
+        forces = forces.sign() * torch.log1p(forces.abs())
+        feet = [self.heights(s), s.air_time, self.touching(s).float(), forces]
+        return {"observation": noisy, "privileged": torch.cat([clean, *feet], dim=-1)}
+
+    def begin(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns the home pose, somewhere within half a meter and just above the ground, and a command."""
+        yaw, zero = s.uniform(-math.pi, math.pi), torch.zeros_like(s.home[:, 0])
+        place = s.home[:, :2] + s.uniform(-0.5, 0.5, 2)
+        height = s.home[:, 2:3] + s.uniform(0.01, 0.05, 1)
+        turn = torch.stack([(0.5 * yaw).cos(), zero, zero, (0.5 * yaw).sin()], dim=-1)
+        return {
+            **self.commanded(s, commands.draw(s, self.curriculum), yaw),
+            "qpos": torch.cat([place, height, turn, s.home[:, 7:]], dim=-1),
+            "until_push": s.uniform(1.0, 3.0),
+            "bias": s.uniform(-BIAS, BIAS, len(self.joints)),
+            "trained": s.trained,  # it counts on over all episodes
+        }
+
+
+def squares(values: torch.Tensor) -> torch.Tensor:
+    """Returns the sum of the squares of each row, ``(num_envs,)``."""
+    return values.square().sum(-1)
+
+
+def find(table: Mapping[str, float], name: str) -> float:
+    """Returns the entry of the first regular expression that matches a whole name.
+
+    Raises:
+        KeyError: none does.
+    """
+    for pattern, value in table.items():
+        if re.fullmatch(pattern, name):
+            return value
+    raise KeyError(f"no entry for {name}: the expressions are {', '.join(table)}")
+
+
+class Go1Velocity(Velocity):
+    """A Unitree Go1, a quadruped of 12 kg, follows a velocity command."""
+
+    body = "go1"
+    model = FOLDER / "go1.xml"
+    config = dataclasses.replace(Velocity.config, integrator="implicitfast")
+    memory = memory(joints=12, feet=4)
+    base = trunk = "trunk"
+    feet = {leg: f"{leg}_foot_collision" for leg in LEGS}
+    stand = {".*calf.*": 0.1, ".*": 0.05}
+    walk = run = {".*calf.*": 0.6, ".*": 0.3}
+    randomize = [sliding(".*_foot_collision", high=1.5), *soft(".*_foot_collision"), com("trunk")]
+
+
+class Go2Velocity(Velocity):
+    """A Unitree Go2, a quadruped of 15 kg, follows a velocity command."""
+
+    body = "go2"
+    model = FOLDER / "go2.xml"
+    memory = memory(joints=12, feet=4)
+    base = trunk = "base"
+    feet = {f"{leg}_foot": leg for leg in ("FL", "FR", "RL", "RR")}
+    action_scale = 0.3
+    stand, walk, run = Go1Velocity.stand, Go1Velocity.walk, Go1Velocity.run
+    randomize = [sliding("FL|FR|RL|RR", high=1.5), *soft("FL|FR|RL|RR"), com("base")]
+
+
+class G1Velocity(Velocity):
+    """A Unitree G1, a humanoid of 29 joints and 33 kg, follows a velocity command."""
+
+    body = "g1"
+    model = FOLDER / "g1.xml"
+    config = dataclasses.replace(Velocity.config, integrator="implicitfast")
+    memory = memory(joints=29, feet=2)
+    base, trunk = "pelvis", "torso_link"
+    feet = {side: rf"{side}\d_collision" for side in ("left_foot", "right_foot")}
+    own_geoms = "(?!.*foot).*_collision"
+    stand = {".*": 0.05}
+    walk = {
+        ".*hip_pitch.*": 0.3,
+        ".*hip_(roll|yaw).*": 0.15,
+        ".*knee.*": 0.35,
+        ".*ankle_pitch.*": 0.25,
+        ".*ankle_roll.*": 0.1,
+        ".*waist_yaw.*": 0.2,
+        ".*waist_roll.*": 0.08,
+        ".*waist_pitch.*": 0.1,
+        ".*shoulder_(pitch|roll).*": 0.15,
+        ".*shoulder_yaw.*": 0.1,
+        ".*elbow.*": 0.15,
+        ".*wrist.*": 0.3,
+    }
+    run = {
+        ".*hip_pitch.*": 0.5,
+        ".*hip_(roll|yaw).*": 0.2,
+        ".*knee.*": 0.6,
+        ".*ankle_pitch.*": 0.35,
+        ".*ankle_roll.*": 0.15,
+        ".*waist_yaw.*": 0.3,
+        ".*waist_roll.*": 0.08,
+        ".*waist_pitch.*": 0.2,
+        ".*shoulder_pitch.*": 0.5,
+        ".*shoulder_roll.*": 0.2,
+        ".*shoulder_yaw.*": 0.15,
+        ".*elbow.*": 0.35,
+        ".*wrist.*": 0.3,
+    }
+    weights = {**WEIGHTS, "trunk_rotation": -0.05, "angular_momentum": -0.02, "self_collision": -1.0}
+    randomize = [sliding(r".*_foot\d_collision"), com("torso_link")]
+
+
+class H1Velocity(Velocity):
+    """A Unitree H1, a humanoid of 19 joints and 51 kg, follows a velocity command."""
+
+    body = "h1"
+    model = FOLDER / "h1.xml"
+    config = dataclasses.replace(Velocity.config, sim_dt=0.004)
+    memory = memory(joints=19, feet=2)
+    base, trunk = "pelvis", "torso_link"
+    feet = {side: rf"{side}\d" for side in ("left_foot", "right_foot")}
+    action_scale = 0.25
+    stand = {".*": 0.05}
+    walk = {
+        ".*hip_pitch": 0.3,
+        ".*hip_(roll|yaw)": 0.15,
+        ".*knee": 0.35,
+        ".*ankle": 0.25,
+        "torso": 0.2,
+        ".*shoulder_(pitch|roll)": 0.15,
+        ".*shoulder_yaw": 0.1,
+        ".*elbow": 0.15,
+    }
+    run = {
+        ".*hip_pitch": 0.5,
+        ".*hip_(roll|yaw)": 0.2,
+        ".*knee": 0.6,
+        ".*ankle": 0.35,
+        "torso": 0.3,
+        ".*shoulder_pitch": 0.5,
+        ".*shoulder_roll": 0.2,
+        ".*shoulder_yaw": 0.15,
+        ".*elbow": 0.35,
+    }
+    weights = {**WEIGHTS, "trunk_rotation": -0.05}
+    randomize = [sliding(r"floor|.*_foot\d"), com("torso_link")]

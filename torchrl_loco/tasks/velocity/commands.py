@@ -1,0 +1,82 @@
+"""Velocity commands: how they are drawn, and how they turn a robot toward a heading."""
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+
+if TYPE_CHECKING:
+    from torchrl_loco.envs.view import View
+
+Ranges = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+"""Least and greatest velocity forward, to the left (m/s), and yaw rate (rad/s)."""
+
+STAND, TURN, AHEAD = 0.1, 0.3, 0.2
+"""Shares of the commands that stand still, hold a heading, and go straight ahead."""
+SLOWEST = 0.3
+"""Least velocity straight ahead (m/s)."""
+STIFFNESS = 0.5
+"""Yaw rate by error of heading (1/s)."""
+
+ROWS: dict[str, int | tuple[int, ...]] = {
+    "command": 3,
+    "heading": (),
+    "holds_heading": (),
+    "until_command": (),
+    "trained": (),
+}
+"""Rows of memory: the command; the heading (rad) and whether it is held; time until the next (s); control steps of
+training, over all episodes of the world."""
+
+
+def limits(s: "View", curriculum: dict[int, Ranges]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns least and greatest command of each world, ``(num_envs, 3)``.
+
+    Args:
+        s: the worlds, whose memory has ``trained``.
+        curriculum: ranges by the control step of training from which they hold, in rising order.
+    """
+    stages = list(curriculum.items())
+    low, high = (
+        torch.tensor(bounds, device=s.device).expand(s.num_envs, 3) for bounds in zip(*stages[0][1], strict=True)
+    )
+    for first, ranges in stages[1:]:
+        reached = s.trained.unsqueeze(-1) >= first
+        later = [torch.tensor(bounds, device=s.device) for bounds in zip(*ranges, strict=True)]
+        low, high = torch.where(reached, later[0], low), torch.where(reached, later[1], high)
+    return low, high
+
+
+def draw(s: "View", curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
+    """Returns rows of a new command: of command, heading, whether it is held, and time until the next."""
+    low, high = limits(s, curriculum)
+    command, kind = low + (high - low) * s.uniform(0.0, 1.0, 3), s.uniform(0.0, 1.0, 3)
+    stands, holds, ahead = kind[:, 0] < STAND, kind[:, 1] < TURN, kind[:, 2] < AHEAD
+    forward = command[:, :1].abs().clamp(min=SLOWEST)
+    straight = torch.cat([forward, torch.zeros_like(command[:, 1:])], dim=-1)
+    command = torch.where(ahead.unsqueeze(-1), straight, command)
+    return {
+        "command": torch.where(stands.unsqueeze(-1), 0.0, command),
+        "heading": s.uniform(-math.pi, math.pi),
+        "holds_heading": (holds & ~stands & ~ahead).float(),
+        "until_command": s.uniform(3.0, 8.0),
+    }
+
+
+def turned(
+    rows: dict[str, torch.Tensor], yaw: torch.Tensor, low: torch.Tensor, high: torch.Tensor
+) -> dict[str, torch.Tensor]:
+    """Returns the rows of a command, whose yaw rate turns the worlds that hold a heading toward it.
+
+    Args:
+        rows: those of :func:`draw`.
+        yaw: where each world looks (rad), ``(num_envs,)``.
+        low: least command, ``(num_envs, 3)``.
+        high: greatest command, ``(num_envs, 3)``.
+    """
+    error = rows["heading"] - yaw
+    rate = STIFFNESS * torch.atan2(error.sin(), error.cos())  # the shorter way
+    rate = torch.minimum(torch.maximum(rate, low[:, 2]), high[:, 2])
+    command = rows["command"]
+    rate = torch.where(rows["holds_heading"] > 0, rate, command[:, 2]).unsqueeze(-1)
+    return {**rows, "command": torch.cat([command[:, :2], rate], dim=-1)}
