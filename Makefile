@@ -8,7 +8,7 @@ PYTEST_ARGS ?= --numprocesses auto --dist loadfile
 NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
 PYTEST := $(BIN)/python -m pytest $(PYTEST_ARGS)
 
-.PHONY: help train test test-fast test-all tests tests-ci lint format docs runners notebooks dist clean
+.PHONY: help train test test-fast test-all tests tests-ci lint format docs runners tables notebooks dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*##/\t/' | expand -t 12
@@ -50,6 +50,9 @@ docs: $(VENV)/installed  ## the site, into docs/_build/html; warnings are errors
 
 runners: $(VENV)/installed  ## draw the picture of the README anew, with the shipped policies
 	PYTHONPATH=docs $(BIN)/python -m generate.runners
+
+tables: $(VENV)/installed  ## write the tables of README and docs/benchmarks.md, and its picture, from benchmarks/results
+	PYTHONPATH=docs $(BIN)/python -m generate.benchmarks
 
 notebooks: $(VENV)/installed  ## run the notebooks and store their output; NOTEBOOKS=notebooks/rewards.ipynb for one
 	$(BIN)/python notebooks/execute.py $(NOTEBOOKS)

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 import torchrl_loco
 
 project = "torchrl_loco"
-author = "the torchrl_loco authors"
+author = "the torchrl_loco developers"
 release = version = torchrl_loco.__version__
 
 extensions = [
@@ -56,7 +56,7 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
-copyright = "the torchrl_loco authors, Apache 2.0"
+copyright = "the torchrl_loco developers, Apache 2.0"
 
 generate.everything()
 

@@ -2,7 +2,6 @@
 
 import os
 import re
-import shlex
 import subprocess
 import sys
 import tarfile
@@ -19,7 +18,6 @@ from torchrl_loco.sim import models
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 NAME = f"torchrl_loco-{torchrl_loco.__version__}"
 UNRELEASED = {".ci/run"}  # for our own CI alone
 
@@ -74,6 +72,7 @@ def test_wheel_holds_the_package_and_nothing_else(built):
     assert f"\nVersion: {torchrl_loco.__version__}\n" in metadata
     assert "# torchrl_loco" in metadata  # the README
     assert "torchrl-loco = torchrl_loco.cli:main" in entry_points
+    assert f"\nAuthor: {PROJECT['authors'][0]['name']}\n" in metadata
 
 
 @pytest.mark.ci
@@ -114,46 +113,3 @@ def test_citation_agrees_with_the_package():
     assert citation["cff-version"] == "1.2.0"
     assert citation["type"] == "software"
     assert all(citation[key] for key in ("message", "title", "authors"))
-
-
-def test_hooks_run_pinned_tools():
-    pinned = {entry.split("==")[0] for entry in PROJECT["optional-dependencies"]["dev"] if "==" in entry}
-    (repo,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
-    assert repo["repo"] == "local"
-    assert {hook["entry"].split()[0] for hook in repo["hooks"]} == pinned
-    for hook in repo["hooks"]:
-        assert hook["language"] == "system"
-        run(sys.executable, "-m", *shlex.split(hook["entry"]), "--help", cwd=ROOT)
-
-
-def steps(workflow):
-    jobs = yaml.safe_load(workflow.read_text())["jobs"].values()
-    return [step for job in jobs for step in job["steps"]]
-
-
-def test_workflows_call_targets_that_exist():
-    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
-    for workflow in WORKFLOWS:
-        called = {target for step in steps(workflow) for target in re.findall(r"\bmake ([\w-]+)", step.get("run", ""))}
-        assert called, workflow
-        assert called <= targets, workflow
-
-
-def test_tests_run_on_every_python_that_is_supported():
-    job = yaml.safe_load((ROOT / ".github" / "workflows" / "test.yml").read_text())["jobs"]["test"]
-    versions = job["strategy"]["matrix"]["python-version"]
-    prefix = "Programming Language :: Python :: "
-    classifiers = [text.removeprefix(prefix) for text in PROJECT["classifiers"] if text.startswith(f"{prefix}3.")]
-    assert all(isinstance(version, str) for version in versions)  # 3.10 would be 3.1
-    assert versions == classifiers
-    assert PROJECT["requires-python"] == f">={versions[0]}"
-
-
-@pytest.mark.ci
-def test_a_release_is_published_under_its_own_tag_alone(built):
-    workflow = ROOT / ".github" / "workflows" / "release.yml"
-    (check,) = (step["run"] for step in steps(workflow) if "GITHUB_REF_NAME" in step.get("run", ""))
-    (built / "dist").symlink_to(built)
-    for tag, status in ((f"v{torchrl_loco.__version__}", 0), ("v9.9.9", 1)):
-        environment = {**os.environ, "GITHUB_REF_NAME": tag}
-        assert subprocess.run(["bash", "-c", check], cwd=built, env=environment).returncode == status

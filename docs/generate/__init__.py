@@ -1,22 +1,20 @@
-"""What the site takes from the package and from benchmarks/results instead of repeating it."""
+"""What the site takes from the package instead of repeating it."""
 
 import shutil
 from pathlib import Path
 
-from generate import benchmarks, bodies, rewards, tasks
+from generate import bodies, fields, rewards, tasks
 from generate.markdown import write
-from torchrl_loco.registry import OURS
 
 DOCS = Path(__file__).parent.parent
 OUT = DOCS / "generated"
-RESULTS = DOCS.parent / "benchmarks" / "results"
 NOTEBOOKS = DOCS.parent / "notebooks"
 
 
 def everything() -> None:
     """Writes all that pages include to docs/generated, and leaves alone what has not changed."""
     fragments = OUT / "fragments"
-    for name in OURS:  # not for the plug-ins that happen to be installed
+    for name in tasks.RUNNERS:  # not for the plug-ins that happen to be installed
         write(fragments / f"{name}_properties.md", tasks.properties(name))
         write(fragments / f"{name}_reward.md", rewards.formula(name))
         write(fragments / f"{name}_policy.md", tasks.shipped_policy(name))
@@ -26,7 +24,8 @@ def everything() -> None:
         write(fragments / f"{body}_action.md", bodies.action_table(body))
         write(fragments / f"{body}_protocols.md", tasks.protocols(body))
     write(fragments / "tasks.md", tasks.overview())
-    write(fragments / "benchmarks.md", benchmarks.all_results(RESULTS, OUT / "pictures"))
+    write(fragments / "velocity_weights.md", tasks.velocity_weights())
+    write(fragments / "fields.md", fields.fields())
     write(fragments / "notebooks.md", notebooks(NOTEBOOKS, OUT / "notebooks"))
 
 

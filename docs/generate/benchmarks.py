@@ -1,114 +1,250 @@
-"""All of benchmarks/results as tables and pictures: a new folder or file there appears by itself."""
+"""The tables and the picture of docs/benchmarks.md, and the tables of the README, from benchmarks/results.
 
-import csv
+``make tables`` writes them into the pages, between two comments each, because GitHub shows the pages as they are.
+"""
+
 import json
+import re
+import statistics
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from benchmarks.plot import plot
-from benchmarks.published import COLUMNS, learning
+from matplotlib.figure import Figure
+
+from benchmarks.published import PUBLISHED, read
 from generate.markdown import table
 
 Row = dict[str, Any]
-FOLDED = 12
-"""Rows from which on a table is folded up."""
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "benchmarks" / "results"
+PICTURE = ROOT / "docs" / "_static" / "returns.png"
+
+LOOP, DAY = "2026-11-22-h200-loop", "2026-11-23-h200"
+ENGINES = (f"{LOOP}/engines.json", f"{LOOP}/engines-others.json")
+COLLECTED = (f"{DAY}/throughput.json", f"{DAY}/throughput-many.json", f"{LOOP}/throughput-apart.json")
+PEERS = (f"{LOOP}/peers.json",)
+SUITE = "2026-11-24-cpu/suite.json"
 
 
-def all_results(results: Path, pictures: Path) -> str:
-    """Returns a section for each folder of results, newest first; paths are relative to docs/.
+class Measured(NamedTuple):
+    """A line of a table of speeds: what was measured, in which files, in which of their rows, under which key."""
 
-    Args:
-        results: the folder benchmarks/results.
-        pictures: a folder below docs/, into which the pictures of training runs are drawn.
+    label: str
+    files: Sequence[str]
+    rows: dict[str, Any]
+    key: str
+
+
+BODIES = ("walker", "humanoid", "cheetah", "hopper", "quadruped")
+STEPS = (
+    Measured("loop of `mujoco_warp.step` in a CUDA graph", ENGINES, {"protocol": "playground"}, "mujoco_warp"),
+    Measured("our step: physics, observation, reward", ENGINES, {"protocol": "playground"}, "with observation"),
+    Measured("the same under `dm_control`", ENGINES, {"protocol": "dm_control"}, "with observation"),
+    Measured("`RolloutCollector`, policy 2 x 256", COLLECTED, {"case": "rollout_collector"}, "ms"),
+    Measured("`env.step_and_maybe_reset`", PEERS, {"case": "env_step_and_maybe_reset"}, "ms"),
+    Measured("MuJoCo Playground 0.2, jitted step", PEERS, {"case": "playground"}, "ms"),
+    Measured("TorchRL's `MujocoPlaygroundEnv`", PEERS, {"case": "playground_torchrl"}, "ms"),
+)
+WORLDS = (2048, 8192, 32768, 131072)
+BY_WORLDS = (
+    Measured("our step (ms)", ENGINES, {"protocol": "playground"}, "with observation"),
+    Measured("times as long in the loop", ENGINES, {"protocol": "playground"}, "ratio"),
+    Measured("collected (million frames/s)", COLLECTED, {"case": "rollout_collector"}, "million steps/s"),
+)
+
+
+class Runs(NamedTuple):
+    """Training runs of a task: the folders that hold its seeds, and runs that had their GPU to themselves.
+
+    ``alone`` names folder, task, protocol and seeds (None: all) of those runs, where they are not the same ones.
     """
-    folders = sorted((path for path in results.iterdir() if path.is_dir()), reverse=True)
-    return "\n".join(_folder(folder, results.parent.parent, pictures) for folder in folders)
+
+    folders: Sequence[str]
+    alone: tuple[str, str, str, str | None] | None = None
 
 
-def _folder(folder: Path, root: Path, pictures: Path) -> str:
-    date, device = folder.name[:10], folder.name[11:]
-    parts = [f"## {device}, {date}\n"]
-    trained = sorted(path.parent for path in folder.rglob("about.json"))
-    parts += [_runs(path, root, pictures / f"{folder.name}-{path.name}.png") for path in trained]
-    for path in sorted(path for path in folder.rglob("*") if path.parent not in trained):
-        link = f"../{path.relative_to(root).as_posix()}"
-        heading = f"### {path.relative_to(folder).with_suffix('').as_posix().replace('/', ', ')}\n"
-        if path.suffix == ".json":
-            parts += [heading, _json(json.loads(path.read_text()), link)]
-        elif path.suffix == ".csv":
-            rows = list(csv.DictReader(path.read_text().splitlines()))
-            parts += [heading, _rows([{key: _number(value) for key, value in row.items()} for row in rows])]
-            parts.append(f"From [{path.name}]({link}).\n")
-        elif path.suffix == ".png":
-            parts.append(f"![{path.stem}]({link})\n")
-        elif path.suffix == ".txt":
-            parts += [heading, f"[{path.name}]({link})\n"]
-    return "\n".join(parts)
+SEEDS = ("2026-11-23-h200-presets/campaign", "2026-11-23-h200-seeds/campaign")
+FIRST, ALONE, LAST = f"{DAY}/campaign", "2026-11-23-h200-alone/campaign", "2026-11-24-h200-alone/campaign"
+RUNNERS, RUN = "2026-11-22-h200-runners/campaign", "2026-11-24-h100/walker-run"
+RUNS = {
+    ("walker_stand", "playground"): Runs(SEEDS, (ALONE, "walker_stand", "playground", None)),
+    ("walker_walk", "playground"): Runs(SEEDS, (SEEDS[1], "walker_walk", "playground", "4")),
+    ("walker_run", "playground"): Runs([RUN]),
+    ("humanoid_stand", "playground"): Runs(SEEDS, (FIRST, "humanoid_stand", "playground", None)),
+    ("humanoid_walk", "playground"): Runs(SEEDS, (FIRST, "humanoid_walk", "playground", None)),
+    ("humanoid_run", "playground"): Runs([FIRST, SEEDS[1]], (FIRST, "humanoid_run", "playground", None)),
+    ("cheetah_run", "playground"): Runs([RUNNERS]),
+    ("hopper_stand", "playground"): Runs([RUNNERS]),
+    ("hopper_hop", "playground"): Runs([RUNNERS]),
+    ("quadruped_walk", "playground"): Runs([RUNNERS]),
+    ("quadruped_run", "playground"): Runs([RUNNERS]),
+    ("walker_stand", "dm_control"): Runs(SEEDS, (ALONE, "walker_stand", "dm_control", None)),
+    ("walker_walk", "dm_control"): Runs(SEEDS, (SEEDS[1], "walker_walk", "playground", "4")),
+    ("walker_run", "dm_control"): Runs([RUN]),
+    ("humanoid_stand", "dm_control"): Runs([*SEEDS, ALONE], (ALONE, "humanoid_stand", "dm_control", None)),
+    ("humanoid_walk", "dm_control"): Runs([*SEEDS, ALONE], (ALONE, "humanoid_walk", "dm_control", None)),
+    ("humanoid_run", "dm_control"): Runs([FIRST, ALONE, LAST], (ALONE, "humanoid_run", "dm_control", None)),
+}
+"""The runs of the presets, by task and protocol."""
+TASKS = [task for task, protocol in RUNS if protocol == "playground"]
 
 
-def _runs(folder: Path, root: Path, picture: Path) -> str:
-    """Returns table and picture of a folder of training runs, and draws the picture."""
-    calls = json.loads((folder / "about.json").read_text())
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    plot(folder, picture)
-    lines = (
-        ["" if row[name] is None else f"{row[name]:{spec}}" for name, spec in COLUMNS.items()]
-        for row in learning(folder)
+def tables() -> dict[str, str]:
+    """Returns the tables as Markdown, by the names that the comments in the pages give them."""
+    return {
+        "steps": speeds(BODIES, STEPS) + sources(line.files for line in STEPS),
+        "worlds": by_worlds() + sources(line.files for line in BY_WORLDS),
+        "returns": returns() + sources([[f"{path}/results.csv" for path in runs.folders] for runs in RUNS.values()]),
+        "steps-short": speeds(("walker", "humanoid"), [line for line in STEPS if "same" not in line.label]),
+        "returns-short": returns_short(),
+    }
+
+
+def filled(text: str) -> str:
+    """Returns a page with its tables as they are now.
+
+    Raises:
+        KeyError: a comment names a table that does not exist.
+    """
+    made = tables()
+    block = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+    return block.sub(lambda found: f"{found[1]}\n{made[found[2]]}\n{found[3]}", text)
+
+
+def speeds(bodies: Sequence[str], lines: Iterable[Measured]) -> str:
+    """Returns the milliseconds that a control step of 8192 worlds takes."""
+    return table(
+        ("", *bodies), [(line.label, *(_found(line, body=body, worlds=8192) for body in bodies)) for line in lines]
     )
-    files = sorted(path for path in folder.iterdir() if path.is_file())
-    links = ", ".join(f"[{path.name}](../{path.relative_to(root).as_posix()})" for path in files)
-    how = "".join(f"`{call['command']}`: {call['devices']} x {call['device']}, {call['date']}\n\n" for call in calls)
-    notes = "".join(f"{note}\n\n" for note in dict.fromkeys(call["note"] for call in calls if "note" in call))
-    return (
-        f"### {folder.name}\n\nThe best policy of each seed in new episodes, beside published returns:\n\n"
-        f"{notes}{table(tuple(COLUMNS), lines)}\n"
-        f"![Return against training time]({picture.relative_to(root / 'docs').as_posix()})\n\n"
-        f"{how}All numbers: {links}.\n"
-    )
 
 
-def _json(results: dict[str, Any], link: str) -> str:
-    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
-    how = (
-        f"`{results['command']}` on {results['device']}, {results['date']}, revision `{results['revision'][:9]}`, "
-        f"with {versions} ([all digits]({link})).\n"
-    )
-    rows = results["rows"]
-    by_worlds = {"body", "worlds", "case", "ms"}
-    if rows and by_worlds <= rows[0].keys() and len({row["worlds"] for row in rows}) > 1:
-        return f"{how}\nMilliseconds for a control step of all worlds:\n\n{_pivot(rows)}\n{_rows(rows, fold=1)}"
-    return f"{how}\n{_rows(rows)}"
+def by_worlds() -> str:
+    """Returns what is measured of walker and humanoid for several numbers of worlds."""
+    rows = [
+        (f"{body}, {line.label}", *(_found(line, body=body, worlds=worlds) for worlds in WORLDS))
+        for body in BODIES[:2]
+        for line in BY_WORLDS
+    ]
+    return table(("worlds", *WORLDS), rows)
 
 
-def _pivot(rows: list[Row]) -> str:
-    """Returns a table with a line for each body and case and a column for each number of worlds."""
-    worlds = sorted({row["worlds"] for row in rows})
-    times: dict[tuple[str, str], Row] = {}
-    for row in rows:
-        times.setdefault((row["body"], row["case"]), {})[row["worlds"]] = row["ms"]
-    lines = [(*key, *(_text(cells.get(n)) for n in worlds)) for key, cells in times.items()]
-    return table(("body", "case", *(f"{n} worlds" for n in worlds)), lines)
+def _found(line: Measured, **where: Any) -> str:
+    """Returns a figure to three digits, empty if no file has it; the first file that does counts."""
+    wanted = line.rows | where
+    for file in line.files:
+        for row in json.loads((RESULTS / file).read_text())["rows"]:
+            if line.key in row and wanted.items() <= row.items():
+                return f"{row[line.key]:#.3g}".rstrip(".")
+    return ""
 
 
-def _rows(rows: list[Row], fold: int = FOLDED) -> str:
-    """Returns rows as they are, folded up if they are many."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    text = table(columns, ([_text(row.get(column)) for column in columns] for row in rows))
-    if len(rows) < fold:
-        return text
-    return f"<details><summary>All {len(rows)} rows</summary>\n\n{text}\n</details>\n"
+def returns() -> str:
+    """Returns the returns of all runs, beside the published ones and those of shipped policies in dm_control."""
+    suite = {row["task"]: row for row in _json(SUITE) if row["where"] == "dm_control"}
+    rows = []
+    for (task, protocol), runs in RUNS.items():
+        seeds = seeds_of(task, protocol, runs)
+        under = protocol if (task, protocol) in PUBLISHED else "dm_control"
+        published, by = PUBLISHED[task, under]
+        there = suite[task] if protocol == "dm_control" else None
+        rows.append(
+            (
+                task,
+                protocol,
+                f"{_mean(seeds, 'mean'):.1f}",
+                ", ".join(f"{float(row['mean']):.0f}" for row in seeds),
+                f"{_mean(seeds, 'frames') / 1e6:.0f}",
+                time_of_training(task, protocol, runs),
+                f"{there['mean']:.1f} +- {there['std']:.1f}" if there else "",
+                f"{by} {published}{'' if under == protocol else f' ({under})'}",
+            )
+        )
+    columns = ("task", "protocol", "mean", "by seed", "million frames", "training (s)")
+    return table((*columns, "shipped policy in dm_control", "published"), rows)
 
 
-def _text(value: Any) -> str:
-    if value is None:
-        return ""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+def returns_short() -> str:
+    """Returns the mean returns and times of training under playground, a line for each body."""
+    by_body: dict[str, list[str]] = {}
+    for task in TASKS:
+        by_body.setdefault(task.split("_")[0], []).append(task)
+    rows = []
+    for body, tasks in by_body.items():
+        found = [(task, RUNS[task, "playground"]) for task in tasks]
+        means = [f"{_mean(seeds_of(task, 'playground', runs), 'mean'):.0f}" for task, runs in found]
+        times = [time_of_training(task, "playground", runs) for task, runs in found]
+        goals = ", ".join(task.removeprefix(f"{body}_") for task in tasks)
+        rows.append((f"{body}: {goals}", ", ".join(means), ", ".join(times)))
+    return table(("task", "return", "training (s)"), rows)
 
 
-def _number(text: str) -> int | float | str:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
+def seeds_of(task: str, protocol: str, runs: Runs) -> list[dict[str, str]]:
+    """Returns the rows of results of a task's runs, one for each seed, by seed."""
+    rows = [row for folder in runs.folders for row in _results(folder, task, protocol)]
+    by_seed = {row["seed"]: row for row in reversed(rows)}  # the first folder that has a seed counts
+    return [by_seed[seed] for seed in sorted(by_seed, key=int)]
+
+
+def time_of_training(task: str, protocol: str, runs: Runs) -> str:
+    """Returns the seconds that a run takes on a GPU of its own, with ~ where runs of another length tell its speed."""
+    frames = _mean(seeds_of(task, protocol, runs), "frames")
+    if runs.alone is None:
+        alone = seeds_of(task, protocol, runs)
+    else:
+        folder, *key, seed = runs.alone
+        alone = [row for row in _results(folder, *key) if seed in (None, row["seed"])]
+    seconds = _mean(alone, "seconds") * frames / _mean(alone, "frames")
+    same = runs.alone is None or runs.alone[1:3] == (task, protocol)
+    return f"{'' if same and frames == _mean(alone, 'frames') else '~'}{seconds:.0f}"
+
+
+def _results(folder: str, task: str, protocol: str) -> list[dict[str, str]]:
+    return [row for row in read(RESULTS / folder, "results.csv") if (row["task"], row["protocol"]) == (task, protocol)]
+
+
+def _mean(rows: Iterable[dict[str, str]], key: str) -> float:
+    return statistics.mean(float(row[key]) for row in rows)
+
+
+def _json(file: str) -> list[Row]:
+    return json.loads((RESULTS / file).read_text())["rows"]
+
+
+def sources(files: Iterable[Iterable[str]]) -> str:
+    """Returns a line of links to files of results, each once."""
+    named = dict.fromkeys(file for group in files for file in group)
+    return "\nFrom " + ", ".join(f"[{file}](../benchmarks/results/{file})" for file in named) + ".\n"
+
+
+def draw(picture: Path) -> None:
+    """Draws the return of every run under playground against its frames, a panel for each task."""
+    figure = Figure(figsize=(11, 7.2), layout="constrained")
+    panels = figure.subplots(3, 4).flat
+    for task, axes in zip(TASKS, panels, strict=False):
+        runs = RUNS[task, "playground"]
+        rows = [row for folder in runs.folders for row in read(RESULTS / folder, "evaluations.csv")]
+        for seed in seeds_of(task, "playground", runs):
+            key = (task, "playground", seed["seed"])
+            found = [row for row in rows if (row["task"], row["protocol"], row["seed"]) == key]
+            points = [(float(row["frames"]) / 1e6, float(row["mean"])) for row in found]
+            axes.plot(*zip(*points, strict=True), "o-", color="C0", markersize=2, linewidth=1)
+        if (task, "playground") in PUBLISHED:
+            value, by = PUBLISHED[task, "playground"]
+            axes.axhline(value, color="C1", linestyle="--", linewidth=1, label=f"{by} {value}")
+            axes.legend(loc="lower right", fontsize="small")
+        axes.set(title=task, ylim=(0, 1020), xlim=(0, None))
+        axes.grid(alpha=0.3)
+    for axes in panels:  # what is left
+        axes.remove()
+    figure.supxlabel("million frames")
+    figure.supylabel("return over 1000 steps")
+    figure.savefig(picture, dpi=100)
+
+
+PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmarks.md")
+
+if __name__ == "__main__":
+    for page in PAGES:
+        page.write_text(filled(page.read_text()))
+    draw(PICTURE)

@@ -14,8 +14,10 @@ from torchrl_loco.config import NACONMAX_FLOOR, NACONMAX_WORLDS, PROTOCOLS, sim_
 from torchrl_loco.policy import shipped_policies
 from torchrl_loco.registry import ALIASES, OURS, env_class
 from torchrl_loco.sim import models
+from torchrl_loco.training.presets import is_runner
 
-CLASSES = {env_class(name).body: env_class(name) for name in OURS}
+RUNNERS = [name for name in OURS if is_runner(name)]  # the others have pages of their own
+CLASSES = {env_class(name).body: env_class(name) for name in RUNNERS}
 """A class of each body."""
 
 MOMENTS = (0, 20, 40, 160)
@@ -61,7 +63,7 @@ def _caption(name: str) -> str:
 def overview() -> str:
     """Returns the table of all tasks."""
     rows = []
-    for name in OURS:
+    for name in RUNNERS:
         cls = env_class(name)
         speed = f"{cls.target_speed:g}" if cls.target_speed else "0"
         policy = _info(name)
@@ -99,31 +101,30 @@ def shipped_policy(name: str) -> str:
 
 def _about_policy(name: str, protocol: str, info: dict[str, Any]) -> str:
     chosen = "" if protocol == "playground" else f', protocol="{protocol}"'
+    episodes = f"{info['episodes']} episodes of {env_class(name).config.episode_length} steps"
+    if info["std"] < 1e-3:
+        earned = f"**{info['mean']:.1f}** under protocol `{protocol}`, where all episodes begin and so end alike"
+    else:
+        earned = (
+            f"**{info['mean']:.1f} ± {info['std']:.1f}** under protocol `{protocol}` (mean and standard deviation over "
+            f"{episodes} that were not used to select it; worst {info['min']:.1f}, best {info['max']:.1f})"
+        )
     return (
-        f'`torchrl_loco.load_policy("{name}"{chosen})` returns **{info["mean"]:.1f} ± {info["std"]:.1f}** under '
-        f"protocol `{protocol}` (mean and standard deviation over {info['episodes']} episodes of "
-        f"{env_class(name).config.episode_length} steps that were not used to select it; worst {info['min']:.1f}, "
-        f"best {info['max']:.1f}). It was trained by {info['algorithm'].upper()} for "
-        f"{info['frames'] / 1e6:.0f} million frames on one {info['trained_on']}, with {info['num_envs']} worlds and "
-        f"seed {info['seed']}.\n"
+        f'`torchrl_loco.load_policy("{name}"{chosen})` returns {earned}. It was trained by '
+        f"{info['algorithm'].upper()} for {info['frames'] / 1e6:.0f} million frames on one {info['trained_on']}, with "
+        f"{info['num_envs']} worlds and seed {info['seed']}.\n"
     )
 
 
 def picture(name: str, path: Path) -> None:
     """Draws a few moments of an episode under the task's policy, or the start alone if there is none."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    imageio.imwrite(path, moments(name, WIDTH, HEIGHT).numpy())
+    imageio.imwrite(path, joined(moments(name, WIDTH, HEIGHT), dim=1, gap=4).numpy())
 
 
 @torch.no_grad()
-def moments(name: str, width: int, height: int) -> torch.Tensor:
-    """Returns frames of a task side by side, in uint8; how many depends on whether it has a policy.
-
-    Args:
-        name: id of the task.
-        width: width of a frame in pixels.
-        height: height of the frames, and so of the picture, in pixels.
-    """
+def moments(name: str, width: int, height: int) -> list[torch.Tensor]:
+    """Returns frames of a task, each ``(height, width, 3)`` in [0, 255]: only the first if it has no policy."""
     env = torchrl_loco.make(name, num_envs=1, device="cpu", seed=2)
     policy = torchrl_loco.load_policy(name, device="cpu") if _info(name) else None
     td, frames = env.reset(), []
@@ -133,7 +134,7 @@ def moments(name: str, width: int, height: int) -> torch.Tensor:
             frames.append(pixels.view(height, 2, width, 2, 3).mean(dim=(1, 3)))  # smooth edges
         if policy:
             td = step_mdp(env.step(policy(td)))
-    return joined(frames, dim=1, gap=4)
+    return frames
 
 
 def joined(pieces: list[torch.Tensor], dim: int, gap: int) -> torch.Tensor:
@@ -146,3 +147,11 @@ def joined(pieces: list[torch.Tensor], dim: int, gap: int) -> torch.Tensor:
     white = torch.full(size, 255.0)
     all_pieces = [part for piece in pieces for part in (white, piece.float())][1:]
     return torch.cat(all_pieces, dim=dim).round().to(torch.uint8)
+
+
+def velocity_weights() -> str:
+    """Returns the table of the weights of the reward of those that follow a velocity, a column a robot."""
+    followers = {name: env_class(name).weights for name in OURS if not is_runner(name)}
+    terms = list(dict.fromkeys(term for weights in followers.values() for term in weights))
+    rows = [(f"`{term}`", *(f"{w[term]:g}" if term in w else "" for w in followers.values())) for term in terms]
+    return table(("term", *(f"`{name}`" for name in followers)), rows)

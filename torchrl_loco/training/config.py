@@ -63,7 +63,7 @@ class TrainingConfig:
     presets: ClassVar[dict[str, Settings]] = {"cpu": {}, "cuda": {}}
     """What differs from the defaults, by kind of device."""
     of_others: ClassVar[Settings] = {"action_repeat": 1, "episode_length": 0}
-    """What differs for tasks other than dm_control's runners: their own episodes."""
+    """What differs for tasks other than those of dm_control's runners, which have episodes of their own."""
 
     task: str
     """The task, an id or the file or module of a class and its name, with a colon between."""
