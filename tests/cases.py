@@ -12,11 +12,19 @@ for _id, _class in zip(
     registry.register(_id, _class)
 
 
-TASKS = list(registry.OURS)  # not those of plug-ins that happen to be installed
+TASKS = [task for task in registry.OURS if not task.endswith("_velocity")]  # nor those of plug-ins
+"""Those of dm_control; test_velocity.py is for the robots."""
 PROTOCOLS = ("playground", "dm_control")
 ENGINES = ("compiled", "mujoco_warp")
 COMPILED = ("walker_run", "humanoid_run", "cheetah_run", "hopper_hop")
 """A task of each body that both engines can step, for what does not depend on the task."""
+KINDS = (
+    ("walker_run", "playground", "compiled"),
+    ("humanoid_run", "dm_control", "compiled"),
+    ("quadruped_run", "dm_control", "mujoco_warp"),
+    ("dog_follow", "playground", "compiled"),
+)
+"""A task of each kind (traced, by lanes, with MuJoCo-Warp, with hooks), for what depends on nothing else of a task."""
 BODIES = (*COMPILED, "quadruped_run")
 """A task of each body."""
 MODELS = {registry.env_class(task).body: registry.env_class(task).model for task in BODIES}

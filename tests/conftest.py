@@ -5,7 +5,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads
 
 import pytest
 import torch
-from cases import BODIES, ENGINES, HOOK_TASKS, PROTOCOLS, TASKS
+from cases import ENGINES, KINDS
 
 import torchrl_loco
 
@@ -29,18 +29,9 @@ def device(request):
     return request.param
 
 
-@pytest.fixture(params=TASKS)
-def task(request):
-    return request.param
-
-
-@pytest.fixture(params=[*BODIES, HOOK_TASKS[0]])
-def body_task(request):
-    return request.param
-
-
-@pytest.fixture(params=PROTOCOLS)
-def protocol(request):
+@pytest.fixture(params=KINDS, ids="-".join)
+def kind(request):
+    """A task, its protocol and its engine."""
     return request.param
 
 

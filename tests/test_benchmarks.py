@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from generate import benchmarks as page
 
 from benchmarks import cases, fidelity, plot, scaling, soak, suite, timing
 from benchmarks.cases import until_interrupted
@@ -108,29 +107,6 @@ def test_pictures_are_drawn_of_recorded_results(tmp_path):
         picture = tmp_path / f"{Path(results).stem}.png"
         plot.plot(RESULTS / results, picture)
         assert picture.stat().st_size > 10_000
-
-
-def test_recorded_runs_on_the_page_beside_published_returns(tmp_path):
-    folder = tmp_path / "benchmarks" / "results" / "2027-01-02-toaster" / "campaign"
-    folder.mkdir(parents=True)
-    (folder / "results.csv").write_text(
-        "task,protocol,seconds,threshold,seconds_to_threshold,wall_to_threshold,mean\n"
-        "walker_walk,playground,20,950,4.5,14,980\n"
-        "walker_walk,playground,30,950,7.5,13,970\n"
-        "snail_crawl,dm_control,10,,,,12.5\n"
-    )
-    (folder / "evaluations.csv").write_text(
-        "task,protocol,seed,seconds,mean\nwalker_walk,playground,0,3,500\nsnail_crawl,dm_control,0,3,12\n"
-    )
-    about = {"command": "python -m benchmarks campaign", "date": "2027-01-02", "device": "toaster", "devices": 2}
-    (folder / "about.json").write_text(json.dumps([about, {**about, "note": "Hot."}]))
-    text = page.all_results(folder.parents[1], tmp_path / "docs" / "pictures")
-    assert "| walker_walk | playground | 2 | 975.0 | 970.0 | 25 | 950 | 8 | 14 | 982.9 | FastTD3 |" in text
-    assert "| snail_crawl | dm_control | 1 | 12.5 | 12.5 | 10 |  |  |  |  |  |" in text
-    assert text.count("Hot.") == 1
-    picture = "pictures/2027-01-02-toaster-campaign.png"
-    assert f"]({picture})" in text
-    assert (tmp_path / "docs" / picture).stat().st_size > 10_000
 
 
 @pytest.mark.slow

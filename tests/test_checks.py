@@ -39,14 +39,17 @@ def test_numbers():
 
 
 def test_intervals():
-    """A bracket includes its bound, a parenthesis does not."""
-    inside = {"[0, 1]": (0, 1), "(0, 1]": (0.1, 1), "[0, 1)": (0, 0.9), "(-inf, inf)": (-1e300, 0, 1e300)}
-    outside = {"[0, 1]": (-0.1, 1.1), "(0, 1]": (0,), "[0, 1)": (1,), "(-inf, inf)": (math.inf, -math.inf, math.nan)}
-    for interval, values in inside.items():
-        assert [checks.check_float("x", value, interval) for value in values] == list(values)
-    for interval, values in outside.items():
-        for value in values:
-            with pytest.raises(ValueError, match="x must lie in"):
+    """Bounds that belong to them and bounds that do not, as a message shows them."""
+    cases = [
+        (checks.FRACTION, "[0, 1]", (0, 1), (-0.1, 1.1)),
+        (checks.Interval(0, 1, with_low=False, with_high=True), "(0, 1]", (0.1, 1), (0,)),
+        (checks.Interval(0, 1), "[0, 1)", (0, 0.9), (1,)),
+        (checks.ANY, "(-inf, inf)", (-1e300, 0, 1e300), (math.inf, -math.inf, math.nan)),
+    ]
+    for interval, shown, inside, outside in cases:
+        assert [checks.check_float("x", value, interval) for value in inside] == list(inside)
+        for value in outside:
+            with pytest.raises(ValueError, match=re.escape(f"x must lie in {shown}, got {value}")):
                 checks.check_float("x", value, interval)
 
 
@@ -79,7 +82,7 @@ class Settings:
 
 
 def test_fields():
-    checks.check_fields(Settings(), {"share": "[0, 1]"})
+    checks.check_fields(Settings(), {"share": checks.FRACTION})
     for values, error in [
         ({"count": 0}, ValueError),
         ({"count": 1.5}, TypeError),
@@ -88,7 +91,7 @@ def test_fields():
         ({"flag": 1}, TypeError),
     ]:
         with pytest.raises(error, match=f"{next(iter(values))} must"):
-            checks.check_fields(Settings(**values), {"share": "[0, 1]"})
+            checks.check_fields(Settings(**values), {"share": checks.FRACTION})
 
 
 def test_multiples():

@@ -23,8 +23,8 @@ QUICK = {"episode_length": 7, "on_overflow": "ignore"}
 
 @pytest.fixture
 def make(shared):
-    def make(task, wrap, device="cpu", num_envs=4, copy=0, **settings):
-        env = shared(task, num_envs, device, stagger=True, copy=copy, **{**QUICK, **coarse(task), **settings})
+    def make(task, wrap, num_envs=4, copy=0, **settings):
+        env = shared(task, num_envs, stagger=True, copy=copy, **{**QUICK, **coarse(task), **settings})
         return torchrl_loco.TransformedEnv(env, Compose(InitTracker(), RewardSum())) if wrap else env
 
     return make
@@ -37,48 +37,50 @@ def policy(env):
     return TensorDictModule(module, in_keys=["observation"], out_keys=["action"])
 
 
-@pytest.mark.parametrize("wrap", [False, True])
-def test_exchangeable_with_torchrls_collector(make, body_task, wrap):
-    ours, theirs = (make(body_task, wrap, copy=copy) for copy in (0, 1))
-    settings = {"frames_per_batch": 20, "total_frames": 60}
-    reference = Collector(
-        theirs, policy(theirs), track_traj_ids=False, auto_register_policy_transforms=False, **settings
-    )
-    got = list(RolloutCollector(ours, policy(ours), **settings))
-    expected = [batch.clone() for batch in reference]
-    reference.shutdown()
-    assert [batch.shape for batch in got] == [batch.shape for batch in expected] == [(4, 5)] * 3
-    for ours_batch, theirs_batch in zip(got, expected, strict=True):
-        assert set(ours_batch.keys(True, True)) == set(theirs_batch.keys(True, True))
-        assert ours_batch.names == theirs_batch.names
-        for key in theirs_batch.keys(True, True):
-            assert torch.equal(ours_batch[key], theirs_batch[key]), key
-    assert not got[0].requires_grad
+def test_exchangeable_with_torchrls_collector(make, kind):
+    task, protocol, engine = kind
+    for wrap in (False, True):
+        ours, theirs = (make(task, wrap, copy=copy, protocol=protocol, engine=engine) for copy in (0, 1))
+        settings = {"frames_per_batch": 20, "total_frames": 60}
+        reference = Collector(
+            theirs, policy(theirs), track_traj_ids=False, auto_register_policy_transforms=False, **settings
+        )
+        got = list(RolloutCollector(ours, policy(ours), **settings))
+        expected = [batch.clone() for batch in reference]
+        reference.shutdown()
+        assert [batch.shape for batch in got] == [batch.shape for batch in expected] == [(4, 5)] * 3
+        for ours_batch, theirs_batch in zip(got, expected, strict=True):
+            assert set(ours_batch.keys(True, True)) == set(theirs_batch.keys(True, True))
+            assert ours_batch.names == theirs_batch.names
+            for key in theirs_batch.keys(True, True):
+                assert torch.equal(ours_batch[key], theirs_batch[key]), (key, wrap)
+        assert not got[0].requires_grad
 
 
-@pytest.mark.parametrize("name", ["step_and_maybe_reset", "_step_and_maybe_reset"])
-def test_a_step_that_a_subclass_overrides_is_called(name):
-    calls = []
+def test_a_step_that_a_subclass_overrides_is_called():
+    for name in ("step_and_maybe_reset", "_step_and_maybe_reset"):
+        calls = []
 
-    def override(self, tensordict):
-        calls.append(name)
-        return getattr(WalkerRun, name)(self, tensordict)
+        def override(self, tensordict, name=name, calls=calls):
+            calls.append(name)
+            return getattr(WalkerRun, name)(self, tensordict)
 
-    counted = type("Counted", (WalkerRun,), {name: override})(2, "cpu", 0, **QUICK)
-    RolloutCollector(counted, policy(counted), frames_per_batch=6).rollout()
-    assert calls == [name] * 3
+        counted = type("Counted", (WalkerRun,), {name: override})(2, "cpu", 0, **QUICK)
+        RolloutCollector(counted, policy(counted), frames_per_batch=6).rollout()
+        assert calls == [name] * 3
 
 
-@pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
-def test_a_policy_explores_as_was_asked_for(make, kind):
+def test_a_policy_explores_as_was_asked_for(make):
     made, seen = make("walker_run", False, num_envs=2), []
 
     def choose(td):
         seen.append(exploration_type())
         return td.set("action", torch.zeros(2, 6))
 
-    RolloutCollector(made, choose, frames_per_batch=4, exploration_type=kind).rollout()
-    assert seen == [kind] * 2
+    for kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
+        RolloutCollector(made, choose, frames_per_batch=4, exploration_type=kind).rollout()
+        assert seen[-2:] == [kind] * 2
+    assert len(seen) == 4
 
 
 def test_endless_and_wrong_sizes(make):
@@ -151,19 +153,25 @@ def on_cuda(task, wrap=False, num_envs=64, **settings):
     return torchrl_loco.TransformedEnv(env, Compose(InitTracker(), RewardSum())) if wrap else env
 
 
-compiled_bodies = pytest.mark.parametrize("body_task", ["walker_run", "humanoid_run", "cheetah_run", "hopper_hop"])
-still_bodies = pytest.mark.parametrize("body_task", ["walker_run", "humanoid_run"])  # they begin at rest
+two_bodies = pytest.mark.parametrize("task", ["walker_run", "humanoid_run"])  # traced, and by lanes
+RANDOM, DETERMINISTIC = ExplorationType.RANDOM, ExplorationType.DETERMINISTIC
 
 
 @pytest.mark.gpu
-@compiled_bodies
-@pytest.mark.parametrize("exploration", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
-@pytest.mark.parametrize("wrap", [False, True])
-def test_recorded_batches_equal_steps_taken_one_by_one(body_task, protocol, wrap, exploration):
+@pytest.mark.parametrize(
+    ("task", "protocol", "wrap", "exploration"),
+    [
+        ("walker_run", "playground", False, RANDOM),
+        ("walker_run", "playground", True, DETERMINISTIC),
+        ("humanoid_run", "dm_control", True, RANDOM),
+        ("hopper_hop", "dm_control", False, DETERMINISTIC),
+    ],
+)
+def test_recorded_batches_equal_steps_taken_one_by_one(task, protocol, wrap, exploration):
     """To the bit: across resets, with noise, and while the weights change in place."""
     batches = []
     for recorded in (True, False):
-        env = on_cuda(body_task, wrap, protocol=protocol)
+        env = on_cuda(task, wrap, protocol=protocol)
         chosen = Noisy(env)
         collector = RolloutCollector(env, chosen, frames_per_batch=64 * 5, exploration_type=exploration)
         assert collector.step_by_step is None
@@ -205,7 +213,7 @@ def test_steps_are_stacked_as_tensordict_does():
 
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")
-@pytest.mark.parametrize("wrap", [False, True])
+@pytest.mark.parametrize(("task", "wrap"), [("walker_run", False), ("humanoid_run", True), ("quadruped_run", True)])
 def test_no_synchronisation(task, wrap):
     env = on_cuda(task, wrap, 256, episode_length=50)
     batches = iter(RolloutCollector(env, policy(env), frames_per_batch=256 * 10))
@@ -221,9 +229,9 @@ def test_no_synchronisation(task, wrap):
 
 
 @pytest.mark.gpu
-@compiled_bodies
-def test_recorded_batches_share_no_memory_and_need_no_more_of_it(body_task):
-    env = on_cuda(body_task)
+@two_bodies
+def test_recorded_batches_share_no_memory_and_need_no_more_of_it(task):
+    env = on_cuda(task)
     collector = RolloutCollector(env, policy(env), frames_per_batch=64 * 5)
     first, second, third = (collector.rollout() for _ in range(3))
     kept = third.clone()
@@ -240,9 +248,9 @@ def test_recorded_batches_share_no_memory_and_need_no_more_of_it(body_task):
 
 
 @pytest.mark.gpu
-@still_bodies
-def test_a_recording_goes_on_from_a_state_and_from_a_closed_environment(body_task):
-    env, other = on_cuda(body_task), on_cuda(body_task)
+@two_bodies
+def test_a_recording_goes_on_from_a_state_and_from_a_closed_environment(task):
+    env, other = on_cuda(task), on_cuda(task)
     collector, second = (RolloutCollector(made, policy(made), frames_per_batch=64 * 5) for made in (env, other))
     for _ in range(4):
         collector.rollout()

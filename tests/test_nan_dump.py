@@ -46,20 +46,25 @@ def too_fast(state, action):
     state["qvel"][BAD, 4] = 3e9
 
 
-@pytest.mark.parametrize("spoil", [bad_action, too_fast])
-def test_the_file_holds_what_the_step_began_with(device, engine, file, actions, spoil):
-    env = made(file, device, engine=engine, iterations=3)
-    state, action, _ = drive(env, actions, spoil)
-    with pytest.warns(NonFiniteWarning, match=rf"world {BAD} became non-finite in step 4 .*dump\.safe.*inspect"):
-        env.close()
-    dump = nan_dump.load(file)
-    for name in ("qpos", "qvel", "qacc_warmstart"):
-        assert torch.equal(dump.tensors[name], state[name][BAD].cpu()), name
-    torch.testing.assert_close(dump.tensors["action"], action[BAD].cpu(), rtol=0, atol=0, equal_nan=True)
-    settings = dump.settings
-    assert (settings["world"], settings["episode"], settings["elapsed_steps"], settings["seed"]) == (BAD, 1, 3, 7)
-    assert (settings["env"], settings["protocol"]) == ("torchrl_loco.tasks.walker.WalkerWalk", "playground")
-    assert (settings["config"]["iterations"], settings["config"]["engine"]) == (3, engine)
+@pytest.mark.parametrize(
+    ("device", "engine"),
+    [("cpu", "compiled"), ("cpu", "mujoco_warp"), pytest.param("cuda", "compiled", marks=pytest.mark.gpu)],
+)
+def test_the_file_holds_what_the_step_began_with(device, engine, file, actions):
+    for spoil in (bad_action, too_fast):
+        env = made(file, device, engine=engine, iterations=3)
+        state, action, _ = drive(env, actions, spoil)
+        with pytest.warns(NonFiniteWarning, match=rf"world {BAD} became non-finite in step 4 .*dump\.safe.*inspect"):
+            env.close()
+        dump = nan_dump.load(file)
+        for name in ("qpos", "qvel", "qacc_warmstart"):
+            assert torch.equal(dump.tensors[name], state[name][BAD].cpu()), name
+        torch.testing.assert_close(dump.tensors["action"], action[BAD].cpu(), rtol=0, atol=0, equal_nan=True)
+        found = dump.settings
+        assert (found["world"], found["episode"], found["elapsed_steps"], found["seed"]) == (BAD, 1, 3, 7)
+        assert (found["env"], found["protocol"]) == ("torchrl_loco.tasks.walker.WalkerWalk", "playground")
+        assert (found["config"]["iterations"], found["config"]["engine"]) == (3, engine)
+        file.unlink()
 
 
 def test_only_the_first_is_kept(file, actions):

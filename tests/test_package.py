@@ -60,7 +60,7 @@ def test_in_a_fresh_interpreter_without_the_extras():
     """A worker that unpickles imports the module that it needs before the rest."""
     code = """
 import sys
-for name in ("matplotlib", "tensorboard", "imageio", "av"):
+for name in ("matplotlib", "tensorboard", "imageio", "av", "gymnasium", "rsl_rl", "stable_baselines3"):
     sys.modules[name] = None
 import torchrl_loco
 assert "walker_walk" in torchrl_loco.list_envs()
@@ -72,6 +72,7 @@ assert torchrl_loco.envs.LocoEnv is torchrl_loco.LocoEnv
 from torchrl_loco import *
 env = make("walker_walk", 1, "cpu")
 assert RolloutCollector and training.PPOConfig("walker_walk")
+assert torchrl_loco.wrappers.GymnasiumVectorEnv
 assert env.rollout(2, load_policy("walker_walk", "cpu")).shape == (1, 2)
 assert "mujoco_warp" not in sys.modules
 assert env.sim.model.opt.timestep.numpy() == env.config.sim_dt and "mujoco_warp" in sys.modules

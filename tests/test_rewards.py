@@ -1,10 +1,14 @@
-"""tolerance against a NumPy version, over a grid that contains the edges."""
+"""tolerance, for Warp and for torch, against a NumPy version, over a grid that contains the edges."""
+
+import itertools
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 from oracle import tolerance as expected_tolerance
 
+import torchrl_loco
 from torchrl_loco.rewards import Sigmoid, tolerance
 
 REACH_ZERO = (Sigmoid.LINEAR, Sigmoid.COSINE, Sigmoid.QUADRATIC)
@@ -40,27 +44,37 @@ def grid(lower, upper, margin):
     return np.concatenate([np.linspace(-20, 20, 401, dtype=np.float32), edges, beside])
 
 
-@pytest.mark.parametrize("kind", Sigmoid)
-def test_agrees_with_numpy(kind, device):
+def test_agrees_with_numpy(device):
     with wp.ScopedDevice(device):
-        for lower, upper in BOUNDS:
-            for margin in MARGINS:
-                for value in [0.1, 0.5, 0.95, *([0.0] if kind in REACH_ZERO else [])]:
-                    x = grid(lower, upper, margin)
-                    ours = run(x, lower, upper, margin, kind, value, device)
-                    theirs = expected_tolerance(x, lower, upper, margin, kind.name.lower(), value)
-                    np.testing.assert_allclose(
-                        ours, theirs, rtol=0, atol=2e-6, err_msg=f"{lower} {upper} {margin} {value}"
-                    )
+        for kind, (lower, upper), margin in itertools.product(Sigmoid, BOUNDS, MARGINS):
+            for value in [0.1, 0.5, 0.95, *([0.0] if kind in REACH_ZERO else [])]:
+                x = grid(lower, upper, margin)
+                ours = run(x, lower, upper, margin, kind, value, device)
+                theirs = expected_tolerance(x, lower, upper, margin, kind.name.lower(), value)
+                message = f"{kind.name} {lower} {upper} {margin} {value}"
+                np.testing.assert_allclose(ours, theirs, rtol=0, atol=2e-6, err_msg=message)
+                seen = torch.tensor(x, dtype=torch.double)
+                in_torch = torchrl_loco.tolerance(seen, (lower, upper), margin, kind.name.lower(), value)
+                np.testing.assert_allclose(in_torch, theirs, rtol=0, atol=1e-9, err_msg=message)
 
 
-@pytest.mark.parametrize("kind", Sigmoid)
-def test_edges(kind):
-    with wp.ScopedDevice("cpu"):
+def test_edges():
+    for kind in Sigmoid:
         value = 0.0 if kind in REACH_ZERO else 0.2
         x = [-1.0, 2.0, 5.0, -4.0, 1e6]
         on_lower, on_upper, *at_margin, far = run(x, -1.0, 2.0, 3.0, kind, value, "cpu")
-        assert on_lower == on_upper == 1.0
-        np.testing.assert_allclose(at_margin, value, atol=1e-6)
-        assert 0.0 <= far < 1e-3
-        assert run([-1.0, 2.0, 2.0001], -1.0, 2.0, 0.0, kind, value, "cpu").tolist() == [1.0, 1.0, 0.0]
+        assert on_lower == on_upper == 1.0, kind
+        np.testing.assert_allclose(at_margin, value, atol=1e-6, err_msg=kind.name)
+        assert 0.0 <= far < 1e-3, kind
+        assert run([-1.0, 2.0, 2.0001], -1.0, 2.0, 0.0, kind, value, "cpu").tolist() == [1.0, 1.0, 0.0], kind
+
+
+def test_in_torch_what_is_not_valid_is_refused():
+    for arguments, message in [
+        ({"bounds": (1, 0)}, "bounds must be"),
+        ({"margin": -1}, "margin must be 0 or more"),
+        ({"sigmoid": "lineer"}, "did you mean 'linear'"),
+        ({"value_at_margin": 0.0, "margin": 1}, "value_at_margin must"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            torchrl_loco.tolerance(torch.zeros(2), **arguments)

@@ -20,6 +20,7 @@ from .envs import PhysicsOverflowWarning as PhysicsOverflowWarning
 from .envs import State as State
 from .envs import TransformedEnv as TransformedEnv
 from .envs.tolerance import tolerance as tolerance
+from .envs.vary import Vary as Vary
 from .envs.view import View as View
 from .export import export_policy as export_policy
 from .policy import Policy as Policy

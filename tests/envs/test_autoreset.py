@@ -34,27 +34,27 @@ def play(env, moves, step_and_maybe_reset):
     return torch.stack(trace)
 
 
-@pytest.mark.parametrize("reward_terms", [False, True])
-@pytest.mark.parametrize("at_once", [False, True])
-@pytest.mark.parametrize("wrap", [False, True])
-def test_same_data_as_torchrl(shared, body_task, actions, wrap, at_once, reward_terms):
+def test_same_data_as_torchrl(shared, kind, actions):
     """Worlds end at different times: at the environment's limit, at a transform's, and by a NaN action."""
-    options = {"protocol": "dm_control", "episode_length": 12, "stagger": True, "reward_terms": reward_terms}
-    options |= coarse(body_task)
-    theirs, ours = (shared(body_task, 6, copy=copy, **options) for copy in (0, 1))
-    if wrap:
-        theirs = TorchRLTransformedEnv(theirs, transforms())
-        ours = torchrl_loco.TransformedEnv(ours, transforms())
-    moves = actions(ours, 30)
-    moves[7, 3] = torch.nan
-    expected = play(theirs, moves, step_by_step(theirs, lambda td: EnvBase.maybe_reset(theirs, td)))
-    got = play(ours, moves, ours.step_and_maybe_reset if at_once else step_by_step(ours, ours.maybe_reset))
-    assert set(expected.keys(True, True)) == set(got.keys(True, True))
-    for key in expected.keys(True, True):
-        torch.testing.assert_close(got[key], expected[key], rtol=0, atol=0, equal_nan=True, msg=str(key))
-    ended = expected["next", "done"].squeeze(-1)
-    assert ended.any(dim=1).sum() > 5
-    assert not ended.all(dim=1).any()
+    task, protocol, engine = kind
+    # Any two of the three options in all their combinations.
+    for wrap, at_once, reward_terms in ((False, False, True), (False, True, False), (True, False, False), (True,) * 3):
+        options = {"protocol": protocol, "engine": engine, "episode_length": 12, "stagger": True, **coarse(task)}
+        theirs, ours = (shared(task, 6, copy=copy, reward_terms=reward_terms, **options) for copy in (0, 1))
+        if wrap:
+            theirs = TorchRLTransformedEnv(theirs, transforms())
+            ours = torchrl_loco.TransformedEnv(ours, transforms())
+        moves = actions(ours, 30)
+        moves[7, 3] = torch.nan
+        expected = play(theirs, moves, step_by_step(theirs, lambda td, env=theirs: EnvBase.maybe_reset(env, td)))
+        got = play(ours, moves, ours.step_and_maybe_reset if at_once else step_by_step(ours, ours.maybe_reset))
+        assert set(expected.keys(True, True)) == set(got.keys(True, True))
+        for key in expected.keys(True, True):
+            message = f"{key}, wrapped {wrap}, at once {at_once}, terms {reward_terms}"
+            torch.testing.assert_close(got[key], expected[key], rtol=0, atol=0, equal_nan=True, msg=message)
+        ended = expected["next", "done"].squeeze(-1)
+        assert ended.any(dim=1).sum() > 5
+        assert not ended.all(dim=1).any()
 
 
 @pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # for any batch
@@ -98,15 +98,9 @@ def test_a_step_begins_without_the_last_reward(shared):
     assert "reward" in td["next"]
 
 
-def test_rollouts_reset_by_it(shared):
-    env = torchrl_loco.TransformedEnv(shared("walker_run", 3, episode_length=5), transforms())
-    td = env.rollout(12, break_when_any_done=False)
-    assert td["next", "done"].squeeze(-1)[0].nonzero().squeeze(-1).tolist() == [4, 9]
-    assert td["is_init"].squeeze(-1)[0].nonzero().squeeze(-1).tolist() == [0, 5, 10]
-
-
-def test_an_empty_mask_changes_nothing(shared, body_task):
-    env = shared(body_task)
+def test_an_empty_mask_changes_nothing(shared, kind):
+    task, protocol, engine = kind
+    env = shared(task, protocol=protocol, engine=engine)
     td = env.rollout(3)[:, -1]["next"]
     before = env.get_state()
     after = env.reset(td.clone().set("_reset", torch.zeros(4, 1, dtype=torch.bool)))
@@ -116,9 +110,11 @@ def test_an_empty_mask_changes_nothing(shared, body_task):
 
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")
-@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: torchrl_loco.TransformedEnv(env, transforms())])
+@pytest.mark.parametrize("wrap", [False, True])
+@pytest.mark.parametrize("task", ["walker_run", "humanoid_run", "quadruped_run"])
 def test_no_synchronisation_over_100_steps_with_resets(task, wrap):
-    env = wrap(torchrl_loco.make(task, 256, "cuda", seed=0, episode_length=50, stagger=True))
+    env = torchrl_loco.make(task, 256, "cuda", seed=0, episode_length=50, stagger=True)
+    env = torchrl_loco.TransformedEnv(env, transforms()) if wrap else env
     td = env.reset()
     action = torch.rand(256, env.action_spec.shape[-1], device="cuda") * 2 - 1
     _, td = env.step_and_maybe_reset(td.set("action", action))

@@ -1,8 +1,8 @@
-"""One contract for every task, on every device."""
+"""One contract for every task; on CUDA for one of each kind."""
 
 import pytest
 import torch
-from cases import BODIES, COMPILED, TASKS, coarse
+from cases import ENGINES, KINDS, TASKS, coarse
 from compare import assert_repeats
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv, check_env_specs
@@ -11,28 +11,16 @@ import torchrl_loco
 from torchrl_loco import State
 
 CASES = [
-    *((task, "playground", "auto") for task in TASKS),
-    *((task, "dm_control", "auto") for task in BODIES),
-    *((task, "playground", "mujoco_warp") for task in COMPILED),
+    *(("cpu", task, "playground", "auto") for task in TASKS),
+    *(("cpu", task, "dm_control", engine) for task in ("walker_run", "humanoid_run") for engine in ENGINES),
+    *(pytest.param("cuda", *kind, marks=pytest.mark.gpu) for kind in KINDS if kind[0] != "dog_follow"),
 ]
 
 
-@pytest.fixture(params=CASES, ids="-".join)
-def env(request, shared, device):
-    task, protocol, engine = request.param
-    return shared(task, 5, device, protocol=protocol, engine=engine, reward_terms=True)
-
-
-def test_specs(env):
+@pytest.mark.parametrize(("device", "task", "protocol", "engine"), CASES)
+def test_specs_and_a_rollout(shared, task, protocol, engine, device):
+    env = shared(task, 5, device, protocol=protocol, engine=engine, reward_terms=True)
     check_env_specs(env)
-
-
-def test_specs_under_transforms(shared, body_task, device):
-    env = shared(body_task, 5, device, protocol="dm_control", reward_terms=True)
-    check_env_specs(TransformedEnv(env, Compose(InitTracker(), RewardSum(), StepCounter())))
-
-
-def test_rollout(env):
     td = env.rollout(20, break_when_any_done=False)
     observation, reward = td["next", "observation"], td["next", "reward"]
     assert observation.shape == (5, 20, env.observation_size)
@@ -47,9 +35,16 @@ def test_rollout(env):
     assert all((term == 0).all() for term in env.reset()["reward_terms"].values())
 
 
-def test_a_step_returns_no_live_buffer(shared, body_task, device, actions):
+def test_specs_under_transforms(shared, kind):
+    task, protocol, engine = kind
+    env = shared(task, 5, protocol=protocol, engine=engine, reward_terms=True)
+    check_env_specs(TransformedEnv(env, Compose(InitTracker(), RewardSum(), StepCounter())))
+
+
+def test_a_step_returns_no_live_buffer(shared, kind, device, actions):
     """A rollout holds what a loop with copies holds, and no two steps share memory."""
-    env = shared(body_task, 5, device, reward_terms=True)
+    task, protocol, engine = kind
+    env = shared(task, 5, device, protocol=protocol, engine=engine, reward_terms=True)
     moves = actions(env, 6)
     env.reset()
     state = env.get_state()
@@ -72,12 +67,14 @@ def test_a_step_returns_no_live_buffer(shared, body_task, device, actions):
     )
     for key in ("observation", "reward"):
         loop = torch.stack([td[key] for td in copies[1:]], dim=1)
-        assert_repeats(rollout["next", key], loop)
+        assert_repeats(rollout["next", key], loop, engine)
 
 
-def test_truncation_is_exact_and_the_terminal_observation_true(shared, body_task, protocol, device):
-    env = shared(body_task, 4, device, 3, protocol=protocol, episode_length=7, **coarse(body_task))
-    twin = shared(body_task, 4, device, 3, protocol=protocol, **coarse(body_task))  # not truncated here
+def test_truncation_is_exact_and_the_terminal_observation_true(shared, kind, device):
+    task, protocol, engine = kind
+    options = {"protocol": protocol, "engine": engine, **coarse(task)}
+    env = shared(task, 4, device, 3, episode_length=7, **options)
+    twin = shared(task, 4, device, 3, **options)  # not truncated here
     carried, td = env.reset(), twin.reset()
     for step in range(1, 8):
         action = env.action_spec.zero()
@@ -107,9 +104,10 @@ def test_a_fallen_body_goes_on_until_1000_steps(shared):
     assert torch.stack(done).nonzero().tolist() == [[19, 1]]
 
 
-def test_batches(body_task):
+def test_batches(kind):
+    task, protocol, engine = kind
     for num_envs in (1, 300):
-        env = torchrl_loco.make(body_task, num_envs, "cpu", seed=0)
+        env = torchrl_loco.make(task, num_envs, "cpu", 0, protocol, engine=engine)
         td = env.rollout(3)
         assert td.shape == (num_envs, 3)
         assert td["next", "observation"].isfinite().all()
@@ -152,13 +150,14 @@ def test_the_callers_default_device_does_not_matter(elsewhere, shared):
         assert env.render(width=8, height=8).device == env.health()["total"].device == torch.device("cpu")
 
 
-def test_making_an_environment_leaves_no_overflow_behind(engine):
+def test_making_an_environment_leaves_no_overflow_behind():
     """Recording steps through states that nobody asked for; what overflowed there does not count."""
-    env = torchrl_loco.make("walker_run", 4, "cpu", seed=0, protocol="dm_control", iterations=1, engine=engine)
-    assert (env.sim.overflow == 0).all()
-    assert all(count == 0 for count in env.health()["total"].values())
-    env.rollout(40)
-    assert env.health()["total", "iteration_limit"] > 0
+    for engine in ENGINES:
+        env = torchrl_loco.make("walker_run", 4, "cpu", seed=0, protocol="dm_control", iterations=1, engine=engine)
+        assert (env.sim.overflow == 0).all()
+        assert all(count == 0 for count in env.health()["total"].values())
+        env.rollout(40)
+        assert env.health()["total", "iteration_limit"] > 0, engine
 
 
 def test_repr(shared):

@@ -52,11 +52,12 @@ def test_the_cpu_always_repeats(shared, task, protocol, engine, actions):
 
 
 @pytest.mark.parametrize(
-    ("task", "protocol", "count"),
+    ("device", "task", "protocol", "count"),
     [
-        ("walker_run", "playground", 131),
-        ("humanoid_run", "dm_control", 131),
-        pytest.param("walker_run", "playground", 20_000, marks=pytest.mark.gpu),  # in three kernels instead of one
+        ("cpu", "walker_run", "playground", 131),
+        ("cpu", "humanoid_run", "dm_control", 131),
+        pytest.param("cuda", "humanoid_run", "dm_control", 131, marks=pytest.mark.gpu),
+        pytest.param("cuda", "walker_run", "playground", 20_000, marks=pytest.mark.gpu),  # in three kernels, not one
     ],
 )
 def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protocol, count, device, actions):
@@ -91,8 +92,12 @@ def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protoc
         # Warps that are full, in one kernel and in three, and a last one that is not.
         *(
             pytest.param(task, "cuda", count, marks=pytest.mark.gpu)
-            for task in ("walker_run", "cheetah_run", "hopper_hop")
-            for count in (8203, 20_011)
+            for task, count in (
+                ("walker_run", 8203),
+                ("walker_run", 20_011),
+                ("cheetah_run", 8203),
+                ("hopper_hop", 20_011),
+            )
         ),
     ],
 )
@@ -147,25 +152,32 @@ def test_the_setting_leaves_the_physics_as_it_is(shared):
 
 
 @pytest.mark.gpu
-def test_cuda_always_repeats(body_task, protocol):
-    if body_task.startswith("quadruped"):
-        pytest.skip("the compiled engine has no quadruped")
-    assert torch.equal(*rollouts(body_task, "cuda", protocol, 1024, 60))
+@pytest.mark.parametrize(
+    ("task", "protocol"),
+    [
+        ("walker_run", "playground"),
+        ("humanoid_run", "dm_control"),
+        ("hopper_hop", "dm_control"),
+        ("dog_follow", "playground"),
+    ],
+)
+def test_cuda_always_repeats(task, protocol):
+    assert torch.equal(*rollouts(task, "cuda", protocol, 1024, 60))
 
 
 @pytest.mark.gpu
-def test_cuda_repeats_bit_for_bit_with_deterministic(body_task, protocol):
-    if body_task.startswith("quadruped"):
-        pytest.skip("deterministic=True refuses its tendons")
+@pytest.mark.parametrize(("task", "protocol"), [("humanoid_run", "dm_control"), ("dog_follow", "playground")])
+def test_cuda_repeats_bit_for_bit_with_deterministic(task, protocol):
     options = {"engine": "mujoco_warp", "deterministic": True}
-    assert torch.equal(*rollouts(body_task, "cuda", protocol, 1024, 60, **options))
+    assert torch.equal(*rollouts(task, "cuda", protocol, 1024, 60, **options))
 
 
 @pytest.mark.gpu
-def test_mujoco_warp_on_cuda_repeats_starts_bit_for_bit_and_a_step_nearly(body_task, protocol):
+@pytest.mark.parametrize("task", ["humanoid_run", "quadruped_run"])
+def test_mujoco_warp_on_cuda_repeats_starts_bit_for_bit_and_a_step_nearly(task):
     starts, steps = [], []
     for _ in range(2):
-        env = torchrl_loco.make(body_task, 1024, "cuda", 0, protocol, engine="mujoco_warp")
+        env = torchrl_loco.make(task, 1024, "cuda", 0, "dm_control", engine="mujoco_warp")
         td = env.reset()
         starts.append(td["observation"].clone())
         env.step(td.set("action", env.action_spec.zero()))

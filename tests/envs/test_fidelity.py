@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from cases import BODIES, COMPILED, MODELS, TASKS
+from cases import MODELS, PROTOCOLS, TASKS
 from oracle import FORCES, Oracle, recorded, without_forces
 
 import torchrl_loco
@@ -20,18 +20,32 @@ def state(record, extra=()):
     return torchrl_loco.State(entries, batch_size=[len(record["qpos"])])
 
 
-def test_the_oracle_agrees_with_dm_control(task):
-    """The NumPy formulas that the rewards are held against are dm_control's own."""
-    record, oracle = recorded(task), Oracle(task, MODELS[task.split("_")[0]])
-    rows = zip(record["next_qpos"], record["next_qvel"], record["action"], strict=True)
-    np.testing.assert_allclose([oracle.reward(*row) for row in rows], record["reward"], rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize(
+CASES = [
     # The last task first: meanwhile another worker, in test_contract, compiles the kernels of the first ones.
-    ("task", "engine"),
-    [*((task, "auto") for task in reversed(TASKS)), *((task, "mujoco_warp") for task in reversed(COMPILED))],
-)
+    *(("cpu", task, "auto") for task in reversed(TASKS)),
+    (
+        "cpu",
+        "humanoid_run",
+        "mujoco_warp",
+    ),  # for others see test_engines_agree
+    *(
+        pytest.param("cuda", task, "auto", marks=pytest.mark.gpu)
+        for task in ("walker_run", "humanoid_run", "hopper_hop", "quadruped_run")
+    ),
+]
+on_all = pytest.mark.parametrize(("device", "task", "engine"), CASES)
+
+
+def test_the_oracle_agrees_with_dm_control():
+    """The NumPy formulas that the rewards are held against are dm_control's own."""
+    for task in TASKS:
+        record, oracle = recorded(task), Oracle(task, MODELS[task.split("_")[0]])
+        rows = zip(record["next_qpos"], record["next_qvel"], record["action"], strict=True)
+        rewards = [oracle.reward(*row) for row in rows]
+        np.testing.assert_allclose(rewards, record["reward"], rtol=0, atol=1e-6, err_msg=task)
+
+
+@on_all
 def test_observation_and_physics_agree_with_dm_control(shared, task, engine, device):
     record = recorded(task)
     env = shared(task, 192, device, protocol="dm_control", engine=engine)
@@ -76,17 +90,10 @@ def interpolated_states(task):
     return record
 
 
-@pytest.mark.parametrize(
-    ("task", "protocol", "engine"),
-    [
-        *((task, "dm_control", "auto") for task in TASKS),
-        *((task, "playground", "auto") for task in BODIES),
-        *((task, "dm_control", "mujoco_warp") for task in COMPILED),
-    ],
-)
-def test_reward_agrees_with_numpy(shared, task, protocol, engine, device):
+@on_all
+def test_reward_agrees_with_numpy(shared, task, engine, device):
     record = interpolated_states(task)
-    env = shared(task, 192, device, protocol=protocol, engine=engine)
+    env = shared(task, 192, device, protocol="dm_control", engine=engine)
     td = env.reset(state(record).to(device), set_state=True)
     action = torch.as_tensor(actions_of(env, record), dtype=torch.float32, device=device)
     rewards = env.step(td.set("action", action))["next", "reward"].squeeze(-1).cpu().numpy()
@@ -99,17 +106,17 @@ def test_reward_agrees_with_numpy(shared, task, protocol, engine, device):
     assert max(expected) > 0.9
 
 
-def test_playground_rows(device):
-    humanoid = torchrl_loco.make("humanoid_walk", 2, device).reset()["observation"].cpu()
+def test_playground_rows():
+    humanoid = torchrl_loco.make("humanoid_walk", 2, "cpu").reset()["observation"]
     expected = torch.zeros(67)
     expected[21], expected[36] = 1.69, 1.0
     expected[22:34] = torch.tensor(HUMANOID_LIMBS)
     torch.testing.assert_close(humanoid, expected.expand(2, -1), atol=1e-4, rtol=0)
 
-    env = torchrl_loco.make("walker_walk", 1, device)
+    env = torchrl_loco.make("walker_walk", 1, "cpu")
     angles = walker_angles(WALKER_ROW)
-    td = torchrl_loco.State({"qpos": torch.tensor([angles]), "qvel": torch.zeros(1, 9)}, batch_size=[1]).to(device)
-    walker = env.reset(td, set_state=True)["observation"].cpu()
+    td = torchrl_loco.State({"qpos": torch.tensor([angles]), "qvel": torch.zeros(1, 9)}, batch_size=[1])
+    walker = env.reset(td, set_state=True)["observation"]
     torch.testing.assert_close(walker, torch.tensor([WALKER_ROW]), atol=2e-4, rtol=0)
 
 
@@ -123,8 +130,9 @@ def walker_angles(row):
     return [0.0, 0.0, torso, *hinges]
 
 
-def test_walker_height_entry(shared, protocol):
-    env = shared("walker_stand", 192, protocol=protocol)
-    height = env.reset()["observation"][:, 14]
-    expected = env.sim.xpos[:, 1, 2] if protocol == "dm_control" else env.sim.xmat[:, 1, 2, 2]
-    torch.testing.assert_close(height, expected)
+def test_walker_height_entry(shared):
+    for protocol in PROTOCOLS:
+        env = shared("walker_stand", 192, protocol=protocol)
+        height = env.reset()["observation"][:, 14]
+        expected = env.sim.xpos[:, 1, 2] if protocol == "dm_control" else env.sim.xmat[:, 1, 2, 2]
+        torch.testing.assert_close(height, expected)

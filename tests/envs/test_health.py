@@ -9,7 +9,7 @@ import warnings
 
 import pytest
 import torch
-from cases import COMPILED
+from cases import COMPILED, PROTOCOLS
 from mujoco_warp import OverflowType
 from tensordict import TensorDict
 
@@ -35,8 +35,8 @@ def fall(env, steps=60):
     return env.health()
 
 
-def test_dropped_constraints_are_counted_in_their_world_and_contacts_in_all(device):
-    found = fall(made(device, njmax=5, on_overflow="ignore"))
+def test_dropped_constraints_are_counted_in_their_world_and_contacts_in_all():
+    found = fall(made("cpu", njmax=5, on_overflow="ignore"))
     counts = found["worlds", "constraint_overflow"].tolist()
     assert counts[0] > 20
     assert counts[1:] == [0, 0, 0]
@@ -45,7 +45,7 @@ def test_dropped_constraints_are_counted_in_their_world_and_contacts_in_all(devi
     assert found["peak", "constraints"] > 5
     assert found["worlds"].batch_size == torch.Size([WORLDS])
 
-    found = fall(made(device, naconmax=2, on_overflow="ignore"))
+    found = fall(made("cpu", naconmax=2, on_overflow="ignore"))
     assert found["total", "contact_overflow"] > 20
     assert found["peak", "contacts"] > 2
 
@@ -97,13 +97,13 @@ def test_peaks_hold_for_all_steps():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("field", ["njmax", "naconmax"])
-def test_the_advice_is_enough(device, field):
-    env = made(device, **{field: 2})
+def test_the_advice_is_enough(field):
+    env = made("cpu", **{field: 2})
     fall(env, 60)
     with pytest.warns(PhysicsOverflowWarning, match=rf"pass {field}=\d+") as caught:
         env.world.health.check()
     (advice,) = {int(re.search(rf"{field}=(\d+)", str(warning.message))[1]) for warning in caught}
-    env = made(device, **{field: advice}, on_overflow="raise")
+    env = made("cpu", **{field: advice}, on_overflow="raise")
     assert fall(env, 60)["total", "constraint_overflow"] == 0
     env.world.health.check()
 
@@ -120,8 +120,8 @@ def test_an_overflow_is_noticed_while_stepping_or_ignored(device):
     env.world.health.check()
 
 
-def test_an_overflow_is_reported_once(device):
-    env = made(device, njmax=5)
+def test_an_overflow_is_reported_once():
+    env = made("cpu", njmax=5)
     fall(env, 60)
     with pytest.warns(PhysicsOverflowWarning):
         env.world.health.check()
@@ -133,30 +133,32 @@ def test_an_overflow_is_reported_once(device):
         env.world.health.check()
 
 
-def test_nothing_is_reported_if_nothing_was_dropped(shared, device, engine, protocol):
-    env = shared("humanoid_stand", WORLDS, device, protocol=protocol, engine=engine, on_overflow="raise")
-    env.rollout(INTERVAL + 1)
-    env.world.health.check()
-    found = env.health()
-    assert found["total", "constraint_overflow"] == found["total", "contact_overflow"] == 0
-    if engine == "mujoco_warp":
-        assert 0 < found["peak", "constraints"] <= env.config.njmax
-    if protocol == "playground":
-        assert found["total", "iteration_limit"] > 0
+def test_nothing_is_reported_if_nothing_was_dropped(shared, engine):
+    for protocol in PROTOCOLS:
+        env = shared("humanoid_stand", WORLDS, protocol=protocol, engine=engine, on_overflow="raise")
+        env.rollout(INTERVAL + 1)
+        env.world.health.check()
+        found = env.health()
+        assert found["total", "constraint_overflow"] == found["total", "contact_overflow"] == 0
+        if engine == "mujoco_warp":
+            assert 0 < found["peak", "constraints"] <= env.config.njmax
+        if protocol == "playground":
+            assert found["total", "iteration_limit"] > 0
 
 
-@pytest.mark.parametrize(("body_task", "share"), [(task, 1e-3 if task == "humanoid_run" else 0.0) for task in COMPILED])
-def test_bodies_that_lie_on_the_floor_lose_hardly_a_contact(body_task, share):
+def test_bodies_that_lie_on_the_floor_lose_hardly_a_contact():
     """Under ``compiled``, whose places are fixed: flat on their backs or faces, bodies touch the floor everywhere."""
-    env = torchrl_loco.make(body_task, 48, "cpu", seed=0, protocol="dm_control", on_overflow="ignore")
-    td = env.reset()
-    for _ in range(120):
-        td = env.step(td.set("action", env.action_spec.zero()))["next"].exclude("reward")
-    assert env.health()["total", "contact_overflow"] <= share * 48 * 120
+    for task in COMPILED:
+        env = torchrl_loco.make(task, 48, "cpu", seed=0, protocol="dm_control", on_overflow="ignore")
+        td = env.reset()
+        for _ in range(120):
+            td = env.step(td.set("action", env.action_spec.zero()))["next"].exclude("reward")
+        share = 1e-3 if task == "humanoid_run" else 0.0
+        assert env.health()["total", "contact_overflow"] <= share * 48 * 120, task
 
 
-def test_worlds_that_are_not_finite_are_counted(device, engine):
-    env = made(device, engine)
+def test_worlds_that_are_not_finite_are_counted(engine):
+    env = made("cpu", engine)
     action = env.action_spec.zero()
     action[2, 0] = float("nan")
     for _ in range(3):

@@ -10,8 +10,7 @@ from hook_tasks import DOG, FollowVelocity, WalkBackwards, WalkBlindly
 from oracle import tolerance as numpy_tolerance
 from torch.fx.experimental.proxy_tensor import make_fx
 
-import torchrl_loco
-from torchrl_loco import LocoEnv, SimConfig, State, WalkerWalk, tolerance
+from torchrl_loco import LocoEnv, SimConfig, State, WalkerWalk
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.part import Part
 
@@ -372,24 +371,49 @@ def test_rows_that_are_returned_together_are_those_of_before():
         torch.testing.assert_close(memory["was"] + 0.1, env.sim.qpos)
 
 
-@pytest.mark.parametrize("leave", [lambda x: torch.tensor(x.numpy()), lambda x: torch.tensor(x.tolist())])
-def test_a_hook_that_leaves_torch_is_not_frozen(leave, caplog):
+def test_a_hook_that_leaves_torch_is_not_frozen(caplog):
     class Leaves(WalkerWalk):
+        leave = staticmethod(lambda x: torch.tensor(x.numpy()))
+
         def reward(self, s):
-            return leave(s.qvel[:, 0].clone())
+            return self.leave(s.qvel[:, 0].clone())
 
         def terminated(self, s):
-            return leave(s.xpos("torso")[:, 2].clone()) < 1.25
+            return self.leave(s.xpos("torso")[:, 2].clone()) < 1.25
 
         def observation(self, s):
-            return leave(s.qpos.clone())
+            return self.leave(s.qpos.clone())
 
-    env = Leaves(2, "cpu", seed=0)
-    td = env.rollout(5, break_when_any_done=False)
-    assert torch.equal(td["next", "reward"][:, -1, 0], env.sim.qvel[:, 0])
-    assert torch.equal(td["next", "observation"][:, -1], env.sim.qpos)
-    assert "Leaves.judge is not compiled" in caplog.text
-    assert "Leaves.observe is not compiled" in caplog.text
+    class LeavesAsLists(Leaves):
+        leave = staticmethod(lambda x: torch.tensor(x.tolist()))
+
+    for task in (Leaves, LeavesAsLists):
+        env = task(2, "cpu", seed=0)
+        td = env.rollout(5, break_when_any_done=False)
+        assert torch.equal(td["next", "reward"][:, -1, 0], env.sim.qvel[:, 0])
+        assert torch.equal(td["next", "observation"][:, -1], env.sim.qpos)
+        assert f"{task.__name__}: reward, terminated: not compiled" in caplog.text
+        assert f"{task.__name__}: observation: not compiled" in caplog.text
+
+
+def test_memory_can_be_an_index():
+    """A trace is compared with the hooks on numbers that may never occur, such as an index out of range."""
+
+    class Stages(WalkerWalk):
+        memory = {"stage": 1}
+
+        def update(self, s):
+            return {"stage": (s.stage + 1) % 3}
+
+        def reward(self, s):
+            return s.qpos[:, :3].gather(1, s.stage.long()).squeeze(1)
+
+    env = Stages(4, "cpu", seed=0)
+    assert env.world._judge.kind == "kernel"
+    env.reset()
+    for stage in (1, 2, 0, 1):
+        reward = env.rand_step()["next", "reward"]
+        assert torch.equal(reward[:, 0], env.sim.qpos[:, stage])
 
 
 def test_a_tensor_that_is_an_index_can_change():
@@ -441,7 +465,7 @@ def test_a_hook_that_cannot_be_compiled_runs_as_it_is_and_says_why(caplog):
             return s.time if bool((s.time > 0).all()) else s.time + 1
 
     env = Looks(2, "cpu", seed=0)
-    assert "Looks.judge is not compiled and runs as plain torch" in caplog.text
+    assert "Looks: reward: not compiled, runs as plain torch" in caplog.text
     assert env.rollout(2)["next", "reward"].shape == (2, 2, 1)
 
 
@@ -450,43 +474,43 @@ def test_a_hook_that_cannot_be_compiled_runs_as_it_is_and_says_why(caplog):
 BASE = {"model": DOG, "config": CONFIG, "reward": lambda self, s: s.time, "observation": lambda self, s: s.qpos}
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
-        ({"reward": None}, TypeError, "must define reward"),
-        ({"config": None}, TypeError, "must set config"),
-        ({"model": "nowhere.xml"}, FileNotFoundError, "no model 'nowhere.xml'"),
-        ({"reward": lambda self, s: s.qpos}, ValueError, r"must return shape \(4,\)"),
-        ({"reward": lambda self, s: {"a": s.time, "b": 0.0}}, TypeError, r"reward\['b'\] must return a tensor"),
-        ({"terminated": lambda self, s: s.time}, TypeError, "must return a bool tensor"),
-        ({"observation": lambda self, s: {"reward": s.qpos}}, ValueError, "'reward' is no name"),
-        ({"observation": lambda self, s: s.action}, ValueError, "keep what you need of it in memory"),
-        ({"update": lambda self, s: {"command": s.time}}, ValueError, "which has no entries"),
-        ({"memory": {"comand": 3}, "events": lambda self, s: {"command": s.time}}, ValueError, "did you mean 'comand'"),
-        ({"memory": {"a": 3}, "events": lambda self, s: {"a": s.qpos}}, ValueError, r"a of shape \(4, 3\)"),
-        ({"memory": {"qpos": 3}}, ValueError, "'qpos' is taken"),
-        ({"memory": {"a": 0}}, ValueError, "sizes of 1 or more"),
-        ({"begin": lambda self, s: {"qpos": s.home / 0}}, ValueError, "not finite"),
-        ({"control": lambda self, s, action: action[:, :2]}, ValueError, r"shape \(4, 8\)"),
-        ({"action_range": (0, 1)}, ValueError, r"must be \(-1, 1\) or"),
-        ({"action_range": (-math.inf, math.inf)}, TypeError, "must define control"),
-        ({"reward": lambda self, s: s.xpos("trunc")[:, 0]}, KeyError, "did you mean 'trunk'"),
-        ({"reward": lambda self, s: s.qvel.add_(1.0)[:, 0]}, ValueError, r"reward writes to s\.qvel"),
-        ({"reward": lambda self, s: setattr(self, "last", s.time) or s.time}, ValueError, r"reward sets self\.last"),
-        ({"reward": lambda self, s: {}}, ValueError, "tensors by name"),
-        ({"observation": lambda self, s: {"memory": s.qpos}}, ValueError, "'memory' is no name"),
-        ({"memory": {"a": 4}, "begin": lambda self, s: {"a": s.time}}, ValueError, r"a of shape \(4, 4\)"),
-        ({"reward": lambda self, s: s.comand}, AttributeError, "the memory has no entries"),
-        ({"reward": lambda self, s: s.model("geom_fiction")}, AttributeError, "no array 'geom_fiction'"),
-        ({"reward": lambda self, s: s.joint_qpos(".*")[:, 0]}, ValueError, "name a free or ball joint alone"),
-        ({"reward": lambda self, s: s.sensor("unread")[:, 0], "engine": "compiled"}, ValueError, "'unread'"),
-    ],
-)
-def test_wrong_tasks_are_refused(changes, error, message):
-    options = {"engine": changes["engine"]} if "engine" in changes else {}
-    entries = {name: value for name, value in {**BASE, **changes}.items() if value is not None and name != "engine"}
-    with pytest.raises(error, match=message):
-        type("Wrong", (LocoEnv,), entries)(4, "cpu", seed=0, **options)
+WRONG = [
+    ({"reward": None}, TypeError, "must define reward"),
+    ({"config": None}, TypeError, "must set config"),
+    ({"model": "nowhere.xml"}, FileNotFoundError, "no model 'nowhere.xml'"),
+    ({"reward": lambda self, s: s.qpos}, ValueError, r"must return shape \(4,\)"),
+    ({"reward": lambda self, s: {"a": s.time, "b": 0.0}}, TypeError, r"reward\['b'\] must return a tensor"),
+    ({"terminated": lambda self, s: s.time}, TypeError, "must return a bool tensor"),
+    ({"observation": lambda self, s: {"reward": s.qpos}}, ValueError, "'reward' is no name"),
+    ({"observation": lambda self, s: s.action}, ValueError, "keep what you need of it in memory"),
+    ({"update": lambda self, s: {"command": s.time}}, ValueError, "which has no entries"),
+    ({"memory": {"comand": 3}, "events": lambda self, s: {"command": s.time}}, ValueError, "did you mean 'comand'"),
+    ({"memory": {"a": 3}, "events": lambda self, s: {"a": s.qpos}}, ValueError, r"a of shape \(4, 3\)"),
+    ({"memory": {"qpos": 3}}, ValueError, "'qpos' is taken"),
+    ({"memory": {"a": 0}}, ValueError, "sizes of 1 or more"),
+    ({"begin": lambda self, s: {"qpos": s.home / 0}}, ValueError, "not finite"),
+    ({"control": lambda self, s, action: action[:, :2]}, ValueError, r"shape \(4, 8\)"),
+    ({"action_range": (0, 1)}, ValueError, r"must be \(-1, 1\) or"),
+    ({"action_range": (-math.inf, math.inf)}, TypeError, "must define control"),
+    ({"reward": lambda self, s: s.xpos("trunc")[:, 0]}, KeyError, "did you mean 'trunk'"),
+    ({"reward": lambda self, s: s.qvel.add_(1.0)[:, 0]}, ValueError, r"reward writes to s\.qvel"),
+    ({"reward": lambda self, s: setattr(self, "last", s.time) or s.time}, ValueError, r"reward sets self\.last"),
+    ({"reward": lambda self, s: {}}, ValueError, "tensors by name"),
+    ({"observation": lambda self, s: {"memory": s.qpos}}, ValueError, "'memory' is no name"),
+    ({"memory": {"a": 4}, "begin": lambda self, s: {"a": s.time}}, ValueError, r"a of shape \(4, 4\)"),
+    ({"reward": lambda self, s: s.comand}, AttributeError, "the memory has no entries"),
+    ({"reward": lambda self, s: s.model("geom_fiction")}, AttributeError, "no array 'geom_fiction'"),
+    ({"reward": lambda self, s: s.joint_qpos(".*")[:, 0]}, ValueError, "name a free or ball joint alone"),
+    ({"reward": lambda self, s: s.sensor("unread")[:, 0], "engine": "compiled"}, ValueError, "'unread'"),
+]
+
+
+def test_wrong_tasks_are_refused():
+    for changes, error, message in WRONG:
+        options = {"engine": changes["engine"]} if "engine" in changes else {}
+        entries = {name: value for name, value in {**BASE, **changes}.items() if value is not None and name != "engine"}
+        with pytest.raises(error, match=message):
+            type("Wrong", (LocoEnv,), entries)(4, "cpu", seed=0, **options)
 
 
 def test_a_sensor_of_forces_is_asked_of_mujoco_warp():
@@ -520,22 +544,3 @@ def test_the_model_as_text_path_and_spec(tmp_path, monkeypatch):
     assert spec.sensor("unread") is not None  # it stays as it was
     assert envs[0].sim.mj_model.nsensor == 0
     assert envs[0].mj_model.nsensor == 11
-
-
-# tolerance in torch.
-
-
-@pytest.mark.parametrize("sigmoid", torchrl_loco.envs.tolerance.SIGMOIDS)
-def test_tolerance_is_dm_controls(sigmoid):
-    x = np.linspace(-4, 6, 401)
-    for lower, upper, margin, value in ((0, 1, 2, 0.3), (1, np.inf, 0.5, 0.1), (-np.inf, 0.5, 1, 0.7), (0, 1, 0, 0.1)):
-        ours = tolerance(torch.tensor(x), (lower, upper), margin, sigmoid, value)
-        expected = [numpy_tolerance(each, lower, upper, margin, sigmoid, value) for each in x]
-        np.testing.assert_allclose(ours.numpy(), expected, rtol=0, atol=1e-9)
-
-
-def test_tolerance_refuses_what_is_not_valid():
-    x = torch.zeros(2)
-    for arguments in ({"bounds": (1, 0)}, {"margin": -1}, {"sigmoid": "lineer"}, {"value_at_margin": 0.0, "margin": 1}):
-        with pytest.raises(ValueError, match=r"bounds|margin|did you mean 'linear'|value_at_margin"):
-            tolerance(x, **arguments)

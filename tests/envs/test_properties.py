@@ -5,7 +5,7 @@ import numpy as np
 import oracle
 import pytest
 import torch
-from cases import BODIES, MODELS
+from cases import BODIES, MODELS, TASKS
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 WORLDS = 5
 SETTINGS = hypothesis.settings(
-    max_examples=25,
+    max_examples=100,
     deadline=None,
     derandomize=True,
     suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture],  # the environment is shared anyway
@@ -25,14 +25,12 @@ seeds = st.integers(0, 2**32 - 1)
 masks = st.lists(st.booleans(), min_size=WORLDS, max_size=WORLDS).map(torch.tensor)
 
 
-@pytest.fixture(params=BODIES)
-def body_task(request):
-    return request.param
+bodies = st.sampled_from(BODIES)
 
 
 @pytest.fixture
-def env(shared, body_task):
-    return shared(body_task, WORLDS, reward_terms=True, on_overflow="ignore")
+def made(shared):
+    return lambda task: shared(task, WORLDS, reward_terms=True, on_overflow="ignore")
 
 
 def states(env, seed, spread):
@@ -49,10 +47,10 @@ def states(env, seed, spread):
 
 
 @SETTINGS
-@hypothesis.given(seed=seeds, spread=st.floats(0, 20), loudness=st.floats(0, 100))
-def test_rewards_and_terms(shared, task, seed, spread, loudness):
+@hypothesis.given(task=st.sampled_from(TASKS), seed=seeds, spread=st.floats(0, 20), loudness=st.floats(0, 100))
+def test_rewards_and_terms(made, task, seed, spread, loudness):
     """Rewards and terms lie in [0, 1] and the terms multiply to the reward, from any state and for any action."""
-    env = shared(task, WORLDS, reward_terms=True, on_overflow="ignore")
+    env = made(task)
     td = env.reset(states(env, seed, spread), set_state=True)
     action = torch.randn(env.action_spec.shape, generator=torch.Generator().manual_seed(seed)) * loudness
     after = env.step(td.set("action", action))["next"]
@@ -65,15 +63,16 @@ def test_rewards_and_terms(shared, task, seed, spread, loudness):
 
 
 @SETTINGS
-@hypothesis.given(seed=seeds, spread=st.floats(0, 3))
-def test_observation_and_state_are_what_was_set(env, body_task, seed, spread):
+@hypothesis.given(task=bodies, seed=seeds, spread=st.floats(0, 3))
+def test_observation_and_state_are_what_was_set(made, task, seed, spread):
     """get_state after set_state is the identity, and the observation is C MuJoCo's of that state."""
+    env = made(task)
     state = states(env, seed, spread)
     td = env.reset(state, set_state=True)
     now = env.get_state()
     assert torch.equal(now["qpos"], state["qpos"])
     assert torch.equal(now["qvel"], state["qvel"])
-    reference = oracle.Oracle(body_task, MODELS[env.body])
+    reference = oracle.Oracle(task, MODELS[env.body])
     for world in range(WORLDS):
         row = {key: now[key][world].double().numpy() for key in ("qpos", "qvel", "act") if key in now}
         expected = reference.observation(env.protocol, **row)
@@ -82,9 +81,10 @@ def test_observation_and_state_are_what_was_set(env, body_task, seed, spread):
 
 
 @SETTINGS
-@hypothesis.given(seed=seeds, mask=masks, spread=st.floats(0, 3))
-def test_masked_reset_touches_only_its_worlds(env, seed, mask, spread):
+@hypothesis.given(task=bodies, seed=seeds, mask=masks, spread=st.floats(0, 3))
+def test_masked_reset_touches_only_its_worlds(made, task, seed, mask, spread):
     hypothesis.assume(mask.any())
+    env = made(task)
     td = env.reset(states(env, seed, spread), set_state=True)
     td = env.step(td.set("action", env.action_spec.zero()))["next"].exclude("reward")
     before = env.get_state()
@@ -100,9 +100,12 @@ def test_masked_reset_touches_only_its_worlds(env, seed, mask, spread):
 
 
 @SETTINGS
-@hypothesis.given(seed=seeds, mask=masks, bad=st.sampled_from([float("nan"), float("inf"), -float("inf"), 1e30]))
-def test_bad_actions_stay_in_their_worlds(env, seed, mask, bad):
+@hypothesis.given(
+    task=bodies, seed=seeds, mask=masks, bad=st.sampled_from([float("nan"), float("inf"), -float("inf"), 1e30])
+)
+def test_bad_actions_stay_in_their_worlds(made, task, seed, mask, bad):
     """Beside any set of bad worlds, the others do bitwise what they do beside none; 1e30 is clipped."""
+    env = made(task)
     state = states(env, seed, 1.0)
     good = torch.rand(env.action_spec.shape, generator=torch.Generator().manual_seed(seed)) * 2 - 1
     spoilt = good.clone()

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from cases import MODELS
+from cases import KINDS, MODELS
 from oracle import DATA, FORCES, Oracle
 from tensordict import TensorDict
 
@@ -14,8 +14,10 @@ from torchrl_loco.sim import models
 SIGNIFICANCE = 1e-4
 # Under playground the humanoid draws nothing.
 DRAWING = [
-    *(("walker_run", "playground"), ("humanoid_run", "dm_control"), ("hopper_hop", "playground")),
-    ("quadruped_run", "dm_control"),
+    *(("cpu", "walker_run", "playground"), ("cpu", "humanoid_run", "dm_control"), ("cpu", "hopper_hop", "playground")),
+    ("cpu", "quadruped_run", "dm_control"),
+    pytest.param("cuda", "humanoid_run", "dm_control", marks=pytest.mark.gpu),
+    pytest.param("cuda", "quadruped_run", "dm_control", marks=pytest.mark.gpu),
 ]
 
 
@@ -53,20 +55,13 @@ def draws(shared):
 
 
 @pytest.mark.parametrize(
-    ("task", "protocol", "engine"),
+    ("device", "task", "protocol", "engine"),
     [
-        ("walker_run", "playground", "compiled"),
-        ("humanoid_run", "dm_control", "compiled"),
-        ("humanoid_run", "playground", "compiled"),
-        ("humanoid_run", "dm_control", "mujoco_warp"),
-        ("cheetah_run", "playground", "compiled"),
-        ("cheetah_run", "dm_control", "mujoco_warp"),
-        ("hopper_hop", "dm_control", "compiled"),
-        ("hopper_hop", "playground", "mujoco_warp"),
-        ("quadruped_run", "dm_control", "mujoco_warp"),
-        ("dog_follow", "playground", "compiled"),
-        ("dog_follow", "playground", "mujoco_warp"),
-        ("walker_blindly", "playground", "compiled"),
+        *(("cpu", *kind) for kind in KINDS),
+        ("cpu", "cheetah_run", "playground", "compiled"),
+        ("cpu", "dog_follow", "playground", "mujoco_warp"),
+        ("cpu", "walker_blindly", "playground", "compiled"),
+        *(pytest.param("cuda", *kind, marks=pytest.mark.gpu) for kind in KINDS),
     ],
 )
 def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol, engine, device, actions):
@@ -102,9 +97,9 @@ def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["walker_walk", "hopper_stand"])
-def test_planar_bodies_start_uniformly(draws, task, device):
+def test_planar_bodies_start_uniformly(draws, task):
     body = task.split("_")[0]
-    qpos = draws(task, 4096, 1, seed=12, device=device)[0].numpy().astype(np.float64)
+    qpos = draws(task, 4096, 1, seed=12)[0].numpy().astype(np.float64)
     model = models.load(MODELS[body])
     assert (qpos[:, :2] == 0).all()
     ranges = [(-np.pi, np.pi), *model.jnt_range[3:]]
@@ -118,27 +113,27 @@ def test_planar_bodies_start_uniformly(draws, task, device):
     assert from_one_distribution(qpos[:, 2:], np.load(DATA / f"{body}_resets_dm_control.npz")["qpos"][:, 2:])
 
 
-@pytest.mark.parametrize("lowered", [0.0, 0.2])
-def test_a_hopper_feels_the_ground_before_its_first_step(shared, engine, lowered, device):
+def test_a_hopper_feels_the_ground_before_its_first_step(shared, engine):
     """What C MuJoCo finds without control, and not the forces of the episode before."""
-    env = shared("hopper_hop", 64, device, protocol="dm_control", engine=engine)
-    env.rollout(30, break_when_any_done=False)
-    td, state = env.reset(), env.get_state()
-    if lowered:
-        state["qpos"][:, 1] -= lowered
-        td = env.reset(state, set_state=True)
+    env = shared("hopper_hop", 64, protocol="dm_control", engine=engine)
     reference = Oracle("hopper_hop", env.model)
-    rows = zip(*(state[key].cpu().double().numpy() for key in ("qpos", "qvel")), strict=True)
-    expected = np.array([reference.observation("dm_control", *row) for row in rows])
-    error = np.abs(td["observation"].cpu().numpy() - expected)[:, FORCES["hopper"]].max(axis=1)
-    assert (expected[:, FORCES["hopper"]] > 0).any() == (lowered > 0)
-    assert np.quantile(error, 0.95) < 1e-4
+    for lowered in (0.0, 0.2):
+        env.rollout(30, break_when_any_done=False)
+        td, state = env.reset(), env.get_state()
+        if lowered:
+            state["qpos"][:, 1] -= lowered
+            td = env.reset(state, set_state=True)
+        rows = zip(*(state[key].double().numpy() for key in ("qpos", "qvel")), strict=True)
+        expected = np.array([reference.observation("dm_control", *row) for row in rows])
+        error = np.abs(td["observation"].numpy() - expected)[:, FORCES["hopper"]].max(axis=1)
+        assert (expected[:, FORCES["hopper"]] > 0).any() == (lowered > 0)
+        assert np.quantile(error, 0.95) < 1e-4
 
 
 @pytest.mark.slow
-def test_quadruped_starts_just_above_the_floor(draws, device):
+def test_quadruped_starts_just_above_the_floor(draws):
     """In any orientation, 1 cm above the highest place of a centimeter grid where C MuJoCo finds a contact."""
-    qpos = draws("quadruped_run", 2048, 1, seed=5, protocol="dm_control", device=device)[0].numpy().astype(np.float64)
+    qpos = draws("quadruped_run", 2048, 1, seed=5, protocol="dm_control")[0].numpy().astype(np.float64)
     model = models.load(MODELS["quadruped"])
     assert (qpos[:, :2] == 0).all()
     assert (qpos[:, 7:] == 0).all()
@@ -158,9 +153,9 @@ def test_quadruped_starts_just_above_the_floor(draws, device):
 
 
 @pytest.mark.slow
-def test_humanoid_starts_free_of_contact(draws, device):
+def test_humanoid_starts_free_of_contact(draws):
     """dm_control's start, judged by C MuJoCo, with the distribution that dm_control recorded."""
-    qpos = draws("humanoid_walk", 2048, 1, seed=5, protocol="dm_control", device=device)[0].numpy().astype(np.float64)
+    qpos = draws("humanoid_walk", 2048, 1, seed=5, protocol="dm_control")[0].numpy().astype(np.float64)
     model = models.load(MODELS["humanoid"])
     data = mujoco.MjData(model)
     for q in qpos:
@@ -174,12 +169,12 @@ def test_humanoid_starts_free_of_contact(draws, device):
 
 
 @pytest.mark.slow
-def test_cheetah_starts_settled(shared, engine, device):
+def test_cheetah_starts_settled(shared, engine):
     """It stands on the floor, nearly at rest, with the distribution that dm_control recorded."""
-    env = shared("cheetah_run", 64, device, protocol="dm_control", engine=engine)
+    env = shared("cheetah_run", 64, protocol="dm_control", engine=engine)
     states, record = env.initial_states(), np.load(DATA / "cheetah_resets_dm_control.npz")
     assert from_one_distribution(states, np.concatenate([record["qpos"], record["qvel"]], axis=1))
-    observation, start = env.reset()["observation"].cpu(), env.get_state().cpu()
+    observation, start = env.reset()["observation"], env.get_state()
     assert torch.equal(observation, torch.cat([start["qpos"][:, 1:], start["qvel"]], dim=1))
     assert len(start["qpos"].unique(dim=0)) > 48
     assert (start["qvel"] != 0).any()
@@ -198,7 +193,7 @@ def test_humanoid_playground_start_is_the_default_pose(draws):
     assert torch.equal(qpos, expected.expand_as(qpos))
 
 
-@pytest.mark.parametrize(("task", "protocol"), DRAWING)
+@pytest.mark.parametrize(("device", "task", "protocol"), DRAWING)
 def test_a_world_draws_from_seed_world_and_episode_alone(shared, draws, task, protocol, device):
     few, many = (draws(task, n, 3, seed=9, protocol=protocol, device=device) for n in (3, 64))
     assert torch.equal(few, many[:, :3])
@@ -215,16 +210,6 @@ def test_a_world_draws_from_seed_world_and_episode_alone(shared, draws, task, pr
         env.reset(TensorDict({"_reset": mask, "done": mask}, batch_size=[3], device=device))
         assert torch.equal(env.get_state()["qpos"][1].cpu(), few[episode, 1])
         assert torch.equal(env.get_state()["qpos"][0].cpu(), few[0, 0])
-
-
-def test_set_seed_starts_the_streams_again(shared):
-    env = shared(seed=1)
-    first = env.reset()["observation"]
-    env.reset()
-    env.set_seed(1)
-    assert torch.equal(env.reset()["observation"], first)
-    env.set_seed(2)
-    assert not torch.equal(env.reset()["observation"], first)
 
 
 def test_no_global_generator_is_read_or_seeded():

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cases import BODIES
+from cases import KINDS
 from compare import assert_repeats
 from tensordict import TensorDict
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv
@@ -21,47 +21,43 @@ def walk(env, td, moves):
 
 def assert_same(one, other):
     assert set(one.keys()) == set(other.keys())
-    assert set(State.KEYS) - set(one.keys()) <= {"act", "memory"}  # of bodies that have none
+    assert set(State.KEYS) - set(one.keys()) <= {"act", "memory", "model"}  # of bodies that have none
     assert (one == other).all()
 
 
 @pytest.mark.parametrize(
-    ("task", "protocol", "engine"),
+    ("device", "task", "protocol", "engine"),
     [
-        ("walker_run", "playground", "compiled"),
-        ("humanoid_run", "dm_control", "compiled"),
-        ("humanoid_run", "dm_control", "mujoco_warp"),
-        ("quadruped_run", "dm_control", "mujoco_warp"),
-        ("dog_follow", "playground", "compiled"),
-        ("dog_follow", "playground", "mujoco_warp"),
-        ("walker_backwards", "playground", "compiled"),
+        *(("cpu", *kind) for kind in KINDS),
+        ("cpu", "dog_follow", "playground", "mujoco_warp"),
+        ("cpu", "walker_backwards", "playground", "compiled"),
+        *(pytest.param("cuda", *kind, marks=pytest.mark.gpu) for kind in KINDS),
     ],
 )
-@pytest.mark.parametrize("transformed", [False, True])
-def test_restores_the_continuation(shared, task, protocol, engine, device, actions, transformed):
-    """Bitwise; across a time limit, so that step count and random counter take part."""
-    env = shared(task, 4, device, protocol=protocol, engine=engine, episode_length=9)
-    if transformed:
-        env = TransformedEnv(env, Compose(InitTracker(), RewardSum(), StepCounter()))
-    moves = actions(env, 10)
-    td = env.reset()
-    _, td = env.step_and_maybe_reset(td.set("action", moves[0]))
-    state = env.get_state()
-    assert isinstance(state, State)
-    kept = state.clone()
-    first = walk(env, td, moves)
-    assert first["truncated"].sum() == 4
-    assert_same(state, kept)  # it is a copy
-    for _ in range(2):  # a state can be restored again
-        second = walk(env, env.reset(state, set_state=True), moves)
-        for key in ("observation", "reward", "done", "truncated"):
-            assert_repeats(first[key], second[key], engine)
-        state = kept.clone()  # TransformedEnv writes into what it is given
+def test_restores_the_continuation(shared, task, protocol, engine, device, actions):
+    """Bitwise; across a time limit, so that step count and random counter take part; and under transforms."""
+    base = shared(task, 4, device, protocol=protocol, engine=engine, episode_length=9)
+    for env in (base, TransformedEnv(base, Compose(InitTracker(), RewardSum(), StepCounter()))):
+        moves = actions(env, 10)
+        td = env.reset()
+        _, td = env.step_and_maybe_reset(td.set("action", moves[0]))
+        state = env.get_state()
+        assert isinstance(state, State)
+        kept = state.clone()
+        first = walk(env, td, moves)
+        assert first["truncated"].sum() == 4
+        assert_same(state, kept)  # it is a copy
+        for _ in range(2):  # a state can be restored again
+            second = walk(env, env.reset(state, set_state=True), moves)
+            for key in ("observation", "reward", "done", "truncated"):
+                assert_repeats(first[key], second[key], engine)
+            state = kept.clone()  # TransformedEnv writes into what it is given
 
 
-def test_restores_the_worlds_of_a_mask_only(shared, body_task):
+def test_restores_the_worlds_of_a_mask_only(shared, kind):
     """What stands in the rows of the other worlds does not matter."""
-    env = shared(body_task)
+    task, protocol, engine = kind
+    env = shared(task, protocol=protocol, engine=engine)
     env.reset()
     old = env.get_state()
     env.rollout(5, auto_reset=False, tensordict=env.reset())
@@ -150,18 +146,19 @@ def test_a_restored_state_is_not_returned(shared):
     state = env.get_state()
     td = env.reset(state, set_state=True)
     assert not set(State.KEYS) & set(td.keys())
-    assert set(state.keys()) == set(State.KEYS) - {"act", "memory"}
+    assert set(state.keys()) == set(State.KEYS) - {"act", "memory", "model"}
     assert env.reset(State(state.to_dict(), batch_size=[4]), set_state=True).device == env.device
     td = torchrl_loco.TransformedEnv(env, InitTracker()).reset(state, set_state=True)
     assert not set(State.KEYS) & set(td.keys())
-    assert set(state.keys()) == set(State.KEYS) - {"act", "memory"}
+    assert set(state.keys()) == set(State.KEYS) - {"act", "memory", "model"}
     assert TransformedEnv(env, InitTracker()).reset(state, set_state=True) is state  # TorchRL's own
 
 
-@pytest.mark.parametrize("body_task", BODIES)  # a task in torch may draw other numbers in each world
-def test_branches_are_copies(shared, body_task, actions):
+@pytest.mark.parametrize("kind", KINDS[:3], ids="-".join)  # a task in torch may draw other numbers in each world
+def test_branches_are_copies(shared, kind, actions):
     """All worlds go on from one world's moment: the same actions lead to the same steps, different ones do not."""
-    env = shared(body_task)
+    task, protocol, engine = kind
+    env = shared(task, protocol=protocol, engine=engine)
     td = env.reset()
     for action in actions(env, 5):
         td = env.step(td.set("action", action))["next"]
@@ -175,7 +172,7 @@ def test_branches_are_copies(shared, body_task, actions):
     assert (trace["observation"] == trace["observation"][:, :1]).all()
     trace = walk(env, env.reset(branch, set_state=True), actions(env, 3, seed=1))
     assert (trace["observation"][-1, 0] != trace["observation"][-1, 1]).any()
-    other = shared(body_task, 3)
+    other = shared(task, 3, protocol=protocol, engine=engine)
     other.reset(state.branch(-1, 3), set_state=True)
     assert torch.equal(other.get_state()["qpos"], state["qpos"][-1:].expand(3, -1))
     branch["qpos"][0] += 1.0  # each has its own memory
@@ -193,9 +190,11 @@ def test_a_file_is_read_without_executing_code(shared, tmp_path):
     assert (torch.load(tmp_path / "state.pt") == env.get_state()).all()
 
 
-def test_state_dict_goes_on_in_another_environment(shared, body_task, actions):
+def test_state_dict_goes_on_in_another_environment(shared, kind, actions):
     """With the seed: what is drawn at the next resets is the same too."""
-    first, second = (shared(body_task, 3, seed=seed, copy=seed, episode_length=4) for seed in (5, 6))
+    task, protocol, engine = kind
+    options = {"protocol": protocol, "engine": engine, "episode_length": 4}
+    first, second = (shared(task, 3, seed=seed, copy=seed, **options) for seed in (5, 6))
     moves = actions(first, 10)
     td = first.reset()
     _, td = first.step_and_maybe_reset(td.set("action", moves[0]))

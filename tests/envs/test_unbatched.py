@@ -3,22 +3,31 @@
 import pytest
 import torch
 from cases import coarse
-from compare import assert_repeats
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, check_env_specs
 
 import torchrl_loco
 from torchrl_loco import RolloutCollector
 
+CASES = [("walker_run", "cpu"), ("dog_follow", "cpu"), pytest.param(("walker_run", "cuda"), marks=pytest.mark.gpu)]
+
+
+@pytest.fixture(params=CASES)
+def made(request, shared):
+    """Makes environments of one task on one device, of any number of worlds."""
+    task, device = request.param
+    return lambda num_envs: shared(task, num_envs, device, episode_length=5, reward_terms=True, **coarse(task))
+
 
 @pytest.fixture
-def env(shared, body_task, device):
-    return shared(body_task, None, device, episode_length=5, reward_terms=True, **coarse(body_task))
+def env(made):
+    return made(None)
 
 
 def test_specs(env):
     assert env.batch_size == ()
     assert env.num_envs == 1
+    assert "num_envs=None" in repr(env)
     check_env_specs(env)
     check_env_specs(torchrl_loco.TransformedEnv(env, Compose(InitTracker(), RewardSum(), StepCounter())))
 
@@ -27,10 +36,9 @@ def play(moves):
     return TensorDictModule(lambda observation: next(moves), in_keys=["observation"], out_keys=["action"])
 
 
-def test_same_data_as_one_world_in_a_batch(env, shared, body_task, device, actions):
+def test_same_data_as_one_world_in_a_batch(env, made, actions):
     """To the bit, across the end of an episode, with rendering and health."""
-    one = shared(body_task, 1, device, episode_length=5, reward_terms=True, **coarse(body_task))
-    moves, results = actions(env, 12), []
+    one, moves, results = made(1), actions(env, 12), []
     for each, action in ((env, moves), (one, moves.unsqueeze(1))):
         steps = iter(action)
         td = each.rollout(12, play(steps), break_when_any_done=False)
@@ -38,10 +46,10 @@ def test_same_data_as_one_world_in_a_batch(env, shared, body_task, device, actio
     assert results[0].shape == (12,)
     assert results[0]["next", "truncated"].sum() == 2
     for key in results[0].keys(True, True):
-        assert_repeats(*(td[key] for td in results))
+        assert torch.equal(*(td[key] for td in results)), key
     pixels = env.render(width=16, height=12)
     assert pixels.shape == (12, 16, 3)
-    assert device == "cuda" or torch.equal(pixels, one.render(width=16, height=12)[0])
+    assert env.device.type == "cuda" or torch.equal(pixels, one.render(width=16, height=12)[0])
     assert env.health()["worlds"].batch_size == (1,)
 
 
@@ -52,27 +60,20 @@ def test_rollout_and_collector(env):
     assert [batch.shape for batch in batches] == [(8,), (8,)]
 
 
-def test_state(env, shared, body_task, device):
-    env.rollout(3)
+def test_states_and_masks(env, made):
+    td = env.rollout(2)[-1]["next"].exclude("reward", "reward_terms")
     state = env.get_state()
     assert state.batch_size == ()
     env.reset()
     env.reset(state, set_state=True)
-    now = env.get_state()
-    assert (now == state).all()
+    assert (env.get_state() == state).all()
     env.load_state_dict(env.state_dict())
-    many = shared(body_task, 3, device, **coarse(body_task))
+    many = made(3)
     many.reset(state.branch(0, 3), set_state=True)
     assert torch.equal(many.get_state()["qpos"], state["qpos"].expand(3, -1))
 
-
-def test_masks(env):
-    td = env.rollout(2)[-1]["next"].exclude("reward", "reward_terms")
     kept = env.reset(td.clone().set("_reset", torch.zeros(1, dtype=torch.bool, device=env.device)))
     assert torch.equal(kept["observation"], td["observation"])
+    assert (env.get_state() == state).all()
     env.reset(td.clone().set("_reset", torch.ones(1, dtype=torch.bool, device=env.device)))
     assert env.get_state()["elapsed_steps"] == 0
-
-
-def test_repr(env):
-    assert "num_envs=None" in repr(env)

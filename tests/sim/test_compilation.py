@@ -20,11 +20,12 @@ def count(total: wp.array[int]):
 
 # MuJoCo-Warp without and with a condition in the solver.
 @pytest.mark.parametrize(
-    ("body", "protocol", "engine", "launches"),
+    ("device", "body", "protocol", "engine", "launches"),
     [
-        ("walker", "playground", "compiled", 1),
-        ("walker", "playground", "mujoco_warp", 100),
-        ("humanoid", "dm_control", "mujoco_warp", 100),
+        ("cpu", "walker", "playground", "compiled", 1),
+        ("cpu", "walker", "playground", "mujoco_warp", 100),
+        ("cpu", "humanoid", "dm_control", "mujoco_warp", 100),
+        pytest.param("cuda", "humanoid", "dm_control", "mujoco_warp", 100, marks=pytest.mark.gpu),
     ],
 )
 def test_a_step_finds_every_kernel_compiled(body, protocol, engine, launches, device, monkeypatch):

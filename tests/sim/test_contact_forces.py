@@ -39,6 +39,12 @@ STACK = """
 """
 
 
+@pytest.fixture
+def device():
+    """One of the tests is run on CUDA too."""
+    return "cpu"
+
+
 @pytest.fixture(params=["traced", "lanes", "mujoco_warp"])
 def simulated(request, monkeypatch, device):
     """Makes simulations with each engine, and with both forms of the compiled step; quickly compiled."""
@@ -70,6 +76,7 @@ def in_c_mujoco(sim, world, substeps=0):
     return data
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_forces_of_a_last_substep_and_of_a_state_are_those_of_c_mujoco(simulated):
     """From where everything lies and leans, with a velocity that differs from world to world."""
     geoms = [6, 0, 3, 1, 4]
@@ -90,21 +97,21 @@ def test_forces_of_a_last_substep_and_of_a_state_are_those_of_c_mujoco(simulated
     assert len(contacts) == 4  # all but the arm
 
 
-@pytest.mark.parametrize("condim", [1, 3])
-def test_what_lies_still_feels_what_lies_on_it(simulated, condim):
+def test_what_lies_still_feels_what_lies_on_it(simulated):
     """A ball with another on it, a capsule with two contacts, and one that hangs on a spring."""
-    sim = simulated(STACK.format(condim=condim), ctrl_dt=0.02, contact_geoms=range(5))
-    sim.reset(every_world(sim))
-    for _ in range(60):
-        sim.step()
-    up = 9.81 * np.array([-6, 2, 3, 1, 0])
-    np.testing.assert_allclose(sim.contact_force[0, :, 2].cpu(), up, atol=2e-2)
-    np.testing.assert_allclose(sim.contact_force[0, :, :2].cpu(), 0.0, atol=2e-2)
-    assert sim.in_contact.tolist() == [[True, True, True, True, False]]
-    sim.qpos[0, 2] += 1.0  # the lower ball is lifted, and so only the two others touch
-    sim.forward(every_world(sim))
-    assert sim.in_contact.tolist() == [[True, False, False, True, False]]
-    assert sim.contact_force[0, [1, 2, 4]].abs().max() == 0.0
+    for condim in (1, 3):
+        sim = simulated(STACK.format(condim=condim), ctrl_dt=0.02, contact_geoms=range(5))
+        sim.reset(every_world(sim))
+        for _ in range(60):
+            sim.step()
+        up = 9.81 * np.array([-6, 2, 3, 1, 0])
+        np.testing.assert_allclose(sim.contact_force[0, :, 2], up, atol=2e-2)
+        np.testing.assert_allclose(sim.contact_force[0, :, :2], 0.0, atol=2e-2)
+        assert sim.in_contact.tolist() == [[True, True, True, True, False]]
+        sim.qpos[0, 2] += 1.0  # the lower ball is lifted, and so only the two others touch
+        sim.forward(every_world(sim))
+        assert sim.in_contact.tolist() == [[True, False, False, True, False]]
+        assert sim.contact_force[0, [1, 2, 4]].abs().max() == 0.0
 
 
 def test_other_worlds_keep_their_forces(simulated):

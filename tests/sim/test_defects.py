@@ -1,5 +1,8 @@
 """Wrong answers that were found in the compiled step, one by one, and what it refuses since."""
 
+import itertools
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from torchrl_loco.sim.compiled.symbols import array, names, scalar
 from torchrl_loco.sim.overflow import Overflow
 from torchrl_loco.sim.simulation import choose_engine
 
+DATA = Path(__file__).parents[1] / "data"
 LIMBS = """
 <mujoco>
   <option timestep="0.004" iterations="100" ls_iterations="50"/>
@@ -34,14 +38,6 @@ LIMBS = """
 </mujoco>
 """
 """A sphere with a limb of two hinges over a floor."""
-
-
-@pytest.fixture(params=[31, 0], ids=["traced", "lanes"], autouse=True)
-def form(request, monkeypatch):
-    """Takes one of the two forms of the compiled step for any model; compiled without optimisation, it is quick."""
-    monkeypatch.setattr(step, "TRACED_DOFS", request.param)
-    monkeypatch.setattr(wp.config, "optimization_level", 0)
-    return "traced" if request.param else "lanes"
 
 
 def limbs(*replaced):
@@ -79,30 +75,14 @@ def errors(model, states):
 # What is refused.
 
 
-@pytest.mark.parametrize(
-    "actuator",
-    [
-        '<pid name="m1" joint="h1" kp="2" ki="1"/>',
-        '<pid name="m1" joint="h1" kp="2"/>',
-        '<motor joint="h2"/><pid name="m1" joint="h1" kp="2" ki="1"/>',
-    ],
-)
-def test_an_actuator_with_several_controls_is_named(actuator):
+def test_an_actuator_with_several_controls_is_named():
     """There are more controls than actuators."""
-    model = limbs(('<motor name="m1" joint="h1" gear="2" ctrlrange="-1 1"/>', actuator))
-    assert model.nu > model.nactuator
-    assert "actuator 'm1': other than one control" in unsupported(model)
-    config = SimConfig(
-        ctrl_dt=0.004,
-        sim_dt=0.004,
-        naconmax=64,
-        njmax=64,
-        iterations=10,
-        ls_iterations=10,
-        euler_damping=True,
-        engine="auto",
-    )
-    assert choose_engine(model, config)[0] == "mujoco_warp"
+    pid = '<pid name="m1" joint="h1" kp="2" ki="1"/>'
+    for actuator in (pid, '<pid name="m1" joint="h1" kp="2"/>', f'<motor joint="h2"/>{pid}'):
+        model = limbs(('<motor name="m1" joint="h1" gear="2" ctrlrange="-1 1"/>', actuator))
+        assert model.nu > model.nactuator
+        assert "actuator 'm1': other than one control" in unsupported(model)
+        assert choose_engine(model, SimConfig(ctrl_dt=0.004, sim_dt=0.004))[0] == "mujoco_warp"
 
 
 def test_a_model_that_cannot_be_read_is_not_supported(monkeypatch):
@@ -113,7 +93,7 @@ def test_a_model_that_cannot_be_read_is_not_supported(monkeypatch):
 # What a step does.
 
 
-def test_actuators_of_a_disabled_group_do_not_act():
+def test_actuators_of_a_disabled_group_do_not_act(form):
     group = ('<motor name="m1"', '<motor name="m1" group="1"')
     model = limbs(group, ('timestep="0.004"', 'timestep="0.004" actuatorgroupdisable="1"'))
     states = falling(model)
@@ -122,7 +102,7 @@ def test_actuators_of_a_disabled_group_do_not_act():
     assert np.abs(compiled_step(model, states).qvel.numpy() - np.array(acting)).max() > 0.1
 
 
-def test_a_light_body_is_moved():
+def test_a_light_body_is_moved(form):
     """Its inertia is below what rounding leaves of one."""
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><option gravity="0 0 0"/><worldbody><body name="a"><joint name="h" axis="0 1 0" springref="1" '
@@ -136,7 +116,7 @@ def test_a_light_body_is_moved():
     np.testing.assert_allclose(compiled_step(model, states).qvel.numpy(), expected, rtol=1e-5)
 
 
-def test_joints_that_do_the_same_are_traced():
+def test_joints_that_do_the_same_are_traced(form):
     """The mass matrix is singular, which is C MuJoCo's to warn of; constants of it are not divided by zero."""
     joints = '<joint axis="0 0 1"/><joint axis="0 0 1"/>'
     model = mujoco.MjModel.from_xml_string(
@@ -146,19 +126,21 @@ def test_joints_that_do_the_same_are_traced():
     assert step.source(model, 1)
 
 
-@pytest.mark.parametrize("shape", ["box", "cylinder", "capsule", "ellipsoid", "sphere"])
-def test_a_site_beside_a_contact_feels_nothing(shape):
+def test_a_site_feels_its_contact_and_none_beside_it(form):
     """The ray of a contact along an axis of the site runs beside it, as long as it may be."""
-    sites = [f'<site name="s{i}" type="{shape}" size=".12 .12 .12" pos="{i} 0 0"/>' for i in range(2)]
+    shapes = ("box", "cylinder", "capsule", "ellipsoid", "sphere")
+    names = [f"{shape}{i}" for shape in shapes for i in range(2)]
+    sites = [f'<site name="{name}" type="{name[:-1]}" size=".12 .12 .12" pos="{name[-1]} 0 0"/>' for name in names]
+    touches = "".join(f'<touch site="{name}"/>' for name in names)
     model = mujoco.MjModel.from_xml_string(
         f'<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body name="a" pos="0 0 .0999"><joint type="slide" '
-        f'axis="0 0 1"/><geom size=".1"/>{"".join(sites)}</body></worldbody><sensor><subtreelinvel body="a"/>'
-        '<touch site="s0"/><touch site="s1"/></sensor></mujoco>'
+        f'axis="0 0 1"/><geom size=".1"/>{"".join(sites)}</body></worldbody><sensor><subtreelinvel body="a"/>{touches}'
+        "</sensor></mujoco>"
     )
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)
-    assert data.sensordata[3] > 1.0
-    assert data.sensordata[4] == 0.0
+    assert (data.sensordata[3::2] > 1.0).all()
+    assert (data.sensordata[4::2] == 0.0).all()
     sim = compiled_step(model, [np.zeros((1, size), np.float32) for size in (1, 1, 1, 0)])
     np.testing.assert_allclose(sim.data.sensordata.numpy()[0, 3:], data.sensordata[3:], rtol=1e-3)
 
@@ -173,17 +155,19 @@ def test_numbers_are_not_rounded_to_zero():
     assert float(evaluate(softness.row(1e-30, scalar(-0.1))[0], {})) == pytest.approx(1e15)
 
 
-@pytest.mark.parametrize("solref", [".05 -10", "-1000 1", "0 1", ".02 0", "0 0", "-500 0"])
-def test_a_solref_that_mixes_its_formats_is_the_default(solref):
+def test_a_solref_that_mixes_its_formats_is_the_default(form):
     """Of contacts, limits and dry friction."""
-    joint = f'<joint solreflimit="{solref}" solreffriction="{solref}" frictionloss=".1" range="-.2 .2" limited="true"/>'
-    model = limbs(("<worldbody>", f'<default><geom solref="{solref}"/>{joint}</default><worldbody>'))
     states = falling(limbs())
     states[0][:, 7] += 0.5
-    assert errors(model, states).max() < 1e-3
+    for solref in (".05 -10", "-1000 1", "0 1", ".02 0", "0 0", "-500 0"):
+        joint = (
+            f'<joint solreflimit="{solref}" solreffriction="{solref}" frictionloss=".1" range="-.2 .2" limited="true"/>'
+        )
+        model = limbs(("<worldbody>", f'<default><geom solref="{solref}"/>{joint}</default><worldbody>'))
+        assert errors(model, states).max() < 1e-3, solref
 
 
-def test_a_joint_may_be_near_both_its_limits():
+def test_a_joint_may_be_near_both_its_limits(form):
     """Each is a row of its own where the margin exceeds half the range. Other joints have one, whichever is nearer."""
     near = '<joint name="h1" range="-.05 .05" limited="true" margin=".1"'
     far = '<joint name="h2" range="-.2 .3" limited="true" margin=".1"'
@@ -239,17 +223,17 @@ def leaning(plane, capsule, count=8):
     return model, [np.array(column) for column in zip(*rows, strict=True)]
 
 
-@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.0, -0.4, 0.9), (0.6, 0.7, -0.2), (0.0, 1.0, 0.0)])
-def test_tangents_are_normal_to_a_tilted_plane(normal):
+def test_tangents_are_normal_to_a_tilted_plane():
     """Of a capsule along the normal, which gives no direction."""
-    normal = np.array(normal) / np.linalg.norm(normal)
-    axis = normal + 1e-8 * np.array([1.0, -2.0, 3.0])
-    tangent = evaluate(
-        collision.frame(array(normal), np.array(names("axis", 3), dtype=object)),
-        {f"axis[{i}]": axis[i] for i in range(3)},
-    )
-    assert normal @ tangent == pytest.approx(0, abs=1e-12)
-    assert np.linalg.norm(tangent) == pytest.approx(1)
+    for normal in ((0.0, 0.0, 1.0), (0.0, -0.4, 0.9), (0.6, 0.7, -0.2), (0.0, 1.0, 0.0)):
+        normal = np.array(normal) / np.linalg.norm(normal)
+        axis = normal + 1e-8 * np.array([1.0, -2.0, 3.0])
+        tangent = evaluate(
+            collision.frame(array(normal), np.array(names("axis", 3), dtype=object)),
+            {f"axis[{i}]": axis[i] for i in range(3)},
+        )
+        assert normal @ tangent == pytest.approx(0, abs=1e-12)
+        assert np.linalg.norm(tangent) == pytest.approx(1)
 
 
 # What fits the shared memory of a GPU.
@@ -280,13 +264,12 @@ def bristly(dofs, condim=3, touch=0):
 KINDS = [{}, {"condim": 1}, {"touch": 1}]
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=str)
-def test_worlds_and_what_warp_adds_fit_a_block(kind):
+def test_worlds_and_what_warp_adds_fit_a_block():
     """Warp takes 4 bytes for each thread."""
-    for dofs in SIZES:
+    for kind, dofs in itertools.product(KINDS, SIZES):
         description = lanes.Description(bristly(dofs, **kind))
         worlds = description.worlds_per_block()
-        assert worlds * (description.layout.bytes + 4 * 32) <= 48 * 1024, dofs
+        assert worlds * (description.layout.bytes + 4 * 32) <= 48 * 1024, (dofs, kind)
 
 
 def wide(model):
@@ -316,9 +299,7 @@ def test_the_size_of_a_world_is_what_its_layout_says(form):
 
 @pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="Warp was built without NVRTC")
 @pytest.mark.parametrize("form", [0], indirect=True, ids=["lanes"])
-@pytest.mark.parametrize(
-    ("dofs", "kind"), [(18, {}), (30, {}), (30, {"condim": 1}), (52, {"touch": 1}), (64, {})], ids=str
-)
+@pytest.mark.parametrize(("dofs", "kind"), [(18, {}), (30, {"condim": 1}), (64, {"touch": 1})], ids=str)
 def test_a_body_builds_for_a_gpu(form, dofs, kind, tmp_path, monkeypatch):
     """NVRTC needs no GPU; ptxas counts the shared memory."""
     monkeypatch.setattr(wp.config, "optimization_level", None)
@@ -331,16 +312,16 @@ def test_a_body_builds_for_a_gpu(form, dofs, kind, tmp_path, monkeypatch):
     assert built.suffix == ".cubin"
 
 
-@pytest.mark.parametrize(("friction", "most"), [(0.01, 5e-3), (0.001, 2e-3)])
-def test_a_slippery_floor_is_no_stiffer_than_single_precision(friction, most):
+def test_a_slippery_floor_is_no_stiffer_than_single_precision(form):
     """Stiffness grows with the inverse square of friction."""
-    model = limbs(("<worldbody>", f'<default><geom friction="{friction}"/></default><worldbody>'))
-    found = errors(model, falling(model, count=60))
-    assert found.max() < most
-    assert np.quantile(found, 0.9) < 5e-4
+    for friction, most in ((0.01, 5e-3), (0.001, 2e-3)):
+        model = limbs(("<worldbody>", f'<default><geom friction="{friction}"/></default><worldbody>'))
+        found = errors(model, falling(model, count=60))
+        assert found.max() < most
+        assert np.quantile(found, 0.9) < 5e-4
 
 
-def test_the_limit_of_iterations_is_flagged_where_it_is_reached():
+def test_the_limit_of_iterations_is_flagged_where_it_is_reached(form):
     """One iteration fewer than a world needs is flagged, as many are not, and give what more of them give."""
     model, reached, flags = limbs(), [], []
     states = falling(model, count=40)
@@ -360,8 +341,17 @@ def test_the_limit_of_iterations_is_flagged_where_it_is_reached():
     assert not final[0][flags[0]].all()
 
 
-@pytest.mark.parametrize(("plane", "capsule"), CASES)
-def test_a_capsule_orients_the_frame_of_its_contact(plane, capsule, monkeypatch):
+def test_a_capsule_orients_the_frame_of_its_contact(form, monkeypatch):
     """However steep it is, and however tilted the plane."""
     monkeypatch.setattr(collision, "UPRIGHT", 1e-6)  # C MuJoCo's rule
-    assert errors(*leaning(plane, capsule)).max() < 2e-5
+    for plane, capsule in CASES:
+        assert errors(*leaning(plane, capsule)).max() < 2e-5, (plane, capsule)
+
+
+def test_a_small_gain_is_found_beside_a_large_cost(form):
+    """Contacts 0.10 and 0.15 m deep cost 6e9 J, of which the last steps of the solver gain 8 to 70 J."""
+    model = mujoco.MjModel.from_xml_path(str(DATA / "stalled.xml"))
+    with np.load(DATA / "stalled_states.npz") as file:
+        rows = np.array([file[name] for name in file.files], dtype=np.float32)
+    states = np.split(rows, np.cumsum([model.nq, model.nv, model.nv]), axis=1)
+    assert (errors(model, states) / model.opt.timestep).max() < 0.02

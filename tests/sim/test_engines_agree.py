@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from cases import COMPILED, ENGINES, MODELS
+from cases import COMPILED, ENGINES, MODELS, PROTOCOLS
 
 import torchrl_loco
 from torchrl_loco import State
@@ -61,10 +61,11 @@ def assert_agree(ours, theirs):
     assert (error.max(axis=1) > 1e-4).sum() <= len(error) / 300
 
 
-def test_both_engines_agree(shared, states, protocol):
+def test_both_engines_agree(shared, states):
     task, state, action = states
-    results = [after(shared(task, len(state), protocol=protocol, engine=engine), state, action) for engine in ENGINES]
-    assert_agree(*results)
+    for protocol in PROTOCOLS:
+        envs = (shared(task, len(state), protocol=protocol, engine=engine) for engine in ENGINES)
+        assert_agree(*(after(env, state, action) for env in envs))
 
 
 def test_converged_steps_agree_with_c_mujoco(shared, states, monkeypatch):

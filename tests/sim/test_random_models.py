@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from contact_forces import net_forces
 from random_models import models, states
+from variation import draw_rows, some_varied
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import Simulation
@@ -39,8 +40,8 @@ def c_mujocos_frames_and_quick_compilation(monkeypatch):
     mujoco.set_mju_user_warning(None)
 
 
-def compiled_step(model, state):
-    """Returns the simulation of all states after one physics step."""
+def compiled_step(model, state, varied=None, rows=None):
+    """Returns the simulation of all states after one physics step, each with its row of numbers of the model."""
     option, count = model.opt, len(state[0])
     config = SimConfig(
         ctrl_dt=option.timestep,
@@ -52,11 +53,14 @@ def compiled_step(model, state):
         euler_damping=not option.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP,
         engine="compiled",
     )
-    sim = Simulation(model, config, count, torch.device("cpu"), contact_geoms=range(model.ngeom))
+    sim = Simulation(model, config, count, torch.device("cpu"), contact_geoms=range(model.ngeom), varied=varied)
     assert sim.cvel.shape == (count, model.nbody, 6)  # asking for it makes the step compute it
     assert sim.subtree_com.shape == (count, model.nbody, 3)
-    for view, rows in zip((sim.qpos, sim.qvel, sim.qacc_warmstart, sim.ctrl), state, strict=True):
-        view.copy_(torch.as_tensor(rows))
+    if varied is not None:
+        sim.numbers.copy_(torch.as_tensor(rows))
+        sim.forward(wp.ones(count, dtype=bool, device="cpu"))
+    for view, values in zip((sim.qpos, sim.qvel, sim.qacc_warmstart, sim.ctrl), state, strict=True):
+        view.copy_(torch.as_tensor(values))
     sim.step()
     return sim
 
@@ -163,8 +167,11 @@ def assert_forces_belong_to_the_acceleration(model, state, sim, world, rng):
     return int((felt > 1e-3).sum()), int((np.abs(pushed).max(axis=1) > 1e-3).sum())
 
 
-def compare(xml, count=STATES):
-    """Holds the model's states to C MuJoCo; returns how many there were, how many agreed closely, and their kinds."""
+def compare(xml, count=STATES, *, vary=False):
+    """Holds the model's states to C MuJoCo; returns how many there were, how many agreed closely, and their kinds.
+
+    With ``vary`` each state has numbers of the model of its own.
+    """
     model = mujoco.MjModel.from_xml_string(xml)
     hypothesis.assume(not unsupported(model))
     # A sphere that can only turn about its center: MuJoCo weighs its contacts by the inverse of nothing, 1e15.
@@ -173,8 +180,12 @@ def compare(xml, count=STATES):
     starts = states(model, rng, count)
     if not len(starts[0]):
         return found
-    sim = compiled_step(model, starts)
-    for world, state in enumerate(zip(*starts, strict=True)):
+    varied = some_varied(model, rng) if vary else None
+    rows = draw_rows(varied, rng, len(starts[0])) if vary else [None] * len(starts[0])
+    sim = compiled_step(model, starts, varied, rows)
+    nominal = model
+    for world, (row, *state) in enumerate(zip(rows, *starts, strict=True)):
+        model = nominal if varied is None else varied.edited(row)
         if sim.overflow[world]:
             found["overflow"] += 1
             continue
@@ -220,3 +231,21 @@ def test_a_step_agrees_with_c_mujoco(traced_dofs, count, monkeypatch):
     assert total["overflow"] < 0.01 * total["states"]
     if count == 200:
         assert min(total[kind] for kind in KINDS) > 50, total
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("traced_dofs", [31, 0], ids=["traced", "lanes"])
+def test_a_step_with_numbers_of_each_world_agrees_with_c_mujoco(traced_dofs, monkeypatch):
+    monkeypatch.setattr(step, "TRACED_DOFS", traced_dofs)
+    total, count = collections.Counter(), 10
+
+    @hypothesis.settings(max_examples=count, **SETTINGS)
+    @hypothesis.given(models())
+    def check(xml):
+        total.update(compare(xml, vary=True))
+
+    check()
+    print(dict(total))
+    assert total["states"] > 8 * count
+    assert total["close"] > 0.95 * total["states"]
+    assert total["overflow"] < 0.01 * total["states"]

@@ -20,12 +20,13 @@ def simulation(body, device, num_envs=4, **overrides):
     return sim, wp.ones(num_envs, dtype=bool, device=sim.device)
 
 
-@pytest.fixture(params=["walker", "humanoid"])
-def body(request):
-    return request.param
+KINDS = [("walker", "compiled"), ("humanoid", "compiled"), ("humanoid", "mujoco_warp")]
+of_each_kind = pytest.mark.parametrize(("body", "engine"), KINDS)
+ON_CUDA = [pytest.param(*kind, "cuda", marks=pytest.mark.gpu) for kind in KINDS[::2]]
 
 
-def test_views_are_zero_copy_and_never_rebound(body, device, engine):
+@pytest.mark.parametrize(("body", "engine", "device"), [*((*kind, "cpu") for kind in KINDS), *ON_CUDA])
+def test_views_are_zero_copy_and_never_rebound(body, engine, device):
     sim, mask = simulation(body, device, engine=engine)
     pointers = {name: getattr(sim, name).data_ptr() for name in VIEWS}
     graph = sim.capture(lambda: (sim.reset(mask), sim.step()))
@@ -37,6 +38,7 @@ def test_views_are_zero_copy_and_never_rebound(body, device, engine):
     assert (sim.data.qpos.numpy() == 0.25).all()
 
 
+@of_each_kind
 def test_replay_equals_eager(body, engine):
     """The recorded step does bitwise what the launched one does, on the CPU."""
     traces = []
@@ -54,32 +56,34 @@ def test_replay_equals_eager(body, engine):
     assert torch.equal(*traces)
 
 
-def test_derived_quantities_belong_to_the_new_state(body, device, engine):
+@of_each_kind
+def test_derived_quantities_belong_to_the_new_state(body, engine):
     """dm_control's order: after a step, xpos, xmat and sensors are those of the qpos and qvel at hand."""
-    sim, mask = simulation(body, device, engine=engine)
+    sim, mask = simulation(body, "cpu", engine=engine)
     sim.reset(mask)
     for _ in range(8):
         sim.ctrl.uniform_(-1, 1)
         sim.step()
     data = mujoco.MjData(sim.mj_model)
     for world in range(sim.num_envs):
-        data.qpos[:], data.qvel[:] = sim.qpos[world].cpu(), sim.qvel[world].cpu()
+        data.qpos[:], data.qvel[:] = sim.qpos[world], sim.qvel[world]
         mujoco.mj_forward(sim.mj_model, data)
-        np.testing.assert_allclose(sim.xpos[world].cpu(), data.xpos, atol=1e-5)
-        np.testing.assert_allclose(sim.xmat[world].cpu().reshape(-1, 9), data.xmat, atol=1e-5)
+        np.testing.assert_allclose(sim.xpos[world], data.xpos, atol=1e-5)
+        np.testing.assert_allclose(sim.xmat[world].reshape(-1, 9), data.xmat, atol=1e-5)
         np.testing.assert_allclose(sim.data.sensordata.numpy()[world], data.sensordata, atol=1e-4)
 
 
-def test_forward_at_rest_is_forward_for_worlds_at_rest(body, device, engine):
+@of_each_kind
+def test_forward_at_rest_is_forward_for_worlds_at_rest(body, engine):
     """What it leaves out is zero after a reset, and the worlds beside keep what they have."""
     states = []
     for at_rest in (False, True):
-        sim, mask = simulation(body, device, engine=engine)
+        sim, mask = simulation(body, "cpu", engine=engine)
         d = sim.data
         arrays = [d.xpos, d.xmat, d.cvel, d.sensordata]
         if engine == "mujoco_warp":
             arrays += [d.geom_xpos, d.efc.J]
-        generator = torch.Generator(device).manual_seed(0)
+        generator = torch.Generator().manual_seed(0)
         sim.reset(mask)
         sim.ctrl.uniform_(-1, 1, generator=generator)
         sim.step()
@@ -93,6 +97,7 @@ def test_forward_at_rest_is_forward_for_worlds_at_rest(body, device, engine):
     assert all(array[1:].any() for array in states[0])
 
 
+@of_each_kind
 def test_mujoco_data_shows_the_present_state(body, engine):
     """Poses of geoms, and contacts where they are asked for, as C MuJoCo finds them; the state stays as it is."""
     sim, mask = simulation(body, "cpu", engine=engine)
@@ -192,12 +197,11 @@ def test_the_compiled_step_has_the_euler_integrator_alone(caplog):
         falling(integrator="implicitfast", engine="compiled")
     with pytest.raises(ValueError, match="needs integrator='euler', got 'rk4'"):
         falling(integrator="rk4", deterministic=True)
-    with pytest.raises(ValueError, match=r"did you mean 'implicitfast'.*euler, implicitfast, rk4"):
-        falling(integrator="implicit_fast")
 
 
-def test_nothing_is_said_where_nothing_is_replaced(body, caplog):
-    simulation(body, "cpu", engine="compiled")
+def test_nothing_is_said_where_nothing_is_replaced(caplog):
+    for body in ("walker", "humanoid"):
+        simulation(body, "cpu", engine="compiled")
     assert not caplog.records
 
 
@@ -218,7 +222,7 @@ def test_the_model_of_the_compiled_step_cannot_be_written(name):
         lambda: wp.to_torch(array),
         lambda: torch.from_dlpack(array),
     ):
-        with pytest.raises((AttributeError, TypeError), match="Edit the model before"):
+        with pytest.raises((AttributeError, TypeError), match="edit the model before"):
             write()
     with pytest.raises(ValueError, match="read-only"):
         array.numpy()[:] = 0.0
