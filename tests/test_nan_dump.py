@@ -148,6 +148,7 @@ def test_nothing_is_overwritten(file, actions):
         made(file)
 
 
+@pytest.mark.slow
 def test_warp_repeats_what_happened_and_c_mujoco_agrees_on_an_ordinary_step(file, engine, actions):
     """With the action repaired. From another warm start, few iterations of the solver end elsewhere."""
 

@@ -218,6 +218,7 @@ def test_a_class_in_a_module(nothing_added, monkeypatch):
             registry.resolve(name)
 
 
+@pytest.mark.slow
 def test_a_class_in_a_script(file):
     """A script is its own module, here and where its file is looked up; so is a file beside it, under its name."""
     script = file.with_name("script.py")

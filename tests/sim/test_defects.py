@@ -264,6 +264,7 @@ def bristly(dofs, condim=3, touch=0):
 KINDS = [{}, {"condim": 1}, {"touch": 1}]
 
 
+@pytest.mark.slow
 def test_worlds_and_what_warp_adds_fit_a_block():
     """Warp takes 4 bytes for each thread."""
     for kind, dofs in itertools.product(KINDS, SIZES):
@@ -282,6 +283,7 @@ def wide(model):
 
 
 @pytest.mark.parametrize("form", [0], indirect=True, ids=["lanes"])
+@pytest.mark.slow
 def test_the_size_of_a_world_is_what_its_layout_says(form):
     """Of every number of degrees of freedom; what a model of lanes compiles to checks it too."""
     models = [bristly(dofs, **KINDS[dofs % 3]) for dofs in SIZES]
@@ -297,6 +299,7 @@ def test_the_size_of_a_world_is_what_its_layout_says(form):
     assert "static_assert(sizeof(World)" in lanes.source(models[0], 1)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="Warp was built without NVRTC")
 @pytest.mark.parametrize("form", [0], indirect=True, ids=["lanes"])
 @pytest.mark.parametrize(("dofs", "kind"), [(18, {}), (30, {"condim": 1}), (64, {"touch": 1})], ids=str)
@@ -321,6 +324,7 @@ def test_a_slippery_floor_is_no_stiffer_than_single_precision(form):
         assert np.quantile(found, 0.9) < 5e-4
 
 
+@pytest.mark.slow
 def test_the_limit_of_iterations_is_flagged_where_it_is_reached(form):
     """One iteration fewer than a world needs is flagged, as many are not, and give what more of them give."""
     model, reached, flags = limbs(), [], []

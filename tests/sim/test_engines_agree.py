@@ -61,6 +61,7 @@ def assert_agree(ours, theirs):
     assert (error.max(axis=1) > 1e-4).sum() <= len(error) / 300
 
 
+@pytest.mark.slow
 def test_both_engines_agree(shared, states):
     task, state, action = states
     for protocol in PROTOCOLS:
@@ -68,6 +69,7 @@ def test_both_engines_agree(shared, states):
         assert_agree(*(after(env, state, action) for env in envs))
 
 
+@pytest.mark.slow
 def test_converged_steps_agree_with_c_mujoco(shared, states, monkeypatch):
     """With its rule for the contact frames of upright capsules, such as the humanoid's shins.
 
