@@ -10,7 +10,6 @@ from torchrl_loco.sim.graph import Recorded as Recorded
 from torchrl_loco.sim.graph import TorchGraph as TorchGraph
 from torchrl_loco.sim.graph import current_stream as current_stream
 from torchrl_loco.sim.graph import joined_to_torch as joined_to_torch
-from torchrl_loco.sim.graph import launch_on_tensors as launch_on_tensors
 from torchrl_loco.sim.graph import torch_is_recording as torch_is_recording
 from torchrl_loco.sim.overflow import Overflow as Overflow
 from torchrl_loco.sim.simulation import Simulation as Simulation

@@ -5,7 +5,7 @@ import os
 import threading
 import weakref
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -47,32 +47,6 @@ def joined_to_torch(device: wp.Device) -> Iterator[None]:
         wp.ScopedCapture(stream=stream, external=True),
     ):
         yield
-
-
-def launch_on_tensors(
-    kernel: wp.Kernel, threads: int, inputs: Sequence[Any], outputs: Sequence[torch.Tensor], block_dim: int
-) -> None:
-    """Launches a kernel on torch's current stream; while torch records, the launch joins the recording.
-
-    Args:
-        kernel: takes an array for each tensor.
-        threads: the number of threads.
-        inputs: tensors and numbers.
-        outputs: tensors, all on the same device as the inputs.
-        block_dim: threads of a block on CUDA.
-    """
-    device = wp.get_device(str(outputs[0].device))
-    recording = torch_is_recording(device)
-    with joined_to_torch(device) if recording else wp.ScopedDevice(device):
-        wp.launch(
-            kernel,
-            dim=threads,
-            inputs=[wp.from_torch(value.detach()) if isinstance(value, torch.Tensor) else value for value in inputs],
-            outputs=[wp.from_torch(value) for value in outputs],
-            device=device,
-            stream=None if recording else current_stream(device),  # a second one would end the recording of the first
-            block_dim=block_dim,
-        )
 
 
 class Graph:
