@@ -27,7 +27,8 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 HIDDEN = {"_build", "generated"}
 PAGES = sorted(path for path in DOCS.rglob("*.md") if not HIDDEN & set(path.relative_to(DOCS).parts))
-WITH_CODE = [path for path in [ROOT / "README.md", *PAGES] if "```python" in path.read_text()]
+BODY_PAGES = sorted((ROOT / "torchrl_loco" / "tasks").glob("*/page.md"))  # which pages of the site include
+WITH_CODE = [path for path in [ROOT / "README.md", *PAGES, *BODY_PAGES] if "```python" in path.read_text()]
 LONG = {"docs/guides/training.md", "docs/api/wrappers.md"}
 """Pages whose code trains."""
 NEEDS = {"docs/api/wrappers.md": ("gymnasium", "moviepy", "rsl_rl", "stable_baselines3")}

@@ -51,8 +51,8 @@ class Trainer:
 
     Raises:
         FileNotFoundError: there is no checkpoint to resume from.
-        ValueError: the checkpoint cannot be read; the run is complete, or too short for so many ranks; trials are
-            running that another number of ranks or of frames does not fit; the run was begun with other objects.
+        ValueError: the checkpoint cannot be read; the run is complete, or too short for so many ranks; the run was
+            begun with other objects.
         TypeError: the network has a part that a policy's file cannot hold.
         ImportError: the package of a logger is missing.
         BlockingIOError: another process is training the run.
