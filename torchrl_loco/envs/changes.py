@@ -7,7 +7,7 @@ import numpy as np
 
 from torchrl_loco.envs.names import Elements
 from torchrl_loco.envs.vary import FIELDS, Vary
-from torchrl_loco.sim.varied import field
+from torchrl_loco.sim.varied import field, is_fixed
 
 
 @dataclasses.dataclass
@@ -91,9 +91,9 @@ def _why_not(name: str, m: mujoco.MjModel, i: int) -> str | None:
     """Returns why an element cannot have a field that varies, if it cannot."""
     if FIELDS[name].of == "body" and i == 0:
         return "the world has neither mass nor inertia"
-    if name == "body_ipos" and m.body_simple[i] == 1:
+    if name == "body_ipos" and is_fixed(m, name, i):
         return "MuJoCo takes the body's mass matrix for diagonal, so move its center of mass a little in the model"
-    if name == "actuator_forcerange" and not m.actuator_forcelimited[i]:
+    if name == "actuator_forcerange" and is_fixed(m, name, i):
         return "no force range limits the actuator"
     if name == "kp" and not _is_position(m, i):
         return "kp is of position actuators"

@@ -6,7 +6,7 @@ import logging
 import os
 import warnings
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -299,8 +299,8 @@ class World:
 
         parts: list[Part] = []
 
-        def part(name: str, *needed: str) -> Callable[[], None]:
-            if hooks is None or not own & set(needed):
+        def part(name: str, needed: Collection[str] | None = None) -> Callable[[], None]:
+            if hooks is None or not own & set(PARTS[name] if needed is None else needed):
                 return _nothing
             called = [hook for hook in PARTS[name] if hook in own] or [name]
             title = f"{self._title}: {', '.join(called)}"
@@ -312,11 +312,10 @@ class World:
             parts.append(Part(variation.vary, streams, f"{self._title}: randomize", variation.fixed()))
             self._vary = parts[-1]
 
-        self._control = part("control", "control")
-        self._judge = part("judge", "update", "reward", "terminated", "events")
-        self._observe = part("observe", *own)
-        self._begin = part("begin", *(own if self.memory else ["begin"]))
-        self._observe_begun = part("observe_begun", "observation")
+        self._control, self._judge = part("control"), part("judge")
+        self._observe = part("observe", own)  # it looks for what is not finite, too
+        self._begin = part("begin", own if self.memory else None)  # it zeroes memory, too
+        self._observe_begun = part("observe_begun")
         kernels = [each for each in parts if task.compile_hooks and each.compile(task.num_envs, sim.device)]
 
         moves = hooks is not None and hooks.moves

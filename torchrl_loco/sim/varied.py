@@ -75,9 +75,7 @@ class Varied:
         if "body_ipos" in self.places:
             self._move_inertial_frames(m)
         if "body_mass" in self.places:
-            m.body_subtreemass[:] = m.body_mass
-            for body in reversed(range(1, m.nbody)):
-                m.body_subtreemass[m.body_parentid[body]] += m.body_subtreemass[body]
+            m.body_subtreemass[:] = subtree_masses(m, m.body_mass)
         return m
 
     def _move_inertial_frames(self, m: mujoco.MjModel) -> None:
@@ -99,18 +97,36 @@ def check(mj_model: mujoco.MjModel, name: str, indices: np.ndarray) -> None:
     """
     if name == "actuator_forcerange":
         for i in indices // 2:
-            if not mj_model.actuator_forcelimited[i]:
+            if is_fixed(mj_model, name, i):
                 raise ValueError(
                     f"actuator_forcerange of actuator {mj_model.actuator(i).name!r} cannot vary, since its "
                     "force has no limits: give it a forcerange in the model"
                 )
     if name == "body_ipos":
         for body in indices // 3:
-            if mj_model.body_simple[body] == 1:
+            if is_fixed(mj_model, name, body):
                 raise ValueError(
                     f"body_ipos of body {mj_model.body(body).name!r} cannot vary, since MuJoCo takes its mass "
                     "matrix for diagonal: in the model, move its center of mass a little off its joints (inertial)"
                 )
+
+
+def is_fixed(mj_model: mujoco.MjModel, name: str, element: int) -> bool:
+    """Returns whether a model cannot follow numbers of an element.
+
+    These are the limits of a force that is not limited, and the center of mass of a body whose mass matrix is diagonal.
+    """
+    if name == "actuator_forcerange":
+        return not mj_model.actuator_forcelimited[element]
+    return name == "body_ipos" and mj_model.body_simple[element] == 1
+
+
+def subtree_masses(mj_model: mujoco.MjModel, masses: np.ndarray) -> np.ndarray:
+    """Returns the mass of each body with all below it, ``(nbody,)``, from those of the bodies: numbers, or symbols."""
+    sums = masses.copy()
+    for body in reversed(range(1, mj_model.nbody)):  # children before parents
+        sums[mj_model.body_parentid[body]] = sums[mj_model.body_parentid[body]] + sums[body]
+    return sums
 
 
 def field(mj_model: mujoco.MjModel, name: str) -> np.ndarray:

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import torch
 
 from torchrl_loco.envs.fusion.nodes import MOST_NUMBERS, TYPES, WHERE, CannotFuse, Node
+from torchrl_loco.sim.compiled.step import WARP
 from torchrl_loco.sim.world_func import BLOCK_DIM
 
-WARP = 32
 LEAST_TOGETHER, WIDEST = 4, 64
 """Numbers of a row that are worth writing together, and the longest piece of a row."""
 

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.symbols import Scalar, maximum
-from torchrl_loco.sim.varied import Varied, field
+from torchrl_loco.sim.varied import Varied, field, subtree_masses
 
 Number = float | Scalar
 """A constant, or what varies."""
@@ -46,9 +46,7 @@ class VariedModel:
 
     def _subtree_masses(self) -> np.ndarray:
         m = self.nominal
-        masses = self._arrays["body_mass"].copy()
-        for body in reversed(range(1, m.nbody)):
-            masses[m.body_parentid[body]] = masses[m.body_parentid[body]] + masses[body]
+        masses = subtree_masses(m, self._arrays["body_mass"])
         return np.array([x if varies(x) else y for x, y in zip(masses, m.body_subtreemass, strict=True)], dtype=object)
 
     def __getattr__(self, name: str) -> Any:

@@ -94,11 +94,9 @@ class Velocity(LocoEnv):
     Args:
         num_envs: as for :class:`~torchrl_loco.LocoEnv`, like all arguments but ``play``.
         device: likewise.
-        seed: likewise.
-        protocol: likewise.
+        others: likewise.
         play: whether to leave out noise, pushes and variation; commands can then be set with :meth:`set_command`.
-        randomize: as for :class:`~torchrl_loco.LocoEnv`.
-        settings: likewise.
+        settings: as for :class:`~torchrl_loco.LocoEnv`.
 
     Observation:
         ``observation``: linear and angular velocity of the base and gravity in its frame (9), joint positions relative
@@ -150,20 +148,17 @@ class Velocity(LocoEnv):
         self,
         num_envs: int | None = 1,
         device: torch.device | str | None = None,
-        seed: int | None = None,
-        protocol: str = "playground",
-        *,
+        *others: Any,
         play: bool = False,
-        randomize: Sequence[Vary] | None = None,
         **settings: Any,
     ) -> None:
         self.play = check_bool("play", play)
         if play:
-            randomize = [] if randomize is None else randomize
+            settings["randomize"] = settings.get("randomize") or []
             worlds = 1 if num_envs is None else check_int("num_envs", num_envs)
             self._set = torch.zeros((worlds, 3), device=check_device(device))
             self._is_set = torch.zeros((worlds, 1), dtype=torch.bool, device=check_device(device))
-        super().__init__(num_envs, device, seed, protocol, randomize=randomize, **settings)
+        super().__init__(num_envs, device, *others, **settings)
 
     def set_command(self, command: Sequence[float] | torch.Tensor | None) -> None:
         """Sets the command that the worlds follow from their next step or reset on.
