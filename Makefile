@@ -51,7 +51,7 @@ docs: $(VENV)/installed  ## the site, into docs/_build/html; warnings are errors
 runners: $(VENV)/installed  ## draw the picture of the README anew, with the shipped policies
 	PYTHONPATH=docs $(BIN)/python -m generate.runners
 
-tables: $(VENV)/installed  ## write the tables of README and docs/benchmarks.md, and its picture, from benchmarks/results
+tables: $(VENV)/installed  ## write tables and pictures of README and docs from benchmarks/results
 	PYTHONPATH=docs $(BIN)/python -m generate.benchmarks
 
 notebooks: $(VENV)/installed  ## run the notebooks and store their output; NOTEBOOKS=notebooks/rewards.ipynb for one

@@ -57,6 +57,11 @@ elsewhere.add_argument("--episodes", type=int, default=32)
 elsewhere.add_argument("--path", type=Path, help="folder that dm_control and its MuJoCo were installed in")
 elsewhere.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 elsewhere.add_argument("--out", type=Path, help="file for the results as JSON")
+vary = commands.add_parser("variation", help="returns of humanoid_walk over a grid of friction, masses and gears")
+vary.add_argument("--policies", type=Path, nargs="*", default=[], help="files of policies beside the shipped one")
+vary.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
+vary.add_argument("--out", type=Path, help="file for the results as JSON")
+vary.add_argument("--picture", type=Path, help="file for a plot")
 spread = commands.add_parser("scaling", help="several GPUs beside one, with the same worlds on each")
 spread.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_walk"])
 spread.add_argument("--gpus", type=int, nargs="+", default=[1, 2], help="numbers of GPUs, or of processes on the CPU")
@@ -67,6 +72,7 @@ draw.add_argument("results", type=Path)
 draw.add_argument("picture", type=Path)
 
 args = parser.parse_args()
+notes = {}
 if args.command == "plot":
     from benchmarks.plot import plot
 
@@ -107,6 +113,13 @@ elif args.command == "scaling":
     from benchmarks.scaling import COLUMNS, scaling
 
     rows = scaling(args.tasks, args.gpus, args.device)
+elif args.command == "variation":
+    from benchmarks.variation import COLUMNS, GRID, plot_variation, variation
+
+    notes["grid"] = dict(zip(("friction", "mass", "gear"), GRID, strict=True))
+    rows, notes["returns"] = variation(args.policies, args.device)
+    if args.picture:
+        plot_variation(notes["returns"], args.picture)
 elif args.command == "suite":
     from benchmarks.suite import COLUMNS, suite
 
@@ -123,5 +136,5 @@ else:
     rows = profile(args.bodies, args.worlds[0], args.cases, args.device)
 show(rows, COLUMNS)
 if args.out:
-    save(rows, args.out, args.device, {"interrupted": True} if INTERRUPTED.is_set() else {})
+    save(rows, args.out, args.device, notes | ({"interrupted": True} if INTERRUPTED.is_set() else {}))
 raise SystemExit(130 if INTERRUPTED.is_set() else 0)

@@ -1,4 +1,4 @@
-"""The tables and the picture of docs/benchmarks.md, and the tables of the README, from benchmarks/results.
+"""The tables and pictures of README, docs/benchmarks.md and guides that show results, from benchmarks/results.
 
 ``make tables`` writes them into the pages, between two comments each, because GitHub shows the pages as they are.
 """
@@ -13,18 +13,20 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 
 from benchmarks.published import PUBLISHED, read
+from benchmarks.variation import plot_variation
 from generate.markdown import table
 
 Row = dict[str, Any]
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
-PICTURE = ROOT / "docs" / "_static" / "returns.png"
+PICTURES = ROOT / "docs" / "_static"
 
 LOOP, DAY = "2026-11-22-h200-loop", "2026-11-23-h200"
 ENGINES = (f"{LOOP}/engines.json", f"{LOOP}/engines-others.json")
 COLLECTED = (f"{DAY}/throughput.json", f"{DAY}/throughput-many.json", f"{LOOP}/throughput-apart.json")
 PEERS = (f"{LOOP}/peers.json",)
 SUITE = "2026-11-24-cpu/suite.json"
+VARIATION = "2026-11-25-h100-third/variation.json"
 
 
 class Measured(NamedTuple):
@@ -98,6 +100,7 @@ def tables() -> dict[str, str]:
         "returns": returns() + sources([[f"{path}/results.csv" for path in runs.folders] for runs in RUNS.values()]),
         "steps-short": speeds(("walker", "humanoid"), [line for line in STEPS if "same" not in line.label]),
         "returns-short": returns_short(),
+        "variation": variation(),
     }
 
 
@@ -179,6 +182,13 @@ def returns_short() -> str:
     return table(("task", "return", "training (s)"), rows)
 
 
+def variation() -> str:
+    """Returns what policies earn on a grid of numbers, in all of it and within what they were trained on."""
+    keys = ("nominal", "inside", "worst inside", "mean")
+    head = ("policy", "model itself", "mean where trained", "worst cell there", "mean of the whole grid")
+    return table(head, [(row["policy"], *(f"{row[key]:.0f}" for key in keys)) for row in _json(VARIATION)])
+
+
 def seeds_of(task: str, protocol: str, runs: Runs) -> list[dict[str, str]]:
     """Returns the rows of results of a task's runs, one for each seed, by seed."""
     rows = [row for folder in runs.folders for row in _results(folder, task, protocol)]
@@ -242,9 +252,10 @@ def draw(picture: Path) -> None:
     figure.savefig(picture, dpi=100)
 
 
-PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmarks.md")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmarks.md", ROOT / "docs" / "guides" / "your-own-task.md")
 
 if __name__ == "__main__":
     for page in PAGES:
         page.write_text(filled(page.read_text()))
-    draw(PICTURE)
+    draw(PICTURES / "returns.png")
+    plot_variation(json.loads((RESULTS / VARIATION).read_text())["returns"], PICTURES / "variation.png")
