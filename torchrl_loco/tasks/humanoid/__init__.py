@@ -197,6 +197,7 @@ class HumanoidWalk(Humanoid):
             "episode_length": 100,
             "gamma": 0.98,
             "max_value": 75.0,
+            "bf16": True,
         }
     }
 

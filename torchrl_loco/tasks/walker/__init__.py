@@ -172,6 +172,7 @@ class WalkerWalk(Walker):
             "episode_length": 100,  # as in WalkerStand
             "gamma": 0.98,
             "max_value": 75.0,
+            "bf16": True,
         }
     }
 
