@@ -139,6 +139,8 @@ def test_presets_of_a_task(monkeypatch):
     assert (config.min_value, config.max_value, config.num_bins) == (-20.0, 20.0, 301)
     assert preset(cls, "cuda:0", "ppo").lr == PPOConfig.presets["cuda"]["lr"]
     assert preset(cls, "cpu", "reppo").lr == REPPOConfig.presets["cpu"]["lr"]
+    first = type("First", (torchrl_loco.WalkerWalk,), {"presets": {"ppo": {}, **own}, "__doc__": "Walk."})
+    assert [preset(task, "cuda:0").algorithm for task in (cls, first)] == ["reppo", "ppo"]
     walker = preset("walker_walk", "cuda:0")
     assert (walker.algorithm, walker.max_value, walker.min_value, walker.num_bins) == ("reppo", 75.0, 0.0, 151)
 

@@ -1,5 +1,8 @@
 """Advantages and normalisation against values computed by hand, and what an update does."""
 
+import dataclasses
+
+import pytest
 import torch
 from small_runs import WALKER, collected
 from tensordict import TensorDict
@@ -167,6 +170,19 @@ def test_the_ratio_is_clipped_where_the_settings_say():
         data["action_log_prob"] -= 1.0  # as if every action had become e times as likely
         objectives.append(ppo.loss(data)["loss_objective"].item())
     assert objectives[0] != objectives[1]
+
+
+def test_the_learning_rate_follows_the_divergence():
+    """By a half up below half of the target, by a third down beyond twice of it, and not by time."""
+    for target, factor in ((1.0, 1.0), (1e3, 1.5), (1e-9, 1 / 1.5)):
+        ppo = made(num_envs=8, num_steps=8, minibatch_size=64, target_kl=1.0, lr=1e-3)
+        with torch.no_grad():
+            data = ppo.prepare(collected(ppo, 8)).reshape(-1)
+        data["action_log_prob"] += 1.0  # the divergence
+        ppo.config = dataclasses.replace(ppo.config, target_kl=target)
+        ppo.gradient_step(data)
+        ppo.schedule(progress=1.0)
+        assert ppo.optimizer.param_groups[0]["lr"].item() == pytest.approx(1e-3 * factor)
 
 
 def test_an_untrained_actor_hardly_looks_at_the_observation():

@@ -129,10 +129,7 @@ class Algorithm(ABC):
             len(batch_metric_names),)``.
         """
         config = self.config
-        lr = config.lr * (1.0 - (1.0 - config.final_lr_fraction) * progress)
-        for optimizer in self.optimizers.values():
-            for group in optimizer.param_groups:
-                group["lr"].fill_(lr)
+        self.schedule(progress)
         with torch.no_grad():
             data = self.prepare(batch).reshape(-1)
             of_batch = self.batch_metrics(data)
@@ -152,6 +149,13 @@ class Algorithm(ABC):
         for key, norm in self.norms.items():
             norm.merge(*distributed.merged_moments(*moments(batch[key])))
         return torch.cat([self._totals / (config.epochs * minibatches), of_batch])
+
+    def schedule(self, progress: float) -> None:
+        """Sets the learning rate for a batch after ``progress`` of the policy's training, in [0, 1]."""
+        lr = self.config.lr * (1.0 - (1.0 - self.config.final_lr_fraction) * progress)
+        for optimizer in self.optimizers.values():
+            for group in optimizer.param_groups:
+                group["lr"].fill_(lr)
 
     def _minibatch_step(self) -> None:
         assert self._data is not None

@@ -34,6 +34,7 @@ INTERVALS = {
     "checkpoint_seconds": NOT_NEGATIVE,
     "clip_epsilon": Interval(0, 1, with_low=False, with_high=True),
     "entropy_coeff": NOT_NEGATIVE,
+    "target_kl": NOT_NEGATIVE,
     "target_entropy": ANY,
     "aux_coeff": NOT_NEGATIVE,
     "num_bins": Interval(2, 2**31),
@@ -226,6 +227,9 @@ class PPOConfig(TrainingConfig):
     """Range of the probability ratio that is not clipped."""
     entropy_coeff: float = 1e-3
     """Weight of the entropy bonus."""
+    target_kl: float = 0.0
+    """KL divergence of a gradient step's policy from the one that collected (nats), beyond twice of which the learning
+    rate falls by a third, and below half of which it rises by half (Rudin et al., 2022). 0 lets it fall with time."""
     init_std: float = 1.0
     """Standard deviation of an action at the start; before tanh, if actions are bounded."""
 

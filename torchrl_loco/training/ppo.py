@@ -11,10 +11,14 @@ from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_loco.policy import ObservationNorm
+from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, StateIndependentScale, make_actor, network_of
 from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import PPOConfig
 from torchrl_loco.training.spaces import Spaces
+
+LR_RANGE = (1e-5, 1e-2)
+"""Of a learning rate that follows the divergence."""
 
 
 class PPO(Algorithm):
@@ -76,8 +80,26 @@ class PPO(Algorithm):
         losses = self._compiled_losses(minibatch)
         self.optimizer.zero_grad()
         (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
+        if self.config.target_kl:
+            self._follow(losses["kl_approx"].detach())
         grad_norm = clip_and_step(self.optimizer, self.config.max_grad_norm)
         return [*(losses[name] for name in self.metric_names[:-1]), grad_norm]
+
+    def schedule(self, progress: float) -> None:
+        """Sets the learning rate, unless it follows the divergence."""
+        if not self.config.target_kl:
+            super().schedule(progress)
+
+    def _follow(self, kl: torch.Tensor) -> None:
+        """Lowers the learning rate where a step goes too far from the policy that collected, raises it where not far.
+
+        A divergence that is not positive, as that of the first step of a batch, says nothing.
+        """
+        kl, target = distributed.mean_of_ranks(kl), self.config.target_kl
+        for group in self.optimizer.param_groups:
+            raised = torch.where((kl > 0.0) & (kl < 0.5 * target), 1.5 * group["lr"], group["lr"])
+            lr = torch.where(kl > 2.0 * target, group["lr"] / 1.5, raised)
+            group["lr"].copy_(lr.clamp(*LR_RANGE))
 
 
 class InBFloat16(nn.Sequential):

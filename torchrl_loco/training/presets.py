@@ -32,7 +32,8 @@ def preset(
     Args:
         task: id of the environment, its class, or where that is: ``"path/to/file.py:Class"``.
         device: where to train; ``None`` takes CUDA if there is any.
-        algorithm: "ppo" or "reppo"; ``None`` takes PPO on a CPU and REPPO on CUDA.
+        algorithm: "ppo" or "reppo"; ``None`` takes PPO on a CPU, and on CUDA the first of the task's ``presets``, REPPO
+            if it has none.
         overrides: fields of the settings.
 
     Raises:
@@ -40,15 +41,17 @@ def preset(
             valid. It may be one in the ``presets`` of the class.
     """
     task, device = task_name(task), check_device(device)
+    own: Mapping[str, Mapping[str, Any]] = {}
+    if device.type == "cuda" or task not in tasks.found():  # importing one of ours takes seconds
+        own = checked_presets(resolve(task))
+    if device.type == "cpu":
+        own = {}
     if algorithm is None:
-        algorithm = "ppo" if device.type == "cpu" else "reppo"
+        algorithm = "ppo" if device.type == "cpu" else next(iter(own), "reppo")
     kind = CONFIGS[check_choice("algorithm", algorithm, CONFIGS)]
     for name in overrides:
         check_setting("setting", name, kind)
-    settings = {**kind.presets[device.type], **({} if is_runner(task) else kind.of_others)}
-    if device.type == "cuda" or task not in tasks.found():  # importing one of ours takes seconds
-        own = checked_presets(resolve(task)).get(algorithm, {})
-        settings |= own if device.type == "cuda" else {}
+    settings = {**kind.presets[device.type], **({} if is_runner(task) else kind.of_others), **own.get(algorithm, {})}
     if not is_runner(task) and kind is REPPOConfig:  # returns of either sign
         settings.setdefault("min_value", -settings.get("max_value", REPPOConfig.max_value))
     return kind(task, **{"device": str(device), **settings, **overrides})

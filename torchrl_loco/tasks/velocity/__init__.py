@@ -122,6 +122,24 @@ class Velocity(LocoEnv):
     config = SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=10, ls_iterations=20)
     episode_length = 1000
     action_range = (-math.inf, math.inf)
+    presets = {
+        "ppo": {
+            "num_envs": 8192,
+            "num_steps": 24,
+            "total_frames": 200_000_000,
+            "reward_scale": 1.0,
+            "gamma": 0.99,
+            "lr": 1e-3,
+            "target_kl": 0.01,
+            "epochs": 5,
+            "minibatch_size": 49_152,
+            "hidden": (512, 256, 128),
+            "entropy_coeff": 0.01,
+            "eval_interval": 20_000_000,
+            "compile": True,
+            "bf16": True,
+        }
+    }
 
     base: ClassVar[str]
     """Body that floats."""
