@@ -47,7 +47,7 @@ class Pair:
     margin: float
     solref: tuple[float, ...]
     solimp: tuple[float, ...]
-    weight: float
+    weight: Number
 
 
 def pairs(m: mujoco.MjModel) -> list[Pair]:
@@ -85,7 +85,7 @@ def least_regularisation(pair: Pair) -> Number:
     0.001: in single precision nothing would be left of the bodies beside it. There it ends where the acceleration
     along the normal is off by some 1e-4 of itself.
     """
-    least = max(MINVAL, LEAST * pair.weight)
+    least = largest(MINVAL, LEAST * pair.weight)
     if pair.condim == 1:
         return MINVAL
     if isinstance(pair.friction, Scalar):

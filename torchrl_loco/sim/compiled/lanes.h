@@ -514,9 +514,16 @@ struct Step : Math {
       const Body body = w.bodies[Model::dof_link(d)];
       const Motion axis = w.axes[d], momentum = body.inertia * axis, bias = {body.torque, body.force};
       w.residual[d] = axis.dot(bias) - joint_force(d);
+//IF VARIED
+      const float armature = Model::armature(d);  // in the loop, lanes would wait for theirs in turn
+//END
       ROLLED for (Model::Dofs left = Model::ancestors(d); left; left &= left - 1) {
         const int j = lowest_bit(left);
+//IF VARIED
+        const float m = w.axes[j].dot(momentum) + (j == d ? armature : 0.0f);
+//ELSE
         const float m = w.axes[j].dot(momentum) + (j == d ? Model::armature(d) : 0.0f);
+//END
         w.mass[STRIDE * d + j] = m;
         w.mass[STRIDE * j + d] = m;
       }
@@ -674,6 +681,11 @@ struct Step : Math {
   INLINE void jacobians() {
     Motion axes[SLOTS];
     OWN_DOFS(slot, d) axes[slot] = w.axes[d < DOFS ? d : 0];
+//IF VARIED
+    static_assert(LANES == 1 || Model::FRICTIONAL <= LANES, "a lane for each contact with friction");
+    float own_friction = 0.0f;  // of the lane's contact: in the loop, all would wait for one after the other
+    if (LANES > 1 && lane < frictional) own_friction = Model::friction(w.contacts[lane].pair);
+//END
     ROLLED for (int i = 0; i < frictional + frictionless; ++i) {
       const Contact c = contact(i);
       const bool friction = i < frictional, ball = c.pair >= Model::PAIRS;
@@ -681,7 +693,11 @@ struct Step : Math {
       const Model::Dofs against = Model::first_dofs(pair), with = Model::second_dofs(pair);
       Vec tangent = {0.0f, 0.0f, 0.0f}, other = tangent;
       if (friction) {
+//IF VARIED
+        tangent = w.tangents[i] * (LANES > 1 ? read(own_friction, i) : Model::friction(pair));
+//ELSE
         tangent = w.tangents[i] * Model::friction(pair);
+//END
         other = c.normal.cross(tangent);
       }
       float* const row = w.jacobian + STRIDE * (friction ? 3 * i : 2 * frictional + i);

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled import collision
+from torchrl_loco.sim.compiled import collision, symbols
 from torchrl_loco.sim.compiled.collision import CAPSULE, PLANE, Pair, contact_weight, least_regularisation, pairs
 from torchrl_loco.sim.compiled.constraints import Softness, both_sides, tolerance
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, MINVAL, SLIDE, acting
@@ -358,9 +358,9 @@ class Description:
         tables.floats("inverse_half_length", [1 / h if h else 0.0 for h in half])
         reach = [sum(m.geom_size[g, 0] + self._half_length(g) for g in p.geoms) + p.margin for p in solid]
         tables.floats("reach_squared", [0.0] * len(planes) + [r * r for r in reach])
-        tables.floats("friction", [p.friction for p in found])
+        balls, mixed = self.limited_balls, any(varies(p.friction) for p in found)
+        tables.floats("friction", [*(p.friction for p in found), *(0.0 for _ in balls if mixed)])
         # The limits of ball joints follow the pairs.
-        balls = self.limited_balls
         tables.size(BALL_LIMITS=len(balls))
         tables.integers("ball_qpos", [m.jnt_qposadr[j] for j in balls])
         tables.integers("ball_dof", [m.jnt_dofadr[j] for j in balls])
@@ -368,10 +368,26 @@ class Description:
         tables.floats("margin", [*(p.margin for p in found), *m.jnt_margin[balls]])
         soft = [*((p.solref, p.solimp) for p in found), *((m.jnt_solref[j], m.jnt_solimp[j]) for j in balls)]
         tables.structs("Softness", "contact_softness", [self._softness(*s) for s in soft])
+        inertias = m.dof_invweight0[m.jnt_dofadr[balls]]
+        if mixed:
+            tables.floats("pair_weight", [*(pair.weight for pair in found), *inertias])
+            self._add_formulas(tables, found[0])
+            return
         weights = [contact_weight(m, pair) for pair in found]
         least = [least_regularisation(pair) for pair in found]
         tables.floats("least_regularisation", [*least, *(MINVAL for _ in balls)])
-        tables.floats("inverse_inertia", [*weights, *m.dof_invweight0[m.jnt_dofadr[balls]]])
+        tables.floats("inverse_inertia", [*weights, *inertias])
+
+    def _add_formulas(self, tables: Tables, pair: Pair) -> None:
+        """Adds what follows from friction: the row of a world has less to read without it, as pairs are many."""
+        friction, weight = symbols.name("mu"), symbols.name("weight")
+        parts = {"mu": "friction(i)", "weight": "Model::pair_weight(i)"}
+        pair = dataclasses.replace(pair, condim=3, friction=friction, weight=weight)
+        for name, found, otherwise in (
+            ("least_regularisation", least_regularisation(pair), MINVAL),
+            ("inverse_inertia", contact_weight(self.m, pair), weight),
+        ):
+            tables.formula(name, symbols.select(friction, ">", 0, found, otherwise), **parts)
 
     def _dofs_of_geom(self, g: int) -> int:
         """Returns a bit for each degree of freedom that moves a geom."""

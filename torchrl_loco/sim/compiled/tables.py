@@ -24,17 +24,18 @@ class Row:
     def __init__(self, numbers: int) -> None:
         self.numbers = numbers
         self.derived: list[Scalar] = []
-        self._places: dict[Scalar, int] = {}
+        self._blocks: dict[tuple[Scalar, ...], int] = {}
 
-    def place(self, x: Number) -> int:
-        """Returns where a number of the model is, or what is made of such numbers."""
-        node = scalar(x)
-        if node.op == "number":
-            return node.args[1]
-        if node not in self._places:
-            self._places[node] = self.numbers + len(self.derived)
-            self.derived.append(node)
-        return self._places[node]
+    def place(self, *values: Number) -> int:
+        """Returns where numbers of the model are one after the other, or what is made of such numbers."""
+        nodes = tuple(map(scalar, values))
+        start = nodes[0].args[1] if nodes[0].op == "number" else 0
+        if all(x.op == "number" and x.args[1] == start + k for k, x in enumerate(nodes)):
+            return start
+        if nodes not in self._blocks:
+            self._blocks[nodes] = self.numbers + len(self.derived)
+            self.derived += nodes
+        return self._blocks[nodes]
 
     def nominal(self, varied: Varied) -> np.ndarray:
         """Returns the row of the model itself."""
@@ -130,6 +131,14 @@ class Tables:
             parts = [f"{{{', '.join(parts[k : k + 3])}}}" for k in (0, 3, 6)]
         self._function(type_, name, [*statements, f"return {{{', '.join(parts)}}};"])
 
+    def formula(self, name: str, x: Scalar, **parts: str) -> None:
+        """Adds a function from an index ``i`` to what is made of other functions of it, ``parts`` by their names."""
+        block = Block()
+        for part, call in parts.items():
+            block(f"const float {part} = {call};")
+        result = f"return {block.value(x)};"
+        self._varied[name] = f"  INLINE float {name}(int i) const {{ {' '.join([*block.lines, result])} }}"
+
     def _function(self, type_: str, name: str, statements: list[str], parameter: str = "int i") -> None:
         head, body = f"  static INLINE {type_} {name}({parameter}) {{", " ".join(statements)
         if len(head) + len(body) + 3 <= 120:
@@ -138,21 +147,30 @@ class Tables:
             self.lines += [head, *(f"    {s}" for s in statements), "  }"]
 
     def _read(self, type_: str, name: str, values: list[Number], parameter: str = "int i") -> None:
-        """Adds a function that reads the row of a world."""
-        count, places = self.COMPONENTS.get(type_, 1), [self.row.place(x) for x in values]
-        parts: list[str] = []
+        """Adds a function that reads the row of a world, but constants before and after what varies from a table."""
+        count = self.COMPONENTS.get(type_, 1)
+        changing = [k // count for k, x in enumerate(values) if varies(x)]
+        first, last = changing[0], changing[-1]
+        inside = values[count * first : count * (last + 1)]
+        outside = [*values[: count * first], *values[count * (last + 1) :]]
         statements: list[str] = []
-        for k in range(count):
-            own = places[k::count]
-            if own == list(range(own[0], own[0] + count * len(own), count)):
-                index = f"{own[0]}" if len(own) == 1 else f"{own[0]} + {count} * i"
-            else:
-                found, index = column(list(map(str, own)), "short", f"places{k}")
-                statements += found
-            parts.append(f"row[{index}]")
-        result = parts[0] if type_ == "float" else f"{{{', '.join(parts)}}}"
-        body = " ".join([*statements, f"return {result};"])
-        self._varied[name] = f"  INLINE {type_} {name}({parameter}) const {{ {body} }}"
+        if count == 1 and 2 * len(set(map(scalar, inside))) < len(inside):  # most are the same
+            statements, place = column([str(self.row.place(x)) for x in values], "short", "places")
+            outside = []
+        else:  # side by side, as lanes read them
+            start = self.row.place(*inside) - count * first
+            place = f"{start} + {count} * i" if len(inside) > count else f"{start + count * first}"
+        within = " && ".join([f"i >= {first}"] * (first > 0) + [f"i <= {last}"] * (count * (last + 1) < len(values)))
+        at = f"row.data + ({place})"
+        if outside and count == 1 and len(set(map(scalar, outside))) == 1:
+            at = f"row.data + ({within} ? {place} : {self.row.place(outside[0])})"
+        elif outside:
+            rest = [literal(0 if varies(x) else constant(x)) for x in values]
+            statements.append(f"static const float table[] = {{{', '.join(rest)}}};")
+            at = f"{within} ? {at} : table + {count} * i"
+        parts = ", ".join(f"at[{k}]" for k in range(count))
+        statements += [f"const Row at = {{{at}}};", f"return {parts if type_ == 'float' else f'{{{parts}}}'};"]
+        self._varied[name] = f"  INLINE {type_} {name}({parameter}) const {{ {' '.join(statements)} }}"
 
     def text(self) -> str:
         """Returns struct ``Model``."""
