@@ -9,11 +9,13 @@ import pytest
 import warp as wp
 from evaluate import evaluate
 from test_random_models import c_data, c_step, compiled_step
+from variation import all_varied
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.compiled import collision, lanes, step, unsupported
 from torchrl_loco.sim.compiled.constraints import Softness
 from torchrl_loco.sim.compiled.engine import Chain, _kernel
+from torchrl_loco.sim.compiled.parameters import VariedModel
 from torchrl_loco.sim.compiled.symbols import array, names, scalar
 from torchrl_loco.sim.overflow import Overflow
 from torchrl_loco.sim.simulation import choose_engine
@@ -302,14 +304,17 @@ def test_the_size_of_a_world_is_what_its_layout_says(form):
 @pytest.mark.slow
 @pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="Warp was built without NVRTC")
 @pytest.mark.parametrize("form", [0], indirect=True, ids=["lanes"])
-@pytest.mark.parametrize(("dofs", "kind"), [(18, {}), (30, {"condim": 1}), (64, {"touch": 1})], ids=str)
-def test_a_body_builds_for_a_gpu(form, dofs, kind, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("dofs", "kind", "varied"), [(18, {}, True), (30, {"condim": 1}, False), (64, {"touch": 1}, False)], ids=str
+)
+def test_a_body_builds_for_a_gpu(form, dofs, kind, varied, tmp_path, monkeypatch):
     """NVRTC needs no GPU; ptxas counts the shared memory."""
     monkeypatch.setattr(wp.config, "optimization_level", None)
     model = bristly(dofs, **kind)
     assert unsupported(model) == []
     start, end = Chain(()), Chain(())
-    kernel = _kernel(step.source(model, 1), start.func, start.struct, end.func, end.struct)
+    text = step.source(VariedModel(model, all_varied(model)) if varied else model, 1)
+    kernel = _kernel(text, start.func, start.struct, end.func, end.struct)
     kernel.module.options["block_dim"] = 32 * lanes.worlds_per_block(model)
     (built,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=False, strip_hash=True)
     assert built.suffix == ".cubin"

@@ -3,7 +3,7 @@
 :func:`source` puts a model's sizes, constants and tables in front of the algorithm in ``lanes.h``, as functions of a
 struct ``Model``: a parameter that is the same everywhere is a constant there, any other a table. Those that differ from
 world to world are functions of struct ``Varied``, which read the row of the world: its numbers, and what follows from
-them, which is computed when the state is evaluated without stepping.
+them, which is computed when the state is evaluated without stepping, or where a lane needs it.
 """
 
 import dataclasses

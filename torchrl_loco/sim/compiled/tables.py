@@ -147,30 +147,36 @@ class Tables:
             self.lines += [head, *(f"    {s}" for s in statements), "  }"]
 
     def _read(self, type_: str, name: str, values: list[Number], parameter: str = "int i") -> None:
-        """Adds a function that reads the row of a world, but constants before and after what varies from a table."""
+        """Adds a function that reads the row of a world."""
         count = self.COMPONENTS.get(type_, 1)
         changing = [k // count for k, x in enumerate(values) if varies(x)]
-        first, last = changing[0], changing[-1]
-        inside = values[count * first : count * (last + 1)]
-        outside = [*values[: count * first], *values[count * (last + 1) :]]
-        statements: list[str] = []
+        inside = values[count * changing[0] : count * (changing[-1] + 1)]
         if count == 1 and 2 * len(set(map(scalar, inside))) < len(inside):  # most are the same
             statements, place = column([str(self.row.place(x)) for x in values], "short", "places")
-            outside = []
-        else:  # side by side, as lanes read them
-            start = self.row.place(*inside) - count * first
-            place = f"{start} + {count} * i" if len(inside) > count else f"{start + count * first}"
-        within = " && ".join([f"i >= {first}"] * (first > 0) + [f"i <= {last}"] * (count * (last + 1) < len(values)))
-        at = f"row.data + ({place})"
-        if outside and count == 1 and len(set(map(scalar, outside))) == 1:
-            at = f"row.data + ({within} ? {place} : {self.row.place(outside[0])})"
-        elif outside:
-            rest = [literal(0 if varies(x) else constant(x)) for x in values]
-            statements.append(f"static const float table[] = {{{', '.join(rest)}}};")
-            at = f"{within} ? {at} : table + {count} * i"
+            at = f"row.data + ({place})"
+        else:
+            statements, at = self._side_by_side(values, count, changing[0], changing[-1])
         parts = ", ".join(f"at[{k}]" for k in range(count))
         statements += [f"const Row at = {{{at}}};", f"return {parts if type_ == 'float' else f'{{{parts}}}'};"]
         self._varied[name] = f"  INLINE {type_} {name}({parameter}) const {{ {' '.join(statements)} }}"
+
+    def _side_by_side(self, values: list[Number], count: int, first: int, last: int) -> tuple[list[str], str]:
+        """Returns statements, and a pointer to element ``i``: in the row, where lanes read neighbours together.
+
+        Constants before the first and after the last element that varies are those of all worlds, which stay nearer.
+        """
+        inside, outside = values[count * first : count * (last + 1)], values[: count * first]
+        outside = [*outside, *values[count * (last + 1) :]]
+        start = self.row.place(*inside)
+        place = f"{start - count * first} + {count} * i" if last > first else f"{start}"
+        if not outside:
+            return [], f"row.data + {place}"
+        within = " && ".join([f"i >= {first}"] * (first > 0) + [f"i <= {last}"] * (count * (last + 1) < len(values)))
+        if count == 1 and len(set(map(scalar, outside))) == 1:
+            return [], f"row.data + ({within} ? {place} : {self.row.place(outside[0])})"
+        rest = [literal(0 if varies(x) else constant(x)) for x in values]
+        table = f"static const float table[] = {{{', '.join(rest)}}};"
+        return [table], f"{within} ? row.data + {place} : table + {count} * i"
 
     def text(self) -> str:
         """Returns struct ``Model``."""
