@@ -39,17 +39,17 @@ WARP_BYTES = 4 * 32
 WORLD_BYTES = (
     11136,
     BLOCK_BYTES // 4 - WARP_BYTES,
-    BLOCK_BYTES // 3 - WARP_BYTES,
+    22704,
     BLOCK_BYTES // 2 - WARP_BYTES,
     BLOCK_BYTES - WARP_BYTES,
 )
 """Shared memory that a world may fill: the first that leaves room for enough contacts. With 11136 bytes, 20 worlds in
-blocks of 4 fit a multiprocessor of an H100 or H200."""
+blocks of 4 fit a multiprocessor of an H100 or H200, with 22704 bytes 10 in blocks of 2."""
 MOST_WORLDS = 4
 """Worlds of a block, at most."""
 LOCKSTEP = True
 """Whether the worlds of a block wait for each other twice a substep, so that they share what they fetch of the text."""
-ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 16, 16
+ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 28, 16
 """Places for contacts with friction, which a world should have and may have, and for those without."""
 
 
