@@ -42,9 +42,8 @@ class SimConfig:
         engine: what steps the physics. ``compiled`` is one kernel made for the model, 6 to 50 times as fast on an
             H200; ``mujoco_warp`` is MuJoCo-Warp; ``auto`` takes ``compiled`` if it supports the model,
             else ``mujoco_warp``.
-        integrator: how velocities and positions advance: ``euler`` (semi-implicit, under both engines),
-            ``implicitfast`` or ``rk4`` (both under ``mujoco_warp``). It replaces the one that the model names, and a
-            line of the log says so.
+        integrator: how velocities and positions advance: ``euler`` (semi-implicit), ``implicitfast``, or ``rk4``
+            (under ``mujoco_warp`` only). It replaces the one that the model names, and a line of the log says so.
 
     Raises:
         TypeError: a value has the wrong type.

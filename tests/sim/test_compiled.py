@@ -35,7 +35,8 @@ MANY = "".join(f'<body pos="{i} 5 1"><freejoint/><geom size="0.1"/></body>' for 
 OTHERS = [
     ("<option/>", '<option cone="elliptic"/>', "elliptic friction cones"),
     ("<option/>", '<option solver="CG"/>', "a solver other than Newton"),
-    ("<option/>", '<option integrator="implicitfast"/>', "an integrator other than Euler"),
+    ("<option/>", '<option integrator="implicit"/>', "an integrator other than Euler and implicitfast"),
+    ("<option/>", '<option integrator="implicitfast"/>', "'loose': implicitfast for a body that is alone in its tree"),
     ("<option/>", '<option noslip_iterations="2"/>', "noslip iterations"),
     ("<option/>", '<option viscosity="1"/>', "forces of a fluid"),
     ("<option/>", '<option density="1"/>', "forces of a fluid"),
@@ -52,7 +53,6 @@ OTHERS = [
     ('<body name="arm"', '<body name="arm" gravcomp="1"', "gravity compensation"),
     ('<freejoint name="loose"/>', '<joint name="loose" type="free" stiffness="1"/>', "'loose': stiffness of a free"),
     ('<freejoint name="loose"/>', '<joint name="loose" type="ball" stiffness="1"/>', "'loose': stiffness of a"),
-    ('damping="1"', 'actuatorfrcrange="-1 1"', "'elbow': limits of actuator forces"),
     ('damping="1"', 'damping="1 2"', "dampers that are not linear"),
     ('damping="1"', 'stiffness="1 2"', "'elbow': springs that are not linear"),
     ('type="capsule" size="0.1 0.2"', 'type="box" size="0.1 0.1 0.1" contype="0"', "plane and box, sphere and box"),
@@ -110,6 +110,7 @@ def test_what_changes_nothing_is_supported():
         ("", ""),
         ("<option/>", '<option><flag eulerdamp="disable" filterparent="disable"/></option>'),
         ('type="capsule" size="0.1 0.2"', 'type="box" size="0.1 0.1 0.1" contype="0" conaffinity="0"'),
+        ('damping="1"', 'actuatorfrcrange="-1 1"'),
     ]:
         assert unsupported(mujoco.MjModel.from_xml_string(MODEL.replace(old, new))) == []
     for body, path in MODELS.items():

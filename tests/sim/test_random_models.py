@@ -19,6 +19,7 @@ from torchrl_loco.sim.compiled import collision, step, unsupported
 STATES = 16
 NOISE = 3e-7
 """Relative noise in a state: about what rounding to float32 makes."""
+ALONE = "implicitfast for a body that is alone in its tree"
 KINDS = ("plane", "dense", "frictionless", "pyramid", "hinge limit", "slide limit", "ball limit", "dry friction")
 """Kinds of constraints that a state can have."""
 SETTINGS = {
@@ -51,6 +52,7 @@ def compiled_step(model, state, varied=None, rows=None):
         iterations=option.iterations,
         ls_iterations=option.ls_iterations,
         euler_damping=not option.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP,
+        integrator=mujoco.mjtIntegrator(option.integrator).name.removeprefix("mjINT_").lower(),
         engine="compiled",
     )
     sim = Simulation(model, config, count, torch.device("cpu"), contact_geoms=range(model.ngeom), varied=varied)
@@ -100,6 +102,14 @@ def cost(model, data, qacc):
     rows[beyond] = (largest * (np.abs(x) - 0.5 * largest / data.efc_D))[beyond]
     apart = qacc - data.qacc_smooth
     return 0.5 * apart @ mass @ apart + rows.sum()
+
+
+def held(model, data):
+    """Returns which actuators' forces are at a limit, of their own or of their joint."""
+    own, joint = model.actuator_forcerange, model.actuator_trnid[:, 0]
+    force, sums, limits = data.actuator_force, data.qfrc_actuator[model.jnt_dofadr[joint]], model.jnt_actfrcrange[joint]
+    at_own = (model.actuator_forcelimited == 1) & ((force <= own[:, 0]) | (force >= own[:, 1]))
+    return at_own | ((model.jnt_actfrclimited[joint] == 1) & ((sums <= limits[:, 0]) | (sums >= limits[:, 1])))
 
 
 def constraints(model, data):
@@ -167,12 +177,30 @@ def assert_forces_belong_to_the_acceleration(model, state, sim, world, rng):
     return int((felt > 1e-3).sum()), int((np.abs(pushed).max(axis=1) > 1e-3).sum())
 
 
-def compare(xml, count=STATES, *, vary=False):
+def with_implicitfast(xml, rng):
+    """Returns a model with implicitfast, actuators that damp, and joints that limit the sum of their forces."""
+    spec = mujoco.MjSpec.from_string(xml)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for actuator in spec.actuators:
+        actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        actuator.biasprm[2] -= rng.uniform(0, 0.5)
+        if rng.random() < 0.5:  # a second one on the joint
+            spec.add_actuator(target=actuator.target, trntype=actuator.trntype, gainprm=actuator.gainprm)
+    for joint in spec.joints:
+        if joint.type in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE) and rng.random() < 0.5:
+            joint.actfrclimited, joint.actfrcrange = mujoco.mjtLimited.mjLIMITED_TRUE, [-rng.uniform(0, 9), 5]
+    model = spec.compile()
+    if ALONE in str(unsupported(model)):
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    return model
+
+
+def compare(xml, count=STATES, *, vary=False, implicitfast=False):
     """Holds the model's states to C MuJoCo; returns how many there were, how many agreed closely, and their kinds.
 
     With ``vary`` each state has numbers of the model of its own.
     """
-    model = mujoco.MjModel.from_xml_string(xml)
+    model = with_implicitfast(xml, np.random.default_rng(0)) if implicitfast else mujoco.MjModel.from_xml_string(xml)
     hypothesis.assume(not unsupported(model))
     # A sphere that can only turn about its center: MuJoCo weighs its contacts by the inverse of nothing, 1e15.
     hypothesis.assume((model.body_invweight0[model.body_weldid > 0, 0] > 1e-6).all())
@@ -192,6 +220,7 @@ def compare(xml, count=STATES, *, vary=False):
         data = c_data(model, *state)
         mujoco.mj_forward(model, data)
         found.update(["states", *constraints(model, data)])
+        found["held"] += int(held(model, data).sum())
         expected = c_step(model, *state)
         error, change = np.abs(sim.qvel[world].numpy() - expected).max(), np.abs(expected - state[1]).max()
         if error <= 1e-4 + 2e-5 * change + 10 * sensitivity(model, state, expected, rng):
@@ -249,3 +278,20 @@ def test_a_step_with_numbers_of_each_world_agrees_with_c_mujoco(traced_dofs, mon
     assert total["states"] > 8 * count
     assert total["close"] > 0.95 * total["states"]
     assert total["overflow"] < 0.01 * total["states"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("vary", [False, True], ids=["alike", "varied"])
+def test_a_step_by_implicitfast_agrees_with_c_mujoco(vary):
+    total, count = collections.Counter(), 10
+
+    @hypothesis.settings(max_examples=count, **SETTINGS)
+    @hypothesis.given(models())
+    def check(xml):
+        total.update(compare(xml, vary=vary, implicitfast=True))
+
+    check()
+    print(dict(total))
+    assert total["states"] > 8 * count
+    assert total["held"] > 2 * count
+    assert total["close"] > 0.97 * total["states"]

@@ -254,6 +254,9 @@ struct Step : Math {
   int frictional, frictionless;  // contacts
   int limits;                    // violated limits of hinges and slides
   int limit_row[Model::LIMIT_SIDES][SLOTS];  // the row of the limit of each own degree of freedom, or -1
+//IF IMPLICIT_ACTUATORS
+  float implicit_damping[SLOTS];  // minus the derivative of the force of each own degree of freedom by its velocity
+//END
 //IF VARIED
   const Varied varied;
 //END
@@ -489,11 +492,20 @@ struct Step : Math {
   }
 
   // Passive and actuator forces of a degree of freedom.
+//IF IMPLICIT_ACTUATORS
+  // Minus their derivative by its velocity is its damping. MuJoCo leaves out actuators whose force a limit holds.
+  INLINE float joint_force(int d, float& damping) const {
+    damping = Model::damping(d);
+//ELSE
   INLINE float joint_force(int d) const {
+//END
     const int q = Model::dof_qpos(d);
     float force = -Model::damping(d) * w.qvel[d];
     if (Model::HAS_SPRINGS) force = force - Model::stiffness(d) * (w.qpos[q] - Model::spring(q));
     const int end = Model::first_actuator(d + (Model::SUBSTEPS > 0));  // a step that is not taken has no actuation
+//IF JOINT_FORCE_LIMITS
+    float actuation = 0.0f;
+//END
     ROLLED for (int a = Model::first_actuator(d); a < end; ++a) {
       const float gear = Model::gear(a);
       const float control = ctrl[world * Model::CONTROLS + Model::control(a)];
@@ -501,8 +513,21 @@ struct Step : Math {
       if (Model::HAS_ACTUATOR_BIAS)
         f = f + Model::bias(a) + gear * (Model::bias_position(a) * w.qpos[q] + Model::bias_velocity(a) * w.qvel[d]);
       if (Model::HAS_FORCE_LIMITS) f = clamp(f, Model::force_low(a), Model::force_high(a));
+//IF IMPLICIT_ACTUATORS
+      if (Model::force_low(a) < f && f < Model::force_high(a)) damping = damping - gear * gear * Model::bias_velocity(a);
+//END
+//IF JOINT_FORCE_LIMITS
+      actuation = actuation + gear * f;
+    }
+    const float low = Model::joint_force_low(d), high = Model::joint_force_high(d);
+    force = force + clamp(actuation, low, high);
+//ELSE
       force = force + gear * f;
     }
+//END
+//IF IMPLICIT_ACTUATORS
+    if (!(low < actuation && actuation < high)) damping = Model::damping(d);
+//END
     return force;
   }
 
@@ -513,7 +538,11 @@ struct Step : Math {
       if (d >= DOFS) continue;
       const Body body = w.bodies[Model::dof_link(d)];
       const Motion axis = w.axes[d], momentum = body.inertia * axis, bias = {body.torque, body.force};
+//IF IMPLICIT_ACTUATORS
+      w.residual[d] = axis.dot(bias) - joint_force(d, implicit_damping[slot]);
+//ELSE
       w.residual[d] = axis.dot(bias) - joint_force(d);
+//END
 //IF VARIED
       const float armature = Model::armature(d);  // in the loop, lanes would wait for theirs in turn
 //END
@@ -1156,7 +1185,11 @@ struct Step : Math {
         start_from_mass(h);
         if (Model::IMPLICIT_DAMPING && stop) {  // (M + h D) a = M qacc, solved for the difference of a and qacc
           OWN_DOFS(slot, d) {
+//IF IMPLICIT_ACTUATORS
+            const float damping = d < DOFS ? Model::timestep() * implicit_damping[slot] : 0.0f;
+//ELSE
             const float damping = d < DOFS ? Model::timestep() * Model::damping(d) : 0.0f;
+//END
             h.diagonal[slot] += damping;
             h.gradient[slot] = d < DOFS ? damping * w.qacc[d] : 0.0f;
           }

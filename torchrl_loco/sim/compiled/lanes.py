@@ -101,6 +101,20 @@ def pad(x: int, unit: int) -> int:
     return -(-x // unit) * unit
 
 
+def is_implicitfast(m: mujoco.MjModel) -> bool:
+    """Returns whether velocities advance by (M - h D) a' = M a, D the derivatives of the joints' forces by them.
+
+    With ``euler`` D is that of the dampers alone, or zero.
+    """
+    return m.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+
+
+def affine_bias(m: mujoco.MjModel) -> np.ndarray:
+    """Returns the force of each actuator without control: its constant, per length and per velocity, ``(nu, 3)``."""
+    unbiased = m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE)
+    return np.where(unbiased[:, None], 0, m.actuator_biasprm[:, :3])
+
+
 class Description:
     """What ``lanes.h`` has to know about a model.
 
@@ -129,6 +143,8 @@ class Description:
         sensors = [(int(m.sensor_type[i]), int(m.sensor_objid[i]), int(m.sensor_adr[i])) for i in range(m.nsensor)]
         self.subtrees = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL)]
         self.touch = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_TOUCH)]
+        self.implicit_actuators = is_implicitfast(m) and present(affine_bias(m)[acting(m), 2])
+        self.joint_force_limits = self.implicit_actuators or m.jnt_actfrclimited.any()
         self.layout = self._layout()
 
     def _dofs_to_root(self, dof: int) -> Iterator[int]:
@@ -296,8 +312,9 @@ class Description:
     def _add_forces(self, tables: Tables, mask: str) -> None:
         m = self.m
         stiffness, damping = m.jnt_stiffness[m.dof_jntid], m.dof_damping
-        explicit = m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-        tables.size(HAS_SPRINGS=present(stiffness), IMPLICIT_DAMPING=present(damping) and not explicit)
+        explicit = m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP) and not is_implicitfast(m)
+        implicit = present(damping) and not explicit
+        tables.size(HAS_SPRINGS=present(stiffness), IMPLICIT_DAMPING=implicit or self.implicit_actuators)
         tables.floats("stiffness", stiffness)
         tables.floats("spring", m.qpos_spring)
         tables.floats("damping", damping)
@@ -305,8 +322,7 @@ class Description:
         tables.integers("ancestors", self.ancestors, mask)
         dofs = m.jnt_dofadr[m.actuator_trnid[:, 0]]
         used = sorted(acting(m), key=lambda a: dofs[a])
-        unbiased = m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE)
-        bias = np.where(unbiased[:, None], 0, m.actuator_biasprm[:, :3])[used]
+        bias = affine_bias(m)[used]
         clamped = m.actuator_ctrllimited.astype(bool)
         limited = m.actuator_forcelimited.astype(bool)
         limits = np.where(clamped[:, None], m.actuator_ctrlrange, [-UNLIMITED, UNLIMITED])[used]
@@ -321,6 +337,11 @@ class Description:
         for k, name in enumerate(("low", "high")):
             tables.floats(f"control_{name}", limits[:, k])
             tables.floats(f"force_{name}", forces[:, k])
+        if self.joint_force_limits:
+            limited = m.jnt_actfrclimited.astype(bool)
+            forces = np.where(limited[:, None], m.jnt_actfrcrange, [-UNLIMITED, UNLIMITED])[m.dof_jntid]
+            for k, name in enumerate(("low", "high")):
+                tables.floats(f"joint_force_{name}", forces[:, k])
 
     def _geom(self, g: int) -> tuple[int, np.ndarray, np.ndarray]:
         """Returns the link of a geom, and its center and z axis in the frame of the link."""
@@ -501,6 +522,8 @@ def source(
         "CONTACT_GEOMS": len(contact_geoms) > 0,
         "VARIED": tables.row.numbers > 0,
         "DERIVED": tables.row.numbers > 0 and substeps == 0,
+        "IMPLICIT_ACTUATORS": description.implicit_actuators,
+        "JOINT_FORCE_LIMITS": description.joint_force_limits,
     }
     text = tables.use(_parts(TEMPLATE.read_text(), asked))
     text = text.replace("//MODEL", tables.text()).replace("//ELIMINATE", description.elimination())

@@ -27,8 +27,12 @@ they wait for memory, and the registers of the physics leave too few warps to hi
 
 
 def is_traced(m: mujoco.MjModel) -> bool:
-    """Returns whether one thread steps a world, in straight-line code; else a group of lanes does, in loops."""
-    return m.nv <= TRACED_DOFS
+    """Returns whether one thread steps a world, in straight-line code; else a group of lanes does, in loops.
+
+    Lanes alone have integrators other than Euler, and joints that limit the forces of their actuators.
+    """
+    euler = m.opt.integrator == int(mujoco.mjtIntegrator.mjINT_EULER)
+    return m.nv <= TRACED_DOFS and euler and not m.jnt_actfrclimited.any()
 
 
 def structure_of_arrays(m: mujoco.MjModel, device: wp.Device) -> bool:

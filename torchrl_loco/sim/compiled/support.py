@@ -58,8 +58,8 @@ def _options(m: mujoco.MjModel) -> list[str]:
         found.append("elliptic friction cones")
     if option.solver != int(mujoco.mjtSolver.mjSOL_NEWTON):
         found.append("a solver other than Newton")
-    if option.integrator != int(mujoco.mjtIntegrator.mjINT_EULER):
-        found.append("an integrator other than Euler")
+    if option.integrator != int(mujoco.mjtIntegrator.mjINT_EULER) and not lanes.is_implicitfast(m):
+        found.append("an integrator other than Euler and implicitfast")
     if option.noslip_iterations:
         found.append("noslip iterations")
     if option.density or option.viscosity:
@@ -100,8 +100,8 @@ def _joints(m: mujoco.MjModel) -> list[str]:
         name = m.joint(j).name
         if m.jnt_type[j] in (FREE, BALL) and m.jnt_stiffness[j]:
             found.setdefault("stiffness of a free or ball joint", []).append(name)
-        if m.jnt_actfrclimited[j]:
-            found.setdefault("limits of actuator forces at a joint", []).append(name)
+        if lanes.is_implicitfast(m) and m.jnt_type[j] == FREE and m.tree_dofnum[m.dof_treeid[m.jnt_dofadr[j]]] == 6:
+            found.setdefault("implicitfast for a body that is alone in its tree", []).append(name)
         if m.jnt_stiffnesspoly[j].any():
             found.setdefault("springs that are not linear", []).append(name)
     dampers = ["dampers that are not linear"] if m.dof_dampingpoly.any() else []
