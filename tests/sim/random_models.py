@@ -23,13 +23,23 @@ SOLIMP = st.sampled_from(
     ]
 )
 SURFACES = {
-    "condim": [1, 3, 3],
     "margin": [0.0, 0.01],
     "gap": [0.0, 0.005],
     "priority": [0, 0, 0, 1],
     "solmix": [1.0, 1.0, 0.3, 2.0],
 }
 """Choices for what a geom's contacts are like; frequent ones are repeated."""
+LAWS = {
+    "sliding": {"cone": "pyramidal", "condim": [1, 3, 3], "impratio": [1.0, 3.0], "friction": [(0.2, 1.5)]},
+    "pyramid": {"cone": "pyramidal", "condim": [1, 3, 4, 6], "impratio": [1.0, 3.0], "friction": [(0.2, 1.5)]},
+    "cone": {
+        "cone": "elliptic",
+        "condim": [1, 3, 4, 6],
+        "impratio": [1.0, 10.0, 100.0],
+        "friction": [(0.2, 1.5), (0.2, 1.5), (0.001, 0.02)],
+    },
+}
+"""Choices for the friction of contacts. A step that is traced has the first alone."""
 
 
 def numbers(low, high):
@@ -54,21 +64,25 @@ def element(kind, *inner, **attributes):
 
 
 @st.composite
-def surfaces(draw):
+def surfaces(draw, law):
     """Returns the attributes of a geom that its contacts follow."""
     chosen = {name: draw(st.sampled_from(choices)) for name, choices in SURFACES.items()}
-    return {**chosen, "friction": draw(numbers(0.2, 1.5)), "solref": draw(SOLREF), "solimp": draw(SOLIMP)}
+    chosen["condim"] = draw(st.sampled_from(LAWS[law]["condim"]))
+    friction = [draw(numbers(*draw(st.sampled_from(LAWS[law]["friction"]))))]
+    if law != "sliding":
+        friction += draw(vectors(0.001, 0.3, 2))
+    return {**chosen, "friction": friction, "solref": draw(SOLREF), "solimp": draw(SOLIMP)}
 
 
 @st.composite
-def geoms(draw):
+def geoms(draw, law):
     """Returns a sphere or a capsule."""
     size = [draw(numbers(0.03, 0.12))]
     kind = draw(st.sampled_from(["sphere", "capsule", "capsule"]))
     if kind == "capsule":
         size.append(draw(numbers(0.05, 0.25)))
     pose = {"pos": draw(vectors(-0.15, 0.15)), "euler": draw(vectors(-180, 180))}
-    return element("geom", type=kind, size=size, density=draw(numbers(200, 2000)), **pose, **draw(surfaces()))
+    return element("geom", type=kind, size=size, density=draw(numbers(200, 2000)), **pose, **draw(surfaces(law)))
 
 
 @st.composite
@@ -112,7 +126,7 @@ def actuators(draw, joint):
 
 
 @st.composite
-def trees(draw, children, body, parent, actuated):
+def trees(draw, children, body, parent, actuated, law):
     """Returns a body with all that hangs on it, and adds the joints that may have an actuator to ``actuated``."""
     root, parts = parent < 0, []
     count = draw(st.sampled_from([1, 1, 1, 2, 3])) if root or draw(st.integers(0, 7)) else 0
@@ -123,38 +137,42 @@ def trees(draw, children, body, parent, actuated):
         if kind in ("free", "ball"):
             break  # MuJoCo allows no rotation after these
         actuated.append(name)
-    parts += [draw(geoms()) for _ in range(draw(st.sampled_from([1, 1, 2])))]
+    parts += [draw(geoms(law)) for _ in range(draw(st.sampled_from([1, 1, 2])))]
     parts.append(draw(zones(body)))
     height = numbers(0.2, 0.8) if root else numbers(0.0, 0.3)
     position = [*draw(vectors(-0.3, 0.3, 2)), draw(height)]
-    inner = [draw(trees(children, child, body, actuated)) for child in children[body]]
+    inner = [draw(trees(children, child, body, actuated, law)) for child in children[body]]
     return element("body", *parts, *inner, name=f"body{body}", pos=position, euler=draw(vectors(-60, 60)))
 
 
 @st.composite
-def models(draw, max_bodies=8):
-    """Returns MJCF of one or more trees of bodies, over one or two planes and at times a capsule that stands still."""
+def models(draw, max_bodies=8, laws=("sliding",)):
+    """Returns MJCF of one or more trees of bodies, over one or two planes and at times a capsule that stands still.
+
+    Friction is by one of some of ``LAWS``.
+    """
+    law = draw(st.sampled_from(laws))
     count, actuated = draw(st.integers(1, max_bodies)), []
     children = {i: [] for i in range(-1, count)}
     for i in range(count):
         children[draw(st.integers(-1, i - 1))].append(i)
-    scene = [element("geom", type="plane", size=(5, 5, 0.1), **draw(surfaces()))]
+    scene = [element("geom", type="plane", size=(5, 5, 0.1), **draw(surfaces(law)))]
     if draw(rarely()):
         pose = {"pos": (-0.4, 0, 0), "euler": draw(vectors(-40, 40))}
-        scene.append(element("geom", type="plane", size=(5, 5, 0.1), **pose, **draw(surfaces())))
+        scene.append(element("geom", type="plane", size=(5, 5, 0.1), **pose, **draw(surfaces(law))))
     if draw(rarely()):
         pose = {"pos": (0.2, 0, 0.1), "euler": draw(vectors(-90, 90))}
-        scene.append(element("geom", type="capsule", size=(0.1, 0.3), **pose, **draw(surfaces())))
-    bodies = [draw(trees(children, i, -1, actuated)) for i in children[-1]]
+        scene.append(element("geom", type="capsule", size=(0.1, 0.3), **pose, **draw(surfaces(law))))
+    bodies = [draw(trees(children, i, -1, actuated, law)) for i in children[-1]]
     exclude = [element("exclude", body1="body0", body2="body1")] if count > 1 and draw(st.booleans()) else []
     flag = element("flag", eulerdamp=draw(st.sampled_from(["enable", "disable"])))
     option = {
         "timestep": draw(st.sampled_from([0.002, 0.005])),
-        "impratio": draw(st.sampled_from([1.0, 3.0])),
+        "impratio": draw(st.sampled_from(LAWS[law]["impratio"])),
         "gravity": draw(st.sampled_from([(0, 0, -9.81), (1, -2, -9)])),
         "iterations": 100,
         "ls_iterations": 50,
-        "cone": "pyramidal",
+        "cone": LAWS[law]["cone"],
     }
     return element(
         "mujoco",

@@ -33,7 +33,6 @@ MODEL = f"""
 """
 MANY = "".join(f'<body pos="{i} 5 1"><freejoint/><geom size="0.1"/></body>' for i in range(10))
 OTHERS = [
-    ("<option/>", '<option cone="elliptic"/>', "elliptic friction cones"),
     ("<option/>", '<option solver="CG"/>', "a solver other than Newton"),
     ("<option/>", '<option integrator="implicit"/>', "an integrator other than Euler and implicitfast"),
     ("<option/>", '<option integrator="implicitfast"/>', "'loose': implicitfast for a body that is alone in its tree"),
@@ -56,8 +55,6 @@ OTHERS = [
     ('damping="1"', 'damping="1 2"', "dampers that are not linear"),
     ('damping="1"', 'stiffness="1 2"', "'elbow': springs that are not linear"),
     ('type="capsule" size="0.1 0.2"', 'type="box" size="0.1 0.1 0.1" contype="0"', "plane and box, sphere and box"),
-    ('size="0.1 0.2"', 'size="0.1 0.2" condim="6"', "contacts with condim 6"),
-    ('<geom name="marble"', '<geom name="marble" condim="4"', "contacts with condim 4"),
     (MOTOR, MOTOR.replace("elbow", "loose"), "'pull': a transmission other than a hinge or slide"),
     (MOTOR, '<general name="pull" joint="elbow" dyntype="filter" dynprm="1"/>', "'pull': activation dynamics"),
     (MOTOR, '<general name="pull" joint="elbow" gaintype="affine" gainprm="1 1"/>', "'pull': a gain that is not fixed"),
@@ -121,15 +118,15 @@ def test_the_engine_is_chosen_by_what_the_model_needs(caplog):
     model = mujoco.MjModel.from_xml_string(MODEL)
     assert choose_engine(model, config("auto"))[0] == choose_engine(model, config("compiled"))[0] == "compiled"
     assert choose_engine(model, config("mujoco_warp")) == ("mujoco_warp", "as asked")
-    model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    model.opt.noslip_iterations = 2
     model.opt.viscosity = 1.0
     assert choose_engine(model, config("mujoco_warp")) == ("mujoco_warp", "as asked")
     assert not caplog.records
-    needs = "does not have: elliptic friction cones; forces of a fluid"
+    needs = "does not have: noslip iterations; forces of a fluid"
     name, why = choose_engine(model, config("auto"))
     assert name == "mujoco_warp"
     assert needs in why
-    assert "elliptic friction cones and 1 more" in caplog.text
+    assert "noslip iterations and 1 more" in caplog.text
     with pytest.raises(ValueError, match=rf"engine='compiled' {needs}.*'auto' or 'mujoco_warp'"):
         choose_engine(model, config("compiled"))
 

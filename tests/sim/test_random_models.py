@@ -9,7 +9,7 @@ import pytest
 import torch
 import warp as wp
 from contact_forces import net_forces
-from random_models import models, states
+from random_models import LAWS, models, states
 from variation import draw_rows, some_varied
 
 from torchrl_loco.config import SimConfig
@@ -22,6 +22,10 @@ NOISE = 3e-7
 ALONE = "implicitfast for a body that is alone in its tree"
 KINDS = ("plane", "dense", "frictionless", "pyramid", "hinge limit", "slide limit", "ball limit", "dry friction")
 """Kinds of constraints that a state can have."""
+KINDS_OF_LANES = (*KINDS, "cone", "turning")
+"""The same with those that are not traced."""
+FORMS = {"traced": (31, ["sliding"]), "lanes": (0, list(LAWS))}
+"""Both forms of the compiled step: most degrees of freedom that are traced, and laws of friction."""
 SETTINGS = {
     "deadline": None,
     "derandomize": True,
@@ -92,16 +96,11 @@ def sensitivity(model, state, expected, rng):
 
 def cost(model, data, qacc):
     """Returns what the solver minimises at an acceleration, in float64."""
-    mass = np.zeros((model.nv, model.nv))
+    mass, rows = np.zeros((model.nv, model.nv)), np.zeros(1)
     mujoco.mj_fullM(model, data, mass)
-    x = data.efc_J.reshape(-1, model.nv) @ qacc - data.efc_aref
-    friction = data.efc_type == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF
-    rows = 0.5 * data.efc_D * x**2 * (friction | (x < 0))
-    largest = data.efc_frictionloss
-    beyond = friction & (np.abs(x) * data.efc_D > largest)
-    rows[beyond] = (largest * (np.abs(x) - 0.5 * largest / data.efc_D))[beyond]
+    mujoco.mj_constraintUpdate(model, data, data.efc_J.reshape(-1, model.nv) @ qacc - data.efc_aref, rows, 0)
     apart = qacc - data.qacc_smooth
-    return 0.5 * apart @ mass @ apart + rows.sum()
+    return 0.5 * apart @ mass @ apart + rows[0]
 
 
 def held(model, data):
@@ -117,8 +116,9 @@ def constraints(model, data):
     kinds, row_types, ids = set(), data.efc_type, data.efc_id
     for geoms in data.contact.geom[data.contact.efc_address >= 0]:
         kinds.add("plane" if mujoco.mjtGeom.mjGEOM_PLANE in model.geom_type[geoms] else "dense")
+    kinds |= {"turning"} if (data.contact.dim[data.contact.efc_address >= 0] > 3).any() else set()
     names = {"mjCNSTR_CONTACT_FRICTIONLESS": "frictionless", "mjCNSTR_CONTACT_PYRAMIDAL": "pyramid"}
-    names["mjCNSTR_FRICTION_DOF"] = "dry friction"
+    names |= {"mjCNSTR_CONTACT_ELLIPTIC": "cone", "mjCNSTR_FRICTION_DOF": "dry friction"}
     kinds |= {kind for name, kind in names.items() if (row_types == getattr(mujoco.mjtConstraint, name)).any()}
     for joint in ids[row_types == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT]:
         kinds.add(mujoco.mjtJoint(model.jnt_type[joint]).name.removeprefix("mjJNT_").lower() + " limit")
@@ -241,15 +241,15 @@ def compare(xml, count=STATES, *, vary=False, implicitfast=False):
     return found
 
 
-@pytest.mark.parametrize("traced_dofs", [31, 0], ids=["traced", "lanes"])
+@pytest.mark.parametrize(("traced_dofs", "laws"), FORMS.values(), ids=FORMS)
 @pytest.mark.parametrize("count", [pytest.param(10, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.ci)])
-def test_a_step_agrees_with_c_mujoco(traced_dofs, count, monkeypatch):
+def test_a_step_agrees_with_c_mujoco(traced_dofs, laws, count, monkeypatch):
     """Both forms of the compiled step, which one takes small bodies and the other large ones, step any model."""
     monkeypatch.setattr(step, "TRACED_DOFS", traced_dofs)
     total = collections.Counter()
 
     @hypothesis.settings(max_examples=count, **SETTINGS)
-    @hypothesis.given(models())
+    @hypothesis.given(models(laws=laws))
     def check(xml):
         total.update(compare(xml))
 
@@ -259,17 +259,17 @@ def test_a_step_agrees_with_c_mujoco(traced_dofs, count, monkeypatch):
     assert total["close"] > 0.95 * total["states"]
     assert total["overflow"] < 0.01 * total["states"]
     if count == 200:
-        assert min(total[kind] for kind in KINDS) > 50, total
+        assert min(total[kind] for kind in (KINDS if traced_dofs else KINDS_OF_LANES)) > 50, total
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("traced_dofs", [31, 0], ids=["traced", "lanes"])
-def test_a_step_with_numbers_of_each_world_agrees_with_c_mujoco(traced_dofs, monkeypatch):
+@pytest.mark.parametrize(("traced_dofs", "laws"), FORMS.values(), ids=FORMS)
+def test_a_step_with_numbers_of_each_world_agrees_with_c_mujoco(traced_dofs, laws, monkeypatch):
     monkeypatch.setattr(step, "TRACED_DOFS", traced_dofs)
     total, count = collections.Counter(), 10
 
     @hypothesis.settings(max_examples=count, **SETTINGS)
-    @hypothesis.given(models())
+    @hypothesis.given(models(laws=laws))
     def check(xml):
         total.update(compare(xml, vary=True))
 

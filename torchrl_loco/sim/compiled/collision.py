@@ -33,8 +33,10 @@ class Pair:
 
     Attributes:
         geoms: their ids, the simpler shape first; the normal points from the first to the second.
-        condim: 1 (no friction) or 3 (sliding friction).
+        condim: 1 (no friction), 3 (sliding), 4 (torsional friction too) or 6 (rolling friction too).
         friction: sliding friction coefficient, 0 without friction.
+        torsional: torsional friction coefficient (m), 0 without.
+        rolling: rolling friction coefficient (m), 0 without.
         margin: distance below which a contact is active (m).
         solref: reference parameters of the constraint, ``(2,)``.
         solimp: impedance parameters, ``(5,)``.
@@ -44,6 +46,8 @@ class Pair:
     geoms: tuple[int, int]
     condim: int
     friction: Number
+    torsional: Number
+    rolling: Number
     margin: float
     solref: tuple[float, ...]
     solimp: tuple[float, ...]
@@ -70,9 +74,14 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
     return found
 
 
+def is_elliptic(m: mujoco.MjModel) -> bool:
+    """Returns whether friction of contacts is bounded by elliptic cones, not by pyramids."""
+    return bool(m.opt.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC))
+
+
 def contact_weight(m: mujoco.MjModel, pair: Pair) -> Number:
-    """Returns the approximate inverse inertia along a row of a contact."""
-    if pair.condim == 1:
+    """Returns the approximate inverse inertia along a row of a contact; along the normal, if its cone is elliptic."""
+    if pair.condim == 1 or is_elliptic(m):
         return pair.weight
     squared = pair.friction * pair.friction
     return pair.weight * (1 + squared) * 2 * squared / m.opt.impratio
@@ -99,13 +108,13 @@ def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
     if one_decides:
         first = 1.0 if m.geom_priority[a] > m.geom_priority[b] else 0.0
         condim = m.geom_condim[a if first else b]
-        friction = m.geom_friction[a if first else b, 0]
+        friction = m.geom_friction[a if first else b]
     else:
         mix = m.geom_solmix[[a, b]]
         large = mix >= MINVAL
         first = mix[0] / mix.sum() if large.all() else (0.5 if not large.any() else float(large[0]))
         condim = max(m.geom_condim[a], m.geom_condim[b])
-        friction = largest(m.geom_friction[a, 0], m.geom_friction[b, 0])
+        friction = [largest(m.geom_friction[a, k], m.geom_friction[b, k]) for k in range(3)]
     solref = m.geom_solref[[a, b]]
     if one_decides or (solref[:, 0] > 0).all():
         solref = first * solref[0] + (1 - first) * solref[1]
@@ -114,8 +123,12 @@ def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
     solimp = first * m.geom_solimp[a] + (1 - first) * m.geom_solimp[b]
     weight = m.body_invweight0[m.geom_bodyid[[a, b]], 0].sum()
     margin = m.geom_margin[a] + m.geom_margin[b]
-    friction = largest(friction, MINMU) if condim > 1 else 0.0
-    return Pair((a, b), int(condim), friction, float(margin), tuple(solref), tuple(solimp), float(weight))
+    sliding, torsional, rolling = (
+        largest(x, MINMU) if condim >= least else 0.0 for x, least in zip(friction, (3, 4, 6), strict=True)
+    )
+    return Pair(
+        (a, b), int(condim), sliding, torsional, rolling, float(margin), tuple(solref), tuple(solimp), float(weight)
+    )
 
 
 # Contacts with a plane of the world.

@@ -193,6 +193,8 @@ enum {
   QUADS = STRIDE / 4,
   SLOTS = (STRIDE + LANES - 1) / LANES,
   CONTACTS = Model::FRICTIONAL + Model::FRICTIONLESS,
+  DIRECTIONS = Model::DIRECTIONS,  // in which a contact with friction acts, each with a row of the Jacobian
+  CONTACT_ROWS = Model::CONTACT_ROWS,  // the constraint rows of such a contact
 };
 #define OWN_DOFS(slot, dof) UNROLLED for (int slot = 0, dof = lane; slot < SLOTS; ++slot, dof += LANES)
 #define SHARED_LOOP(i, count) ROLLED for (int i = lane; i < (count); i += LANES)
@@ -243,6 +245,144 @@ struct alignas(16) World {
   unsigned zones[Model::TOUCH ? CONTACTS : 1];  // the touch sensors that feel each contact, one bit each
 };
 
+// ---- Friction ------------------------------------------------------------------------------------------------------
+
+// The law of a contact with friction: gradient and Hessian of its cost with respect to its directions, which are the
+// normal, two tangents, and turning about these three.
+//IF ELLIPTIC
+//
+// With a residual n along the normal and one of length t off it, an elliptic cone costs D / 2 times the squared distance
+// from n >= mu t. In the plane of both that is a parabola of what lies beside the cone, and one of what lies beyond its
+// tip, which have one side each:
+//   D / (1 + mu^2) / 2 (min(beside, 0)^2 + min(beyond, 0)^2),  beside = n - mu t,  beyond = mu n + t.
+// None of them counts while the contact is open, the first while it slides, both while it sticks.
+
+struct Cone {
+  enum Zone { OPEN, SLIDING, STICKING };
+  float gradient[DIRECTIONS];
+  float square, mixed;  // of the Hessian: of the normal, and of the normal with the way off it;
+  float along, across;  // off the normal: along that way, and across
+  float way[DIRECTIONS];
+
+  static INLINE float length(const float* x) {  // off the normal
+    float squared = 0.0f;
+    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) squared += x[j] * x[j];
+    return Math::root(squared);
+  }
+  static INLINE Zone zone(float n, float t, float mu) {
+    return !(n - mu * t < 0.0f) ? OPEN : mu * n + t > 0.0f ? SLIDING : STICKING;
+  }
+  static INLINE Zone zone(const float* x, float mu) { return zone(x[0], length(x), mu); }
+
+  INLINE Cone(const float* x, float weight, float mu) {
+    const float n = x[0], t = length(x), inverse = t > 0.0f ? Math::divide(1.0f, t) : 0.0f, beside = n - mu * t;
+    const Zone in = zone(n, t, mu);
+    const bool slides = in == SLIDING;
+    square = in == OPEN ? 0.0f : slides ? Math::divide(weight, 1.0f + mu * mu) : weight;
+    mixed = slides ? -mu * square : 0.0f;
+    along = slides ? mu * mu * square : square;
+    across = slides ? mixed * beside * inverse : square;
+    gradient[0] = square * (slides ? beside : n);
+    const float off = slides ? mixed * beside : square * t;
+    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
+      way[j] = x[j] * inverse;
+      gradient[j] = off * way[j];
+    }
+  }
+  INLINE bool open() const { return square == 0.0f; }
+  INLINE void times(const float* v, float* product) const {  // the Hessian
+    float forward = 0.0f;
+    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) forward += way[j] * v[j];
+    product[0] = square * v[0] + mixed * forward;
+    const float common = mixed * v[0] + (along - across) * forward;
+    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) product[j] = common * way[j] + across * v[j];
+  }
+};
+typedef Cone Law;
+
+// The cost of an elliptic cone while its residuals move along a line, x + alpha v.
+struct ConeRay {
+  float weight, mu, parabola;         // parabola: the weight of both
+  float normal, normal_rate;          // residual along the normal
+  float forward, speed, apart, away;  // off the normal: along v, and its rate; squared across v; length at alpha = 0
+
+  INLINE ConeRay(const float* x, const float* v, float weight, float mu) : weight(weight), mu(mu) {
+    parabola = Math::divide(weight, 1.0f + mu * mu);
+    normal = x[0];
+    normal_rate = v[0];
+    speed = Cone::length(v);
+    const float inverse = speed > 0.0f ? Math::divide(1.0f, speed) : 0.0f;
+    forward = apart = 0.0f;
+    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) forward += x[j] * (v[j] * inverse);
+    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
+      const float off = x[j] - forward * (v[j] * inverse);
+      apart += off * off;
+    }
+    away = Math::root(forward * forward + apart);
+  }
+
+  // The change of y^2, where it counts below zero, if y goes from `before` by `by`.
+  static INLINE float grown(float before, float after, float by) {
+    if (after < 0.0f) return before < 0.0f ? by * (before + after) : after * after;
+    return before < 0.0f ? -before * before : 0.0f;
+  }
+
+  // Adds the cost relative to alpha = 0, its slope and its curvature to three sums.
+  INLINE void add(float alpha, float* sums) const {
+    const float n = normal + alpha * normal_rate, p = forward + alpha * speed, t = Math::root(p * p + apart);
+    const float inverse = t > 0.0f ? Math::divide(1.0f, t) : 0.0f;
+    const float by_n = alpha * normal_rate;
+    const float by_t = t + away > 0.0f ? Math::divide(alpha * speed * (forward + p), t + away) : 0.0f;
+    const float beside = n - mu * t;
+    sums[0] += 0.5f * parabola * (grown(normal - mu * away, beside, by_n - mu * by_t) +
+                                  grown(mu * normal + away, mu * n + t, mu * by_n + by_t));
+    const Cone::Zone in = Cone::zone(n, t, mu);
+    if (in == Cone::STICKING) {
+      sums[1] += weight * (n * normal_rate + p * speed);
+      sums[2] += weight * (normal_rate * normal_rate + speed * speed);
+    } else if (in == Cone::SLIDING) {
+      const float rate = normal_rate - mu * speed * p * inverse, bend = speed * inverse;
+      sums[1] += parabola * beside * rate;
+      sums[2] += parabola * (rate * rate - mu * beside * (apart * inverse) * (bend * bend));
+    }
+  }
+
+  // The cost at alpha = 0.
+  INLINE float cost() const {
+    const float beside = Math::smaller(normal - mu * away, 0.0f), beyond = Math::smaller(mu * normal + away, 0.0f);
+    return 0.5f * parabola * (beside * beside + beyond * beyond);
+  }
+};
+//ELSE
+
+// A pyramid's edges are rows: the normal, plus or minus one of the others.
+struct Pyramid {
+  float gradient[DIRECTIONS];
+  float square[DIRECTIONS], mixed[DIRECTIONS];  // of the Hessian: of each direction, and of the normal with it
+
+  INLINE Pyramid(const float* x, float weight) {
+    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
+      const float plus = x[2 * j - 2], minus = x[2 * j - 1];
+      const float d = plus < 0.0f ? weight : 0.0f, e = minus < 0.0f ? weight : 0.0f;
+      square[j] = d + e;
+      mixed[j] = d - e;
+      gradient[j] = d * plus - e * minus;
+      square[0] = j == 1 ? square[1] : square[0] + square[j];
+      gradient[0] = (j == 1 ? d * plus : gradient[0] + d * plus) + e * minus;
+    }
+  }
+  INLINE bool open() const { return square[0] == 0.0f; }
+  INLINE void times(const float* v, float* product) const {  // the Hessian
+    product[0] = square[0] * v[0];
+    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
+      product[0] = product[0] + mixed[j] * v[j];
+      product[j] = mixed[j] * v[0] + square[j] * v[j];
+    }
+  }
+};
+typedef Pyramid Law;
+//END
+
 // ---- One substep ---------------------------------------------------------------------------------------------------
 
 struct Step : Math {
@@ -274,15 +414,17 @@ struct Step : Math {
       : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world) {}
 //END
 
-  // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for its normal and
-  // two for its tangents (times the friction coefficient), and a constraint row for each of the four edges of its
-  // pyramid. Limits of hinges and slides, and dry friction in joints, need no Jacobian: they act along one degree of
+  // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for each direction
+  // (all but the normal times a factor), and a constraint row for each edge of its pyramid, or for each direction of its
+  // cone. Limits of hinges and slides, and dry friction in joints, need no Jacobian: they act along one degree of
   // freedom.
-  INLINE int jacobian_rows() const { return 3 * frictional + frictionless; }
-  INLINE int first_frictionless() const { return 4 * frictional; }
-  INLINE int first_limit() const { return 4 * frictional + frictionless; }
+  INLINE int jacobian_rows() const { return DIRECTIONS * frictional + frictionless; }
+  INLINE int first_frictionless() const { return CONTACT_ROWS * frictional; }
+  INLINE int first_limit() const { return CONTACT_ROWS * frictional + frictionless; }
   INLINE int first_friction() const { return first_limit() + limits; }
   INLINE int rows() const { return first_friction() + Model::FRICTION_LOSSES; }
+  // Rows from here on cost something each; those of a cone do together.
+  INLINE int first_single() const { return Model::ELLIPTIC ? first_frictionless() : 0; }
 
   // ---- What the lanes do together
 
@@ -575,7 +717,7 @@ struct Step : Math {
   // then a coordinate axis. All lanes call this together, so that contacts lie in the order of the lanes.
   INLINE void add_contact(bool touches, const bool friction, int pair, Vec point, float distance, Vec normal,
                           Vec hint) {
-    const int left = Model::JACOBIAN_ROWS - 3 * frictional;
+    const int left = Model::JACOBIAN_ROWS - DIRECTIONS * frictional;
     const int places = friction ? Model::FRICTIONAL : left < Model::FRICTIONLESS ? left : Model::FRICTIONLESS;
     int& count = friction ? frictional : frictionless;
     const unsigned hits = ballot(touches);
@@ -729,13 +871,18 @@ struct Step : Math {
 //END
         other = c.normal.cross(tangent);
       }
-      float* const row = w.jacobian + STRIDE * (friction ? 3 * i : 2 * frictional + i);
+//IF TURNING
+      const Vec twist = c.normal * Model::torsional(pair);
+      const Vec roll = w.tangents[friction ? i : 0] * Model::rolling(pair), other_roll = c.normal.cross(roll);
+//END
+      float* const row = w.jacobian + STRIDE * (friction ? DIRECTIONS * i : (DIRECTIONS - 1) * frictional + i);
       OWN_DOFS(slot, d) {
         if (d >= STRIDE) continue;
         Vec point = c.point;
         if (Model::TREES > 1) point = point + w.com[0] - w.com[Model::tree(Model::dof_link(d < DOFS ? d : 0))];
         Vec velocity = axes[slot].linear + axes[slot].angular.cross(point);
-        velocity = velocity * (d < DOFS ? (float)((int)(with >> d & 1) - (int)(against >> d & 1)) : 0.0f);
+        const float sign = d < DOFS ? (float)((int)(with >> d & 1) - (int)(against >> d & 1)) : 0.0f;
+        velocity = velocity * sign;
         if (Model::BALL_LIMITS && ball) {
           const int k = d - Model::ball_dof(c.pair - Model::PAIRS);
           row[d] = k >= 0 && k < 3 ? c.normal.component(k) : 0.0f;
@@ -745,6 +892,13 @@ struct Step : Math {
         if (friction) {
           row[STRIDE + d] = velocity.dot(tangent);
           row[2 * STRIDE + d] = velocity.dot(other);
+//IF TURNING
+          const Vec angular = axes[slot].angular * sign;
+          row[3 * STRIDE + d] = angular.dot(twist);
+          if (DIRECTIONS == 4) continue;
+          row[4 * STRIDE + d] = angular.dot(roll);
+          row[5 * STRIDE + d] = angular.dot(other_roll);
+//END
         }
       }
     }
@@ -757,11 +911,27 @@ struct Step : Math {
     w.x[r] = softness.stiffness * impedance * position;
   }
 
-  INLINE int contact_of_row(int r) const { return r < first_frictionless() ? r / 4 : r - 3 * frictional; }
+  INLINE int contact_of_row(int r) const {
+    return r < first_frictionless() ? r / CONTACT_ROWS : r - (CONTACT_ROWS - 1) * frictional;
+  }
 
   INLINE void set_rows() {
     SHARED_LOOP(r, first_limit()) {
       const Contact& c = contact(contact_of_row(r));
+//IF ELLIPTIC
+      if (r < first_frictionless() && r % CONTACT_ROWS > 0) {  // nothing is violated off the normal
+        w.weight[r] = Model::mu(c.pair);
+        w.x[r] = 0.0f;
+        continue;
+      }
+//END
+//IF SOME_LACK_EDGES
+      if (r < first_frictionless() && r % CONTACT_ROWS >= Model::edges(c.pair)) {  // so far open that it stays so
+        w.weight[r] = 0.0f;
+        w.x[r] = 1e15f;
+        continue;
+      }
+//END
       set_row(r, Model::contact_softness(c.pair), Model::inverse_inertia(c.pair), c.distance,
               Model::least_regularisation(c.pair));
     }
@@ -797,12 +967,11 @@ struct Step : Math {
 
   // Row r of J times the search direction.
   INLINE float row_velocity(int r) const {
-    if (r < first_frictionless()) {  // edges of a pyramid: the normal, plus or minus a tangent
-      const float* const p = w.projected + 3 * (r / 4);
-      const float tangent = p[r & 2 ? 2 : 1];
-      return r & 1 ? p[0] - tangent : p[0] + tangent;
+    if (!Model::ELLIPTIC && r < first_frictionless()) {  // edges of a pyramid: the normal, plus or minus another
+      const float *const p = w.projected + DIRECTIONS * (r / CONTACT_ROWS), other = p[1 + (unsigned)r % CONTACT_ROWS / 2];
+      return r & 1 ? p[0] - other : p[0] + other;
     }
-    if (r < first_limit()) return w.projected[r - frictional];
+    if (r < first_limit()) return w.projected[r - (CONTACT_ROWS - DIRECTIONS) * frictional];
     if (r < first_friction()) {
       const int limit = w.limits[r - first_limit()];
       return limit < 128 ? w.search[limit] : -w.search[limit - 128];
@@ -819,6 +988,37 @@ struct Step : Math {
     }
     return x < 0.0f ? 0 : 1;
   }
+
+  // The law of a contact with friction at the residuals of now. The first of its rows has the weight of all; of a cone,
+  // the second has mu.
+  INLINE Law law(int contact) const {
+    const float *const x = w.x + CONTACT_ROWS * contact, *const weight = w.weight + CONTACT_ROWS * contact;
+//IF ELLIPTIC
+    return Law(x, weight[0], weight[1]);
+//ELSE
+    float edges[CONTACT_ROWS];
+    UNROLLED for (int i = 0; i < CONTACT_ROWS; ++i) edges[i] = CONTACT_ROWS == 4 ? read4(x).v[i & 3] : x[i];
+    return Law(edges, weight[0]);
+//END
+  }
+//IF ELLIPTIC
+
+  INLINE ConeRay cone_ray(int contact) const {
+    const int first = CONTACT_ROWS * contact;
+    return ConeRay(w.x + first, w.change + first, w.weight[first], w.weight[first + 1]);
+  }
+
+  // Moves the residuals of a cone, and returns whether the Hessian of its cost changes.
+  INLINE bool move_cone(int contact, float alpha) {
+    const int first = CONTACT_ROWS * contact;
+    float* const x = w.x + first;
+    const float mu = w.weight[first + 1];
+    const Cone::Zone before = Cone::zone(x, mu);
+    UNROLLED for (int j = 0; j < CONTACT_ROWS; ++j) x[j] += alpha * w.change[first + j];
+    const Cone::Zone after = Cone::zone(x, mu);
+    return before != after || after == Cone::SLIDING;
+  }
+//END
 
   // ---- Newton's method: the minimum over qacc of  (qacc - smooth)' M (qacc - smooth) / 2  +  the cost of the rows.
 
@@ -863,35 +1063,35 @@ struct Step : Math {
       }
     }
     ROLLED for (int k = 0; k < frictional; ++k) {
-      // The four edges n + t, n - t, n + u, n - u in the basis of the Jacobian rows n, t, u.
-      const Quad x = read4(w.x + 4 * k);
-      const float weight = w.weight[4 * k];
-      float d[4];
-      UNROLLED for (int i = 0; i < 4; ++i) d[i] = x.v[i] < 0.0f ? weight : 0.0f;
-      const float tt = d[0] + d[1], uu = d[2] + d[3], nn = tt + uu, nt = d[0] - d[1], nu = d[2] - d[3];
-      const float ft = d[0] * x.v[0] - d[1] * x.v[1], fu = d[2] * x.v[2] - d[3] * x.v[3];
-      const float fn = d[0] * x.v[0] + d[1] * x.v[1] + d[2] * x.v[2] + d[3] * x.v[3];
-      if (nn == 0.0f) continue;
-      const float *n = w.jacobian + 3 * STRIDE * k, *t = n + STRIDE, *u = t + STRIDE;
+      const Law cost = law(k);
+      if (cost.open()) continue;
+      const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
       OWN_DOFS(slot, dof) {
         const int e = dof < STRIDE ? dof : STRIDE - 1;
-        const float n0 = n[e], t0 = t[e], u0 = u[e];
-        const float cn = nn * n0 + nt * t0 + nu * u0, ct = nt * n0 + tt * t0, cu = nu * n0 + uu * u0;
-        h.gradient[slot] = h.gradient[slot] + fn * n0 + ft * t0 + fu * u0;
-        h.diagonal[slot] = h.diagonal[slot] + cn * n0 + ct * t0 + cu * u0;
-        if (LANES == 1 && cn == 0.0f && ct == 0.0f && cu == 0.0f) continue;
+        float own[DIRECTIONS], c[DIRECTIONS];
+        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + e];
+        cost.times(own, c);
+        bool some = false;
+        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
+          h.gradient[slot] = h.gradient[slot] + cost.gradient[i] * own[i];
+          h.diagonal[slot] = h.diagonal[slot] + c[i] * own[i];
+          some = some || c[i] != 0.0f;
+        }
+        if (LANES == 1 && !some) continue;
         UNROLLED for (int i = 0; i < QUADS; ++i) {
           if (4 * i >= LANES * (slot + 1)) break;
-          const Quad a = read4(n + 4 * i), b = read4(t + 4 * i), c = read4(u + 4 * i);
+          Quad columns[DIRECTIONS];
+          UNROLLED for (int l = 0; l < DIRECTIONS; ++l) columns[l] = read4(rows + STRIDE * l + 4 * i);
           UNROLLED for (int j = 0; j < 4; ++j)
-            h.row[slot][4 * i + j] = h.row[slot][4 * i + j] + cn * a.v[j] + ct * b.v[j] + cu * c.v[j];
+            UNROLLED for (int l = 0; l < DIRECTIONS; ++l)
+              h.row[slot][4 * i + j] = h.row[slot][4 * i + j] + c[l] * columns[l].v[j];
         }
       }
     }
     ROLLED for (int k = 0; k < frictionless; ++k) {
-      const float x = w.x[4 * frictional + k], weight = w.weight[4 * frictional + k];
+      const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
       if (!(x < 0.0f)) continue;
-      const float* n = w.jacobian + STRIDE * (3 * frictional + k);
+      const float* n = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
       OWN_DOFS(slot, dof) {
         const float n0 = n[dof < STRIDE ? dof : STRIDE - 1], c = weight * n0;
         h.gradient[slot] += c * x;
@@ -1094,7 +1294,15 @@ struct Step : Math {
       t[1] += s * w.mass_search[d];
       t[2] += s * s;
     }
-    SHARED_LOOP(r, rows()) {
+//IF ELLIPTIC
+    SHARED_LOOP(k, frictional) {
+      const ConeRay ray = cone_ray(k);
+      t[3] += ray.cost();
+      ray.add(0.0f, t + 3);
+    }
+//END
+    SHARED_LOOP(i, rows() - first_single()) {
+      const int r = first_single() + i;
       const Row row = row_at(r);
       if (Model::FRICTION_LOSSES && r >= first_friction()) {
         const float bound = Model::friction_bound(r - first_friction());
@@ -1118,7 +1326,13 @@ struct Step : Math {
 
     float sums[9] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
     const float newton = start.newton();
-    SHARED_LOOP(r, rows()) add_row(r, row_at(r), newton, sums);
+//IF ELLIPTIC
+    SHARED_LOOP(k, frictional) cone_ray(k).add(newton, sums);
+//END
+    SHARED_LOOP(i, rows() - first_single()) {
+      const int r = first_single() + i;
+      add_row(r, row_at(r), newton, sums);
+    }
     sum(sums, 3);
     const Point first = point_at(newton, slope, curvature, sums);
     result.take(first, first.flat(accept));
@@ -1128,7 +1342,16 @@ struct Step : Math {
     ROLLED for (int i = 0; i < Model::LS_ITERATIONS && !found; ++i) {
       const float a = low.newton(), b = high.newton(), c = 0.5f * (low.alpha + high.alpha);
       UNROLLED for (int k = 0; k < 9; ++k) sums[k] = 0.0f;
-      SHARED_LOOP(r, rows()) {
+//IF ELLIPTIC
+      SHARED_LOOP(k, frictional) {
+        const ConeRay ray = cone_ray(k);
+        ray.add(a, sums);
+        ray.add(b, sums + 3);
+        ray.add(c, sums + 6);
+      }
+//END
+      SHARED_LOOP(j, rows() - first_single()) {
+        const int r = first_single() + j;
         const Row row = row_at(r);
         add_row(r, row, a, sums);
         add_row(r, row, b, sums + 3);
@@ -1240,7 +1463,11 @@ struct Step : Math {
         w.residual[d] += step.alpha * w.mass_search[d];
       }
       bool crossed = false;
-      SHARED_LOOP(r, rows()) {
+//IF ELLIPTIC
+      SHARED_LOOP(k, frictional) crossed = move_cone(k, step.alpha) || crossed;
+//END
+      SHARED_LOOP(i, rows() - first_single()) {
+        const int r = first_single() + i;
         const float x = w.x[r], next = x + step.alpha * w.change[r];
         crossed = crossed || piece(r, x) != piece(r, next);
         w.x[r] = next;
@@ -1354,7 +1581,12 @@ struct Step : Math {
   INLINE void write_touch(float* sensordata) const {
     ROLLED for (int s = 0; s < Model::TOUCH; ++s) {
       float force = 0.0f;
-      SHARED_LOOP(r, first_limit()) {
+//IF ELLIPTIC
+      SHARED_LOOP(k, frictional)
+        if (w.zones[k] >> s & 1) force -= law(k).gradient[0];
+//END
+      SHARED_LOOP(i, first_limit() - first_single()) {
+        const int r = first_single() + i;
         const bool felt = w.zones[place_of(contact_of_row(r))] >> s & 1;
         if (felt) force -= w.weight[r] * smaller(w.x[r], 0.0f);
       }
@@ -1377,17 +1609,15 @@ struct Step : Math {
     sync();
   }
 
-  // The force of an own contact on its second geom: along the normal and the tangents, times friction, that the edges
-  // of its pyramid are made of.
+  // The force of an own contact on its second geom.
   INLINE Vec contact_force(int i, const OwnContact& c) const {
     if (i >= frictional) {
       const int r = first_frictionless() + i - frictional;
       return c.normal * (-w.weight[r] * smaller(w.x[r], 0.0f));
     }
-    float edge[4];
-    UNROLLED for (int k = 0; k < 4; ++k) edge[k] = -w.weight[4 * i + k] * smaller(w.x[4 * i + k], 0.0f);
-    return c.normal * (edge[0] + edge[1] + edge[2] + edge[3]) + c.tangent * (edge[0] - edge[1]) +
-           c.normal.cross(c.tangent) * (edge[2] - edge[3]);
+    const Law cost = law(i);
+    return c.normal * -cost.gradient[0] + c.tangent * -cost.gradient[1] +
+           c.normal.cross(c.tangent) * -cost.gradient[2];
   }
 
   // The sum of the contact forces on each geom, and whether there is a contact.

@@ -16,11 +16,19 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled import collision, symbols
-from torchrl_loco.sim.compiled.collision import CAPSULE, PLANE, Pair, contact_weight, least_regularisation, pairs
+from torchrl_loco.sim.compiled.collision import (
+    CAPSULE,
+    PLANE,
+    Pair,
+    contact_weight,
+    is_elliptic,
+    least_regularisation,
+    pairs,
+)
 from torchrl_loco.sim.compiled.constraints import Softness, both_sides, tolerance
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, MINVAL, SLIDE, acting
 from torchrl_loco.sim.compiled.links import Mass, matrix, moving_bodies, places
-from torchrl_loco.sim.compiled.parameters import VariedModel, present, varies
+from torchrl_loco.sim.compiled.parameters import Number, VariedModel, present, varies
 from torchrl_loco.sim.compiled.tables import Tables
 from torchrl_loco.sim.overflow import Overflow
 
@@ -55,7 +63,13 @@ ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 28, 16
 
 @dataclasses.dataclass
 class Layout:
-    """Sizes of the state of a world, as ``struct World`` has them."""
+    """Sizes of the state of a world, as ``struct World`` has them.
+
+    Attributes:
+        directions: in which a contact with friction acts, each with a row of the Jacobian: the normal, two tangents,
+            and turning about these three as far as any contact resists it.
+        contact_rows: constraint rows of such a contact.
+    """
 
     positions: int
     dofs: int
@@ -66,6 +80,8 @@ class Layout:
     friction_losses: int
     touch: int
     candidates: int
+    directions: int
+    contact_rows: int
     frictional: int
     frictionless: int
     jacobian_rows: int
@@ -77,8 +93,9 @@ class Layout:
 
     @property
     def rows(self) -> int:
-        """Constraint rows: four for a contact with friction, one for anything else."""
-        contacts = 4 * self.frictional + min(self.frictionless, self.jacobian_rows - 3 * self.frictional)
+        """Constraint rows: several for a contact with friction, one for anything else."""
+        left = self.jacobian_rows - self.directions * self.frictional
+        contacts = self.contact_rows * self.frictional + min(self.frictionless, left)
         return pad(contacts + self.limits + self.friction_losses, 4) or 4
 
     @property
@@ -133,6 +150,9 @@ class Description:
         self.masses = [Mass.join(m, self.places, bodies) for bodies in self.members]
         self.ancestors = [sum(1 << int(j) for j in self._dofs_to_root(d)) for d in range(m.nv)]
         self.pairs = self._sorted_pairs(pairs(m))
+        self.condims = {p.condim for p in self.pairs} - {1}
+        self.elliptic = bool(self.condims) and is_elliptic(m)
+        self.some_lack_edges = len(self.condims) > 1 and not self.elliptic
         self.geoms = sorted({g for p in self.pairs for g in p.geoms if m.geom_type[g] != PLANE})
         limited = [j for j in range(m.njnt) if m.jnt_limited[j]]
         self.limited = [j for j in limited if m.jnt_type[j] in (SLIDE, HINGE)]
@@ -177,6 +197,7 @@ class Description:
         frictionless = min(frictionless, MOST_FRICTIONLESS) + len(self.limited_balls)
         if not frictional and not frictionless:
             frictionless = 1  # C++ has no empty arrays
+        directions = max(self.condims, default=3)
         empty = Layout(
             positions=m.nq,
             dofs=m.nv,
@@ -187,13 +208,15 @@ class Description:
             friction_losses=len(self.losses),
             touch=len(self.touch),
             candidates=max(1, sum(not self.is_plane(p) for p in self.pairs)),
+            directions=directions,
+            contact_rows=directions if self.elliptic else 2 * (directions - 1),
             frictional=0,
             frictionless=frictionless,
             jacobian_rows=0,
         )
 
         def sized(places: int, more_rows: int = 0) -> Layout:
-            rows = max(3 * places + more_rows, frictionless, 1)
+            rows = max(directions * places + more_rows, frictionless, 1)
             return dataclasses.replace(empty, frictional=places, jacobian_rows=rows)
 
         enough, most = min(frictional, ENOUGH_FRICTIONAL), min(frictional, MOST_FRICTIONAL)
@@ -235,6 +258,8 @@ class Description:
             CANDIDATES=layout.candidates,
             FRICTIONAL=layout.frictional,
             FRICTIONLESS=layout.frictionless,
+            DIRECTIONS=layout.directions,
+            CONTACT_ROWS=layout.contact_rows,
             JACOBIAN_ROWS=layout.jacobian_rows,
             ROWS=layout.rows,
         )
@@ -379,8 +404,9 @@ class Description:
         tables.floats("inverse_half_length", [1 / h if h else 0.0 for h in half])
         reach = [sum(m.geom_size[g, 0] + self._half_length(g) for g in p.geoms) + p.margin for p in solid]
         tables.floats("reach_squared", [0.0] * len(planes) + [r * r for r in reach])
-        balls, mixed = self.limited_balls, any(varies(p.friction) for p in found)
-        tables.floats("friction", [*(p.friction for p in found), *(0.0 for _ in balls if mixed)])
+        balls, plain = self.limited_balls, not self.elliptic and self.layout.directions == 3
+        mixed = plain and any(varies(p.friction) for p in found)
+        self._add_friction(tables, [0.0 for _ in balls if mixed])
         # The limits of ball joints follow the pairs.
         tables.size(BALL_LIMITS=len(balls))
         tables.integers("ball_qpos", [m.jnt_qposadr[j] for j in balls])
@@ -395,7 +421,7 @@ class Description:
             self._add_formulas(tables, found[0])
             return
         weights = [contact_weight(m, pair) for pair in found]
-        least = [least_regularisation(pair) for pair in found]
+        least = [MINVAL if self.elliptic else least_regularisation(pair) for pair in found]
         tables.floats("least_regularisation", [*least, *(MINVAL for _ in balls)])
         tables.floats("inverse_inertia", [*weights, *inertias])
 
@@ -409,6 +435,26 @@ class Description:
             ("inverse_inertia", contact_weight(self.m, pair), weight),
         ):
             tables.formula(name, symbols.select(friction, ">", 0, found, otherwise), **parts)
+
+    def _add_friction(self, tables: Tables, of_balls: Sequence[float]) -> None:
+        """Adds the factors of the rows of the Jacobian off the normal, and what else the laws of friction read.
+
+        The factors of a pyramid are the coefficients of friction. An elliptic cone becomes a round one of slope ``mu``,
+        with the normal as it is, by factors that are the coefficients over ``mu``; the ratio of impedances makes it
+        less steep than sliding friction.
+        """
+        found, ratio = self.pairs, math.sqrt(self.m.opt.impratio)
+        tables.size(ELLIPTIC=self.elliptic)
+        slopes: list[Number] = [1.0] * len(found)
+        if self.elliptic:
+            slopes = [p.friction / ratio if p.condim > 1 else 1.0 for p in found]
+            tables.floats("mu", slopes)
+        tables.floats("friction", [*(ratio if self.elliptic else p.friction for p in found), *of_balls])
+        if self.layout.directions > 3:
+            tables.floats("torsional", [p.torsional / mu for p, mu in zip(found, slopes, strict=True)])
+            tables.floats("rolling", [p.rolling / mu for p, mu in zip(found, slopes, strict=True)])
+        if self.some_lack_edges:
+            tables.integers("edges", [2 * (p.condim - 1) for p in found])
 
     def _dofs_of_geom(self, g: int) -> int:
         """Returns a bit for each degree of freedom that moves a geom."""
@@ -520,6 +566,9 @@ def source(
     asked = {
         "SUBTREE_COM": with_subtree_com,
         "CONTACT_GEOMS": len(contact_geoms) > 0,
+        "ELLIPTIC": description.elliptic,
+        "TURNING": description.layout.directions > 3,
+        "SOME_LACK_EDGES": description.some_lack_edges,
         "VARIED": tables.row.numbers > 0,
         "DERIVED": tables.row.numbers > 0 and substeps == 0,
         "IMPLICIT_ACTUATORS": description.implicit_actuators,

@@ -54,8 +54,6 @@ def _size(m: mujoco.MjModel) -> list[str]:
 
 def _options(m: mujoco.MjModel) -> list[str]:
     option, found = m.opt, []
-    if option.cone != int(mujoco.mjtCone.mjCONE_PYRAMIDAL):
-        found.append("elliptic friction cones")
     if option.solver != int(mujoco.mjtSolver.mjSOL_NEWTON):
         found.append("a solver other than Newton")
     if option.integrator != int(mujoco.mjtIntegrator.mjINT_EULER) and not lanes.is_implicitfast(m):
@@ -136,17 +134,12 @@ def _lines(kind: str, found: Found) -> list[str]:
 
 
 def _contacts(m: mujoco.MjModel) -> list[str]:
-    kinds, dimensions = set(), set()
+    kinds = set()
     for pair in pairs(m):
         if not _collides(m, pair):
             names = [mujoco.mjtGeom(int(m.geom_type[geom])).name.removeprefix("mjGEOM_").lower() for geom in pair.geoms]
             kinds.add(" and ".join(names))
-        if pair.condim not in (1, 3):
-            dimensions.add(f"contacts with condim {pair.condim}")
-    found = sorted(dimensions)
-    if kinds:
-        found.insert(0, f"contacts of {', '.join(sorted(kinds))}: only spheres, capsules and planes of the world")
-    return found
+    return [f"contacts of {', '.join(sorted(kinds))}: only spheres, capsules and planes of the world"] if kinds else []
 
 
 def _collides(m: mujoco.MjModel, pair: Pair) -> bool:
