@@ -404,10 +404,9 @@ class Description:
         tables.floats("inverse_half_length", [1 / h if h else 0.0 for h in half])
         reach = [sum(m.geom_size[g, 0] + self._half_length(g) for g in p.geoms) + p.margin for p in solid]
         tables.floats("reach_squared", [0.0] * len(planes) + [r * r for r in reach])
-        balls, plain = self.limited_balls, not self.elliptic and self.layout.directions == 3
-        mixed = plain and any(varies(p.friction) for p in found)
-        self._add_friction(tables, [0.0 for _ in balls if mixed])
+        self._add_friction(tables)
         # The limits of ball joints follow the pairs.
+        balls = self.limited_balls
         tables.size(BALL_LIMITS=len(balls))
         tables.integers("ball_qpos", [m.jnt_qposadr[j] for j in balls])
         tables.integers("ball_dof", [m.jnt_dofadr[j] for j in balls])
@@ -416,19 +415,21 @@ class Description:
         soft = [*((p.solref, p.solimp) for p in found), *((m.jnt_solref[j], m.jnt_solimp[j]) for j in balls)]
         tables.structs("Softness", "contact_softness", [self._softness(*s) for s in soft])
         inertias = m.dof_invweight0[m.jnt_dofadr[balls]]
-        if mixed:
+        plain = not self.elliptic and self.layout.directions == 3
+        if plain and any(varies(pair.friction) for pair in found):
             tables.floats("pair_weight", [*(pair.weight for pair in found), *inertias])
             self._add_formulas(tables, found[0])
-            return
-        weights = [contact_weight(m, pair) for pair in found]
-        least = [MINVAL if self.elliptic else least_regularisation(pair) for pair in found]
-        tables.floats("least_regularisation", [*least, *(MINVAL for _ in balls)])
-        tables.floats("inverse_inertia", [*weights, *inertias])
+        else:
+            weights = [contact_weight(m, pair) for pair in found]
+            least = [MINVAL if self.elliptic else least_regularisation(pair) for pair in found]
+            tables.floats("least_regularisation", [*least, *(MINVAL for _ in balls)])
+            tables.floats("inverse_inertia", [*weights, *inertias])
 
     def _add_formulas(self, tables: Tables, pair: Pair) -> None:
         """Adds what follows from friction: the row of a world has less to read without it, as pairs are many."""
         friction, weight = symbols.name("mu"), symbols.name("weight")
-        parts = {"mu": "friction(i)", "weight": "Model::pair_weight(i)"}
+        of_pair = "Model::BALL_LIMITS && i >= Model::PAIRS ? 0.0f : friction(i)"
+        parts = {"mu": of_pair, "weight": "Model::pair_weight(i)"}
         pair = dataclasses.replace(pair, condim=3, friction=friction, weight=weight)
         for name, found, otherwise in (
             ("least_regularisation", least_regularisation(pair), MINVAL),
@@ -436,7 +437,7 @@ class Description:
         ):
             tables.formula(name, symbols.select(friction, ">", 0, found, otherwise), **parts)
 
-    def _add_friction(self, tables: Tables, of_balls: Sequence[float]) -> None:
+    def _add_friction(self, tables: Tables) -> None:
         """Adds the factors of the rows of the Jacobian off the normal, and what else the laws of friction read.
 
         The factors of a pyramid are the coefficients of friction. An elliptic cone becomes a round one of slope ``mu``,
@@ -449,7 +450,7 @@ class Description:
         if self.elliptic:
             slopes = [p.friction / ratio if p.condim > 1 else 1.0 for p in found]
             tables.floats("mu", slopes)
-        tables.floats("friction", [*(ratio if self.elliptic else p.friction for p in found), *of_balls])
+        tables.floats("friction", [ratio if self.elliptic else p.friction for p in found])
         if self.layout.directions > 3:
             tables.floats("torsional", [p.torsional / mu for p, mu in zip(found, slopes, strict=True)])
             tables.floats("rolling", [p.rolling / mu for p, mu in zip(found, slopes, strict=True)])
