@@ -40,6 +40,13 @@ LAWS = {
     },
 }
 """Choices for the friction of contacts. A step that is traced has the first alone."""
+SOLIDS = {
+    "box": {"contype": 6, "conaffinity": 0},
+    "cylinder": {"contype": 2, "conaffinity": 0},
+    "ellipsoid": {"contype": 2, "conaffinity": 0},
+}
+"""Shapes that do not touch all others, and the masks that see to it."""
+RIGHT_ANGLES = st.lists(st.sampled_from([0, 90, 180]), min_size=3, max_size=3)
 
 
 def numbers(low, high):
@@ -75,14 +82,21 @@ def surfaces(draw, law):
 
 
 @st.composite
-def geoms(draw, law):
-    """Returns a sphere or a capsule."""
-    size = [draw(numbers(0.03, 0.12))]
+def geoms(draw, name, law, named=None):
+    """Returns a sphere or a capsule; at times another shape if there is a list to add it to, by kind and name."""
+    size, masks = [draw(numbers(0.03, 0.12))], {"conaffinity": 5}
     kind = draw(st.sampled_from(["sphere", "capsule", "capsule"]))
     if kind == "capsule":
         size.append(draw(numbers(0.05, 0.25)))
     pose = {"pos": draw(vectors(-0.15, 0.15)), "euler": draw(vectors(-180, 180))}
-    return element("geom", type=kind, size=size, density=draw(numbers(200, 2000)), **pose, **draw(surfaces(law)))
+    if named is not None and draw(st.booleans()):
+        kind, size = draw(st.sampled_from(list(SOLIDS))), draw(vectors(0.03, 0.15))
+        pose["euler"] = draw(vectors(-180, 180) if draw(st.integers(0, 2)) else RIGHT_ANGLES)
+        masks = SOLIDS[kind]
+    attributes = {**pose, **draw(surfaces(law)), **masks}
+    if named is not None:
+        named.append((kind, name))
+    return element("geom", name=name, type=kind, size=size, density=draw(numbers(200, 2000)), **attributes)
 
 
 @st.composite
@@ -126,7 +140,7 @@ def actuators(draw, joint):
 
 
 @st.composite
-def trees(draw, children, body, parent, actuated, law):
+def trees(draw, children, body, parent, actuated, law, named):
     """Returns a body with all that hangs on it, and adds the joints that may have an actuator to ``actuated``."""
     root, parts = parent < 0, []
     count = draw(st.sampled_from([1, 1, 1, 2, 3])) if root or draw(st.integers(0, 7)) else 0
@@ -137,33 +151,47 @@ def trees(draw, children, body, parent, actuated, law):
         if kind in ("free", "ball"):
             break  # MuJoCo allows no rotation after these
         actuated.append(name)
-    parts += [draw(geoms(law)) for _ in range(draw(st.sampled_from([1, 1, 2])))]
+    parts += [draw(geoms(f"geom{body}_{i}", law, named)) for i in range(draw(st.sampled_from([1, 1, 2])))]
     parts.append(draw(zones(body)))
     height = numbers(0.2, 0.8) if root else numbers(0.0, 0.3)
     position = [*draw(vectors(-0.3, 0.3, 2)), draw(height)]
-    inner = [draw(trees(children, child, body, actuated, law)) for child in children[body]]
+    inner = [draw(trees(children, child, body, actuated, law, named)) for child in children[body]]
     return element("body", *parts, *inner, name=f"body{body}", pos=position, euler=draw(vectors(-60, 60)))
 
 
 @st.composite
-def models(draw, max_bodies=8, laws=("sliding",)):
+def contact_pairs(draw, law, named):
+    """Returns an explicit pair of two geoms, or of the floor and one, or nothing if their shapes cannot touch."""
+    first, second = draw(st.sampled_from([("plane", "floor"), *named])), draw(st.sampled_from(named))
+    kinds = {first[0], second[0]}
+    if first == second or not (kinds <= {"sphere", "capsule", "box"} or "plane" in kinds) or kinds == {"box"}:
+        return ""
+    fields = draw(surfaces(law))
+    sliding = numbers(*draw(st.sampled_from(LAWS[law]["friction"])))
+    fields["friction"] = [draw(sliding), draw(sliding), *draw(vectors(0.001, 0.3))]
+    fields = {name: fields[name] for name in ("condim", "margin", "gap", "friction", "solref", "solimp")}
+    return element("pair", geom1=first[1], geom2=second[1], **fields)
+
+
+@st.composite
+def models(draw, max_bodies=8, lanes=False):
     """Returns MJCF of one or more trees of bodies, over one or two planes and at times a capsule that stands still.
 
-    Friction is by one of some of ``LAWS``.
+    With ``lanes`` there are laws of friction, shapes and explicit pairs, which only lanes know.
     """
-    law = draw(st.sampled_from(laws))
+    law, named = (draw(st.sampled_from(list(LAWS))), []) if lanes else ("sliding", None)
     count, actuated = draw(st.integers(1, max_bodies)), []
     children = {i: [] for i in range(-1, count)}
     for i in range(count):
         children[draw(st.integers(-1, i - 1))].append(i)
-    scene = [element("geom", type="plane", size=(5, 5, 0.1), **draw(surfaces(law)))]
+    scene = [element("geom", name="floor", type="plane", size=(5, 5, 0.1), conaffinity=3, **draw(surfaces(law)))]
     if draw(rarely()):
         pose = {"pos": (-0.4, 0, 0), "euler": draw(vectors(-40, 40))}
-        scene.append(element("geom", type="plane", size=(5, 5, 0.1), **pose, **draw(surfaces(law))))
+        scene.append(element("geom", type="plane", size=(5, 5, 0.1), conaffinity=3, **pose, **draw(surfaces(law))))
     if draw(rarely()):
         pose = {"pos": (0.2, 0, 0.1), "euler": draw(vectors(-90, 90))}
         scene.append(element("geom", type="capsule", size=(0.1, 0.3), **pose, **draw(surfaces(law))))
-    bodies = [draw(trees(children, i, -1, actuated, law)) for i in children[-1]]
+    bodies = [draw(trees(children, i, -1, actuated, law, named)) for i in children[-1]]
     exclude = [element("exclude", body1="body0", body2="body1")] if count > 1 and draw(st.booleans()) else []
     flag = element("flag", eulerdamp=draw(st.sampled_from(["enable", "disable"])))
     option = {
@@ -178,7 +206,7 @@ def models(draw, max_bodies=8, laws=("sliding",)):
         "mujoco",
         element("option", flag, **option),
         element("worldbody", *scene, *bodies),
-        element("contact", *exclude),
+        element("contact", *exclude, *(draw(contact_pairs(law, named)) for _ in range(2 * lanes))),
         element("actuator", *(draw(actuators(joint)) for joint in actuated if draw(st.integers(0, 3)))),
         element(
             "sensor",

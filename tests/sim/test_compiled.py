@@ -46,7 +46,6 @@ OTHERS = [
     ("<option/>", '<option><flag energy="enable"/></option>', "enabled energy"),
     ("</worldbody>", '</worldbody><tendon><fixed><joint joint="elbow" coef="1"/></fixed></tendon>', "tendons"),
     ("</worldbody>", '</worldbody><equality><weld body1="arm"/></equality>', "equality constraints"),
-    ("<sensor>", '<contact><pair geom1="hand" geom2="marble"/></contact><sensor>', "explicit contact pairs"),
     ("</worldbody>", '<body mocap="true"/></worldbody>', "mocap bodies"),
     ("</worldbody>", f"{MANY}</worldbody>", "67 degrees of freedom, more than 64"),
     ('<body name="arm"', '<body name="arm" gravcomp="1"', "gravity compensation"),
@@ -54,7 +53,7 @@ OTHERS = [
     ('<freejoint name="loose"/>', '<joint name="loose" type="ball" stiffness="1"/>', "'loose': stiffness of a"),
     ('damping="1"', 'damping="1 2"', "dampers that are not linear"),
     ('damping="1"', 'stiffness="1 2"', "'elbow': springs that are not linear"),
-    ('type="capsule" size="0.1 0.2"', 'type="box" size="0.1 0.1 0.1" contype="0"', "plane and box, sphere and box"),
+    ('type="capsule" size="0.1 0.2"', 'type="cylinder" size="0.1 0.1"', "contacts of sphere and cylinder: "),
     (MOTOR, MOTOR.replace("elbow", "loose"), "'pull': a transmission other than a hinge or slide"),
     (MOTOR, '<general name="pull" joint="elbow" dyntype="filter" dynprm="1"/>', "'pull': activation dynamics"),
     (MOTOR, '<general name="pull" joint="elbow" gaintype="affine" gainprm="1 1"/>', "'pull': a gain that is not fixed"),
@@ -91,8 +90,9 @@ def test_what_the_quadruped_needs_is_named_in_full():
         "actuator 'yaw_front_left', 'lift_front_left', 'extend_front_left' and 9 more: activation dynamics",
         "actuator 'lift_front_left', 'extend_front_left', 'lift_front_right' and 5 more: "
         "a transmission other than a hinge or slide",
-        "contacts of capsule and cylinder, capsule and ellipsoid, plane and cylinder, plane and ellipsoid, "
-        "sphere and cylinder, sphere and ellipsoid: only spheres, capsules and planes of the world",
+        "contacts of capsule and cylinder, capsule and ellipsoid, sphere and cylinder, sphere and ellipsoid: only "
+        "spheres and capsules with each other and with boxes, and with planes of the world all of these, cylinders and "
+        "ellipsoids",
         "sensor 'imu_accel', 'imu_gyro', 'velocimeter' and 8 more: "
         "anything but touch and the velocity of a subtree, as they are",
     ]

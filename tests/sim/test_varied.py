@@ -168,15 +168,17 @@ def test_each_world_steps_with_its_numbers(kind, device):
     np.testing.assert_allclose(sim.qpos.cpu(), plain.qpos.cpu(), rtol=0, atol=1e-6)
 
 
-def test_numbers_of_pairs_vary_under_mujoco_warp():
+@pytest.mark.parametrize("kind", ["mujoco_warp", "lanes"])
+def test_numbers_of_pairs_vary(kind):
+    """Friction differs along the two tangents."""
     model, rng = mujoco.MjModel.from_xml_string(MARBLE), np.random.default_rng(0)
     varied = Varied(model, {"pair_friction": [0, 1]})
-    assert unsupported(model, varied) == ["explicit contact pairs"]
-    rows = rng.uniform(0.01, 0.3, (WORLDS, 2)).astype(np.float32)
+    assert unsupported(model, varied) == []
+    rows = rng.uniform(0.05, 0.3, (WORLDS, 2)).astype(np.float32)
     start = [np.repeat(x[None], WORLDS, axis=0).astype(np.float32) for x in (model.qpos0, np.zeros(6), np.zeros(6))]
     start[1][:, :2] = 1.0
     start.append(np.zeros((WORLDS, 0), np.float32))
-    sim = simulate(model, "mujoco_warp", varied=varied)
+    sim = simulate(model, kind, varied=varied)
     step_from(sim, start, rows)
     found, off = (errors(sim, m, start) for m in ([varied.edited(row) for row in rows], [model] * WORLDS))
     assert p95(found)[0] < 1e-6 < 0.01 * off[:, 0].max()

@@ -11,10 +11,15 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.dynamics import MINVAL, Poses, constant_matrix
-from torchrl_loco.sim.compiled.parameters import Number, largest
+from torchrl_loco.sim.compiled.parameters import Number, largest, varies
 from torchrl_loco.sim.compiled.symbols import Scalar, array, dot, select, sqrt
 
-PLANE, SPHERE, CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("PLANE", "SPHERE", "CAPSULE"))
+PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
+    for kind in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX")
+)
+ROUND, SOLID = (SPHERE, CAPSULE), (ELLIPSOID, CYLINDER, BOX)
+"""Shapes that are a segment with a radius, which both schedules know; and those that only lanes know."""
 MINMU = 1e-5
 """MuJoCo's mjMINMU."""
 SLIPPERY, LEAST = 0.03, 1e-4
@@ -34,9 +39,11 @@ class Pair:
     Attributes:
         geoms: their ids, the simpler shape first; the normal points from the first to the second.
         condim: 1 (no friction), 3 (sliding), 4 (torsional friction too) or 6 (rolling friction too).
-        friction: sliding friction coefficient, 0 without friction.
+        friction: sliding friction coefficient, along the first tangent of the contact, 0 without friction.
+        friction_ratio: that along the second tangent over the first; 1 unless an explicit pair says otherwise.
         torsional: torsional friction coefficient (m), 0 without.
-        rolling: rolling friction coefficient (m), 0 without.
+        rolling: rolling friction coefficient (m), about the first tangent, 0 without.
+        rolling_ratio: that about the second tangent over the first; 1 unless an explicit pair says otherwise.
         margin: distance below which a contact is active (m).
         solref: reference parameters of the constraint, ``(2,)``.
         solimp: impedance parameters, ``(5,)``.
@@ -52,17 +59,26 @@ class Pair:
     solref: tuple[float, ...]
     solimp: tuple[float, ...]
     weight: Number
+    friction_ratio: Number = 1.0
+    rolling_ratio: Number = 1.0
 
 
 def pairs(m: mujoco.MjModel) -> list[Pair]:
-    """Returns all pairs of geoms that may touch: MuJoCo's filters by type, body, parent, and exclusion."""
+    """Returns all pairs of geoms that may touch: explicit ones, then those of MuJoCo's filters.
+
+    The filters are by type, body, parent and exclusion; explicit pairs pass them, but for geoms that cannot move
+    relative to each other.
+    """
     weld = m.body_weldid[m.geom_bodyid]
     parent_weld = m.body_weldid[m.body_parentid[weld]]
     filter_parent = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
     excluded = set(m.exclude_signature.tolist())
-    found = []
+    explicit = [tuple(sorted((int(m.pair_geom1[i]), int(m.pair_geom2[i])))) for i in range(m.npair)]
+    found = [_explicit_pair(m, i) for i, (a, b) in enumerate(explicit) if weld[a] != weld[b]]
     for a in range(m.ngeom):
         for b in range(a + 1, m.ngeom):
+            if (a, b) in explicit:
+                continue
             bodies = sorted((m.geom_bodyid[a], m.geom_bodyid[b]))
             masked = not (m.geom_contype[a] & m.geom_conaffinity[b] or m.geom_contype[b] & m.geom_conaffinity[a])
             related = weld[a] and weld[b] and (weld[a] == parent_weld[b] or weld[b] == parent_weld[a])
@@ -77,6 +93,17 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
 def is_elliptic(m: mujoco.MjModel) -> bool:
     """Returns whether friction of contacts is bounded by elliptic cones, not by pyramids."""
     return bool(m.opt.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC))
+
+
+def needs_lanes(m: mujoco.MjModel) -> bool:
+    """Returns whether a model has contacts that only lanes can do.
+
+    These are contacts of solids and of explicit pairs, and those with elliptic cones or friction against turning.
+    """
+    slides = 1 if is_elliptic(m) else 3
+    return bool(m.npair) or any(
+        pair.condim > slides or any(m.geom_type[geom] in SOLID for geom in pair.geoms) for pair in pairs(m)
+    )
 
 
 def contact_weight(m: mujoco.MjModel, pair: Pair) -> Number:
@@ -129,6 +156,34 @@ def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
     return Pair(
         (a, b), int(condim), sliding, torsional, rolling, float(margin), tuple(solref), tuple(solimp), float(weight)
     )
+
+
+def _explicit_pair(m: mujoco.MjModel, i: int) -> Pair:
+    """Returns a pair with the parameters that the model gives it."""
+    a, b = sorted((int(m.pair_geom1[i]), int(m.pair_geom2[i])), key=lambda g: m.geom_type[g])
+    condim = int(m.pair_dim[i])
+    sliding, second, torsional, rolling, second_rolling = (
+        largest(x, MINMU) if condim >= least else 0.0
+        for x, least in zip(m.pair_friction[i], (3, 3, 4, 6, 6), strict=True)
+    )
+    return Pair(
+        geoms=(a, b),
+        condim=condim,
+        friction=sliding,
+        torsional=torsional,
+        rolling=rolling,
+        margin=float(m.pair_margin[i]),
+        solref=tuple(m.pair_solref[i]),
+        solimp=tuple(m.pair_solimp[i]),
+        weight=float(m.body_invweight0[m.geom_bodyid[[a, b]], 0].sum()),
+        friction_ratio=_ratio(second, sliding),
+        rolling_ratio=_ratio(second_rolling, rolling),
+    )
+
+
+def _ratio(a: Number, b: Number) -> Number:
+    same = not varies(a) and not varies(b) and a == b
+    return 1.0 if same else a / b
 
 
 # Contacts with a plane of the world.

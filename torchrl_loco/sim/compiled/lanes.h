@@ -165,7 +165,7 @@ struct Softness {  // of a constraint: solref and solimp
 // ---- The model -----------------------------------------------------------------------------------------------------
 
 enum Joint { FREE, BALL, SLIDE_JOINT, HINGE_JOINT };
-enum Shape { SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX };
+enum Shape { SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX };  // of geoms and of sites
 enum Dof { TRANSLATION, ROTATION, SLIDE, HINGE };  // of a free joint; of a free or ball joint; the two others
 
 //MODEL
@@ -204,7 +204,7 @@ struct alignas(16) Quad { float v[4]; };
 struct alignas(16) LocalPose { Quat orientation; Vec position; };
 struct alignas(16) Pose { Mat orientation; Vec position; };
 struct alignas(16) Body { Inertia inertia; Vec torque, force; };  // 16 floats
-struct alignas(16) Geom { Vec center, half_axis; float radius; };  // a sphere has no half axis
+struct alignas(16) Geom { Vec center, half_axis; float radius; };  // only a capsule has a half axis
 struct alignas(16) Contact { Vec point; float distance; Vec normal; int pair; };
 
 struct alignas(16) World {
@@ -760,12 +760,68 @@ struct Step : Math {
     }
   }
 
+//IF SOLIDS
+  INLINE Mat geom_axes(int g) const {  // by rows
+    const Mat link = pose_of(Model::geom_link(g)).orientation, own = Model::geom_orientation(g);
+    return {own.transposed_times(link.row0), own.transposed_times(link.row1), own.transposed_times(link.row2)};
+  }
+
+  // Point k of a solid that may touch a plane with normal n, in the frame of the solid; returns false if there is none.
+  static INLINE bool point_below(int g, int k, Vec n, Vec& point) {
+    const Vec size = Model::geom_size(g);
+    const int shape = Model::geom_shape(g);
+    if (shape == ELLIPSOID) {  // the support point
+      const Vec p = {n.x * size.x, n.y * size.y, n.z * size.z};
+      const float inverse = divide(-1.0f, larger(p.norm(), MINVAL));
+      point = {p.x * size.x * inverse, p.y * size.y * inverse, p.z * size.z * inverse};
+      return k == 0;
+    }
+    if (shape == CYLINDER) {
+      // The lowest point of each rim, and two more of the lower rim, which make an equilateral triangle. All of the rim
+      // of an upright cylinder is lowest: the first point is then on its x axis.
+      const float radius = size.x, level = root(n.x * n.x + n.y * n.y), scale = divide(-radius, level);
+      const bool upright = level < 1e-6f;
+      const float x = upright ? radius : n.x * scale, y = upright ? 0.0f : n.y * scale;
+      const float down = n.z > 0.0f ? -size.y : size.y, aside = k == 2 ? 0.866025404f : -0.866025404f;
+      if (k < 2) point = {x, y, k == 0 ? down : -down};
+      else point = {aside * y - 0.5f * x, -aside * x - 0.5f * y, down};
+      return true;
+    }
+    // A box: of each two opposite corners the lower one.
+    point = {k & 1 ? size.x : -size.x, k & 2 ? size.y : -size.y, -size.z};
+    if (n.dot(point) > 0.0f) point = point * -1.0f;
+    return true;
+  }
+
+  // Boxes, cylinders and ellipsoids against planes of the world.
+  INLINE void collide_solids_with_planes(const int begin, const int end, const bool friction) {
+    ROLLED for (int base = begin; base < end; base += LANES) {
+      const bool valid = base + lane < end;
+      const int pair = valid ? base + lane : begin, g = Model::second_geom(pair);
+      const Geom geom = w.geoms[g];
+      const Vec normal = Model::plane_normal(pair);
+      const float height = normal.dot(geom.center) + normal.dot(w.com[0]) - Model::plane_offset(pair);
+      const bool near = valid && height - geom.radius < Model::margin(pair);
+      if (!ballot(near)) continue;
+      const Mat axes = geom_axes(g);
+      const Vec n = axes.transposed_times(normal);
+      ROLLED for (int k = 0; k < 4; ++k) {
+        Vec point;
+        const bool exists = point_below(g, k, n, point);
+        const float distance = height + n.dot(point);
+        add_contact(near && exists && distance < Model::margin(pair), friction, pair,
+                    geom.center + axes * point - normal * (0.5f * distance), distance, normal, {0.0f, 0.0f, 0.0f});
+      }
+    }
+  }
+
+//END
   struct Nearest {  // points of two segments, as fractions of their lengths from the start
     float first, second;
   };
 
-  // Spheres and capsules against each other: first by bounding spheres, then the nearest points of the two segments.
-  INLINE void collide_geoms(const int begin, const int end, const bool friction) {
+  // Lists the pairs whose bounding spheres are within their margin, and returns how many there are.
+  INLINE int near_pairs(const int begin, const int end) {
     int candidates = 0;
     ROLLED for (int base = begin; base < end; base += LANES) {
       const bool valid = base + lane < end;
@@ -777,6 +833,12 @@ struct Step : Math {
       candidates += bits(hits);
     }
     sync();
+    return candidates;
+  }
+
+  // Spheres and capsules against each other: the nearest points of the two segments.
+  INLINE void collide_geoms(const int begin, const int end, const bool friction) {
+    const int candidates = near_pairs(begin, end);
     ROLLED for (int base = 0; base < candidates; base += LANES) {
       const bool valid = base + lane < candidates;
       const int pair = valid ? w.candidates[base + lane] : begin;
@@ -818,6 +880,153 @@ struct Step : Math {
     sync();
   }
 
+//IF BOXES
+  // ---- Spheres and capsules against boxes, in the frame of the box
+
+  struct Depth { float distance; Vec normal, point; };
+
+  static INLINE Depth sphere_and_box(Vec center, float radius, Vec size) {
+    const Vec inside = {clamp(center.x, -size.x, size.x), clamp(center.y, -size.y, size.y),
+                        clamp(center.z, -size.z, size.z)};
+    const Vec gap = inside - center;
+    const float length = gap.norm();
+    if (length > MINVAL) {
+      const Vec normal = gap * divide(1.0f, length);
+      return {length - radius, normal, (inside + center + normal * radius) * 0.5f};
+    }
+    float depth = 1e30f;  // the center is inside: out through the nearest face
+    Vec normal;
+    ROLLED for (int face = 0; face < 6; ++face) {
+      const float sign = face & 1 ? -1.0f : 1.0f, x = size.component(face / 2) + sign * center.component(face / 2);
+      if (!(x < depth)) continue;
+      depth = x;
+      normal = {face / 2 == 0 ? sign : 0.0f, face / 2 == 1 ? sign : 0.0f, face / 2 == 2 ? sign : 0.0f};
+    }
+    return {-depth - radius, normal, center + normal * (0.5f * (radius - depth))};
+  }
+
+  static INLINE Vec from_axis(Vec v, int axis) {  // the same with its components in cyclic order
+    return {v.component(axis), v.component(axis < 2 ? axis + 1 : 0), v.component(axis ? axis - 1 : 2)};
+  }
+
+  struct Ends { float first, second; int points; };  // on a capsule's segment, in half axes from its center
+
+  // The point of a capsule's segment that is nearest to a box; and if the capsule lies along a face or an edge, the
+  // point up to which it does. The choices, and their order where several are as near, are MuJoCo's.
+  static INLINE Ends capsule_and_box(Vec center, Vec half, Vec size) {
+    const float length_squared = half.dot(half);
+    float nearest = 1e30f, at = 0.0f, on_edge = 0.0f;
+    int face = -1, edge = -1, side = 1, corner = 0;
+    ROLLED for (int end = 0; end < 2; ++end) {  // an end that is beyond one face, or inside
+      const float sign = end ? 1.0f : -1.0f;
+      const Vec tip = center + half * sign;
+      const int beyond = (fabsf(tip.x) > size.x) | (fabsf(tip.y) > size.y) << 1 | (fabsf(tip.z) > size.z) << 2;
+      if (beyond & (beyond - 1)) continue;
+      const float x = beyond ? fabsf(tip.component(beyond / 2)) - size.component(beyond / 2) : 0.0f;
+      if (!(x * x < nearest)) continue;
+      nearest = x * x;
+      at = sign;
+      face = beyond ? beyond / 2 : -1;
+    }
+    ROLLED for (int e = 0; e < 12; ++e) {  // a point between the ends, or the end of an edge
+      const int axis = e / 4, below = (1 << axis) - 1, start = (e & 3 & below) | (e & 3 & ~below) << 1;
+      const Vec h = from_axis(half, axis), s = from_axis(size, axis), c = from_axis(center, axis);
+      const bool up = start >> (axis < 2 ? axis + 1 : 0) & 1, out = start >> (axis ? axis - 1 : 2) & 1;
+      const Vec gap = {-c.x, (up ? s.y : -s.y) - c.y, (out ? s.z : -s.z) - c.z};
+      const float across = h.y * h.y + h.z * h.z;
+      if (s.x * s.x * across < MINVAL) continue;  // parallel
+      float q = divide(h.y * gap.y + h.z * gap.z, across), p = divide(h.x * q - gap.x, s.x);
+      int part = 1;  // of the edge: its start, between, or its end
+      if (fabsf(p) > 1.0f) {
+        part = p > 0.0f ? 2 : 0;
+        p = p > 0.0f ? 1.0f : -1.0f;
+        q = divide(h.dot(gap) + p * s.x * h.x, length_squared);
+      }
+      if (fabsf(q) > 1.0f) {
+        q = q > 0.0f ? 1.0f : -1.0f;
+        p = divide(q * h.x - gap.x, s.x);
+        if (fabsf(p) > 1.0f) {
+          part = p > 0.0f ? 2 : 0;
+          p = p > 0.0f ? 1.0f : -1.0f;
+        }
+      }
+      const Vec apart = gap - h * q + Vec{p * s.x, 0.0f, 0.0f};
+      const float squared = apart.dot(apart);
+      // Rounding does not decide: of points that are as near, the first counts, but a point within an edge before a
+      // corner, which is never nearer than what is within its edges.
+      const float least = part == 1 && side != 1 ? 1.00001f : 0.99999f;
+      if (!(squared < nearest * least - MINVAL)) continue;
+      nearest = squared;
+      at = q;
+      on_edge = p;
+      edge = axis;
+      side = part;
+      corner = start | (part == 2) << axis;
+    }
+
+    const float level = 1e-6f * root(length_squared);  // what is aligned but for rounding does not rise
+    const int rising = (half.x > level) | (half.y > level) << 1 | (half.z > level) << 2;
+    const Ends one = {at, at, 1};
+    float further, sign;
+    if (edge < 0) {  // over a face
+      if (face < 0) return one;
+      sign = -at;
+      further = 2.0f;
+      ROLLED for (int i = 0; i < 6; ++i) {
+        const int axis = i / 2;
+        const float h = half.component(axis), bound = i & 1 ? -size.component(axis) : size.component(axis);
+        const float x = divide(bound - center.component(axis) - at * h, h) * sign;
+        if (axis != face && x > 0.0f && x < further) further = x;
+      }
+    } else if (side != 1) {  // at a corner: along its edge, or across its face
+      int apart = rising ^ corner;
+      if (apart == 0 || apart == 7) return one;
+      const bool two = apart & (apart - 1);
+      if (two) apart = 7 - apart;
+      sign = two ? -1.0f : 1.0f;
+      const Vec h = from_axis(half, apart / 2), s = from_axis(size, apart / 2);
+      if (h.x * h.x > 0.5f * length_squared) {
+        further = smaller(divide(2.0f * s.x, fabsf(h.x)), 1.0f - sign * at);
+      } else {
+        further = smaller(divide(2.0f * s.y, fabsf(h.y)), 1.0f + sign * at);
+        further = smaller(divide(2.0f * s.z, fabsf(h.z)), further);
+        sign = -sign;
+      }
+    } else {  // across an edge: along the face to which the capsule is at a smaller angle
+      const int next = edge < 2 ? edge + 1 : 0, last = edge ? edge - 1 : 2;
+      const int apart = (rising ^ corner) & ~(1 << edge);
+      if (apart == 0 || apart & (apart - 1)) return one;
+      const Vec h = from_axis(half, edge), s = from_axis(size, edge);
+      const bool along_next = fabsf(h.y) > fabsf(h.z), forward = apart >> (along_next ? next : last) & 1;
+      sign = forward ? 1.0f : -1.0f;
+      const float wide = along_next ? s.y : s.z, component = along_next ? h.y : h.z;
+      further = smaller(divide(2.0f * wide, fabsf(component)), 1.0f - sign * at);
+      const float left = (rising >> edge & 1) == forward ? 1.0f - on_edge : 1.0f + on_edge;
+      further = smaller(divide(s.x * left, fabsf(h.x)), further);
+    }
+    return {at, at + sign * further, 2};
+  }
+
+  INLINE void collide_boxes(const int begin, const int end, const bool friction) {
+    const int candidates = near_pairs(begin, end);
+    ROLLED for (int base = 0; base < candidates; base += LANES) {
+      const bool valid = base + lane < candidates;
+      const int pair = valid ? w.candidates[base + lane] : begin, g = Model::second_geom(pair);
+      const Geom geom = w.geoms[Model::first_geom(pair)];
+      const Vec origin = w.geoms[g].center, size = Model::geom_size(g);
+      const Mat axes = geom_axes(g);
+      const Vec center = axes.transposed_times(geom.center - origin), half = axes.transposed_times(geom.half_axis);
+      const Ends ends = half.dot(half) > MINVAL ? capsule_and_box(center, half, size) : Ends{0.0f, 0.0f, 1};
+      ROLLED for (int i = 0; i < 2; ++i) {
+        const Depth depth = sphere_and_box(center + half * (i ? ends.second : ends.first), geom.radius, size);
+        add_contact(valid && i < ends.points && depth.distance < Model::margin(pair), friction, pair,
+                    origin + axes * depth.point, depth.distance, axes * depth.normal, {0.0f, 0.0f, 0.0f});
+      }
+    }
+    sync();
+  }
+
+//END
   // The limit of a ball joint is a row along three degrees of freedom; it lies among the contacts without friction.
   INLINE void limit_balls() {
     ROLLED for (int base = 0; base < Model::BALL_LIMITS; base += LANES) {
@@ -834,10 +1043,22 @@ struct Step : Math {
     frictional = frictionless = 0;
     if (Model::GEOMS > 0) place_geoms();
     collide_with_planes(0, Model::PLANE_FRICTIONAL_END, true);
-    collide_geoms(Model::PLANE_END, Model::GEOM_FRICTIONAL_END, true);
+//IF SOLIDS
+    collide_solids_with_planes(Model::PLANE_END, Model::SOLID_FRICTIONAL_END, true);
+//END
+    collide_geoms(Model::SOLID_END, Model::GEOM_FRICTIONAL_END, true);
+//IF BOXES
+    collide_boxes(Model::GEOM_END, Model::BOX_FRICTIONAL_END, true);
+//END
     limit_balls();
     collide_with_planes(Model::PLANE_FRICTIONAL_END, Model::PLANE_END, false);
-    collide_geoms(Model::GEOM_FRICTIONAL_END, Model::PAIRS, false);
+//IF SOLIDS
+    collide_solids_with_planes(Model::SOLID_FRICTIONAL_END, Model::SOLID_END, false);
+//END
+    collide_geoms(Model::GEOM_FRICTIONAL_END, Model::GEOM_END, false);
+//IF BOXES
+    collide_boxes(Model::BOX_FRICTIONAL_END, Model::PAIRS, false);
+//END
     sync();
     if (Model::TOUCH) feel_contacts();
     sync();
@@ -848,6 +1069,11 @@ struct Step : Math {
   // Contacts with friction come first, then those without, each from a place of its own.
   INLINE int place_of(int i) const { return i < frictional ? i : Model::FRICTIONAL + i - frictional; }
   INLINE const Contact& contact(int i) const { return w.contacts[place_of(i)]; }
+
+  // The second tangent of a contact, times friction.
+  INLINE Vec second_tangent(Vec normal, Vec first, int pair) const {
+    return normal.cross(first) * Model::friction_ratio(pair);
+  }
 
   INLINE void jacobians() {
     Motion axes[SLOTS];
@@ -869,11 +1095,12 @@ struct Step : Math {
 //ELSE
         tangent = w.tangents[i] * Model::friction(pair);
 //END
-        other = c.normal.cross(tangent);
+        other = second_tangent(c.normal, tangent, pair);
       }
 //IF TURNING
       const Vec twist = c.normal * Model::torsional(pair);
-      const Vec roll = w.tangents[friction ? i : 0] * Model::rolling(pair), other_roll = c.normal.cross(roll);
+      const Vec roll = w.tangents[friction ? i : 0] * Model::rolling(pair);
+      const Vec other_roll = c.normal.cross(roll) * Model::rolling_ratio(pair);
 //END
       float* const row = w.jacobian + STRIDE * (friction ? DIRECTIONS * i : (DIRECTIONS - 1) * frictional + i);
       OWN_DOFS(slot, d) {
@@ -1617,7 +1844,7 @@ struct Step : Math {
     }
     const Law cost = law(i);
     return c.normal * -cost.gradient[0] + c.tangent * -cost.gradient[1] +
-           c.normal.cross(c.tangent) * -cost.gradient[2];
+           second_tangent(c.normal, c.tangent, c.pair) * -cost.gradient[2];
   }
 
   // The sum of the contact forces on each geom, and whether there is a contact.

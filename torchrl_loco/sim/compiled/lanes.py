@@ -17,8 +17,11 @@ import numpy as np
 
 from torchrl_loco.sim.compiled import collision, symbols
 from torchrl_loco.sim.compiled.collision import (
+    BOX,
     CAPSULE,
+    CYLINDER,
     PLANE,
+    SOLID,
     Pair,
     contact_weight,
     is_elliptic,
@@ -176,14 +179,20 @@ class Description:
         """Returns whether the first geom of a pair is a plane."""
         return self.m.geom_type[pair.geoms[0]] == PLANE
 
+    def is_solid(self, pair: Pair) -> bool:
+        """Returns whether the second geom of a pair is neither a sphere nor a capsule."""
+        return self.m.geom_type[pair.geoms[1]] in SOLID
+
     def _sorted_pairs(self, found: list[Pair]) -> list[Pair]:
-        """Returns planes before others, and in both parts those with friction first."""
-        return sorted(found, key=lambda p: (not self.is_plane(p), p.condim == 1))
+        """Returns planes before others, in both parts solids last, and in all parts those with friction first."""
+        return sorted(found, key=lambda p: (not self.is_plane(p), self.is_solid(p), p.condim == 1))
 
     def points(self, pair: Pair) -> int:
         """Returns how many contacts a pair can have."""
-        capsules = sum(self.m.geom_type[g] == CAPSULE for g in pair.geoms)
-        return 2 if capsules == (1 if self.is_plane(pair) else 2) else 1
+        first, second = self.m.geom_type[list(pair.geoms)]
+        if first == PLANE:
+            return {CAPSULE: 2, BOX: 4, CYLINDER: 4}.get(second, 1)
+        return 2 if first == CAPSULE and second in (CAPSULE, BOX) else 1
 
     def _layout(self) -> Layout:
         """Returns the sizes, with as many places for contacts as there is room for.
@@ -376,6 +385,10 @@ class Description:
     def _half_length(self, g: int) -> float:
         return float(self.m.geom_size[g, 1]) if self.m.geom_type[g] == CAPSULE else 0.0
 
+    def _radius(self, g: int) -> float:
+        """Returns the radius of a sphere or capsule, and that of the bounding sphere of a solid."""
+        return float(self.m.geom_rbound[g] if self.m.geom_type[g] in SOLID else self.m.geom_size[g, 0])
+
     def _add_geoms(self, tables: Tables, mask: str) -> None:
         m, found = self.m, self.pairs
         geoms = [self._geom(g) for g in self.geoms]
@@ -383,15 +396,26 @@ class Description:
         tables.integers("geom_link", [link for link, _, _ in geoms])
         tables.structs("Vec", "geom_position", [center for _, center, _ in geoms])
         tables.structs("Vec", "geom_half_axis", [axis * h for (_, _, axis), h in zip(geoms, half, strict=True)])
-        tables.floats("geom_radius", m.geom_size[self.geoms, 0])
+        tables.floats("geom_radius", [self._radius(g) for g in self.geoms])
         planes = [p for p in found if self.is_plane(p)]
-        solid = found[len(planes) :]
+        others = found[len(planes) :]
+        solids, boxes = ([p for p in part if self.is_solid(p)] for part in (planes, others))
+        first_solid, first_box = len(planes) - len(solids), len(found) - len(boxes)
         tables.size(
-            PLANE_FRICTIONAL_END=sum(p.condim != 1 for p in planes),
-            PLANE_END=len(planes),
-            GEOM_FRICTIONAL_END=len(planes) + sum(p.condim != 1 for p in solid),
+            PLANE_FRICTIONAL_END=sum(p.condim != 1 for p in planes[:first_solid]),
+            PLANE_END=first_solid,
+            SOLID_FRICTIONAL_END=first_solid + sum(p.condim != 1 for p in solids),
+            SOLID_END=len(planes),
+            GEOM_FRICTIONAL_END=len(planes) + sum(p.condim != 1 for p in found[len(planes) : first_box]),
+            GEOM_END=first_box,
+            BOX_FRICTIONAL_END=first_box + sum(p.condim != 1 for p in boxes),
             PAIRS=len(found),
         )
+        if solids or boxes:
+            tables.integers("geom_shape", [SHAPES[int(m.geom_type[g])] for g in self.geoms])
+            tables.structs("Vec", "geom_size", m.geom_size[self.geoms])
+            turns = [self.places[m.geom_bodyid[g]].turn(m.geom_quat[g]) for g in self.geoms]
+            tables.structs("Mat", "geom_orientation", [matrix(turn).ravel() for turn in turns])
         index = {g: i for i, g in enumerate(self.geoms)}
         tables.integers("first_geom", [index.get(p.geoms[0], 0) for p in found])
         tables.integers("second_geom", [index[p.geoms[1]] for p in found])
@@ -402,7 +426,7 @@ class Description:
         tables.floats("plane_offset", [normal @ center for _, center, normal in frames])
         half = [self._half_length(p.geoms[1]) for p in planes]
         tables.floats("inverse_half_length", [1 / h if h else 0.0 for h in half])
-        reach = [sum(m.geom_size[g, 0] + self._half_length(g) for g in p.geoms) + p.margin for p in solid]
+        reach = [sum(self._radius(g) + self._half_length(g) for g in p.geoms) + p.margin for p in others]
         tables.floats("reach_squared", [0.0] * len(planes) + [r * r for r in reach])
         self._add_friction(tables)
         # The limits of ball joints follow the pairs.
@@ -451,9 +475,11 @@ class Description:
             slopes = [p.friction / ratio if p.condim > 1 else 1.0 for p in found]
             tables.floats("mu", slopes)
         tables.floats("friction", [ratio if self.elliptic else p.friction for p in found])
+        tables.floats("friction_ratio", [p.friction_ratio for p in found])
         if self.layout.directions > 3:
             tables.floats("torsional", [p.torsional / mu for p, mu in zip(found, slopes, strict=True)])
             tables.floats("rolling", [p.rolling / mu for p, mu in zip(found, slopes, strict=True)])
+            tables.floats("rolling_ratio", [p.rolling_ratio for p in found])
         if self.some_lack_edges:
             tables.integers("edges", [2 * (p.condim - 1) for p in found])
 
@@ -574,6 +600,8 @@ def source(
         "DERIVED": tables.row.numbers > 0 and substeps == 0,
         "IMPLICIT_ACTUATORS": description.implicit_actuators,
         "JOINT_FORCE_LIMITS": description.joint_force_limits,
+        "SOLIDS": any(map(description.is_solid, description.pairs)),
+        "BOXES": any(description.is_solid(p) and not description.is_plane(p) for p in description.pairs),
     }
     text = tables.use(_parts(TEMPLATE.read_text(), asked))
     text = text.replace("//MODEL", tables.text()).replace("//ELIMINATE", description.elimination())

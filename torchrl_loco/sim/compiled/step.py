@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from torchrl_loco.sim.compiled import lanes, traced
-from torchrl_loco.sim.compiled.collision import is_elliptic, pairs
+from torchrl_loco.sim.compiled.collision import needs_lanes
 from torchrl_loco.sim.compiled.parameters import VariedModel
 
 TRACED_DOFS = 16
@@ -30,16 +30,11 @@ they wait for memory, and the registers of the physics leave too few warps to hi
 def is_traced(m: mujoco.MjModel) -> bool:
     """Returns whether one thread steps a world, in straight-line code; else a group of lanes does, in loops.
 
-    Lanes alone have integrators other than Euler, joints that limit the forces of their actuators, elliptic cones, and
-    friction against turning.
+    Lanes alone have integrators other than Euler, joints that limit the forces of their actuators, and contacts that
+    are more than friction that slides on spheres and capsules.
     """
     euler = m.opt.integrator == int(mujoco.mjtIntegrator.mjINT_EULER)
-    return m.nv <= TRACED_DOFS and euler and not m.jnt_actfrclimited.any() and _slides_in_pyramids(m)
-
-
-def _slides_in_pyramids(m: mujoco.MjModel) -> bool:
-    friction = {pair.condim for pair in pairs(m)} - {1}
-    return friction <= {3} and not (friction and is_elliptic(m))
+    return m.nv <= TRACED_DOFS and euler and not m.jnt_actfrclimited.any() and not needs_lanes(m)
 
 
 def structure_of_arrays(m: mujoco.MjModel, device: wp.Device) -> bool:

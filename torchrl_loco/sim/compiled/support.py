@@ -3,7 +3,7 @@
 import mujoco
 
 from torchrl_loco.sim.compiled import lanes
-from torchrl_loco.sim.compiled.collision import CAPSULE, PLANE, SPHERE, Pair, pairs
+from torchrl_loco.sim.compiled.collision import BOX, PLANE, ROUND, SOLID, Pair, is_elliptic, pairs
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE
 from torchrl_loco.sim.compiled.parameters import VariedModel
 from torchrl_loco.sim.compiled.sensors import SUBTREE_VELOCITY, TOUCH
@@ -77,7 +77,6 @@ def _elements(m: mujoco.MjModel) -> list[str]:
     counts = {
         "tendons": m.ntendon,
         "equality constraints": m.neq,
-        "explicit contact pairs": m.npair,
         "flexes": m.nflex,
         "plugins": m.nplugin,
         "mocap bodies": m.nmocap,
@@ -134,19 +133,26 @@ def _lines(kind: str, found: Found) -> list[str]:
 
 
 def _contacts(m: mujoco.MjModel) -> list[str]:
-    kinds = set()
+    kinds, found = set(), []
     for pair in pairs(m):
         if not _collides(m, pair):
             names = [mujoco.mjtGeom(int(m.geom_type[geom])).name.removeprefix("mjGEOM_").lower() for geom in pair.geoms]
             kinds.add(" and ".join(names))
-    return [f"contacts of {', '.join(sorted(kinds))}: only spheres, capsules and planes of the world"] if kinds else []
+    if kinds:
+        found.append(
+            f"contacts of {', '.join(sorted(kinds))}: only spheres and capsules with each other and with boxes, and "
+            "with planes of the world all of these, cylinders and ellipsoids"
+        )
+    if is_elliptic(m) and m.pair_solreffriction.any():  # pyramids do without
+        found.append("solreffriction of an explicit pair with an elliptic cone")
+    return found
 
 
 def _collides(m: mujoco.MjModel, pair: Pair) -> bool:
     first, second = (m.geom_type[geom] for geom in pair.geoms)
-    if first not in (PLANE, SPHERE, CAPSULE) or second not in (SPHERE, CAPSULE):
-        return False
-    return bool(m.body_weldid[m.geom_bodyid[pair.geoms[0]]] == 0) if first == PLANE else True
+    if first == PLANE:
+        return second in ROUND + SOLID and bool(m.body_weldid[m.geom_bodyid[pair.geoms[0]]] == 0)
+    return first in ROUND and second in (*ROUND, BOX)
 
 
 def _sensors(m: mujoco.MjModel) -> list[str]:

@@ -1,0 +1,132 @@
+"""Contacts that lanes find, in number, place and depth, against C MuJoCo in float64."""
+
+import collections
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+from lane_contacts import find_contacts
+
+from torchrl_loco.sim.compiled import unsupported
+
+STATES = 400
+CLOSE = 1e-6
+"""Distance to the margin (m) within which rounding decides whether there is a contact."""
+FLOORS = """
+    <geom name="floor" type="plane" size="5 5 .1" margin=".01" gap=".005"/>
+    <geom name="slope" type="plane" size="5 5 .1" pos=".1 0 0" euler="20 -30 40"/>
+"""
+BODY = """
+    <body pos="0 0 1"><freejoint/>
+      <geom name="{name}" type="{kind}" size="{size}" pos=".02 .01 -.03" euler="10 20 30" {attributes}/></body>
+"""
+SOLIDS = {"box": ".1 .07 .04", "cylinder": ".06 .09", "ellipsoid": ".1 .07 .04"}
+
+
+@pytest.fixture(autouse=True)
+def quick_compilation(monkeypatch):
+    monkeypatch.setattr(wp.config, "optimization_level", 0)
+
+
+def model(*parts):
+    return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{''.join(parts)}</worldbody></mujoco>")
+
+
+def orientations(rng, count):
+    """Returns quaternions, a third of them of whole quarter turns."""
+    for _ in range(count):
+        quaternion = rng.normal(size=4)
+        if rng.random() < 1 / 3:
+            mujoco.mju_euler2Quat(quaternion, rng.integers(0, 4, 3) * np.pi / 2, "xyz")
+        yield quaternion / np.linalg.norm(quaternion)
+
+
+def turned(m, geom, quaternion):
+    """Returns the orientation of the body of a geom whose own is a quaternion."""
+    back, result = np.zeros(4), np.zeros(4)
+    mujoco.mju_negQuat(back, m.geom_quat[geom])
+    mujoco.mju_mulQuat(result, quaternion, back)
+    return result
+
+
+def contacts_of_c(m, data):
+    """Returns the contacts by their geoms, as :func:`find_contacts` has them, and the pairs that rounding decides."""
+    found, unclear = collections.defaultdict(list), set()
+    for contact in data.contact:
+        depth = contact.dist - contact.includemargin
+        if abs(depth) < CLOSE:
+            unclear.add(tuple(contact.geom))
+        if depth < 0:
+            found[tuple(contact.geom)].append(np.concatenate([[depth], contact.pos, contact.frame[:3]]))
+    return found, unclear
+
+
+def assert_same(m, states, may_differ=lambda data, geoms: False):
+    """Every state has the contacts of C MuJoCo; returns how many pairs had how many."""
+    assert unsupported(m) == []
+    counts, data = collections.Counter(), mujoco.MjData(m)
+    for qpos, ours in zip(states, find_contacts(m, states), strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(m, data)
+        expected, unclear = contacts_of_c(m, data)
+        found = collections.defaultdict(list)
+        for geoms, row in ours:
+            found[geoms].append(row)
+        for geoms in set(expected) | set(found):
+            if geoms in unclear:
+                continue
+            a, b = np.array(expected[geoms]), np.array(found[geoms])
+            assert len(a) == len(b), (geoms, qpos)
+            counts[tuple(m.geom(g).name for g in geoms), len(a)] += 1
+            np.testing.assert_allclose(np.sort(b[:, 0]), np.sort(a[:, 0]), rtol=0, atol=2e-6)
+            if not may_differ(data, geoms):
+                apart = np.abs(a[:, None] - b).max(axis=2)
+                assert max(apart.min(axis=0).max(), apart.min(axis=1).max()) < 5e-6, (geoms, qpos)
+    return counts
+
+
+def is_upright_cylinder(data, geoms):
+    """Whether the lowest point of a cylinder's rim is any: rounding chooses it in C MuJoCo."""
+    normal, axis = (data.geom_xmat[g].reshape(3, 3)[:, 2] for g in geoms)
+    return data.model.geom_type[geoms[1]] == mujoco.mjtGeom.mjGEOM_CYLINDER and abs(normal @ axis) > 1 - 1e-9
+
+
+def test_solids_touch_planes():
+    bodies = [BODY.format(name=kind, kind=kind, size=size, attributes='contype="0"') for kind, size in SOLIDS.items()]
+    m, rng = model(FLOORS, *bodies), np.random.default_rng(0)
+    states = np.zeros((STATES, m.nq))
+    for body in range(len(SOLIDS)):
+        states[:, 7 * body : 7 * body + 3] = rng.uniform((-0.3, -0.3, 0.0), (0.3, 0.3, 0.2), (STATES, 3))
+        states[:, 7 * body + 3 : 7 * body + 7] = [turned(m, 2 + body, q) for q in orientations(rng, STATES)]
+    counts = assert_same(m, states.astype(np.float32), is_upright_cylinder)
+    for floor in ("floor", "slope"):
+        for kind, most in (("box", 4), ("cylinder", 4), ("ellipsoid", 1)):
+            assert all(counts[(floor, kind), number] > 3 for number in range(1, most + 1)), counts
+
+
+def is_on_the_surface(data, geoms):
+    """Whether a center of a sphere, or of an end of a capsule, is near the surface: rounding turns the normal."""
+    radius = data.model.geom_size[geoms[0], 0]
+    return any(abs(c.dist + radius) < 0.1 * radius for c in data.contact if tuple(c.geom) == geoms)
+
+
+def test_spheres_and_capsules_touch_boxes():
+    """A third of them are aligned without rounding: with it, rounding decides in C MuJoCo."""
+    shapes = {"ball": ("sphere", ".05"), "short": ("capsule", ".03 .05"), "long": ("capsule", ".02 .3")}
+    box = '<geom name="box" type="box" size=".1 .07 .04" margin=".01"/>'
+    bodies = [
+        f'<body pos="0 0 1"><freejoint/><geom name="{name}" type="{kind}" size="{size}" contype="0"/></body>'
+        for name, (kind, size) in shapes.items()
+    ]
+    m, rng = model(box, *bodies), np.random.default_rng(0)
+    states = np.zeros((3 * STATES, m.nq))
+    for body in range(len(shapes)):
+        states[:, 7 * body : 7 * body + 3] = rng.uniform((-0.2, -0.2, -0.15), (0.2, 0.2, 0.15), (len(states), 3))
+        states[:, 7 * body + 3 : 7 * body + 7] = rng.normal(size=(len(states), 4))
+        states[: len(states) // 3, 7 * body + 3 : 7 * body + 7] = [1, 0, 0, 0]
+    counts = assert_same(m, states.astype(np.float32), is_on_the_surface)
+    assert all(counts[pair] > 100 for pair in [(("ball", "box"), 1), (("short", "box"), 1), (("long", "box"), 1)]), (
+        counts
+    )
+    assert all(counts[(name, "box"), 2] > 100 for name in ("short", "long")), counts
