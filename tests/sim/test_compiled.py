@@ -32,6 +32,7 @@ MODEL = f"""
 </mujoco>
 """
 MANY = "".join(f'<body pos="{i} 5 1"><freejoint/><geom size="0.1"/></body>' for i in range(10))
+PAIR = '<contact><pair geom1="hand" geom2="marble" solreffriction="0.1 1"/></contact>'
 OTHERS = [
     ("<option/>", '<option solver="CG"/>', "a solver other than Newton"),
     ("<option/>", '<option integrator="implicit"/>', "an integrator other than Euler and implicitfast"),
@@ -54,6 +55,7 @@ OTHERS = [
     ('damping="1"', 'damping="1 2"', "dampers that are not linear"),
     ('damping="1"', 'stiffness="1 2"', "'elbow': springs that are not linear"),
     ('type="capsule" size="0.1 0.2"', 'type="cylinder" size="0.1 0.1"', "contacts of sphere and cylinder: "),
+    ("<sensor>", f'<option cone="elliptic"/>{PAIR}<sensor>', "solreffriction of an explicit pair"),
     (MOTOR, MOTOR.replace("elbow", "loose"), "'pull': a transmission other than a hinge or slide"),
     (MOTOR, '<general name="pull" joint="elbow" dyntype="filter" dynprm="1"/>', "'pull': activation dynamics"),
     (MOTOR, '<general name="pull" joint="elbow" gaintype="affine" gainprm="1 1"/>', "'pull': a gain that is not fixed"),
@@ -108,6 +110,7 @@ def test_what_changes_nothing_is_supported():
         ("<option/>", '<option><flag eulerdamp="disable" filterparent="disable"/></option>'),
         ('type="capsule" size="0.1 0.2"', 'type="box" size="0.1 0.1 0.1" contype="0" conaffinity="0"'),
         ('damping="1"', 'actuatorfrcrange="-1 1"'),
+        ("<sensor>", f"{PAIR}<sensor>"),
     ]:
         assert unsupported(mujoco.MjModel.from_xml_string(MODEL.replace(old, new))) == []
     for body, path in MODELS.items():
