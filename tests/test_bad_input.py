@@ -38,6 +38,7 @@ BAD = {
     "deterministic": (None, TypeError),
     "engine": ("compield", ValueError),
     "integrator": ("eular", ValueError),
+    "contacts": ("floor", ValueError),
 }
 
 

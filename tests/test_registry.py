@@ -80,6 +80,7 @@ def test_every_field_can_be_overridden():
         "ls_iterations": 4,
         "euler_damping": True,
         "integrator": "euler",
+        "contacts": "ground",
         "episode_length": 11,
         "deterministic": True,
         "engine": "mujoco_warp",

@@ -13,6 +13,8 @@ ENGINES = ("auto", "compiled", "mujoco_warp")
 
 INTEGRATORS = ("euler", "implicitfast", "rk4")
 
+CONTACTS = ("all", "ground")
+
 # The documented naconmax is for this many worlds (Playground's default batch) and scales with num_envs.
 NACONMAX_WORLDS = 2048
 # Minimum for few worlds: naconmax also limits broadphase pairs, and a curled-up humanoid has more pairs than contacts.
@@ -44,6 +46,8 @@ class SimConfig:
             else ``mujoco_warp``.
         integrator: how velocities and positions advance: ``euler`` (semi-implicit), ``implicitfast``, or ``rk4``
             (under ``mujoco_warp`` only). It replaces the one that the model names, and a line of the log says so.
+        contacts: what bodies touch: ``all`` that the model says, or the ``ground``, that is, what is fixed to the
+            world and not each other. Under both engines, and in :attr:`torchrl_loco.LocoEnv.mj_model`.
 
     Raises:
         TypeError: a value has the wrong type.
@@ -62,11 +66,13 @@ class SimConfig:
     deterministic: bool = False
     engine: str = "auto"
     integrator: str = "euler"
+    contacts: str = "all"
 
     def __post_init__(self) -> None:
         check_fields(self, {})
         check_choice("engine", self.engine, ENGINES)
         check_choice("integrator", self.integrator, INTEGRATORS)
+        check_choice("contacts", self.contacts, CONTACTS)
         if self.deterministic and self.integrator != "euler":
             raise ValueError(f"deterministic=True needs integrator='euler', got {self.integrator!r}")
         check_multiple("ctrl_dt", self.ctrl_dt, "sim_dt", self.sim_dt)

@@ -5,10 +5,14 @@ import collections
 import mujoco
 import numpy as np
 import pytest
+import torch
 import warp as wp
 from lane_contacts import find_contacts
 
+from torchrl_loco.config import SimConfig
+from torchrl_loco.sim import Simulation
 from torchrl_loco.sim.compiled import unsupported
+from torchrl_loco.sim.simulation import set_options
 
 STATES = 400
 CLOSE = 1e-6
@@ -130,3 +134,44 @@ def test_spheres_and_capsules_touch_boxes():
         counts
     )
     assert all(counts[(name, "box"), 2] > 100 for name in ("short", "long")), counts
+
+
+MASKED = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 .1" contype="2" conaffinity="4"/>
+    <geom name="step" type="box" size=".5 .5 .1" conaffinity="6"/>
+    <body pos="0 0 .19"><freejoint/><geom name="a" size=".1"/></body>
+    <body pos="0 0 .35"><freejoint/><geom name="b" size=".1"/></body>
+    <body pos="1 0 .09"><freejoint/><geom name="c" size=".1" contype="4" conaffinity="0"/></body>
+    <body pos="1 .1 .09"><freejoint/><geom name="d" size=".1" contype="0" conaffinity="2"/></body>
+    <body pos="2 0 .09"><freejoint/><geom name="e" size=".1" contype="0" conaffinity="0"/></body>
+    <body pos="2 .1 .09"><freejoint/><geom name="f" size=".1" contype="4" conaffinity="6"/></body>
+    <body pos="2 .2 .09"><freejoint/><geom name="g" size=".1" contype="2" conaffinity="4"/></body>
+  </worldbody>
+  <contact><pair geom1="e" geom2="f"/><pair geom1="e" geom2="floor"/></contact>
+</mujoco>
+"""
+
+
+def touching(m):
+    data = mujoco.MjData(m)
+    mujoco.mj_forward(m, data)
+    return {"".join(sorted(m.geom(g).name for g in c.geom)) for c in data.contact if not c.exclude}
+
+
+@pytest.mark.parametrize("engine", ["compiled", "mujoco_warp"])
+def test_bodies_touch_the_ground_only(engine):
+    m = mujoco.MjModel.from_xml_string(MASKED)
+    assert touching(m) == {"ab", "astep", "ef", "fg", "cfloor", "dfloor", "efloor", "ffloor"}
+    settings = {"ctrl_dt": 0.002, "sim_dt": 0.002, "iterations": 50, "ls_iterations": 50, "euler_damping": True}
+    config = SimConfig(**settings, naconmax=100, njmax=100, engine=engine, contacts="ground")
+    sim = Simulation(m, config, 1, torch.device("cpu"))
+    sim.reset(wp.ones(1, dtype=bool, device="cpu"))
+    assert touching(m) == {"astep", "cfloor", "dfloor", "efloor", "ffloor"}
+    data = mujoco.MjData(m)
+    mujoco.mj_step(m, data)
+    sim.step()
+    np.testing.assert_allclose(sim.qvel[0], data.qvel, rtol=0, atol=1e-4)
+    set_options(m, config)
+    assert len(touching(m)) == 5

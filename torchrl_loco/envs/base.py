@@ -249,7 +249,8 @@ class LocoEnv(EnvBase):
         device, protocol, seed = str(self.device), self.protocol, self.seed
         engine = self.engine if self.engine == "compiled" else f"{self.engine} ({self.engine_reason})"
         randomize = f", randomize={list(self.randomize)}" if self.randomize else ""
-        return f"{type(self).__name__}({num_envs=}, {device=}, {seed=}, {protocol=}, {engine=}{randomize})"
+        contacts = "" if self.config.contacts == "all" else f", contacts={self.config.contacts!r}"
+        return f"{type(self).__name__}({num_envs=}, {device=}, {seed=}, {protocol=}, {engine=}{contacts}{randomize})"
 
     # The hooks of a task, in plain torch, in the order in which they are called.
 

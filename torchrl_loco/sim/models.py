@@ -9,6 +9,12 @@ import numpy as np
 SCENE = Path(__file__).with_name("scene.xml")
 """What every model can include by its name, from any folder: light, materials, the look of the floor."""
 
+NEVER = -1e10
+"""Margin (m) of an explicit pair of geoms that does not touch: nothing is so deep."""
+
+BITS = 31
+"""Bits of a mask of contacts, but for its sign."""
+
 VELOCITY_SENSORS = {
     int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
     for name in (
@@ -98,6 +104,36 @@ def control(mj_model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
     """
     low, high = mj_model.actuator_ctrlrange.T
     return 0.5 * (low + high) + 0.5 * (high - low) * np.clip(action, -1.0, 1.0)
+
+
+def touch_ground_only(mj_model: mujoco.MjModel) -> None:
+    """Takes the contacts of moving bodies with each other out of a model.
+
+    What they touch of that which is fixed to the world stays as it is.
+
+    Raises:
+        ValueError: geoms that are fixed have so many different masks that bits do not suffice.
+    """
+    m = mj_model
+    fixed = m.body_weldid[m.geom_bodyid] == 0
+    # Each kind of fixed geoms has a bit of its own, which the moving geoms that touch it accept.
+    kinds = sorted({(int(m.geom_contype[g]), int(m.geom_conaffinity[g])) for g in np.flatnonzero(fixed)} - {(0, 0)})
+    if len(kinds) > BITS:
+        raise ValueError(f"contacts='ground' can do {BITS} kinds of contype and conaffinity of fixed geoms at most")
+    for g in range(m.ngeom):
+        own = int(m.geom_contype[g]), int(m.geom_conaffinity[g])
+        if fixed[g]:
+            bit = 1 << kinds.index(own) if own in kinds else 0
+            m.geom_contype[g], m.geom_conaffinity[g] = bit, 0
+        else:
+            touched = (k for k, other in enumerate(kinds) if own[0] & other[1] or own[1] & other[0])
+            m.geom_contype[g], m.geom_conaffinity[g] = 0, sum(1 << k for k in touched)
+    for body in range(m.nbody):
+        own = m.geom_bodyid == body
+        m.body_contype[body] = np.bitwise_or.reduce(m.geom_contype[own])
+        m.body_conaffinity[body] = np.bitwise_or.reduce(m.geom_conaffinity[own])
+    moving = ~fixed[m.pair_geom1] & ~fixed[m.pair_geom2]
+    m.pair_margin[moving] = NEVER
 
 
 def check(mj_model: mujoco.MjModel, *, own_control: bool = False) -> mujoco.MjModel:

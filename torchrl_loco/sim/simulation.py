@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from torchrl_loco.config import SimConfig
-from torchrl_loco.sim import compiled, mjw, mujoco_warp
+from torchrl_loco.sim import compiled, mjw, models, mujoco_warp
 from torchrl_loco.sim.batched_model import BatchedModel, with_every_row
 from torchrl_loco.sim.compilation import compile_kernels
 from torchrl_loco.sim.graph import Graph, ScratchPool
@@ -93,7 +93,7 @@ class Simulation:
     ``compiled``.
 
     Args:
-        mj_model: the compiled model; its options are set from ``config``.
+        mj_model: the compiled model; its options, and what it leaves out of contacts, are set from ``config``.
         config: settings of the simulation.
         num_envs: number of worlds.
         device: where they live.
@@ -286,7 +286,9 @@ class Simulation:
 
 
 def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
-    """Sets the options of a model from ``config``."""
+    """Sets the options of a model from ``config``, and takes contacts out of it that ``config`` does not want."""
+    if config.contacts == "ground":
+        models.touch_ground_only(mj_model)
     option = mj_model.opt
     option.integrator = integrator(config)
     option.timestep = config.sim_dt

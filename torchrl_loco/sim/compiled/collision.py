@@ -13,6 +13,7 @@ import numpy as np
 from torchrl_loco.sim.compiled.dynamics import MINVAL, Poses, constant_matrix
 from torchrl_loco.sim.compiled.parameters import Number, largest, varies
 from torchrl_loco.sim.compiled.symbols import Scalar, array, dot, select, sqrt
+from torchrl_loco.sim.models import NEVER
 
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
@@ -74,7 +75,9 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
     filter_parent = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
     excluded = set(m.exclude_signature.tolist())
     explicit = [tuple(sorted((int(m.pair_geom1[i]), int(m.pair_geom2[i])))) for i in range(m.npair)]
-    found = [_explicit_pair(m, i) for i, (a, b) in enumerate(explicit) if weld[a] != weld[b]]
+    found = [
+        _explicit_pair(m, i) for i, (a, b) in enumerate(explicit) if weld[a] != weld[b] and m.pair_margin[i] > NEVER
+    ]
     for a in range(m.ngeom):
         for b in range(a + 1, m.ngeom):
             if (a, b) in explicit:

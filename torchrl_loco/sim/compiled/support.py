@@ -133,15 +133,17 @@ def _lines(kind: str, found: Found) -> list[str]:
 
 
 def _contacts(m: mujoco.MjModel) -> list[str]:
-    kinds, found = set(), []
+    kinds, found, moving = set(), [], False
     for pair in pairs(m):
         if not _collides(m, pair):
+            moving = moving or m.body_weldid[m.geom_bodyid[list(pair.geoms)]].all()
             names = [mujoco.mjtGeom(int(m.geom_type[geom])).name.removeprefix("mjGEOM_").lower() for geom in pair.geoms]
             kinds.add(" and ".join(names))
     if kinds:
+        choice = "; contacts='ground' leaves out those of moving bodies with each other" if moving else ""
         found.append(
             f"contacts of {', '.join(sorted(kinds))}: only spheres and capsules with each other and with boxes, and "
-            "with planes of the world all of these, cylinders and ellipsoids"
+            f"with planes of the world all of these, cylinders and ellipsoids{choice}"
         )
     if is_elliptic(m) and m.pair_solreffriction.any():  # pyramids do without
         found.append("solreffriction of an explicit pair with an elliptic cone")
