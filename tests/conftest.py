@@ -3,8 +3,11 @@ import os
 if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads than one each would slow them down
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import gc
+
 import pytest
 import torch
+import warp as wp
 from cases import ENGINES, KINDS
 
 import torchrl_loco
@@ -27,6 +30,18 @@ def torch_generator():
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request):
     return request.param
+
+
+@pytest.fixture
+def cuda_memory():
+    """Returns a function that gives the bytes in use on the GPU by this process, whatever others have there."""
+
+    def used():
+        gc.collect()
+        torch.cuda.synchronize()
+        return torch.cuda.memory_allocated() + wp.get_mempool_used_mem_current("cuda")
+
+    return used
 
 
 @pytest.fixture(params=KINDS, ids="-".join)
