@@ -16,7 +16,7 @@ from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed, preset
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.config import CONFIGS
-from torchrl_loco.training.environments import make_env
+from torchrl_loco.training.environments import Environments
 from torchrl_loco.training.spaces import Spaces
 from torchrl_loco.training.trainer import ALGORITHMS
 
@@ -42,7 +42,7 @@ def measure(task: str, algorithm: str, device: str, settings: dict[str, Any]) ->
     config = preset(task, distributed.own_device(device), algorithm, **settings)
     torch.manual_seed(config.seed)
     with tempfile.TemporaryDirectory() as folder:
-        env = make_env(config, Path(folder, "nan_dump"))
+        env = Environments(config).training(Path(folder, "nan_dump"))
         learner = ALGORITHMS[algorithm](config, Spaces.of(env))
         collector = RolloutCollector(env, learner.actor, frames_per_batch=config.batch_size)
 

@@ -10,7 +10,7 @@ from torchrl.envs import StepCounter, Transform, TransformedEnv, UnsqueezeTransf
 
 import torchrl_loco
 from torchrl_loco.training import PPOConfig, Spaces
-from torchrl_loco.training.environments import ActionRepeat, Environments, make_env
+from torchrl_loco.training.environments import ActionRepeat, Environments
 
 
 class Stumble(torchrl_loco.WalkerStand):
@@ -86,7 +86,7 @@ def test_lengths_of_episodes(tmp_path):
 def test_terms_of_the_reward_are_returned_where_a_task_has_them(tmp_path):
     for task, terms in ((Stumble, {"one", "nothing"}), (Free, set()), ("walker_stand", set())):
         config = PPOConfig(task, num_envs=2, num_steps=4, minibatch_size=8, total_frames=100)
-        spec = make_env(config, tmp_path / "none").observation_spec
+        spec = Environments(config).training(tmp_path / "none").observation_spec
         assert set(spec.get("reward_terms", {}).keys()) == terms
 
 

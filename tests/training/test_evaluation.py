@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 import torchrl_loco
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import RunFolder, evaluate_run, preset
-from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, shipped_return, summarize
+from torchrl_loco.training.evaluation import describe, episode_returns, evaluation_seed, shipped_return, summarize
 from torchrl_loco.training.playback import record
 
 
@@ -42,9 +42,10 @@ def test_evaluation_plays_full_episodes():
     """A policy that does nothing earns what the environment pays for that until the time limit or termination."""
     env = torchrl_loco.make("walker_stand", 2, "cpu", seed=11)
     expected = env.rollout(10 * EPISODE, lambda td: td.set("action", env.action_spec.zero()))["next", "reward"].sum(1)
+    own = torchrl_loco.make("walker_stand", 2, "cpu")
     for action_repeat in (1, 7):
-        evaluator = Evaluator(torchrl_loco.make("walker_stand", 2, "cpu"), 11, action_repeat)
-        returns, again = (evaluator(lambda td: td.set("action", torch.zeros(2, 6))) for _ in range(2))
+        evaluated = lambda policy: episode_returns(policy, own, 11, action_repeat)  # noqa: B023, E731
+        returns, again = (evaluated(lambda td: td.set("action", torch.zeros(2, 6))) for _ in range(2))
         assert torch.equal(returns, again)
         torch.testing.assert_close(returns, expected.squeeze(-1), rtol=1e-4, atol=0)
 
@@ -57,7 +58,7 @@ def test_evaluation_plays_full_episodes():
         return td.set("action", action)
 
     calls = []
-    returns = evaluator(policy)
+    returns = evaluated(policy)
     assert returns[0] == 0.0
     torch.testing.assert_close(returns[1], expected[1, 0], rtol=1e-4, atol=0)
 
@@ -69,10 +70,11 @@ def test_actions_are_held_in_evaluations_and_videos(tmp_path):
         calls.append(1)
         return td.set("action", torch.zeros(1, 6))
 
-    Evaluator(torchrl_loco.make("walker_stand", 1, "cpu"), 0, action_repeat=7)(policy)
+    env = torchrl_loco.make("walker_stand", 1, "cpu", 0)
+    episode_returns(policy, env, 0, action_repeat=7)
     assert len(calls) == 6  # of 40 frames
     calls.clear()
-    record(policy, torchrl_loco.make("walker_stand", 1, "cpu", 0), tmp_path / "video.mp4", 0.1, action_repeat=2)
+    record(policy, env, tmp_path / "video.mp4", 0.1, action_repeat=2)
     assert len(calls) == 2  # of 4
 
 

@@ -56,7 +56,7 @@ def test_a_missing_package_is_named_before_anything_is_made(tmp_path, monkeypatc
     run = made(tmp_path / "elsewhere", logger=())  # trained on a machine that has the package
     text = (run.path / "config.json").read_text()
     (run.path / "config.json").write_text(text.replace('"logger": []', '"logger": ["wandb"]'))
-    monkeypatch.setattr("torchrl_loco.training.environments.make_env", None)
+    monkeypatch.setattr("torchrl_loco.training.environments.Environments.training", None)
     for name, extra in {"wandb": "wandb", "mlflow": "mlflow", "tensorboard": "train"}.items():
         monkeypatch.setitem(sys.modules, name, None)
         command = ["train", "walker_stand", "--device=cpu", f"--out={tmp_path / 'runs'}", "--logger", "csv", name]

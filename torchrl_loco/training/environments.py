@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import functools
 import hashlib
 import inspect
 from pathlib import Path
@@ -35,11 +34,15 @@ class Environments:
     def __init__(self, config: TrainingConfig, given: EnvBase | None = None) -> None:
         self._config, self._given = config, given
         self._base: LocoEnv | None = None
+        self._evaluating: dict[int, LocoEnv] = {}
         self.transforms: tuple[Transform, ...] = ()
-        if given is not None:
+        if given is None:
+            task = resolve(config.task)
+            self.full_length = task.config.episode_length if task.episode_length is None else task.episode_length
+        else:
             self._base, self.transforms = unwrapped(given)
             _refuse_further_arguments(type(self._base))
-        self.full_length = length_of(resolve(config.task)) if self._base is None else self._base.config.episode_length
+            self.full_length = self._base.config.episode_length
 
     @property
     def names_of_transforms(self) -> list[str]:
@@ -48,25 +51,51 @@ class Environments:
         return [type(one).__name__ for some in parts for one in some]
 
     def training(self, nan_dump: Path) -> EnvBase:
-        """Returns the environment in which the run trains; see :func:`make_env`."""
-        if self._given is None:
-            return make_env(self._config, nan_dump)
-        return _holding(self._given, self._config)
+        """Returns the environment in which the run trains: actions are held for ``action_repeat`` frames.
+
+        Its worlds are those of this rank: world k of rank r is world ``r * num_envs + k`` of the whole. It returns the
+        terms of its reward, unless the task is one of dm_control's runners.
+
+        If a world becomes non-finite, a NaN dump is written to ``nan_dump``, unless one is already there.
+        """
+        config, env, runner = self._config, self._given, is_runner(self._config.task)
+        if env is None:
+            env = make(
+                config.task,
+                config.num_envs,
+                config.device,
+                config.seed,
+                config.protocol,
+                world_offset=distributed.rank() * config.num_envs,
+                stagger=True,
+                reward_terms=not runner,
+                nan_dump=None if nan_dump.exists() else nan_dump,
+                episode_length=config.episode_length or self.full_length,
+            )
+        if config.action_repeat == 1:
+            return env
+        # The runners' tasks end at the time limit alone, and TorchRL's transform has less to do.
+        return TransformedEnv(env, (FrameSkipTransform if runner else ActionRepeat)(config.action_repeat))
 
     def evaluation(self, episodes: int, seed: int) -> EnvBase:
-        """Returns new worlds in which a policy of the run can be played, each for an episode of the task's own length.
+        """Returns worlds in which a policy of the run can be played, each for an episode of the task's own length.
 
-        They have the settings and the transforms of the environment that was handed in. With transforms there are as
-        many worlds as there, whatever ``episodes`` is: some transforms keep a row for each.
+        They are made once for a number of episodes; then their random streams begin anew. They have the settings and
+        the transforms of the environment that was handed in. With transforms there are as many worlds as there,
+        whatever ``episodes`` is: some transforms keep a row for each.
         """
         config, base = self._config, self._base
-        if base is None:
-            return make(config.task, episodes, config.device, seed, config.protocol, world_offset=0)
-        settings = {**dataclasses.asdict(base.config)}
-        del settings["naconmax"]  # which is for the number of its worlds
-        settings["randomize"] = base.randomize
-        worlds = base.num_envs if self.transforms else episodes
-        env: EnvBase = type(base)(worlds, base.device, seed, base.protocol, world_offset=0, **settings)
+        worlds = base.num_envs if base is not None and self.transforms else episodes
+        if worlds not in self._evaluating:
+            if base is None:
+                own = make(config.task, worlds, config.device, seed, config.protocol, world_offset=0)
+            else:
+                settings = {**dataclasses.asdict(base.config), "randomize": base.randomize}
+                del settings["naconmax"]  # which is for the number of its worlds
+                own = type(base)(worlds, base.device, seed, base.protocol, world_offset=0, **settings)
+            self._evaluating[worlds] = own
+        env: EnvBase = self._evaluating[worlds]
+        env.set_seed(seed)
         for transform in self.transforms:
             env = TransformedEnv(env, copy.deepcopy(transform.clone()))  # that it learns in evaluations stays apart
         return env
@@ -99,11 +128,6 @@ def source_of(task: str) -> str:
     return "" if file is None or not Path(file).is_file() else hashlib.sha256(Path(file).read_bytes()).hexdigest()
 
 
-def length_of(task: type[LocoEnv]) -> int:
-    """Returns the control steps of a task's own episodes."""
-    return task.config.episode_length if task.episode_length is None else task.episode_length
-
-
 def unwrapped(env: EnvBase) -> tuple[LocoEnv, tuple[Transform, ...]]:
     """Returns the environment of this package that lies below transforms, and them, the innermost first.
 
@@ -120,37 +144,6 @@ def unwrapped(env: EnvBase) -> tuple[LocoEnv, tuple[Transform, ...]]:
     if not env.batch_size:
         raise ValueError("train takes a batch of worlds: make the environment with num_envs=1 or more, not None")
     return env, tuple(part for part in transforms if not isinstance(part, Compose) or len(part))
-
-
-def make_env(config: TrainingConfig, nan_dump: Path) -> EnvBase:
-    """Returns the environment of a run: each action is held for ``config.action_repeat`` frames, rewards are summed.
-
-    Its worlds are those of this rank: world k of rank r is world ``r * num_envs + k`` of the whole. It returns the
-    terms of its reward, unless the task is one of dm_control's runners.
-
-    If a world becomes non-finite, a NaN dump is written to ``nan_dump``, unless one is already there.
-    """
-    new = functools.partial(
-        make,
-        config.task,
-        config.num_envs,
-        config.device,
-        config.seed,
-        config.protocol,
-        world_offset=distributed.rank() * config.num_envs,
-        stagger=True,
-        nan_dump=None if nan_dump.exists() else nan_dump,
-        episode_length=config.episode_length or length_of(resolve(config.task)),
-    )
-    return _holding(new(reward_terms=not is_runner(config.task)), config)
-
-
-def _holding(env: EnvBase, config: TrainingConfig) -> EnvBase:
-    if config.action_repeat == 1:
-        return env
-    # The runners' tasks end at the time limit alone, and TorchRL's transform has less to do.
-    kind = FrameSkipTransform if is_runner(config.task) else ActionRepeat
-    return TransformedEnv(env, kind(config.action_repeat))
 
 
 def make_for(policy: Policy, num_envs: int, device: Any, seed: int) -> LocoEnv:

@@ -20,28 +20,25 @@ PolicyFunc = Callable[[TensorDictBase], TensorDictBase]
 """Reads ``observation`` and writes ``action``."""
 
 
-class Evaluator:
-    """Plays full episodes without exploration; the same episodes every time.
+def episode_returns(policy: PolicyFunc, env: Any, seed: int, action_repeat: int = 1) -> torch.Tensor:
+    """Plays full episodes without exploration, for the same seed the same ones.
 
     Args:
+        policy: what is evaluated.
         env: the worlds, one for each episode.
         seed: decides their initial states.
         action_repeat: frames for which an action is held.
+
+    Returns:
+        The return of each episode, shape ``(episodes,)``.
     """
-
-    def __init__(self, env: Any, seed: int, action_repeat: int = 1) -> None:
-        self._env, self._seed, self._action_repeat = env, seed, action_repeat
-
-    def __call__(self, policy: PolicyFunc) -> torch.Tensor:
-        """Returns the return of each episode, shape ``(episodes,)``."""
-        env = self._env
-        env.set_seed(self._seed)
-        returns = torch.zeros(env.num_envs, 1, device=env.device)
-        alive = torch.ones_like(returns, dtype=torch.bool)
-        for after in play(policy, env, self._action_repeat, env.config.episode_length, "evaluation"):
-            returns += after["reward"] * alive
-            alive &= ~after["done"]
-        return returns.squeeze(-1)
+    env.set_seed(seed)
+    returns = torch.zeros(env.num_envs, 1, device=env.device)
+    alive = torch.ones_like(returns, dtype=torch.bool)
+    for after in play(policy, env, action_repeat, env.config.episode_length, "evaluation"):
+        returns += after["reward"] * alive
+        alive &= ~after["done"]
+    return returns.squeeze(-1)
 
 
 def summarize(returns: torch.Tensor) -> dict[str, float]:
@@ -92,8 +89,8 @@ def evaluate_policy(policy: Policy, episodes: int | None = None, seed: int | Non
     seed = evaluation_seed(info["seed"], final=True) if seed is None else check_int("seed", seed, SEED)
     device = str(next(policy.parameters()).device)
     with settings_for_small_networks():
-        evaluator = Evaluator(make_for(policy, episodes, device, seed), seed, info["action_repeat"])
-        return summarize(evaluator(policy))
+        env = make_for(policy, episodes, device, seed)
+        return summarize(episode_returns(policy, env, seed, info["action_repeat"]))
 
 
 def evaluate_run(

@@ -19,7 +19,7 @@ from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networ
 from torchrl_loco.training.config import check_loggers
 from torchrl_loco.training.environments import Environments, source_of, unwrapped
 from torchrl_loco.training.episodes import Episodes
-from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, shipped_return, summarize
+from torchrl_loco.training.evaluation import describe, episode_returns, evaluation_seed, shipped_return, summarize
 from torchrl_loco.training.given import Given
 from torchrl_loco.training.interrupts import interruptible
 from torchrl_loco.training.lock import lock, unlock
@@ -32,7 +32,7 @@ from torchrl_loco.training.run_folder import RunFolder
 from torchrl_loco.training.spaces import Spaces
 from torchrl_loco.training.trials import Trials
 
-ALGORITHMS: dict[str, type[Algorithm]] = {"ppo": PPO, "reppo": REPPO}
+ALGORITHMS: dict[str, type[Algorithm]] = {cls.config_type.algorithm: cls for cls in (PPO, REPPO)}
 
 
 class Trainer:
@@ -110,7 +110,6 @@ class Trainer:
         elif first:
             run.forget_after(0)  # what a process wrote that torchrun has restarted before its first checkpoint
         distributed.copy_from_first(self.algorithm.networks.state_dict().values())
-        self._evaluator: Evaluator | None = None
 
     def train(self) -> None:
         """Trains to the last frame, then evaluates the best policy, plots the learning curve and records a video.
@@ -258,31 +257,29 @@ class Trainer:
 
     def evaluate(self) -> dict[str, float]:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""
-        if self._evaluator is None:
-            self._evaluator = self._make_evaluator(evaluation_seed(self.config.seed, final=False))
         when = {"frames": self.frames, "seconds": round(self.seconds, 3)}
         of_env: dict[str, Any] = {"trained_on": self.device_name, "control_timestep": self._base.config.ctrl_dt}
         if self.environments.transforms:
             of_env["transforms"] = self.environments.names_of_transforms
         policy = deterministic_policy(self.algorithm.actor, self.config, {**when, **of_env})
-        summary = summarize(self._evaluator(policy))
+        summary = self._summary(policy, final=False)
         self.run.append_evaluation({**when, **summary})
         if summary["mean"] >= self._best:
             self._best = policy.info["selected_by"] = summary["mean"]
             policy.save(self.run.policy)
         return summary
 
-    def _make_evaluator(self, seed: int) -> Evaluator:
-        """Returns what evaluates policies of this run in episodes that begin as the seed says."""
-        config = self.config
+    def _summary(self, policy: Policy, final: bool) -> dict[str, float]:
+        """Returns what a policy earns in the episodes that select the best policy, or in those at the end."""
+        config, seed = self.config, evaluation_seed(self.config.seed, final)
         env = self.environments.evaluation(config.eval_episodes, seed)
-        return Evaluator(env, seed, config.action_repeat)
+        return summarize(episode_returns(policy, env, seed, config.action_repeat))
 
     def _finish(self) -> None:
         """Evaluates the best policy in episodes that did not select it, plots the learning curve, records a video."""
         config = self.config
         policy = Policy.load(self.run.policy, config.device)
-        summary = summarize(self._make_evaluator(evaluation_seed(config.seed, final=True))(policy))
+        summary = self._summary(policy, final=True)
         plot_runs([self.run], self.run.path / "learning_curve.png")
         if config.video_seconds > 0:
             env = self.environments.evaluation(1, evaluation_seed(config.seed, final=True))
