@@ -11,8 +11,8 @@ from small_runs import SMALL, made, small_walker
 
 import torchrl_loco
 from torchrl_loco import cli
-from torchrl_loco.cli.runs import missing_processes, way_to_resume
-from torchrl_loco.training import RunFolder, Trainer, distributed
+from torchrl_loco.cli.runs import missing_processes
+from torchrl_loco.training import Given, RunFolder, Trainer, distributed
 
 pytestmark = pytest.mark.slow  # several processes train
 
@@ -150,10 +150,11 @@ def test_what_several_ranks_cannot_do(tmp_path, monkeypatch):
 
 
 def test_the_way_to_resume_keeps_the_number_of_ranks(monkeypatch):
-    assert way_to_resume("runs/a", 1) == "torchrl-loco resume runs/a"
+    way = Given().way_to_resume
+    assert way("runs/a", 1) == "torchrl-loco resume runs/a"
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    assert way_to_resume("runs/a", 2) == "torchrl-loco resume runs/a --gpus 2"
-    assert way_to_resume("runs/a", 4).startswith("torchrun, with the options of this launch")  # several machines
+    assert way("runs/a", 2) == "torchrl-loco resume runs/a --gpus 2"
+    assert way("runs/a", 4).startswith("torchrun, with the options of this launch")  # several machines
 
 
 def test_wrong_numbers_of_gpus(tmp_path, monkeypatch, capsys):

@@ -170,22 +170,10 @@ def _train_group(group: "training.RunGroup") -> None:
 
 def train_to_end(trainer: "training.Trainer") -> None:
     """Trains to the last frame and prints where the results are."""
-    from torchrl_loco.training import distributed
+    from torchrl_loco.training.distributed import is_first
+    from torchrl_loco.training.start import Given, saying_how_to_continue
 
-    ranks, first = distributed.ranks(), distributed.is_first()
-    try:
-        with user_errors(OSError):  # such as a full disk; other errors are bugs and keep their traceback
-            trainer.train()
-    except (KeyboardInterrupt, SystemExit):
-        if first and trainer.run.has_checkpoint:
-            print(f"to continue: {way_to_resume(trainer.run.path, ranks)}", file=sys.stderr)
-        raise
-    if first:
+    with saying_how_to_continue(trainer, Given()), user_errors(OSError):  # others are bugs and keep their traceback
+        trainer.train()
+    if is_first():
         print(f"policy, curve, video and logs: {trainer.run.path}")
-
-
-def way_to_resume(run: Path, ranks: int) -> str:
-    """Returns the command that continues a run with the same number of ranks."""
-    if ranks > 1 and os.environ.get("LOCAL_WORLD_SIZE") != str(ranks):
-        return f"torchrun, with the options of this launch, -m torchrl_loco resume {run}"
-    return f"torchrl-loco resume {run}" + (f" --gpus {ranks}" if ranks > 1 else "")

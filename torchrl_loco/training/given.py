@@ -1,6 +1,7 @@
 """What a user hands to a training run as objects, which its folder cannot hold."""
 
 import dataclasses
+import os
 from pathlib import Path
 
 from torchrl.envs import EnvBase
@@ -44,9 +45,13 @@ class Given:
             f"continue it in Python with {_call_to_resume(run.path, run.given)}"
         )
 
-    def way_to_resume(self, run: Path) -> str:
-        """Returns the call or the command that continues a run."""
-        return _call_to_resume(run, self.names) if self.names else f"torchrl-loco resume {run}"
+    def way_to_resume(self, run: Path, ranks: int) -> str:
+        """Returns the call, or the command with the same number of ranks, that continues a run."""
+        if self.names:
+            return _call_to_resume(run, self.names)
+        if ranks > 1 and os.environ.get("LOCAL_WORLD_SIZE") != str(ranks):
+            return f"torchrun, with the options of this launch, -m torchrl_loco resume {run}"
+        return f"torchrl-loco resume {run}" + (f" --gpus {ranks}" if ranks > 1 else "")
 
 
 def _call_to_resume(run: Path, given: tuple[str, ...]) -> str:

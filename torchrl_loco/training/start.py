@@ -143,27 +143,30 @@ def _train(what: TrainingConfig | RunFolder, given: Given) -> RunFolder:
     config = what.load_config() if isinstance(what, RunFolder) else what
     with distributed.joined(config.device):
         trainer = Trainer(what, resume=True, given=given) if isinstance(what, RunFolder) else begin(what, given)
-        with _closed_after(trainer, given):
-            trainer.train()
+        try:
+            with saying_how_to_continue(trainer, given):
+                trainer.train()
+        finally:
+            if given.env is None:
+                trainer.env.close()
         return trainer.run
 
 
 @contextlib.contextmanager
-def _closed_after(trainer: Trainer, given: Given) -> Iterator[None]:
-    """Closes the environment of a run at the end, unless it was handed in.
+def saying_how_to_continue(trainer: Trainer, given: Given) -> Iterator[None]:
+    """Prints how to continue a run that has a checkpoint, if it is interrupted.
 
     Raises:
-        KeyboardInterrupt: the run was interrupted; the way to continue is printed before.
+        KeyboardInterrupt: Ctrl-C or SIGTERM.
+        SystemExit: an error, which was printed.
     """
+    first, ranks = distributed.is_first(), distributed.ranks()
     try:
         yield
-    except KeyboardInterrupt:
-        if distributed.is_first() and trainer.run.has_checkpoint:
-            print(f"to continue: {given.way_to_resume(trainer.run.path)}", file=sys.stderr)
+    except (KeyboardInterrupt, SystemExit):
+        if first and trainer.run.has_checkpoint:
+            print(f"to continue: {given.way_to_resume(trainer.run.path, ranks)}", file=sys.stderr)
         raise
-    finally:
-        if given.env is None:
-            trainer.env.close()
 
 
 def begin(config: TrainingConfig, given: "Given | None" = None) -> Trainer:
