@@ -35,6 +35,10 @@ COARSE = {"sim_dt": 0.0125}
 """Two physics steps in a control step, for tests in which the physics does not matter: the fewer, the faster."""
 
 
+STAGGERED = {"episode_length": 7, "stagger": True, "on_overflow": "ignore"}
+"""Short episodes that do not end together. Coarse steps make a humanoid fly apart, with more contacts than places."""
+
+
 def coarse(task):
     """The same for any task: COARSE is for the walker and the humanoid."""
     return {"sim_dt": registry.env_class(task).config.ctrl_dt / 2}

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from cases import coarse
+from cases import STAGGERED, coarse
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
@@ -17,14 +17,11 @@ from torchrl_loco import RolloutCollector
 from torchrl_loco.collector import stack, what_forbids_recording
 from torchrl_loco.tasks.walker import WalkerRun
 
-QUICK = {"episode_length": 7, "on_overflow": "ignore"}
-"""Coarse steps make a humanoid fly apart, with more contacts than there are places."""
-
 
 @pytest.fixture
 def make(shared):
     def make(task, wrap, num_envs=4, copy=0, **settings):
-        env = shared(task, num_envs, stagger=True, copy=copy, **{**QUICK, **coarse(task), **settings})
+        env = shared(task, num_envs, copy=copy, **{**STAGGERED, **coarse(task), **settings})
         return torchrl_loco.TransformedEnv(env, Compose(InitTracker(), RewardSum())) if wrap else env
 
     return make
@@ -65,7 +62,7 @@ def test_a_step_that_a_subclass_overrides_is_called():
             calls.append(name)
             return getattr(WalkerRun, name)(self, tensordict)
 
-        counted = type("Counted", (WalkerRun,), {name: override})(2, "cpu", 0, **QUICK)
+        counted = type("Counted", (WalkerRun,), {name: override})(2, "cpu", 0, **STAGGERED)
         RolloutCollector(counted, policy(counted), frames_per_batch=6).rollout()
         assert calls == [name] * 3
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cases import coarse
+from cases import STAGGERED, coarse
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter, VecNormV2
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
@@ -10,7 +10,7 @@ import torchrl_loco
 
 
 def transforms():
-    return Compose(InitTracker(), RewardSum(), StepCounter(max_steps=9))
+    return Compose(InitTracker(), RewardSum(), StepCounter(max_steps=5))
 
 
 def step_by_step(env, maybe_reset):
@@ -39,8 +39,9 @@ def test_same_data_as_torchrl(shared, kind, actions):
     task, protocol, engine = kind
     # Any two of the three options in all their combinations.
     for wrap, at_once, reward_terms in ((False, False, True), (False, True, False), (True, False, False), (True,) * 3):
-        options = {"protocol": protocol, "engine": engine, "episode_length": 12, "stagger": True, **coarse(task)}
-        theirs, ours = (shared(task, 6, copy=copy, reward_terms=reward_terms, **options) for copy in (0, 1))
+        options = {"protocol": protocol, "engine": engine, **STAGGERED, **coarse(task)}
+        options |= {"reward_terms": True} if reward_terms else {}
+        theirs, ours = (shared(task, copy=copy, **options) for copy in (0, 1))
         if wrap:
             theirs = TorchRLTransformedEnv(theirs, transforms())
             ours = torchrl_loco.TransformedEnv(ours, transforms())
@@ -100,7 +101,7 @@ def test_a_step_begins_without_the_last_reward(shared):
 
 def test_an_empty_mask_changes_nothing(shared, kind):
     task, protocol, engine = kind
-    env = shared(task, protocol=protocol, engine=engine)
+    env = shared(task, protocol=protocol, engine=engine, reward_terms=True)
     td = env.rollout(3)[:, -1]["next"]
     before = env.get_state()
     after = env.reset(td.clone().set("_reset", torch.zeros(4, 1, dtype=torch.bool)))

@@ -19,15 +19,15 @@ CASES = [
 
 @pytest.mark.parametrize(("device", "task", "protocol", "engine"), CASES)
 def test_specs_and_a_rollout(shared, task, protocol, engine, device):
-    env = shared(task, 5, device, protocol=protocol, engine=engine, reward_terms=True)
+    env = shared(task, 4, device, protocol=protocol, engine=engine, reward_terms=True)
     check_env_specs(env)
     td = env.rollout(20, break_when_any_done=False)
     observation, reward = td["next", "observation"], td["next", "reward"]
-    assert observation.shape == (5, 20, env.observation_size)
+    assert observation.shape == (4, 20, env.observation_size)
     assert observation.isfinite().all()
     assert ((reward >= 0) & (reward <= 1)).all()
     assert (reward > 0).all() or env.body in ("cheetah", "hopper", "quadruped")  # which may earn nothing
-    assert reward.shape == td["next", "done"].shape == td["next", "terminated"].shape == (5, 20, 1)
+    assert reward.shape == td["next", "done"].shape == td["next", "terminated"].shape == (4, 20, 1)
     assert not td["next", "done"].any()
     assert env.action_spec.contains(td["action"][:, 0])
     product = torch.stack(list(td["next", "reward_terms"].values())).prod(0)
@@ -37,14 +37,14 @@ def test_specs_and_a_rollout(shared, task, protocol, engine, device):
 
 def test_specs_under_transforms(shared, kind):
     task, protocol, engine = kind
-    env = shared(task, 5, protocol=protocol, engine=engine, reward_terms=True)
+    env = shared(task, protocol=protocol, engine=engine, reward_terms=True)
     check_env_specs(TransformedEnv(env, Compose(InitTracker(), RewardSum(), StepCounter())))
 
 
 def test_a_step_returns_no_live_buffer(shared, kind, device, actions):
     """A rollout holds what a loop with copies holds, and no two steps share memory."""
     task, protocol, engine = kind
-    env = shared(task, 5, device, protocol=protocol, engine=engine, reward_terms=True)
+    env = shared(task, 4, device, protocol=protocol, engine=engine, reward_terms=True)
     moves = actions(env, 6)
     env.reset()
     state = env.get_state()
@@ -72,7 +72,7 @@ def test_a_step_returns_no_live_buffer(shared, kind, device, actions):
 
 def test_truncation_is_exact_and_the_terminal_observation_true(shared, kind, device):
     task, protocol, engine = kind
-    options = {"protocol": protocol, "engine": engine, **coarse(task)}
+    options = {"protocol": protocol, "engine": engine, "reward_terms": True, **coarse(task)}
     env = shared(task, 4, device, 3, episode_length=7, **options)
     twin = shared(task, 4, device, 3, **options)  # not truncated here
     carried, td = env.reset(), twin.reset()
@@ -135,11 +135,11 @@ def test_the_callers_default_dtype_and_inference_mode_do_not_matter():
 @pytest.mark.parametrize("elsewhere", ["meta", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_the_callers_default_device_does_not_matter(elsewhere, shared):
     """An environment on the CPU stays there where tensors are made on another device by default."""
-    action = torch.zeros(5, 21)
+    action = torch.zeros(4, 21)
     options = {"protocol": "dm_control", "reward_terms": True}
-    expected = shared("humanoid_run", 5, **options).reset()["observation"]
+    expected = shared("humanoid_run", **options).reset()["observation"]
     with torch.device(elsewhere):
-        env = torchrl_loco.make("humanoid_run", 5, "cpu", seed=0, stagger=True, **options)
+        env = torchrl_loco.make("humanoid_run", 4, "cpu", seed=0, stagger=True, **options)
         td = env.reset()
         torch.testing.assert_close(td["observation"], expected, rtol=0, atol=0)
         for _ in range(101):

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from hook_tasks import DOG, FollowVelocity, WalkBackwards, WalkBlindly
+from hook_tasks import DOG, WalkBackwards, WalkBlindly
 from oracle import tolerance as numpy_tolerance
 from torch.fx.experimental.proxy_tensor import make_fx
 
@@ -445,11 +445,8 @@ def test_time_is_that_of_the_state():
 
 
 def test_numbers_of_memory_that_are_not_finite_end_their_world():
-    class Breaks(FollowVelocity):
-        def update(self, s):
-            return {"air_time": torch.where(s.qpos[:, :1] < 0, torch.nan, s.air_time)}
-
-    env = Breaks(4, "cpu", seed=0)
+    update = lambda self, s: {"air_time": torch.where(s.qpos[:, :1] < 0, torch.nan, s.air_time)}  # noqa: E731
+    env = type("Breaks", (LocoEnv,), {**BASE, "memory": {"air_time": 4}, "update": update})(4, "cpu", seed=0)
     env.reset()
     state = env.get_state()
     state["qpos"][:, 0] = torch.tensor([1.0, -1.0, 1.0, 1.0])
@@ -523,12 +520,13 @@ def test_a_sensor_of_forces_is_asked_of_mujoco_warp():
 
 
 def test_bounds_of_actions():
-    free = type("Free", (FollowVelocity,), {"action_range": (-math.inf, math.inf)})(2, "cpu", seed=0)
+    entries = {**BASE, "control": lambda self, s, action: s.home[:, 7:] + 0.5 * action}
+    free = type("Free", (LocoEnv,), {**entries, "action_range": (-math.inf, math.inf)})(2, "cpu", seed=0)
     td = free.step(free.reset().set("action", torch.full((2, 8), 3.0)))
     expected = torch.tensor(free.mj_model.key_qpos[0][7:]).float() + 1.5
     torch.testing.assert_close(free.sim.ctrl, expected.expand(2, -1))
     assert free.action_spec.contains(td["action"] * 1e6)
-    bound = FollowVelocity(2, "cpu", seed=0)
+    bound = type("Bound", (LocoEnv,), entries)(2, "cpu", seed=0)
     bound.step(bound.reset().set("action", torch.full((2, 8), 3.0)))
     torch.testing.assert_close(bound.sim.ctrl, (expected - 1.0).expand(2, -1))
 
@@ -537,7 +535,7 @@ def test_the_model_as_text_path_and_spec(tmp_path, monkeypatch):
     (tmp_path / "dog.xml").write_text(DOG)
     monkeypatch.chdir(tmp_path)
     spec = mujoco.MjSpec.from_string(DOG)
-    envs = [type("Dog", (FollowVelocity,), {"model": m})(2, "cpu", seed=0) for m in (DOG, "dog.xml", spec)]
+    envs = [type("Dog", (LocoEnv,), {**BASE, "model": m})(2, "cpu", seed=0) for m in (DOG, "dog.xml", spec)]
     rollouts = [env.rollout(3, Still(env)) for env in envs]
     for rollout in rollouts[1:]:
         assert torch.equal(rollout["observation"], rollouts[0]["observation"])

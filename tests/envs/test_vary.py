@@ -3,12 +3,11 @@
 import json
 import pickle
 
-import hook_tasks
 import mujoco
 import numpy as np
 import pytest
 import torch
-from cases import COARSE, coarse
+from cases import COARSE
 from torchrl.envs import Compose, RewardSum, TransformedEnv, check_env_specs
 
 import torchrl_loco as loco
@@ -67,9 +66,21 @@ def drawn(model, *varys, worlds=2, episode=1, seed=0, offset=0, mask=None):
     return lambda name: variation.field(name, arrays["numbers"])
 
 
+OPTIONS = {**COARSE, "seed": 3, "device": "cpu", "world_offset": 0, "episode_length": 6}
+
+
 def made(*varys, num_envs=4, engine="mujoco_warp", **options):
-    options = {**COARSE, "seed": 3, "device": "cpu", "world_offset": 0, **options}
-    return loco.make("walker_walk", num_envs, engine=engine, randomize=varys, **options)
+    return loco.make("walker_walk", num_envs, engine=engine, randomize=varys, **{**OPTIONS, **options})
+
+
+@pytest.fixture
+def varied(shared):
+    """An environment with VARYS, ``varied(engine, device)``, which other tests use too."""
+
+    def get(engine="mujoco_warp", device="cpu"):
+        return shared("walker_walk", 4, engine=engine, randomize=VARYS, **{**OPTIONS, "device": device})
+
+    return get
 
 
 # What is drawn.
@@ -143,6 +154,7 @@ def exactly(field, value, **options):
         ([exactly("body_mass", 2), exactly("body_mass", 1, how="add", of="upper")], "body_mass", "upper", 5),
         ([exactly("body_mass", 1, how="add", of="upper"), exactly("body_mass", 2)], "body_mass", "upper", 6),
         ([exactly("body_mass", 2), exactly("body_mass", 1, how="add", of="upper")], "body_mass", "lower", 2),
+        ([exactly("body_mass", 2, of=["ball", "lower"])], "body_mass", "lower", 2),
     ],
 )
 def test_numbers_of_an_element(arm, varys, field, of, expected):
@@ -169,10 +181,12 @@ def test_gravity_and_what_is_zero(arm):
         ({"field": "geom_friction", "component": 3}, r"component must lie in \[0, 3\)"),
         ({"field": "actuator_biasprm", "how": "add"}, "say which of the 10 numbers"),
         ({"field": "gravity", "of": "upper"}, "takes no of="),
+        ({"field": "body_mass", "of": []}, "of must be a name, names or a regular expression"),
+        ({"field": "body_mass", "of": ["upper", 1]}, "of must be a name, names or a regular expression"),
     ],
 )
 def test_a_vary_that_cannot_be(vary, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, TypeError), match=message):
         loco.Vary(**{"low": 0.5, "high": 1.5, **vary})
 
 
@@ -210,11 +224,11 @@ def test_several_draws_are_checked_together(arm):
         Variation(varys[::-1], arm, torch.device("cpu"))
 
 
-def test_it_is_pickled_and_written_as_json():
+def test_it_is_pickled_and_written_as_json(varied):
     for vary in VARYS:
         assert pickle.loads(pickle.dumps(vary)) == vary
         assert eval(repr(vary), {"Vary": loco.Vary}) == vary
-    env = made(*VARYS)
+    env = varied()
     assert repr(VARYS[0]) in repr(env)
     assert [loco.Vary(**vary) for vary in json.loads(json.dumps(env.settings()))["randomize"]] == list(VARYS)
 
@@ -241,22 +255,22 @@ def test_each_reset_draws_in_its_worlds_alone(engine, device):
     assert (env.get_state()["model"] == second).all()  # a step changes nothing
 
 
-def test_numbers_do_not_depend_on_batch_engine_or_rank(engine, device):
-    whole = made(*VARYS, num_envs=3000, engine="mujoco_warp", device=device, naconmax=60_000)
+def test_numbers_do_not_depend_on_batch_engine_or_rank(varied, device):
+    whole = made(*VARYS, num_envs=3000, engine="compiled", device=device)
     whole.reset()
     expected = whole.get_state()["model"]
-    for offset in (0, 2997):
-        part = made(*VARYS, num_envs=3, engine=engine, device=device, world_offset=offset)
-        part.reset()
-        assert (part.get_state()["model"] == expected[offset : offset + 3]).all()
-    plain = made(*VARYS, num_envs=3, engine=engine, device=device, compile_hooks=False)
+    last = made(*VARYS, num_envs=4, engine="compiled", device=device, world_offset=2996)
+    plain = made(*VARYS, engine="compiled", device=device, compile_hooks=False)
+    for env, worlds in ((varied("mujoco_warp", device), expected[:4]), (last, expected[2996:])):
+        env.reset()
+        assert (env.get_state()["model"] == worlds).all()
     plain.reset()
-    torch.testing.assert_close(plain.get_state()["model"].to_dict(), expected[:3].to_dict())
+    torch.testing.assert_close(plain.get_state()["model"].to_dict(), expected[:4].to_dict())
 
 
 @pytest.mark.parametrize("transformed", [False, True])
-def test_a_state_holds_them(engine, device, actions, transformed):
-    env = base = made(*VARYS, engine=engine, device=device, episode_length=6)
+def test_a_state_holds_them(varied, engine, device, actions, transformed):
+    env = base = varied(engine, device)
     if transformed:
         env = TransformedEnv(env, Compose(RewardSum()))
     moves, td = actions(base, 8), env.reset()
@@ -276,8 +290,8 @@ def test_a_state_holds_them(engine, device, actions, transformed):
     assert (drawn == again).all()
 
 
-def test_what_a_state_does_to_them(tmp_path):
-    env = made(*VARYS)
+def test_what_a_state_does_to_them(tmp_path, varied):
+    env = varied()
     env.reset()
     state = env.get_state()
     torch.save(state, tmp_path / "state.pt")
@@ -294,20 +308,40 @@ def test_what_a_state_does_to_them(tmp_path):
         env.reset(loco.State({**state, "model": {"body_mass": torch.ones(4, 2)}}, batch_size=[4]), set_state=True)
 
 
-class Moving(hook_tasks.FollowVelocity):
-    """Observes the velocity of its center of mass, which depends on masses and where they are."""
+class Seen(loco.WalkerWalk):
+    """Observes the velocity of its center of mass, which depends on masses and where they are, and numbers."""
 
     randomize = [
-        loco.Vary("body_ipos", -0.1, 0.1, of="trunk", how="add"),
+        loco.Vary("body_ipos", -0.1, 0.1, of="torso", how="add"),
         loco.Vary("body_mass", 0.5, 2.0, shared=False),
+        loco.Vary("actuator_gear", 0.8, 1.2, shared=False),
     ]
 
     def observation(self, s):
-        return s.sensor("velocity")
+        numbers = s.model("actuator_gear")[:, :, 0], s.model("body_mass")[:, 1:3], s.model("gravity")
+        return {"observation": s.sensor("torso_velocity"), "privileged": torch.cat(numbers, dim=-1)}
+
+    def begin(self, s):
+        return {"qvel": torch.zeros_like(s.qvel) + s.model("body_mass")[:, 1:2]}
 
 
-def test_poses_and_sensors_follow_a_state_with_other_numbers(engine, device):
-    env = Moving(3, device, 0, engine=engine, world_offset=0, **coarse("dog_follow"))
+@pytest.fixture
+def seen(engine, device):
+    return Seen(5, device, 0, engine=engine, world_offset=0, **COARSE)
+
+
+def test_hooks_see_them_and_poses_and_sensors_follow_a_state_with_others(seen):
+    env = seen
+    for observe in (env.reset, env.reset, lambda: env.rollout(2)["next"][:, -1]):
+        td = observe()
+        gear, mass, gravity = env.model_value("actuator_gear"), env.model_value("body_mass"), env.mj_model.opt.gravity
+        assert torch.equal(td["privileged"][:, :6], gear[:, :, 0])
+        assert torch.equal(td["privileged"][:, 6:8], mass[:, 1:3])
+        assert (td["privileged"][:, 8:].cpu().numpy() == gravity.astype(np.float32)).all()
+        if observe == env.reset:
+            assert torch.equal(env.get_state()["qvel"], mass[:, 1:2].expand(5, 9))
+    assert len(gear[:, :, 0].unique()) == 30
+    assert env.world._begin.kind == env.world._observe_begun.kind == "kernel"
     expected, first = env.rollout(3)["next", "observation"][:, -1], env.get_state()
     env.reset()
     torch.testing.assert_close(env.reset(first, set_state=True)["observation"], expected, rtol=0, atol=1e-4)
@@ -316,9 +350,9 @@ def test_poses_and_sensors_follow_a_state_with_other_numbers(engine, device):
     assert (other - expected).abs().amax(-1).min() > 1e-3
 
 
-def test_state_dict_of_another_process(tmp_path):
+def test_state_dict_of_another_process(varied):
     """As training resumes: the same numbers, and the same draws from there on."""
-    env, other = made(*VARYS), made(*VARYS, seed=9)
+    env, other = varied(), made(*VARYS, seed=9)
     env.reset()
     other.load_state_dict(env.state_dict())
     for _ in range(2):
@@ -337,31 +371,8 @@ def test_without_a_batch_dimension():
     assert (env.get_state() == state).all()
 
 
-class Seen(hook_tasks.FollowVelocity):
-    """Observes numbers that vary, and one that does not."""
-
-    randomize = [loco.Vary("kp", 0.8, 1.2, shared=False), loco.Vary("body_mass", 0.0, 1.0, of="trunk", how="add")]
-
-    def observation(self, s):
-        numbers = s.model("actuator_gainprm")[:, :, 0], s.model("body_mass")[:, 1:3], s.model("gravity")
-        return {"observation": s.qpos, "privileged": torch.cat(numbers, dim=-1)}
-
-
-def test_hooks_see_them(engine, device):
-    env = Seen(5, device, 0, engine=engine, world_offset=0, **coarse("dog_follow"))
-    for observe in (env.reset, env.reset, lambda: env.rollout(2)["next"][:, -1]):
-        td = observe()
-        kp, mass, gravity = env.model_value("actuator_gainprm"), env.model_value("body_mass"), env.mj_model.opt.gravity
-        assert torch.equal(td["privileged"][:, :8], kp[:, :, 0])
-        assert torch.equal(td["privileged"][:, 8:10], mass[:, 1:3])
-        assert (td["privileged"][:, 10:].cpu().numpy() == gravity.astype(np.float32)).all()
-    assert (kp[:, :, 0] == -env.model_value("actuator_biasprm")[:, :, 1]).all()
-    assert len(kp[:, :, 0].unique()) == 40
-    assert env.world._begin.kind == env.world._observe_begun.kind == "kernel"
-
-
 def test_the_argument_replaces_the_class():
-    for env, different in ((Seen(2, "cpu", randomize=[]), 1), (Seen(2, "cpu"), 2)):
+    for env, different in ((Seen(2, "cpu", randomize=[], **COARSE), 1), (Seen(2, "cpu", **COARSE), 2)):
         env.reset()
         assert len(env.model_value("body_mass")[:, 1].unique()) == different
     with pytest.raises(TypeError, match=r"randomize must be a list of torchrl_loco\.Vary"):
@@ -370,8 +381,8 @@ def test_the_argument_replaces_the_class():
         type("Odd", (Seen,), {"randomize": ["body_mass"]})(2, "cpu")
 
 
-def test_fields_that_do_not_vary():
-    env = made(*VARYS)
+def test_fields_that_do_not_vary(varied):
+    env = varied()
     env.reset()
     values = env.model_value("jnt_range")
     assert (values.numpy() == env.mj_model.jnt_range.astype(np.float32)).all()
@@ -443,11 +454,11 @@ class HeavyOrLight(loco.WalkerWalk):
     randomize = [loco.Vary("body_mass", 0.3, 3.0, shared=False)]
 
 
-def test_of_a_class_the_doctor_and_evaluations_know_them(device):
+def test_of_a_class_the_doctor_and_evaluations_know_them(varied, device):
     _, error, _ = doctor.self_test(HeavyOrLight, device)
     assert error < doctor.TOLERANCE
     check_env_specs(HeavyOrLight(2, device, **COARSE))
-    env = made(*VARYS, device=device)
+    env = varied(device=device)
     config = PPOConfig("walker_walk", num_envs=4, minibatch_size=8, device=device)
     assert Environments(config, env).evaluation(2, seed=7).randomize == VARYS
     run = PPOConfig(f"{__name__}:HeavyOrLight", num_envs=4, minibatch_size=8, device=device)

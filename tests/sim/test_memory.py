@@ -12,6 +12,7 @@ import torchrl_loco
 from torchrl_loco.config import sim_config
 from torchrl_loco.sim import Simulation, compiled, models, mujoco_warp, simulation
 from torchrl_loco.sim.compiled import step
+from torchrl_loco.sim.graph import ScratchPool
 
 
 def allocated(thing):
@@ -40,6 +41,15 @@ def test_the_estimate_is_what_is_allocated(body, num_envs, overrides, geoms):
     data = compiled.CompiledEngine(model, config, num_envs, device, geoms).data
     arrays = [array for array in vars(data).values() if isinstance(array, wp.array)]
     assert compiled.data_bytes(model, num_envs, len(geoms)) == sum(array.capacity for array in arrays)
+
+
+def test_scratch_memory_is_used_again():
+    pool = ScratchPool(wp.get_device("cpu"))
+    first, other = pool.allocate(64), pool.allocate(64)
+    pool.deallocate(first, 64)
+    assert first not in (other, pool.allocate(32))
+    assert pool.allocate(64) == first
+    assert pool.allocate(64) not in (first, other)
 
 
 def test_too_many_worlds_are_refused_before_they_are_allocated(engine, monkeypatch):

@@ -9,7 +9,15 @@ from cases import MODELS
 
 from torchrl_loco.envs.episode import poser
 from torchrl_loco.sim import fill, models
-from torchrl_loco.sim.sampling import FreePose, draw_free_pose, make_skeleton, segment_distance
+from torchrl_loco.sim.sampling import (
+    FreePose,
+    Outline,
+    depth_below,
+    draw_free_pose,
+    make_outline,
+    make_skeleton,
+    segment_distance,
+)
 from torchrl_loco.sim.world_func import launch_together
 
 
@@ -49,6 +57,40 @@ def test_segment_distance_agrees_with_mujoco():
         arrays[1][:], arrays[3][:] = 0, 0
         wp.launch(distances, n, [*(wp.array(a, dtype=wp.vec3) for a in arrays), out])
         np.testing.assert_allclose(out.numpy(), np.linalg.norm(centers[0] - centers[1], axis=1), atol=1e-6)
+
+
+@wp.kernel
+def depths(outline: Outline, down: wp.array[wp.vec3], out: wp.array[float]):
+    out[wp.tid()] = depth_below(outline, down[wp.tid()])
+
+
+def test_a_body_that_is_raised_by_its_depth_touches_the_floor():
+    """In C MuJoCo, with each kind of geom alone and with all of them."""
+    geoms = [
+        f'<geom type="{kind}" size="{size}" pos="0.1 -0.05 {0.1 * i}" euler="20 {30 * i} 40" margin="0.05"/>'
+        for i, (kind, size) in enumerate(
+            {"sphere": "0.1", "capsule": "0.05 0.2", "ellipsoid": "0.1 0.2 0.05", "cylinder": "0.1 0.05"}.items()
+        )
+    ]
+    xml = '<mujoco><worldbody><geom type="plane" size="1 1 1"/><body><freejoint/>{}</body></worldbody></mujoco>'
+    quats = np.random.default_rng(0).normal(size=(30, 4))
+    for some in (*geoms, "".join(geoms)):
+        model = mujoco.MjModel.from_xml_string(xml.format(some))
+        data = mujoco.MjData(model)
+        turned = np.zeros((len(quats), 9))
+        for row, quat in zip(turned, quats, strict=True):
+            mujoco.mju_quat2Mat(row, quat / np.linalg.norm(quat))
+        with wp.ScopedDevice("cpu"):
+            out = wp.full(len(quats), np.nan, dtype=float)
+            down = wp.array(-turned[:, 6:], dtype=wp.vec3)
+            wp.launch(depths, len(quats), [make_outline(model, wp.get_device("cpu")), down, out])
+        for quat, depth in zip(quats, out.numpy(), strict=True):
+            data.qpos[:] = [0, 0, depth, *quat]
+            mujoco.mj_fwdPosition(model, data)
+            assert abs(data.contact.dist.min()) < 1e-5, some
+    box = mujoco.MjModel.from_xml_string(xml.format('<geom type="box" size="1 1 1"/>'))
+    with pytest.raises(ValueError, match="an outline consists of"):
+        make_outline(box, wp.get_device("cpu"))
 
 
 def test_poses_near_the_floor_do_not_touch_it():
