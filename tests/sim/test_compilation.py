@@ -1,5 +1,7 @@
 """All kernels are compiled before they are needed, and compiling launches none."""
 
+import os
+import select
 import threading
 import time
 
@@ -10,7 +12,7 @@ from cases import CONFIGS, MODELS
 
 from torchrl_loco.config import sim_config
 from torchrl_loco.sim import Simulation, models
-from torchrl_loco.sim.compilation import compile_kernels
+from torchrl_loco.sim.compilation import compile_kernels, one_process
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -74,6 +76,20 @@ def test_another_thread_goes_on_launching():
 
     compile_kernels([launch], wp.get_device("cpu"))
     assert (total.numpy()[0], outside.numpy()[0]) == (0, 3)
+
+
+def test_a_module_that_another_process_compiles_is_waited_for():
+    reading, writing = os.pipe()
+    with one_process("a"):
+        if (child := os.fork()) == 0:
+            for name in ("b", "a"):
+                with one_process(name):
+                    os.write(writing, name.encode())
+            os._exit(0)
+        assert os.read(reading, 1) == b"b"
+        assert select.select([reading], [], [], 0.2)[0] == []
+    assert os.read(reading, 1) == b"a"
+    os.waitpid(child, 0)
 
 
 def test_an_error_leaves_warp_as_it_was():

@@ -1,10 +1,13 @@
 """Compiles the kernels of a launch before it first runs: in parallel, and with a progress bar."""
 
 import contextlib
+import fcntl
 import os
 import threading
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
 from typing import Any
 
 import warp as wp
@@ -20,7 +23,8 @@ def compile_kernels(launches: Iterable[Callable[[], None]], device: wp.Device) -
     """Compiles and loads the kernels that ``launches`` would launch, without launching any.
 
     Warp compiles a module when one of its kernels is first launched, one module after another. Once the modules are
-    known they can be compiled on all cores, and the progress bar knows how many are left.
+    known they can be compiled on all cores, and the progress bar knows how many are left. A module that another process
+    is compiling is waited for.
 
     Args:
         launches: functions that make the launches. Whatever else they do takes effect.
@@ -33,9 +37,28 @@ def compile_kernels(launches: Iterable[Callable[[], None]], device: wp.Device) -
         ThreadPoolExecutor(max_workers=os.cpu_count()) as pool,
         tqdm(total=len(variants), desc=f"compiling for {device}", unit="module", delay=SHOW_AFTER, leave=False) as bar,
     ):
-        for loaded in as_completed([pool.submit(module.load, device, block_dim) for module, block_dim in variants]):
+        for loaded in as_completed([pool.submit(_load, module, device, block_dim) for module, block_dim in variants]):
             loaded.result()
             bar.update()
+
+
+def _load(module: wp.Module, device: wp.Device, block_dim: int) -> None:
+    with one_process(module.name):
+        module.load(device, block_dim)
+
+
+@contextlib.contextmanager
+def one_process(module: str) -> Iterator[None]:
+    """Lets one process at a time compile a module, which the others then find in Warp's cache."""
+    path = Path(wp.config.kernel_cache_dir, f"lock{zlib.crc32(module.encode()) % 256}")
+    with path.open("a") as file:
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_UN)  # a process that was forked meanwhile has the file open, too
 
 
 @contextlib.contextmanager
