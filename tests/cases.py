@@ -4,10 +4,12 @@ import hook_tasks
 
 from torchrl_loco import registry
 
-HOOK_TASKS = ("dog_follow", "walker_backwards", "walker_blindly")
+HOOK_TASKS = ("dog_follow", "walker_backwards", "walker_blindly", "walker_unsteady")
 """Tasks in plain torch, wholly or in part."""
 for _id, _class in zip(
-    HOOK_TASKS, (hook_tasks.FollowVelocity, hook_tasks.WalkBackwards, hook_tasks.WalkBlindly), strict=True
+    HOOK_TASKS,
+    (hook_tasks.FollowVelocity, hook_tasks.WalkBackwards, hook_tasks.WalkBlindly, hook_tasks.Unsteady),
+    strict=True,
 ):
     registry.register(_id, _class)
 
@@ -22,7 +24,7 @@ KINDS = (
     ("walker_run", "playground", "compiled"),
     ("humanoid_run", "dm_control", "compiled"),
     ("quadruped_run", "dm_control", "mujoco_warp"),
-    ("dog_follow", "playground", "compiled"),
+    ("walker_unsteady", "playground", "compiled"),
 )
 """A task of each kind (traced, by lanes, with MuJoCo-Warp, with hooks), for what depends on nothing else of a task."""
 BODIES = (*COMPILED, "quadruped_run")

@@ -21,13 +21,6 @@ MOTORS = [
     for leg in LEGS
     for joint, low, high in (("hip", -1.2, 1.2), ("knee", -2.2, 0.0))
 ]
-HEAD = """
-<body name="head" pos="0.25 0 0.05">
-  <joint name="neck_yaw" axis="0 0 1" stiffness="3" damping="0.3" armature="0.01"/>
-  <joint name="neck_pitch" axis="0 1 0" stiffness="3" damping="0.3" armature="0.01"/>
-  <joint name="neck_roll" axis="1 0 0" stiffness="3" damping="0.3" armature="0.01"/>
-  <geom type="sphere" pos="0.05 0 0" size="0.04" mass="0.3" contype="0" conaffinity="0"/>
-</body>"""
 DOG = f"""
 <mujoco model="dog">
   <compiler angle="radian"/>
@@ -56,21 +49,17 @@ DOG = f"""
 </mujoco>"""
 
 
-DOG_WITH_HEAD = DOG.replace("</body>\n  </worldbody>", f"{HEAD}</body></worldbody>").replace('-1 "/>', '-1 0 0 0"/>')
-"""The lanes step it, whose text is made four times as fast as that of the traced dog."""
-
-
 class FollowVelocity(loco.LocoEnv):
     """A dog follows a velocity command: every hook, memory, two groups of observations, pushes, an early end."""
 
     body = "dog"
-    model = DOG_WITH_HEAD
+    model = DOG
     config = loco.SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=4, ls_iterations=8, euler_damping=True)
     memory = {"command": 3, "last_action": 8, "air_time": 4, "until_push": ()}
     episode_length = 200
 
     def control(self, s, action):
-        return s.joint_qpos(".*_(hip|knee)") * 0 + s.home[:, 7:15] + 0.5 * action
+        return s.joint_qpos(".*_(hip|knee)") * 0 + s.home[:, 7:] + 0.5 * action
 
     def update(self, s):
         touching = s.in_contact(".*_foot")
@@ -104,7 +93,7 @@ class FollowVelocity(loco.LocoEnv):
                 s.to_body("trunk", s.linvel("trunk")),
                 s.to_body("trunk", s.angvel("trunk")),
                 s.projected_gravity("trunk"),
-                s.joint_qpos(".*_(hip|knee)") - s.home[:, 7:15],
+                s.joint_qpos(".*_(hip|knee)") - s.home[:, 7:],
                 s.joint_qvel(".*_(hip|knee)"),
                 s.last_action,
                 s.command,
@@ -139,3 +128,38 @@ class WalkBlindly(loco.WalkerWalk):
 
     def observation(self, s):
         return torch.cat([s.qpos[:, 1:], s.qvel], dim=-1)
+
+
+class Unsteady(loco.WalkerStand):
+    """Every hook, on a body that is quick to make: memory, two groups of observations, pushes, an early end."""
+
+    memory = {"last_action": 6, "until_push": (), "low": ()}
+
+    def control(self, s, action):
+        return 0.8 * action + 0.2 * s.last_action
+
+    def update(self, s):
+        return {"low": torch.where(s.xpos("torso")[:, 2] < 1.0, s.low + s.dt, 0.0)}
+
+    def reward(self, s):
+        height = s.xpos("torso")[:, 2] - 1.0
+        return {"height": height, "rate": -0.1 * (s.action - s.last_action).square().sum(-1), "low": -s.low}
+
+    def terminated(self, s):
+        return s.low > 1.0
+
+    def events(self, s):
+        push = s.until_push <= 0
+        qvel = s.qvel + 0.3 * s.normal(9) * push.unsqueeze(-1)
+        return {"last_action": s.action, "qvel": qvel, "until_push": torch.where(push, 0.1, s.until_push - s.dt)}
+
+    def observation(self, s):
+        clean = torch.cat([s.qpos[:, 1:], s.qvel, s.last_action], dim=-1)
+        return {
+            "observation": clean + s.uniform(-0.05, 0.05, 23),
+            "privileged": torch.cat([clean, s.xpos("torso")], -1),
+        }
+
+    def begin(self, s):
+        drawn = s.uniform(-0.1, 0.1, 10)
+        return {"qpos": s.home + drawn[:, :9], "until_push": 0.1 + drawn[:, 9]}

@@ -185,7 +185,7 @@ def test_branches_are_copies(shared, kind, actions):
 
 
 def test_a_file_is_read_without_executing_code(shared, tmp_path):
-    env = shared("dog_follow", protocol="playground", engine="compiled", reward_terms=True)
+    env = shared("walker_unsteady", protocol="playground", engine="compiled", reward_terms=True)
     env.reset()
     torch.save(env.get_state(), tmp_path / "state.pt")
     assert (torch.load(tmp_path / "state.pt") == env.get_state()).all()

@@ -9,7 +9,7 @@ from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, check_env
 import torchrl_loco
 from torchrl_loco import RolloutCollector
 
-CASES = [("walker_run", "cpu"), ("dog_follow", "cpu"), pytest.param(("walker_run", "cuda"), marks=pytest.mark.gpu)]
+CASES = [("walker_run", "cpu"), ("walker_unsteady", "cpu"), pytest.param(("walker_run", "cuda"), marks=pytest.mark.gpu)]
 
 
 @pytest.fixture(params=CASES)

@@ -402,10 +402,12 @@ def test_nothing_is_launched_without(actions):
     assert "model" not in env.get_state()
 
 
+FAR = loco.Vary("body_mass", 0.3, 3.0), loco.Vary("actuator_gear", 0.3, 3.0, shared=False)
+"""Numbers far from the model's, so that a mistake is seen."""
+
+
 def test_c_mujoco_steps_the_model_of_a_world(engine, actions):
-    """With numbers far from the model's, so that a mistake is seen."""
-    varys = loco.Vary("body_mass", 0.3, 3.0), loco.Vary("actuator_gear", 0.3, 3.0, shared=False)
-    env = made(*varys, engine=engine, protocol="dm_control")
+    env = made(*FAR, engine=engine, protocol="dm_control")
     td = env.reset()
     for action in actions(env, 5):
         state = env.get_state()
@@ -425,9 +427,10 @@ def test_c_mujoco_steps_the_model_of_a_world(engine, actions):
         env.mujoco_model(4)
 
 
+@pytest.mark.parametrize("engine", ["compiled", pytest.param("mujoco_warp", marks=pytest.mark.slow)])
 def test_a_nan_dump_replays_them(tmp_path, engine, actions):
     file = tmp_path / "dump.safetensors"
-    env = made(loco.Vary("body_mass", 0.3, 3.0), engine=engine, protocol="dm_control", nan_dump=file)
+    env = made(*FAR, engine=engine, protocol="dm_control", nan_dump=file)
     td = env.reset()
     for action in actions(env, 4):
         td = env.step(td.set("action", action))["next"].exclude("reward")
@@ -443,7 +446,7 @@ def test_a_nan_dump_replays_them(tmp_path, engine, actions):
         env.close()
     dump = nan_dump.load(file)
     assert torch.equal(dump.tensors["model.body_mass"], numbers)
-    assert "with numbers of its own of body_mass" in list(nan_dump.describe(dump, "cpu"))
+    assert "with numbers of its own of actuator_gear, body_mass" in list(nan_dump.describe(dump, "cpu"))
     dump.tensors["action"][3] = repaired
     warp, c = nan_dump.warp_trace(dump, "cpu"), nan_dump.mujoco_trace(dump)
     np.testing.assert_allclose(warp[-1, env.mj_model.nq :], expected, atol=1e-5)
