@@ -65,6 +65,11 @@ def test_a_held_action_ends_where_the_world_does():
     """Of four steps the third terminates: its reward, its observation and its end are what is returned."""
     env, held = Stumble(2, "cpu", seed=0, reward_terms=True), Stumble(2, "cpu", seed=0, reward_terms=True)
     expected = env.rollout(3, lambda td: td.set("action", torch.full((2, 6), 0.3)))[:, 2]["next"]
+    twice = torchrl_loco.TransformedEnv(held, ActionRepeat(2))
+    after = twice.step(twice.reset().set("action", torch.full((2, 6), 0.3)))["next"]
+    assert (after["reward"] == 2.0).all()
+    assert not after["done"].any()
+    held.set_seed(0)
     held = torchrl_loco.TransformedEnv(held, ActionRepeat(4))
     after = held.step(held.reset().set("action", torch.full((2, 6), 0.3)))["next"]
     assert after["terminated"].all()
