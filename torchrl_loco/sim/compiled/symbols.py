@@ -269,6 +269,7 @@ class Block:
         self.lines: list[str] = []
         self._names: dict[Scalar, str] = {}
         self._cells: dict[Scalar, frozenset[str]] = outer._cells if outer else {}
+        self._readers: dict[str, list[Scalar]] = {}  # named expressions by the cells that they depend on
         self._counter: list[int] = outer._counter if outer else [0]
         if outer:
             self._names = {node: text for node, text in outer._names.items() if not self._cells[node]}
@@ -305,6 +306,8 @@ class Block:
 
     def _compute(self, node: Scalar, parts: list[Scalar]) -> None:
         self._cells[node] = frozenset().union(*map(self._reads, parts))
+        for variable in self._cells[node]:
+            self._readers.setdefault(variable, []).append(node)
         a = [self._reference(part) for part in parts]
         if node.op == "cos":  # computed with its sine
             self._names[node] = f"{a[0]}_cos"
@@ -344,8 +347,8 @@ class Block:
             return
         value = self.value(x)
         self(f"{target} {how} {value};")
-        variable = target.split()[-1].split("[")[0]
-        self._names = {node: text for node, text in self._names.items() if variable not in self._cells[node]}
+        for node in self._readers.pop(target.split()[-1].split("[")[0], ()):
+            self._names.pop(node, None)
 
     @contextmanager
     def scope(self, head: str) -> Iterator["Block"]:
