@@ -16,6 +16,7 @@ from torch import nn
 import torchrl_loco
 from torchrl_loco import storage
 from torchrl_loco.checks import check_output_file, check_packages
+from torchrl_loco.deployment import of_robot
 from torchrl_loco.policy import ObservationNorm, Policy
 from torchrl_loco.registry import resolve
 
@@ -37,7 +38,8 @@ def export_policy(policy: Policy, path: Path) -> float:
     compared with the policy, on the CPU and on random observations that reach beyond those of the training. Information
     travels with it: task, protocol, sizes, bounds of an action, the time between two control steps (s), for how many of
     them an action is held, and all of ``policy.info``; as ``metadata_props`` in ONNX, in the extra file
-    ``metadata.json`` with torch.export.
+    ``metadata.json`` with torch.export. If the task has a layout (:meth:`torchrl_loco.LocoEnv.layout`), so do the terms
+    of the observation, how actions become controls, and what is known of the robot: :mod:`torchrl_loco.deployment`.
 
     Args:
         policy: the policy, on any device.
@@ -111,6 +113,7 @@ def _facts(policy: Policy, n: int, m: int) -> dict[str, Any]:
         "action_repeat": info["action_repeat"],
         "torchrl_loco": torchrl_loco.__version__,
         "info": info,
+        **of_robot(policy),
     }
 
 

@@ -160,7 +160,7 @@ class LocoEnv(EnvBase):
         check_choice("on_overflow", on_overflow, ON_OVERFLOW)
         nan_dump = None if nan_dump is None else check_output_file("nan_dump", nan_dump)
         varys = check_randomize("randomize", self.randomize if randomize is None else randomize)
-        mj_model = models.load(self.model, _folder_of(type(self)))
+        mj_model = models.load(self.model, folder_of(type(self)))
         variation = Variation(varys, mj_model, device) if varys else None
 
         super().__init__(device=device, batch_size=[] if num_envs is None else [worlds])
@@ -195,7 +195,7 @@ class LocoEnv(EnvBase):
         model, stepped = self.mj_model, self.mj_model
         if self.hooks and model.nsensor and {"reward", "observation"} <= own:
             kept = sorted(self.hooks.catalog.sensors)
-            stepped = models.load(self.model, _folder_of(type(self)), kept)
+            stepped = models.load(self.model, folder_of(type(self)), kept)
             sizes = [int(size) for size in model.sensor_dim[kept]]
             self.hooks.catalog.sensor_address = {i: sum(sizes[:k]) for k, i in enumerate(kept)}
             set_options(model, self.config)
@@ -288,6 +288,27 @@ class LocoEnv(EnvBase):
 
         What is not returned begins as zero, ``qpos`` as ``s.home``. The worlds are at rest; ``s`` shows the memory that
         the last episode left.
+        """
+        return {}
+
+    # What a policy's file tells of the task.
+
+    @classmethod
+    def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns what programs without this package must know of the task to play a policy; by default nothing.
+
+        ``export`` writes it into ONNX files, and ``torchrl-loco verify`` reads it there. It counts if no class below
+        the one that defines it changes what is observed or controlled.
+
+        Args:
+            m: the model.
+            info: the policy's information: protocol, settings of its training.
+
+        Returns:
+            ``observation``, a list of terms as in :mod:`torchrl_loco.verification.layout`, in their order;
+            ``action_offset`` and ``action_scale``, each ``(nu,)``, if actions become controls in another way than
+            scaled to each ``ctrlrange``; for robots that follow a velocity command ``velocity``, as in
+            :mod:`torchrl_loco.verification.velocity`.
         """
         return {}
 
@@ -736,7 +757,7 @@ def rows_of(mask: torch.Tensor, entry: torch.Tensor) -> torch.Tensor:
     return mask.view(*mask.shape[:-1], *[1] * (entry.ndim - mask.ndim + 1))
 
 
-def _folder_of(cls: type) -> Path | None:
+def folder_of(cls: type) -> Path | None:
     """Returns the folder of the file that sets the model of a class, from which a relative path is meant."""
     base = next(base for base in cls.__mro__ if "model" in vars(base))
     file = getattr(sys.modules.get(base.__module__), "__file__", None)

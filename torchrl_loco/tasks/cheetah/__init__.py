@@ -1,6 +1,7 @@
 """Cheetah: a planar body on a back and a front leg that learns to run."""
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,12 @@ class CheetahRun(LocoEnv):
     term_names = ("move",)
     presets = {"reppo": {"total_frames": 30_000_000, "lr": 1e-3, "minibatch_size": 4096, "min_temperature": 1e-9}}
     target_speed = RUN_SPEED
+
+    @classmethod
+    def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns the terms of the observation, as :meth:`torchrl_loco.LocoEnv.layout` wants them."""
+        qpos = {"term": "qpos", "size": m.nq - 1, "first": 1}
+        return {"observation": [qpos, {"term": "qvel", "size": m.nv, "first": 0}]}
 
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""

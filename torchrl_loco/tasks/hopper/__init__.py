@@ -1,8 +1,10 @@
 """Hopper: a planar body on one leg that learns to stand and to hop."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import warp as wp
 
 from torchrl_loco.config import SimConfig
@@ -78,6 +80,17 @@ class Hopper(LocoEnv):
     config = SimConfig(ctrl_dt=0.02, sim_dt=0.005, naconmax=50_000, njmax=50, iterations=4, ls_iterations=10)
     observation_size = 15
     target_speed = 0.0
+
+    @classmethod
+    def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns the terms of the observation, as :meth:`torchrl_loco.LocoEnv.layout` wants them."""
+        return {
+            "observation": [
+                {"term": "qpos", "size": m.nq - 1, "first": 1},
+                {"term": "qvel", "size": m.nv, "first": 0},
+                {"term": "sensors", "size": 2, "names": ["touch_toe", "touch_heel"], "function": "log1p"},
+            ]
+        }
 
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import mujoco
+import numpy as np
 import torch
 
 from torchrl_loco.checks import check_bool, check_device, check_int
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.vary import Vary
+from torchrl_loco.sim import models
 from torchrl_loco.tasks.velocity import commands
 from torchrl_loco.tasks.velocity.momentum import angular_momentum
 
@@ -36,6 +38,10 @@ BIAS = 0.015
 """Greatest error of a joint's encoder in an episode (rad)."""
 PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
 """Greatest change of the base's velocity by a push (m/s, rad/s)."""
+PUSH_EVERY = (1.0, 3.0)
+"""Least and greatest time between pushes (s)."""
+START_HEIGHT = (0.01, 0.05)
+"""Least and greatest height above the home pose at the start (m)."""
 STANDS, RUNS = 0.05, 1.5
 """Speed of a command (m/s + rad/s) up to which a robot stands, and from which it runs."""
 STEP_HEIGHT = 0.1
@@ -201,8 +207,7 @@ class Velocity(LocoEnv):
     @property
     def joints(self) -> list[str]:
         """Names of the actuated joints, in the order of the actuators."""
-        m: mujoco.MjModel = self.mj_model
-        return [m.joint(int(joint)).name for joint in m.actuator_trnid[:, 0]]
+        return actuated(self.mj_model)
 
     def home(self, s: "View") -> torch.Tensor:
         """Returns the joint positions of the home pose (rad), ``(num_envs, joints)``."""
@@ -233,6 +238,36 @@ class Velocity(LocoEnv):
         moves = [s.to_body(self.base, s.linvel(self.base)), s.to_body(self.base, s.angvel(self.base))]
         joints = [s.joint_qpos(self.joints) - self.home(s), s.joint_qvel(self.joints)]
         return [*moves, s.projected_gravity(self.base), *joints, s.last_action, s.command]
+
+    @classmethod
+    def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns what :meth:`observation`, :meth:`control` and the episodes are, as in numbers of a file."""
+        joints = actuated(m)
+        home = models.home_pose(m)[[int(m.joint(name).qposadr[0]) for name in joints]].tolist()
+        size = {"size": len(joints), "joints": joints}
+        linear, angular, gravity, position, velocity = NOISE
+        scale = np.full(m.nu, cls.action_scale or 0.0)
+        if cls.action_scale is None:
+            scale = 0.25 * m.actuator_forcerange[:, 1] / m.actuator_gainprm[:, 0]
+        low, high = commands.reached(cls.curriculum, info.get("frames", 0) // info.get("num_envs", 1))
+        return {
+            "observation": [
+                {"term": "linear_velocity", "size": 3, "body": cls.base, "noise": linear},
+                {"term": "angular_velocity", "size": 3, "body": cls.base, "noise": angular},
+                {"term": "gravity", "size": 3, "body": cls.base, "noise": gravity},
+                {"term": "joint_positions", **size, "home": home, "noise": position, "bias": BIAS},
+                {"term": "joint_velocities", **size, "noise": velocity},
+                {"term": "last_action", "size": m.nu},
+                {"term": "command", "size": 3},
+            ],
+            "action_offset": home,
+            "action_scale": scale.tolist(),
+            "velocity": {
+                **{"base": cls.base, "trunk": cls.trunk, "fallen": UPSIDE},
+                **{"command_low": low, "command_high": high, "command_every": commands.EVERY, "still": commands.STAND},
+                **{"push": PUSH, "push_every": PUSH_EVERY, "start_height": START_HEIGHT},
+            },
+        }
 
     # The hooks, in the order in which they are called.
 
@@ -320,7 +355,7 @@ class Velocity(LocoEnv):
         push = s.until_push <= 0.0
         change = s.uniform(-1.0, 1.0, 6) * torch.tensor(PUSH, device=s.device)
         base = s.qvel[:, :6] + torch.where(push.unsqueeze(-1), change, 0.0)
-        until_push = torch.where(push, s.uniform(1.0, 3.0), s.until_push - s.dt)
+        until_push = torch.where(push, s.uniform(*PUSH_EVERY), s.until_push - s.dt)
         return {"qvel": torch.cat([base, s.qvel[:, 6:]], dim=-1), "until_push": until_push}
 
     def observation(self, s: "View") -> dict[str, torch.Tensor]:
@@ -341,15 +376,20 @@ class Velocity(LocoEnv):
         """Returns the home pose, somewhere within half a meter and just above the ground, and a command."""
         yaw, zero = s.uniform(-math.pi, math.pi), torch.zeros_like(s.home[:, 0])
         place = s.home[:, :2] + s.uniform(-0.5, 0.5, 2)
-        height = s.home[:, 2:3] + s.uniform(0.01, 0.05, 1)
+        height = s.home[:, 2:3] + s.uniform(*START_HEIGHT, 1)
         turn = torch.stack([(0.5 * yaw).cos(), zero, zero, (0.5 * yaw).sin()], dim=-1)
         return {
             **self.commanded(s, commands.draw(s, self.curriculum), yaw),
             "qpos": torch.cat([place, height, turn, s.home[:, 7:]], dim=-1),
-            "until_push": s.uniform(1.0, 3.0),
+            "until_push": s.uniform(*PUSH_EVERY),
             "bias": s.uniform(-BIAS, BIAS, len(self.joints)),
             "trained": s.trained,  # it counts on over all episodes
         }
+
+
+def actuated(m: mujoco.MjModel) -> list[str]:
+    """Returns the names of a model's actuated joints, in the order of the actuators."""
+    return [m.joint(int(joint)).name for joint in m.actuator_trnid[:, 0]]
 
 
 def squares(values: torch.Tensor) -> torch.Tensor:

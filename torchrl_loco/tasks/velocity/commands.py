@@ -13,6 +13,8 @@ Ranges = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 
 STAND, TURN, AHEAD = 0.1, 0.3, 0.2
 """Shares of the commands that stand still, hold a heading, and go straight ahead."""
+EVERY = (3.0, 8.0)
+"""Least and greatest time for which a command holds (s)."""
 SLOWEST = 0.3
 """Least velocity straight ahead (m/s)."""
 STIFFNESS = 0.5
@@ -47,6 +49,12 @@ def limits(s: "View", curriculum: dict[int, Ranges]) -> tuple[torch.Tensor, torc
     return low, high
 
 
+def reached(curriculum: dict[int, Ranges], steps: int) -> tuple[list[float], list[float]]:
+    """Returns least and greatest command after so many control steps of training."""
+    ranges = [ranges for first, ranges in curriculum.items() if steps >= first][-1]
+    return [low for low, _ in ranges], [high for _, high in ranges]
+
+
 def draw(s: "View", curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
     """Returns rows of a new command: of command, heading, whether it is held, and time until the next."""
     low, high = limits(s, curriculum)
@@ -59,7 +67,7 @@ def draw(s: "View", curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
         "command": torch.where(stands.unsqueeze(-1), 0.0, command),
         "heading": s.uniform(-math.pi, math.pi),
         "holds_heading": (holds & ~stands & ~ahead).float(),
-        "until_command": s.uniform(3.0, 8.0),
+        "until_command": s.uniform(*EVERY),
     }
 
 

@@ -1,0 +1,85 @@
+"""What a policy's file tells of its task and robot, so that a program can play it without this package."""
+
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.registry import resolve
+
+if TYPE_CHECKING:
+    from torchrl_loco.envs import LocoEnv
+    from torchrl_loco.policy import Policy
+
+HOOKS = ("observation", "observation_func", "control", "layout")
+"""What a layout describes, and the layout: of the most derived definition of them it must be a part."""
+
+
+def why_not(policy: "Policy") -> str:
+    """Returns why the file of a policy cannot tell how to play it, an empty string if it can."""
+    task = policy.info["task"]
+    if names := policy.info.get("transforms"):
+        return f"the policy was trained behind {', '.join(names)}"
+    try:
+        cls = resolve(task)
+    except (ValueError, OSError, ImportError) as error:
+        return f"its task is not at hand: {error}"
+    below = next(base for base in cls.__mro__ if vars(base).keys() & set(HOOKS))
+    if "layout" not in vars(below) or below.__module__ == "torchrl_loco.envs.base":
+        return f"{cls.__name__} has no layout() of its own observation and control: see help(torchrl_loco.LocoEnv)"
+    return ""
+
+
+def of_robot(policy: "Policy") -> dict[str, Any]:
+    """Returns what the file of a policy tells of its task and robot; nothing where :func:`why_not` says why.
+
+    Returns:
+        By name: ``observation``, terms as in :mod:`torchrl_loco.verification.layout`; ``action_offset`` and
+        ``action_scale`` ``(nu,)``, by which the controls are ``offset + scale * action``; ``actuators``, their names;
+        ``joints``, those of the joints that they move, empty for a tendon; ``stiffness``, ``damping`` and
+        ``force_limit`` of position actuators, 0 and ``None`` for others; ``home``, the home pose ``(nq,)``;
+        ``physics_timestep`` of the training (s); ``mjcf``, the model as text, with six digits, unless it needs further
+        files; and whatever else the task's layout holds, such as ``velocity``.
+    """
+    if why_not(policy):
+        return {}
+    from torchrl_loco.envs.base import folder_of
+    from torchrl_loco.sim import models
+
+    cls: type[LocoEnv] = resolve(policy.info["task"])
+    spec = models.specification(cls.model, folder_of(cls))
+    m = spec.compile()
+    low, high = m.actuator_ctrlrange.T
+    return {
+        "action_offset": (0.5 * (low + high)).tolist(),
+        "action_scale": (0.5 * (high - low)).tolist(),
+        **_actuators(m),
+        "home": models.home_pose(m).tolist(),
+        "physics_timestep": cls.config.sim_dt,
+        **_text(spec),
+        **cls.layout(m, policy.info),
+    }
+
+
+def _actuators(m: mujoco.MjModel) -> dict[str, Any]:
+    """Returns names, joints, gains (N m/rad, N m s/rad) and limits (N m) of a model's actuators."""
+    of_joint = np.isin(m.actuator_trntype, (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)))
+    servo = (m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)) & (m.actuator_biasprm[:, 1] < 0)
+    limited = m.actuator_forcelimited.astype(bool)
+    return {
+        "actuators": [m.actuator(i).name for i in range(m.nu)],
+        "joints": [m.joint(int(m.actuator_trnid[i, 0])).name if of_joint[i] else "" for i in range(m.nu)],
+        "stiffness": np.where(servo, -m.actuator_biasprm[:, 1], 0.0).tolist(),
+        "damping": np.where(servo, -m.actuator_biasprm[:, 2], 0.0).tolist(),
+        "force_limit": [float(m.actuator_forcerange[i, 1]) if limited[i] else None for i in range(m.nu)],
+    }
+
+
+def _text(spec: mujoco.MjSpec) -> dict[str, str]:
+    """Returns the MJCF of a model, unless it cannot be compiled without further files, such as meshes."""
+    text = spec.to_xml()
+    try:
+        mujoco.MjModel.from_xml_string(text)
+    except ValueError:
+        return {}
+    return {"mjcf": text}

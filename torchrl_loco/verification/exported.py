@@ -1,0 +1,93 @@
+"""An exported policy: its network, and what its file says of task and robot."""
+
+import contextlib
+import json
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.verification.layout import Layout
+
+ITERATIONS, LS_ITERATIONS, TOLERANCE = 100, 50, 1e-8
+"""Least limits of the solver, and the greatest tolerance: MuJoCo's defaults."""
+
+
+class Exported:
+    """A policy from an ONNX file that :func:`torchrl_loco.export_policy` wrote; needs MuJoCo and onnxruntime alone.
+
+    Args:
+        path: the file.
+
+    Attributes:
+        facts: what the file says, by name: see :mod:`torchrl_loco.deployment`.
+        model: the robot's model at full accuracy: its own options (cone, integrator, time step), and a solver that
+            converges.
+        layout: what the policy observes.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no exported policy, or does not say how to play it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        import onnxruntime
+
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"there is no file {path}")
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's have no base of their own
+            raise ValueError(f"{path} cannot be read as an ONNX file: {error}") from error
+        self.facts: dict[str, Any] = {}
+        for name, word in self._session.get_modelmeta().custom_metadata_map.items():
+            self.facts[name] = word
+            with contextlib.suppress(json.JSONDecodeError):  # words are not quoted
+                self.facts[name] = json.loads(word)
+        missing = [name for name in ("observation", "mjcf", "action_scale") if name not in self.facts]
+        if missing:
+            raise ValueError(
+                f"{path} does not say how to play it: it lacks {', '.join(missing)}. Export the policy again, with the "
+                "task at hand; the task needs a layout(), and a model that needs no further files"
+            )
+        self.model = mujoco.MjModel.from_xml_string(self.facts["mjcf"])
+        option = self.model.opt
+        option.iterations = max(option.iterations, ITERATIONS)
+        option.ls_iterations = max(option.ls_iterations, LS_ITERATIONS)
+        option.tolerance = min(option.tolerance, TOLERANCE)
+        self.layout = Layout(self.facts["observation"], self.model)
+        self._offset, self._scale = (np.array(self.facts[f"action_{name}"]) for name in ("offset", "scale"))
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        return self.facts["task"]
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps of the model in a control step.
+
+        Raises:
+            ValueError: the model's time step does not divide it.
+        """
+        steps = self.facts["control_timestep"] / self.model.opt.timestep
+        if abs(steps - round(steps)) > 1e-6:
+            raise ValueError(f"the model's time step {self.model.opt.timestep} s does not divide a control step")
+        return round(steps)
+
+    @property
+    def hold(self) -> int:
+        """Control steps for which an action is held."""
+        return int(self.facts["action_repeat"])
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Returns the actions ``(n, nu)`` for observations ``(n, size)``."""
+        (action,) = self._session.run(["action"], {"observation": observation.astype(np.float32)})
+        return action.astype(float)
+
+    def control(self, action: np.ndarray) -> np.ndarray:
+        """Returns the controls of actions, each ``(n, nu)``."""
+        if self.facts["action_low"] is not None:
+            action = action.clip(self.facts["action_low"], self.facts["action_high"])
+        return self._offset + self._scale * action
