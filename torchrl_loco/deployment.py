@@ -8,7 +8,6 @@ import numpy as np
 from torchrl_loco.registry import resolve
 
 if TYPE_CHECKING:
-    from torchrl_loco.envs import LocoEnv
     from torchrl_loco.policy import Policy
 
 HOOKS = ("observation", "observation_func", "control", "layout")
@@ -43,22 +42,33 @@ def of_robot(policy: "Policy") -> dict[str, Any]:
     """
     if why_not(policy):
         return {}
-    from torchrl_loco.envs.base import folder_of
-    from torchrl_loco.sim import models
-
-    cls: type[LocoEnv] = resolve(policy.info["task"])
-    spec = models.specification(cls.model, folder_of(cls))
+    cls, spec = resolve(policy.info["task"]), specification(policy.info["task"])
     m = spec.compile()
-    low, high = m.actuator_ctrlrange.T
+    (low, high), keys = m.actuator_ctrlrange.T, [m.key(i).name for i in range(m.nkey)]
     return {
         "action_offset": (0.5 * (low + high)).tolist(),
         "action_scale": (0.5 * (high - low)).tolist(),
         **_actuators(m),
-        "home": models.home_pose(m).tolist(),
+        "home": (m.key("home").qpos if "home" in keys else m.qpos0).tolist(),
         "physics_timestep": cls.config.sim_dt,
         **_text(spec),
         **cls.layout(m, policy.info),
     }
+
+
+def specification(task: str) -> mujoco.MjSpec:
+    """Returns the model of a task, to be compiled.
+
+    Raises:
+        ValueError: there is no such task, or its model is no valid MJCF.
+        OSError: there is no such file.
+        ImportError: the file or module of the task raises an error.
+    """
+    from torchrl_loco.envs.base import folder_of
+    from torchrl_loco.sim import models
+
+    cls = resolve(task)
+    return models.specification(cls.model, folder_of(cls))
 
 
 def _actuators(m: mujoco.MjModel) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from torchrl_loco.cli import runs
 from torchrl_loco.cli.diagnosis import diagnose, inspect, list_tasks
 from torchrl_loco.cli.errors import process_name, user_errors
 from torchrl_loco.cli.options import VALUES, task_options
-from torchrl_loco.cli.policies import evaluate, export, play, record
+from torchrl_loco.cli.policies import evaluate, export, play, record, verify
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -51,6 +51,7 @@ def _run(args: list[str]) -> None:
         "play": play,
         "plot": runs.plot,
         "export": export,
+        "verify": verify,
         "inspect": inspect,
         "list": list_tasks,
         "doctor": diagnose,

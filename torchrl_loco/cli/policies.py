@@ -1,8 +1,10 @@
-"""Commands on trained policies: eval, record, play and export."""
+"""Commands on trained policies: eval, record, play, export and verify."""
 
 import dataclasses
+import json
 import re
 import sys
+import tempfile
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,6 +13,7 @@ import tyro
 import torchrl_loco
 from torchrl_loco.checks import SEED, check_device, check_float, check_int, check_output_file, check_packages, is_run
 from torchrl_loco.cli.errors import user_errors
+from torchrl_loco.verification.conditions import DEFAULT, Conditions
 
 CONTAINERS = (".mp4", ".mkv", ".mov")
 """Suffixes of a video."""
@@ -230,3 +233,70 @@ def export(
         error = export_policy(policy, out)
     print(f"largest difference from the policy, on random observations: {error:.1e} (at most {TOLERANCE:.0e})")
     print(out)
+
+
+ConditionOptions = Annotated[Conditions, tyro.conf.arg(name="")]
+
+
+def verify(
+    run_task_or_file: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            metavar="RUN_TASK_OR_FILE",
+            help="an exported policy (.onnx), or what export takes, which is exported for it: a run folder, a policy "
+            "file, or the id of a task for the policy of the package.",
+        ),
+    ],
+    /,
+    protocol: Protocol = "playground",
+    device: str | None = None,
+    alone: bool = False,
+    out: Path | None = None,
+    conditions: ConditionOptions = DEFAULT,
+) -> None:
+    """Play a policy, as exported, in C MuJoCo on the robot's model at full accuracy; status 1 if it does not hold.
+
+    Robots with a velocity command: falls and tracking errors, under late actions, noise, friction and pushes, beside
+    the same episodes in the simulator of the training. Other tasks: the return, beside that there.
+
+    Args:
+        run_task_or_file: what to verify.
+        protocol: which policy of the package.
+        device: where the simulator of the training computes; default: CUDA if there is any.
+        alone: whether to play a robot in C MuJoCo alone, which is quicker on a CPU.
+        out: figures as JSON, a new file; default: a new verify.json in the run folder, none elsewhere.
+        conditions: what the policy must hold in.
+    """
+    with (
+        user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError),
+        tempfile.TemporaryDirectory() as folder,
+    ):
+        from torchrl_loco.verification.verify import verify
+
+        conditions.check()
+        out = None if out is None else check_output_file("out", out, (".json",))
+        path = Path(run_task_or_file)
+        if path.suffix != ".onnx":
+            path, in_run = _exported_for(run_task_or_file, protocol, Path(folder))
+            out = in_run if out is None else out
+        report = verify(path, conditions, device, alone=alone)
+        print(*report.lines, sep="\n")
+        if out is not None:
+            out.write_text(f"{json.dumps(report.figures, indent=2)}\n")
+            print(out)
+    if not report.holds:
+        raise SystemExit(1)
+
+
+def _exported_for(run_or_task: str, protocol: str, folder: Path) -> tuple[Path, Path | None]:
+    """Exports a policy into a folder. Returns the file, and where figures belong in its run folder, if it has one."""
+    from torchrl_loco import training
+    from torchrl_loco.deployment import why_not
+    from torchrl_loco.export import export_policy
+
+    policy, beside = _policy(run_or_task, protocol, "cpu")
+    if reason := why_not(policy):
+        raise ValueError(f"{run_or_task} cannot be verified: {reason}")
+    path = folder / "policy.onnx"
+    export_policy(policy, path)
+    return path, training.unused_path(beside.with_name("verify.json")) if is_run(beside.parent) else None

@@ -13,6 +13,7 @@ from torchrl_loco.verification.layout import State
 
 WARNINGS = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in ("BADQPOS", "BADQVEL", "BADQACC")]
 """After these MuJoCo starts a world again."""
+NO_ACTUATION = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
 
 
 class CMujoco:
@@ -39,14 +40,18 @@ class CMujoco:
         self._pool, self._chunk = ThreadPoolExecutor(threads), -(-n // (4 * threads))
 
     def begin(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Puts all worlds into states ``(n, nq)`` and ``(n, nv)``, without activation or control."""
+        """Puts all worlds into states ``(n, nq)`` and ``(n, nv)``; sensors of forces are those without actuation."""
 
         def begin(i: int) -> None:
             mujoco.mj_resetData(self._models[i], self._data[i])
             self._data[i].qpos[:], self._data[i].qvel[:] = qpos[i], qvel[i]
             mujoco.mj_forward(self._models[i], self._data[i])
 
+        for model in self._models:
+            model.opt.disableflags |= NO_ACTUATION
         self._each(begin, np.arange(len(self._data)))
+        for model in self._models:
+            model.opt.disableflags &= ~NO_ACTUATION
 
     def act(self, action: np.ndarray, worlds: np.ndarray) -> None:
         """Steps the worlds of a mask ``(n,)`` by a control step under the policy's actions ``(n, nu)``."""

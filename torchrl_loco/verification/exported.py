@@ -15,7 +15,9 @@ ITERATIONS, LS_ITERATIONS, TOLERANCE = 100, 50, 1e-8
 
 
 class Exported:
-    """A policy from an ONNX file that :func:`torchrl_loco.export_policy` wrote; needs MuJoCo and onnxruntime alone.
+    """A policy from an ONNX file that :func:`torchrl_loco.export_policy` wrote.
+
+    It needs MuJoCo and onnxruntime alone, unless the model needs further files.
 
     Args:
         path: the file.
@@ -28,7 +30,8 @@ class Exported:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is no exported policy, or does not say how to play it.
+        ValueError: it is no exported policy, or does not say what the policy observes; or it has no model, and its task
+            is not at hand.
     """
 
     def __init__(self, path: Path) -> None:
@@ -45,19 +48,26 @@ class Exported:
             self.facts[name] = word
             with contextlib.suppress(json.JSONDecodeError):  # words are not quoted
                 self.facts[name] = json.loads(word)
-        missing = [name for name in ("observation", "mjcf", "action_scale") if name not in self.facts]
-        if missing:
+        if "observation" not in self.facts:
             raise ValueError(
-                f"{path} does not say how to play it: it lacks {', '.join(missing)}. Export the policy again, with the "
-                "task at hand; the task needs a layout(), and a model that needs no further files"
+                f"{path} does not say what the policy observes: export it again with its task at hand, which needs a "
+                "layout(), see help(torchrl_loco.LocoEnv)"
             )
-        self.model = mujoco.MjModel.from_xml_string(self.facts["mjcf"])
+        self.model = self._model()
         option = self.model.opt
         option.iterations = max(option.iterations, ITERATIONS)
         option.ls_iterations = max(option.ls_iterations, LS_ITERATIONS)
         option.tolerance = min(option.tolerance, TOLERANCE)
         self.layout = Layout(self.facts["observation"], self.model)
         self._offset, self._scale = (np.array(self.facts[f"action_{name}"]) for name in ("offset", "scale"))
+
+    def _model(self) -> mujoco.MjModel:
+        """Returns the model in the file, or the task's if it needs further files, such as meshes."""
+        if "mjcf" in self.facts:
+            return mujoco.MjModel.from_xml_string(self.facts["mjcf"])
+        from torchrl_loco.deployment import specification
+
+        return specification(self.facts["task"]).compile()
 
     @property
     def task(self) -> str:

@@ -44,7 +44,7 @@ class State:
         act: activations, ``(n, na)``.
         xpos: positions of the bodies (m), ``(n, nbody, 3)``.
         xmat: orientations of the bodies, ``(n, nbody, 3, 3)``.
-        sensordata: sensors: those of forces are of the last physics step, the others of the state, ``(n, nsensordata)``.
+        sensordata: sensors, those of forces of the last physics step, the others of the state, ``(n, nsensordata)``.
     """
 
     qpos: np.ndarray
@@ -80,7 +80,7 @@ class Layout:
         bias: greatest error of each number in an episode, ``(size,)``.
 
     Raises:
-        ValueError: a term is unknown, or has not the size that it says.
+        ValueError: a term is unknown, or cannot be had of the model.
         KeyError: the model has no such body, joint or sensor.
     """
 
@@ -98,6 +98,9 @@ class Layout:
             state: the state of n worlds.
             last_action: the policy's last actions, ``(n, nu)``.
             command: commands, ``(n, 3)``; not read without a term ``command``.
+
+        Raises:
+            ValueError: a term has not the size that it says.
         """
         parts = []
         for term, read in self._terms:
@@ -112,7 +115,11 @@ Read = Callable[[State, np.ndarray, np.ndarray], np.ndarray]
 
 
 def _reader(term: Term, m: mujoco.MjModel) -> Read:
-    """Returns the function of state, last action and command that gives a term, ``(n, ...)``."""
+    """Returns the function of state, last action and command that gives a term, ``(n, ...)``.
+
+    Raises:
+        ValueError: the term is unknown.
+    """
     kind = term["term"]
     if kind not in _READERS:
         raise ValueError(f"unknown term {kind!r} in the observation: known are {', '.join(_READERS)}")

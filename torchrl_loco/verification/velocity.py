@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from tqdm.auto import trange
 
+from torchrl_loco.verification.conditions import Conditions
 from torchrl_loco.verification.exported import Exported
 from torchrl_loco.verification.layout import State, into_frame
 
@@ -64,35 +65,22 @@ class Episodes:
     seed: int
 
 
-def draw(
-    exported: Exported,
-    n: int,
-    seconds: float,
-    seed: int,
-    delay: tuple[int, int],
-    friction: tuple[float, float],
-    noise: float,
-    pushes: float,
-) -> Episodes:
-    """Returns what happens in n episodes.
+def draw(exported: Exported, conditions: Conditions, seconds: float) -> Episodes:
+    """Returns what happens in episodes.
 
     The first half have one of the fixed commands throughout: standing, and each way and both turns at the limits of the
     range; the others draw a new one as in training.
 
     Args:
         exported: the policy.
-        n: number of episodes.
+        conditions: what they are drawn from.
         seconds: their length (s).
-        seed: of the draws.
-        delay: least and greatest delay of an action (control steps); episodes take turns.
-        friction: least and greatest sliding friction.
-        noise: errors of the observation, as a share of those of the training.
-        pushes: changes of the velocity by pushes, likewise.
     """
-    facts, generator, dt = exported.facts["velocity"], np.random.default_rng(seed), exported.facts["control_timestep"]
-    steps = max(round(seconds / dt), 1)
+    facts, dt = exported.facts["velocity"], exported.facts["control_timestep"]
+    n, steps, generator = conditions.episodes, max(round(seconds / dt), 1), np.random.default_rng(conditions.seed)
     qpos, yaw = np.tile(np.array(exported.facts["home"]), (n, 1)), generator.uniform(-np.pi, np.pi, n)
-    qpos[:, 2] += generator.uniform(*facts["start_height"], n)
+    lowest, highest = facts["start_height"]
+    qpos[:, 2] += generator.uniform(lowest, highest, n)
     qpos[:, 3:7] = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=1)
 
     low, high = np.array(facts["command_low"]), np.array(facts["command_high"])
@@ -109,18 +97,18 @@ def draw(
                 age[first:last, i] = np.arange(last - first)
         for _, last in _intervals(generator, facts["push_every"], steps, dt):
             if last < steps:
-                push[last, i] = pushes * generator.uniform(-1.0, 1.0, 6) * facts["push"]
-    least, most = delay
+                push[last, i] = conditions.pushes * generator.uniform(-1.0, 1.0, 6) * facts["push"]
+    least, most = conditions.delay
     return Episodes(
         qpos=qpos,
         command=command,
         age=age,
         is_fixed=is_fixed,
         push=push,
-        delay=least + np.arange(n) % (most - least + 1),
-        friction=generator.uniform(*friction, n),
-        noise=noise,
-        seed=seed,
+        delay=generator.permutation(least + np.arange(n) % (most - least + 1)),
+        friction=generator.uniform(*conditions.friction, size=n),
+        noise=conditions.noise,
+        seed=conditions.seed,
     )
 
 
@@ -156,15 +144,18 @@ class Outcome:
     angular: np.ndarray
     counted: np.ndarray
 
-    def of(self, episodes: np.ndarray) -> dict[str, float]:
-        """Returns falls, mean length (control steps) and mean errors of the episodes of a mask; ``None`` for none."""
+    def of(self, episodes: np.ndarray) -> dict[str, float | None]:
+        """Returns falls, mean length (control steps) and mean errors of the episodes of a mask.
+
+        An error is ``None`` if no control step of these episodes counted.
+        """
         counted = int(self.counted[episodes].sum())
+        errors = {"linear_error": self.linear, "angular_error": self.angular}  # m/s, rad/s
         return {
             "episodes": int(episodes.sum()),
             "falls": int(self.fell[episodes].sum()),
             "mean_steps": float(self.steps[episodes].mean()),
-            "linear_error": float(self.linear[episodes].sum() / counted) if counted else float("nan"),
-            "angular_error": float(self.angular[episodes].sum() / counted) if counted else float("nan"),
+            **{name: float(sums[episodes].sum() / counted) if counted else None for name, sums in errors.items()},
         }
 
 

@@ -1,0 +1,60 @@
+"""Drives a robot with an exported policy: NumPy, onnxruntime and MuJoCo, without torch and this library.
+
+    torchrl-loco export runs/go1_velocity-... --out go1.onnx
+    python examples/deploy.py go1.onnx --command 0.5 0 0 --seconds 10
+
+On a robot, ``Robot`` is what reads its sensors and sends the targets of its joints.
+"""
+
+import argparse
+import json
+
+import mujoco
+import numpy as np
+import onnxruntime
+
+
+class Robot:
+    """A robot in MuJoCo that stands in its home pose."""
+
+    def __init__(self, facts):
+        self.model = mujoco.MjModel.from_xml_string(facts["mjcf"])
+        self.data, self.facts = mujoco.MjData(self.model), facts
+        self.data.qpos[:] = facts["home"]
+        mujoco.mj_forward(self.model, self.data)
+
+    def read(self, term, last_action, command):
+        d, kind = self.data, term["term"]
+        if kind in ("linear_velocity", "angular_velocity", "gravity"):
+            rotation = d.body(term["body"]).xmat.reshape(3, 3)  # from the base's frame to the world's
+            vectors = {"linear_velocity": rotation.T @ d.qvel[:3], "angular_velocity": d.qvel[3:6]}
+            return vectors.get(kind, -rotation[2])
+        if kind == "joint_positions":
+            return np.concatenate([d.joint(name).qpos for name in term["joints"]]) - term["home"]
+        if kind == "joint_velocities":
+            return np.concatenate([d.joint(name).qvel for name in term["joints"]])
+        return {"last_action": last_action, "command": command}[kind]
+
+    def send(self, targets):
+        self.data.ctrl[:] = targets
+        mujoco.mj_step(self.model, self.data, round(self.facts["control_timestep"] / self.model.opt.timestep))
+        mujoco.mj_kinematics(self.model, self.data)
+
+
+parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+parser.add_argument("file")
+parser.add_argument("--command", type=float, nargs=3, default=[0.5, 0, 0], help="forward, to the left, m/s; rad/s")
+parser.add_argument("--seconds", type=float, default=10)
+args = parser.parse_args()
+session = onnxruntime.InferenceSession(args.file)
+words, text = session.get_modelmeta().custom_metadata_map, ("task", "protocol", "torchrl_loco", "mjcf")
+facts = {name: word if name in text else json.loads(word) for name, word in words.items()}
+offset, scale = np.array(facts["action_offset"]), np.array(facts["action_scale"])
+robot, action = Robot(facts), np.zeros(len(scale))
+for step in range(round(args.seconds / facts["control_timestep"])):
+    if step % facts["action_repeat"] == 0:
+        observation = np.concatenate([robot.read(term, action, args.command) for term in facts["observation"]])
+        action = session.run(["action"], {"observation": observation[None].astype(np.float32)})[0][0]
+    robot.send(offset + scale * action)
+print("base at", *robot.data.qpos[:3].round(2), "m; targets (rad):")
+print(*(f"{name} {target:.2f}" for name, target in zip(facts["joints"], robot.data.ctrl, strict=True)), sep=", ")
