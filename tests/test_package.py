@@ -18,7 +18,7 @@ LAYERS = [  # a module imports from its own layer or from those before it
     {"tasks"},
     {"registry", "collector"},
     {"policy", "nan_dump", "doctor", "wrappers"},
-    {"export"},
+    {"export", "deployment", "verification"},
     {"training"},
     {"cli", "__main__"},
 ]
