@@ -224,6 +224,7 @@ def export(
     with user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
         policy, beside = _policy(run_or_task, protocol, "cpu")
         from torchrl_loco import training
+        from torchrl_loco.deployment import why_not
         from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy
 
         suffix = SUFFIXES[format]
@@ -231,6 +232,8 @@ def export(
             check_output_file("out", out, (suffix,))
         out = training.unused_path(beside.with_suffix(suffix)) if out is None else out
         error = export_policy(policy, out)
+    if reason := why_not(policy):
+        print(f"the file holds the network alone: {reason}")
     print(f"largest difference from the policy, on random observations: {error:.1e} (at most {TOLERANCE:.0e})")
     print(out)
 

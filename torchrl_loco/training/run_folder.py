@@ -75,9 +75,10 @@ class RunFolder:
     """A run on disk.
 
     It holds ``config.json``, ``metrics.csv``, ``evaluations.csv``, ``checkpoint.pt``, ``policy.safetensors``,
-    ``learning_curve.png``, ``video.mp4``, what its loggers write (``tensorboard/``, ``wandb/``, ``mlflow.db``), and
-    ``nan_dump.safetensors`` if a world became non-finite. ``launch.txt`` names the launch by torchrun that began it,
-    ``given.json`` what was handed to :func:`torchrl_loco.training.train` as an object.
+    ``learning_curve.png``, ``video.mp4``, what its loggers write (``tensorboard/``, ``wandb/``, ``mlflow.db``),
+    ``verify.json`` if the policy was verified, and ``nan_dump.safetensors`` if a world became non-finite.
+    ``launch.txt`` names the launch by torchrun that began it, ``given.json`` what was handed to
+    :func:`torchrl_loco.training.train` as an object.
 
     Args:
         path: an existing run folder.

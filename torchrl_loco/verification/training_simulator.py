@@ -115,11 +115,8 @@ class TrainingSimulator:
 
     def push(self, change: np.ndarray) -> None:
         """Adds changes ``(n, 6)`` to the velocities of the free joint (m/s, rad/s)."""
-        if change.any():
-            state = self.env.get_state()
-            state["qvel"][:, :6] += self._tensor(change)
-            self.env.reset(state, set_state=True)
-            self._read()
+        self.env.sim.qvel[:, :6] += self._tensor(change)  # poses stay, and the next step begins from it
+        self.state.qvel[:] = self.env.sim.qvel.cpu().numpy()
 
     def _tensor(self, rows: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(rows, dtype=torch.float32).to(self.env.device)
@@ -184,6 +181,7 @@ def compare_returns(exported: Exported, env: LocoEnv, steps: int) -> Returns:
         for name in ("qpos", "qvel", "act"):
             if name in state:
                 state[name] = torch.as_tensor(getattr(worlds.state, name), dtype=torch.float32).to(env.device)
+        state["elapsed_steps"].fill_(t)
         reward, ended = judge(env, state, played, exported.control(played))
         there += reward * alive
         alive &= ~ended

@@ -75,9 +75,14 @@ def draw(exported: Exported, conditions: Conditions, seconds: float) -> Episodes
         exported: the policy.
         conditions: what they are drawn from.
         seconds: their length (s).
+
+    Raises:
+        ValueError: the base is not the model's first joint.
     """
     facts, dt = exported.facts["velocity"], exported.facts["control_timestep"]
     n, steps, generator = conditions.episodes, max(round(seconds / dt), 1), np.random.default_rng(conditions.seed)
+    if int(exported.model.body(facts["base"]).jntadr[0]) != 0:
+        raise ValueError(f"the free joint of {facts['base']}, which is pushed, must be the model's first joint")
     qpos, yaw = np.tile(np.array(exported.facts["home"]), (n, 1)), generator.uniform(-np.pi, np.pi, n)
     lowest, highest = facts["start_height"]
     qpos[:, 2] += generator.uniform(lowest, highest, n)
