@@ -33,7 +33,7 @@ def of_robot(policy: "Policy") -> dict[str, Any]:
     """Returns what the file of a policy tells of its task and robot; nothing where :func:`why_not` says why.
 
     Returns:
-        By name: ``observation``, terms as in :mod:`torchrl_loco.verification.layout`; ``action_offset`` and
+        The facts by name. ``observation``, terms as in :mod:`torchrl_loco.verification.layout`; ``action_offset`` and
         ``action_scale`` ``(nu,)``, by which the controls are ``offset + scale * action``; ``actuators``, their names;
         ``joints``, those of the joints that they move, empty for a tendon; ``stiffness``, ``damping`` and
         ``force_limit`` of position actuators, 0 and ``None`` for others; ``home``, the home pose ``(nq,)``;

@@ -12,7 +12,7 @@ class Conditions:
     episodes: int = 256
     """Number of episodes."""
     seconds: float | None = None
-    """Length of an episode (s); default: 20 s for robots, else that of the task."""
+    """Length of an episode (s), by default 20 s for robots with a velocity, else that of the task."""
     seed: int = 0
     """Seed of the episodes."""
     delay: tuple[int, int] = (0, 2)
@@ -26,7 +26,7 @@ class Conditions:
     max_falls: float = 0.01
     """Greatest share of episodes with a fall."""
     min_return: float = 0.9
-    """For other tasks: least return, as a share of that in the simulator of the training."""
+    """Least return of other tasks, as a share of that in the simulator of the training."""
 
     def check(self) -> None:
         """Checks all values.

@@ -62,7 +62,7 @@ def check_layout(exported: Exported, env: LocoEnv, seed: int) -> None:
     expected = exported.layout(worlds_in_c.state, action[:n], command[:n])
     if seen.shape != expected.shape:
         raise ValueError(f"the layout has {expected.shape[1]} numbers, {exported.task} observes {seen.shape[1]}")
-    wrong = np.abs(seen - expected) > AGREEMENT * np.maximum(1.0, np.abs(expected))
+    wrong = ~(np.abs(seen - expected) <= AGREEMENT * np.maximum(1.0, np.abs(expected)))  # true for NaN too
     first = 0
     for term in exported.facts["observation"]:
         entries, first = slice(first, first + term["size"]), first + term["size"]
