@@ -1,6 +1,7 @@
 """The simulator in which a policy was trained, beside C MuJoCo: layout, velocity episodes and returns."""
 
 import dataclasses
+import inspect
 from typing import Any
 
 import mujoco
@@ -12,7 +13,6 @@ import torchrl_loco
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.vary import Vary
 from torchrl_loco.registry import resolve
-from torchrl_loco.tasks.velocity import Velocity
 from torchrl_loco.verification.c_mujoco import CMujoco
 from torchrl_loco.verification.exported import Exported
 from torchrl_loco.verification.layout import State
@@ -24,9 +24,9 @@ AGREEMENT = 1e-2
 
 
 def make(exported: Exported, n: int, seed: int, device: str | None, **settings: Any) -> LocoEnv:
-    """Returns worlds of a policy's task under the protocol of its training; robots without noise and pushes."""
+    """Returns worlds of a policy's task under the protocol of its training, without noise and pushes if it has play."""
     cls, facts = resolve(exported.task), exported.facts
-    play = {"play": True} if issubclass(cls, Velocity) else {}
+    play = {"play": True} if "play" in inspect.signature(cls.__init__).parameters else {}
     return torchrl_loco.make(cls, n, device, seed, facts["protocol"], world_offset=0, **play, **settings)
 
 
