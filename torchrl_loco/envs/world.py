@@ -284,7 +284,7 @@ class World:
             self.sim.reset(self.mask.warp, before=self._start, after=self._fused, at_rest=self._starts_at_rest)
 
     def _launch_move(self) -> None:
-        self.sim.forward(self._moved.warp, after=self._fused)
+        self.sim.forward(self._moved.warp, after=self._fused, contacts=False)  # which belong to the step
 
     def _launch_refresh(self) -> None:
         self.sim.forward(self.mask.warp, after=[*self._fused, *self._check_finite])
@@ -371,10 +371,8 @@ class World:
         return Recorded(launch, self.sim.capture(launch), self.sim.device)
 
     def _keeping_what_was(self, move: Callable[[], None]) -> Callable[[], None]:
-        """Returns ``move`` such that what belongs to the step stays: a fused function's reward, the contact forces."""
+        """Returns ``move`` such that what belongs to the step stays: a fused function's reward."""
         rows = [self.reward.torch, self.terms.torch] if self._fused else []
-        if self.sim.contact_force.shape[1]:
-            rows += [self.sim.contact_force, self.sim.in_contact]
 
         def moved() -> None:
             kept = [values.clone() for values in rows]

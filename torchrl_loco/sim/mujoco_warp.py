@@ -274,6 +274,7 @@ class MujocoWarpEngine:
         after: Sequence[WorldFunc] = (),
         *,
         at_rest: bool = False,
+        contacts: bool = True,
     ) -> None:
         """Updates poses and sensors where ``mask`` ``(nworld,)`` is set. It costs almost nothing if none is.
 
@@ -284,15 +285,17 @@ class MujocoWarpEngine:
             before: what each of them does first.
             after: what it does at the end.
             at_rest: whether they are at rest, which costs less.
+            contacts: whether contact forces are found.
         """
+        forces = self._kept_sensors if contacts or self._has_force_sensors else None
 
         def update() -> None:
             launch_together(before, mask)
             if self._batched is not None:
                 self._batched.update(mask)
             self._clear_constraints(mask)
-            if self._kept_sensors is not None:  # forces act at rest too
-                self._evaluate_forces(mask, *self._kept_sensors)
+            if forces is not None:  # they act at rest too
+                self._evaluate_forces(mask, *forces, contacts=contacts)
             elif at_rest:
                 self._rest(mask)
                 mjw.kinematics(self.model, self.data)
@@ -316,7 +319,7 @@ class MujocoWarpEngine:
         mjw.com_vel(self.model, self.data)
         mjw.sensor_vel(self.model, self.data)
 
-    def _evaluate_forces(self, mask: wp.array, sensordata: wp.array, overflow: wp.array) -> None:
+    def _evaluate_forces(self, mask: wp.array, sensordata: wp.array, overflow: wp.array, *, contacts: bool) -> None:
         """Evaluates all sensors, those of forces without control, where ``mask`` ``(nworld,)`` is set.
 
         That takes the first half of a physics step of all worlds.
@@ -325,6 +328,7 @@ class MujocoWarpEngine:
             mask: the worlds.
             sensordata: room for the sensors of the others.
             overflow: room for the overflow of all.
+            contacts: whether contact forces are found.
         """
         model, data = self.model, self.data
         wp.copy(sensordata, data.sensordata)
@@ -333,7 +337,7 @@ class MujocoWarpEngine:
         model.opt.disableflags |= mjw.DisableBit.ACTUATION
         mjw.forward(model, data)
         model.opt.disableflags = flags
-        if self.contact_forces is not None:
+        if contacts and self.contact_forces is not None:
             self.contact_forces.update(model, data, mask)
         wp.launch(
             restore_others,

@@ -227,14 +227,16 @@ class Simulation:
             self._kernels[key] = WorldKernel(funcs)
         self._kernels[key].launch(funcs, mask)
 
-    def forward(self, mask: wp.array, after: Sequence[WorldFunc] = ()) -> None:
+    def forward(self, mask: wp.array, after: Sequence[WorldFunc] = (), *, contacts: bool = True) -> None:
         """Updates poses and sensors after ``qpos``, ``qvel`` or ``numbers`` were changed.
 
         Args:
             mask: the worlds, bool ``(nworld,)``.
             after: what each of them does at the end.
+            contacts: whether the forces of ``contact_geoms`` are found, too, which takes a part of a physics step;
+                else they stay as they are.
         """
-        self.engine.forward(mask, after=after)
+        self.engine.forward(mask, after=after, contacts=contacts)
 
     def mujoco_data(self, *, contacts: bool = False) -> "mjw.Data":
         """Returns the present state as ``mjData`` of MuJoCo-Warp, with poses of geoms, sites and cameras.

@@ -318,11 +318,11 @@ class CompiledEngine:
         """
         if self._launch_size.one_kernel:
             self._launch_apart(first)
-            self._launch(self._substeps, self._all, before, after)
+            self._launch(self._substeps, self._all, before, after, self._contact_geoms)
             self._launch_apart(last)
         else:
             self._launch_apart([*first, *before])
-            self._launch(self._substeps, self._all, (), ())
+            self._launch(self._substeps, self._all, (), (), self._contact_geoms)
             self._launch_apart([*after, *last])
 
     def forward(
@@ -332,6 +332,7 @@ class CompiledEngine:
         after: Sequence[WorldFunc] = (),
         *,
         at_rest: bool = False,
+        contacts: bool = True,
     ) -> None:
         """Updates poses and sensors where ``mask`` ``(nworld,)`` is set; ``at_rest`` makes no difference.
 
@@ -340,8 +341,9 @@ class CompiledEngine:
             before: what each of them does first, in the same kernel.
             after: what it does at the end, likewise.
             at_rest: whether they are at rest.
+            contacts: whether contact forces are found.
         """
-        self._launch(0, mask, before, after)
+        self._launch(0, mask, before, after, self._contact_geoms if contacts else ())
 
     def _launch_apart(self, funcs: Sequence[WorldFunc]) -> None:
         key = tuple(func for func, _ in funcs)
@@ -349,12 +351,19 @@ class CompiledEngine:
             self._kernels_apart[key] = WorldKernel(funcs)
         self._kernels_apart[key].launch(funcs, self._all)
 
-    def _launch(self, substeps: int, mask: wp.array, before: Sequence[WorldFunc], after: Sequence[WorldFunc]) -> None:
+    def _launch(
+        self,
+        substeps: int,
+        mask: wp.array,
+        before: Sequence[WorldFunc],
+        after: Sequence[WorldFunc],
+        contact_geoms: tuple[int, ...],
+    ) -> None:
         outputs = self.data.outputs()
-        key = substeps, *(func for func, _ in before), None, *(func for func, _ in after)
+        key = substeps, contact_geoms, *(func for func, _ in before), None, *(func for func, _ in after)
         if key not in self._kernels:
             asked = {f"with_{name}": outputs[name] is not None for name in LATER}
-            text = source(self._mj_model, substeps, contact_geoms=self._contact_geoms, **asked)
+            text = source(self._mj_model, substeps, contact_geoms=contact_geoms, **asked)
             start, end = Chain(before), Chain(after)
             self._kernels[key] = _kernel(text, start.func, start.struct, end.func, end.struct), start, end
         kernel, start, end = self._kernels[key]
