@@ -62,6 +62,13 @@ vary.add_argument("--policies", type=Path, nargs="*", default=[], help="files of
 vary.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 vary.add_argument("--out", type=Path, help="file for the results as JSON")
 vary.add_argument("--picture", type=Path, help="file for a plot")
+numbers = commands.add_parser("price", help="what numbers that differ from world to world cost (CUDA)")
+numbers.add_argument(
+    "--models", nargs="+", choices=["humanoid", "go1", "go2", "g1", "h1"], default=["humanoid", "g1", "go1"]
+)
+numbers.add_argument("--worlds", type=int, nargs="+", default=[8192, 32768])
+numbers.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
+numbers.add_argument("--out", type=Path, help="file for the results as JSON")
 spread = commands.add_parser("scaling", help="several GPUs beside one, with the same worlds on each")
 spread.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_walk"])
 spread.add_argument("--gpus", type=int, nargs="+", default=[1, 2], help="numbers of GPUs, or of processes on the CPU")
@@ -120,6 +127,12 @@ elif args.command == "variation":
     rows, notes["returns"] = variation(args.policies, args.device)
     if args.picture:
         plot_variation(notes["returns"], args.picture)
+elif args.command == "price":
+    from benchmarks.price import COLUMNS, price
+
+    if args.device.type != "cuda":
+        parser.error("price needs a CUDA device")
+    rows = price(args.models, args.worlds, args.device)
 elif args.command == "suite":
     from benchmarks.suite import COLUMNS, suite
 

@@ -42,14 +42,16 @@ def of_robot(policy: "Policy") -> dict[str, Any]:
     """
     if why_not(policy):
         return {}
+    from torchrl_loco.sim import models
+
     cls, spec = resolve(policy.info["task"]), specification(policy.info["task"])
     m = spec.compile()
-    (low, high), keys = m.actuator_ctrlrange.T, [m.key(i).name for i in range(m.nkey)]
+    low, high = m.actuator_ctrlrange.T
     return {
         "action_offset": (0.5 * (low + high)).tolist(),
         "action_scale": (0.5 * (high - low)).tolist(),
         **_actuators(m),
-        "home": (m.key("home").qpos if "home" in keys else m.qpos0).tolist(),
+        "home": models.home_pose(m).tolist(),
         "physics_timestep": cls.config.sim_dt,
         **_text(spec),
         **cls.layout(m, policy.info),

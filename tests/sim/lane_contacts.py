@@ -5,6 +5,8 @@ import numpy as np
 import warp as wp
 
 from torchrl_loco.sim.compiled import lanes
+from torchrl_loco.sim.compiled.engine import Chain, Data, _kernel
+from torchrl_loco.sim.compiled.step import launch_size
 
 FIELDS = 8
 """Numbers of a contact: the pair, the distance less the margin, the point and the normal."""
@@ -32,74 +34,20 @@ def find_contacts(m: mujoco.MjModel, qpos: np.ndarray) -> list[list[tuple[tuple[
     most = description.layout.frictional + description.layout.frictionless + 1
     text = lanes.source(m, 1)
     assert text.count("    jacobians();\n") == 1
-    head = "static float* contact_dump;\ncontact_dump = found_out.data + world * found_out.shape[1];\n"
+    # A model without numbers of each world leaves their array alone.
+    head = "static float* contact_dump;\ncontact_dump = numbers_out.data + world * numbers_out.shape[1];\n"
 
-    @wp.func_native(head + text.replace("    jacobians();\n", DUMP))
-    def advance(
-        world: int,
-        lane: int,
-        live: bool,
-        ctrl_in: wp.array2d[float],
-        qpos_out: wp.array2d[float],
-        qvel_out: wp.array2d[float],
-        qacc_warmstart_out: wp.array2d[float],
-        time_out: wp.array[float],
-        xpos_out: wp.array2d[wp.vec3],
-        xmat_out: wp.array2d[wp.mat33],
-        cvel_out: wp.array2d[wp.spatial_vector],
-        sensordata_out: wp.array2d[float],
-        overflow_out: wp.array[int],
-        found_out: wp.array2d[float],
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def find(
-        ctrl_in: wp.array2d[float],
-        qpos_out: wp.array2d[float],
-        qvel_out: wp.array2d[float],
-        qacc_warmstart_out: wp.array2d[float],
-        time_out: wp.array[float],
-        xpos_out: wp.array2d[wp.vec3],
-        xmat_out: wp.array2d[wp.mat33],
-        cvel_out: wp.array2d[wp.spatial_vector],
-        sensordata_out: wp.array2d[float],
-        overflow_out: wp.array[int],
-        found_out: wp.array2d[float],
-    ):
-        advance(
-            wp.tid(),
-            0,
-            True,
-            ctrl_in,
-            qpos_out,
-            qvel_out,
-            qacc_warmstart_out,
-            time_out,
-            xpos_out,
-            xmat_out,
-            cvel_out,
-            sensordata_out,
-            overflow_out,
-            found_out,
-        )
-
+    before, after = Chain(()), Chain(())
+    text = head + text.replace("    jacobians();\n", DUMP)
+    kernel = _kernel(text, before.func, before.struct, after.func, after.struct)
     count = len(qpos)
+    data = Data(m, count, wp.get_device("cpu"), structure_of_arrays=False)
+    data.qpos.assign(qpos.astype(np.float32))
     found = wp.zeros((count, FIELDS * most), dtype=float, device="cpu")
-    overflow = wp.zeros(count, dtype=int, device="cpu")
-    arrays = [
-        wp.zeros((count, max(m.nu, 1)), dtype=float, device="cpu"),
-        wp.array(qpos.astype(np.float32), dtype=float, device="cpu"),
-        wp.zeros((count, m.nv), dtype=float, device="cpu"),
-        wp.zeros((count, m.nv), dtype=float, device="cpu"),
-        wp.zeros(count, dtype=float, device="cpu"),
-        wp.zeros((count, m.nbody), dtype=wp.vec3, device="cpu"),
-        wp.zeros((count, m.nbody), dtype=wp.mat33, device="cpu"),
-        wp.zeros((count, m.nbody), dtype=wp.spatial_vector, device="cpu"),
-        wp.zeros((count, max(m.nsensordata, 1)), dtype=float, device="cpu"),
-        overflow,
-        found,
-    ]
-    wp.launch(find, dim=count, outputs=arrays, device="cpu")
+    everywhere = wp.ones(count, dtype=bool, device="cpu")
+    size = launch_size(m, count, wp.get_device("cpu"))
+    inputs = [size.worlds_per_warp, size.lanes, everywhere, before.args(()), after.args(()), data.ctrl]
+    wp.launch(kernel, dim=size.threads, inputs=inputs, outputs=[found, *data.outputs().values()], device="cpu")
     result = []
     for rows in found.numpy().reshape(count, most, FIELDS):
         end = int(np.argmax(rows[:, 0] < 0))

@@ -41,13 +41,13 @@ def preset(
             valid. It may be one in the ``presets`` of the class.
     """
     task, device = task_name(task), check_device(device)
+    on_cuda = device.type == "cuda"
     own: Mapping[str, Mapping[str, Any]] = {}
-    if device.type == "cuda" or task not in tasks.found():  # importing one of ours takes seconds
-        own = checked_presets(resolve(task))
-    if device.type == "cpu":
-        own = {}
+    if on_cuda or task not in tasks.found():  # importing one of ours takes seconds
+        checked = checked_presets(resolve(task))
+        own = checked if on_cuda else {}
     if algorithm is None:
-        algorithm = "ppo" if device.type == "cpu" else next(iter(own), "reppo")
+        algorithm = next(iter(own), "reppo") if on_cuda else "ppo"
     kind = CONFIGS[check_choice("algorithm", algorithm, CONFIGS)]
     for name in overrides:
         check_setting("setting", name, kind)
