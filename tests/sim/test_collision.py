@@ -11,7 +11,7 @@ from lane_contacts import find_contacts
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import Simulation
-from torchrl_loco.sim.compiled import unsupported
+from torchrl_loco.sim.compiled import lanes, unsupported
 from torchrl_loco.sim.simulation import set_options
 
 STATES = 400
@@ -175,3 +175,41 @@ def test_bodies_touch_the_ground_only(engine):
     np.testing.assert_allclose(sim.qvel[0], data.qvel, rtol=0, atol=1e-4)
     set_options(m, config)
     assert len(touching(m)) == 5
+
+
+def test_the_deepest_contacts_stay(monkeypatch):
+    """With and without friction. Limits of ball joints, which are among the latter, stay whatever they are."""
+    for name in ("ENOUGH_FRICTIONAL", "MOST_FRICTIONAL", "MOST_FRICTIONLESS"):
+        monkeypatch.setattr(lanes, name, 3)
+    balls = [
+        f'<geom size=".05" pos="{0.1 * i} {0.1 * condim} {0.02 * i}" condim="{condim}" margin="{0.001 * i}"/>'
+        for condim in (1, 3)
+        for i in range(8)
+    ]
+    joint = '<joint type="ball" range="0 10" limited="true"/>'
+    m = model(
+        '<geom type="plane" size="5 5 .1" condim="1"/>',
+        f'<body pos="0 0 .1"><freejoint/>{"".join(balls)}<body>{joint}<geom size=".01" pos="0 0 1"/></body></body>',
+    )
+    rng = np.random.default_rng(0)
+    states = np.zeros((50, m.nq))
+    states[:, 2] = rng.uniform(-0.3, 0.2, len(states))
+    states[:, 3:7] = list(orientations(rng, len(states)))
+    states[:, 7:] = [np.cos(0.2), np.sin(0.2), 0, 0]
+    data, numbers = mujoco.MjData(m), collections.Counter()
+    for qpos, ours in zip(states.astype(np.float32), find_contacts(m, states), strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(m, data)
+        for condim in (1, 3):
+            depths = sorted(c.dist - c.includemargin for c in data.contact if c.dim == condim and not c.exclude)
+            found = sorted(row[0] for geoms, row in ours if m.geom_condim[geoms[1]] == condim)
+            np.testing.assert_allclose(found, depths[:3], rtol=0, atol=2e-6)
+            numbers[len(depths) > 3] += 1
+    assert numbers[True] > 30
+    assert numbers[False] > 30
+
+
+def test_there_are_places_for_what_a_body_stands_on():
+    feet = "".join(f'<geom type="box" size=".1 .03 .02" pos="0 {0.1 * i} {0.001 * i}"/>' for i in range(7))
+    m = model(FLOORS, f'<body pos="0 0 1"><freejoint/>{feet}<geom type="box" size=".1 .1 .1" pos="0 0 .2"/></body>')
+    assert lanes.Description(m).layout.frictional >= 28

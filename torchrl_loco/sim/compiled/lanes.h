@@ -454,11 +454,24 @@ struct Step : Math {
     }
     UNROLLED for (int i = 0; i < n; ++i) x[i] = read(quarter[i / 4], i & 3);
   }
+
+  // Replaces a value of each lane, and where it is, by those of the lane with the largest, or the first place of several.
+  INLINE void largest(float& x, int& at) const {
+    ROLLED for (int o = 16; o; o >>= 1) {
+      const float other = __shfl_xor_sync(~0u, x, o);
+      const int other_at = __shfl_xor_sync(~0u, at, o);
+      if (other > x || (other == x && other_at < at)) {
+        x = other;
+        at = other_at;
+      }
+    }
+  }
 #else
   INLINE void sync() const {}
   INLINE unsigned ballot(bool x) const { return x; }
   INLINE float read(float x, int) const { return x; }
   INLINE void sum(float*, const int) const {}
+  INLINE void largest(float&, int&) const {}
 #endif
   INLINE unsigned lanes_below() const { return (1u << lane) - 1; }
 
@@ -713,6 +726,39 @@ struct Step : Math {
     sync();
   }
 
+  // The deepest contacts stay: one that finds no place takes that of the shallowest. Returns the place of this lane's
+  // contact, or none of them. Limits of ball joints, which have no depth, are not displaced.
+  INLINE int make_room(bool touches, Contact* stored, int place, int places, int pair, float depth) const {
+    if (touches && place < places) {
+      stored[place].distance = depth;
+      stored[place].pair = pair;
+    }
+    sync();
+    ROLLED for (unsigned late = ballot(touches && place >= places); late; late &= late - 1) {
+      const int from = lowest_bit(late);
+      const float new_depth = read(depth, from);
+      float shallowest = -1e30f;
+      int at = places;
+      SHARED_LOOP(i, places) {
+        if (stored[i].distance <= shallowest || (Model::BALL_LIMITS && stored[i].pair >= Model::PAIRS)) continue;
+        shallowest = stored[i].distance;
+        at = i;
+      }
+      largest(shallowest, at);
+      if (new_depth < shallowest) {
+        if (lane == from) {
+          place = at;
+          stored[at].distance = depth;
+          stored[at].pair = pair;
+        } else if (place == at) {
+          place = places;
+        }
+      }
+      sync();
+    }
+    return place;
+  }
+
   // Stores a contact where `touches`. The first tangent follows the hint, unless that is nearly normal (or nothing);
   // then a coordinate axis. All lanes call this together, so that contacts lie in the order of the lanes.
   INLINE void add_contact(bool touches, const bool friction, int pair, Vec point, float distance, Vec normal,
@@ -721,11 +767,13 @@ struct Step : Math {
     const int places = friction ? Model::FRICTIONAL : left < Model::FRICTIONLESS ? left : Model::FRICTIONLESS;
     int& count = friction ? frictional : frictionless;
     const unsigned hits = ballot(touches);
-    const int place = count + bits(hits & lanes_below());
+    int place = count + bits(hits & lanes_below());
     count += bits(hits);
     if (count > places) {
       count = places;
       if (lane == 0 && Model::SUBSTEPS) overflow[world] |= Model::NO_PLACE;
+      place = make_room(touches, w.contacts + (friction ? 0 : Model::FRICTIONAL), place, places, pair,
+                        distance - Model::margin(pair));
     }
     if (!touches || place >= places) return;
     w.contacts[friction ? place : Model::FRICTIONAL + place] = {point, distance - Model::margin(pair), normal, pair};
@@ -1079,9 +1127,9 @@ struct Step : Math {
     Motion axes[SLOTS];
     OWN_DOFS(slot, d) axes[slot] = w.axes[d < DOFS ? d : 0];
 //IF VARIED
-    static_assert(LANES == 1 || Model::FRICTIONAL <= LANES, "a lane for each contact with friction");
+    const bool own = LANES > 1 && Model::FRICTIONAL <= LANES;
     float own_friction = 0.0f;  // of the lane's contact: in the loop, all would wait for one after the other
-    if (LANES > 1 && lane < frictional) own_friction = Model::friction(w.contacts[lane].pair);
+    if (own && lane < frictional) own_friction = Model::friction(w.contacts[lane].pair);
 //END
     ROLLED for (int i = 0; i < frictional + frictionless; ++i) {
       const Contact c = contact(i);
@@ -1091,7 +1139,7 @@ struct Step : Math {
       Vec tangent = {0.0f, 0.0f, 0.0f}, other = tangent;
       if (friction) {
 //IF VARIED
-        tangent = w.tangents[i] * (LANES > 1 ? read(own_friction, i) : Model::friction(pair));
+        tangent = w.tangents[i] * (own ? read(own_friction, i) : Model::friction(pair));
 //ELSE
         tangent = w.tangents[i] * Model::friction(pair);
 //END

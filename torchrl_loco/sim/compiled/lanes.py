@@ -6,6 +6,7 @@ world to world are functions of struct ``Varied``, which read the row of the wor
 them, which is computed when the state is evaluated without stepping, or where a lane needs it.
 """
 
+import copy
 import dataclasses
 import itertools
 import math
@@ -31,8 +32,9 @@ from torchrl_loco.sim.compiled.collision import (
 from torchrl_loco.sim.compiled.constraints import Softness, both_sides, tolerance
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, MINVAL, SLIDE, acting
 from torchrl_loco.sim.compiled.links import Mass, matrix, moving_bodies, places
-from torchrl_loco.sim.compiled.parameters import Number, VariedModel, present, varies
+from torchrl_loco.sim.compiled.parameters import Number, VariedModel, nominal, present, varies
 from torchrl_loco.sim.compiled.tables import Tables
+from torchrl_loco.sim.models import NEVER, home_pose
 from torchrl_loco.sim.overflow import Overflow
 
 TEMPLATE = pathlib.Path(__file__).with_name("lanes.h")
@@ -50,18 +52,24 @@ WARP_BYTES = 4 * 32
 WORLD_BYTES = (
     11136,
     BLOCK_BYTES // 4 - WARP_BYTES,
-    22704,
+    18720,
+    22592,
     BLOCK_BYTES // 2 - WARP_BYTES,
     BLOCK_BYTES - WARP_BYTES,
 )
-"""Shared memory that a world may fill: the first that leaves room for enough contacts. With 11136 bytes, 20 worlds in
-blocks of 4 fit a multiprocessor of an H100 or H200, with 22704 bytes 10 in blocks of 2."""
+"""Shared memory that a world may fill: the first that leaves room for enough contacts. So 20 and 16 worlds in blocks of
+4, 12, 10 and 8 in blocks of 2, and 4 fit a multiprocessor of an H100 or H200."""
 MOST_WORLDS = 4
 """Worlds of a block, at most."""
 LOCKSTEP = True
 """Whether the worlds of a block wait for each other twice a substep, so that they share what they fetch of the text."""
 ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 28, 16
-"""Places for contacts with friction, which a world should have and may have, and for those without."""
+"""Places for contacts with friction, which a world should have and may have, and for those without.
+
+A body that touches the floor in more places when it stands should have, and has, those.
+"""
+STANDING, FAR = 0.01, 1e3
+"""Height over its lowest point of what a body stands on, and a height that no pose exceeds (m)."""
 
 
 @dataclasses.dataclass
@@ -194,6 +202,27 @@ class Description:
             return {CAPSULE: 2, BOX: 4, CYLINDER: 4}.get(second, 1)
         return 2 if first == CAPSULE and second in (CAPSULE, BOX) else 1
 
+    def _standing(self) -> tuple[int, int]:
+        """Returns how many contacts with friction and without there are when the bodies stand in their home pose."""
+        m = copy.copy(nominal(self.m))
+        planes = m.geom_type == PLANE
+        m.geom_margin[planes] = m.body_margin[m.geom_bodyid[planes]] = FAR
+        of_planes = planes[m.pair_geom1] | planes[m.pair_geom2]
+        m.pair_margin[of_planes & (m.pair_margin > NEVER)] = FAR
+        data = mujoco.MjData(m)
+        data.qpos[:] = home_pose(m)
+        mujoco.mj_kinematics(m, data)
+        mujoco.mj_comPos(m, data)
+        mujoco.mj_collision(m, data)
+        heights: dict[tuple[int, int], list[tuple[float, int]]] = {}  # by plane and tree
+        for contact in data.contact:
+            plane, geom = contact.geom
+            if planes[plane] and not contact.exclude:
+                root = m.body_rootid[m.geom_bodyid[geom]]
+                heights.setdefault((plane, root), []).append((contact.dist, contact.dim))
+        touching = [dim for found in heights.values() for height, dim in found if height < min(found)[0] + STANDING]
+        return sum(dim > 1 for dim in touching), sum(dim == 1 for dim in touching)
+
     def _layout(self) -> Layout:
         """Returns the sizes, with as many places for contacts as there is room for.
 
@@ -203,7 +232,8 @@ class Description:
         m = self.m
         frictional = sum(self.points(p) for p in self.pairs if p.condim != 1)
         frictionless = sum(self.points(p) for p in self.pairs if p.condim == 1)
-        frictionless = min(frictionless, MOST_FRICTIONLESS) + len(self.limited_balls)
+        standing, standing_frictionless = self._standing() if self.pairs else (0, 0)
+        frictionless = min(frictionless, max(MOST_FRICTIONLESS, standing_frictionless)) + len(self.limited_balls)
         if not frictional and not frictionless:
             frictionless = 1  # C++ has no empty arrays
         directions = max(self.condims, default=3)
@@ -228,7 +258,8 @@ class Description:
             rows = max(directions * places + more_rows, frictionless, 1)
             return dataclasses.replace(empty, frictional=places, jacobian_rows=rows)
 
-        enough, most = min(frictional, ENOUGH_FRICTIONAL), min(frictional, MOST_FRICTIONAL)
+        enough = min(frictional, max(ENOUGH_FRICTIONAL, standing))
+        most = min(frictional, max(MOST_FRICTIONAL, enough))
         budget = next((b for b in WORLD_BYTES if sized(enough).bytes <= b), None)
         if budget is None:
             raise ValueError(
