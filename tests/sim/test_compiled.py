@@ -108,6 +108,9 @@ def test_what_changes_nothing_is_supported():
     for old, new in [
         ("", ""),
         ("<option/>", '<option><flag eulerdamp="disable" filterparent="disable"/></option>'),
+        ("<option/>", '<option cone="elliptic"/>'),
+        ('size="0.1 0.2"', 'size="0.1 0.2" condim="6"'),
+        ('<geom name="marble"', '<geom name="marble" condim="4"'),
         ('type="capsule" size="0.1 0.2"', 'type="box" size="0.1 0.1 0.1" contype="0" conaffinity="0"'),
         ('damping="1"', 'actuatorfrcrange="-1 1"'),
         ("<sensor>", f"{PAIR}<sensor>"),

@@ -243,7 +243,7 @@ def test_tangents_are_normal_to_a_tilted_plane():
 SIZES = range(17, 65)
 
 
-def bristly(dofs, condim=3, touch=0):
+def bristly(dofs, condim=3, touch=0, cone="pyramidal"):
     """Returns a sphere with limbs of up to three hinges, that touch each other and the floor."""
     limbs, left = [], dofs - 6
     while left > 0:
@@ -258,12 +258,13 @@ def bristly(dofs, condim=3, touch=0):
         left -= 3
     sensors = '<touch site="s"/>' * touch
     return mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .5"><freejoint/><geom size=".12" '
-        f'condim="{condim}"/><site name="s"/>{"".join(limbs)}</body></worldbody><sensor>{sensors}</sensor></mujoco>'
+        f'<mujoco><option cone="{cone}"/><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .5"><freejoint/>'
+        f'<geom size=".12" condim="{condim}"/><site name="s"/>'
+        f"{''.join(limbs)}</body></worldbody><sensor>{sensors}</sensor></mujoco>"
     )
 
 
-KINDS = [{}, {"condim": 1}, {"touch": 1}]
+KINDS = [{}, {"condim": 1}, {"touch": 1, "condim": 6}, {"condim": 4, "cone": "elliptic"}]
 
 
 @pytest.mark.slow
@@ -288,7 +289,7 @@ def wide(model):
 @pytest.mark.slow
 def test_the_size_of_a_world_is_what_its_layout_says(form):
     """Of every number of degrees of freedom; what a model of lanes compiles to checks it too."""
-    models = [bristly(dofs, **KINDS[dofs % 3]) for dofs in SIZES]
+    models = [bristly(dofs, **KINDS[dofs % len(KINDS)]) for dofs in SIZES]
 
     @wp.func_native("\n".join(map(wide, [*models, limbs()])))
     def declare(x: int): ...
@@ -305,7 +306,15 @@ def test_the_size_of_a_world_is_what_its_layout_says(form):
 @pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="Warp was built without NVRTC")
 @pytest.mark.parametrize("form", [0], indirect=True, ids=["lanes"])
 @pytest.mark.parametrize(
-    ("dofs", "kind", "varied"), [(18, {}, True), (30, {"condim": 1}, False), (64, {"touch": 1}, False)], ids=str
+    ("dofs", "kind", "varied"),
+    [
+        (18, {}, True),
+        (30, {"condim": 1}, False),
+        (64, {"touch": 1}, False),
+        (18, {"condim": 6}, False),
+        (36, {"condim": 6, "cone": "elliptic"}, True),
+    ],
+    ids=str,
 )
 def test_a_body_builds_for_a_gpu(form, dofs, kind, varied, tmp_path, monkeypatch):
     """NVRTC needs no GPU; ptxas counts the shared memory."""

@@ -214,7 +214,7 @@ struct alignas(16) World {
   float mass_search[STRIDE];  // M times the search direction
   Motion axes[DOFS];          // motion of the tree for a unit velocity of each degree of freedom (MuJoCo's cdof)
   float mass[DOFS * STRIDE];
-  // Constraint rows: residual J qacc - aref, weight D. They cost D x^2 / 2 where x < 0.
+  // Constraint rows: residual J qacc - aref, weight D. They cost D x^2 / 2 where x < 0, all but those of cones.
   float x[Model::ROWS], weight[Model::ROWS];
   union {
     struct {  // until the rows are set up
@@ -247,21 +247,20 @@ struct alignas(16) World {
 
 // ---- Friction ------------------------------------------------------------------------------------------------------
 
-// The law of a contact with friction: gradient and Hessian of its cost with respect to its directions, which are the
-// normal, two tangents, and turning about these three.
-//IF ELLIPTIC
-//
-// With a residual n along the normal and one of length t off it, an elliptic cone costs D / 2 times the squared distance
-// from n >= mu t. In the plane of both that is a parabola of what lies beside the cone, and one of what lies beyond its
-// tip, which have one side each:
-//   D / (1 + mu^2) / 2 (min(beside, 0)^2 + min(beyond, 0)^2),  beside = n - mu t,  beyond = mu n + t.
-// None of them counts while the contact is open, the first while it slides, both while it sticks.
+// The law of a contact with friction: gradient and Hessian of its cost, as a function of its residuals in its
+// directions, which are the normal, two tangents, and turning about these three.
 
+//IF ELLIPTIC
+// An elliptic cone. With a residual n along the normal and one of length t off it, it costs D / 2 times their squared
+// distance from n >= mu t. That is a parabola of how far they lie beside the cone, and one of how far beyond its tip, each
+// with one side (in the plane of n and t, the two axes are at right angles):
+//   D / (1 + mu^2) / 2 (min(beside, 0)^2 + min(beyond, 0)^2),  beside = n - mu t,  beyond = mu n + t.
+// Neither counts while the contact is open, the first while it slides, both while it sticks.
 struct Cone {
-  enum Zone { OPEN, SLIDING, STICKING };
+  enum State { OPEN, SLIDING, STICKING };
   float gradient[DIRECTIONS];
-  float square, mixed;  // of the Hessian: of the normal, and of the normal with the way off it;
-  float along, across;  // off the normal: along that way, and across
+  // The Hessian: of the normal, of the normal with the way that the residual has off it, along that way, and across.
+  float square, mixed, along, across;
   float way[DIRECTIONS];
 
   static INLINE float length(const float* x) {  // off the normal
@@ -269,14 +268,14 @@ struct Cone {
     UNROLLED for (int j = 1; j < DIRECTIONS; ++j) squared += x[j] * x[j];
     return Math::root(squared);
   }
-  static INLINE Zone zone(float n, float t, float mu) {
+  static INLINE State state(float n, float t, float mu) {
     return !(n - mu * t < 0.0f) ? OPEN : mu * n + t > 0.0f ? SLIDING : STICKING;
   }
-  static INLINE Zone zone(const float* x, float mu) { return zone(x[0], length(x), mu); }
+  static INLINE State state(const float* x, float mu) { return state(x[0], length(x), mu); }
 
   INLINE Cone(const float* x, float weight, float mu) {
     const float n = x[0], t = length(x), inverse = t > 0.0f ? Math::divide(1.0f, t) : 0.0f, beside = n - mu * t;
-    const Zone in = zone(n, t, mu);
+    const State in = state(n, t, mu);
     const bool slides = in == SLIDING;
     square = in == OPEN ? 0.0f : slides ? Math::divide(weight, 1.0f + mu * mu) : weight;
     mixed = slides ? -mu * square : 0.0f;
@@ -297,65 +296,44 @@ struct Cone {
     const float common = mixed * v[0] + (along - across) * forward;
     UNROLLED for (int j = 1; j < DIRECTIONS; ++j) product[j] = common * way[j] + across * v[j];
   }
+
+  // The change of y^2, where it counts below zero, as y goes `by` from one value to another.
+  static INLINE float grown(float from, float to, float by) {
+    if (to < 0.0f) return from < 0.0f ? by * (from + to) : to * to;
+    return from < 0.0f ? -from * from : 0.0f;
+  }
+  // Adds to three sums how the cost changes from x to x + alpha v, and its slope and curvature there.
+  static INLINE void add(const float* x, const float* v, float weight, float mu, float alpha, float* sums) {
+    float start = 0.0f, squared = 0.0f, gained = 0.0f, forward = 0.0f, speed = 0.0f;
+    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
+      const float next = x[j] + alpha * v[j];
+      start += x[j] * x[j];
+      squared += next * next;
+      gained += (x[j] + next) * v[j];
+      forward += next * v[j];
+      speed += v[j] * v[j];
+    }
+    const float t0 = Math::root(start), t = Math::root(squared), inverse = t > 0.0f ? Math::divide(1.0f, t) : 0.0f;
+    const float by_t = t0 + t > 0.0f ? Math::divide(alpha * gained, t0 + t) : 0.0f;
+    const float by_n = alpha * v[0], n = x[0] + by_n, beside = n - mu * t;
+    const float parabola = Math::divide(weight, 1.0f + mu * mu);
+    sums[0] += 0.5f * parabola * (grown(x[0] - mu * t0, beside, by_n - mu * by_t) +
+                                  grown(mu * x[0] + t0, mu * n + t, mu * by_n + by_t));
+    const State in = state(n, t, mu);
+    if (in == STICKING) {
+      sums[1] += weight * (n * v[0] + forward);
+      sums[2] += weight * (v[0] * v[0] + speed);
+    } else if (in == SLIDING) {
+      const float towards = forward * inverse, sideways = Math::larger(speed - towards * towards, 0.0f);
+      const float rate = v[0] - mu * towards;
+      sums[1] += parabola * beside * rate;
+      sums[2] += parabola * (rate * rate - mu * beside * sideways * inverse);
+    }
+  }
 };
 typedef Cone Law;
-
-// The cost of an elliptic cone while its residuals move along a line, x + alpha v.
-struct ConeRay {
-  float weight, mu, parabola;         // parabola: the weight of both
-  float normal, normal_rate;          // residual along the normal
-  float forward, speed, apart, away;  // off the normal: along v, and its rate; squared across v; length at alpha = 0
-
-  INLINE ConeRay(const float* x, const float* v, float weight, float mu) : weight(weight), mu(mu) {
-    parabola = Math::divide(weight, 1.0f + mu * mu);
-    normal = x[0];
-    normal_rate = v[0];
-    speed = Cone::length(v);
-    const float inverse = speed > 0.0f ? Math::divide(1.0f, speed) : 0.0f;
-    forward = apart = 0.0f;
-    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) forward += x[j] * (v[j] * inverse);
-    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
-      const float off = x[j] - forward * (v[j] * inverse);
-      apart += off * off;
-    }
-    away = Math::root(forward * forward + apart);
-  }
-
-  // The change of y^2, where it counts below zero, if y goes from `before` by `by`.
-  static INLINE float grown(float before, float after, float by) {
-    if (after < 0.0f) return before < 0.0f ? by * (before + after) : after * after;
-    return before < 0.0f ? -before * before : 0.0f;
-  }
-
-  // Adds the cost relative to alpha = 0, its slope and its curvature to three sums.
-  INLINE void add(float alpha, float* sums) const {
-    const float n = normal + alpha * normal_rate, p = forward + alpha * speed, t = Math::root(p * p + apart);
-    const float inverse = t > 0.0f ? Math::divide(1.0f, t) : 0.0f;
-    const float by_n = alpha * normal_rate;
-    const float by_t = t + away > 0.0f ? Math::divide(alpha * speed * (forward + p), t + away) : 0.0f;
-    const float beside = n - mu * t;
-    sums[0] += 0.5f * parabola * (grown(normal - mu * away, beside, by_n - mu * by_t) +
-                                  grown(mu * normal + away, mu * n + t, mu * by_n + by_t));
-    const Cone::Zone in = Cone::zone(n, t, mu);
-    if (in == Cone::STICKING) {
-      sums[1] += weight * (n * normal_rate + p * speed);
-      sums[2] += weight * (normal_rate * normal_rate + speed * speed);
-    } else if (in == Cone::SLIDING) {
-      const float rate = normal_rate - mu * speed * p * inverse, bend = speed * inverse;
-      sums[1] += parabola * beside * rate;
-      sums[2] += parabola * (rate * rate - mu * beside * (apart * inverse) * (bend * bend));
-    }
-  }
-
-  // The cost at alpha = 0.
-  INLINE float cost() const {
-    const float beside = Math::smaller(normal - mu * away, 0.0f), beyond = Math::smaller(mu * normal + away, 0.0f);
-    return 0.5f * parabola * (beside * beside + beyond * beyond);
-  }
-};
 //ELSE
-
-// A pyramid's edges are rows: the normal, plus or minus one of the others.
+// A pyramid. Its edges, the normal plus or minus one of the others, are rows of their own.
 struct Pyramid {
   float gradient[DIRECTIONS];
   float square[DIRECTIONS], mixed[DIRECTIONS];  // of the Hessian: of each direction, and of the normal with it
@@ -414,16 +392,15 @@ struct Step : Math {
       : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world) {}
 //END
 
-  // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for each direction
-  // (all but the normal times a factor), and a constraint row for each edge of its pyramid, or for each direction of its
-  // cone. Limits of hinges and slides, and dry friction in joints, need no Jacobian: they act along one degree of
-  // freedom.
+  // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for each direction (all
+  // but the normal times a factor), and a constraint row for each edge of its pyramid, or each direction of its cone.
+  // Limits of hinges and slides, and dry friction in joints, need no Jacobian: they act along one degree of freedom.
   INLINE int jacobian_rows() const { return DIRECTIONS * frictional + frictionless; }
   INLINE int first_frictionless() const { return CONTACT_ROWS * frictional; }
   INLINE int first_limit() const { return CONTACT_ROWS * frictional + frictionless; }
   INLINE int first_friction() const { return first_limit() + limits; }
   INLINE int rows() const { return first_friction() + Model::FRICTION_LOSSES; }
-  // Rows from here on cost something each; those of a cone do together.
+  // Rows from here on have a cost each; those of a cone have one together.
   INLINE int first_single() const { return Model::ELLIPTIC ? first_frictionless() : 0; }
 
   // ---- What the lanes do together
@@ -1243,7 +1220,8 @@ struct Step : Math {
   // Row r of J times the search direction.
   INLINE float row_velocity(int r) const {
     if (!Model::ELLIPTIC && r < first_frictionless()) {  // edges of a pyramid: the normal, plus or minus another
-      const float *const p = w.projected + DIRECTIONS * (r / CONTACT_ROWS), other = p[1 + (unsigned)r % CONTACT_ROWS / 2];
+      const float* const p = w.projected + DIRECTIONS * (r / CONTACT_ROWS);
+      const float other = p[1 + (unsigned)r % CONTACT_ROWS / 2];
       return r & 1 ? p[0] - other : p[0] + other;
     }
     if (r < first_limit()) return w.projected[r - (CONTACT_ROWS - DIRECTIONS) * frictional];
@@ -1278,9 +1256,9 @@ struct Step : Math {
   }
 //IF ELLIPTIC
 
-  INLINE ConeRay cone_ray(int contact) const {
+  INLINE void add_cone(int contact, float alpha, float* sums) const {
     const int first = CONTACT_ROWS * contact;
-    return ConeRay(w.x + first, w.change + first, w.weight[first], w.weight[first + 1]);
+    Cone::add(w.x + first, w.change + first, w.weight[first], w.weight[first + 1], alpha, sums);
   }
 
   // Moves the residuals of a cone, and returns whether the Hessian of its cost changes.
@@ -1288,9 +1266,9 @@ struct Step : Math {
     const int first = CONTACT_ROWS * contact;
     float* const x = w.x + first;
     const float mu = w.weight[first + 1];
-    const Cone::Zone before = Cone::zone(x, mu);
+    const Cone::State before = Cone::state(x, mu);
     UNROLLED for (int j = 0; j < CONTACT_ROWS; ++j) x[j] += alpha * w.change[first + j];
-    const Cone::Zone after = Cone::zone(x, mu);
+    const Cone::State after = Cone::state(x, mu);
     return before != after || after == Cone::SLIDING;
   }
 //END
@@ -1571,9 +1549,15 @@ struct Step : Math {
     }
 //IF ELLIPTIC
     SHARED_LOOP(k, frictional) {
-      const ConeRay ray = cone_ray(k);
-      t[3] += ray.cost();
-      ray.add(0.0f, t + 3);
+      const Law cost = law(k);
+      const float *const x = w.x + CONTACT_ROWS * k, *const v = w.change + CONTACT_ROWS * k;
+      float bent[DIRECTIONS];
+      cost.times(v, bent);
+      UNROLLED for (int j = 0; j < DIRECTIONS; ++j) {
+        t[3] += 0.5f * cost.gradient[j] * x[j];
+        t[4] += cost.gradient[j] * v[j];
+        t[5] += bent[j] * v[j];
+      }
     }
 //END
     SHARED_LOOP(i, rows() - first_single()) {
@@ -1602,7 +1586,7 @@ struct Step : Math {
     float sums[9] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
     const float newton = start.newton();
 //IF ELLIPTIC
-    SHARED_LOOP(k, frictional) cone_ray(k).add(newton, sums);
+    SHARED_LOOP(k, frictional) add_cone(k, newton, sums);
 //END
     SHARED_LOOP(i, rows() - first_single()) {
       const int r = first_single() + i;
@@ -1618,11 +1602,11 @@ struct Step : Math {
       const float a = low.newton(), b = high.newton(), c = 0.5f * (low.alpha + high.alpha);
       UNROLLED for (int k = 0; k < 9; ++k) sums[k] = 0.0f;
 //IF ELLIPTIC
-      SHARED_LOOP(k, frictional) {
-        const ConeRay ray = cone_ray(k);
-        ray.add(a, sums);
-        ray.add(b, sums + 3);
-        ray.add(c, sums + 6);
+      SHARED_LOOP(task, 3 * frictional) {  // a contact at one of the three points
+        const int point = task % 3;
+        float part[3] = {0.0f, 0.0f, 0.0f};
+        add_cone(task / 3, point == 0 ? a : point == 1 ? b : c, part);
+        UNROLLED for (int k = 0; k < 9; ++k) sums[k] += k / 3 == point ? part[k % 3] : 0.0f;
       }
 //END
       SHARED_LOOP(j, rows() - first_single()) {
