@@ -1648,6 +1648,11 @@ struct Step : Math {
     return step.improvement > 0.0f && step.improvement * Model::scale() < Model::tolerance();
   }
 
+  static INLINE bool flat(float gradient_squared, float decrement) {
+    const bool small_slope = Model::scale() * root(gradient_squared) < Model::tolerance();
+    return small_slope || Model::scale() * 0.5f * decrement < Model::tolerance();
+  }
+
   // Leaves the acceleration in qacc; with implicit damping, search is what has to be added to it before integration.
   INLINE void solve() {
     enum { VELOCITY = -2, ACCELERATION = -1 };  // two passes first, which bring both into the rows
@@ -1657,7 +1662,9 @@ struct Step : Math {
     ROLLED for (int iteration = VELOCITY;; ++iteration) {
       if (!stop && iteration == Model::ITERATIONS) {
         stop = true;
-        if (lane == 0 && Model::SUBSTEPS && !small(step)) overflow[world] |= Model::LIMIT_REACHED;
+        // Gradient and decrement are known of the point that was reached if the direction still holds.
+        const bool converged = small(step) || (!changed && flat(gradient_squared, decrement));
+        if (lane == 0 && Model::SUBSTEPS && !converged) overflow[world] |= Model::LIMIT_REACHED;
       }
       if (stop && !Model::IMPLICIT_DAMPING) break;
       if (iteration < 0) {
@@ -1692,8 +1699,7 @@ struct Step : Math {
         remaining = 1.0f;
       }
       if (iteration > 0) {
-        const bool small_slope = Model::scale() * root(gradient_squared) < Model::tolerance();
-        if (small(step) || small_slope || Model::scale() * 0.5f * decrement < Model::tolerance()) {
+        if (small(step) || flat(gradient_squared, decrement)) {
           stop = true;
           continue;
         }

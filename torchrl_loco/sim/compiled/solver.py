@@ -174,7 +174,8 @@ class NewtonSolver:
             self._line_search(iteration, scale)
             iteration("if (alpha == 0.0f) { converged = true; break; }")
             self._advance(iteration)
-        block(f"if (!converged && !({tests[0]})) overflow |= LIMIT_REACHED;")
+        known = f"(!changed && ({tests[1]} || {tests[2]}))"  # of the point that was reached, without a new direction
+        block(f"if (!converged && !({tests[0]}) && !{known}) overflow |= LIMIT_REACHED;")
 
     def read_touch(self, block: Block) -> None:
         """Sets the touch sensors from the forces that were found."""
