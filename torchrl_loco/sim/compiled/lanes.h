@@ -252,8 +252,8 @@ struct alignas(16) World {
 
 //IF ELLIPTIC
 // An elliptic cone. With a residual n along the normal and one of length t off it, it costs D / 2 times their squared
-// distance from n >= mu t. That is a parabola of how far they lie beside the cone, and one of how far beyond its tip, each
-// with one side (in the plane of n and t, the two axes are at right angles):
+// distance from n >= mu t. That is a parabola of how far they lie beside the cone, and one of how far beyond its tip,
+// each with one side (in the plane of n and t, the two axes are at right angles):
 //   D / (1 + mu^2) / 2 (min(beside, 0)^2 + min(beyond, 0)^2),  beside = n - mu t,  beyond = mu n + t.
 // Neither counts while the contact is open, the first while it slides, both while it sticks.
 struct Cone {
@@ -392,9 +392,10 @@ struct Step : Math {
       : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world) {}
 //END
 
-  // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for each direction (all
-  // but the normal times a factor), and a constraint row for each edge of its pyramid, or each direction of its cone.
-  // Limits of hinges and slides, and dry friction in joints, need no Jacobian: they act along one degree of freedom.
+  // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for each direction
+  // (all but the normal times a factor), and a constraint row for each edge of its pyramid, or each direction of its
+  // cone. Limits of hinges and slides, and dry friction in joints, need no Jacobian: they act along one degree of
+  // freedom.
   INLINE int jacobian_rows() const { return DIRECTIONS * frictional + frictionless; }
   INLINE int first_frictionless() const { return CONTACT_ROWS * frictional; }
   INLINE int first_limit() const { return CONTACT_ROWS * frictional + frictionless; }
