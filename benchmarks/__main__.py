@@ -1,6 +1,7 @@
 """``python -m benchmarks``: measure, print a table, write JSON, draw."""
 
 import argparse
+import sys
 from pathlib import Path
 
 import torch
@@ -74,6 +75,11 @@ spread.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_
 spread.add_argument("--gpus", type=int, nargs="+", default=[1, 2], help="numbers of GPUs, or of processes on the CPU")
 spread.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 spread.add_argument("--out", type=Path, help="file for the results as JSON")
+models = commands.add_parser("coverage", help="which models of installed packages and of folders compile, and why not")
+models.add_argument("folders", type=Path, nargs="*", metavar="FOLDER")
+models.add_argument("--path", type=Path, help="folder that the packages were installed in")
+models.add_argument("--out", type=Path, help="file for the results as JSON")
+models.set_defaults(device=torch.device("cpu"))
 draw = commands.add_parser("plot", help="draw throughput or return from the JSON, or a folder of stored runs")
 draw.add_argument("results", type=Path)
 draw.add_argument("picture", type=Path)
@@ -137,6 +143,13 @@ elif args.command == "suite":
     from benchmarks.suite import COLUMNS, suite
 
     rows = suite(args.tasks, args.episodes, args.device, args.path)
+elif args.command == "coverage":
+    from benchmarks.coverage import COLUMNS, TOTALS, coverage, folders
+
+    sys.path += [str(args.path)] if args.path else []
+    found = [coverage(title, folder) for title, folder in folders(args.folders).items()]
+    rows = [row for table, _ in found for row in table]
+    show([total for _, total in found], TOTALS)
 elif args.command == "training":
     from benchmarks.training import COLUMNS, training
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import cases, fidelity, plot, scaling, soak, suite, timing
+from benchmarks import cases, coverage, fidelity, plot, scaling, soak, suite, timing
 from benchmarks.cases import until_interrupted
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
@@ -153,3 +153,24 @@ def test_what_is_profiled_of_learning_are_gradient_steps(monkeypatch):
     with torch.no_grad():
         cases.update("walker", 512, torch.device("cpu"))()
     assert sizes == [256, 256]
+
+
+def test_coverage_tells_what_is_missing(tmp_path):
+    box = '<body pos="{} 0 1"><freejoint/><geom type="box" size=".1 .1 .1"/></body>'
+    files = {
+        "plain.xml": f"<mujoco><worldbody>{box.format(0)}</worldbody></mujoco>",
+        "boxes.xml": f'<mujoco><option cone="elliptic"/><worldbody>{box.format(0)}{box.format(1)}</worldbody></mujoco>',
+        "fluid.xml": f'<mujoco><option density="1" cone="elliptic"/><worldbody>{box.format(0)}</worldbody></mujoco>',
+        "part.xml": "<mujocoinclude/>",
+        "still.xml": "<mujoco/>",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    rows, totals = coverage.coverage("own", tmp_path)
+    found = {row["model"]: [row[way] for way in coverage.WAYS] + [row["missing in the last"]] for row in rows}
+    assert found == {
+        "own/plain.xml": ["yes", "yes", "yes", ""],
+        "own/boxes.xml": ["", "", "yes", ""],
+        "own/fluid.xml": ["", "", "", "forces of a fluid"],
+    }
+    assert totals == {"set": "own", "models": 3, "as is": 1, "options": 1, "ground": 2, "not compiled": 1}
