@@ -44,8 +44,11 @@ SOLIDS = {
     "box": {"contype": 6, "conaffinity": 0},
     "cylinder": {"contype": 2, "conaffinity": 0},
     "ellipsoid": {"contype": 2, "conaffinity": 0},
+    "mesh": {"contype": 2, "conaffinity": 0, "mesh": "wedge"},
 }
 """Shapes that do not touch all others, and the masks that see to it."""
+WEDGE = (0, 0, 0, 0.2, 0, 0, 0.25, 0.1, 0, 0.1, 0.2, 0, 0, 0.1, 0, 0, 0, 0.1, 0.2, 0, 0.15)
+"""Vertices of a mesh (m)."""
 RIGHT_ANGLES = st.lists(st.sampled_from([0, 90, 180]), min_size=3, max_size=3)
 
 
@@ -96,7 +99,9 @@ def geoms(draw, name, law, named=None):
     attributes = {**pose, **draw(surfaces(law)), **masks}
     if named is not None:
         named.append((kind, name))
-    return element("geom", name=name, type=kind, size=size, density=draw(numbers(200, 2000)), **attributes)
+    if kind != "mesh":
+        attributes["size"] = size
+    return element("geom", name=name, type=kind, density=draw(numbers(200, 2000)), **attributes)
 
 
 @st.composite
@@ -205,6 +210,7 @@ def models(draw, max_bodies=8, lanes=False):
     return element(
         "mujoco",
         element("option", flag, **option),
+        element("asset", element("mesh", name="wedge", vertex=WEDGE)),
         element("worldbody", *scene, *bodies),
         element("contact", *exclude, *(draw(contact_pairs(law, named)) for _ in range(2 * lanes))),
         element("actuator", *(draw(actuators(joint)) for joint in actuated if draw(st.integers(0, 3)))),

@@ -93,8 +93,8 @@ def test_what_the_quadruped_needs_is_named_in_full():
         "actuator 'lift_front_left', 'extend_front_left', 'lift_front_right' and 5 more: "
         "a transmission other than a hinge or slide",
         "contacts of capsule and cylinder, capsule and ellipsoid, sphere and cylinder, sphere and ellipsoid: only "
-        "spheres and capsules with each other and with boxes, and with planes of the world all of these, cylinders and "
-        "ellipsoids; contacts='ground' leaves out those of moving bodies with each other",
+        "spheres and capsules with each other and with boxes, and with planes of the world all of these, cylinders, "
+        "ellipsoids and meshes; contacts='ground' leaves out those of moving bodies with each other",
         "sensor 'imu_accel', 'imu_gyro', 'velocimeter' and 8 more: "
         "anything but touch and the velocity of a subtree, as they are",
     ]

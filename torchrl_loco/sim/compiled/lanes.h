@@ -165,7 +165,7 @@ struct Softness {  // of a constraint: solref and solimp
 // ---- The model -----------------------------------------------------------------------------------------------------
 
 enum Joint { FREE, BALL, SLIDE_JOINT, HINGE_JOINT };
-enum Shape { SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX };  // of geoms and of sites
+enum Shape { SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH };  // of geoms and of sites
 enum Dof { TRANSLATION, ROTATION, SLIDE, HINGE };  // of a free joint; of a free or ball joint; the two others
 
 //MODEL
@@ -792,6 +792,40 @@ struct Step : Math {
     return {own.transposed_times(link.row0), own.transposed_times(link.row1), own.transposed_times(link.row2)};
   }
 
+//IF MESHES
+  struct Corner { int vertex, corner; };  // of a mesh; the corner is that of a face, or -1
+
+  // The lowest vertex of a mesh over a plane with normal n, and its corner of the face that is most parallel to it.
+  static INLINE Corner lowest_corner(int g, Vec n) {
+    Corner lowest = {Model::first_vertex(g), -1};
+    const int end = Model::last_vertex(g);
+    float least = 1e30f;
+    ROLLED for (int i = lowest.vertex; i < end; ++i) {
+      const float height = n.dot(Model::vertex(i));
+      if (!(height < least)) continue;
+      least = height;
+      lowest.vertex = i;
+    }
+    float facing = 1.0f;
+    const int last = Model::first_corner(lowest.vertex + 1);
+    ROLLED for (int i = Model::first_corner(lowest.vertex); i < last; ++i) {
+      const float x = n.dot(Model::corner_normal(i));
+      if (!(x < facing)) continue;
+      facing = x;
+      lowest.corner = i;
+    }
+    return lowest;
+  }
+
+  // Point k of a mesh that may touch the plane: the vertex, and those of the face that are below the center.
+  static INLINE bool vertex_below(Corner lowest, int k, Vec n, Vec& point) {
+    const int i = k == 0 ? lowest.vertex : lowest.corner < 0 ? -1 : Model::corner_vertex(3 * lowest.corner + k - 1);
+    if (i < 0) return false;
+    point = Model::vertex(i);
+    return k == 0 || n.dot(point) <= 0.0f;
+  }
+
+//END
   // Point k of a solid that may touch a plane with normal n, in the frame of the solid; returns false if there is none.
   static INLINE bool point_below(int g, int k, Vec n, Vec& point) {
     const Vec size = Model::geom_size(g);
@@ -819,7 +853,7 @@ struct Step : Math {
     return true;
   }
 
-  // Boxes, cylinders and ellipsoids against planes of the world.
+  // Boxes, cylinders, ellipsoids and meshes against planes of the world.
   INLINE void collide_solids_with_planes(const int begin, const int end, const bool friction) {
     ROLLED for (int base = begin; base < end; base += LANES) {
       const bool valid = base + lane < end;
@@ -831,9 +865,17 @@ struct Step : Math {
       if (!ballot(near)) continue;
       const Mat axes = geom_axes(g);
       const Vec n = axes.transposed_times(normal);
+//IF MESHES
+      const bool is_mesh = near && Model::geom_shape(g) == MESH;
+      const Corner lowest = is_mesh ? lowest_corner(g, n) : Corner{0, -1};
+//END
       ROLLED for (int k = 0; k < 4; ++k) {
         Vec point;
+//IF MESHES
+        const bool exists = is_mesh ? vertex_below(lowest, k, n, point) : point_below(g, k, n, point);
+//ELSE
         const bool exists = point_below(g, k, n, point);
+//END
         const float distance = height + n.dot(point);
         add_contact(near && exists && distance < Model::margin(pair), friction, pair,
                     geom.center + axes * point - normal * (0.5f * distance), distance, normal, {0.0f, 0.0f, 0.0f});

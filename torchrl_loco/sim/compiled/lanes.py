@@ -21,8 +21,10 @@ from torchrl_loco.sim.compiled.collision import (
     BOX,
     CAPSULE,
     CYLINDER,
+    MESH,
     PLANE,
     SOLID,
+    Mesh,
     Pair,
     contact_weight,
     is_elliptic,
@@ -42,9 +44,11 @@ TRANSLATION, ROTATION = 0, 1
 """Kinds of a degree of freedom in ``lanes.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
 SHAPES = {
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")): i
-    for i, kind in enumerate(("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"))
+    for i, kind in enumerate(("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH"))
 }
 UNLIMITED = 1e30
+MOST_VERTICES = 4000
+"""Vertices of all meshes that touch something: tables count their corners with 16 bits."""
 BLOCK_BYTES = 48 * 1024
 """Static shared memory that a block of a GPU may have."""
 WARP_BYTES = 4 * 32
@@ -165,6 +169,11 @@ class Description:
         self.elliptic = bool(self.condims) and is_elliptic(m)
         self.some_lack_edges = len(self.condims) > 1 and not self.elliptic
         self.geoms = sorted({g for p in self.pairs for g in p.geoms if m.geom_type[g] != PLANE})
+        used = sorted({int(m.geom_dataid[g]) for g in self.geoms if m.geom_type[g] == MESH})
+        self.meshes = {mesh: Mesh.of(m, mesh) for mesh in used}
+        vertices = sum(len(mesh.vertices) for mesh in self.meshes.values())
+        if vertices > MOST_VERTICES:
+            raise ValueError(f"meshes with {vertices} vertices, more than {MOST_VERTICES}")
         limited = [j for j in range(m.njnt) if m.jnt_limited[j]]
         self.limited = [j for j in limited if m.jnt_type[j] in (SLIDE, HINGE)]
         self.limit_sides = 2 if any(both_sides(m, j) for j in self.limited) else 1
@@ -199,7 +208,7 @@ class Description:
         """Returns how many contacts a pair can have."""
         first, second = self.m.geom_type[list(pair.geoms)]
         if first == PLANE:
-            return {CAPSULE: 2, BOX: 4, CYLINDER: 4}.get(second, 1)
+            return {CAPSULE: 2, BOX: 4, CYLINDER: 4, MESH: 4}.get(second, 1)
         return 2 if first == CAPSULE and second in (CAPSULE, BOX) else 1
 
     def _standing(self) -> tuple[int, int]:
@@ -258,7 +267,8 @@ class Description:
             rows = max(directions * places + more_rows, frictionless, 1)
             return dataclasses.replace(empty, frictional=places, jacobian_rows=rows)
 
-        enough = min(frictional, max(ENOUGH_FRICTIONAL, standing))
+        least, wanted = (min(frictional, n) for n in (ENOUGH_FRICTIONAL, max(ENOUGH_FRICTIONAL, standing)))
+        enough = max((n for n in range(least, wanted + 1) if sized(n).bytes <= WORLD_BYTES[-1]), default=least)
         most = min(frictional, max(MOST_FRICTIONAL, enough))
         budget = next((b for b in WORLD_BYTES if sized(enough).bytes <= b), None)
         if budget is None:
@@ -447,6 +457,8 @@ class Description:
             tables.structs("Vec", "geom_size", m.geom_size[self.geoms])
             turns = [self.places[m.geom_bodyid[g]].turn(m.geom_quat[g]) for g in self.geoms]
             tables.structs("Mat", "geom_orientation", [matrix(turn).ravel() for turn in turns])
+        if self.meshes:
+            self._add_meshes(tables)
         index = {g: i for i, g in enumerate(self.geoms)}
         tables.integers("first_geom", [index.get(p.geoms[0], 0) for p in found])
         tables.integers("second_geom", [index[p.geoms[1]] for p in found])
@@ -513,6 +525,25 @@ class Description:
             tables.floats("rolling_ratio", [p.rolling_ratio for p in found])
         if self.some_lack_edges:
             tables.integers("edges", [2 * (p.condim - 1) for p in found])
+
+    def _add_meshes(self, tables: Tables) -> None:
+        of = [int(self.m.geom_dataid[g]) if self.m.geom_type[g] == MESH else -1 for g in self.geoms]
+        used = list(self.meshes)
+        meshes = list(self.meshes.values())
+        sizes = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+        corners = [
+            (normal, [sizes[i] + vertex for vertex in others] + [-1] * (3 - len(others)))
+            for i, mesh in enumerate(meshes)
+            for of_vertex in mesh.corners
+            for normal, others in of_vertex
+        ]
+        counts = [len(of_vertex) for mesh in meshes for of_vertex in mesh.corners]
+        tables.integers("first_vertex", [sizes[used.index(mesh)] if mesh >= 0 else 0 for mesh in of])
+        tables.integers("last_vertex", [sizes[used.index(mesh) + 1] if mesh >= 0 else 0 for mesh in of])
+        tables.structs("Vec", "vertex", np.concatenate([mesh.vertices for mesh in meshes]))
+        tables.integers("first_corner", np.cumsum([0, *counts]))
+        tables.structs("Vec", "corner_normal", [normal for normal, _ in corners])
+        tables.integers("corner_vertex", [vertex for _, others in corners for vertex in others])
 
     def _dofs_of_geom(self, g: int) -> int:
         """Returns a bit for each degree of freedom that moves a geom."""
@@ -631,6 +662,7 @@ def source(
         "DERIVED": tables.row.numbers > 0 and substeps == 0,
         "IMPLICIT_ACTUATORS": description.implicit_actuators,
         "JOINT_FORCE_LIMITS": description.joint_force_limits,
+        "MESHES": bool(description.meshes),
         "SOLIDS": any(map(description.is_solid, description.pairs)),
         "BOXES": any(description.is_solid(p) and not description.is_plane(p) for p in description.pairs),
     }
@@ -648,18 +680,19 @@ def _parts(text: str, asked: dict[str, bool]) -> str:
     """Returns a text without the parts that are not asked for.
 
     A part stands between the lines ``//IF NAME`` and ``//END``; what follows a line ``//ELSE`` in it is for the
-    opposite.
+    opposite. Parts may stand in parts.
     """
-    lines, keep = [], True
+    lines: list[str] = []
+    keep: list[bool] = []
     for line in text.splitlines(keepends=True):
         match line.split():
             case ["//IF", name]:
-                keep = asked[name]
+                keep.append(asked[name])
             case ["//ELSE"]:
-                keep = not keep
+                keep[-1] = not keep[-1]
             case ["//END"]:
-                keep = True
-            case _ if keep:
+                keep.pop()
+            case _ if all(keep):
                 lines.append(line)
     return "".join(lines)
 

@@ -143,7 +143,7 @@ def _contacts(m: mujoco.MjModel) -> list[str]:
         choice = "; contacts='ground' leaves out those of moving bodies with each other" if moving else ""
         found.append(
             f"contacts of {', '.join(sorted(kinds))}: only spheres and capsules with each other and with boxes, and "
-            f"with planes of the world all of these, cylinders and ellipsoids{choice}"
+            f"with planes of the world all of these, cylinders, ellipsoids and meshes{choice}"
         )
     if is_elliptic(m) and m.pair_solreffriction.any():  # pyramids do without
         found.append("solreffriction of an explicit pair with an elliptic cone")
