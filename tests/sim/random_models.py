@@ -10,6 +10,9 @@ DEEPEST = -0.02
 """Distance of geoms (m) below which a state is not used: forces of deep contacts leave no digits for the rest."""
 FASTEST = 30.0
 """Velocity (m/s, rad/s) above which a state is not used."""
+FARTHEST = 10.0
+"""Distance of a body from the origin (m) above which a state is not used: inertias about a center of mass that is so
+far away leave no digits for those of light bodies."""
 
 AXES = st.sampled_from([(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, -1, 0), (1, 2, 0.5), (-0.3, 0.7, 1)])
 SOLREF = st.sampled_from([(0.02, 1), (0.015, 1.2), (0.05, 0.7), (-800, -30)])
@@ -225,7 +228,7 @@ def models(draw, max_bodies=8, lanes=False):
 def states(model, rng, count, longest=600):
     """Returns float32 states along trajectories of C MuJoCo: qpos, qvel, qacc_warmstart and ctrl, ``(count, …)`` each.
 
-    Those that go too deep or too fast are left out, so there may be fewer than ``count``.
+    Those that go too deep, too far or too fast are left out, so there may be fewer than ``count``.
     """
     found, data = [], mujoco.MjData(model)
     for _ in range(count + 20):
@@ -237,7 +240,8 @@ def states(model, rng, count, longest=600):
                 data.ctrl[:] = rng.uniform(-1.5, 1.5, model.nu)
             mujoco.mj_step(model, data)
         shallow = not data.ncon or data.contact.dist.min() > DEEPEST
-        if shallow and not data.warning.number.any() and np.abs(data.qvel).max() < FASTEST:
+        usual = np.abs(data.xpos).max() < FARTHEST and np.abs(data.qvel).max() < FASTEST
+        if shallow and usual and not data.warning.number.any():
             rows = data.qpos, data.qvel, data.qacc_warmstart, data.ctrl
             found.append([row.astype(np.float32) for row in rows])
         if len(found) == count:
