@@ -1699,20 +1699,18 @@ struct Step : Math {
   // Leaves the acceleration in qacc; with implicit damping, search is what has to be added to it before integration.
   INLINE void solve() {
     enum { VELOCITY = -2, ACCELERATION = -1 };  // two passes first, which bring both into the rows
-    float remaining = 1.0f, gradient_squared = 0.0f, decrement = 0.0f;  // of the current direction
+    float gradient_squared = 0.0f, decrement = 0.0f;  // where the current direction begins
     Search step = {0.0f, 0.0f};
-    bool changed = true, stop = false;  // whether the set of active rows changed; whether qacc is final
+    bool same = false, stop = false;  // whether the last step left all rows on their sides; whether qacc is final
     ROLLED for (int iteration = VELOCITY;; ++iteration) {
       if (!stop && iteration == Model::ITERATIONS) {
         stop = true;
-        // Gradient and decrement are known of the point that was reached if the direction still holds.
-        const bool converged = small(step) || (!changed && flat(gradient_squared, decrement));
-        if (lane == 0 && Model::SUBSTEPS && !converged) overflow[world] |= Model::LIMIT_REACHED;
+        if (lane == 0 && Model::SUBSTEPS && !small(step)) overflow[world] |= Model::LIMIT_REACHED;
       }
       if (stop && !Model::IMPLICIT_DAMPING) break;
       if (iteration < 0) {
         SHARED_LOOP(d, DOFS) w.search[d] = iteration == VELOCITY ? w.qvel[d] : w.qacc[d];
-      } else if (changed || stop) {
+      } else {
         Slots h;
         start_from_mass(h);
         if (Model::IMPLICIT_DAMPING && stop) {  // (M + h D) a = M qacc, solved for the difference of a and qacc
@@ -1739,27 +1737,22 @@ struct Step : Math {
         sum(t, 2);
         gradient_squared = t[0];
         decrement = t[1];
-        remaining = 1.0f;
       }
-      if (iteration > 0) {
-        if (small(step) || flat(gradient_squared, decrement)) {
-          stop = true;
-          continue;
-        }
+      if (iteration > 0 && (small(step) || flat(gradient_squared, decrement))) {
+        stop = true;
+        continue;
       }
-      if (changed) {
-        sync();
-        project_search();
-        SHARED_LOOP(r, rows()) {
-          const float v = row_velocity(r);
-          if (iteration == VELOCITY) w.x[r] += row_damping(r) * v;
-          else if (iteration == ACCELERATION) w.x[r] += v;
-          else w.change[r] = v;
-        }
-        if (iteration == ACCELERATION) SHARED_LOOP(d, DOFS) w.residual[d] += w.mass_search[d];
-        sync();
-        if (iteration < 0) continue;
+      sync();
+      project_search();
+      SHARED_LOOP(r, rows()) {
+        const float v = row_velocity(r);
+        if (iteration == VELOCITY) w.x[r] += row_damping(r) * v;
+        else if (iteration == ACCELERATION) w.x[r] += v;
+        else w.change[r] = v;
       }
+      if (iteration == ACCELERATION) SHARED_LOOP(d, DOFS) w.residual[d] += w.mass_search[d];
+      sync();
+      if (iteration < 0) continue;
       step = line_search();
       if (step.alpha == 0.0f) {
         stop = true;
@@ -1781,14 +1774,11 @@ struct Step : Math {
         w.x[r] = next;
       }
       sync();
-      const bool repeated = !changed;
-      changed = ballot(crossed) != 0;
-      stop = repeated && !changed;  // a second search of one parabola: rounding is left
-      if (!changed) {  // the same parabola: gradient and decrement shrink with what remains of the Newton step
-        const float ratio = remaining == 0.0f ? 0.0f : divide(remaining - step.alpha, remaining);
-        remaining -= step.alpha;
-        gradient_squared *= ratio * ratio;
-        decrement *= ratio * ratio;
+      const bool repeated = same;
+      same = ballot(crossed) == 0;
+      if (same) {  // what is left of a Newton step; of a second one on the same parabola, rounding
+        const float left = (1.0f - step.alpha) * (1.0f - step.alpha);
+        stop = repeated || small(step) || flat(gradient_squared * left, decrement * left);
       }
     }
     sync();

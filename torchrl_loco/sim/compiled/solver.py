@@ -155,27 +155,23 @@ class NewtonSolver:
         for i, product in enumerate(self.tree.mass_times(cells("qacc", m.nv))):
             block.set(f"M_qacc[{i}]", product)
         scale = 1 / (m.stat.meaninertia * max(m.nv, 1))
-        block("float remaining = 1.0f, gradient2 = 0.0f, decrement = 0.0f, improvement = 0.0f, alpha = 0.0f;")
-        block("bool converged = false;")
-        block("bool changed = true;  // whether a row changed sides since the direction was computed")
+        block("float gradient2 = 0.0f, decrement = 0.0f, improvement = 0.0f, alpha = 0.0f;")
+        block("bool converged = false, same = false;  // whether the last step left all rows on their sides")
         with block.loop("iteration", option.iterations) as iteration:
-            with iteration.scope("if (changed)") as fresh:
-                self._direction(fresh)
-            tests = [
-                f"improvement > 0.0f && improvement * {literal(scale)} < {literal(tolerance(m))}",
-                f"{literal(scale)} * SQRT(gradient2) < {literal(tolerance(m))}",
-                f"0.5f * {literal(scale)} * decrement < {literal(tolerance(m))}",
-            ]
-            iteration(
-                f"if (iteration > 0 && (({tests[0]}) || {tests[1]} || {tests[2]})) {{ converged = true; break; }}"
-            )
-            with iteration.scope("if (changed)") as fresh:
-                self._project(fresh)
+            self._direction(iteration)
+            small = f"(improvement > 0.0f && improvement * {literal(scale)} < {literal(tolerance(m))})"
+            slope = f"{literal(scale)} * SQRT(LEFT gradient2) < {literal(tolerance(m))}"
+            flat = f"({slope} || LEFT 0.5f * {literal(scale)} * decrement < {literal(tolerance(m))})"
+            iteration(f"if (iteration > 0 && ({small} || {flat.replace('LEFT ', '')})) {{ converged = true; break; }}")
+            self._project(iteration)
             self._line_search(iteration, scale)
             iteration("if (alpha == 0.0f) { converged = true; break; }")
             self._advance(iteration)
-        known = f"(!changed && ({tests[1]} || {tests[2]}))"  # of the point that was reached, without a new direction
-        block(f"if (!converged && !({tests[0]}) && !{known}) overflow |= LIMIT_REACHED;")
+            # What is left of a Newton step; of a second one on the same parabola, rounding.
+            iteration("const float left = (1.0f - alpha) * (1.0f - alpha);")
+            done = f"repeated || {small} || {flat.replace('LEFT', 'left *')}"
+            iteration(f"if (same && ({done})) {{ converged = true; break; }}")
+        block(f"if (!converged && !{small}) overflow |= LIMIT_REACHED;")
 
     def read_touch(self, block: Block) -> None:
         """Sets the touch sensors from the forces that were found."""
@@ -217,7 +213,6 @@ class NewtonSolver:
             solution = factor.solve(gradient)
         block.set("gradient2", dot(gradient, gradient))
         block.set("decrement", dot(gradient, solution))
-        block("remaining = 1.0f;")
         for i, entry in enumerate([block.keep(entry) for entry in solution]):
             block.set(f"search[{i}]", -entry)
 
@@ -260,22 +255,18 @@ class NewtonSolver:
         return f"{{ {self.friction.loop(body)} }}" if self.friction.count else ""
 
     def _advance(self, block: Block) -> None:
-        """Moves along the direction. What was quadratic stays so: gradient and decrement shrink without a new H."""
+        """Moves along the direction, and notes whether a row changed sides."""
         for i in range(self.m.nv):
             block(f"qacc[{i}] += alpha * search[{i}]; M_qacc[{i}] += alpha * M_search[{i}];")
-        block("const bool repeated = !changed;")
-        block("changed = false;")
+        block("bool changed = false;")
         block(self.limits.advance())
         block(self.friction.advance())
         if self.ground.count:
             block(self.ground.pyramid.advance("0", "ground"))
         if self.dense.count:
             block(self.dense.pyramid.advance("ground", "contacts"))
-        block("if (!changed) {")
-        block("  if (repeated) { converged = true; break; }  // a second search of one parabola: rounding is left")
-        block("  const float share = remaining == 0.0f ? 0.0f : DIV(remaining - alpha, remaining);")
-        block("  remaining -= alpha; gradient2 *= share * share; decrement *= share * share;")
-        block("}")
+        block("const bool repeated = same;")
+        block("same = !changed;")
 
 
 def _expand(text: str, word: str, loop: Callable[[str], str]) -> str:
