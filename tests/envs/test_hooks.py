@@ -13,6 +13,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torchrl_loco import LocoEnv, SimConfig, State, WalkerWalk
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.part import Part
+from torchrl_loco.envs.view import View
 
 SENSORS = ("gyro", "velocimeter", "attitude", "sole_in_trunk", "sole_velocity", "shank_rotation", "geom_axis")
 CONFIG = SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=20, ls_iterations=20, euler_damping=True)
@@ -41,6 +42,8 @@ class SeesEverything(LocoEnv):
             "geom_xpos": s.geom_xpos(feet),
             "force": s.contact_force(".*_foot"),
             "touching": s.in_contact(".*_foot").float(),
+            "forces": s.contact_force(["fl_foot", "hr_foot"], history=True),
+            "touched": s.in_contact("fl_foot", history=True).float(),
             "joints": s.joint_qpos(["hr_knee", "fl_hip"]),
             "root": s.joint_qvel("root"),
             "gravity": s.projected_gravity("hr_shank"),
@@ -169,6 +172,17 @@ def test_contacts_are_those_of_c_mujoco(everything):
         np.testing.assert_allclose(td["force"][world].numpy(), force, rtol=5e-3, atol=0.05 + 2e-3 * np.abs(force).max())
         some += touching.sum()
     assert some > 10
+    legs = [[m.geom(i).name for i in geoms].index(f"{leg}_foot") for leg in ("fl", "hr")]
+    assert td["forces"].shape == (env.num_envs, 4, 2, 3)  # of each substep; after a reset, of the state
+    assert torch.equal(td["forces"], td["force"][:, None, legs].expand(-1, 4, -1, -1))
+    assert torch.equal(td["touched"], td["touching"][:, legs[:1]].expand(-1, 4))
+
+
+def test_history_that_was_not_asked_for_at_first_is_refused(shared):
+    env = shared("dog_follow", 8, episode_length=40)
+    arrays = {"contact_force": env.sim.contact_force, "in_contact": env.sim.in_contact}
+    with pytest.raises(ValueError, match="contact_force_history was not asked for when the hooks were first called"):
+        View(env.hooks.catalog, arrays, "reward").contact_force(".*_foot", history=True)
 
 
 def stepped_like_walker_walk(shared, task, actions):

@@ -97,6 +97,30 @@ def test_forces_of_a_last_substep_and_of_a_state_are_those_of_c_mujoco(simulated
     assert len(contacts) == 4  # all but the arm
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_history_has_the_forces_of_each_substep(simulated):
+    """As C MuJoCo finds them step by step; of a state, all rows are its own."""
+    geoms = [6, 0, 3, 1]
+    sim = simulated(SCENE, 4, ctrl_dt=0.008, contact_geoms=geoms, contact_history=True)
+    sim.reset(every_world(sim))
+    for _ in range(50):
+        sim.step()
+    sim.qvel.add_(0.5 * torch.randn(sim.qvel.shape).to(sim.qvel.device))
+    expected = [[net_forces(sim.mj_model, in_c_mujoco(sim, world, substeps=k)) for k in range(4)] for world in range(4)]
+    sim.step()
+    touches = np.array([[row[2][geoms] for row in rows] for rows in expected])
+    assert sim.in_contact_history.tolist() == touches.tolist()
+    for found, rows in zip(sim.contact_force_history.cpu().numpy(), expected, strict=True):
+        for force, (net, size, _) in zip(found, rows, strict=True):
+            error = np.abs(force - net[geoms]).max(axis=1)
+            assert (error <= 5e-3 * size[geoms] + 5e-2).all(), (force, net[geoms])
+    assert (touches.any(axis=1) & ~touches[:, -1]).any()  # a contact that ended before the last substep
+    assert torch.equal(sim.contact_force, sim.contact_force_history[:, -1])
+    sim.forward(every_world(sim))
+    for history, last in ((sim.contact_force_history, sim.contact_force), (sim.in_contact_history, sim.in_contact)):
+        assert torch.equal(history, last.unsqueeze(1).expand_as(history))
+
+
 def test_what_lies_still_feels_what_lies_on_it(simulated):
     """A ball with another on it, a capsule with two contacts, and one that hangs on a spring."""
     for condim in (1, 3):

@@ -306,23 +306,23 @@ def test_the_size_of_a_world_is_what_its_layout_says(form):
 @pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="Warp was built without NVRTC")
 @pytest.mark.parametrize("form", [0], indirect=True, ids=["lanes"])
 @pytest.mark.parametrize(
-    ("dofs", "kind", "varied"),
+    ("dofs", "kind", "varied", "asked"),
     [
-        (18, {}, True),
-        (30, {"condim": 1}, False),
-        (64, {"touch": 1}, False),
-        (18, {"condim": 6}, False),
-        (36, {"condim": 6, "cone": "elliptic"}, True),
+        (18, {}, True, {}),
+        (30, {"condim": 1}, False, {}),
+        (64, {"touch": 1}, False, {}),
+        (18, {"condim": 6}, False, {"contact_geoms": (1, 2), "contact_rows": 2}),
+        (36, {"condim": 6, "cone": "elliptic"}, True, {}),
     ],
     ids=str,
 )
-def test_a_body_builds_for_a_gpu(form, dofs, kind, varied, tmp_path, monkeypatch):
+def test_a_body_builds_for_a_gpu(form, dofs, kind, varied, asked, tmp_path, monkeypatch):
     """NVRTC needs no GPU; ptxas counts the shared memory."""
     monkeypatch.setattr(wp.config, "optimization_level", None)
     model = bristly(dofs, **kind)
     assert unsupported(model) == []
     start, end = Chain(()), Chain(())
-    text = step.source(VariedModel(model, all_varied(model)) if varied else model, 1)
+    text = step.source(VariedModel(model, all_varied(model)) if varied else model, 2, **asked)
     kernel = _kernel(text, start.func, start.struct, end.func, end.struct)
     kernel.module.options["block_dim"] = 32 * lanes.worlds_per_block(model)
     (built,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=False, strip_hash=True)

@@ -27,20 +27,25 @@ def allocated(thing):
 
 
 @pytest.mark.parametrize(
-    ("body", "num_envs", "overrides", "geoms"),
-    [("walker", 1, {}, ()), ("walker", 40, {"naconmax": 3}, (4, 0, 2)), ("humanoid", 100, {"njmax": 77}, (1,))],
+    ("body", "num_envs", "overrides", "geoms", "rows"),
+    [
+        ("walker", 1, {}, (), 1),
+        ("walker", 40, {"naconmax": 3}, (4, 0, 2), 10),
+        ("humanoid", 100, {"njmax": 77}, (1,), 1),
+    ],
 )
-def test_the_estimate_is_what_is_allocated(body, num_envs, overrides, geoms):
+def test_the_estimate_is_what_is_allocated(body, num_envs, overrides, geoms, rows):
     config = sim_config(CONFIGS[body], "playground", num_envs, overrides)
     model, device = models.load(MODELS[body]), wp.get_device("cpu")
-    engine = mujoco_warp.MujocoWarpEngine(model, config, num_envs, device, geoms)
+    engine = mujoco_warp.MujocoWarpEngine(model, config, num_envs, device, geoms, contact_rows=rows)
     needed = sum(allocated(engine.data).values())
     if geoms:
-        needed += sum(array.capacity for array in vars(engine.contact_forces).values())
-    assert mujoco_warp.data_bytes(model, config, num_envs, len(geoms)) == needed
-    data = compiled.CompiledEngine(model, config, num_envs, device, geoms).data
+        arrays = [array for array in vars(engine.contact_forces).values() if isinstance(array, wp.array)]
+        needed += sum(array.capacity for array in arrays)
+    assert mujoco_warp.data_bytes(model, config, num_envs, len(geoms), contact_rows=rows) == needed
+    data = compiled.CompiledEngine(model, config, num_envs, device, geoms, contact_rows=rows).data
     arrays = [array for array in vars(data).values() if isinstance(array, wp.array)]
-    assert compiled.data_bytes(model, num_envs, len(geoms)) == sum(array.capacity for array in arrays)
+    assert compiled.data_bytes(model, num_envs, rows * len(geoms)) == sum(array.capacity for array in arrays)
 
 
 def test_scratch_memory_is_used_again():

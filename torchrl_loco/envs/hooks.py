@@ -10,7 +10,7 @@ import torch
 from torchrl_loco.checks import suggestion
 from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.state import State
-from torchrl_loco.envs.view import Catalog, View, usable
+from torchrl_loco.envs.view import CONTACT_HISTORY, Catalog, View, usable
 from torchrl_loco.sim import models
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ class Hooks:
         if models.has_home(mj_model) and not _draws_states(type(env)):
             self.own |= {"begin"}
         bounded = env.action_range != (-float("inf"), float("inf"))
-        shapes = memory_shapes(type(env))
+        self._substeps, shapes = env.config.substeps, memory_shapes(type(env))
         settings = env.num_envs, env.device, shapes, env.config.ctrl_dt
         self.catalog = Catalog(mj_model, *settings, bounded=bounded, variation=env.variation)
         self.groups: dict[str, tuple[int, ...]] = {}
@@ -155,6 +155,7 @@ class Hooks:
         rows: dict[str, Any] = {name: getattr(data, name) for name in ("qpos", "qvel", "ctrl", "xpos", "cvel")}
         rows |= {"xmat": data.xmat.reshape(-1, 3, 3), "subtree_com": data.subtree_com, "sensordata": data.sensordata}
         rows |= {"contact_force": [[0.0] * 3], "in_contact": [0.0], "action": [0.0] * m.nu}
+        rows |= {name: [rows[name.removesuffix("_history")]] * self._substeps for name in CONTACT_HISTORY}
         rows |= {"numbers": catalog.variation.varied.nominal()} if catalog.variation else {}
         rows |= {f"memory.{name}": torch.zeros(shape) for name, shape in catalog.memory.items()}
         arrays = {name: torch.as_tensor(row, dtype=torch.float32).to(device) for name, row in rows.items()}

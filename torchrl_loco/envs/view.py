@@ -16,6 +16,8 @@ from torchrl_loco.sim import models
 
 OF_A_STEP = frozenset({"action", "ctrl"})
 """What belongs to a step: an observation is also made after a reset, where there was none."""
+CONTACT_HISTORY = frozenset({"contact_force_history", "in_contact_history"})
+"""Arrays of contacts with a row for each substep."""
 
 
 class Catalog(Elements):
@@ -294,18 +296,23 @@ class View:
         first = self._catalog.sensor_address[sensor]
         return self._array("sensordata")[:, first : first + int(self._catalog.mj_model.sensor_dim[sensor])]
 
-    def contact_force(self, geoms: Names) -> torch.Tensor:
+    def contact_force(self, geoms: Names, *, history: bool = False) -> torch.Tensor:
         """Returns the net force of all contacts on each geom, world frame (N), of the last physics step.
 
-        Shape ``(num_envs, 3)``, or ``(num_envs, count, 3)`` for several.
+        Shape ``(num_envs, 3)``, or ``(num_envs, count, 3)`` for several. With ``history`` that of each physics step of
+        the control step, in their order: ``(num_envs, substeps, 3)`` or ``(num_envs, substeps, count, 3)``. After a
+        reset, all are those of the present state.
         """
-        return self._of_contacts("contact_force", geoms)
+        return self._of_contacts("contact_force", geoms, history)
 
-    def in_contact(self, geoms: Names) -> torch.Tensor:
-        """Returns whether each geom had a contact in the last physics step, bool ``(num_envs,)`` or with ``count``."""
-        return self._of_contacts("in_contact", geoms) > 0
+    def in_contact(self, geoms: Names, *, history: bool = False) -> torch.Tensor:
+        """Returns whether each geom had a contact in the last physics step, bool ``(num_envs,)`` or with ``count``.
 
-    def _of_contacts(self, array: str, geoms: Names) -> torch.Tensor:
+        With ``history`` as :meth:`contact_force`, ``(num_envs, substeps)`` or ``(num_envs, substeps, count)``.
+        """
+        return self._of_contacts("in_contact", geoms, history) > 0
+
+    def _of_contacts(self, name: str, geoms: Names, history: bool) -> torch.Tensor:
         ids, one = self._catalog.ids("geom", geoms)
         columns = self._catalog.contact_geoms
         new = [geom for geom in ids if geom not in columns]
@@ -313,10 +320,11 @@ class View:
             names = ", ".join(self._catalog.names("geom")[geom] for geom in new)
             raise ValueError(f"contacts of {names} were not asked for when the hooks were first called")
         columns += new
-        values = self._array(array)
+        values = self._array(f"{name}_history").transpose(1, 2) if history else self._array(name)
         if not self._catalog.complete:
             values = values[:, :1].expand(-1, len(columns), *values.shape[2:])
-        return self._catalog.pick(values, [columns.index(geom) for geom in ids], one)
+        found = self._catalog.pick(values, [columns.index(geom) for geom in ids], one)
+        return found.transpose(1, 2) if history and not one else found
 
     # Random numbers.
 

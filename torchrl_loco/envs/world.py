@@ -34,6 +34,7 @@ from torchrl_loco.envs.hooks import PARTS, Hooks
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.variation import Variation
+from torchrl_loco.envs.view import CONTACT_HISTORY
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import (
     EXCLUSIVE,
@@ -122,6 +123,7 @@ class World:
             asked: dict[str, Any] = {}
             if hooks and hooks.catalog.contact_geoms:
                 asked["contact_geoms"] = hooks.catalog.contact_geoms
+                asked["contact_history"] = bool(hooks.catalog.arrays & CONTACT_HISTORY)
             if self._variation is not None:
                 asked["varied"] = self._variation.varied
             self.sim = Simulation(mj_model, task.config, n, task.device, **asked)
@@ -355,6 +357,7 @@ class World:
             arrays["sensordata"] = wp.to_torch(sim.data.sensordata)
         if catalog.contact_geoms:
             arrays |= {"contact_force": sim.contact_force, "in_contact": sim.in_contact}
+            arrays |= {name: getattr(sim, name) for name in catalog.arrays & CONTACT_HISTORY}
         arrays |= {
             "action": self.action.torch,
             "elapsed_steps": self.elapsed_steps.torch,

@@ -61,6 +61,8 @@ def add_contacts(
 def read_sums(
     # In:
     mask_in: wp.array[bool],
+    first_row: int,
+    end_row: int,
     sum_in: wp.array3d[wp.int64],
     touches_in: wp.array2d[bool],
     # Out:
@@ -73,8 +75,10 @@ def read_sums(
     force = wp.vec3()
     for i in range(3):
         force[i] = float(wp.float64(sum_in[world, geom, i]) / UNITS)
-    force_out[world, geom] = force
-    in_contact_out[world, geom] = touches_in[world, geom]
+    for row in range(first_row, end_row):
+        place = row * touches_in.shape[1] + geom
+        force_out[world, place] = force
+        in_contact_out[world, place] = touches_in[world, geom]
 
 
 class ContactForces:
@@ -84,16 +88,20 @@ class ContactForces:
         m: the model.
         geoms: the geoms.
         data: the data whose contacts are added up.
+        rows: of how many substeps the sums are kept.
 
     Attributes:
-        force: net force of the contacts on each geom, in the world's frame (N), ``(nworld, len(geoms))`` vec3.
-        in_contact: whether it has any, ``(nworld, len(geoms))`` bool.
+        rows: as above.
+        force: net force of the contacts on each geom, in the world's frame (N), ``(nworld, rows * len(geoms))`` vec3,
+            substep by substep.
+        in_contact: whether it has any, ``(nworld, rows * len(geoms))`` bool.
     """
 
-    def __init__(self, m: mujoco.MjModel, geoms: Sequence[int], data: "mjw.Data") -> None:
-        shape, device = (data.nworld, len(geoms)), data.qpos.device
-        self.force = wp.zeros(shape, dtype=wp.vec3, device=device)
-        self.in_contact = wp.zeros(shape, dtype=bool, device=device)
+    def __init__(self, m: mujoco.MjModel, geoms: Sequence[int], data: "mjw.Data", rows: int = 1) -> None:
+        shape, kept, device = (data.nworld, len(geoms)), (data.nworld, rows * len(geoms)), data.qpos.device
+        self.rows = rows
+        self.force = wp.zeros(kept, dtype=wp.vec3, device=device)
+        self.in_contact = wp.zeros(kept, dtype=bool, device=device)
         self._sum = wp.zeros((*shape, 3), dtype=wp.int64, device=device)
         self._touches = wp.zeros(shape, dtype=bool, device=device)
         index = np.full(m.ngeom, -1)
@@ -102,21 +110,29 @@ class ContactForces:
         self._contacts = wp.array(np.arange(data.naconmax), dtype=int, device=device)
         self._of_contact = wp.zeros(data.naconmax, dtype=wp.spatial_vector, device=device)
 
-    def update(self, model: "mjw.Model", data: "mjw.Data", mask: wp.array) -> None:
-        """Adds up the contacts of the last physics step in the worlds where ``mask`` ``(nworld,)`` is set."""
+    def update(self, model: "mjw.Model", data: "mjw.Data", mask: wp.array, row: int | None = None) -> None:
+        """Adds up the contacts of the last physics step in the worlds where ``mask`` ``(nworld,)`` is set.
+
+        Args:
+            model: the model.
+            data: its data.
+            mask: the worlds.
+            row: where the sums are kept; ``None`` writes them into every row.
+        """
         device, contact = data.qpos.device, data.contact
         mjw.contact_force(model, data, self._contacts, True, self._of_contact)  # in the world's frame
         sums, shape = [self._sum, self._touches], self._touches.shape
         wp.launch(clear, dim=shape, outputs=sums, device=device)
         inputs = [data.nacon, contact.geom, contact.efc_address, contact.worldid, self._index, self._of_contact]
         wp.launch(add_contacts, dim=data.naconmax, inputs=inputs, outputs=sums, device=device)
+        bounds = (0, self.rows) if row is None else (row, row + 1)
         outputs = [self.force, self.in_contact]
-        wp.launch(read_sums, dim=shape, inputs=[mask, *sums], outputs=outputs, device=device)
+        wp.launch(read_sums, dim=shape, inputs=[mask, *bounds, *sums], outputs=outputs, device=device)
 
 
-def contact_forces_bytes(m: mujoco.MjModel, geoms: int, num_envs: int, naconmax: int) -> int:
-    """Returns the memory of :class:`ContactForces` of so many geoms and contacts (bytes)."""
+def contact_forces_bytes(m: mujoco.MjModel, geoms: int, num_envs: int, naconmax: int, rows: int = 1) -> int:
+    """Returns the memory of :class:`ContactForces` of so many geoms, contacts and rows (bytes)."""
     if not geoms:
         return 0
-    per_geom, per_contact = 12 + 1 + 24 + 1, 4 + 24
+    per_geom, per_contact = rows * (12 + 1) + 24 + 1, 4 + 24
     return num_envs * geoms * per_geom + naconmax * per_contact + 4 * m.ngeom

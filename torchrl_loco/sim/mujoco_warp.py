@@ -132,6 +132,7 @@ class MujocoWarpEngine:
         device: where they live.
         contact_geoms: geoms whose contact forces are computed.
         varied: which numbers of the model differ from world to world.
+        contact_rows: of how many substeps contact forces are kept: of the last, or of all.
 
     Attributes:
         model: the model on the device.
@@ -154,6 +155,7 @@ class MujocoWarpEngine:
         device: wp.Device,
         contact_geoms: Sequence[int] = (),
         varied: Varied | None = None,
+        contact_rows: int = 1,
     ) -> None:
         self._num_envs, self._device = num_envs, device
         self._substeps = config.substeps
@@ -177,7 +179,9 @@ class MujocoWarpEngine:
         # Threads per small matrix of a world: measured in benchmarks/README.md.
         self.model.block_dim.update_gradient_cholesky = 32
         self.model.block_dim.update_gradient_JTDAJ_dense = 64
-        self.contact_forces = ContactForces(mj_model, contact_geoms, self.data) if contact_geoms else None
+        self.contact_forces: ContactForces | None = None
+        if contact_geoms:
+            self.contact_forces = ContactForces(mj_model, contact_geoms, self.data, contact_rows)
         self.with_subtree_com = False
         self._has_force_sensors = not FORCE_SENSORS.isdisjoint(mj_model.sensor_type)
         self._kept_sensors: tuple[wp.array, wp.array] | None = None
@@ -194,7 +198,7 @@ class MujocoWarpEngine:
         return f"a physics step needed up to {most}: pass {ROOM[dropped]}={with_margin(most)}"
 
     def contact_arrays(self) -> tuple[wp.array, wp.array]:
-        """Returns net contact forces ``(nworld, geoms)`` vec3 and whether there is a contact, ``(nworld, geoms)``."""
+        """Returns net contact forces vec3 and whether there is a contact, ``(nworld, contact_rows * geoms)`` each."""
         assert self.contact_forces is not None
         return self.contact_forces.force, self.contact_forces.in_contact
 
@@ -228,8 +232,9 @@ class MujocoWarpEngine:
             with self._substep_only(sensors=self._has_force_sensors and i == self._substeps - 1):
                 self._substep()
                 self._record_peaks()
-        if self.contact_forces is not None:
-            self.contact_forces.update(self.model, self.data, self._all)
+            if self.contact_forces is not None and i >= self._substeps - self.contact_forces.rows:
+                row = i - self._substeps + self.contact_forces.rows
+                self.contact_forces.update(self.model, self.data, self._all, row)
         self._evaluate()
         launch_together([*after, *last], self._all)
 
@@ -370,6 +375,7 @@ def data_bytes(
     num_envs: int,
     contact_geoms: int = 0,
     varied: Varied | None = None,
+    contact_rows: int = 1,
 ) -> int:
     """Returns the memory that ``mjData`` of so many worlds takes (bytes), without allocating it.
 
@@ -381,6 +387,7 @@ def data_bytes(
         num_envs: number of worlds.
         contact_geoms: number of geoms whose contact forces are asked for.
         varied: which numbers of the model differ from world to world; their memory is counted too.
+        contact_rows: of how many substeps contact forces are kept.
     """
     with_rows = with_every_row(mj_model, varied)
 
@@ -388,7 +395,8 @@ def data_bytes(
         with wp.ScopedDevice("cpu"):
             return _array_bytes(mjw.make_data(with_rows, nworld=worlds, naconmax=contacts, njmax=config.njmax))
 
-    base, forces = size(1, 1), contact_forces_bytes(mj_model, contact_geoms, num_envs, config.naconmax)
+    base = size(1, 1)
+    forces = contact_forces_bytes(mj_model, contact_geoms, num_envs, config.naconmax, contact_rows)
     data = base + (num_envs - 1) * (size(2, 1) - base) + (config.naconmax - 1) * (size(1, 2) - base)
     return data + forces + batched_bytes(mj_model, varied, num_envs)
 

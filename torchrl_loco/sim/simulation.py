@@ -79,6 +79,8 @@ class Simulation:
     ``contact_force``   ``(nworld, geoms, 3)``     net force of all contacts on each of ``contact_geoms``, in the
                                                    world's frame (N)
     ``in_contact``      ``(nworld, geoms)``        whether it has any contact, bool
+    ``..._history``     ``(nworld, rows, ...)``    both with a row for each substep if ``contact_history``, else for the
+                                                   last
     ``cvel``            ``(nworld, nbody, 6)``     velocities of the bodies about their tree's center of mass (rad/s,
                                                    m/s); ask for them before the first step
     ``subtree_com``     ``(nworld, nbody, 3)``     that center of mass (m), in the row of each tree's root; likewise
@@ -99,6 +101,8 @@ class Simulation:
         device: where they live.
         contact_geoms: ids of the geoms whose contact forces are computed.
         varied: which numbers of this model differ from world to world.
+        contact_history: whether contact forces of all substeps of a control step are kept, and not of the last alone;
+            after ``reset`` and ``forward`` all rows are those of the present state.
 
     Attributes:
         engine: what advances the worlds.
@@ -121,19 +125,22 @@ class Simulation:
         *,
         contact_geoms: Sequence[int] = (),
         varied: Varied | None = None,
+        contact_history: bool = False,
     ) -> None:
         warn_of_integrator(mj_model, config)
         set_options(mj_model, config)
         geoms = check_geoms(mj_model, contact_geoms)
         differing = varied if varied is not None and varied.count else None
         self.engine_choice = name, _ = choose_engine(mj_model, config, differing)
-        check_memory(memory(name, mj_model, config, num_envs, device, len(geoms), differing), num_envs, device)
+        rows = config.substeps if contact_history else 1
+        needed = memory(name, mj_model, config, num_envs, device, len(geoms), differing, rows)
+        check_memory(needed, num_envs, device)
         self.mj_model, self.config, self.varied = mj_model, config, varied
         self.num_envs = num_envs
         init_warp()
         self.device = wp.get_device(str(device))
         engines: dict[str, type] = {"compiled": compiled.CompiledEngine, "mujoco_warp": mujoco_warp.MujocoWarpEngine}
-        self.engine = engines[name](mj_model, config, num_envs, self.device, geoms, differing)
+        self.engine = engines[name](mj_model, config, num_envs, self.device, geoms, differing, rows)
         self.model, self.data = self.engine.model, self.engine.data
         self._mujoco_data: mjw.Data | None = None
         self._batched: BatchedModel | None = None
@@ -153,10 +160,12 @@ class Simulation:
         self.numbers = torch.empty((num_envs, 0), device=device)
         if differing is not None:
             self.numbers = wp.to_torch(self.engine.numbers)
-        self.contact_force = torch.empty((num_envs, 0, 3), device=device)
-        self.in_contact = torch.empty((num_envs, 0), dtype=torch.bool, device=device)
+        self.contact_force_history = torch.empty((num_envs, rows, 0, 3), device=device)
+        self.in_contact_history = torch.empty((num_envs, rows, 0), dtype=torch.bool, device=device)
         if geoms:
-            self.contact_force, self.in_contact = map(wp.to_torch, self.engine.contact_arrays())
+            kept = [wp.to_torch(array).unflatten(1, (rows, len(geoms))) for array in self.engine.contact_arrays()]
+            self.contact_force_history, self.in_contact_history = kept
+        self.contact_force, self.in_contact = self.contact_force_history[:, -1], self.in_contact_history[:, -1]
 
     @property
     def cvel(self) -> torch.Tensor:
@@ -367,12 +376,13 @@ def memory(
     device: torch.device,
     contact_geoms: int = 0,
     varied: Varied | None = None,
+    contact_rows: int = 1,
 ) -> int:
     """Returns the memory that a simulation takes (bytes)."""
     if engine == "compiled":
-        return compiled.data_bytes(mj_model, num_envs, contact_geoms, varied)
+        return compiled.data_bytes(mj_model, num_envs, contact_geoms * contact_rows, varied)
     scratch = DETERMINISTIC_SCRATCH if config.deterministic and device.type == "cuda" else SCRATCH
-    return int(scratch * mujoco_warp.data_bytes(mj_model, config, num_envs, contact_geoms, varied))
+    return int(scratch * mujoco_warp.data_bytes(mj_model, config, num_envs, contact_geoms, varied, contact_rows))
 
 
 def check_memory(needed: int, num_envs: int, device: torch.device) -> None:

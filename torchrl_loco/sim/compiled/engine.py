@@ -35,8 +35,8 @@ ROWS = {
     "xmat": ("nbody", wp.mat33),
     "cvel": ("nbody", wp.spatial_vector),
     "subtree_com": ("nbody", wp.vec3),
-    "contact_force": ("contact_geoms", wp.vec3),
-    "in_contact": ("contact_geoms", wp.bool),
+    "contact_force": ("contacts", wp.vec3),
+    "in_contact": ("contacts", wp.bool),
     "sensordata": ("nsensordata", wp.float32),
     "overflow": (None, wp.int32),
 }
@@ -54,7 +54,7 @@ class Data:
         nworld: number of worlds.
         device: where they live.
         structure_of_arrays: whether the world is the fastest index in memory.
-        contact_geoms: number of geoms whose contact forces are asked for.
+        contacts: number of geoms whose contact forces are asked for, times that of the substeps that are kept.
 
     Attributes:
         qpos: positions, ``(nworld, nq)``.
@@ -65,8 +65,8 @@ class Data:
         xpos: positions of the bodies (m), ``(nworld, nbody)`` vec3.
         xmat: orientations of the bodies, ``(nworld, nbody)`` mat33.
         contact_force: net force of the contacts on each of the geoms that were asked for, in the world's frame (N),
-            ``(nworld, contact_geoms)`` vec3.
-        in_contact: whether they have any, ``(nworld, contact_geoms)`` bool.
+            ``(nworld, contacts)`` vec3, substep by substep.
+        in_contact: whether they have any, ``(nworld, contacts)`` bool.
         sensordata: sensors, ``(nworld, nsensordata)``.
         overflow: ``Overflow`` bits, ``(nworld,)``.
         act: activations of the actuators, ``(nworld, 0)``: a supported model has none.
@@ -92,10 +92,10 @@ class Data:
         device: wp.Device,
         *,
         structure_of_arrays: bool,
-        contact_geoms: int = 0,
+        contacts: int = 0,
     ) -> None:
         def make(name: str) -> wp.array:
-            shape = _shape(m, nworld, name, contact_geoms)
+            shape = _shape(m, nworld, name, contacts)
             return _zeros(shape, ROWS[name][1], device, structure_of_arrays=structure_of_arrays)
 
         self.act = wp.zeros((nworld, 0), dtype=float, device=device)
@@ -174,27 +174,27 @@ def _fill_rows(array: wp.array, row: np.ndarray) -> None:
     array.assign(np.broadcast_to(row.reshape(shape[1:]), shape))
 
 
-def _shape(m: mujoco.MjModel, nworld: int, name: str, contact_geoms: int) -> tuple[int, ...]:
+def _shape(m: mujoco.MjModel, nworld: int, name: str, contacts: int) -> tuple[int, ...]:
     match ROWS[name][0]:
         case None:
             return (nworld,)
-        case "contact_geoms":
-            return nworld, contact_geoms
+        case "contacts":
+            return nworld, contacts
         case size:
             return nworld, getattr(m, size)
 
 
-def data_bytes(m: mujoco.MjModel, num_envs: int, contact_geoms: int = 0, varied: Varied | None = None) -> int:
+def data_bytes(m: mujoco.MjModel, num_envs: int, contacts: int = 0, varied: Varied | None = None) -> int:
     """Returns the memory that the state of so many worlds takes, without what is asked for later (bytes).
 
     Args:
         m: the model.
         num_envs: number of worlds.
-        contact_geoms: number of geoms whose contact forces are asked for.
+        contacts: number of geoms whose contact forces are asked for, times that of the substeps that are kept.
         varied: which numbers of the model differ from world to world; their memory is counted too.
     """
     rows = sum(
-        math.prod(_shape(m, num_envs, name, contact_geoms)) * wp.types.type_size_in_bytes(dtype)
+        math.prod(_shape(m, num_envs, name, contacts)) * wp.types.type_size_in_bytes(dtype)
         for name, (_, dtype) in ROWS.items()
         if name not in LATER
     )
@@ -244,6 +244,7 @@ class CompiledEngine:
         device: where they live.
         contact_geoms: geoms whose contact forces are computed.
         varied: which numbers of the model differ from world to world.
+        contact_rows: of how many substeps they are kept: of the last, or of all.
 
     Attributes:
         model: the model on the device, with nominal numbers.
@@ -266,16 +267,17 @@ class CompiledEngine:
         device: wp.Device,
         contact_geoms: Sequence[int] = (),
         varied: Varied | None = None,
+        contact_rows: int = 1,
     ) -> None:
         self._mj_model = mj_model if varied is None else VariedModel(mj_model, varied)
         self._substeps, self._device = config.substeps, device
-        self._contact_geoms = tuple(contact_geoms)
+        self._contact_geoms, self._contact_rows = tuple(contact_geoms), contact_rows
         check_worlds(mj_model, num_envs, device)
         self.model = Model(mj_model, device)
         self._launch_size = launch_size(self._mj_model, num_envs, device)
         by_world = structure_of_arrays(mj_model, device)
-        count = len(self._contact_geoms)
-        self.data = Data(mj_model, num_envs, device, structure_of_arrays=by_world, contact_geoms=count)
+        contacts = len(self._contact_geoms) * contact_rows
+        self.data = Data(mj_model, num_envs, device, structure_of_arrays=by_world, contacts=contacts)
         self._rows = self.numbers = wp.zeros((num_envs, 0), dtype=float, device=device)
         if isinstance(self._mj_model, VariedModel):
             row = nominal_row(self._mj_model)
@@ -294,7 +296,7 @@ class CompiledEngine:
         return f"a world of the compiled engine has no more places for {dropped}: pass engine='mujoco_warp'"
 
     def contact_arrays(self) -> tuple[wp.array, wp.array]:
-        """Returns net contact forces ``(nworld, geoms)`` vec3 and whether there is a contact, ``(nworld, geoms)``."""
+        """Returns net contact forces vec3 and whether there is a contact, ``(nworld, contact_rows * geoms)`` each."""
         return self.data.contact_force, self.data.in_contact
 
     def subtree_com(self) -> wp.array:
@@ -362,8 +364,9 @@ class CompiledEngine:
         outputs = self.data.outputs()
         key = substeps, contact_geoms, *(func for func, _ in before), None, *(func for func, _ in after)
         if key not in self._kernels:
-            asked = {f"with_{name}": outputs[name] is not None for name in LATER}
-            text = source(self._mj_model, substeps, contact_geoms=contact_geoms, **asked)
+            asked: dict[str, Any] = {f"with_{name}": outputs[name] is not None for name in LATER}
+            asked |= {"contact_geoms": contact_geoms, "contact_rows": self._contact_rows}
+            text = source(self._mj_model, substeps, **asked)
             start, end = Chain(before), Chain(after)
             self._kernels[key] = _kernel(text, start.func, start.struct, end.func, end.struct), start, end
         kernel, start, end = self._kernels[key]

@@ -12,6 +12,7 @@ import itertools
 import math
 import pathlib
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -279,7 +280,14 @@ class Description:
         more = max(r for r in range(frictionless + 1) if sized(count, r).bytes <= budget)
         return sized(count, more)
 
-    def tables(self, substeps: int, *, with_subtree_com: bool = False, contact_geoms: Sequence[int] = ()) -> Tables:
+    def tables(
+        self,
+        substeps: int,
+        *,
+        with_subtree_com: bool = False,
+        contact_geoms: Sequence[int] = (),
+        contact_rows: int = 1,
+    ) -> Tables:
         """Returns structs ``Model`` and ``Varied``."""
         m, layout = self.m, self.layout
         tables = Tables(m.varied.count if isinstance(m, VariedModel) else 0)
@@ -331,6 +339,8 @@ class Description:
             tables.integers("root_body", self.roots)
         if contact_geoms:
             self._add_contact_geoms(tables, contact_geoms)
+            if contact_rows > 1:
+                tables.size(HISTORY=contact_rows)
         return tables
 
     def _add_links(self, tables: Tables) -> None:
@@ -640,7 +650,12 @@ class Description:
 
 
 def source(
-    m: mujoco.MjModel, substeps: int, *, with_subtree_com: bool = False, contact_geoms: Sequence[int] = ()
+    m: mujoco.MjModel,
+    substeps: int,
+    *,
+    with_subtree_com: bool = False,
+    contact_geoms: Sequence[int] = (),
+    contact_rows: int = 1,
 ) -> str:
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 
@@ -649,12 +664,15 @@ def source(
         substeps: physics steps; 0 evaluates the state without stepping.
         with_subtree_com: whether the centers of mass of the trees are written.
         contact_geoms: geoms whose contact forces are written.
+        contact_rows: how many rows of them: one for the last substep, or one for each.
     """
     description = Description(m)
-    tables = description.tables(substeps, with_subtree_com=with_subtree_com, contact_geoms=contact_geoms)
+    contacts: dict[str, Any] = {"contact_geoms": contact_geoms, "contact_rows": contact_rows}
+    tables = description.tables(substeps, with_subtree_com=with_subtree_com, **contacts)
     asked = {
         "SUBTREE_COM": with_subtree_com,
         "CONTACT_GEOMS": len(contact_geoms) > 0,
+        "CONTACT_HISTORY": len(contact_geoms) > 0 and contact_rows > 1,
         "ELLIPTIC": description.elliptic,
         "TURNING": description.layout.directions > 3,
         "SOME_LACK_EDGES": description.some_lack_edges,

@@ -180,21 +180,26 @@ class ContactForces:
         index = {geom: i for i, geom in enumerate(geoms)}
         self._places = [[*(index.get(pair[i], -1) for pair in pairs), -1] for i in range(2)]
 
-    def clear(self, block: Block) -> None:
-        """Sets all to no contact."""
+    def _place(self, geom: str, row: str | None) -> str:
+        return geom if row is None else f"{self.count} * {row} + {geom}"
+
+    def clear(self, block: Block, row: str | None = None) -> None:
+        """Sets all to no contact, in the row that a C++ expression names if there are several."""
+        place = self._place("i", row)
         with block.scope(f"for (int i = 0; i < {self.count}; ++i)") as each:
-            each("wp::index(contact_force_out, world, i) = wp::vec3(0.0f, 0.0f, 0.0f);")
-            each("wp::index(in_contact_out, world, i) = false;")
+            each(f"wp::index(contact_force_out, world, {place}) = wp::vec3(0.0f, 0.0f, 0.0f);")
+            each(f"wp::index(in_contact_out, world, {place}) = false;")
         for title, places in zip(("first", "second"), self._places, strict=True):
             block(f"static const int force_{title}[{len(places)}] = {{{', '.join(map(str, places))}}};")
 
-    def add(self, block: Block, bounds: tuple[str, str], force: np.ndarray) -> None:
+    def add(self, block: Block, bounds: tuple[str, str], force: np.ndarray, row: str | None = None) -> None:
         """Adds contacts.
 
         Args:
             block: a block after the solver and :meth:`clear`.
             bounds: C++ expressions of the first contact, and of the one behind the last.
             force: force of contact ``k`` on its second geom, ``(3,)`` (N).
+            row: C++ expression of the row that they are written to, if there are several.
         """
         with block.scope(f"for (int k = {bounds[0]}; k < {bounds[1]}; ++k)") as contact:
             contact("const int first = force_first[contact_corner[k]], second = force_second[contact_corner[k]];")
@@ -203,8 +208,8 @@ class ContactForces:
             contact(f"const wp::vec3 push({parts});")
             for geom, sign in (("second", "+"), ("first", "-")):
                 with contact.scope(f"if ({geom} >= 0)") as asked:
-                    asked(f"wp::index(contact_force_out, world, {geom}) {sign}= push;")
-                    asked(f"wp::index(in_contact_out, world, {geom}) = true;")
+                    asked(f"wp::index(contact_force_out, world, {self._place(geom, row)}) {sign}= push;")
+                    asked(f"wp::index(in_contact_out, world, {self._place(geom, row)}) = true;")
 
 
 def read(m: mujoco.MjModel, tree: Dynamics, touch: TouchSensors) -> list[Scalar | None]:

@@ -181,12 +181,12 @@ class NewtonSolver:
         if self.dense.count:
             self.touch.add(block, "ground", "contacts", self.dense.pyramid.normal_force())
 
-    def read_contact_forces(self, block: Block) -> None:
-        """Writes the forces of the contacts on the geoms that were asked for."""
-        self.contact_forces.clear(block)
+    def read_contact_forces(self, block: Block, row: str | None = None) -> None:
+        """Writes the forces of the contacts on the geoms that were asked for, into a row if there are several."""
+        self.contact_forces.clear(block, row)
         for rows, first, end in ((self.ground, "0", "ground"), (self.dense, "ground", "contacts")):
             if rows.count:
-                self.contact_forces.add(block, (first, end), rows.pyramid.force(rows.directions))
+                self.contact_forces.add(block, (first, end), rows.pyramid.force(rows.directions), row)
 
     def _direction(self, block: Block) -> None:
         """Sets ``search`` to -H^-1 gradient, and the two measures of convergence."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -65,6 +65,7 @@ def source(
     with_cvel: bool = False,
     with_subtree_com: bool = False,
     contact_geoms: Sequence[int] = (),
+    contact_rows: int = 1,
 ) -> str:
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 
@@ -74,12 +75,16 @@ def source(
         with_cvel: whether the velocities of the bodies are written.
         with_subtree_com: whether the centers of mass of the trees are written.
         contact_geoms: geoms whose contact forces are written.
+        contact_rows: how many rows of them: one for the last substep, or one for each.
     """
+    asked: dict[str, Any] = {
+        "with_subtree_com": with_subtree_com,
+        "contact_geoms": contact_geoms,
+        "contact_rows": contact_rows,
+    }
     if not is_traced(m):  # lanes write cvel wherever there is an array for it
-        return lanes.source(m, substeps, with_subtree_com=with_subtree_com, contact_geoms=contact_geoms)
-    return traced.source(
-        m, substeps, with_cvel=with_cvel, with_subtree_com=with_subtree_com, contact_geoms=contact_geoms
-    )
+        return lanes.source(m, substeps, **asked)
+    return traced.source(m, substeps, with_cvel=with_cvel, **asked)
 
 
 def nominal_row(m: VariedModel) -> np.ndarray:

@@ -77,6 +77,7 @@ def source(
     with_cvel: bool = False,
     with_subtree_com: bool = False,
     contact_geoms: Sequence[int] = (),
+    contact_rows: int = 1,
 ) -> str:
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 
@@ -86,6 +87,7 @@ def source(
         with_cvel: whether the velocities of the bodies are written.
         with_subtree_com: whether the centers of mass of the trees are written.
         contact_geoms: geoms whose contact forces are written.
+        contact_rows: how many rows of them: one for the last substep, or one for each.
     """
     world = Block()
     world("if (!live) return;")
@@ -101,7 +103,7 @@ def source(
     if substeps or TOUCH in m.sensor_type or contact_geoms:
         if not substeps:
             world("// Touch is a force: a step that is not taken finds it, without actuation.")
-        step, arrays = _substep(m, substeps, contact_geoms)
+        step, arrays = _substep(m, substeps, contact_geoms, contact_rows)
         for title, count in arrays.items():
             if count and title != "qacc":
                 world(f"float {title}[{count}];")
@@ -128,7 +130,9 @@ def _argument(title: str) -> str:
     return {"qacc": "qacc_warmstart_out", "ctrl": "ctrl_in"}.get(title, f"{title}_out")
 
 
-def _substep(m: mujoco.MjModel, substeps: int, contact_geoms: Sequence[int]) -> tuple[Block, dict[str, int]]:
+def _substep(
+    m: mujoco.MjModel, substeps: int, contact_geoms: Sequence[int], contact_rows: int
+) -> tuple[Block, dict[str, int]]:
     """Returns one of ``substeps`` physics steps, and the arrays that it needs; with 0 it does not integrate."""
     block = Block()
     qpos, qvel = names("qpos", m.nq), names("qvel", m.nv)
@@ -138,11 +142,16 @@ def _substep(m: mujoco.MjModel, substeps: int, contact_geoms: Sequence[int]) -> 
         block.set(f"force[{i}]", force)
     solver = NewtonSolver(tree, pairs(m), contact_geoms)
     solver.write(block, (qpos, qvel, cells("qacc", m.nv)))
-    if solver.touch or contact_geoms:
+    history = bool(contact_geoms) and contact_rows > 1
+    if history:
+        first, end = ("step", "step + 1") if substeps else ("0", f"{contact_rows}")
+        with block.scope(f"for (int row = {first}; row < {end}; ++row)") as each:
+            solver.read_contact_forces(each, "row")
+    if solver.touch or (contact_geoms and not history):
         with block.scope(f"if (step == {max(substeps - 1, 0)})") as last:
             if solver.touch:
                 solver.read_touch(last)
-            if contact_geoms:
+            if contact_geoms and not history:
                 solver.read_contact_forces(last)
     if substeps:
         _integrate(block, m, tree)

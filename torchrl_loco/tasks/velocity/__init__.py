@@ -317,8 +317,8 @@ class Velocity(LocoEnv):
         if "angular_momentum" in self.weights:
             terms["angular_momentum"] = squares(angular_momentum(s))
         if "self_collision" in self.weights:
-            hard = s.contact_force([self.own_geoms]).norm(dim=-1) > HARD_CONTACT
-            terms["self_collision"] = self.config.substeps * hard.any(-1).float()
+            hard = s.contact_force([self.own_geoms], history=True).norm(dim=-1) > HARD_CONTACT
+            terms["self_collision"] = hard.any(-1).float().sum(-1)
         return terms
 
     def terminated(self, s: "View") -> torch.Tensor:
