@@ -34,12 +34,14 @@ SOLIDS = {
 }
 """Shapes, and how many contacts with a plane they have at most."""
 PRISM = " ".join(
-    f"{0.1 * np.cos(a):.4f} {0.08 * np.sin(a):.4f} {z}" for a in np.arange(0.1, 6.2, 0.8) for z in (-0.03, 0.04)
+    f"{size * np.cos(a):.4f} {0.8 * size * np.sin(a):.4f} {z}"
+    for a in np.arange(0.1, 6.2, 0.8)
+    for size, z in ((0.1, -0.03), (0.1, 0.04), (0.05, 0.0))
 )
 MESHES = f'''
 <asset><mesh name="prism" vertex="{PRISM}"/><mesh name="bowl" builtin="hemisphere" params="3" scale=".1 .1 .1"/></asset>
 '''
-"""A prism over eight corners, and many small faces with one that is large."""
+"""A prism over eight corners with as many points inside, and many small faces with one that is large."""
 
 
 @pytest.fixture(autouse=True)

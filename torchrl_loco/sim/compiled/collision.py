@@ -258,7 +258,7 @@ class Mesh:
     """The convex hull of a mesh, as a plane meets it.
 
     Attributes:
-        vertices: those of the mesh, ``(n, 3)`` (m).
+        vertices: those of the hull, ``(n, 3)`` (m).
         corners: for each vertex its corners: the normal of a face, and those of its other vertices that are in contact
             with a plane where this one is the lowest, up to three.
     """
@@ -268,18 +268,20 @@ class Mesh:
 
     @classmethod
     def of(cls, m: mujoco.MjModel, mesh: int) -> "Mesh":
-        """Returns a mesh of a model."""
+        """Returns a mesh of a model, without the vertices that lie inside of its hull."""
         first = int(m.mesh_vertadr[mesh])
-        vertices = m.mesh_vert[first : first + m.mesh_vertnum[mesh]].astype(float)
+        outside = np.flatnonzero(m.mesh_polymapnum[first : first + m.mesh_vertnum[mesh]])
+        vertices = m.mesh_vert[first + outside].astype(float)
+        place = {int(vertex): i for i, vertex in enumerate(outside)}
         corners: list[list[tuple[np.ndarray, list[int]]]] = []
-        for vertex in range(len(vertices)):
+        for vertex in outside:
             start = m.mesh_polymapadr[first + vertex]
             faces = m.mesh_polyadr[mesh] + m.mesh_polymap[start : start + m.mesh_polymapnum[first + vertex]]
             corners.append([])
             for face in faces:
                 start = m.mesh_polyvertadr[face]
-                around = m.mesh_polyvert[start : start + m.mesh_polyvertnum[face]].tolist()
-                at = around.index(vertex)
+                around = [place[int(i)] for i in m.mesh_polyvert[start : start + m.mesh_polyvertnum[face]]]
+                at = around.index(place[int(vertex)])
                 corners[-1].append((m.mesh_polynormal[face], _widest(vertices, around[at:] + around[:at])[1:]))
         return cls(vertices, corners)
 
