@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
+import os
 import re
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -469,3 +471,131 @@ def test_commands_are_set_in_play_alone_and_have_three_numbers(play, many):
         many.set_command((1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match=r"\(3,\) or \(16, 3\)"):
         play.set_command((1.0, 0.0))
+
+
+# Robots of users.
+
+
+class Table(velocity.Velocity):
+    """A table for a robot with four joints, which stands on two feet."""
+
+    model = """
+<mujoco>
+  <asset><mesh name="shell" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    <body name="trunk" pos="0 0 .33">
+      <freejoint/><geom type="box" size=".1 .1 .05" mass="2"/>
+      <geom type="mesh" mesh="shell" contype="0" conaffinity="0"/>
+      <body name="left" pos="0 .08 0">
+        <joint name="left_hip" axis="0 1 0" range="-60 60"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.15" size=".02" contype="0" conaffinity="0"/>
+        <body name="left_shank" pos="0 0 -.15"><joint name="left_knee" axis="0 1 0" range="-90 90"/>
+          <geom name="left_foot" type="capsule" fromto="-.04 0 -.15 .04 0 -.15" size=".02"/>
+          <site name="left_sole" pos="0 0 -.17"/></body></body>
+      <body name="right" pos="0 -.08 0">
+        <joint name="right_hip" axis="0 1 0" range="-60 60"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.15" size=".02" contype="0" conaffinity="0"/>
+        <body name="right_shank" pos="0 0 -.15"><joint name="right_knee" axis="0 1 0" range="-90 90"/>
+          <geom name="right_foot" type="capsule" fromto="-.04 0 -.15 .04 0 -.15" size=".02"/>
+          <site name="right_sole" pos="0 0 -.17"/></body></body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position joint="left_hip" kp="20" kv=".5" forcerange="-10 10"/>
+    <position joint="left_knee" kp="20" kv=".5" forcerange="-10 10"/>
+    <position joint="right_hip" kp="20" kv=".5" forcerange="-10 10"/>
+    <position joint="right_knee" kp="20" kv=".5" forcerange="-10 10"/>
+  </actuator>
+  <keyframe><key name="home" qpos="0 0 .33 1 0 0 0 .2 -.4 .2 -.4"/></keyframe>
+</mujoco>"""
+    memory = velocity.memory(joints=4, feet=2)
+    base = trunk = "trunk"
+    feet = {"left_sole": "left_foot", "right_sole": "right_foot"}
+    stand = walk = run = {".*": 0.3}
+    step_height = 0.05
+
+
+def test_a_table_makes_a_task_of_a_users_robot(caplog):
+    env = Table(4, "cpu", 0)
+    assert env.rollout(40, break_when_any_done=False)["next", "observation"].isfinite().all()
+    assert "meshes without contacts are drawn and touch nothing: shell" in caplog.text
+    with pytest.raises(TypeError, match="Bare must set base, trunk, feet, stand, walk, run"):
+        type("Bare", (velocity.Velocity,), {"model": Table.model})(1, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<freejoint/>", '<joint type="slide"/>', "first joint must be a free joint of the base 'trunk'"),
+        ('position joint="left_hip" kp="20" kv=".5"', 'motor name="m" joint="left_hip"', r"must be servos, .*: m"),
+        (' forcerange="-10 10"', "", "actuators need a forcerange, or Table an action_scale"),
+        ('range="-90 90"', "", "joints need a range: left_knee, right_knee"),
+        ('name="home" ', "", "a keyframe 'home'"),
+    ],
+)
+def test_a_model_that_the_formulas_do_not_fit_is_refused(old, new, message):
+    model = Table.model.replace(old, new)
+    if "slide" in new:
+        model = model.replace("0 0 .33 1 0 0 0 .2", "0 .2")
+    with pytest.raises(ValueError, match=message):
+        type("Table", (Table,), {"model": model})(1, "cpu")
+
+
+def of_menagerie(folder, scene, base, trunk, feet):
+    """Returns a model of Menagerie as the recipe needs it: with servos, a home pose, and sites and names of feet."""
+    spec = mujoco.MjSpec.from_file(str(folder / scene))
+    for actuator in spec.actuators:
+        if actuator.biastype == mujoco.mjtBias.mjBIAS_NONE:
+            actuator.forcerange = actuator.ctrlrange
+            actuator.set_to_position(kp=actuator.ctrlrange[1], kv=0.03 * actuator.ctrlrange[1])
+    for mesh in spec.meshes:
+        mesh.maxhullvert = 64
+    if "home" not in [key.name for key in spec.keys]:
+        spec.keys[0].name = "home"
+    found = {}
+    for foot, body in feet.items():
+        geoms = [
+            g for g in spec.body(body).geoms if g.contype and (g.name == foot or foot not in ("FL", "FR", "RL", "RR"))
+        ]
+        for i, geom in enumerate(geoms):
+            geom.name = f"{foot}_{i}"
+        spec.body(body).add_site(name=f"{foot}_sole", pos=geoms[0].pos)
+        found[f"{foot}_sole"] = rf"{foot}_\d+"
+    table = {"model": spec, "base": base, "trunk": trunk, "feet": found, "action_scale": 0.25, "randomize": []}
+    joints = velocity.actuated(spec.compile())
+    return type("Menagerie", (Table,), {**table, "memory": velocity.memory(len(joints), len(found))})
+
+
+LEGS = {leg: f"{leg}_calf" for leg in ("FL", "FR", "RL", "RR")}
+SIDES = ("left", "right")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("MUJOCO_MENAGERIE" not in os.environ, reason="MUJOCO_MENAGERIE names no checkout of Menagerie")
+@pytest.mark.parametrize(
+    ("scene", "contacts", "base", "trunk", "feet"),
+    [
+        ("unitree_go2/scene_mjx.xml", "all", "base", "base", LEGS),
+        ("unitree_go2/scene.xml", "ground", "base", "base", LEGS),
+        ("unitree_g1/scene.xml", "ground", "pelvis", "torso_link", {s: f"{s}_ankle_roll_link" for s in SIDES}),
+        ("unitree_h1/scene.xml", "ground", "pelvis", "torso_link", {s: f"{s}_ankle_link" for s in SIDES}),
+    ],
+)
+def test_a_robot_of_menagerie_does_the_same_task(scene, contacts, base, trunk, feet, caplog):
+    cls = of_menagerie(Path(os.environ["MUJOCO_MENAGERIE"]), scene, base, trunk, feet)
+    env = cls(4, "cpu", 0, contacts=contacts, play=True, iterations=100, ls_iterations=50)
+    assert "meshes without contacts are drawn" in caplog.text
+    assert env.engine == "compiled"
+    td = env.reset()
+    for _ in range(10):
+        before, action = env.get_state(), 0.3 * torch.randn(env.action_spec.shape)
+        td = env.step(td.set("action", action))["next"].exclude("reward", "reward_terms")
+    m, d, error = env.sim.mj_model, mujoco.MjData(env.sim.mj_model), []
+    for world in range(4):
+        d.qpos[:], d.qvel[:], d.ctrl[:] = before["qpos"][world], before["qvel"][world], env.sim.ctrl[world]
+        d.qacc_warmstart[:] = before["qacc_warmstart"][world]
+        for _ in range(env.config.substeps):
+            mujoco.mj_step(m, d)
+        error.append(np.abs(env.sim.qpos[world].numpy() - d.qpos).max())
+    assert np.median(error) < 1e-4

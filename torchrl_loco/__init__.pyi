@@ -40,6 +40,7 @@ from .tasks.velocity import G1Velocity as G1Velocity
 from .tasks.velocity import Go1Velocity as Go1Velocity
 from .tasks.velocity import Go2Velocity as Go2Velocity
 from .tasks.velocity import H1Velocity as H1Velocity
+from .tasks.velocity import Velocity as Velocity
 from .tasks.walker import WalkerRun as WalkerRun
 from .tasks.walker import WalkerStand as WalkerStand
 from .tasks.walker import WalkerWalk as WalkerWalk

@@ -161,6 +161,7 @@ class LocoEnv(EnvBase):
         nan_dump = None if nan_dump is None else check_output_file("nan_dump", nan_dump)
         varys = check_randomize("randomize", self.randomize if randomize is None else randomize)
         mj_model = models.load(self.model, folder_of(type(self)))
+        self.check_model(mj_model)
         variation = Variation(varys, mj_model, device) if varys else None
 
         super().__init__(device=device, batch_size=[] if num_envs is None else [worlds])
@@ -243,6 +244,14 @@ class LocoEnv(EnvBase):
                     f"{table.__name__}.initial_states is not used, since an inherited pose_func draws the states: "
                     f"set pose_func = torchrl_loco.LocoEnv.pose_func in {table.__name__}"
                 )
+
+    @classmethod
+    def check_model(cls, mj_model: mujoco.MjModel) -> None:
+        """Checks that a model has what the task takes for granted; by default nothing.
+
+        Raises:
+            ValueError: it has not.
+        """
 
     def __repr__(self) -> str:
         num_envs = self.num_envs if self.batch_size else None

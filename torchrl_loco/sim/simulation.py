@@ -129,6 +129,7 @@ class Simulation:
     ) -> None:
         warn_of_integrator(mj_model, config)
         set_options(mj_model, config)
+        say_what_is_only_seen(mj_model)
         geoms = check_geoms(mj_model, contact_geoms)
         differing = varied if varied is not None and varied.count else None
         self.engine_choice = name, _ = choose_engine(mj_model, config, differing)
@@ -324,6 +325,20 @@ def warn_of_integrator(mj_model: mujoco.MjModel, config: SimConfig) -> None:
             "the model's integrator %s is replaced by %s, which config names: pass integrator=... to choose another",
             named,
             config.integrator,
+        )
+
+
+def say_what_is_only_seen(mj_model: mujoco.MjModel) -> None:
+    """Says in the log which meshes touch nothing: robots have them for their looks, or lack primitives."""
+    m = mj_model
+    mesh, masks = int(mujoco.mjtGeom.mjGEOM_MESH), m.geom_contype | m.geom_conaffinity
+    seen = [g for g in range(m.ngeom) if m.geom_type[g] == mesh and not masks[g]]
+    seen = [g for g in seen if g not in m.pair_geom1 and g not in m.pair_geom2]
+    if seen:
+        names = [m.geom(g).name or m.mesh(int(m.geom_dataid[g])).name for g in seen]
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+        logging.getLogger("torchrl_loco").warning(
+            "geoms that are meshes without contacts are drawn and touch nothing: %s%s", ", ".join(names[:3]), more
         )
 
 

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).parent
 LEGS = ("FR", "FL", "RR", "RL")
+FREE, JOINT = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtTrn.mjTRN_JOINT)
+FIXED, AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
+TABLE = ("base", "trunk", "feet", "stand", "walk", "run")
+"""What a robot sets beside what every task does."""
 
 CURRICULUM: dict[int, commands.Ranges] = {
     0: ((-1.0, 1.0), (-1.0, 1.0), (-0.5, 0.5)),
@@ -44,8 +48,6 @@ START_HEIGHT = (0.01, 0.05)
 """Least and greatest height above the home pose at the start (m)."""
 STANDS, RUNS = 0.05, 1.5
 """Speed of a command (m/s + rad/s) up to which a robot stands, and from which it runs."""
-STEP_HEIGHT = 0.1
-"""Height of a foot in mid-swing (m)."""
 UPSIDE = math.cos(math.radians(70.0))
 """Cosine of the tilt at which a trunk has fallen."""
 HARD_CONTACT = 10.0
@@ -95,7 +97,10 @@ def soft(geoms: str) -> list[Vary]:
 class Velocity(LocoEnv):
     """What robots that follow a velocity command share; a robot sets the attributes without a value.
 
-    The command is a velocity forward and to the left (m/s) and a yaw rate (rad/s), drawn anew every 3 to 8 s.
+    The command is a velocity forward and to the left (m/s) and a yaw rate (rad/s), drawn anew every 3 to 8 s. The base
+    must have the first joint, a free one; actuators must be servos of joints with a range; the pose is kept around the
+    keyframe ``home``. A robot also sets ``memory = velocity.memory(joints=..., feet=...)``, and ``randomize``, for
+    which :func:`sliding`, :func:`soft` and :func:`com` make entries.
 
     Args:
         num_envs: as for :class:`~torchrl_loco.LocoEnv`, like all arguments but ``play``.
@@ -165,6 +170,8 @@ class Velocity(LocoEnv):
     """Weights of the reward's terms."""
     curriculum: ClassVar[dict[int, commands.Ranges]] = CURRICULUM
     """Ranges of the commands by the control step of training from which they hold."""
+    step_height: ClassVar[float] = 0.1
+    """Height of a foot in mid-swing (m)."""
     own_geoms: ClassVar[str] = ""
     """Regular expression of the geoms of which ``self_collision`` counts the contacts."""
 
@@ -201,6 +208,47 @@ class Velocity(LocoEnv):
             raise ValueError(f"command must have shape (3,) or ({self.num_envs}, 3), got {tuple(rows.shape)}")
         self._set.copy_(rows)
         self._is_set.fill_(command is not None)
+
+    @classmethod
+    def check_class(cls) -> None:
+        """Checks the table of the robot beside what :meth:`torchrl_loco.LocoEnv.check_class` does.
+
+        Raises:
+            TypeError: an attribute is missing.
+        """
+        missing = [name for name in TABLE if not hasattr(cls, name)]
+        if missing:
+            raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.Velocity)")
+        super().check_class()
+
+    @classmethod
+    def check_model(cls, mj_model: mujoco.MjModel) -> None:
+        """Checks what the formulas take for granted of a robot.
+
+        Raises:
+            ValueError: the base does not float first, an actuator is no servo or has no greatest force, a joint has no
+                range, or there is no home pose.
+        """
+        m, wrong = mj_model, []
+        if m.njnt == 0 or m.jnt_type[0] != FREE or m.body(m.jnt_bodyid[0]).name != cls.base:
+            wrong.append(f"its first joint must be a free joint of the base {cls.base!r}")
+        of_joint = (m.actuator_trntype == JOINT) & (m.actuator_gaintype == FIXED) & (m.actuator_biastype == AFFINE)
+        gain, stiffness = m.actuator_gainprm[:, 0], -m.actuator_biasprm[:, 1]
+        servo = of_joint & (gain > 0) & np.isclose(gain, stiffness)
+        names = [m.actuator(i).name for i in range(m.nu)]
+        if not servo.all() or m.nu == 0:
+            wrong.append(f"actuators must be servos, as a spec's set_to_position(kp) makes them{_some(names, ~servo)}")
+        strong = m.actuator_forcelimited.astype(bool) & (m.actuator_forcerange[:, 1] > 0)
+        if cls.action_scale is None and not strong.all():
+            wrong.append(f"actuators need a forcerange, or {cls.__name__} an action_scale{_some(names, ~strong)}")
+        if servo.all():
+            moved = m.actuator_trnid[:, 0]
+            free = m.jnt_limited[moved] == 0
+            wrong += [f"joints need a range{_some(actuated(m), free)}"] if free.any() else []
+        if not models.has_home(m):
+            wrong.append("it needs a keyframe 'home', the pose around which actions move the joints")
+        if wrong:
+            raise ValueError(f"the model of {cls.__name__} does not do for this task: {'; '.join(wrong)}")
 
     # What hooks share.
 
@@ -307,8 +355,8 @@ class Velocity(LocoEnv):
             "pose": torch.exp(-(stray / spread).square().mean(-1)),
             "joint_limits": beyond.clamp(min=0.0).sum(-1),
             "action_rate": squares(s.action - s.last_action),
-            "foot_clearance": moves * ((heights - STEP_HEIGHT).abs() * slides.sqrt()).sum(-1),
-            "foot_swing_height": moves * (landed * (s.peak / STEP_HEIGHT - 1.0).square()).sum(-1),
+            "foot_clearance": moves * ((heights - self.step_height).abs() * slides.sqrt()).sum(-1),
+            "foot_swing_height": moves * (landed * (s.peak / self.step_height - 1.0).square()).sum(-1),
             "foot_slip": moves * (touching * slides).sum(-1),
             "soft_landing": moves * (landed * self.forces(s).norm(dim=-1)).sum(-1),
         }
@@ -390,6 +438,12 @@ class Velocity(LocoEnv):
 def actuated(m: mujoco.MjModel) -> list[str]:
     """Returns the names of a model's actuated joints, in the order of the actuators."""
     return [m.joint(int(joint)).name for joint in m.actuator_trnid[:, 0]]
+
+
+def _some(names: list[str], which: np.ndarray) -> str:
+    """Returns the names of the first elements of a mask, for a message."""
+    chosen = [name for name, yes in zip(names, which, strict=True) if yes]
+    return f": {', '.join(chosen[:3])}{f' and {len(chosen) - 3} more' if len(chosen) > 3 else ''}" if chosen else ""
 
 
 def squares(values: torch.Tensor) -> torch.Tensor:
