@@ -41,6 +41,14 @@ add("hooks", "what a task in plain torch costs beside the physics", small)
 commands.choices["hooks"].add_argument("--task", required=True, help="id, or file.py:Class")
 add("soak", "millions of steps under hostile actions and states", small)
 commands.choices["soak"].add_argument("--frames", type=float, default=1e5 if DEVICE == "cpu" else 5e7)
+falls = commands.add_parser(
+    "rollouts", help="episodes of random actions that no fall ends: what is lost, how fast it gets"
+)
+falls.add_argument("--tasks", nargs="+", choices=list_envs(), default=[t for t in list_envs() if "velocity" in t])
+falls.add_argument("--worlds", type=int, default=small[0])
+falls.add_argument("--frames", type=float, default=1e7, help="steps of each task, over all worlds")
+falls.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
+falls.add_argument("--out", type=Path, help="file for the results as JSON")
 for name, further, default in (("throughput", {}, list(CASES)), ("profile", LEARNING, ["env_step_and_maybe_reset"])):
     commands.choices[name].add_argument("--cases", nargs="+", choices=[*CASES, *VARIANTS, *further], default=default)
 commands.choices["peers"].add_argument("--path", type=Path, help="folder that the peers' packages were installed in")
@@ -122,6 +130,10 @@ elif args.command == "soak":
     from benchmarks.soak import COLUMNS, soak
 
     rows = soak(args.bodies, args.worlds[0], int(args.frames), args.device)
+elif args.command == "rollouts":
+    from benchmarks.rollouts import COLUMNS, rollouts
+
+    rows = rollouts(args.tasks, args.worlds, int(args.frames), args.device)
 elif args.command == "scaling":
     from benchmarks.scaling import COLUMNS, scaling
 

@@ -8,10 +8,12 @@ import sys
 import threading
 from pathlib import Path
 
+import mujoco
 import pytest
 import torch
+from hook_tasks import FollowVelocity
 
-from benchmarks import cases, coverage, fidelity, plot, scaling, soak, suite, timing
+from benchmarks import cases, coverage, fidelity, plot, rollouts, scaling, soak, suite, timing
 from benchmarks.cases import until_interrupted
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
@@ -119,6 +121,27 @@ def test_soak_compares_the_counters_with_what_happened(monkeypatch):
     monkeypatch.setattr(soak.LocoEnv, "health", lambda env: {"total": {"non_finite": torch.tensor(3)}})
     with pytest.raises(AssertionError):
         soak.soak(["walker"], 32, 40 * 32, torch.device("cpu"))
+
+
+@pytest.mark.slow
+def test_rollouts_count_what_lies_and_how_much_it_moves():
+    """Of a robot that would have ended its episodes; its kinetic energy is that of C MuJoCo."""
+    task = rollouts.lying(FollowVelocity)
+    env = task(6, "cpu", 0, episode_length=60)
+    env.reset()
+    state = env.get_state()
+    state["qpos"][:3, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])  # on their backs
+    td = env.reset(state, set_state=True)
+    for _ in range(50):
+        td = env.step(td.set("action", 4 * torch.randn(env.action_spec.shape)))["next"].exclude("reward")
+    m, d = env.mj_model, mujoco.MjData(env.mj_model)
+    for world in range(6):
+        d.qpos[:], d.qvel[:] = env.sim.qpos[world], env.sim.qvel[world]
+        mujoco.mj_forward(m, d)
+        mujoco.mj_energyVel(m, d)
+        assert td["energy"][world].item() == pytest.approx(d.energy[1], rel=1e-4)
+    assert (env.sim.xmat[:3, 1, 2, 2] < 0).all()
+    assert not td["done"].any()
 
 
 @pytest.mark.ci
