@@ -434,6 +434,7 @@ def test_episodes_start_near_home_above_the_ground(many):
 @pytest.mark.parametrize(("name", "low", "high"), [("go1", 0.3, 1.5), ("g1", 0.3, 1.2), ("h1", 0.3, 1.2)])
 def test_worlds_differ_in_friction_and_mass(robot, name, low, high):
     env = robot(name)
+    env.reset()  # before, all have the numbers of the model
     friction, ipos, m = env.model_value("geom_friction"), env.model_value("body_ipos"), env.mj_model
     feet = [geom for geom in range(m.ngeom) if "_foot" in m.geom(geom).name]
     sliding = friction[:, feet, 0]
