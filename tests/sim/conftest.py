@@ -4,6 +4,14 @@ import warp as wp
 from torchrl_loco.sim.compiled import step
 
 
+@pytest.fixture(autouse=True)
+def texts_anew():
+    """Tests here change constants of the compiled step."""
+    step.texts.clear()
+    yield
+    step.texts.clear()
+
+
 @pytest.fixture(params=[31, 0], ids=["traced", "lanes"])
 def form(request, monkeypatch):
     """Takes one of the two forms of the compiled step for any model; compiled without optimisation, it is quick."""

@@ -13,8 +13,9 @@ from mujoco_warp import OverflowType
 import torchrl_loco
 from torchrl_loco.config import SimConfig, sim_config
 from torchrl_loco.sim import Simulation, models
-from torchrl_loco.sim.compiled import collision, dense_contacts, lanes, unsupported
+from torchrl_loco.sim.compiled import collision, dense_contacts, lanes, step, unsupported
 from torchrl_loco.sim.simulation import choose_engine
+from torchrl_loco.sim.varied import Varied
 
 BODY = '<body name="arm"><joint name="elbow" damping="1"/><geom name="hand" type="capsule" size="0.1 0.2"/></body>'
 BALL = '<body name="ball" pos="1 0 1"><freejoint name="loose"/><geom name="marble" size="0.1"/></body>'
@@ -368,6 +369,7 @@ ROW = "".join(f'<body name="{i or "root"}" pos="0 0 {0.19 * i}">{SLIDE}</body>' 
 
 def column(places, monkeypatch, qpos, qvel):
     """Returns the simulation after a control step, with so many places for contacts between moving bodies."""
+    step.texts.clear()
     with monkeypatch.context() as patched:
         patched.setattr(dense_contacts, "MAX_DENSE", places)
         patched.setattr(lanes, "ENOUGH_FRICTIONAL", places)
@@ -413,6 +415,29 @@ def test_a_dropped_contact_is_reported_with_what_helps():
     assert env.health()["worlds", "contact_overflow"].tolist() == [0, 1, 0]
     with pytest.warns(torchrl_loco.PhysicsOverflowWarning, match="contacts were dropped in 1 .*engine='mujoco_warp'"):
         env.close()
+
+
+def test_a_text_is_kept_for_a_model_with_the_same_numbers_alone():
+    body = '<body><joint axis="0 1 0"/><geom size="0.1" pos="0 0 1"/></body>'
+    model, same = (mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>") for _ in "ab")
+    varied = step.VariedModel(model, Varied(model, {"body_mass": [1]}))
+    other = step.VariedModel(model, Varied(model, {"dof_damping": [0]}))
+    options = {"with_cvel": False, "with_subtree_com": False, "contact_geoms": ()}
+
+    def texts():
+        return [
+            *(step.kept_source(m, 1, **options) for m in (model, varied, other)),
+            step.kept_source(model, 2, **options),
+            *(step.kept_source(model, 1, **{**options, name: True}) for name in ("with_cvel", "with_subtree_com")),
+            step.kept_source(model, 1, **{**options, "contact_geoms": (0,)}),
+        ]
+
+    first = texts()
+    assert len(set(first)) == len(first)
+    assert all(one is other for one, other in zip(texts(), first, strict=True))
+    assert step.kept_source(same, 1, **options) is first[0] == step.source(model, 1)
+    same.dof_damping[0] = 1e-3
+    assert step.kept_source(same, 1, **options) == step.source(same, 1) != first[0]
 
 
 def test_settings_of_room_change_nothing():

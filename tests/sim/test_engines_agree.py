@@ -11,6 +11,7 @@ import torchrl_loco
 from torchrl_loco import State
 from torchrl_loco.sim import models
 from torchrl_loco.sim.compiled import collision
+from torchrl_loco.sim.compiled.step import texts
 from torchrl_loco.sim.simulation import set_options
 
 WORLDS, AGES = 128, (10, 30, 50, 80)
@@ -82,6 +83,7 @@ def test_converged_steps_agree_with_c_mujoco(shared, states, monkeypatch):
     if task.startswith("humanoid"):
         assert np.quantile(np.abs(after(env, state, action) - expected), 0.95) > 1e-5
         monkeypatch.setattr(collision, "UPRIGHT", 1e-6)
+        texts.clear()
         monkeypatch.setattr(wp.config, "optimization_level", 0)  # it is compiled for this test alone
         env = torchrl_loco.make(task, len(state), "cpu", protocol="dm_control")
     assert_agree(after(env, state, action), expected)

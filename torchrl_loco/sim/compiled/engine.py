@@ -17,9 +17,9 @@ from torchrl_loco.sim.compiled.read_only import ReadOnly, read_only
 from torchrl_loco.sim.compiled.step import (
     WARP,
     check_worlds,
+    kept_source,
     launch_size,
     nominal_row,
-    source,
     structure_of_arrays,
 )
 from torchrl_loco.sim.varied import Varied
@@ -366,7 +366,7 @@ class CompiledEngine:
         if key not in self._kernels:
             asked: dict[str, Any] = {f"with_{name}": outputs[name] is not None for name in LATER}
             asked |= {"contact_geoms": contact_geoms, "contact_rows": self._contact_rows}
-            text = source(self._mj_model, substeps, **asked)
+            text = kept_source(self._mj_model, substeps, **asked)
             start, end = Chain(before), Chain(after)
             self._kernels[key] = _kernel(text, start.func, start.struct, end.func, end.struct), start, end
         kernel, start, end = self._kernels[key]

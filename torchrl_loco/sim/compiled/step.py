@@ -1,5 +1,6 @@
 """A control step of one model as one function of C++: all substeps of a world, then what an observation reads."""
 
+import hashlib
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ import warp as wp
 
 from torchrl_loco.sim.compiled import lanes, traced
 from torchrl_loco.sim.compiled.collision import needs_lanes
-from torchrl_loco.sim.compiled.parameters import VariedModel
+from torchrl_loco.sim.compiled.parameters import VariedModel, nominal
 
 TRACED_DOFS = 16
 """Most degrees of freedom of a body that is traced. A thread holds its state; for the humanoid that would be 12 KiB and
@@ -25,6 +26,12 @@ and more warps wait for each other's instructions (measured)."""
 MANY = 2
 """Above this multiple of the worlds that fill those warps, observation and bookkeeping run in kernels of their own:
 they wait for memory, and the registers of the physics leave too few warps to hide that."""
+
+MOST_TEXTS = 32
+"""Texts of steps that a process keeps."""
+
+texts: dict[tuple, str] = {}
+"""The texts that were written last, by all that they depend on but the constants of this package."""
 
 
 def is_traced(m: mujoco.MjModel) -> bool:
@@ -85,6 +92,32 @@ def source(
     if not is_traced(m):  # lanes write cvel wherever there is an array for it
         return lanes.source(m, substeps, **asked)
     return traced.source(m, substeps, with_cvel=with_cvel, **asked)
+
+
+def kept_source(m: mujoco.MjModel, substeps: int, **options: Any) -> str:
+    """Returns :func:`source`, which is written once for environments of the same model: it takes up to half a second.
+
+    Args:
+        m: the model, or a ``VariedModel``.
+        substeps: physics steps.
+        options: those of :func:`source`, which can be hashed.
+    """
+    key = _fingerprint(m), substeps, *sorted(options.items())
+    if key not in texts:
+        texts[key] = source(m, substeps, **options)
+        if len(texts) > MOST_TEXTS:
+            del texts[next(iter(texts))]
+    return texts[key]
+
+
+def _fingerprint(m: mujoco.MjModel) -> bytes:
+    """Returns a hash of all numbers of a model, and of which of them vary."""
+    whole = np.empty(mujoco.mj_sizeModel(nominal(m)), dtype=np.uint8)
+    mujoco.mj_saveModel(nominal(m), None, whole)
+    digest = hashlib.sha256(whole.tobytes())
+    if isinstance(m, VariedModel):
+        digest.update(repr([(name, places.tolist()) for name, places in m.varied.places.items()]).encode())
+    return digest.digest()
 
 
 def nominal_row(m: VariedModel) -> np.ndarray:
