@@ -70,25 +70,29 @@ def test_layers_that_a_file_cannot_hold(tmp_path):
 
 
 def test_round_trip(policy, shared, tmp_path):
-    policy.save(tmp_path / "policy.safetensors", half=True)
+    policy.save(tmp_path / "policy.safetensors", small=True)
     whole = tmp_path / "whole.safetensors"
     policy.save(whole)
     assert whole.stat().st_size > 1.5 * (tmp_path / "policy.safetensors").stat().st_size
+    for stored, layer in zip(Policy.load(tmp_path / "policy.safetensors", "cpu").module, policy.module, strict=True):
+        if isinstance(layer, nn.Linear):
+            error = (stored.weight - layer.weight).abs() / layer.weight.abs().amax(dim=1, keepdim=True)
+            assert 0 < error.max() <= 0.5001 / 127
     again = Policy.load(tmp_path / "policy.safetensors", "cpu")
     assert again.info == INFO
     assert not any(parameter.requires_grad for parameter in again.parameters())
     env = shared("walker_run", 16)
     td = env.reset()
-    torch.testing.assert_close(again(td.clone())["action"], policy(td.clone())["action"], atol=1e-3, rtol=0)
+    torch.testing.assert_close(again(td.clone())["action"], policy(td.clone())["action"], atol=2e-2, rtol=0)
     assert env.rollout(3, again)["action"].abs().max() <= 1
 
 
 def test_large_observations_survive_a_file(tmp_path):
-    """Half precision ends at 65504, and a variance may be larger."""
+    """A variance may be larger than a small file's weights can be exact to."""
     norm, center = ObservationNorm(2), torch.tensor([1e5, 3000.0])
     norm.update(torch.randn(1000, 2) * 1000 + center)
     policy = Policy(nn.Sequential(norm, nn.Linear(2, 1), nn.Tanh()), {})
-    policy.save(tmp_path / "policy.safetensors", half=True)
+    policy.save(tmp_path / "policy.safetensors", small=True)
     seen = torch.randn(50, 2) * 1000 + center
     again = Policy.load(tmp_path / "policy.safetensors", "cpu")
     torch.testing.assert_close(again(observation=seen), policy(observation=seen), atol=2e-3, rtol=0)
@@ -143,7 +147,7 @@ SHIPPED = [(name, protocol) for protocol in PROTOCOLS for name in shipped_polici
 def test_shipped_policies_are_small_and_belong_to_their_task_and_protocol():
     assert {protocol for _, protocol in SHIPPED} == set(PROTOCOLS)
     for name, protocol in SHIPPED:
-        assert shipped_policies(protocol)[name].stat().st_size < 1e6
+        assert shipped_policies(protocol)[name].stat().st_size < 4e5
         policy = torchrl_loco.load_policy(name, "cpu", protocol)
         assert (policy.info["task"], policy.info["protocol"]) == (name, protocol)
         env_class = torchrl_loco.registry.env_class(name)

@@ -97,25 +97,23 @@ class Policy(TensorDictModule):
         """Whether all actions lie in [-1, 1]: whether the last layer is a tanh."""
         return isinstance(self.module[-1], nn.Tanh)
 
-    def save(self, path: Path, half: bool = False) -> None:
+    def save(self, path: Path, small: bool = False) -> None:
         """Writes the policy to a file.
 
         Args:
             path: where to.
-            half: whether to store weights in half precision, which halves the file and changes an action by some
-                thousandths at most. The observation's statistics, whose range is larger, stay in single precision.
+            small: whether to store a linear layer's weights in 8 bits each, as shares of the largest of their row: a
+                quarter of the size, for errors of 0.4 % of that at most. All else stays in single precision.
 
         Raises:
             TypeError: a layer is of a kind that a file cannot hold.
         """
         layers = layers_of(self.module)
-        tensors = {
-            f"{i}.{name}": tensor.to(
-                torch.float16 if half and not isinstance(layer, ObservationNorm) else torch.float32
-            )
-            for i, layer in enumerate(layers)
-            for name, tensor in layer.state_dict().items()
-        }
+        tensors: dict[str, torch.Tensor] = {}
+        for i, layer in enumerate(layers):
+            for name, tensor in layer.state_dict().items():
+                rounded = small and isinstance(layer, nn.Linear) and name == "weight"
+                tensors |= _in_8_bits(f"{i}.{name}", tensor) if rounded else {f"{i}.{name}": tensor.float()}
         storage.save(path, "policy", tensors, {"layers": [_description(layer) for layer in layers], "info": self.info})
 
     @classmethod
@@ -135,7 +133,8 @@ class Policy(TensorDictModule):
         """
         device = check_device(device)
         tensors, settings = storage.load(path, "policy")
-        tensors = {name: tensor.float() for name, tensor in tensors.items()}
+        scales = {name: tensors.pop(name) for name in list(tensors) if name.endswith(SCALE)}
+        tensors = {name: tensor.float() * scales.get(name + SCALE, 1.0) for name, tensor in tensors.items()}
         try:
             descriptions = settings["layers"]
             of_each: list[dict[str, torch.Tensor]] = [{} for _ in descriptions]
@@ -148,6 +147,17 @@ class Policy(TensorDictModule):
         except (ValueError, LookupError, TypeError, RuntimeError) as error:
             raise ValueError(f"{path} cannot be read as a policy: {error}") from error
         return cls(network.to(device).requires_grad_(False), info)
+
+
+SCALE = ".scale"
+"""What a file adds to the name of weights in 8 bits, for what to multiply them with."""
+
+
+def _in_8_bits(name: str, weight: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Returns weights of shape ``(outputs, inputs)`` as integers from -127 to 127, and the scales ``(outputs, 1)``."""
+    weight = weight.detach().float()
+    scale = (weight.abs().amax(dim=1, keepdim=True) / 127).clamp(min=torch.finfo(torch.float32).tiny)
+    return {name: (weight / scale).round().to(torch.int8), name + SCALE: scale}
 
 
 KINDS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
