@@ -48,7 +48,7 @@ dist: $(VENV)/installed  ## wheel and sdist, checked and tried out, into dist/
 docs: $(VENV)/installed  ## the site, into docs/_build/html; warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
 
-runners: $(VENV)/installed  ## draw the picture of the README anew, with the shipped policies
+runners: $(VENV)/installed  ## draw the moving picture of the README anew, with the shipped policies
 	PYTHONPATH=docs $(BIN)/python -m generate.runners
 
 tables: $(VENV)/installed  ## write tables and pictures of README and docs from benchmarks/results

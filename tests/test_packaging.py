@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 import yaml
 from cases import MODELS
+from generate import address
 
 import torchrl_loco
+from hatch_build import absolute, urls
 from torchrl_loco.sim import models
 
 ROOT = Path(__file__).parents[1]
@@ -73,6 +75,23 @@ def test_wheel_holds_the_package_and_nothing_else(built):
     assert "# torchrl_loco" in metadata  # the README
     assert "torchrl-loco = torchrl_loco.cli:main" in entry_points
     assert f"\nAuthor: {PROJECT['authors'][0]['name']}\n" in metadata
+    assert (built / f"{NAME}-py3-none-any.whl").stat().st_size < 6e6
+    checked = run(sys.executable, "-m", "twine", "check", "--strict", *map(str, built.iterdir()), cwd=built)
+    assert checked.count("PASSED") == 2, checked
+
+
+def test_what_follows_from_an_address():
+    """Links of the README that work on the package index, its pages, badges, and notebooks in Colab."""
+    public = "https://github.com/Someone/loco"
+    text = absolute((ROOT / "README.md").read_text(), public, "v1.2.3")
+    links = re.findall(r"\]\(([^)]+)\)", text)
+    assert all(link.startswith("https://") for link in links), links
+    assert f"({public}/raw/v1.2.3/docs/_static/runners.webp)" in text
+    assert f"({public}/blob/v1.2.3/docs/benchmarks.md#" in text
+    assert urls(public)["Documentation"] == "https://someone.github.io/loco/"
+    assert f"{public}/actions/workflows/test.yml/badge.svg" in address.badges(public)
+    assert "colab.research.google.com/github/Someone/loco/blob/main/notebooks/planning.ipynb" in address.colab(public)
+    assert (urls(""), address.badges(""), address.colab("")) == ({}, "", "")
 
 
 @pytest.mark.ci
@@ -112,4 +131,5 @@ def test_citation_agrees_with_the_package():
     assert citation["license"] == PROJECT["license"]
     assert citation["cff-version"] == "1.2.0"
     assert citation["type"] == "software"
+    assert citation.get("repository-code", "") == address.ADDRESS
     assert all(citation[key] for key in ("message", "title", "authors"))

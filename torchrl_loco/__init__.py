@@ -1,4 +1,4 @@
-"""TorchRL environments for dm_control's locomotion tasks, stepped by MuJoCo-Warp thousands of worlds at a time."""
+"""Locomotion for TorchRL on a GPU: tasks in plain torch, thousands of worlds, a MuJoCo step compiled for the body."""
 
 import lazy_loader
 

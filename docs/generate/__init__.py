@@ -18,7 +18,7 @@ def everything() -> None:
         write(fragments / f"{name}_properties.md", tasks.properties(name))
         write(fragments / f"{name}_reward.md", rewards.formula(name))
         write(fragments / f"{name}_policy.md", tasks.shipped_policy(name))
-        tasks.picture(name, OUT / "pictures" / f"{name}.png")
+        tasks.picture(name, OUT / "pictures" / f"{name}.webp")
     for body in tasks.CLASSES:
         write(fragments / f"{body}_observation.md", bodies.observation_table(body))
         write(fragments / f"{body}_action.md", bodies.action_table(body))

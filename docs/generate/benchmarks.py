@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.published import PUBLISHED, read
 from benchmarks.variation import plot_variation
+from generate import address
 from generate.markdown import table
 
 Row = dict[str, Any]
@@ -27,6 +28,10 @@ COLLECTED = (f"{DAY}/throughput.json", f"{DAY}/throughput-many.json", f"{LOOP}/t
 PEERS = (f"{LOOP}/peers.json",)
 SUITE = "2026-11-24-cpu/suite.json"
 VARIATION = "2026-11-25-h100-third/variation.json"
+TO_950 = "2026-11-23-h200-presets/time-to-return.csv"
+BRAX_TO_950 = "2026-11-21-h200/training/time-to-return.json"
+GO1 = "2026-11-25-h100/library-go1.txt"
+MJLAB = "2026-11-24-h100/mjlab.txt"
 
 
 class Measured(NamedTuple):
@@ -98,9 +103,11 @@ def tables() -> dict[str, str]:
         "steps": speeds(BODIES, STEPS) + sources(line.files for line in STEPS),
         "worlds": by_worlds() + sources(line.files for line in BY_WORLDS),
         "returns": returns() + sources([[f"{path}/results.csv" for path in runs.folders] for runs in RUNS.values()]),
-        "steps-short": speeds(("walker", "humanoid"), [line for line in STEPS if "same" not in line.label]),
-        "returns-short": returns_short(),
+        "speed": speed(),
+        "speed-sources": sources([(TO_950, BRAX_TO_950, GO1, MJLAB)]),
         "variation": variation(),
+        "badges": address.badges(),
+        "colab": address.colab(),
     }
 
 
@@ -167,19 +174,28 @@ def returns() -> str:
     return table((*columns, "shipped policy in dm_control", "published"), rows)
 
 
-def returns_short() -> str:
-    """Returns the mean returns and times of training under playground, a line for each body."""
-    by_body: dict[str, list[str]] = {}
-    for task in TASKS:
-        by_body.setdefault(task.split("_")[0], []).append(task)
-    rows = []
-    for body, tasks in by_body.items():
-        found = [(task, RUNS[task, "playground"]) for task in tasks]
-        means = [f"{_mean(seeds_of(task, 'playground', runs), 'mean'):.0f}" for task, runs in found]
-        times = [time_of_training(task, "playground", runs) for task, runs in found]
-        goals = ", ".join(task.removeprefix(f"{body}_") for task in tasks)
-        rows.append((f"{body}: {goals}", ", ".join(means), ", ".join(times)))
-    return table(("task", "return", "training (s)"), rows)
+def speed() -> str:
+    """Returns how fast the library is beside others: steps, time to a return, and training of a robot."""
+    loop, ours, playground = STEPS[0], STEPS[1], STEPS[5]
+    rows: list[tuple[str, ...]] = []
+    for body in BODIES[:2]:
+        step = (_found(line, body=body, worlds=8192) for line in (ours, loop))
+        rows.append((f"control step of 8192 {body}s (ms, H200)", *step, "", _found(playground, body=body, worlds=8192)))
+    folder, file = TO_950.split("/")
+    run = [row for row in read(RESULTS / folder, file) if row["task"] == "walker_walk"]
+    brax = [row for row in _json(BRAX_TO_950) if row["trainer"] != "ours"]
+    seconds = [
+        f"{next(float(row[key]) for row in found if float(row['mean']) >= 950):.0f}"
+        for found, key in ((run, "wall"), (brax, "seconds"))
+    ]
+    rows.append(("walker walks, return 950, from the start of the process (s, H200)", seconds[0], "", "", seconds[1]))
+    rates = (
+        re.search(r'"frames_per_second": (\d+)', (RESULTS / GO1).read_text()),
+        re.search(r"Go1 .* ([\d,]+) frames per second", (RESULTS / MJLAB).read_text()),
+    )
+    ours_go1, mjlab = (f"{int(found[1].replace(',', '')) / 1e6:.3g}" for found in rates if found)
+    rows.append(("Go1 learns a velocity command (million frames/s, H100)", ours_go1, "", mjlab, ""))
+    return table(("", "torchrl_loco", "`mujoco_warp`", "mjlab 1.6", "Playground 0.2"), rows)
 
 
 def variation() -> str:
@@ -252,7 +268,11 @@ def draw(picture: Path) -> None:
     figure.savefig(picture, dpi=100)
 
 
-PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmarks.md", ROOT / "docs" / "guides" / "your-own-task.md")
+PAGES = (
+    ROOT / "README.md",
+    ROOT / "notebooks" / "README.md",
+    *(ROOT / "docs" / name for name in ("benchmarks.md", "guides/your-own-task.md")),
+)
 
 if __name__ == "__main__":
     for page in PAGES:

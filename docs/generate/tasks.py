@@ -1,11 +1,12 @@
 """What the page of a task says in numbers, and its picture."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as imageio
 import torch
+from PIL import Image
 from torchrl.envs.utils import step_mdp
 
 import torchrl_loco
@@ -20,10 +21,10 @@ RUNNERS = [name for name in OURS if is_runner(name)]  # the others have pages of
 CLASSES = {env_class(name).body: env_class(name) for name in RUNNERS}
 """A class of each body."""
 
-MOMENTS = (0, 20, 40, 160)
-"""Control steps after the reset at which the picture of a task is taken."""
-WIDTH, HEIGHT = 220, 200
-"""Size of one of its frames, in pixels."""
+WIDTH, HEIGHT, SECONDS = 440, 330, 4.0
+"""Size of a task's moving picture in pixels, and time that passes."""
+RATE, QUALITY = 20, 60
+"""Frames a second of moving pictures, and their quality in percent."""
 
 
 def _aliases(name: str) -> str:
@@ -49,15 +50,8 @@ def properties(name: str) -> str:
         ("episode", f"{length} control steps, {length * config.ctrl_dt:g} s"),
         ("protocols", ", ".join(f"`{protocol}`" for protocol in PROTOCOLS)),
     ]
-    return f"![{name}](../generated/pictures/{name}.png)\n\n{_caption(name)}\n\n{table(('property', 'value'), rows)}"
-
-
-def _caption(name: str) -> str:
-    if _info(name) is None:
-        return "*The start.*"
-    dt = env_class(name).config.ctrl_dt
-    *first, last = (f"{moment * dt:g}" for moment in MOMENTS)
-    return f"*The shipped policy, {', '.join(first)} and {last} s after a reset.*"
+    shown = f"![{name}: the shipped policy after a reset](../generated/pictures/{name}.webp)"
+    return f"{shown}\n\n{table(('property', 'value'), rows)}"
 
 
 def overview() -> str:
@@ -117,24 +111,43 @@ def _about_policy(name: str, protocol: str, info: dict[str, Any]) -> str:
 
 
 def picture(name: str, path: Path) -> None:
-    """Draws a few moments of an episode under the task's policy, or the start alone if there is none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    imageio.imwrite(path, joined(moments(name, WIDTH, HEIGHT), dim=1, gap=4).numpy())
+    """Draws the first seconds of an episode under the task's policy, unless the file is there and newer than that."""
+    if not path.is_file() or path.stat().st_mtime < shipped_policies("playground")[name].stat().st_mtime:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_moving(path, frames(name, WIDTH, HEIGHT, SECONDS))
 
 
 @torch.no_grad()
-def moments(name: str, width: int, height: int) -> list[torch.Tensor]:
-    """Returns frames of a task, each ``(height, width, 3)`` in [0, 255]: only the first if it has no policy."""
-    env = torchrl_loco.make(name, num_envs=1, device="cpu", seed=2)
-    policy = torchrl_loco.load_policy(name, device="cpu") if _info(name) else None
-    td, frames = env.reset(), []
-    for step in range(MOMENTS[-1] + 1 if policy else 1):
-        if step in MOMENTS:
+def frames(
+    name: str, width: int, height: int, seconds: float, protocol: str = "playground", seed: int = 2
+) -> list[torch.Tensor]:
+    """Returns what the shipped policy of a task does after a reset, ``RATE`` times a second.
+
+    Each frame is ``(height, width, 3)``, in [0, 255], and the mean of four pixels each, which smooths the edges.
+
+    Raises:
+        ValueError: the task has no policy under the protocol.
+    """
+    policy = torchrl_loco.load_policy(name, device="cpu", protocol=protocol)
+    env = torchrl_loco.make(name, num_envs=1, device="cpu", seed=seed, protocol=protocol)
+    dt, repeat = env.config.ctrl_dt, policy.info.get("action_repeat", 1)
+    wanted = [round(i / RATE / dt) for i in range(round(seconds * RATE))]
+    td, found = env.reset(), []
+    for step in range(wanted[-1] + 1):
+        if step == wanted[len(found)]:
             pixels = env.render("side", 2 * width, 2 * height)[0].float()
-            frames.append(pixels.view(height, 2, width, 2, 3).mean(dim=(1, 3)))  # smooth edges
-        if policy:
-            td = step_mdp(env.step(policy(td)))
-    return frames
+            found.append(pixels.view(height, 2, width, 2, 3).mean(dim=(1, 3)))
+        if step % repeat == 0:
+            action = policy(td)["action"]
+        td = step_mdp(env.step(td.set("action", action)))
+    return found
+
+
+def save_moving(path: Path, pictures: Sequence[torch.Tensor]) -> None:
+    """Writes pictures of shape ``(height, width, 3)`` as a WebP file that repeats without end."""
+    first, *others = (Image.fromarray(picture.round().to(torch.uint8).numpy()) for picture in pictures)
+    options = {"quality": QUALITY, "method": 5, "duration": round(1000 / RATE), "loop": 0}
+    first.save(path, save_all=True, append_images=others, **options)
 
 
 def joined(pieces: list[torch.Tensor], dim: int, gap: int) -> torch.Tensor:
