@@ -1,5 +1,6 @@
 """The documentation site; `make docs` builds it into docs/_build/html."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -7,6 +8,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(1, str(Path(__file__).parents[1]))  # for the package benchmarks
 
 import generate
+from generate.address import ADDRESS
 from sphinx.util import inspect
 from sphinx.util.inspect import stringify_signature
 from torchrl.envs import EnvBase
@@ -41,20 +43,22 @@ autodoc_preserve_defaults = True
 html_theme = "pydata_sphinx_theme"
 html_sidebars = {page: [] for page in ("benchmarks", "changelog", "comparison", "fidelity")}  # without subpages
 html_static_path = ["_static"]
-html_css_files = ["wide.css"]
+html_css_files = ["site.css"]
 html_title = f"torchrl_loco {release}"
+html_logo = html_favicon = "_static/logo.svg"
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
     "logo": {"text": "torchrl_loco"},
     "navbar_align": "left",
-    "header_links_before_dropdown": 9,
-    "navbar_end": ["theme-switcher"],
+    "header_links_before_dropdown": 6,
+    "navbar_end": ["theme-switcher", "navbar-icon-links"],
     "show_toc_level": 2,
     "navigation_depth": 3,
     "secondary_sidebar_items": ["page-toc"],
     "footer_start": ["copyright"],
     "footer_end": [],
+    **({"icon_links": [{"name": "Repository", "url": ADDRESS, "icon": "fa-brands fa-github"}]} if ADDRESS else {}),
 }
 copyright = "the torchrl_loco developers, Apache 2.0"
 
@@ -69,6 +73,12 @@ def sign_environment(app, what, name, thing, options, signature, returns):
     return None
 
 
+def find_notebooks(app, page, source):
+    """Points links to notebooks, which are right on GitHub, to where the site has them."""
+    source[0] = re.sub(r"\]\((?:\.\./)+notebooks/(\w+\.ipynb)\)", r"](/generated/notebooks/\1)", source[0])
+
+
 def setup(app):
     """Registers what Sphinx calls."""
+    app.connect("source-read", find_notebooks)
     app.connect("autodoc-process-signature", sign_environment)

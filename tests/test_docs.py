@@ -170,9 +170,10 @@ def test_tables_are_those_of_the_results():
     assert "| walker, collected (million frames/s) |  | 34.9 | 82.4 | 99.3 |" in made["worlds"]
 
 
-def test_the_picture_of_the_returns_is_drawn(tmp_path):
-    benchmarks.draw(tmp_path / "returns.png")
-    assert (tmp_path / "returns.png").stat().st_size > 50_000
+@pytest.mark.parametrize("draw", [benchmarks.draw, benchmarks.draw_steps])
+def test_pictures_of_results_are_drawn(draw, tmp_path):
+    draw(tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").stat().st_size > 30_000
 
 
 # The site.
@@ -188,8 +189,8 @@ def test_site_builds_without_warnings():
     assert built.returncode == 0, built.stderr
     for task in RUNNERS:
         page = (html / "tasks" / f"{task}.html").read_text()
-        assert f"{task}.png" in page
-        assert (html / "_images" / f"{task}.png").stat().st_size > 5_000
+        assert f"{task}.webp" in page
+        assert (html / "_images" / f"{task}.webp").stat().st_size > 5_000
         for script in re.findall(r'<script[^>]* src="([^"]+)"', page):  # formulas among others need no network
             assert (html / "tasks" / script.split("?")[0]).resolve().is_file(), script
 

@@ -3,7 +3,7 @@
 import shutil
 from pathlib import Path
 
-from generate import bodies, fields, rewards, tasks
+from generate import benchmarks, bodies, fields, rewards, tasks
 from generate.markdown import write
 
 DOCS = Path(__file__).parent.parent
@@ -15,7 +15,7 @@ def everything() -> None:
     """Writes all that pages include to docs/generated, and leaves alone what has not changed."""
     fragments = OUT / "fragments"
     for name in tasks.RUNNERS:  # not for the plug-ins that happen to be installed
-        write(fragments / f"{name}_properties.md", tasks.properties(name))
+        write(fragments / f"{name}_properties.md", tasks.properties(name, benchmarks.training(name)))
         write(fragments / f"{name}_reward.md", rewards.formula(name))
         write(fragments / f"{name}_policy.md", tasks.shipped_policy(name))
         tasks.picture(name, OUT / "pictures" / f"{name}.webp")
@@ -23,7 +23,6 @@ def everything() -> None:
         write(fragments / f"{body}_observation.md", bodies.observation_table(body))
         write(fragments / f"{body}_action.md", bodies.action_table(body))
         write(fragments / f"{body}_protocols.md", tasks.protocols(body))
-    write(fragments / "tasks.md", tasks.overview())
     write(fragments / "velocity_weights.md", tasks.velocity_weights())
     write(fragments / "fields.md", fields.fields())
     write(fragments / "notebooks.md", notebooks(NOTEBOOKS, OUT / "notebooks"))

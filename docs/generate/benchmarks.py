@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.published import PUBLISHED, read
 from benchmarks.variation import plot_variation
-from generate import address
+from generate import address, tasks
 from generate.markdown import table
 
 Row = dict[str, Any]
@@ -103,6 +103,7 @@ def tables() -> dict[str, str]:
         "steps": speeds(BODIES, STEPS) + sources(line.files for line in STEPS),
         "worlds": by_worlds() + sources(line.files for line in BY_WORLDS),
         "returns": returns() + sources([[f"{path}/results.csv" for path in runs.folders] for runs in RUNS.values()]),
+        "tasks": tasks.overview(),
         "speed": speed(),
         "speed-sources": sources([(TO_950, BRAX_TO_950, GO1, MJLAB)]),
         "variation": variation(),
@@ -147,6 +148,17 @@ def _found(line: Measured, **where: Any) -> str:
             if line.key in row and wanted.items() <= row.items():
                 return f"{row[line.key]:#.3g}".rstrip(".")
     return ""
+
+
+def training(task: str) -> list[tuple[str, str]]:
+    """Returns lines for the page of a task: what policies of its preset earn, and how long they train."""
+    runs = RUNS[task, "playground"]
+    seeds = seeds_of(task, "playground", runs)
+    earned = f"{_mean(seeds, 'mean'):.0f} on average over {len(seeds)} seeds"
+    return [
+        ("return after training", earned),
+        ("training (s)", f"{time_of_training(task, 'playground', runs)}, on one GPU"),
+    ]
 
 
 def returns() -> str:
@@ -243,6 +255,22 @@ def sources(files: Iterable[Iterable[str]]) -> str:
     return "\nFrom " + ", ".join(f"[{file}](../benchmarks/results/{file})" for file in named) + ".\n"
 
 
+def draw_steps(picture: Path) -> None:
+    """Draws the times of a control step of 8192 worlds, walker and humanoid, as bars."""
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    for body, axes in zip(BODIES[:2], figure.subplots(1, 2, sharey=True), strict=True):
+        lines = [line for line in reversed(STEPS) if line.rows.get("protocol") != "dm_control"]
+        times = [float(_found(line, body=body, worlds=8192)) for line in lines]
+        others = ("loop", "MuJoCo Playground", "TorchRL's")
+        colors = ["#9aa7ad" if line.label.startswith(others) else "#f5a623" for line in lines]
+        axes.bar_label(
+            axes.barh([line.label.replace("`", "") for line in lines], times, color=colors), fmt="%g", padding=3
+        )
+        axes.set(title=f"8192 {body}s", xscale="log", xlabel="ms for a control step, one H200", xlim=(0.05, 300))
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(picture, dpi=130)
+
+
 def draw(picture: Path) -> None:
     """Draws the return of every run under playground against its frames, a panel for each task."""
     figure = Figure(figsize=(11, 7.2), layout="constrained")
@@ -271,11 +299,12 @@ def draw(picture: Path) -> None:
 PAGES = (
     ROOT / "README.md",
     ROOT / "notebooks" / "README.md",
-    *(ROOT / "docs" / name for name in ("benchmarks.md", "guides/your-own-task.md")),
+    *(ROOT / "docs" / name for name in ("benchmarks.md", "tasks/index.md", "guides/your-own-task.md")),
 )
 
 if __name__ == "__main__":
     for page in PAGES:
         page.write_text(filled(page.read_text()))
+    draw_steps(PICTURES / "steps.png")
     draw(PICTURES / "returns.png")
     plot_variation(json.loads((RESULTS / VARIATION).read_text())["returns"], PICTURES / "variation.png")

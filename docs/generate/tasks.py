@@ -31,8 +31,8 @@ def _aliases(name: str) -> str:
     return ", ".join(f"`{alias}`" for alias, target in ALIASES.items() if target == name)
 
 
-def properties(name: str) -> str:
-    """Returns the head of a task's page: its picture and a table."""
+def properties(name: str, more: Sequence[tuple[str, str]]) -> str:
+    """Returns the head of a task's page: its picture and a table, which ends with more lines."""
     cls = env_class(name)
     config = cls.config
     nu = models.load(cls.model).nu
@@ -49,6 +49,7 @@ def properties(name: str) -> str:
         ("physics step", f"{config.sim_dt:g} s, {config.substeps} in a control step"),
         ("episode", f"{length} control steps, {length * config.ctrl_dt:g} s"),
         ("protocols", ", ".join(f"`{protocol}`" for protocol in PROTOCOLS)),
+        *more,
     ]
     shown = f"![{name}: the shipped policy after a reset](../generated/pictures/{name}.webp)"
     return f"{shown}\n\n{table(('property', 'value'), rows)}"
@@ -62,7 +63,7 @@ def overview() -> str:
         speed = f"{cls.target_speed:g}" if cls.target_speed else "0"
         policy = _info(name)
         best = f"{policy['mean']:.0f} ± {policy['std']:.0f}" if policy else "none yet"
-        link = f"[{name}](/tasks/{name}.md)"
+        link = f"[{name}]({name}.md)"
         rows.append((link, _aliases(name), models.load(cls.model).nu, cls.observation_size, speed, best))
     return table(("id", "alias", "action", "observation", "target speed (m/s)", "return of the policy"), rows)
 
