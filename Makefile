@@ -8,7 +8,7 @@ PYTEST_ARGS ?= --numprocesses auto --dist loadfile
 NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
 PYTEST := $(BIN)/python -m pytest $(PYTEST_ARGS)
 
-.PHONY: help train test test-fast test-all tests tests-ci lint format docs runners tables notebooks dist clean
+.PHONY: help train test test-fast test-all tests tests-ci lint format docs runners tables notebooks report dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*##/\t/' | expand -t 12
@@ -53,6 +53,10 @@ runners: $(VENV)/installed  ## draw the moving picture of the README anew, with 
 
 tables: $(VENV)/installed  ## write tables and pictures of README and docs from benchmarks/results
 	PYTHONPATH=docs $(BIN)/python -m generate.benchmarks
+
+report:  ## docs/report as a PDF in docs/_build; needs pdflatex
+	mkdir -p docs/_build
+	cd docs/report && for run in 1 2; do pdflatex -interaction=nonstopmode -output-directory=../_build report.tex; done
 
 notebooks: $(VENV)/installed  ## run the notebooks and store their output; NOTEBOOKS=notebooks/rewards.ipynb for one
 	$(BIN)/python notebooks/execute.py $(NOTEBOOKS)
