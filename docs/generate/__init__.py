@@ -5,6 +5,7 @@ from pathlib import Path
 
 from generate import benchmarks, bodies, fields, rewards, tasks
 from generate.markdown import write
+from torchrl_loco.policy import shipped_policies
 
 DOCS = Path(__file__).parent.parent
 OUT = DOCS / "generated"
@@ -18,6 +19,7 @@ def everything() -> None:
         write(fragments / f"{name}_properties.md", tasks.properties(name, benchmarks.training(name)))
         write(fragments / f"{name}_reward.md", rewards.formula(name))
         write(fragments / f"{name}_policy.md", tasks.shipped_policy(name))
+    for name in shipped_policies("playground"):
         tasks.picture(name, OUT / "pictures" / f"{name}.webp")
     for body in tasks.CLASSES:
         write(fragments / f"{body}_observation.md", bodies.observation_table(body))
@@ -34,5 +36,8 @@ def notebooks(source: Path, target: Path) -> str:
     if not source.is_dir():
         return "There are none in this copy of the repository.\n"
     shutil.copytree(source, target, ignore=shutil.ignore_patterns("[!a-zA-Z]*", "runs"))
+    lines = (source / "README.md").read_text().splitlines()
+    table = "\n".join(line for line in ["", *lines] if not line or line.startswith(("|", "In Colab")))
+    table = table.replace("](", "](/generated/notebooks/").replace("/generated/notebooks/https", "https")
     entries = "\n".join(f"generated/notebooks/{path.stem}" for path in sorted(source.glob("*.ipynb")))
-    return f"```{{toctree}}\n{entries}\n```\n"
+    return f"{table}\n```{{toctree}}\n:hidden:\n\n{entries}\n```\n"
