@@ -122,13 +122,6 @@ def test_what_was_not_tuned_is_said():
         assert ("walker_stand and walker_walk by ppo" in note) == said
 
 
-def test_returns_that_the_critic_cannot_represent_are_reported():
-    for device in ("cpu", "cuda"):
-        config = dataclasses.replace(preset("walker_walk", "cpu", "reppo"), device=device, action_repeat=4)
-        assert "Returns of up to 100 may occur" in tuning_note(config)
-        assert "Returns of" not in tuning_note(dataclasses.replace(config, reward_scale=0.25))
-
-
 def test_presets_of_a_task(monkeypatch):
     """Its own on CUDA, where the critic of a task that is not of this package has bins for returns of either sign."""
     monkeypatch.setattr(presets, "check_device", torch.device)

@@ -87,25 +87,7 @@ def is_runner(task: "str | type[LocoEnv]") -> bool:
 
 
 def tuning_note(config: TrainingConfig) -> str:
-    """Returns a note if ``config.task`` was not tuned on the CPU, or settings do not fit each other, else ``""``."""
-    return " ".join(note for note in (_untuned(config), _values_cut_off(config)) if note)
-
-
-def _untuned(config: TrainingConfig) -> str:
+    """Returns a note if ``config.task`` was not tuned on the CPU by its algorithm, else an empty string."""
     if config.device != "cpu" or (config.algorithm == "ppo" and config.task in ("walker_stand", "walker_walk")):
         return ""
     return "On a CPU only walker_stand and walker_walk by ppo were tuned: other tasks need a GPU, or many more frames."
-
-
-def _values_cut_off(config: TrainingConfig) -> str:
-    """Returns a note if returns may be larger than the critic of REPPO can represent, else an empty string."""
-    if not isinstance(config, REPPOConfig) or not is_runner(config.task):
-        return ""  # of other rewards only the run itself can tell
-    largest = config.reward_scale * config.action_repeat / max(1.0 - config.gamma, 1e-9)
-    if largest <= config.max_value * (1.0 + 1e-9):  # of rounding
-        return ""
-    scale = config.reward_scale * config.max_value / largest
-    return (
-        f"Returns of up to {largest:.4g} may occur, but the critic cannot tell those above --max_value "
-        f"{config.max_value:g} apart: raise it, or pass --reward_scale {scale:.3g}."
-    )
