@@ -115,7 +115,7 @@ def test_a_run_needs_an_undamaged_checkpoint_of_this_version(ppo_run, tmp_path):
         path.write_bytes(bad)
         refused(ValueError, "checkpoint.pt cannot be read as a checkpoint")
     torch.save({"version": 0}, path)
-    refused(ValueError, "has version 0, this release reads 6")
+    refused(ValueError, "has version 0, this release reads 7")
     path.unlink()
     refused(FileNotFoundError, "has no checkpoint")
 

@@ -3,17 +3,16 @@
 import copy
 import dataclasses
 import inspect
-import math
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import NormalParamExtractor, TensorDictModule
+from tensordict.nn import AddStateIndependentNormalScale, NormalParamExtractor, TensorDictModule
 from torch import nn
 from torch.distributions import Independent, Normal, TransformedDistribution
 from torchrl.data import Bounded, Unbounded
-from torchrl.modules import ProbabilisticActor
+from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.modules.distributions.continuous import SafeTanhTransform
 
 from torchrl_loco.policy import ObservationNorm, Policy, copied, layers_of
@@ -25,23 +24,6 @@ Network = Callable[[int, int], nn.Module]
 
 TOLERANCE = 1e-4
 """Largest difference of an action of a saved policy from the actor's, as a fraction of those above 1: rounding."""
-
-
-class DiagonalNormal(Independent):
-    """Independent normal variables.
-
-    Args:
-        loc: means, shape ``(..., n)``.
-        scale: standard deviations, of the same shape.
-    """
-
-    def __init__(self, loc: torch.Tensor, scale: torch.Tensor) -> None:
-        super().__init__(Normal(loc, scale, validate_args=False), 1, validate_args=False)
-
-    @property
-    def deterministic_sample(self) -> torch.Tensor:
-        """The mean, shape ``(..., n)``."""
-        return self.mean
 
 
 class SquashedNormal(TransformedDistribution):
@@ -63,18 +45,6 @@ class SquashedNormal(TransformedDistribution):
     def deterministic_sample(self) -> torch.Tensor:
         """The image of the mean, shape ``(..., n)``."""
         return self.base_dist.mean.tanh()
-
-
-class StateIndependentScale(nn.Module):
-    """Appends a learned log standard deviation, the same in every state, to the mean of an action."""
-
-    def __init__(self, size: int, init_std: float) -> None:
-        super().__init__()
-        self.log_std = nn.Parameter(torch.full((size,), math.log(init_std)))
-
-    def forward(self, loc: torch.Tensor) -> torch.Tensor:
-        """Returns means of shape ``(..., size)`` with the log deviations behind them, ``(..., 2 size)``."""
-        return torch.cat([loc, self.log_std.expand_as(loc)], dim=-1)
 
 
 def network_of(make: Network, inputs: int, outputs: int) -> nn.Module:
@@ -116,7 +86,8 @@ def make_actor(spaces: Spaces, device: torch.device | str, network: nn.Module, l
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         spec=spec,
-        distribution_class=SquashedNormal if spaces.bounded else DiagonalNormal,
+        distribution_class=SquashedNormal if spaces.bounded else IndependentNormal,
+        distribution_kwargs={} if spaces.bounded else {"validate_args": False},  # which waits for the device
         return_log_prob=log_prob,
     ).to(device)
 
@@ -131,10 +102,10 @@ def deterministic_policy(actor: ProbabilisticActor, config: TrainingConfig, info
         RuntimeError: what can be held acts differently from the actor.
     """
     network: Any = actor[0].module
-    of_scale = (StateIndependentScale, NormalParamExtractor)
+    of_scale = (AddStateIndependentNormalScale, NormalParamExtractor)
     parts = [part for part in network if not isinstance(part, of_scale)]
     *layers, last = (copied(layer) for part in parts for layer in layers_of(part))
-    if not any(isinstance(part, StateIndependentScale) for part in network):
+    if not any(isinstance(part, AddStateIndependentNormalScale) for part in network):
         last = _first_half(last)
     tanh = [nn.Tanh()] if actor[-1].distribution_class is SquashedNormal else []
     settings = {

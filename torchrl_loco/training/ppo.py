@@ -1,18 +1,19 @@
 """Proximal policy optimization (Schulman et al., 2017), by TorchRL's ClipPPOLoss."""
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import NormalParamExtractor
+from tensordict.nn import AddStateIndependentNormalScale
 from torch import nn
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training import distributed
-from torchrl_loco.training.actor import Network, StateIndependentScale, make_actor, network_of
+from torchrl_loco.training.actor import Network, make_actor, network_of
 from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import PPOConfig
 from torchrl_loco.training.spaces import Spaces
@@ -132,9 +133,9 @@ def make_actor_critic(
     mean: Any = make(spaces.observation, spaces.action)
     if network is None:
         nn.init.orthogonal_(mean[-1].weight, gain=0.01)  # the first actions are near zero, whatever is observed
-    scale = StateIndependentScale(spaces.action, config.init_std)
+    scale = AddStateIndependentNormalScale(spaces.action, init_value=math.log(config.init_std))
     mean, value = (InBFloat16(part) if config.bf16 else part for part in (mean, make(spaces.critic, 1)))
-    whole = nn.Sequential(norms["observation"], mean, scale, NormalParamExtractor("exp"))
+    whole = nn.Sequential(norms["observation"], mean, scale)
     actor = make_actor(spaces, config.device, whole, log_prob=True)
     if spaces.privileged is not None:
         norms["privileged"] = ObservationNorm(spaces.privileged)

@@ -22,7 +22,7 @@ from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig, check_loggers, config_from_json
 from torchrl_loco.training.lock import lock
 
-CHECKPOINT_VERSION = 6
+CHECKPOINT_VERSION = 7
 
 _UNREADABLE = (pickle.UnpicklingError, RuntimeError, OSError, EOFError, LookupError, TypeError, ValueError)
 """Errors that reading a damaged checkpoint may raise."""
