@@ -495,7 +495,6 @@ class World:
                 its controls when the state was written.
         """
         self.action.torch.copy_(action)
-        self.ended.torch.zero_()
         self._judge()
         return self.reward.torch, self.ended.torch
 
