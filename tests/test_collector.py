@@ -8,13 +8,14 @@ import torch
 from cases import STAGGERED, coarse
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torch._subclasses import FakeTensorMode
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, FiniteTensorDictCheck, InitTracker, RewardSum
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 import torchrl_loco
 from torchrl_loco import RolloutCollector
-from torchrl_loco.collector import stack, what_forbids_recording
+from torchrl_loco.collector import stack, stacks_slowly, what_forbids_recording
 from torchrl_loco.tasks.walker import WalkerRun
 
 
@@ -87,6 +88,7 @@ def test_endless_and_wrong_sizes(make):
     assert first["observation"].data_ptr() != second["observation"].data_ptr()
     going_on = ~first["next", "done"][:, -1].squeeze(-1)
     assert torch.equal(first["next", "observation"][:, -1][going_on], second["observation"][:, 0][going_on])
+    assert list(RolloutCollector(made, policy(made), frames_per_batch=8, total_frames=0)) == []
     for frames in (0, 6, -4):
         with pytest.raises(ValueError, match="positive multiple of the 4 worlds"):
             RolloutCollector(made, policy(made), frames_per_batch=frames)
@@ -187,6 +189,15 @@ def test_recorded_batches_equal_steps_taken_one_by_one(task, protocol, wrap, exp
     assert set(got.keys(True, True)) == set(expected.keys(True, True))
     for key in expected.keys(True, True):
         assert torch.equal(got[key], expected[key]), key
+
+
+def test_what_is_stacked_slowly():
+    """Rows of 16 to 128 bytes that are no multiple of 16, on CUDA."""
+    with FakeTensorMode():
+        for numbers, slow in ((4, False), (5, True), (6, True), (8, False), (31, True), (32, False), (33, False)):
+            assert stacks_slowly(torch.empty(5, 2, numbers, device="cuda"), 2) == slow, numbers
+    assert not stacks_slowly(torch.zeros(5, 6), 1)
+    assert not stacks_slowly("a text", 1)
 
 
 @pytest.mark.gpu

@@ -214,6 +214,29 @@ def test_a_vary_that_the_model_cannot_have(arm, vary, message):
         Variation([vary], arm, torch.device("cpu"))
 
 
+def test_inertias_that_a_body_may_have():
+    """Of a flat body the greatest is the sum of the other two; a body without any may stay without."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body name="plate"><joint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 2"/>'
+        '<body name="frame"/></body></worldbody></mujoco>'
+    )
+    plate, device = {"of": "plate"}, torch.device("cpu")
+    for vary in (
+        loco.Vary("body_inertia", 0.5, 1.5, **plate),
+        exactly("body_inertia", (3, 4, 7), how="set", **plate),
+        exactly("body_inertia", 0, how="add", of="frame"),
+    ):
+        Variation([vary], model, device)
+    for vary in (
+        loco.Vary("body_inertia", (0.5, 1, 1), (1.5, 1, 1), **plate),
+        exactly("body_inertia", (3, 4, 7.01), how="set", **plate),
+        exactly("body_inertia", (0, 1, 1), how="set", **plate),
+        exactly("body_inertia", -1.5, how="add", **plate),
+    ):
+        with pytest.raises(ValueError, match="inertia of plate could become"):
+            Variation([vary], model, device)
+
+
 def test_several_draws_are_checked_together(arm):
     """Each alone is possible."""
     varys = [exactly("body_mass", -1.5, how="add", of="upper"), loco.Vary("body_mass", 0.5, 1.0)]

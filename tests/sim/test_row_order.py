@@ -129,6 +129,25 @@ def test_the_solver_finds_rows_in_order_and_sums_in_order(sim, monkeypatch):
     assert sim.model.opt.deterministic == mjw.DeterminismType.NONE
 
 
+def test_rows_beyond_the_room_for_them_are_left_out():
+    """MuJoCo-Warp counts them, but has them nowhere."""
+    spheres = "".join(f'<geom size="0.1" pos="{0.3 * i} 0 0.09"/>' for i in range(4))
+    body = f'<body><joint type="slide" axis="0 0 1"/>{spheres}</body>'
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="plane" size="5 5 1"/>{body}</worldbody></mujoco>'
+    )
+    with wp.ScopedDevice("cpu"):
+        m, d = mjw.put_model(model), mjw.make_data(model, nworld=3, njmax=6)
+        mjw.step1(m, d)
+        assert (d.nefc.numpy() > 6).all()
+        for world, first in enumerate(((4, 3, 2, 1, 4, 3), (2, 2, 1, 1, 3, 4), (1, 2, 3, 4, 1, 2))):
+            d.contact.geom.assign([(0, geom) for geom in np.arange(len(d.contact.geom)) + 1])
+            d.efc.id[world].assign(np.array(first) - 1)
+            d.efc.pos[world].assign(np.array(first, dtype=np.float32))
+        RowOrder(m, d).apply()
+    assert d.efc.pos.numpy().tolist() == [[1, 2, 3, 3, 4, 4], [1, 1, 2, 2, 3, 4], [1, 1, 2, 2, 3, 4]]
+
+
 def test_other_models_are_refused():
     body = '<body gravcomp="1"><joint/><geom size="1"/></body>'
     xml = f'<mujoco><option cone="elliptic"/><worldbody>{body}</worldbody></mujoco>'
