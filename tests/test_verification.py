@@ -138,7 +138,7 @@ def test_a_runner_earns_the_same_in_c_mujoco(capsys, tmp_path):
     here, there = (returns[name]["mean"] for name in ("training simulator", "C MuJoCo"))
     assert 150 < here < 200
     assert there == pytest.approx(here, rel=0.01)
-    status, said = verify(capsys, tmp_path / "policy.safetensors", *options, "--min_return", 1.1)
+    status, said = verify(capsys, tmp_path / "policy.safetensors", *options, "--seconds", 1, "--min_return", 1.1)
     assert (status, "DOES NOT HOLD: return" in said) == (1, True)
 
 

@@ -261,7 +261,7 @@ class Clumsy(Unsteady):
         return super().terminated(s) | (s.uniform(0.0, 1.0) < 0.05)
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+@pytest.mark.parametrize("algorithm", ["ppo", pytest.param("reppo", marks=pytest.mark.slow)])
 def test_a_task_with_memory_falls_and_what_the_critic_alone_reads(algorithm, tmp_path):
     """Episodes end early, and a run that is stopped and goes on equals one that was not."""
     more = {"min_value": -20.0, "max_value": 20.0} if algorithm == "reppo" else {}

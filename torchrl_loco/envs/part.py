@@ -169,7 +169,7 @@ def no_collection() -> Iterator[None]:
 
 def constants_on(device: torch.device, traced: torch.fx.GraphModule) -> torch.fx.GraphModule:
     """Returns a trace in which tensors of other devices are copied to ``device`` once, and not at each step."""
-    copies = (torch.ops.aten._to_copy.default, torch.ops.aten.lift_fresh_copy.default)
+    copies, copied = (torch.ops.aten._to_copy.default, torch.ops.aten.lift_fresh_copy.default), False
     for node in list(traced.graph.nodes):
         if node.target not in copies or node.args[0].op != "get_attr":
             continue
@@ -181,5 +181,7 @@ def constants_on(device: torch.device, traced: torch.fx.GraphModule) -> torch.fx
         with traced.graph.inserting_before(node):
             node.replace_all_uses_with(traced.graph.get_attr(name))
         traced.graph.erase_node(node)
-    traced.recompile()
+        copied = True
+    if copied:
+        traced.recompile()
     return traced

@@ -27,7 +27,7 @@ MANY = 2
 """Above this multiple of the worlds that fill those warps, observation and bookkeeping run in kernels of their own:
 they wait for memory, and the registers of the physics leave too few warps to hide that."""
 
-MOST_TEXTS = 32
+MOST_TEXTS = 64
 """Texts of steps that a process keeps."""
 
 texts: dict[tuple, str] = {}
