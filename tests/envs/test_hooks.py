@@ -10,7 +10,7 @@ from hook_tasks import DOG, WalkBackwards, WalkBlindly
 from oracle import tolerance as numpy_tolerance
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from torchrl_loco import LocoEnv, SimConfig, State, WalkerWalk
+from torchrl_loco import LocoEnv, SimConfig, State, Vary, WalkerWalk
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.view import View
@@ -499,6 +499,10 @@ WRONG = [
     ({"memory": {"a": 3}, "events": lambda self, s: {"a": s.qpos}}, ValueError, r"a of shape \(4, 3\)"),
     ({"memory": {"qpos": 3}}, ValueError, "'qpos' is taken"),
     ({"memory": {"a": 0}}, ValueError, "sizes of 1 or more"),
+    ({"command_ranges": {"a": {"x": (0, 1)}}}, ValueError, "'a' is no entry of memory, which has none"),
+    ({"memory": {"a": 2}, "command_ranges": {"a": {"x": (0, 1)}}}, ValueError, "must be a row of 1 numbers"),
+    ({"memory": {"a": 1}, "command_ranges": {"a": {"x": (1, 1)}}}, ValueError, "a least and a greatest value"),
+    ({"memory": {"a": 1}, "command_ranges": {"a": (0, 1)}}, TypeError, "must be a dict such as"),
     ({"begin": lambda self, s: {"qpos": s.home / 0}}, ValueError, "not finite"),
     ({"control": lambda self, s, action: action[:, :2]}, ValueError, r"shape \(4, 8\)"),
     ({"action_range": (0, 1)}, ValueError, r"must be \(-1, 1\) or"),
@@ -514,6 +518,58 @@ WRONG = [
     ({"reward": lambda self, s: s.joint_qpos(".*")[:, 0]}, ValueError, "name a free or ball joint alone"),
     ({"reward": lambda self, s: s.sensor("unread")[:, 0], "engine": "compiled"}, ValueError, "'unread'"),
 ]
+
+
+class Commanded(WalkerWalk):
+    """Two commands, drawn anew at every step; the reward is what it was told."""
+
+    memory = {"speed": (), "turn": 2}
+    command_ranges = {"speed": {"m/s": (0.0, 1.0)}, "turn": {"rad/s": (0.0, 1.0), "rad": (-1.0, 1.0)}}
+    randomize = [Vary("body_mass", 0.5, 2.0, of="torso")]
+
+    def reward(self, s):
+        return s.speed
+
+    def begin(self, s):
+        return {"speed": s.uniform(0.0, 1.0), "turn": s.uniform(0.0, 1.0, 2)}
+
+    def events(self, s):
+        return self.begin(s)
+
+    def observation(self, s):
+        return torch.cat([s.qpos, s.speed.unsqueeze(-1), s.turn], dim=-1)
+
+
+def test_commands_of_a_task_can_be_set_where_it_is_played():
+    env = Commanded(4, "cpu", seed=0, play=True, compile_hooks=False)
+    assert env.randomize == ()
+    drawn = env.rollout(2)["observation"][..., -3:]
+    assert len(drawn.reshape(-1, 3).unique(dim=0)) == 8
+    env.set_command(0.7, "speed")
+    each = torch.rand(4, 2)
+    env.set_command(each, "turn")
+    td = env.rollout(3)
+    torch.testing.assert_close(
+        td["observation"][..., -3:], torch.cat([torch.full((4, 1), 0.7), each], 1)[:, None].expand(4, 3, 3)
+    )
+    assert (td["next", "reward"] == 0.7).all()
+    env.set_command(None, "turn")
+    td = env.rand_step()["next"]["observation"]
+    assert (td[:, -3] == 0.7).all()
+    assert not torch.isclose(td[:, -2:], each).any()
+    for command, entry, message in (
+        (0.7, None, "pass one of speed, turn"),
+        (0.7, "spede", "did you mean 'speed'"),
+        ([0.7], "turn", r"must have shape \(2,\) or \(4, 2\), got \(1,\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            env.set_command(command, entry)
+    with pytest.raises(ValueError, match="has no command"):
+        WalkBlindly(2, "cpu", play=True, compile_hooks=False).set_command([1.0])
+    trained = Commanded(4, "cpu", seed=0, compile_hooks=False)
+    assert len(trained.randomize) == 1
+    with pytest.raises(ValueError, match="play=True"):
+        trained.set_command(0.7, "speed")
 
 
 def test_wrong_tasks_are_refused():

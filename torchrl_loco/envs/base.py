@@ -31,7 +31,7 @@ from torchrl_loco.checks import (
     check_output_file,
 )
 from torchrl_loco.config import SimConfig, sim_config
-from torchrl_loco.envs.hooks import Hooks, memory_shapes, own_hooks
+from torchrl_loco.envs.hooks import Hooks, check_commands, memory_shapes, own_hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.state import State, without_state, write_state
 from torchrl_loco.envs.variation import Variation, constant_of
@@ -81,6 +81,8 @@ class LocoEnv(EnvBase):
             ``None`` takes the class's, ``[]`` is none.
         compile_hooks: whether hooks in torch become kernels; what they read of Python is fixed then. ``False`` runs
             them as they are at every step, to print from them or to debug them.
+        play: whether the worlds are for looking at a policy, not for training: commands can be set with
+            :meth:`set_command`, ``randomize=None`` varies nothing, and tasks leave out noise and pushes.
         config: fields of :class:`torchrl_loco.SimConfig` to override.
 
     Attributes:
@@ -93,6 +95,7 @@ class LocoEnv(EnvBase):
         mj_model: the model, a ``mujoco.MjModel``.
         groups: shape of a row of each tensor of the observation, by name.
         term_names: names of the reward's terms.
+        play: whether the worlds are for looking at a policy; hooks may read it.
 
     Raises:
         ValueError: an argument is out of range or unknown; the message names the valid choices.
@@ -107,6 +110,10 @@ class LocoEnv(EnvBase):
     memory: ClassVar[Mapping[str, int | tuple[int, ...]]] = {}
     """What a world remembers, as names and shapes of its rows, such as ``{"command": 3, "air_time": 4}``.
     ``s.command`` reads it; :meth:`update`, :meth:`events` and :meth:`begin` return new rows. The state holds it."""
+    command_ranges: ClassVar[Mapping[str, Mapping[str, tuple[float, float]]]] = {}
+    """Entries of :attr:`memory` that are commands: by entry, the name of each of its numbers, with its unit, and the
+    least and greatest value, such as ``{"command": {"forward (m/s)": (-1.0, 2.0)}}``. With ``play=True`` they can be
+    set, and the viewer has a slider for each."""
     randomize: Sequence[Vary] = ()
     """Numbers of the model that each world draws at its resets; see :class:`torchrl_loco.Vary`."""
     episode_length: ClassVar[int | None] = None
@@ -139,6 +146,7 @@ class LocoEnv(EnvBase):
         nan_dump: Path | str | None = None,
         randomize: Sequence[Vary] | None = None,
         compile_hooks: bool = True,
+        play: bool = False,
         **config: Any,
     ) -> None:
         self.check_class()
@@ -156,10 +164,12 @@ class LocoEnv(EnvBase):
         elif seed is not None:
             _warn_if_worlds_repeat()
         reward_terms, stagger = check_bool("reward_terms", reward_terms), check_bool("stagger", stagger)
-        compile_hooks = check_bool("compile_hooks", compile_hooks)
+        compile_hooks, play = check_bool("compile_hooks", compile_hooks), check_bool("play", play)
         check_choice("on_overflow", on_overflow, ON_OVERFLOW)
         nan_dump = None if nan_dump is None else check_output_file("nan_dump", nan_dump)
-        varys = check_randomize("randomize", self.randomize if randomize is None else randomize)
+        if randomize is None:
+            randomize = () if play else self.randomize
+        varys = check_randomize("randomize", randomize)
         mj_model = models.load(self.model, folder_of(type(self)))
         self.check_model(mj_model)
         variation = Variation(varys, mj_model, device) if varys else None
@@ -168,7 +178,7 @@ class LocoEnv(EnvBase):
         self.num_envs, self.world_offset = worlds, world_offset
         self.seed = secrets.randbits(32) if seed is None else seed
         self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
-        self.stagger, self.compile_hooks = stagger, compile_hooks
+        self.stagger, self.compile_hooks, self.play = stagger, compile_hooks, play
         self.randomize, self.variation = varys, variation
         self.on_overflow, self.nan_dump = on_overflow, nan_dump
         self._action_shape = torch.Size([*self.batch_size, mj_model.nu])
@@ -234,7 +244,7 @@ class LocoEnv(EnvBase):
             raise ValueError(f"{name}.action_range must be (-1, 1) or (-inf, inf), got {cls.action_range!r}")
         if tuple(cls.action_range) == UNBOUNDED and "control" not in own:
             raise TypeError(f"{name} has actions without bounds, so it must define control(self, s, action)")
-        memory_shapes(cls)
+        check_commands(cls, memory_shapes(cls))
         check_randomize(f"{name}.randomize", cls.randomize)
         # Of the package's own functions only LocoEnv's reads the table.
         if cls.pose_func is not LocoEnv.pose_func and cls.pose_func.__module__.startswith("torchrl_loco."):
@@ -299,6 +309,35 @@ class LocoEnv(EnvBase):
         the last episode left.
         """
         return {}
+
+    # Looking at a policy.
+
+    def set_command(self, command: Sequence[float] | torch.Tensor | None, entry: str | None = None) -> None:
+        """Sets a command that the worlds follow from their next step or reset on.
+
+        Args:
+            command: a row of the memory, or one for each world, ``(num_envs, *row)``; ``None`` lets the worlds draw it
+                again, as at first.
+            entry: which entry of :attr:`command_ranges`; ``None`` takes the only one.
+
+        Raises:
+            ValueError: the environment was made without ``play=True``, the class has no such command, or the shape is
+                another one.
+        """
+        if not self.play:
+            raise ValueError("commands are drawn in training: make the environment with play=True to set them")
+        settable = self.hooks.commands if self.hooks else {}
+        if not settable:
+            raise ValueError(f"{type(self).__name__} has no command: its command_ranges are empty")
+        if entry is None and len(settable) > 1:
+            raise ValueError(f"{type(self).__name__} has several commands: pass one of {', '.join(settable)} as entry")
+        values, is_set = settable[check_choice("entry", next(iter(settable)) if entry is None else entry, settable)]
+        row = values.shape[1:]
+        rows = torch.zeros(row) if command is None else torch.as_tensor(command, dtype=torch.float32)
+        if rows.shape not in (row, values.shape):
+            raise ValueError(f"command must have shape {tuple(row)} or {tuple(values.shape)}, got {tuple(rows.shape)}")
+        values.copy_(rows)
+        is_set.fill_(command is not None)
 
     # What a policy's file tells of the task.
 

@@ -1,5 +1,6 @@
 """The hooks of a task: which are its own, what they return and ask for, and the parts of a control step they make."""
 
+import math
 import weakref
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -85,6 +86,31 @@ def memory_shapes(cls: type) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
+def check_commands(cls: type["LocoEnv"], memory: Mapping[str, tuple[int, ...]]) -> None:
+    """Checks the commands that a class declares.
+
+    Args:
+        cls: the class.
+        memory: shapes of a row of each entry of its memory.
+
+    Raises:
+        ValueError: there is no such entry, it has another number of numbers, or a range is empty.
+        TypeError: ``command_ranges`` is no table of names and ranges.
+    """
+    title, entries = f"{cls.__name__}.command_ranges", cls.command_ranges
+    if not isinstance(entries, Mapping) or not all(isinstance(ranges, Mapping) for ranges in entries.values()):
+        raise TypeError(f"{title} must be a dict such as {{'command': {{'forward (m/s)': (-1.0, 2.0)}}}}")
+    for entry, ranges in entries.items():
+        if entry not in memory:
+            raise ValueError(f"{title}: {entry!r} is no entry of memory, which has {', '.join(memory) or 'none'}")
+        if len(memory[entry]) > 1 or len(ranges) != math.prod(memory[entry]):
+            raise ValueError(f"{title}: {entry!r} must be a row of {len(ranges)} numbers, as many as there are ranges")
+        for name, bounds in ranges.items():
+            low, high = bounds
+            if not -MAX_VALUE < low < high < MAX_VALUE:
+                raise ValueError(f"{title}: {name!r} must have a least and a greatest value, got {bounds}")
+
+
 class Hooks:
     """The hooks of an environment's task that are plain torch.
 
@@ -101,6 +127,8 @@ class Hooks:
         groups: shape of a row of each tensor of the observation, by name; empty if a Warp function observes.
         term_names: names of the terms of the reward; ``None`` if a Warp function rewards.
         moves: whether ``events`` changes qpos or qvel.
+        commands: in worlds to play with, the commands that can be set: their values, ``(num_envs, *row)``, and in which
+            worlds they are, bool ``(num_envs,)``.
 
     Raises:
         TypeError: a hook returns something of the wrong type.
@@ -117,6 +145,11 @@ class Hooks:
         self._substeps, shapes = env.config.substeps, memory_shapes(type(env))
         settings = env.num_envs, env.device, shapes, env.config.ctrl_dt
         self.catalog = Catalog(mj_model, *settings, bounded=bounded, variation=env.variation)
+        kept: dict[str, Any] = {"device": env.device}
+        self.commands = {
+            entry: (torch.zeros(env.num_envs, *shapes[entry], **kept), torch.zeros(env.num_envs, **kept) > 0)
+            for entry in (type(env).command_ranges if env.play else ())
+        }
         self.groups: dict[str, tuple[int, ...]] = {}
         self.term_names: tuple[str, ...] | None = None
         self.moves = False
@@ -277,6 +310,7 @@ class Hooks:
             if changed:
                 a["moved"].copy_(torch.stack(changed).any(0))
             self._remember(a, rows)
+        self._remember(a, self._commanded(a))
 
     def observe(self, a: Arrays) -> None:
         """At the end of a step: writes the observation, and marks and zeroes worlds that are not finite."""
@@ -299,6 +333,14 @@ class Hooks:
             rows = {**home, **self._rows("begin", a, {**memory, "qpos": (m.nq,), "qvel": (m.nv,)})}
         zeros = {name: torch.zeros_like(a[f"memory.{name}"]) for name in memory if name not in rows}
         self._remember(a, {**zeros, **rows}, a["mask"])
+        self._remember(a, self._commanded(a), a["mask"])
+
+    def _commanded(self, a: Arrays) -> dict[str, torch.Tensor]:
+        """Returns the commands of all worlds, by entry of memory: those that are set, in the others what they drew."""
+        return {
+            entry: torch.where(_by_world(is_set, values), values, a[f"memory.{entry}"])
+            for entry, (values, is_set) in self.commands.items()
+        }
 
     def observe_begun(self, a: Arrays) -> None:
         """After a reset, or after a state was written: writes the observation of the masked worlds."""

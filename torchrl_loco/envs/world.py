@@ -314,7 +314,7 @@ class World:
             parts.append(Part(variation.vary, streams, f"{self._title}: randomize", variation.fixed()))
             self._vary = parts[-1]
 
-        self._control, self._judge = part("control"), part("judge")
+        self._control, self._judge = part("control"), part("judge", own if hooks and hooks.commands else None)
         self._observe = part("observe", own)  # it looks for what is not finite, too
         self._begin = part("begin", own if self.memory else None)  # it zeroes memory, too
         self._observe_begun = part("observe_begun")

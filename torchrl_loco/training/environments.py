@@ -92,7 +92,7 @@ class Environments:
             else:
                 settings = {**dataclasses.asdict(base.config), "randomize": base.randomize}
                 del settings["naconmax"]  # which is for the number of its worlds
-                own = type(base)(worlds, base.device, seed, base.protocol, world_offset=0, **settings)
+                own = type(base)(worlds, base.device, seed, base.protocol, world_offset=0, play=base.play, **settings)
             self._evaluating[worlds] = own
         env: EnvBase = self._evaluating[worlds]
         env.set_seed(seed)
@@ -146,18 +146,34 @@ def unwrapped(env: EnvBase) -> tuple[LocoEnv, tuple[Transform, ...]]:
     return env, tuple(part for part in transforms if not isinstance(part, Compose) or len(part))
 
 
-def make_for(policy: Policy, num_envs: int, device: Any, seed: int) -> LocoEnv:
+def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: Any) -> LocoEnv:
     """Returns new worlds of the task of a policy, under the protocol that it was trained under.
+
+    Args:
+        policy: the policy.
+        num_envs: number of worlds.
+        device: where they compute.
+        seed: their seed.
+        settings: further arguments of :class:`torchrl_loco.LocoEnv`.
 
     Raises:
         ValueError: it was trained behind transforms.
         OSError: the file of its task is missing.
         ImportError: the file or module of its task is broken.
     """
+    refuse_transforms(policy)
     info = policy.info
-    if names := info.get("transforms"):
+    return make(info["task"], num_envs, device, seed, info["protocol"], world_offset=0, **settings)
+
+
+def refuse_transforms(policy: Policy) -> None:
+    """Refuses a policy that was trained behind transforms.
+
+    Raises:
+        ValueError: it was.
+    """
+    if names := policy.info.get("transforms"):
         raise ValueError(
             f"this policy was trained behind {', '.join(names)}, which its file does not hold: play it in an "
             "environment with these transforms, by env.rollout(steps, policy)"
         )
-    return make(info["task"], num_envs, device, seed, info["protocol"], world_offset=0)

@@ -1,7 +1,6 @@
 """The simulator in which a policy was trained, beside C MuJoCo: layout, velocity episodes and returns."""
 
 import dataclasses
-import inspect
 from typing import Any
 
 import mujoco
@@ -24,10 +23,9 @@ AGREEMENT = 1e-2
 
 
 def make(exported: Exported, n: int, seed: int, device: str | None, **settings: Any) -> LocoEnv:
-    """Returns worlds of a policy's task under the protocol of its training, without noise and pushes if it has play."""
+    """Returns worlds of a policy's task under the protocol of its training, without noise and pushes."""
     cls, facts = resolve(exported.task), exported.facts
-    play = {"play": True} if "play" in inspect.signature(cls.__init__).parameters else {}
-    return torchrl_loco.make(cls, n, device, seed, facts["protocol"], world_offset=0, **play, **settings)
+    return torchrl_loco.make(cls, n, device, seed, facts["protocol"], world_offset=0, play=True, **settings)
 
 
 def check_layout(exported: Exported, env: LocoEnv, seed: int) -> None:

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_loco.checks import check_bool, check_device, check_int
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.vary import Vary
@@ -102,13 +101,6 @@ class Velocity(LocoEnv):
     keyframe ``home``. A robot also sets ``memory = velocity.memory(joints=..., feet=...)``, and ``randomize``, for
     which :func:`sliding`, :func:`soft` and :func:`com` make entries.
 
-    Args:
-        num_envs: as for :class:`~torchrl_loco.LocoEnv`, like all arguments but ``play``.
-        device: likewise.
-        others: likewise.
-        play: whether to leave out noise, pushes and variation; commands can then be set with :meth:`set_command`.
-        settings: as for :class:`~torchrl_loco.LocoEnv`.
-
     Observation:
         ``observation``: linear and angular velocity of the base and gravity in its frame (9), joint positions relative
         to home, joint velocities, last action, command (3); with noise. ``privileged``: the same without noise, then
@@ -133,6 +125,7 @@ class Velocity(LocoEnv):
     config = SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=10, ls_iterations=20)
     episode_length = 1000
     action_range = (-math.inf, math.inf)
+    command_ranges = {"command": commands.greatest(CURRICULUM)}
     presets = {
         "ppo": {
             "num_envs": 8192,
@@ -174,40 +167,6 @@ class Velocity(LocoEnv):
     """Height of a foot in mid-swing (m)."""
     own_geoms: ClassVar[str] = ""
     """Regular expression of the geoms of which ``self_collision`` counts the contacts."""
-
-    def __init__(
-        self,
-        num_envs: int | None = 1,
-        device: torch.device | str | None = None,
-        *others: Any,
-        play: bool = False,
-        **settings: Any,
-    ) -> None:
-        self.play = check_bool("play", play)
-        if play:
-            settings["randomize"] = settings.get("randomize") or []
-            worlds = 1 if num_envs is None else check_int("num_envs", num_envs)
-            self._set = torch.zeros((worlds, 3), device=check_device(device))
-            self._is_set = torch.zeros((worlds, 1), dtype=torch.bool, device=check_device(device))
-        super().__init__(num_envs, device, *others, **settings)
-
-    def set_command(self, command: Sequence[float] | torch.Tensor | None) -> None:
-        """Sets the command that the worlds follow from their next step or reset on.
-
-        Args:
-            command: velocity forward and to the left (m/s) and yaw rate (rad/s), ``(3,)`` or ``(num_envs, 3)``;
-                ``None`` lets the worlds draw commands again, as they do at first.
-
-        Raises:
-            ValueError: the environment was made without ``play=True``, or the shape is another one.
-        """
-        if not self.play:
-            raise ValueError("commands are drawn in training: make the environment with play=True to set them")
-        rows = torch.as_tensor([0.0] * 3 if command is None else command, dtype=torch.float32)
-        if rows.shape not in ((3,), (self.num_envs, 3)):
-            raise ValueError(f"command must have shape (3,) or ({self.num_envs}, 3), got {tuple(rows.shape)}")
-        self._set.copy_(rows)
-        self._is_set.fill_(command is not None)
 
     @classmethod
     def check_class(cls) -> None:
@@ -392,11 +351,8 @@ class Velocity(LocoEnv):
         }
 
     def commanded(self, s: "View", rows: dict[str, torch.Tensor], yaw: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Returns the rows of a command for robots that look toward ``yaw`` (rad): turned, or as it was set."""
-        rows = commands.turned(rows, yaw, *commands.limits(s, self.curriculum))
-        if self.play:
-            rows["command"] = torch.where(self._is_set, self._set, rows["command"])
-        return rows
+        """Returns the rows of a command for robots that look toward ``yaw`` (rad)."""
+        return commands.turned(rows, yaw, *commands.limits(s, self.curriculum))
 
     def pushed(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns velocities, which a push changes every 1 to 3 s, and the time until the next."""

@@ -20,6 +20,9 @@ SLOWEST = 0.3
 STIFFNESS = 0.5
 """Yaw rate by error of heading (1/s)."""
 
+NAMES = ("forward (m/s)", "left (m/s)", "yaw rate (rad/s)")
+"""Of the numbers of a command."""
+
 ROWS: dict[str, int | tuple[int, ...]] = {
     "command": 3,
     "heading": (),
@@ -53,6 +56,11 @@ def reached(curriculum: dict[int, Ranges], steps: int) -> tuple[list[float], lis
     """Returns least and greatest command after so many control steps of training."""
     ranges = [ranges for first, ranges in curriculum.items() if steps >= first][-1]
     return [low for low, _ in ranges], [high for _, high in ranges]
+
+
+def greatest(curriculum: dict[int, Ranges]) -> dict[str, tuple[float, float]]:
+    """Returns the ranges of commands at the end of a curriculum, by name."""
+    return dict(zip(NAMES, list(curriculum.values())[-1], strict=True))
 
 
 def draw(s: "View", curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
