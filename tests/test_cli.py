@@ -14,7 +14,7 @@ import sys
 from torchrl_loco.cli import main
 from torchrl_loco.cli.errors import EXTRA
 
-class Missing:  # the extra "train", as if it were not installed
+class Missing:  # the extras train and viewer, as if they were not installed
     @staticmethod
     def find_spec(name, *rest):
         if name in EXTRA:
@@ -43,11 +43,12 @@ def test_help_and_wrong_options_wait_for_nothing():
     helpful = ["--help", "list", "train --help", "play --help"]
     wrong = ["fly", "train", "train walker_wlak", "train --seed 1", "play", "play walker_wlak", "eval x --episode many"]
     wrong += [f"{command} no/such/run" for command in ("eval", "resume", "record", "plot", "export")]
-    wrong.append("play walker_walk")  # right, but for the extra
+    wrong += ["play walker_walk --viewer video", "play walker_walk --viewer browser"]  # right, but for the extras
     said, exits, imported = in_fresh_process(*helpful, *wrong)
     assert exits == ["exit 0"] * len(helpful) + ["exit 2"] * len(wrong), said
     assert imported[-1] == "imported []"
-    assert said.count("install it with: pip install 'torchrl-loco[train]'") == 3  # of play and record
+    assert said.count("install it with: pip install 'torchrl-loco[train]'") == 2, said  # of play and plot
+    assert said.count("pip install 'torchrl-loco[viewer]'") == 1
     assert "Train a policy" in said
     assert said.count("Walk at 1 m/s or faster, in any direction.") == 2  # in the list and among what can be trained
 

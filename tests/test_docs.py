@@ -31,7 +31,10 @@ BODY_PAGES = sorted((ROOT / "torchrl_loco" / "tasks").glob("*/page.md"))  # whic
 WITH_CODE = [path for path in [ROOT / "README.md", *PAGES, *BODY_PAGES] if "```python" in path.read_text()]
 LONG = {"docs/guides/training.md", "docs/api/wrappers.md"}
 """Pages whose code trains."""
-NEEDS = {"docs/api/wrappers.md": ("gymnasium", "moviepy", "rsl_rl", "stable_baselines3")}
+NEEDS = {
+    "docs/api/wrappers.md": ("gymnasium", "moviepy", "rsl_rl", "stable_baselines3"),
+    "docs/guides/viewer.md": ("mjviser",),
+}
 """Pages whose code needs packages that not every installation has."""
 
 # The code.

@@ -14,7 +14,7 @@ LAYERS = [  # a module imports from its own layer or from those before it
     {"checks", "config", "rewards", "storage"},
     {"sim"},
     {"rendering"},
-    {"envs"},
+    {"envs", "viewer"},
     {"tasks"},
     {"registry", "collector"},
     {"policy", "nan_dump", "doctor", "wrappers"},

@@ -43,19 +43,18 @@ def test_from_training_to_a_video(tmp_path, capsys, monkeypatch):
     assert (path / "video.mp4").read_text() == "mine"
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(training, "has_display", lambda: False)
     monkeypatch.setattr(training, "record", lambda policy, env, path, *rest: path.touch(exist_ok=False))
     for what, options, name in (
-        ([str(path)], [], "video-3.mp4"),
-        (["walker_walk"], [], "walker_walk.mp4"),
-        (["walker_walk"], [], "walker_walk-2.mp4"),
+        ([str(path)], ["--viewer", "video"], "video-3.mp4"),
+        (["walker_walk"], ["--viewer", "video"], "walker_walk.mp4"),
+        (["walker_walk"], ["--viewer", "video"], "walker_walk-2.mp4"),
         ([str(path / "policy.safetensors")], ["--out", "x.mp4"], "x.mp4"),
     ):
         assert cli.main(["play", *what, *video, *options]) == 0
         head, returns, out = capsys.readouterr().out.splitlines()
         assert (head.split(",")[0], returns.split()[0], Path(out).name) == ("walker_walk", "return", name)
         assert Path(out).exists()
-    assert cli.main(["play", "walker_walk", "--protocol", "dm_control", *video]) == 0
+    assert cli.main(["play", "walker_walk", "--viewer", "video", "--protocol", "dm_control", *video]) == 0
     assert "protocol dm_control" in capsys.readouterr().out
 
 

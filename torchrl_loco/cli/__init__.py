@@ -16,7 +16,7 @@ from torchrl_loco.cli import runs
 from torchrl_loco.cli.diagnosis import diagnose, inspect, list_tasks
 from torchrl_loco.cli.errors import process_name, user_errors
 from torchrl_loco.cli.options import VALUES, task_options
-from torchrl_loco.cli.policies import evaluate, export, play, record, verify
+from torchrl_loco.cli.policies import evaluate, export, play, record, verify, watch
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -49,6 +49,7 @@ def _run(args: list[str]) -> None:
         "eval": evaluate,
         "record": record,
         "play": play,
+        "watch": watch,
         "plot": runs.plot,
         "export": export,
         "verify": verify,

@@ -5,8 +5,11 @@ import os
 import sys
 from collections.abc import Iterator
 
-EXTRA = ("matplotlib", "tensorboard", "imageio", "av")
-"""Modules of the extra "train"."""
+EXTRA = {
+    **dict.fromkeys(("matplotlib", "tensorboard", "imageio", "av"), "train"),
+    **dict.fromkeys(("viser", "mjviser"), "viewer"),
+}
+"""The extras by the modules that they bring."""
 
 
 def process_name() -> str:
@@ -23,5 +26,6 @@ def user_errors(*kinds: type[Exception]) -> Iterator[None]:
     except kinds as error:
         print(f"{process_name()}: {error}", file=sys.stderr)
         if isinstance(error, ModuleNotFoundError) and error.name in EXTRA:
-            print("install it with: pip install 'torchrl-loco[train]', or pip install '.[train]'", file=sys.stderr)
+            extra = EXTRA[error.name]
+            print(f"install it with: pip install 'torchrl-loco[{extra}]', or pip install '.[{extra}]'", file=sys.stderr)
         raise SystemExit(2) from None

@@ -1,19 +1,33 @@
 """Commands on trained policies: eval, record, play, export and verify."""
 
 import dataclasses
+import ipaddress
 import json
+import os
 import re
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 import torchrl_loco
-from torchrl_loco.checks import SEED, check_device, check_float, check_int, check_output_file, check_packages, is_run
+from torchrl_loco.checks import (
+    SEED,
+    Interval,
+    check_device,
+    check_float,
+    check_int,
+    check_output_file,
+    check_packages,
+    check_run,
+    is_run,
+)
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.verification.conditions import DEFAULT, Conditions
+from torchrl_loco.viewer.settings import LOOPBACK, PORT, WORLDS, check_viewer
 
 CONTAINERS = (".mp4", ".mkv", ".mov")
 """Suffixes of a video."""
@@ -129,6 +143,9 @@ class Video:
             check_device(self.device)
         if self.out is not None:
             check_output_file("out", self.out, CONTAINERS)
+
+    def check_encoder(self) -> None:
+        """Checks that a video can be written."""
         check_packages("a video", ("imageio", "av"), "train")
 
     def make(self, policy: "torchrl_loco.Policy", default: Path) -> None:
@@ -150,6 +167,44 @@ class Video:
 VideoOptions = Annotated[Video, tyro.conf.arg(name="")]
 
 
+@dataclasses.dataclass(frozen=True)
+class Browser:
+    """Options of the page in the browser."""
+
+    num_envs: int = 4
+    """Number of worlds side by side in the browser."""
+    host: str = LOOPBACK
+    """Address that the page is served at; by default this machine alone reaches it. There is no password."""
+    port: int = PORT
+    """Port of the page; the next free one if it is taken."""
+
+    def check(self) -> None:
+        """Checks all options before anything is printed or made."""
+        check_viewer()
+        check_int("num_envs", self.num_envs, WORLDS)
+        check_int("port", self.port, Interval(1, 2**16))
+
+    def show(
+        self,
+        env: "torchrl_loco.LocoEnv",
+        policy: "torchrl_loco.Policy | None",
+        newer: "Callable[[], torchrl_loco.Policy | None] | None" = None,
+    ) -> None:
+        """Serves the page until it is interrupted, and prints its address."""
+        from torchrl_loco.training.algorithm import settings_for_small_networks
+        from torchrl_loco.viewer.viewer import Viewer
+
+        with settings_for_small_networks():
+            viewer = Viewer(env, policy, newer=newer, host=self.host, port=self.port)
+            if not ipaddress.ip_address(self.host).is_loopback:
+                print(f"warning: whoever reaches {self.host} can see and steer the worlds, without a password")
+            print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
+            viewer.run()
+
+
+BrowserOptions = Annotated[Browser, tyro.conf.arg(name="")]
+
+
 def record(
     run_or_task: RunOrTask,
     /,
@@ -167,6 +222,7 @@ def record(
     """
     with user_errors():
         video.check()
+        video.check_encoder()
         played, beside = _policy(run_or_task, protocol, video.device, policy)
         video.make(played, _video_file(played, beside))
 
@@ -174,31 +230,102 @@ def record(
 def play(
     run_or_task: RunOrTask,
     /,
+    viewer: Annotated[
+        Literal["auto", "window", "browser", "video"],
+        tyro.conf.arg(help="where it is shown; auto is a window if there is a display, else the browser."),
+    ] = "auto",
     protocol: Protocol = "playground",
     policy: OtherPolicy = None,
+    browser: BrowserOptions = Browser(),
     video: VideoOptions = Video(),
 ) -> None:
-    """Show a trained policy: in a window if there is a display, else as a video.
+    """Show a trained policy: in a window, in the browser or as a video.
 
     Args:
         run_or_task: what to play.
+        viewer: where it is shown.
         protocol: which policy of the package.
         policy: a policy that may be of another task.
+        browser: how many worlds the browser shows, and at which address.
         video: which part of an episode is shown, and how; --out always records a video.
     """
     with user_errors():
-        from torchrl_loco import training
-
         video.check()
+        if video.out is not None:
+            viewer = "video"
+        if viewer == "browser":
+            browser.check()
+        if viewer == "video":
+            video.check_encoder()
         played, beside = _policy(run_or_task, protocol, video.device, policy)
+        from torchrl_loco import training
+        from torchrl_loco.training.environments import make_for
+
+        if viewer == "auto":
+            viewer = _default_viewer(browser, video)
         info, shown = played.info, ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
         print(info["task"], *(f"{key} {info[key]}" for key in shown if key in info), sep=", ")
         if "mean" in info:
             print(training.describe(info))
-        if video.out is None and training.has_display():
+        if viewer == "window":
             training.view(played, video.env(played), info["action_repeat"])
+        elif viewer == "browser":
+            of = {"reward_terms": True, "play": True}
+            browser.show(make_for(played, browser.num_envs, video.device, video.seed, **of), played)
         else:
             video.make(played, _video_file(played, beside))
+
+
+def _default_viewer(browser: Browser, video: Video) -> Literal["window", "browser", "video"]:
+    """Returns where a policy is shown: in a window if there is a display, else in the browser, if that is installed."""
+    from torchrl_loco import training
+
+    if training.has_display():
+        return "window"
+    try:
+        browser.check()
+    except ImportError as error:
+        print(f"torchrl-loco: there is no display for a window, and {error}. A video is recorded.", file=sys.stderr)
+        video.check_encoder()
+        return "video"
+    return "browser"
+
+
+def watch(
+    run: tyro.conf.Positional[Path],
+    /,
+    device: str = "cpu",
+    seed: int = 0,
+    browser: BrowserOptions = Browser(),
+) -> None:
+    """Show a running training in the browser: its newest policy, swapped in as it appears.
+
+    It reads the files of the run and nothing else, and computes with what other processes leave of the CPU.
+
+    Args:
+        run: folder of the run.
+        device: where the worlds that are shown compute; on CUDA they would share the GPU with the training.
+        seed: seed of the worlds.
+        browser: how many worlds are shown, and at which address.
+    """
+    with user_errors():
+        check_run(run)
+        browser.check()
+        check_int("seed", seed, SEED)
+        check_device(device)
+        _yield_to_others()
+        from torchrl_loco import training
+        from torchrl_loco.training.watching import Watched
+
+        watched = Watched(training.RunFolder(run), browser.num_envs, device, seed)
+        browser.show(watched.env, watched.newer(), watched.newer)
+
+
+def _yield_to_others() -> None:
+    """Gives this process the lowest priority that there is; threads that it makes from here on have the same."""
+    os.nice(19)
+    if hasattr(os, "SCHED_IDLE"):  # of Linux: a fifth of the share of nice 19
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
 def _video_file(policy: "torchrl_loco.Policy", beside: Path) -> Path:

@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import secrets
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -43,6 +43,7 @@ from torchrl_loco.sim.simulation import set_options
 
 if TYPE_CHECKING:
     from torchrl_loco.envs.view import View
+    from torchrl_loco.viewer.viewer import Viewer
 
 BOUNDED, UNBOUNDED = (-1.0, 1.0), (-math.inf, math.inf)
 """What ``action_range`` can be."""
@@ -338,6 +339,27 @@ class LocoEnv(EnvBase):
             raise ValueError(f"command must have shape {tuple(row)} or {tuple(values.shape)}, got {tuple(rows.shape)}")
         values.copy_(rows)
         is_set.fill_(command is not None)
+
+    def view(
+        self, policy: Callable[[TensorDictBase], TensorDictBase], action_repeat: int | None = None, **server: Any
+    ) -> "Viewer":
+        """Plays a policy in these worlds in the browser, in a thread of its own; a notebook shows the page inline.
+
+        Args:
+            policy: reads ``observation`` and writes ``action``.
+            action_repeat: control steps for which an action is held; ``None`` takes that of ``policy.info``, else 1.
+            server: ``host`` and ``port``, as for :class:`torchrl_loco.viewer.viewer.Viewer`.
+
+        Returns:
+            The viewer. Leave the worlds to it until its ``close()``.
+
+        Raises:
+            ImportError: the extra ``viewer`` is not installed.
+            ValueError: there are more than 64 worlds.
+        """
+        from torchrl_loco.viewer.viewer import Viewer
+
+        return Viewer(self, policy, action_repeat, **server).start()
 
     # What a policy's file tells of the task.
 

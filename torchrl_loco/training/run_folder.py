@@ -179,9 +179,14 @@ class RunFolder:
         return policy
 
     @property
+    def checkpoint(self) -> Path:
+        """What a run continues from."""
+        return self.path / "checkpoint.pt"
+
+    @property
     def has_checkpoint(self) -> bool:
         """Whether there is a checkpoint to resume from."""
-        return (self.path / "checkpoint.pt").is_file()
+        return self.checkpoint.is_file()
 
     @property
     def nan_dump(self) -> Path:
@@ -267,7 +272,7 @@ class RunFolder:
         """
         buffer = io.BytesIO()  # torch's own writer does not say what went wrong
         torch.save({"version": CHECKPOINT_VERSION, **entries}, buffer)
-        storage.replace_file(self.path / "checkpoint.pt", buffer.getbuffer())
+        storage.replace_file(self.checkpoint, buffer.getbuffer())
 
     def load_checkpoint(self, device: torch.device | str) -> dict[str, Any]:
         """Reads the checkpoint without executing code.
@@ -279,7 +284,7 @@ class RunFolder:
             FileNotFoundError: the run has none yet.
             ValueError: it is damaged, or of another version.
         """
-        path = self.path / "checkpoint.pt"
+        path = self.checkpoint
         if not self.has_checkpoint:
             raise FileNotFoundError(f"{self.path} has no checkpoint.pt: start a new run")
         try:

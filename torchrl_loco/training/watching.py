@@ -1,0 +1,54 @@
+"""A run that may still be training, seen from another process: its files are read, and nothing else."""
+
+from torchrl_loco.policy import Policy
+from torchrl_loco.registry import make
+from torchrl_loco.training.actor import deterministic_policy
+from torchrl_loco.training.environments import refuse_transforms
+from torchrl_loco.training.run_folder import RunFolder
+from torchrl_loco.training.spaces import Spaces
+from torchrl_loco.training.trainer import ALGORITHMS
+
+
+class Watched:
+    """Worlds of a run's task, and the run's newest policy.
+
+    That is the one of ``checkpoint.pt`` or of ``policy.safetensors``, whichever was written last. A run that was begun
+    with objects of one's own (:class:`torchrl_loco.training.Given`) has them in no file, so it is the latter.
+
+    Args:
+        run: the run.
+        num_envs: number of worlds.
+        device: where they compute.
+        seed: their seed.
+
+    Attributes:
+        env: the worlds, without noise and pushes.
+    """
+
+    def __init__(self, run: RunFolder, num_envs: int, device: str, seed: int) -> None:
+        self._run, self._config = run, run.load_config(device=device)
+        config = self._config
+        settings = {"world_offset": 0, "reward_terms": True, "play": True}
+        self.env = make(config.task, num_envs, device, seed, config.protocol, **settings)
+        self._files = [run.policy] if run.given else [run.policy, run.checkpoint]
+        self._seen = 0
+
+    def newer(self) -> Policy | None:
+        """Returns the newest policy, or ``None`` if there is none that this has not returned before.
+
+        Raises:
+            ValueError: a file cannot be read, or the policy was trained behind transforms.
+        """
+        written = [(file.stat().st_mtime_ns, file) for file in self._files if file.is_file()]
+        when, newest = max(written, default=(0, None))
+        if newest is None or when <= self._seen:
+            return None
+        self._seen = when
+        if newest == self._run.policy:
+            policy = self._run.load_policy(self._config.device)
+            refuse_transforms(policy)
+            return policy
+        checkpoint = self._run.load_checkpoint(self._config.device)
+        algorithm = ALGORITHMS[self._config.algorithm](self._config, Spaces.of(self.env))
+        algorithm.networks.load_state_dict(checkpoint["algorithm"]["networks"])
+        return deterministic_policy(algorithm.actor, self._config, {"frames": checkpoint["frames"]})

@@ -1,0 +1,200 @@
+"""The page of the viewer: scene, buttons, sliders and curves. What is clicked is passed on, not done here."""
+
+import contextlib
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+import viser
+from mjviser import ViserMujocoScene
+from viser import uplot
+
+from torchrl_loco.viewer.player import Player
+
+SOLVER = {"iterations": 100, "ls_iterations": 50}
+"""With which C MuJoCo finds the forces that arrows show: it converges, whatever the worlds' own settings are."""
+SPACING = 1.5
+"""Distance between worlds, by the size of the model."""
+ELEVATION, AZIMUTH = np.deg2rad(20.0), np.deg2rad(120.0)
+"""Where the camera is at first, seen from the chosen world."""
+COLORS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
+"""Of the lines of a plot, again from the first after the last."""
+OVER_TIME = {"x": uplot.Scale(time=False, auto=True)}
+"""A plot's axis of seconds, which are no dates."""
+
+
+class _Server(viser.ViserServer):
+    """A server that opens no tunnel: any client could ask for one, and the page would be public."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Does nothing."""
+
+
+class Page:
+    """The page of some worlds.
+
+    Args:
+        player: the worlds.
+        host: address that the server listens on.
+        port: its port; the next free one if it is taken.
+        title: what stands above the controls.
+        act: takes what a click asks for, a function to be called by whoever steps the worlds.
+
+    Attributes:
+        world: index of the chosen world.
+        server: viser's server.
+        clock: buttons of the clock, whose clicks are for the caller.
+        speed: buttons of its speed, likewise.
+    """
+
+    def __init__(
+        self, player: Player, host: str, port: int, title: str, act: Callable[[Callable[[], None]], None]
+    ) -> None:
+        self._player, self._act, self.world = player, act, 0
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner
+            self.server = _Server(host, port, verbose=False)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.server.gui.main_panel.dock_right()
+        self._model = player.env.mujoco_model()
+        for name, value in SOLVER.items():
+            setattr(self._model.opt, name, value)
+        self.scene = ViserMujocoScene(self.server, self._model, player.env.num_envs)
+        side = int(np.ceil(np.sqrt(player.env.num_envs)))
+        self._spacing = SPACING * self._model.stat.extent
+        rows, columns = np.divmod(np.arange(player.env.num_envs), side)
+        self._places = self._spacing * np.stack([-rows, columns, 0 * rows], axis=1)
+        self._look(2.2 * self._model.stat.extent + 0.4 * (side - 1) * self._spacing)
+        gui = self.server.gui
+        gui.add_markdown(f"**{title}**")
+        self._status = gui.add_markdown("")
+        self.clock = gui.add_button_group("Clock", ("Play/Pause", "Step", "Reset"))
+        self.speed = gui.add_button_group("Speed", ("Slower", "Real time", "Faster"))
+        self._make_choice()
+        self._sliders: dict[str, list[Any]] = {}
+        for entry, ranges in type(player.env).command_ranges.items() if player.env.play else ():
+            self._make_command(entry, ranges)
+        self._make_curves()
+
+    @property
+    def port(self) -> int:
+        """The port that the server listens on."""
+        return self.server.get_port()
+
+    @property
+    def watched(self) -> bool:
+        """Whether the page is open in a browser."""
+        return bool(self.server.get_clients())
+
+    def _look(self, distance: float) -> None:
+        away = [-np.cos(ELEVATION) * np.cos(AZIMUTH), -np.cos(ELEVATION) * np.sin(AZIMUTH), np.sin(ELEVATION)]
+        self.server.initial_camera.position = tuple(distance * np.array(away))
+        self.server.initial_camera.look_at = (0.0, 0.0, 0.0)  # the chosen world is kept there
+
+    # Controls.
+
+    def _make_choice(self) -> None:
+        gui, n = self.server.gui, self._player.env.num_envs
+        self.choice = gui.add_slider("World", 0, max(1, n - 1), 1, 0, disabled=n == 1)
+        self.follow = gui.add_checkbox("Follow", True, hint="Keep the chosen world in the middle of the picture.")
+        self.alone = gui.add_checkbox("Hide other worlds", False, visible=n > 1)
+        self.forces = gui.add_checkbox("Contacts and forces", False, hint="Of the chosen world, by C MuJoCo.")
+        for control in (self.choice, self.follow, self.alone, self.forces):
+            control.on_update(lambda _: self._act(self._choose))
+
+    def _choose(self) -> None:
+        if not self.follow.value and self.scene.camera_tracking_enabled:
+            self._move_cameras(self._followed)  # the scene goes back to its own coordinates
+        if self.follow.value and not self.scene.camera_tracking_enabled:
+            self._move_cameras(-self._followed)
+        self.world = int(self.choice.value)
+        self.scene.camera_tracking_enabled = self.follow.value
+        self.scene.show_only_selected = self.alone.value
+        self.scene.show_contact_points = self.scene.show_contact_forces = self.forces.value
+
+    def _move_cameras(self, by: np.ndarray) -> None:
+        for client in self.server.get_clients().values():
+            client.camera.position = client.camera.position + by  # which takes what it looks at along
+
+    @property
+    def _followed(self) -> np.ndarray:
+        """Place of the first body that moves, of the chosen world (m)."""
+        body = int(np.flatnonzero(self._model.body_weldid)[0])
+        return self._player.env.sim.xpos[self.world, body].cpu().numpy().astype(float)
+
+    def _make_command(self, entry: str, ranges: Any) -> None:
+        gui = self.server.gui
+        with gui.add_folder(entry.replace("_", " ").capitalize()):
+            by_hand = gui.add_checkbox("Set by hand", False, hint="In all worlds; else each draws its own.")
+            start = self._player.command(entry, self.world)
+            sliders = []
+            for (name, (low, high)), value in zip(ranges.items(), start, strict=True):
+                step = (high - low) / 100
+                sliders.append(gui.add_slider(name, low, high, step, min(max(value, low), high)))
+        self._sliders[entry] = [by_hand, *sliders]
+
+        def set_command() -> None:
+            env = self._player.env
+            numbers = torch.tensor([slider.value for slider in sliders]).reshape(env.world.memory[entry].shape[1:])
+            env.set_command(numbers if by_hand.value else None, entry)
+
+        def moved(event: Any) -> None:
+            if event.client is not None:  # by a person, not by show()
+                by_hand.value = True
+                self._act(set_command)
+
+        by_hand.on_update(lambda event: self._act(set_command))
+        for slider in sliders:
+            slider.on_update(moved)
+
+    def _make_curves(self) -> None:
+        gui, names = self.server.gui, self._player.term_names
+        returns = ("this world", "mean of all")[: self._player.env.num_envs]
+        with gui.add_folder("Return of the episode"):
+            self._return = gui.add_uplot(*_plot(returns), scales=OVER_TIME, height=180)
+        self._terms = None
+        if names:
+            with gui.add_folder("Terms of the reward"):
+                self._terms = gui.add_uplot(*_plot(names), scales=OVER_TIME, height=240)
+
+    # What is shown.
+
+    def show_worlds(self) -> None:
+        """Shows the present state of all worlds; the chosen one stands in its own place, the others beside it."""
+        sim, chosen = self._player.env.sim, self.world
+        shift = self._places - self._places[chosen]
+        of_forces = {}
+        if self.forces.value:
+            of_forces = {name: getattr(sim, name).cpu().numpy() for name in ("qpos", "qvel", "ctrl")}
+        self.scene.update_from_arrays(
+            sim.xpos.cpu().numpy() + shift[:, None].astype(np.float32),
+            sim.xmat.cpu().numpy().copy(),
+            env_idx=chosen,
+            **of_forces,
+        )
+
+    def show_curves(self) -> None:
+        """Shows curves and command of the chosen world."""
+        times, returns, terms = self._player.curves(self.world)
+        if len(times) > 1:
+            self._return.data = (times, *np.ascontiguousarray(returns.T)[: self._player.env.num_envs])
+            if self._terms is not None:
+                self._terms.data = (times, *np.ascontiguousarray(terms.T))
+        for entry, (by_hand, *sliders) in self._sliders.items():
+            if not by_hand.value:
+                for slider, value in zip(sliders, self._player.command(entry, self.world), strict=True):
+                    slider.value = min(max(value, slider.min), slider.max)
+
+    def show_status(self, text: str) -> None:
+        """Shows a line of Markdown above the controls."""
+        if self._status.content != text:
+            self._status.content = text
+
+
+def _plot(names: tuple[str, ...]) -> tuple[tuple[np.ndarray, ...], tuple[uplot.Series, ...]]:
+    """Returns data, as yet none, and lines of a plot over time."""
+    lines = [
+        uplot.Series(label=name, stroke=COLORS[k % len(COLORS)], width=1.5, show=True) for k, name in enumerate(names)
+    ]
+    return tuple(np.zeros(1) for _ in range(1 + len(names))), (uplot.Series(label="time (s)"), *lines)

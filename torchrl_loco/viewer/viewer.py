@@ -1,0 +1,192 @@
+"""Worlds and their page together: in real time, in a loop or beside a notebook."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from torchrl_loco.checks import check_int
+from torchrl_loco.viewer.player import Player
+from torchrl_loco.viewer.settings import LOOPBACK, PORT, WORLDS, check_viewer
+
+if TYPE_CHECKING:
+    from torchrl_loco.envs.base import LocoEnv
+
+SPEEDS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
+"""Of the simulation, by real time."""
+PICTURE, CURVES, LOOK_FOR_POLICY, IDLE = 1 / 30, 0.25, 1.0, 0.1
+"""Time between two pictures, two updates of curves, two looks for a newer policy, and two looks for a page (s)."""
+
+
+class Viewer:
+    """Shows 1 to 64 worlds in the browser, live, under a policy; the page serves to steer and understand them.
+
+    :meth:`run` plays them until it is interrupted, :meth:`start` in a thread of its own, as in a notebook, where the
+    viewer shows its page as the result of a cell. The worlds stand still while no browser shows the page.
+
+    Args:
+        env: the worlds. Nobody else may step them meanwhile. With ``reward_terms=True`` there are curves of the terms,
+            with ``play=True`` sliders for the commands that the task declares.
+        policy: reads ``observation`` and writes ``action``; ``None`` waits for ``newer``.
+        action_repeat: control steps for which an action is held; ``None`` takes that of ``policy.info``, else 1.
+        newer: called now and then, returns another policy to go on with, or ``None``.
+        host: address that the server listens on. There is no password: whoever reaches it can steer the worlds.
+        port: its port; the next free one if it is taken.
+
+    Raises:
+        ImportError: the extra ``viewer`` is not installed.
+        ValueError: there are more than 64 worlds.
+    """
+
+    def __init__(
+        self,
+        env: "LocoEnv",
+        policy: Callable[[Any], Any] | None,
+        action_repeat: int | None = None,
+        *,
+        newer: Callable[[], Callable[[Any], Any] | None] | None = None,
+        host: str = LOOPBACK,
+        port: int = PORT,
+    ) -> None:
+        check_viewer()
+        check_int("num_envs", env.num_envs, WORLDS)
+        from torchrl_loco.viewer.page import Page
+
+        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._newer, self._host = newer, host
+        self.player = Player(env, policy, action_repeat)
+        self.page = Page(self.player, host, port, type(env).__name__, self._requests.put)
+        clock = {"Play/Pause": self._pause, "Step": self._step_once, "Reset": self._reset}
+        self.page.clock.on_click(lambda event: self._requests.put(clock[event.target.value]))
+        self.page.speed.on_click(lambda event: self._requests.put(lambda: self._change_speed(event.target.value)))
+        self.paused, self.speed = False, 1.0
+        self._thread: threading.Thread | None = None
+        self._ends = threading.Event()
+        self._due = {"picture": 0.0, "curves": 0.0, "policy": 0.0}
+        self._last, self._owed, self._measured = time.perf_counter(), 0.0, (time.perf_counter(), 0)
+        self._real_speed = 0.0
+        self._show()
+
+    @property
+    def url(self) -> str:
+        """Address of the page on this machine."""
+        return f"http://{LOOPBACK if self._host == '0.0.0.0' else self._host}:{self.page.port}"
+
+    # Playing.
+
+    def run(self) -> None:
+        """Plays until :meth:`close` is called, or it is interrupted."""
+        try:
+            while not self._ends.is_set():
+                self.tick()
+        finally:
+            self.page.server.stop()
+
+    def start(self) -> "Viewer":
+        """Plays in a thread of its own until :meth:`close` is called.
+
+        Returns:
+            The viewer.
+        """
+        self._thread = threading.Thread(target=self.run, name="torchrl-loco viewer", daemon=True)
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Ends :meth:`run` or what :meth:`start` began, and the page with it; the worlds stay."""
+        self._ends.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def __enter__(self) -> "Viewer":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+        self.page.server.stop()
+
+    def _repr_html_(self) -> str:
+        """Returns the page as a frame of a notebook."""
+        return f'<iframe src="{self.url}" width="100%" height="640" style="border: 0"></iframe>'
+
+    def tick(self) -> None:
+        """Does what was clicked and what is due, and waits until something is due again."""
+        now = time.perf_counter()
+        while not self._requests.empty():
+            self._requests.get()()
+            self._due["picture"] = self._due["curves"] = 0.0
+        if self._newer is not None and self._is_due("policy", now, LOOK_FOR_POLICY):
+            self._swap(self._newer())
+        elapsed, self._last = now - self._last, now
+        if not self.page.watched:
+            self._ends.wait(IDLE)
+            return
+        if self._plays:
+            self._owed += elapsed * self.speed
+            until = now + PICTURE
+            while self._owed >= self.player.dt and time.perf_counter() < until:
+                self.step()
+                self._owed -= self.player.dt
+            self._owed = min(self._owed, self.player.dt)  # what the machine cannot keep up with is not made up for
+        if self._is_due("picture", now, PICTURE):
+            self.page.show_worlds()
+        if self._is_due("curves", now, CURVES):
+            self._show_numbers()
+        self._ends.wait(max(0.001, min(self._due["picture"], now + self.player.dt) - time.perf_counter()))
+
+    def _is_due(self, what: str, now: float, every: float) -> bool:
+        if now < self._due[what]:
+            return False
+        self._due[what] = max(now, self._due[what] + every)
+        return True
+
+    def step(self) -> None:
+        """Takes a control step in every world, if there is a policy."""
+        if self.player.policy is not None:
+            self.player.step()
+
+    @property
+    def _plays(self) -> bool:
+        return not self.paused and self.player.policy is not None
+
+    def _swap(self, policy: Callable[[Any], Any] | None) -> None:
+        if policy is not None:
+            self.player.policy = policy
+            self._due["curves"] = 0.0
+
+    # What is clicked.
+
+    def _pause(self) -> None:
+        self.paused, self._owed = not self.paused, 0.0
+
+    def _step_once(self) -> None:
+        self.paused = True
+        self.step()
+
+    def _reset(self) -> None:
+        self.player.reset()
+        self._measured = time.perf_counter(), 0
+
+    def _change_speed(self, to: str) -> None:
+        at = SPEEDS.index(self.speed) + {"Slower": -1, "Real time": 0, "Faster": 1}[to]
+        self.speed = 1.0 if to == "Real time" else SPEEDS[min(max(at, 0), len(SPEEDS) - 1)]
+
+    # What is shown.
+
+    def _show(self) -> None:
+        self.page.show_worlds()
+        self._show_numbers()
+
+    def _show_numbers(self) -> None:
+        player, now = self.player, time.perf_counter()
+        since, steps = self._measured
+        if now - since >= 1.0:
+            self._real_speed = (player.steps - steps) * player.dt / (now - since)
+            self._measured = now, player.steps
+        self.page.show_curves()
+        policy, info = "no policy yet", getattr(player.policy, "info", {})
+        if player.policy is not None:
+            policy = f"policy of {info['frames']:,} frames" if "frames" in info else "policy"
+        pace = "paused" if self.paused else f"speed {self.speed:g}, reached {self._real_speed:.2f}"
+        self.page.show_status(f"{policy} · {player.steps * player.dt:.1f} s · {pace}")
