@@ -8,11 +8,11 @@ import numpy as np
 from torchrl_loco.sim.compiled.symbols import Scalar, scalar
 
 FUNCTIONS: dict[str, Callable[..., float]] = {
-    "SQRT": np.sqrt,
-    "wp::min": min,
-    "wp::max": max,
+    "Math::root": np.sqrt,
+    "Math::smaller": min,
+    "Math::larger": max,
     "fabsf": abs,
-    "powf": pow,
+    "Math::raised": pow,
 }
 COMPARISONS: dict[str, Callable[[float, float], bool]] = {"<": lambda a, b: a < b, "<=": lambda a, b: a <= b}
 

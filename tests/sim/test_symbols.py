@@ -2,6 +2,7 @@
 
 import math
 import re
+import types
 
 import hypothesis
 import numpy as np
@@ -83,15 +84,17 @@ def test_values_are_those_of_plain_arithmetic(tree, values):
     assert run(block, values, result) == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
-FUNCTIONS = {"DIV": lambda a, b: a / b, "SQRT": math.sqrt, "fabsf": abs, "wp_min": min, "wp_max": max}
+MATH = types.SimpleNamespace(divide=lambda a, b: a / b, root=math.sqrt, smaller=min, larger=max)
 
 
 def run(block, variables, result):
     """Returns the value of a C++ expression after the statements of a block, which are straight-line code."""
-    scope = {**FUNCTIONS, **variables, "math": math}
+    scope = {"Math": MATH, "fabsf": abs, **variables, "math": math}
     for line in [*block.lines, f"result = {result};"]:
-        text = line.replace("wp::", "wp_")
-        text = re.sub(r"float (\w+), \w+; SINCOS\((.*), \w+, (\w+)\);", r"\1, \3 = math.sin(\2), math.cos(\2)", text)
+        text = line.replace("::", ".")
+        text = re.sub(
+            r"float (\w+), \w+; Math\.sincos\((.*), \w+, (\w+)\);", r"\1, \3 = math.sin(\2), math.cos(\2)", text
+        )
         text = re.sub(r"(?<=\d)f\b", "", text).removeprefix("const ").removeprefix("float ").removesuffix(";")
         text = re.sub(r"= (.*) \? (.*) : (.*)$", r"= (\2) if (\1) else (\3)", text)
         exec(text, scope)

@@ -19,6 +19,7 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 ``solver``           Newton iterations and their line search
 ``sensors``          velocities of subtrees, touch, and contact forces of geoms
 ``lanes``            a group of lanes a world: what ``lanes.h`` has to know about a model
+``shared``           the C++ of both: arithmetic, laws, line search
 ``links``            bodies that are welded together
 ``parameters``       numbers of the model that differ from world to world
 ``tables``           constants and tables as C++

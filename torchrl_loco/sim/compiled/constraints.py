@@ -113,9 +113,8 @@ class Softness:
         if scalar(self.rise).constant == 0:
             return scalar(self.dmin)
         x = minimum(absolute(position) * self.per_width, 1)
-        below = self.lower * raised(x, self.power)
-        above = 1 - self.upper * raised(1 - x, self.power)
-        return self.dmin + select(x, "<=", self.midpoint, below, above) * self.rise
+        power = raised(select(x, "<=", self.midpoint, x, 1 - x), self.power)
+        return self.dmin + select(x, "<=", self.midpoint, self.lower * power, 1 - self.upper * power) * self.rise
 
     def row(self, weight: float | Scalar, position: Scalar, least: float | Scalar = MINVAL) -> tuple[Scalar, Scalar]:
         """Returns D, and the part of the residual that the position makes.
@@ -129,12 +128,23 @@ class Softness:
         regularisation = maximum(scalar(weight) * (1 - impedance) / impedance, least)
         return 1 / regularisation, self.stiffness * impedance * position
 
+    @classmethod
+    def functions(cls) -> str:
+        """Returns :meth:`row` as C++, a member of a struct that has the attributes."""
+        softness = cls(*(name(field.name) for field in dataclasses.fields(cls)))
+        results = softness.row(name("inverse_inertia"), name("position"), name("least"))
+        block = Block()
+        for target, result in zip(("weight", "residual"), results, strict=True):
+            block.set(target, result)
+        arguments = "float inverse_inertia, float position, float least, float& weight, float& residual"
+        return f"INLINE void row({arguments}) const {{\n{block.text()}\n}}"
+
 
 def raised(x: Scalar, power: float | Scalar) -> Scalar:
     """Returns ``x`` to a power."""
     constant = scalar(power).constant
     if constant is None or constant != int(constant) or constant > 8:
-        return call("powf", x, power)
+        return call("Math::raised", x, power)
     result = x
     for _ in range(int(constant) - 1):
         result = result * x
@@ -226,7 +236,7 @@ class JointLimits:
         """Adds the rows to the gradient of the cost and to the diagonal of its Hessian."""
         for i, (j, _) in enumerate(self.rows):
             d, x, sign = self.m.jnt_dofadr[j], cell(f"limit_x[{i}]"), cell(f"limit_sign[{i}]")
-            weight = select(x, "<", 0, cell(f"limit_D[{i}]"), 0)
+            weight = call("OneSided::curvature", x, cell(f"limit_D[{i}]"))
             gradient[d] = gradient[d] + weight * sign * x
             diagonal[d] = diagonal[d] + weight
 
@@ -242,7 +252,7 @@ class JointLimits:
         return (
             f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ "
             "const float x = limit_x[i] + alpha * limit_v[i]; "
-            "changed |= limit_D[i] > 0.0f && (x < 0.0f) != (limit_x[i] < 0.0f); limit_x[i] = x; }"
+            "changed |= limit_D[i] > 0.0f && OneSided::crosses(limit_x[i], x); limit_x[i] = x; }"
         )
 
 
@@ -263,14 +273,12 @@ class DryFriction:
         weights = m.dof_invweight0[self.dofs]
         rows = zip(weights, self.softness, strict=True)
         self.weight = [1 / max(w * (1 - softness.dmin) / softness.dmin, MINVAL) for w, softness in rows]
-        self.limit: list[Number] = [losses[d] if varies(losses[d]) else float(losses[d]) for d in self.dofs]
-        self.bound = [limit / weight for limit, weight in zip(self.limit, self.weight, strict=True)]
-        self._kept = "const" if any(map(varies, self.limit)) else "static const"
+        self.bound: list[Number] = [losses[d] / weight for d, weight in zip(self.dofs, self.weight, strict=True)]
+        self._kept = "const" if any(map(varies, self.bound)) else "static const"
 
     def create(self, block: Block, variables: Variables) -> None:
         """Sets the residuals."""
         _, qvel, qacc = variables
-        self.limit = [block.keep(limit) if varies(limit) else limit for limit in self.limit]
         self.bound = [block.keep(bound) if varies(bound) else bound for bound in self.bound]
         for i, d in enumerate(self.dofs):
             block.set(f"friction_x[{i}]", qacc[d] + self.softness[i].damping * qvel[d])
@@ -283,32 +291,25 @@ class DryFriction:
     def add_to(self, gradient: list[Scalar], diagonal: list[Scalar]) -> None:
         """Adds the rows to the gradient of the cost and to the diagonal of its Hessian."""
         for i, d in enumerate(self.dofs):
-            weight, limit, x = self.weight[i], self.limit[i], cell(f"friction_x[{i}]")
-            gradient[d] = gradient[d] + maximum(minimum(weight * x, limit), -limit)
-            diagonal[d] = diagonal[d] + select(absolute(x), "<", self.bound[i], weight, 0)
+            row = cell(f"friction_x[{i}]"), self.weight[i], self.bound[i]
+            gradient[d] = gradient[d] + call("DryFriction::gradient", *row)
+            diagonal[d] = diagonal[d] + call("DryFriction::curvature", *row)
 
     def loop(self, body: str) -> str:
-        """Returns a C++ loop over the rows, with x, v, D and the largest force."""
-        listed = [", ".join(map(constant_text, values)) for values in (self.weight, self.limit)]
+        """Returns a C++ loop over the rows, with x, v, D and the bound of x beyond which the force is largest."""
+        listed = [", ".join(map(constant_text, values)) for values in (self.weight, self.bound)]
         return (
-            f"{self._kept} float friction_D[] = {{{listed[0]}}}, friction_limit[] = {{{listed[1]}}};\n"
+            f"{self._kept} float friction_D[] = {{{listed[0]}}}, friction_bound[] = {{{listed[1]}}};\n"
             f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ const float x = friction_x[i], "
-            f"v = friction_v[i], D = friction_D[i], limit = friction_limit[i]; {body} }}"
+            f"v = friction_v[i], D = friction_D[i], bound = friction_bound[i]; {body} }}"
         )
 
     def advance(self) -> str:
         """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides."""
         if not self.count:
             return ""
-        sides = "(x < b) != (old < b) || (x > -b) != (old > -b)"
-        if any(map(varies, self.limit)):  # a force of zero has no sides
-            sides = f"b > 0.0f && ({sides})"
-        return (
-            f"{self._kept} float friction_bound[] = {{{', '.join(map(constant_text, self.bound))}}};\n"
-            f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ const float b = friction_bound[i], "
-            "old = friction_x[i], x = old + alpha * friction_v[i]; "
-            f"changed |= {sides}; friction_x[i] = x; }}"
-        )
+        moves = "const float y = x + alpha * v; changed |= DryFriction::crosses(x, y, bound); friction_x[i] = y;"
+        return f"{{ {self.loop(moves)} }}"
 
 
 def constant_text(x: Number) -> str:

@@ -18,50 +18,24 @@ from torchrl_loco.sim.compiled.symbols import (
     dot,
     literal,
     name,
-    names,
     scalar,
     select,
     total,
+    vec,
 )
 
 MAX_DENSE = 12
 """Places for contacts between moving bodies. What finds none is dropped and counted."""
 
-SEGMENTS = """
-// Closest points of the segments p0 + s (p1 - p0) and q0 + t (q1 - q0): one pair of weights (s, t), or two if the
-// segments are parallel. (The end points of each overlap, and points instead of segments, are cases of their own.)
-const wp::vec3 pd = p_half + p_half, qd = q_half + q_half, p0 = p - p_half, q0 = q - q_half, apart = p0 - q0;
-const float pp = wp::dot(pd, pd), qq = wp::dot(qd, qd), pq = wp::dot(pd, qd);
-const float pa = wp::dot(pd, apart), qa = wp::dot(qd, apart);
-const wp::vec3 across = wp::cross(pd, qd);
-const float sine2 = wp::dot(across, across);  // times pp * qq
-float s[2] = {0.0f, 0.0f}, t[2] = {0.0f, 0.0f};
-int points = 1;
-if (pp <= 1e-15f || qq <= 1e-15f) {
-  if (qq > 1e-15f) t[0] = CLAMP01(DIV(qa, qq));
-  else if (pp > 1e-15f) s[0] = CLAMP01(DIV(-pa, pp));
-} else {
-  points = sine2 > 1e-8f * pp * qq ? 1 : 2;
-  for (int i = 0; i < points; ++i) {
-    float u = points == 2 ? (float)i : CLAMP01(DIV(wp::dot(across, wp::cross(qd, apart)), sine2));
-    float w = DIV(pq * u + qa, qq);
-    if (w < 0.0f) { w = 0.0f; u = CLAMP01(DIV(-pa, pp)); }
-    else if (w > 1.0f) { w = 1.0f; u = CLAMP01(DIV(pq - pa, pp)); }
-    s[i] = u; t[i] = w;
-  }
-}
-"""
-
-CONTACT_FRAME = """
-const float distance = WP_LENGTH(gap) - (p_radius + q_radius), position = distance - margin;
+CONTACT = """
+const Vec from = first_segment.at(nearest.first[i]), gap = second_segment.at(nearest.second[i]) - from;
+float length;
+const Vec n = Frame::normal(gap, length);
+const float distance = length - (p_radius + q_radius), position = distance - margin;
 if (!(position < 0.0f)) continue;
 if (contacts >= MAX_CONTACTS) { overflow |= NO_PLACE; continue; }
-const float length = WP_LENGTH(gap);
-const wp::vec3 n = length > 0.0f ? gap * DIV(1.0f, length) : wp::vec3(1.0f, 0.0f, 0.0f);
-const wp::vec3 side = fabsf(n[1]) < 0.5f ? wp::vec3(0.0f, 1.0f, 0.0f) : wp::vec3(0.0f, 0.0f, 1.0f);
-const wp::vec3 level = side - n * wp::dot(n, side);
-const wp::vec3 tangent = level * DIV(1.0f, WP_LENGTH(level)), other_tangent = wp::cross(n, tangent);
-const wp::vec3 at = p0 + pd * s[i] + n * (p_radius + 0.5f * distance);
+const Vec tangent = Frame::tangent(n), other_tangent = n.cross(tangent), at = from + n * (p_radius + 0.5f * distance);
+const int k = contacts++;
 """
 
 
@@ -173,15 +147,15 @@ class DenseContacts:
             for variable, geom in (("p", "first"), ("q", "second")):
                 for suffix, source in (("", "center"), ("_half", "half")):
                     parts = ", ".join(f"geom_{source}[3 * {geom} + {i}]" for i in range(3))
-                    candidate(f"const wp::vec3 {variable}{suffix}({parts});")
-            candidate(SEGMENTS)
-            with candidate.loop("i", "points") as point:
-                point("const wp::vec3 gap = q0 + qd * t[i] - p0 - pd * s[i];")
-                point(CONTACT_FRAME.replace("MAX_CONTACTS", f"ground + {self.count - len(self.balls)}"))
-                point("const int k = contacts++;")
-                axes = [np.array(names(title, 3), dtype=object) for title in ("n", "tangent", "other_tangent")]
+                    candidate(f"const Vec {variable}{suffix} = {{{parts}}};")
+            candidate("const Segment first_segment = {p - p_half, p_half + p_half};")
+            candidate("const Segment second_segment = {q - q_half, q_half + q_half};")
+            candidate("const Nearest nearest = Nearest::of(first_segment, second_segment);")
+            with candidate.loop("i", "nearest.points") as point:
+                point(CONTACT.replace("MAX_CONTACTS", f"ground + {self.count - len(self.balls)}"))
+                axes = [vec(title) for title in ("n", "tangent", "other_tangent")]
                 axes = [axes[0], axes[1] * friction, axes[2] * friction]
-                contact_point = np.array(names("at", 3), dtype=object)
+                contact_point = vec("at")
                 jacobians = [[scalar(0)] * nv for _ in self.pyramid.directions]
                 for d in range(nv):
                     sign = name(f"(float)(((second_dofs >> {d}) & 1) - ((first_dofs >> {d}) & 1))")
@@ -230,7 +204,7 @@ class DenseContacts:
             first, second = (f"{body} >> {s} & 1" for body in sensors)
             with block.scope(f"if (({first}) | ({second}))") as near:
                 away = name(f"({first} ? 1.0f : -1.0f)")
-                self.touch.mark(near, s, at, np.array(names("n", 3), dtype=object) * away)
+                self.touch.mark(near, s, at, vec("n") * away)
 
     def _limit_ball(self, block: Block, joint: int, variables: Variables) -> None:
         """Adds the limit of a ball joint: one row against its rotation from the reference."""
@@ -239,16 +213,13 @@ class DenseContacts:
         softness = Softness.make(m, m.jnt_solref[joint], m.jnt_solimp[joint])
         with block.scope("") as scope:
             w, x, y, z = (scope.value(q) for q in qpos[address : address + 4])
-            scope(f"const wp::vec3 imaginary({x}, {y}, {z});")
-            scope(f"const float sine = WP_LENGTH(imaginary), half_angle = atan2f(sine, {w});")
-            scope("const float turned = 2.0f * half_angle - (half_angle > 1.57079633f ? 6.28318531f : 0.0f);")
-            scope(f"const float position = {literal(max(m.jnt_range[joint]) - m.jnt_margin[joint])} - fabsf(turned);")
+            scope(f"float angle; const Vec axis = Quat{{{w}, {x}, {y}, {z}}}.axis(angle);")
+            scope(f"const float position = {literal(max(m.jnt_range[joint]) - m.jnt_margin[joint])} - angle;")
             with scope.scope("if (position < 0.0f)") as violated:
                 violated("const int k = contacts++;")
-                violated("const wp::vec3 axis = imaginary * DIV(turned < 0.0f ? 1.0f : -1.0f, sine);")
                 jacobians = [[scalar(0)] * m.nv for _ in self.pyramid.directions]
-                for i in range(3):
-                    jacobians[0][dof + i] = name(f"axis[{i}]")
+                for i, component in enumerate(vec("axis")):
+                    jacobians[0][dof + i] = -component
                 weight, residual = softness.row(m.dof_invweight0[dof], name("position"))
                 share = self.pyramid.share(1)
                 self._store(violated, jacobians, weight * share, residual, softness.damping, variables)

@@ -8,125 +8,14 @@
 //
 // Sums are written with the accumulator first, so that a compiler fuses each product with its addition.
 
+//SHARED
 #ifdef __CUDA_ARCH__
-#define INLINE __device__ __forceinline__
 #define ROLLED _Pragma("unroll 1")
-#define UNROLLED _Pragma("unroll")
 enum { LANES = 32 };
 #else
-#define INLINE inline
 #define ROLLED
-#define UNROLLED
 enum { LANES = 1 };
 #endif
-
-// ---- Arithmetic ----------------------------------------------------------------------------------------------------
-
-static constexpr float MINVAL = 1e-15f;  // MuJoCo's mjMINVAL
-
-struct Math {
-  static INLINE float smaller(float a, float b) { return a < b ? a : b; }
-  static INLINE float larger(float a, float b) { return a > b ? a : b; }
-  static INLINE float clamp(float x, float low, float high) { return smaller(larger(x, low), high); }
-#ifdef __CUDA_ARCH__
-  // Approximate, and with denormals as zero: quicker, and near enough.
-  static INLINE float divide(float a, float b) {
-    float x;
-    asm("div.approx.ftz.f32 %0, %1, %2;" : "=f"(x) : "f"(a), "f"(b));
-    return x;
-  }
-  static INLINE float root(float x) {
-    float y;
-    asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(larger(x, 1e-30f)));
-    return x * y;
-  }
-  static INLINE int bits(unsigned x) { return __popc(x); }
-  static INLINE int lowest_bit(unsigned x) { return __ffs(x) - 1; }
-  static INLINE int lowest_bit(unsigned long long x) { return __ffsll(x) - 1; }
-#else
-  static INLINE float divide(float a, float b) { return a / b; }
-  static INLINE float root(float x) { return sqrtf(x); }
-  static INLINE int bits(unsigned x) { return __builtin_popcount(x); }
-  static INLINE int lowest_bit(unsigned x) { return __builtin_ctz(x); }
-  static INLINE int lowest_bit(unsigned long long x) { return __builtin_ctzll(x); }
-#endif
-
-  // Sine and cosine at once, as in traced.py: x is reduced to a quarter turn about 0 (Cody and Waite, with fused products), there
-  // both are polynomials.
-  static INLINE void sincos(float x, float& sine, float& cosine) {
-    const float quarters = rintf(x * 0.636619772f);
-    float y = fmaf(quarters, -1.57079601f, x);
-    y = fmaf(quarters, -3.13916473e-7f, y);
-    y = fmaf(quarters, -5.39030253e-15f, y);
-    const float z = y * y;
-    const float s = y + ((((2.86567956e-6f * z - 1.98559923e-4f) * z + 8.33338592e-3f) * z - 1.66666672e-1f) * z) * y;
-    const float c = (((2.44677067e-5f * z - 1.38877297e-3f) * z + 4.16666567e-2f) * z - 0.5f) * z + 1.0f;
-    const int quadrant = (int)quarters;
-    sine = quadrant & 1 ? c : s;
-    cosine = quadrant & 1 ? s : c;
-    if (quadrant & 2) sine = -sine;
-    if ((quadrant + 1) & 2) cosine = -cosine;
-  }
-};
-
-struct Vec {
-  float x, y, z;
-  INLINE Vec operator+(Vec b) const { return {x + b.x, y + b.y, z + b.z}; }
-  INLINE Vec operator-(Vec b) const { return {x - b.x, y - b.y, z - b.z}; }
-  INLINE Vec operator*(float k) const { return {x * k, y * k, z * k}; }
-  INLINE float dot(Vec b) const { return x * b.x + y * b.y + z * b.z; }
-  INLINE Vec cross(Vec b) const { return {y * b.z - z * b.y, z * b.x - x * b.z, x * b.y - y * b.x}; }
-  INLINE float norm() const { return Math::root(dot(*this)); }
-  INLINE float component(int i) const { return i == 0 ? x : i == 1 ? y : z; }
-};
-
-struct Quat {  // of unit length, as MuJoCo orders it
-  float w, x, y, z;
-  INLINE Quat operator*(Quat b) const {
-    return {w * b.w - x * b.x - y * b.y - z * b.z, w * b.x + x * b.w + y * b.z - z * b.y,
-            w * b.y - x * b.z + y * b.w + z * b.x, w * b.z + x * b.y - y * b.x + z * b.w};
-  }
-  INLINE Quat normalized() const {
-    const float k = Math::divide(1.0f, Math::root(w * w + x * x + y * y + z * z));
-    return {w * k, x * k, y * k, z * k};
-  }
-  INLINE Vec rotate(Vec v) const {
-    const Vec u = {x, y, z}, t = u.cross(v) * 2.0f;
-    return v + t * w + u.cross(t);
-  }
-  // The rotation as a vector: its axis times its angle, at most half a turn.
-  INLINE Vec rotation_vector() const {
-    const float sine = Vec{x, y, z}.norm();
-    float angle = 2.0f * atan2f(sine, w);
-    if (angle > 3.14159265f) angle -= 6.28318531f;
-    return Vec{x, y, z} * (sine > MINVAL ? Math::divide(angle, sine) : 0.0f);
-  }
-};
-
-struct Mat {  // by rows
-  Vec row0, row1, row2;
-  INLINE Vec operator*(Vec v) const { return {row0.dot(v), row1.dot(v), row2.dot(v)}; }
-  INLINE Vec transposed_times(Vec v) const { return row0 * v.x + row1 * v.y + row2 * v.z; }
-  INLINE Vec column(int i) const { return {row0.component(i), row1.component(i), row2.component(i)}; }
-  static INLINE Mat from(Quat q) {
-    const float w = q.w, x = q.x, y = q.y, z = q.z;
-    return {{w * w + x * x - y * y - z * z, 2.0f * (x * y - w * z), 2.0f * (x * z + w * y)},
-            {2.0f * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0f * (y * z - w * x)},
-            {2.0f * (x * z - w * y), 2.0f * (y * z + w * x), w * w - x * x - y * y + z * z}};
-  }
-};
-
-struct Symmetric {
-  float xx, xy, xz, yy, yz, zz;
-  INLINE Vec operator*(Vec v) const {
-    return {xx * v.x + xy * v.y + xz * v.z, xy * v.x + yy * v.y + yz * v.z, xz * v.x + yz * v.y + zz * v.z};
-  }
-  // The same in axes turned by r: r S r'.
-  INLINE Symmetric turned(Mat r) const {
-    const Vec a = *this * r.row0, b = *this * r.row1, c = *this * r.row2;
-    return {r.row0.dot(a), r.row0.dot(b), r.row0.dot(c), r.row1.dot(b), r.row1.dot(c), r.row2.dot(c)};
-  }
-};
 
 // Spatial vectors (Featherstone, "Rigid Body Dynamics Algorithms", 2008), in world axes about the centre of mass of
 // their tree.
@@ -153,19 +42,13 @@ struct Inertia {
 };
 
 struct Softness {  // of a constraint: solref and solimp
-  float stiffness, damping, dmin, range, inverse_width, midpoint, power, below, above;
-  // The impedance rises from dmin by the range as the violation grows to the width.
-  INLINE float impedance(float position) const {
-    const float x = Math::smaller(fabsf(position) * inverse_width, 1.0f);
-    return dmin + (x <= midpoint ? below * raised(x) : 1.0f - above * raised(1.0f - x)) * range;
-  }
-  INLINE float raised(float x) const { return power == 1.0f ? x : power == 2.0f ? x * x : powf(x, power); }
+  float stiffness, damping, dmin, rise, per_width, midpoint, power, lower, upper;
+//SOFTNESS
 };
 
 // ---- The model -----------------------------------------------------------------------------------------------------
 
 enum Joint { FREE, BALL, SLIDE_JOINT, HINGE_JOINT };
-enum Shape { SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH };  // of geoms and of sites
 enum Dof { TRANSLATION, ROTATION, SLIDE, HINGE };  // of a free joint; of a free or ball joint; the two others
 
 //MODEL
@@ -341,7 +224,7 @@ struct Pyramid {
   INLINE Pyramid(const float* x, float weight) {
     UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
       const float plus = x[2 * j - 2], minus = x[2 * j - 1];
-      const float d = plus < 0.0f ? weight : 0.0f, e = minus < 0.0f ? weight : 0.0f;
+      const float d = OneSided::curvature(plus, weight), e = OneSided::curvature(minus, weight);
       square[j] = d + e;
       mixed[j] = d - e;
       gradient[j] = d * plus - e * minus;
@@ -756,15 +639,7 @@ struct Step : Math {
     if (!touches || place >= places) return;
     w.contacts[friction ? place : Model::FRICTIONAL + place] = {point, distance - Model::margin(pair), normal, pair};
     if (!friction) return;
-    Vec tangent = hint - normal * normal.dot(hint);
-    float length = tangent.norm();
-    if (length < Model::least_aligned()) {
-      const bool steep = fabsf(normal.y) < 0.5f;
-      const Vec axis = {0.0f, steep ? 1.0f : 0.0f, steep ? 0.0f : 1.0f};
-      tangent = axis - normal * normal.dot(axis);
-      length = tangent.norm();
-    }
-    w.tangents[place] = tangent * divide(1.0f, length);
+    w.tangents[place] = Frame::tangent(normal, hint, Model::least_aligned());
   }
 
   // Spheres and the ends of capsules against planes of the world.
@@ -884,10 +759,6 @@ struct Step : Math {
   }
 
 //END
-  struct Nearest {  // points of two segments, as fractions of their lengths from the start
-    float first, second;
-  };
-
   // Lists the pairs whose bounding spheres are within their margin, and returns how many there are.
   INLINE int near_pairs(const int begin, const int end) {
     int candidates = 0;
@@ -911,37 +782,16 @@ struct Step : Math {
       const bool valid = base + lane < candidates;
       const int pair = valid ? w.candidates[base + lane] : begin;
       const Geom a = w.geoms[Model::first_geom(pair)], b = w.geoms[Model::second_geom(pair)];
-      const Vec start_a = a.center - a.half_axis, start_b = b.center - b.half_axis;
-      const Vec along_a = a.half_axis * 2.0f, along_b = b.half_axis * 2.0f, between = start_a - start_b;
-      const float aa = along_a.dot(along_a), bb = along_b.dot(along_b), ab = along_a.dot(along_b);
-      const float a_between = along_a.dot(between), b_between = along_b.dot(between);
-      const Vec normal_to_both = along_a.cross(along_b);
-      const float determinant = normal_to_both.dot(normal_to_both);
-      Nearest nearest[2] = {{0.0f, 0.0f}, {0.0f, 0.0f}};
-      int points = valid ? 1 : 0;
-      if (aa <= MINVAL || bb <= MINVAL) {  // a sphere
-        if (bb > MINVAL) nearest[0].second = clamp(divide(b_between, bb), 0.0f, 1.0f);
-        else if (aa > MINVAL) nearest[0].first = clamp(divide(-a_between, aa), 0.0f, 1.0f);
-      } else {
-        // The point of a that is nearest to the start and to the end of b.
-        const float to_start = clamp(divide(-a_between, aa), 0.0f, 1.0f);
-        const float to_end = clamp(divide(ab - a_between, aa), 0.0f, 1.0f);
-        const bool parallel = determinant <= 1e-8f * aa * bb;
-        const float crossing = divide(normal_to_both.dot(along_b.cross(between)), determinant);
-        float first = parallel ? 0.0f : clamp(crossing, 0.0f, 1.0f);
-        UNROLLED for (int i = 0; i < 2; ++i) {  // parallel segments may touch at both ends
-          const float second = divide(ab * first + b_between, bb);
-          nearest[i] = {second < 0.0f ? to_start : second > 1.0f ? to_end : first, clamp(second, 0.0f, 1.0f)};
-          first = 1.0f;
-        }
-        if (parallel) points *= 2;
-      }
+      const Segment first = {a.center - a.half_axis, a.half_axis * 2.0f};
+      const Segment second = {b.center - b.half_axis, b.half_axis * 2.0f};
+      const Nearest nearest = Nearest::of(first, second);
       ROLLED for (int i = 0; i < 2; ++i) {
-        const Nearest at = i ? nearest[1] : nearest[0];
-        const Vec point = start_a + along_a * at.first, gap = start_b + along_b * at.second - point;
-        const float length = gap.norm(), distance = length - (a.radius + b.radius);
-        const Vec normal = length > 0.0f ? gap * divide(1.0f, length) : Vec{1.0f, 0.0f, 0.0f};
-        add_contact(i < points && distance < Model::margin(pair), friction, pair,
+        const Vec point = first.at(i ? nearest.first[1] : nearest.first[0]);
+        const Vec gap = second.at(i ? nearest.second[1] : nearest.second[0]) - point;
+        float length;
+        const Vec normal = Frame::normal(gap, length);
+        const float distance = length - (a.radius + b.radius);
+        add_contact(valid && i < nearest.points && distance < Model::margin(pair), friction, pair,
                     point + normal * (a.radius + 0.5f * distance), distance, normal, {0.0f, 0.0f, 0.0f});
       }
     }
@@ -1100,10 +950,11 @@ struct Step : Math {
     ROLLED for (int base = 0; base < Model::BALL_LIMITS; base += LANES) {
       const bool valid = base + lane < Model::BALL_LIMITS;
       const int i = valid ? base + lane : 0, pair = Model::PAIRS + i;
-      const Vec turn = qpos_quat(Model::ball_qpos(i)).rotation_vector();
-      const float angle = turn.norm(), distance = Model::ball_range(i) - angle;
-      add_contact(valid && distance < Model::margin(pair), false, pair, {0.0f, 0.0f, 0.0f}, distance,
-                  turn * divide(-1.0f, larger(angle, MINVAL)), {0.0f, 0.0f, 0.0f});
+      float angle;
+      const Vec axis = qpos_quat(Model::ball_qpos(i)).axis(angle);
+      const float distance = Model::ball_range(i) - angle;
+      add_contact(valid && distance < Model::margin(pair), false, pair, {0.0f, 0.0f, 0.0f}, distance, axis * -1.0f,
+                  {0.0f, 0.0f, 0.0f});
     }
   }
 
@@ -1201,9 +1052,7 @@ struct Step : Math {
 
   // A row from the inverse inertia along it and how far it is violated. Velocity and acceleration follow in solve().
   INLINE void set_row(int r, Softness softness, float inverse_inertia, float position, float least) {
-    const float impedance = softness.impedance(position);
-    w.weight[r] = divide(1.0f, larger(divide(inverse_inertia * (1.0f - impedance), impedance), least));
-    w.x[r] = softness.stiffness * impedance * position;
+    softness.row(inverse_inertia, position, least, w.weight[r], w.x[r]);
   }
 
   INLINE int contact_of_row(int r) const {
@@ -1275,16 +1124,6 @@ struct Step : Math {
     return w.search[Model::friction_dof(Model::FRICTION_LOSSES ? r - first_friction() : 0)];
   }
 
-  // Which piece of its cost a row is on. Dry friction costs D x^2 / 2 near zero and grows linearly beyond: -1, 0, 1 are
-  // the linear piece below, the parabola, and the linear piece above. Other rows: 0 where active, 1 where not.
-  INLINE int piece(int r, float x) const {
-    if (Model::FRICTION_LOSSES && r >= first_friction()) {
-      const float bound = Model::friction_bound(r - first_friction());
-      return x <= -bound ? -1 : x >= bound ? 1 : 0;
-    }
-    return x < 0.0f ? 0 : 1;
-  }
-
   // The law of a contact with friction at the residuals of now. The first of its rows has the weight of all; of a cone,
   // the second has mu.
   INLINE Law law(int contact) const {
@@ -1353,9 +1192,10 @@ struct Step : Math {
       }
       const int loss = Model::friction_row(d < DOFS ? d : 0);
       if (Model::FRICTION_LOSSES && d < DOFS && loss >= 0) {
-        const int r = first_friction() + loss, on = piece(r, w.x[r]);
-        if (on == 0) h.diagonal[slot] += w.weight[r];
-        h.gradient[slot] += w.weight[r] * (on == 0 ? w.x[r] : on * Model::friction_bound(loss));
+        const int r = first_friction() + loss;
+        const float bound = Model::friction_bound(loss);
+        h.diagonal[slot] += DryFriction::curvature(w.x[r], w.weight[r], bound);
+        h.gradient[slot] += DryFriction::gradient(w.x[r], w.weight[r], bound);
       }
     }
     ROLLED for (int k = 0; k < frictional; ++k) {
@@ -1512,76 +1352,33 @@ struct Step : Math {
     sync();
   }
 
-  // ---- Line search, as in mujoco_warp: the cost along the search direction is convex, piecewise quadratic
+  // ---- Line search
 
-  struct Point {
-    float alpha, cost, slope, curvature;  // the cost relative to alpha = 0
-    INLINE float newton() const { return curvature == 0.0f ? alpha : alpha - Math::divide(slope, curvature); }
-    // Whether this improves on alpha = 0 and is nearly a minimum.
-    INLINE bool flat(float tolerance) const { return fabsf(slope) < tolerance && cost < 0.0f; }
-    // Whether p lies between this and the minimum: its slope has the same sign, and is smaller.
-    INLINE bool outside(const Point& p) const {
-      return (slope < p.slope && p.slope < 0.0f) || (slope > p.slope && p.slope > 0.0f);
+  // Adds what n steps change of the costs of all rows, and slopes and curvatures there, to three sums each.
+  INLINE void add_rows(const float* alphas, const int n, float* sums) const {
+//IF ELLIPTIC
+    SHARED_LOOP(task, n * frictional) {  // a contact at one of the steps
+      const int step = n == 1 ? 0 : task % n;
+      float alpha = alphas[0], part[3] = {0.0f, 0.0f, 0.0f};
+      UNROLLED for (int k = 1; k < n; ++k) alpha = step == k ? alphas[k] : alpha;
+      add_cone(n == 1 ? task : task / n, alpha, part);
+      UNROLLED for (int k = 0; k < 3 * n; ++k) sums[k] += k / 3 == step ? part[k % 3] : 0.0f;
     }
-    INLINE bool move(const Point& p, bool wanted) {
-      if (wanted) *this = p;
-      return wanted;
+//END
+    SHARED_LOOP(i, rows() - first_single()) {
+      const int r = first_single() + i;
+      const float x = w.x[r], v = w.change[r], weight = w.weight[r];
+      if (Model::FRICTION_LOSSES && r >= first_friction()) {
+        const float bound = Model::friction_bound(r - first_friction());
+        UNROLLED for (int k = 0; k < n; ++k) DryFriction::add(x, v, weight, bound, alphas[k], sums + 3 * k);
+      } else {
+        UNROLLED for (int k = 0; k < n; ++k) OneSided::add(x, v, weight, alphas[k], sums + 3 * k);
+      }
     }
-  };
-
-  struct Row {
-    float x, v, weight, linear, square, constant, cost;  // cost at alpha = 0; its parabola
-  };
-
-  INLINE Row row_at(int r) const {
-    const float x = w.x[r], v = w.change[r], weight = w.weight[r], constant = 0.5f * weight * x * x;
-    return {x, v, weight, weight * v * x, weight * v * v, constant, x < 0.0f ? constant : 0.0f};
-  }
-
-  // Adds cost, slope and curvature of a row at alpha to three sums. Its change of cost is no difference of costs where
-  // it stays active: beside what a deep contact costs, a single number has no room for what is gained.
-  INLINE void add_row(int r, const Row& row, float alpha, float* sums) const {
-    if (Model::FRICTION_LOSSES && r >= first_friction()) {
-      add_friction(row, alpha, Model::friction_bound(r - first_friction()), sums);
-      return;
-    }
-    const float x = row.x + alpha * row.v;
-    const bool active = x < 0.0f;
-    const float grown = row.x < 0.0f ? alpha * (row.linear + 0.5f * alpha * row.square) : 0.5f * row.weight * x * x;
-    sums[0] += active ? grown : -row.cost;
-    sums[1] += active ? row.linear + alpha * row.square : 0.0f;
-    sums[2] += active ? row.square : 0.0f;
-  }
-
-  static INLINE float friction_cost(float weight, float x, float bound) {
-    return fabsf(x) < bound ? 0.5f * weight * x * x : weight * bound * (fabsf(x) - 0.5f * bound);
-  }
-
-  static INLINE void add_friction(const Row& row, float alpha, float bound, float* sums) {
-    const float x = row.x + alpha * row.v;
-    const bool inside = fabsf(x) < bound && fabsf(row.x) < bound;
-    sums[0] += inside ? 0.5f * row.weight * (x + row.x) * (alpha * row.v)
-                      : friction_cost(row.weight, x, bound) - friction_cost(row.weight, row.x, bound);
-    sums[1] += row.weight * row.v * clamp(x, -bound, bound);
-    sums[2] += fabsf(x) < bound ? row.square : 0.0f;
-  }
-
-  struct Search {
-    float alpha, improvement;
-    INLINE void take(const Point& p, bool acceptable) {
-      if (!acceptable || -p.cost <= improvement) return;
-      alpha = p.alpha;
-      improvement = -p.cost;
-    }
-  };
-
-  static INLINE Point point_at(float alpha, float slope, float curvature, const float* sums) {
-    const float cost = alpha * slope + 0.5f * alpha * alpha * curvature + sums[0];
-    return {alpha, cost, slope + alpha * curvature + sums[1], curvature + sums[2]};
+    sum(sums, 3 * n);
   }
 
   INLINE Search line_search() {
-    // The smooth part: slope and curvature of the quadratic form; then the rows at alpha = 0.
     float t[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
     OWN_DOFS(slot, d) {
       if (d >= DOFS) continue;
@@ -1605,95 +1402,28 @@ struct Step : Math {
 //END
     SHARED_LOOP(i, rows() - first_single()) {
       const int r = first_single() + i;
-      const Row row = row_at(r);
+      const float x = w.x[r], v = w.change[r], weight = w.weight[r];
       if (Model::FRICTION_LOSSES && r >= first_friction()) {
         const float bound = Model::friction_bound(r - first_friction());
-        t[3] += friction_cost(row.weight, row.x, bound);
-        add_friction(row, 0.0f, bound, t + 3);
-      } else if (row.x < 0.0f) {
-        t[3] += row.constant;
-        t[4] += row.linear;
-        t[5] += row.square;
+        t[3] += DryFriction::cost(x, weight, bound);
+        DryFriction::add(x, v, weight, bound, 0.0f, t + 3);
+      } else {
+        t[3] += OneSided::cost(x, weight);
+        OneSided::add(x, v, weight, 0.0f, t + 3);
       }
     }
     sum(t, 6);
-    const float slope = t[0], curvature = t[1];
-    const Point start = {0.0f, 0.0f, slope + t[4], curvature + t[5]};
-    // Slopes below `noise` are rounding: the sums behind them are that large.
-    const float tolerance = larger(Model::ls_tolerance() * divide(root(t[2]), Model::scale()), 1e-6f);
-    const float noise = 8.0f * 1.1920929e-7f * (root(2.0f * larger(t[3], 0.0f) * larger(t[5], 0.0f)) + fabsf(slope));
-    const float accept = larger(tolerance, noise);
-    Search result = {0.0f, 0.0f};
-    if (fabsf(start.slope) < noise) return result;
-
-    float sums[9] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
-    const float newton = start.newton();
-//IF ELLIPTIC
-    SHARED_LOOP(k, frictional) add_cone(k, newton, sums);
-//END
-    SHARED_LOOP(i, rows() - first_single()) {
-      const int r = first_single() + i;
-      add_row(r, row_at(r), newton, sums);
-    }
-    sum(sums, 3);
-    const Point first = point_at(newton, slope, curvature, sums);
-    result.take(first, first.flat(accept));
-    const bool less = first.slope < start.slope;
-    Point low = less ? first : start, high = less ? start : first;
-    bool found = result.improvement > 0.0f;
-    ROLLED for (int i = 0; i < Model::LS_ITERATIONS && !found; ++i) {
-      const float a = low.newton(), b = high.newton(), c = 0.5f * (low.alpha + high.alpha);
-      UNROLLED for (int k = 0; k < 9; ++k) sums[k] = 0.0f;
-//IF ELLIPTIC
-      SHARED_LOOP(task, 3 * frictional) {  // a contact at one of the three points
-        const int point = task % 3;
-        float part[3] = {0.0f, 0.0f, 0.0f};
-        add_cone(task / 3, point == 0 ? a : point == 1 ? b : c, part);
-        UNROLLED for (int k = 0; k < 9; ++k) sums[k] += k / 3 == point ? part[k % 3] : 0.0f;
-      }
-//END
-      SHARED_LOOP(j, rows() - first_single()) {
-        const int r = first_single() + j;
-        const Row row = row_at(r);
-        add_row(r, row, a, sums);
-        add_row(r, row, b, sums + 3);
-        add_row(r, row, c, sums + 6);
-      }
-      sum(sums, 9);
-      const Point next_low = point_at(a, slope, curvature, sums), next_high = point_at(b, slope, curvature, sums + 3);
-      const Point middle = point_at(c, slope, curvature, sums + 6);
-      const bool flat_low = next_low.flat(accept), flat_high = next_high.flat(accept);
-      const bool flat_middle = middle.flat(accept);
-      found = flat_low || flat_high || flat_middle;
-      if (found) {
-        result = {0.0f, 0.0f};
-        result.take(next_low, flat_low);
-        result.take(next_high, flat_high);
-        result.take(middle, flat_middle);
-      } else {
-        bool moved = low.move(next_low, low.outside(next_low));
-        moved |= low.move(middle, low.outside(middle));
-        moved |= low.move(next_high, low.outside(next_high));
-        moved |= high.move(next_high, high.outside(next_high) || (high.slope < 0.0f && next_high.slope > 0.0f));
-        moved |= high.move(middle, high.outside(middle));
-        moved |= high.move(next_low, high.outside(next_low));
-        if (low.cost < 0.0f || high.cost < 0.0f) {
-          const bool lower = low.cost < high.cost;
-          result = {lower ? low.alpha : high.alpha, -smaller(low.cost, high.cost)};
-        }
-        found = !moved || (low.flat(tolerance) && low.slope < 0.0f) || (high.flat(tolerance) && high.slope > 0.0f);
-      }
-    }
-    return result;
+    const float *const quadratic = t, *const begin = t + 3;
+    const auto add_rows = [this](const float* alphas, const int n, float* sums) { this->add_rows(alphas, n, sums); };
+//LINE_SEARCH
   }
 
   INLINE bool small(Search step) const {
-    return step.improvement > 0.0f && step.improvement * Model::scale() < Model::tolerance();
+    return Converged::small(step, Model::scale(), Model::tolerance());
   }
 
   static INLINE bool flat(float gradient_squared, float decrement) {
-    const bool small_slope = Model::scale() * root(gradient_squared) < Model::tolerance();
-    return small_slope || Model::scale() * 0.5f * decrement < Model::tolerance();
+    return Converged::flat(gradient_squared, decrement, Model::scale(), Model::tolerance());
   }
 
   // Leaves the acceleration in qacc; with implicit damping, search is what has to be added to it before integration.
@@ -1770,7 +1500,9 @@ struct Step : Math {
       SHARED_LOOP(i, rows() - first_single()) {
         const int r = first_single() + i;
         const float x = w.x[r], next = x + step.alpha * w.change[r];
-        crossed = crossed || piece(r, x) != piece(r, next);
+        const bool dry = Model::FRICTION_LOSSES && r >= first_friction();
+        const float bound = dry ? Model::friction_bound(r - first_friction()) : 0.0f;
+        crossed = crossed || (dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next));
         w.x[r] = next;
       }
       sync();
@@ -1798,12 +1530,7 @@ struct Step : Math {
     SHARED_LOOP(i, Model::QUATERNIONS) {
       const int q = Model::quaternion_qpos(i), d = Model::quaternion_dof(i);
       const Vec rate = {w.qvel[d], w.qvel[d + 1], w.qvel[d + 2]};
-      const float speed = rate.norm();
-      float sine, cosine;
-      sincos(0.5f * h * speed, sine, cosine);
-      const Vec u = rate * (speed > 0.0f ? divide(sine, speed) : 0.0f);
-      const Quat now = {w.qpos[q], w.qpos[q + 1], w.qpos[q + 2], w.qpos[q + 3]};
-      const Quat next = (now * Quat{cosine, u.x, u.y, u.z}).normalized();
+      const Quat next = Quat{w.qpos[q], w.qpos[q + 1], w.qpos[q + 2], w.qpos[q + 3]}.turned(rate, h);
       w.qpos[q] = next.w;
       w.qpos[q + 1] = next.x;
       w.qpos[q + 2] = next.y;
@@ -1813,46 +1540,6 @@ struct Step : Math {
   }
 
   // ---- Touch sensors
-
-  struct Interval {  // of a ray's parameter
-    float from, to;
-    INLINE Interval both(Interval b) const { return {Math::larger(from, b.from), Math::smaller(to, b.to)}; }
-    INLINE bool ahead() const { return from <= to && to >= 0.0f; }
-    // Where a t^2 + 2 b t + c <= 0.
-    static INLINE Interval quadratic(float a, float b, float c) {
-      const float discriminant = b * b - a * c;
-      if (a < MINVAL) return {c <= 0.0f ? -1e30f : 1e30f, c <= 0.0f ? 1e30f : -1e30f};
-      if (discriminant < 0.0f) return {1e30f, -1e30f};
-      const float r = Math::root(discriminant);
-      return {Math::divide(-b - r, a), Math::divide(-b + r, a)};
-    }
-    static INLINE Interval sphere(Vec p, Vec v, float radius) {
-      return quadratic(v.dot(v), p.dot(v), p.dot(p) - radius * radius);
-    }
-    static INLINE Interval cylinder(Vec p, Vec v, float radius) {
-      return sphere({p.x, p.y, 0.0f}, {v.x, v.y, 0.0f}, radius);
-    }
-    static INLINE Interval slab(float p, float v, float half) { return quadratic(v * v, p * v, p * p - half * half); }
-  };
-
-  // Whether a ray from p along v, in the frame of a site, meets the site.
-  static INLINE bool meets_site(int s, Vec p, Vec v) {
-    const Vec size = Model::site_size(s);
-    const int shape = Model::site_shape(s);
-    const Interval along_z = Interval::slab(p.z, v.z, shape == BOX ? size.z : size.y);
-    if (shape == BOX)
-      return along_z.both(Interval::slab(p.x, v.x, size.x)).both(Interval::slab(p.y, v.y, size.y)).ahead();
-    if (shape == CYLINDER) return along_z.both(Interval::cylinder(p, v, size.x)).ahead();
-    if (shape == CAPSULE) {
-      const Vec end = {0.0f, 0.0f, size.y};
-      return along_z.both(Interval::cylinder(p, v, size.x)).ahead() || Interval::sphere(p - end, v, size.x).ahead() ||
-             Interval::sphere(p + end, v, size.x).ahead();
-    }
-    // An ellipsoid, squeezed to a unit sphere.
-    const Vec inverse = {divide(1.0f, size.x), divide(1.0f, size.y), divide(1.0f, size.z)};
-    const Vec q = {p.x * inverse.x, p.y * inverse.y, p.z * inverse.z};
-    return Interval::sphere(q, {v.x * inverse.x, v.y * inverse.y, v.z * inverse.z}, 1.0f).ahead();
-  }
 
   // A touch sensor feels a contact of its body if the ray from the point along the normal, into the body, meets its
   // site.
@@ -1868,7 +1555,8 @@ struct Step : Math {
         const Vec p = c.point + w.com[0] - pose.position;
         const Vec offset = pose.orientation.transposed_times(p) - Model::site_position(s);
         const Vec ray = pose.orientation.transposed_times(c.normal) * (second ? -1.0f : 1.0f);
-        const bool meets = meets_site(s, site.transposed_times(offset), site.transposed_times(ray));
+        const Vec start = site.transposed_times(offset), along = site.transposed_times(ray);
+        const bool meets = Interval::meets(Model::site_shape(s), Model::site_size(s), start, along);
         if ((first || second) && meets) felt |= 1u << s;
       }
       w.zones[place_of(i)] = felt;

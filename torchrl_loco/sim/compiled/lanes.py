@@ -17,13 +17,14 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled import collision, symbols
+from torchrl_loco.sim.compiled import collision, shared, symbols
 from torchrl_loco.sim.compiled.collision import (
     BOX,
     CAPSULE,
     CYLINDER,
     MESH,
     PLANE,
+    SHAPES,
     SOLID,
     Mesh,
     Pair,
@@ -41,12 +42,9 @@ from torchrl_loco.sim.models import NEVER, home_pose
 from torchrl_loco.sim.overflow import Overflow
 
 TEMPLATE = pathlib.Path(__file__).with_name("lanes.h")
+LINE_SEARCH = shared.line_search("Model::scale()", "Model::ls_tolerance()", "Model::LS_ITERATIONS")
 TRANSLATION, ROTATION = 0, 1
 """Kinds of a degree of freedom in ``lanes.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
-SHAPES = {
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")): i
-    for i, kind in enumerate(("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH"))
-}
 UNLIMITED = 1e30
 MOST_VERTICES = 4000
 """Vertices of all meshes that touch something: tables count their corners with 16 bits."""
@@ -463,7 +461,7 @@ class Description:
             PAIRS=len(found),
         )
         if solids or boxes:
-            tables.integers("geom_shape", [SHAPES[int(m.geom_type[g])] for g in self.geoms])
+            tables.integers("geom_shape", [SHAPES.index(m.geom_type[g]) for g in self.geoms])
             tables.structs("Vec", "geom_size", m.geom_size[self.geoms])
             turns = [self.places[m.geom_bodyid[g]].turn(m.geom_quat[g]) for g in self.geoms]
             tables.structs("Mat", "geom_orientation", [matrix(turn).ravel() for turn in turns])
@@ -617,7 +615,7 @@ class Description:
         tables.integers("touch_address", [address for _, _, address in self.touch])
         tables.integers("site_body", m.site_bodyid[sites])
         tables.integers("site_link", [p.link for _, p in at])
-        tables.integers("site_shape", [SHAPES[int(m.site_type[s])] for s in sites])
+        tables.integers("site_shape", [SHAPES.index(m.site_type[s]) for s in sites])
         tables.structs("Vec", "site_size", sizes)
         tables.structs("Vec", "site_position", [p.point(m.site_pos[s]) for s, p in at])
         tables.structs("Mat", "site_orientation", [matrix(p.turn(m.site_quat[s])).ravel() for s, p in at])
@@ -685,6 +683,8 @@ def source(
         "BOXES": any(description.is_solid(p) and not description.is_plane(p) for p in description.pairs),
     }
     text = tables.use(_parts(TEMPLATE.read_text(), asked))
+    text = text.replace("//SHARED", shared.LAWS).replace("//SOFTNESS", Softness.functions())
+    text = text.replace("//LINE_SEARCH", LINE_SEARCH)
     text = text.replace("//MODEL", tables.text()).replace("//ELIMINATE", description.elimination())
     return text.replace("//VARYING", tables.varied_text()).replace("//DERIVE", tables.row.derive())
 

@@ -136,7 +136,7 @@ def evaluate(x: Scalar, row: Sequence[float] | np.ndarray) -> float:
             return a[0] * a[1]
         case "/":
             return a[0] / a[1]
-        case "call" if x.args[0] == "wp::max":
+        case "call" if x.args[0] == "Math::larger":
             return max(a)
         case "select" if x.args[0] == "<=":
             return a[2] if a[0] <= a[1] else a[3]

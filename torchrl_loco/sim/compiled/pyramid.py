@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_loco.sim.compiled.symbols import Scalar, cell, literal, scalar, select, total
+from torchrl_loco.sim.compiled.symbols import Scalar, call, cell, literal, scalar, total
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Pyramid:
         hessian = {(0, 0): scalar(0)}
         for sign, direction, count in self.edges:
             residual = self.residual((sign, direction, count), x)
-            active = select(residual, "<", 0, count * weight, 0)
+            active = call("OneSided::curvature", residual, count * weight)
             force = active * residual
             gradient[0] = gradient[0] + force
             hessian[0, 0] = hessian[0, 0] + active
@@ -91,7 +91,7 @@ class Pyramid:
 
     def advance(self, first: str, count: str) -> str:
         """Returns C++ that moves the residuals along the search direction, and notes whether an edge changed sides."""
-        edges = self.loop(first, count, "changed |= (x + alpha * v < 0.0f) != (x < 0.0f);").removesuffix("}")
+        edges = self.loop(first, count, "changed |= OneSided::crosses(x, x + alpha * v);").removesuffix("}")
         moves = " ".join(f"contact_x{d}[k] += alpha * contact_v{d}[k];" for d in self.directions)
         return f"{edges}  {moves}\n}}"
 

@@ -7,31 +7,23 @@
 ===========================  ===========================================================================
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled.collision import SPHERE
-from torchrl_loco.sim.compiled.dynamics import MINVAL, Dynamics, Poses, constant_matrix
+from torchrl_loco.sim.compiled.collision import SHAPES, SPHERE
+from torchrl_loco.sim.compiled.dynamics import Dynamics, Poses, constant_matrix
 from torchrl_loco.sim.compiled.symbols import (
     Block,
     Scalar,
     array,
-    dot,
-    maximum,
-    minimum,
     name,
     scalar,
-    select,
-    sqrt,
     zeros,
 )
 
 SUBTREE_VELOCITY, TOUCH = (int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}")) for kind in ("SUBTREELINVEL", "TOUCH"))
-ELLIPSOID, CYLINDER, BOX = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("ELLIPSOID", "CYLINDER", "BOX"))
-NEVER, ALWAYS = 1e30, -1e30
 
 
 def subtree_velocity(m: mujoco.MjModel, tree: Dynamics, root: int) -> list[Scalar]:
@@ -44,62 +36,6 @@ def subtree_velocity(m: mujoco.MjModel, tree: Dynamics, root: int) -> list[Scala
         if body:
             momentum = momentum + (tree.inertia[body] @ tree.cvel[body])[3:]
     return list(momentum / m.body_subtreemass[root])
-
-
-@dataclasses.dataclass(frozen=True)
-class Interval:
-    """The part of a ray that lies in a convex shape: parameters ``low`` to ``high``, empty if ``high < low``."""
-
-    low: Scalar
-    high: Scalar
-
-    @classmethod
-    def quadratic(cls, a: Scalar, b: Scalar, c: Scalar) -> "Interval":
-        """Returns where ``a t^2 + 2 b t + c <= 0``, for ``a >= 0``; where ``a`` vanishes, so must ``b``."""
-        discriminant = b * b - a * c
-        root = sqrt(maximum(discriminant, 0))
-        divisor = maximum(a, MINVAL)
-        still = select(a, "<", MINVAL, 1, 0)
-        low = select(discriminant, "<", 0, NEVER, (-b - root) / divisor)
-        high = select(discriminant, "<", 0, ALWAYS, (root - b) / divisor)
-        inside = select(c, "<=", 0, 1, -1)
-        return cls(select(0, "<", still, inside * ALWAYS, low), select(0, "<", still, inside * NEVER, high))
-
-    @classmethod
-    def ball(cls, p: np.ndarray, v: np.ndarray, radius: float) -> "Interval":
-        """Returns where the ray ``p + t v`` lies in a ball about the origin; in the plane, in a disc."""
-        return cls.quadratic(dot(v, v), dot(p, v), dot(p, p) - radius**2)
-
-    def both(self, other: "Interval") -> "Interval":
-        """Returns the intersection."""
-        return Interval(maximum(self.low, other.low), minimum(self.high, other.high))
-
-    def ahead(self) -> Scalar:
-        """Returns 1 if some of it has a parameter of zero or more, else 0."""
-        return select(self.low, "<=", self.high, select(0, "<=", self.high, 1, 0), 0)
-
-
-def meets(kind: int, size: np.ndarray, p: np.ndarray, v: np.ndarray) -> Scalar:
-    """Returns 1 if the ray ``p + t v``, ``t >= 0``, in the frame of a site meets it, else 0.
-
-    Args:
-        kind: shape of the site.
-        size: its size (m), ``(3,)``, as in ``MjModel.site_size``.
-        p: start of the ray (m), ``(3,)``.
-        v: its direction, ``(3,)``.
-    """
-    if kind == BOX:
-        x, y, z = (Interval.ball(p[i : i + 1], v[i : i + 1], size[i]) for i in range(3))
-        return x.both(y).both(z).ahead()
-    if kind in (SPHERE, ELLIPSOID):
-        scale = 1 / (size[[0, 0, 0]] if kind == SPHERE else size)
-        return Interval.ball(p * scale, v * scale, 1.0).ahead()
-    shaft = Interval.ball(p[:2], v[:2], size[0]).both(Interval.ball(p[2:], v[2:], size[1])).ahead()
-    if kind == CYLINDER:
-        return shaft
-    end = array([0.0, 0.0, size[1]])
-    caps = [Interval.ball(p - side * end, v, size[0]).ahead() for side in (1, -1)]
-    return maximum(shaft, maximum(*caps))
 
 
 class TouchSensors:
@@ -141,8 +77,10 @@ class TouchSensors:
         body = m.site_bodyid[site]
         axes = self.poses.xmat[body] @ constant_matrix(m.site_quat[site])
         center = self.poses.xpos[body] + self.poses.xmat[body] @ array(m.site_pos[site])
-        felt = meets(int(m.site_type[site]), m.site_size[site], axes.T @ (point - center), axes.T @ ray)
-        block(f"if ({block.value(felt)} > 0.0f) contact_zones[k] |= {1 << sensor};")
+        size = m.site_size[site, [0, 0, 0]] if m.site_type[site] == SPHERE else m.site_size[site]
+        start, along = axes.T @ (point - center), axes.T @ ray
+        vectors = ", ".join(f"Vec{{{', '.join([block.value(x) for x in v])}}}" for v in (size, start, along))
+        block(f"if (Interval::meets({SHAPES.index(m.site_type[site])}, {vectors})) contact_zones[k] |= {1 << sensor};")
 
     def add(self, block: Block, first: str, count: str, force: Scalar) -> None:
         """Adds the normal forces of the contacts from ``first`` to ``count``.

@@ -3,13 +3,13 @@
     minimise  1/2 (a - a_smooth)' M (a - a_smooth) + the cost of the rows
 
 Each iteration solves H s = -gradient with H = M + J' D J over the active rows, and searches along s for the minimum of
-the cost, which is piecewise quadratic and convex there. While no row changes sides, H and the direction stay what they
-are. Source: MuJoCo's documentation, chapter Computation ("Solver algorithms", Newton). Bracketing, tolerances and
-stopping tests are those of mujoco_warp, so that both engines stop at the same iteration.
+the cost, which is piecewise quadratic and convex there. Source: MuJoCo's documentation, chapter Computation ("Solver
+algorithms", Newton). What rows cost, the line search and the stopping tests are in ``laws.h`` and ``line_search.h``.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
+from torchrl_loco.sim.compiled import shared
 from torchrl_loco.sim.compiled.collision import Pair
 from torchrl_loco.sim.compiled.constraints import DryFriction, JointLimits, Variables, tolerance
 from torchrl_loco.sim.compiled.dense_contacts import DenseContacts
@@ -18,95 +18,11 @@ from torchrl_loco.sim.compiled.ground_contacts import GroundContacts
 from torchrl_loco.sim.compiled.sensors import ContactForces, TouchSensors
 from torchrl_loco.sim.compiled.symbols import Block, cell, cells, dot, literal, total
 
-LINE_SEARCH = """
-// Cost, slope and curvature along the search direction at a step, relative to the cost at zero.
-struct Point { float step, cost, slope, curvature; };
-const float slope_smooth = SLOPE_SMOOTH, curvature_smooth = CURVATURE_SMOOTH, length = SQRT(LENGTH2);
-auto smooth = [&](float step) {
-  const float cost = step * (slope_smooth + 0.5f * step * curvature_smooth);
-  return Point{step, cost, slope_smooth + step * curvature_smooth, curvature_smooth};
-};
-// A row whose residual y is x + step * v costs D / 2 y^2 where that is negative. Its change of cost is no difference of
-// costs where it stays negative: beside what a deep contact costs, a single number has no room for what is gained.
-#define ROW const float slope = D * v, curvature = slope * v, half = 0.5f * D, at_zero = wp::min(x, 0.0f);
-#define ADD_ROW(p) { \\
-  const float y = wp::min(fmaf(p.step, v, x), 0.0f); \\
-  const float moved = y < 0.0f && x < 0.0f ? p.step * v : y - at_zero; \\
-  p.cost = fmaf(half * (y + at_zero), moved, p.cost); \\
-  p.slope = fmaf(slope, y, p.slope); \\
-  p.curvature += y < 0.0f ? curvature : 0.0f; }
-// A row of dry friction: quadratic up to the largest force, linear beyond.
-#define FRICTION_COST(y) (fabsf(y) < bound ? 0.5f * D * (y) * (y) : limit * (fabsf(y) - 0.5f * bound))
-#define ADD_FRICTION(p) { \\
-  const float y = fmaf(p.step, v, x); const bool inside = fabsf(y) < bound; \\
-  p.cost += inside && fabsf(x) < bound ? 0.5f * D * (x + y) * (p.step * v) : FRICTION_COST(y) - FRICTION_COST(x); \\
-  p.slope += v * (inside ? D * y : y < 0.0f ? -limit : limit); \\
-  p.curvature += inside ? D * v * v : 0.0f; }
-
-float constraint_cost = 0.0f, row_curvature = 0.0f;
-Point zero{0.0f, 0.0f, slope_smooth, curvature_smooth};
-EACH_ROW({
-  if (x < 0.0f) { constraint_cost += 0.5f * D * x * x; zero.slope += D * v * x; row_curvature += D * v * v; }
-})
-zero.curvature += row_curvature;
-EACH_FRICTION({ const float bound = DIV(limit, D); constraint_cost += FRICTION_COST(x); ADD_FRICTION(zero) })
-const float slope_tolerance = wp::max(LS_TOLERANCE * DIV(length, SCALE), 1e-6f);
-const float slope_scale = SQRT(2.0f * wp::max(constraint_cost, 0.0f) * wp::max(row_curvature, 0.0f));
-const float rounding = 8.0f * 1.1920929e-07f * (slope_scale + fabsf(slope_smooth));
-const float small_slope = wp::max(slope_tolerance, rounding);
-alpha = 0.0f;
-improvement = 0.0f;
-if (!(fabsf(zero.slope) < rounding)) {
-  Point first = smooth(zero.curvature == 0.0f ? 0.0f : -DIV(zero.slope, zero.curvature));
-  EACH_ROW({ ROW ADD_ROW(first) })
-  EACH_FRICTION({ const float bound = DIV(limit, D); ADD_FRICTION(first) })
-  if (fabsf(first.slope) < small_slope && first.cost < 0.0f) {
-    alpha = first.step;
-    improvement = -first.cost;
-  } else {
-    Point low = first.slope < zero.slope ? first : zero, high = first.slope < zero.slope ? zero : first;
-    #pragma unroll 1
-    for (int search_step = 0; search_step < LS_ITERATIONS; ++search_step) {
-      Point from_low = smooth(low.curvature == 0.0f ? low.step : low.step - DIV(low.slope, low.curvature));
-      Point from_high = smooth(high.curvature == 0.0f ? high.step : high.step - DIV(high.slope, high.curvature));
-      Point middle = smooth(0.5f * (low.step + high.step));
-      EACH_ROW({ ROW ADD_ROW(from_low) ADD_ROW(from_high) ADD_ROW(middle) })
-      EACH_FRICTION({
-        const float bound = DIV(limit, D);
-        ADD_FRICTION(from_low) ADD_FRICTION(from_high) ADD_FRICTION(middle)
-      })
-      float best = 0.0f;
-      bool found = false;
-      auto consider = [&](const Point& p) {
-        const bool flat = fabsf(p.slope) < small_slope && p.cost < 0.0f;
-        if (flat && p.cost < best) { best = p.cost; alpha = p.step; improvement = -p.cost; }
-        found |= flat;
-      };
-      consider(from_low); consider(from_high); consider(middle);
-      if (found) break;
-      bool moved = false;
-      auto closer = [](const Point& end, const Point& p) {
-        return (end.slope < p.slope && p.slope < 0.0f) || (end.slope > p.slope && p.slope > 0.0f);
-      };
-      auto move = [&](Point& end, const Point& p, bool replace) { if (replace) { end = p; moved = true; } };
-      move(low, from_low, closer(low, from_low));
-      move(low, middle, closer(low, middle));
-      move(low, from_high, closer(low, from_high));
-      move(high, from_high, closer(high, from_high) || (high.slope < 0.0f && from_high.slope > 0.0f));
-      move(high, middle, closer(high, middle));
-      move(high, from_low, closer(high, from_low));
-      if (low.cost < 0.0f || high.cost < 0.0f) {
-        alpha = low.cost < high.cost ? low.step : high.step;
-        improvement = -wp::min(low.cost, high.cost);
-      }
-      const bool low_done = low.cost < 0.0f && low.slope < 0.0f && low.slope > -slope_tolerance;
-      const bool high_done = high.cost < 0.0f && high.slope > 0.0f && high.slope < slope_tolerance;
-      if (!moved || low_done || high_done) break;
-    }
-  }
-}
-"""
-"""Line search by bracketing: Newton steps from both ends, and bisection. It leaves ``alpha`` and ``improvement``."""
+ZERO = "begin[0] += OneSided::cost(x, D); OneSided::add(x, v, D, 0.0f, begin);"
+ZERO_FRICTION = "begin[0] += DryFriction::cost(x, D, bound); DryFriction::add(x, v, D, bound, 0.0f, begin);"
+STEPS = "UNROLLED for (int s = 0; s < n; ++s) OneSided::add(x, v, D, alphas[s], sums + 3 * s);"
+STEPS_FRICTION = "UNROLLED for (int s = 0; s < n; ++s) DryFriction::add(x, v, D, bound, alphas[s], sums + 3 * s);"
+"""What the line search does with each row."""
 
 
 class NewtonSolver:
@@ -155,22 +71,23 @@ class NewtonSolver:
         for i, product in enumerate(self.tree.mass_times(cells("qacc", m.nv))):
             block.set(f"M_qacc[{i}]", product)
         scale = 1 / (m.stat.meaninertia * max(m.nv, 1))
-        block("float gradient2 = 0.0f, decrement = 0.0f, improvement = 0.0f, alpha = 0.0f;")
+        block("float gradient2 = 0.0f, decrement = 0.0f; Search taken = {0.0f, 0.0f};")
         block("bool converged = false, same = false;  // whether the last step left all rows on their sides")
         with block.loop("iteration", option.iterations) as iteration:
             self._direction(iteration)
-            small = f"(improvement > 0.0f && improvement * {literal(scale)} < {literal(tolerance(m))})"
-            slope = f"{literal(scale)} * SQRT(LEFT gradient2) < {literal(tolerance(m))}"
-            flat = f"({slope} || LEFT 0.5f * {literal(scale)} * decrement < {literal(tolerance(m))})"
-            iteration(f"if (iteration > 0 && ({small} || {flat.replace('LEFT ', '')})) {{ converged = true; break; }}")
+            limits = f"{literal(scale)}, {literal(tolerance(m))}"
+            small = f"Converged::small(taken, {limits})"
+            begins = f"{small} || Converged::flat(gradient2, decrement, {limits})"
+            iteration(f"if (iteration > 0 && ({begins})) {{ converged = true; break; }}")
             self._project(iteration)
             self._line_search(iteration, scale)
+            iteration("const float alpha = taken.alpha;")
             iteration("if (alpha == 0.0f) { converged = true; break; }")
             self._advance(iteration)
             # What is left of a Newton step; of a second one on the same parabola, rounding.
             iteration("const float left = (1.0f - alpha) * (1.0f - alpha);")
-            done = f"repeated || {small} || {flat.replace('LEFT', 'left *')}"
-            iteration(f"if (same && ({done})) {{ converged = true; break; }}")
+            ends = f"repeated || {small} || Converged::flat(gradient2 * left, decrement * left, {limits})"
+            iteration(f"if (same && ({ends})) {{ converged = true; break; }}")
         block(f"if (!converged && !{small}) overflow |= LIMIT_REACHED;")
 
     def read_touch(self, block: Block) -> None:
@@ -230,29 +147,29 @@ class NewtonSolver:
         m, nv, option = self.m, self.m.nv, self.m.opt
         search = cells("search", nv)
         residual = [cell(f"M_qacc[{i}]") - cell(f"force[{i}]") for i in range(nv)]
-        text = LINE_SEARCH
-        for word, value in {
-            "SLOPE_SMOOTH": block.value(dot(search, residual)),
-            "CURVATURE_SMOOTH": block.value(dot(search, cells("M_search", nv))),
-            "LENGTH2": block.value(dot(search, search)),
-            "LS_TOLERANCE": literal(tolerance(m) * option.ls_tolerance),
-            "LS_ITERATIONS": str(option.ls_iterations),
-            "SCALE": literal(scale),
-        }.items():
-            text = text.replace(word, value)
-        block(_expand(_expand(text, "EACH_ROW", self._each_row), "EACH_FRICTION", self._each_friction))
+        sums = (dot(search, residual), dot(search, cells("M_search", nv)), dot(search, search))
+        block(f"const float quadratic[3] = {{{', '.join([block.value(x) for x in sums])}}};")
+        block("float begin[3] = {0.0f, 0.0f, 0.0f};")
+        block(self._each_row(ZERO, ZERO_FRICTION))
+        block("const auto add_rows = [&](const float* alphas, const int n, float* sums) {")
+        block(self._each_row(STEPS, STEPS_FRICTION))
+        block("};")
+        block("const auto line_search = [&]() {")
+        tolerances = literal(scale), literal(tolerance(m) * option.ls_tolerance), str(option.ls_iterations)
+        block(shared.line_search(*tolerances))
+        block("};")
+        block("taken = line_search();")
 
-    def _each_row(self, body: str) -> str:
-        """Returns C++ that runs ``body`` for each row, with its x, v and D."""
+    def _each_row(self, body: str, of_friction: str) -> str:
+        """Returns C++ that runs ``body`` for each row, with its x, v and D; of dry friction another, with its bound."""
         loops = [self.limits.loop(body)]
         if self.ground.count:
             loops.append(self.ground.pyramid.loop("0", "ground", body))
         if self.dense.count:
             loops.append(self.dense.pyramid.loop("ground", "contacts", body))
+        if self.friction.count:
+            loops.append(f"{{ {self.friction.loop(of_friction)} }}")
         return "\n".join(loops)
-
-    def _each_friction(self, body: str) -> str:
-        return f"{{ {self.friction.loop(body)} }}" if self.friction.count else ""
 
     def _advance(self, block: Block) -> None:
         """Moves along the direction, and notes whether a row changed sides."""
@@ -267,17 +184,3 @@ class NewtonSolver:
             block(self.dense.pyramid.advance("ground", "contacts"))
         block("const bool repeated = same;")
         block("same = !changed;")
-
-
-def _expand(text: str, word: str, loop: Callable[[str], str]) -> str:
-    """Returns a text with each ``word({body})`` replaced by the loop around ``body``."""
-    while (start := text.find(word + "(")) >= 0:
-        depth, end = 0, start + len(word)
-        while True:
-            depth += {"(": 1, ")": -1}.get(text[end], 0)
-            end += 1
-            if depth == 0:
-                break
-        body = text[start + len(word) + 1 : end - 1].strip().removeprefix("{").removesuffix("}")
-        text = text[:start] + loop(body) + text[end:]
-    return text

@@ -164,6 +164,11 @@ def names(text: str, count: int) -> list[Scalar]:
     return [name(f"{text}[{i}]") for i in range(count)]
 
 
+def vec(text: str) -> np.ndarray:
+    """Returns the components of a C++ ``Vec`` that does not change in its scope, ``(3,)``."""
+    return np.array([name(f"{text}.{component}") for component in "xyz"], dtype=object)
+
+
 def cell(text: str) -> Scalar:
     """Returns the scalar of a C++ variable or array element that is assigned more than once."""
     return Scalar("cell", text)
@@ -182,17 +187,17 @@ def call(function: str, *args: Any) -> Scalar:
 def sqrt(x: Any) -> Scalar:
     """Returns the square root."""
     x = scalar(x)
-    return scalar(np.sqrt(x.constant)) if x.constant is not None else call("SQRT", x)
+    return scalar(np.sqrt(x.constant)) if x.constant is not None else call("Math::root", x)
 
 
 def minimum(a: Any, b: Any) -> Scalar:
     """Returns the smaller of two scalars."""
-    return call("wp::min", a, b)
+    return call("Math::smaller", a, b)
 
 
 def maximum(a: Any, b: Any) -> Scalar:
     """Returns the larger of two scalars."""
-    return call("wp::max", a, b)
+    return call("Math::larger", a, b)
 
 
 def absolute(x: Any) -> Scalar:
@@ -315,13 +320,13 @@ class Block:
         self._counter[0] += 1
         result = self._names[node] = f"t{self._counter[0]}"
         if node.op == "sin":
-            self(f"float {result}, {result}_cos; SINCOS({a[0]}, {result}, {result}_cos);")
+            self(f"float {result}, {result}_cos; Math::sincos({a[0]}, {result}, {result}_cos);")
             return
         match node.op:
             case "neg":
                 text = f"-{a[0]}"
             case "/":
-                text = f"DIV({a[0]}, {a[1]})"
+                text = f"Math::divide({a[0]}, {a[1]})"
             case "call":
                 text = f"{node.args[0]}({', '.join(a)})"
             case "select":

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import mujoco
 
-from torchrl_loco.sim.compiled import sensors
+from torchrl_loco.sim.compiled import sensors, shared
 from torchrl_loco.sim.compiled.collision import pairs
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, Dynamics
 from torchrl_loco.sim.compiled.parameters import VariedModel, number, present
@@ -14,56 +14,15 @@ from torchrl_loco.sim.compiled.symbols import (
     Block,
     Scalar,
     cells,
-    dot,
     literal,
     names,
     scalar,
-    select,
-    sincos,
-    sqrt,
     zeros,
 )
 from torchrl_loco.sim.overflow import Overflow
 
 PRELUDE = """
-#ifdef __CUDA_ARCH__
-// Approximate, and with denormals as zero: quicker, and near enough.
-struct Quick {
-  static __device__ __forceinline__ float divide(float a, float b) {
-    float x;
-    asm("div.approx.ftz.f32 %0, %1, %2;" : "=f"(x) : "f"(a), "f"(b));
-    return x;
-  }
-  static __device__ __forceinline__ float root(float a) {
-    float x;
-    asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(x) : "f"(wp::max(a, 1e-30f)));
-    return a * x;
-  }
-};
-#define DIV(a, b) Quick::divide(a, b)
-#define SQRT(a) Quick::root(a)
-#else
-#define DIV(a, b) ((a) / (b))
-#define SQRT(a) sqrtf(a)
-#endif
-#define CLAMP01(x) wp::min(wp::max(x, 0.0f), 1.0f)
-#define WP_LENGTH(a) SQRT(wp::dot(a, a))
-// Sine and cosine together: reduction to a quarter turn, then polynomials (errors below 1e-7 for angles of joints).
-#define SINCOS(x, s, c) { \\
-  const float quarter = rintf((x) * 0.636619772f); \\
-  float r = fmaf(quarter, -1.57079601f, x); \\
-  r = fmaf(quarter, -3.13916473e-07f, r); \\
-  r = fmaf(quarter, -5.39030253e-15f, r); \\
-  const float z = r * r; \\
-  float sine = fmaf(fmaf(2.86567956e-6f, z, -1.98559923e-4f), z, 8.33338592e-3f); \\
-  sine = fmaf(fmaf(sine, z, -1.66666672e-1f), z * r, r); \\
-  float cosine = fmaf(fmaf(2.44677067e-5f, z, -1.38877297e-3f), z, 4.16666567e-2f); \\
-  cosine = fmaf(fmaf(cosine, z, -0.5f), z, 1.0f); \\
-  const int turns = (int)quarter; \\
-  s = turns & 1 ? cosine : sine; \\
-  c = turns & 1 ? sine : cosine; \\
-  if (turns & 2) s = -s; \\
-  if ((turns + 1) & 2) c = -c; }
+#define ROLLED _Pragma("unroll 1")
 """
 
 INPUTS = {"qpos": "nq", "qvel": "nv", "qacc": "nv", "ctrl": "nu"}
@@ -122,7 +81,7 @@ def source(
         world("overflow_out.data[world] |= overflow;")
     _outputs(world, m, with_cvel, with_subtree_com)
     bits = f"#define NO_PLACE {int(Overflow.NARROWPHASE)}\n#define LIMIT_REACHED {int(Overflow.ITERATIONS)}\n"
-    return PRELUDE + bits + world.text() + "\n"
+    return shared.LAWS + PRELUDE + bits + world.text() + "\n"
 
 
 def _argument(title: str) -> str:
@@ -179,27 +138,15 @@ def _integrate(block: Block, m: mujoco.MjModel, tree: Dynamics) -> None:
                 for i in range(3):
                     block.set(f"qpos[{q + i}]", h * qvel[d + i], "+=")
                 q, d = q + 3, d + 3
-            turned = _turn(block, cells("qpos", m.nq)[q : q + 4], qvel[d : d + 3], h)
-            for i, component in enumerate([block.keep(x) for x in turned]):
-                block.set(f"qpos[{q + i}]", component)
+            q_text, rate = (
+                ", ".join(f"{title}[{at + i}]" for i in range(n)) for title, at, n in (("qpos", q, 4), ("qvel", d, 3))
+            )
+            with block.scope("") as turn:
+                turn(f"const Quat next = Quat{{{q_text}}}.turned(Vec{{{rate}}}, {literal(h)});")
+                for i, component in enumerate("wxyz"):
+                    turn(f"qpos[{q + i}] = next.{component};")
         else:
             block.set(f"qpos[{q}]", h * qvel[d], "+=")
-
-
-def _turn(block: Block, q: list[Scalar], omega: list[Scalar], h: float) -> list[Scalar]:
-    """Returns a quaternion (w, x, y, z) turned by an angular velocity in its own frame for a time ``h``."""
-    speed = block.keep(sqrt(dot(omega, omega)))
-    sine, cosine = sincos(0.5 * h * speed)
-    scale = block.keep(select(0, "<", speed, sine / speed, 0))
-    w, (x, y, z) = block.keep(cosine), (component * scale for component in omega)
-    product = [
-        q[0] * w - q[1] * x - q[2] * y - q[3] * z,
-        q[0] * x + q[1] * w + q[2] * z - q[3] * y,
-        q[0] * y - q[1] * z + q[2] * w + q[3] * x,
-        q[0] * z + q[1] * y - q[2] * x + q[3] * w,
-    ]
-    norm = 1 / sqrt(dot(product, product))
-    return [component * norm for component in product]
 
 
 def _outputs(world: Block, m: mujoco.MjModel, with_cvel: bool, with_subtree_com: bool) -> None:

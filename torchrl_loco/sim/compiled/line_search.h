@@ -1,0 +1,52 @@
+// The line search of both schedules, the body of a function: the cost along the search direction is convex, and
+// quadratic in pieces. It starts from what is known at alpha = 0, and reads the rows by two functions:
+//   quadratic[3]                slope and curvature of the quadratic form, and the squared length of the direction
+//   begin[3]                    cost, slope and curvature of the rows
+//   add_rows(alphas, n, sums)   adds three numbers for each of n steps, over all rows
+
+const float slope = quadratic[0], curvature = quadratic[1];
+const Point start = {0.0f, 0.0f, slope + begin[1], curvature + begin[2]};
+// Slopes below `noise` are rounding: the sums behind them are that large.
+const float tolerance = Math::larger(LS_TOLERANCE * Math::divide(Math::root(quadratic[2]), SCALE), 1e-6f);
+const float sizes = Math::root(2.0f * Math::larger(begin[0], 0.0f) * Math::larger(begin[2], 0.0f)) + fabsf(slope);
+const float noise = 8.0f * 1.1920929e-7f * sizes, accept = Math::larger(tolerance, noise);
+Search result = {0.0f, 0.0f};
+if (fabsf(start.slope) < noise) return result;
+
+float sums[9] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+const float whole[1] = {start.newton()};
+add_rows(whole, 1, sums);
+const Point first = Point::at(whole[0], slope, curvature, sums);
+result.take(first, first.flat(accept));
+const bool less = first.slope < start.slope;
+Point low = less ? first : start, high = less ? start : first;
+bool found = result.improvement > 0.0f;
+ROLLED for (int i = 0; i < LS_ITERATIONS && !found; ++i) {
+  const float alphas[3] = {low.newton(), high.newton(), 0.5f * (low.alpha + high.alpha)};
+  UNROLLED for (int k = 0; k < 9; ++k) sums[k] = 0.0f;
+  add_rows(alphas, 3, sums);
+  const Point next_low = Point::at(alphas[0], slope, curvature, sums);
+  const Point next_high = Point::at(alphas[1], slope, curvature, sums + 3);
+  const Point middle = Point::at(alphas[2], slope, curvature, sums + 6);
+  const bool flat_low = next_low.flat(accept), flat_high = next_high.flat(accept), flat_middle = middle.flat(accept);
+  found = flat_low || flat_high || flat_middle;
+  if (found) {
+    result = {0.0f, 0.0f};
+    result.take(next_low, flat_low);
+    result.take(next_high, flat_high);
+    result.take(middle, flat_middle);
+  } else {
+    bool moved = low.move(next_low, low.outside(next_low));
+    moved |= low.move(middle, low.outside(middle));
+    moved |= low.move(next_high, low.outside(next_high));
+    moved |= high.move(next_high, high.outside(next_high) || (high.slope < 0.0f && next_high.slope > 0.0f));
+    moved |= high.move(middle, high.outside(middle));
+    moved |= high.move(next_low, high.outside(next_low));
+    if (low.cost < 0.0f || high.cost < 0.0f) {
+      const bool lower = low.cost < high.cost;
+      result = {lower ? low.alpha : high.alpha, -Math::smaller(low.cost, high.cost)};
+    }
+    found = !moved || (low.flat(tolerance) && low.slope < 0.0f) || (high.flat(tolerance) && high.slope > 0.0f);
+  }
+}
+return result;
