@@ -86,6 +86,7 @@ spread.add_argument("--out", type=Path, help="file for the results as JSON")
 models = commands.add_parser("coverage", help="which models of installed packages and of folders compile, and why not")
 models.add_argument("folders", type=Path, nargs="*", metavar="FOLDER")
 models.add_argument("--path", type=Path, help="folder that the packages were installed in")
+models.add_argument("--check", action="store_true", help="step those that are accepted beside C MuJoCo")
 models.add_argument("--out", type=Path, help="file for the results as JSON")
 models.set_defaults(device=torch.device("cpu"))
 draw = commands.add_parser("plot", help="draw throughput or return from the JSON, or a folder of stored runs")
@@ -159,7 +160,7 @@ elif args.command == "coverage":
     from benchmarks.coverage import COLUMNS, TOTALS, coverage, folders
 
     sys.path += [str(args.path)] if args.path else []
-    found = [coverage(title, folder) for title, folder in folders(args.folders).items()]
+    found = [coverage(title, folder, check=args.check) for title, folder in folders(args.folders).items()]
     rows = [row for table, _ in found for row in table]
     show([total for _, total in found], TOTALS)
 elif args.command == "training":

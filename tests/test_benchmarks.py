@@ -189,11 +189,23 @@ def test_coverage_tells_what_is_missing(tmp_path):
     }
     for name, text in files.items():
         (tmp_path / name).write_text(text)
-    rows, totals = coverage.coverage("own", tmp_path)
+    rows, totals = coverage.coverage("own", tmp_path, check=True)
     found = {row["model"]: [row[way] for way in coverage.WAYS] + [row["missing in the last"]] for row in rows}
     assert found == {
         "own/plain.xml": ["yes", "yes", "yes", ""],
         "own/boxes.xml": ["", "", "yes", ""],
         "own/fluid.xml": ["", "", "", "forces of a fluid"],
     }
-    assert totals == {"set": "own", "models": 3, "as is": 1, "options": 1, "ground": 2, "not compiled": 1}
+    assert totals == {
+        "set": "own",
+        "models": 3,
+        "as is": 1,
+        "options": 1,
+        "ground": 2,
+        "not compiled": 1,
+        "checked": 2,
+        "wrong": 0,
+    }
+    errors = {row["model"]: row["p90"] for row in rows}
+    assert errors["own/fluid.xml"] is None
+    assert 0 < max(errors["own/plain.xml"], errors["own/boxes.xml"]) < 1e-5
