@@ -4,6 +4,7 @@ import contextlib
 import doctest
 import io
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -36,6 +37,8 @@ NEEDS = {
     "docs/guides/viewer.md": ("mjviser",),
 }
 """Pages whose code needs packages that not every installation has."""
+FILES = {"docs/guides/your-own-robot.md": ["solo12.urdf"]}
+"""Files beside pages that their code reads."""
 
 # The code.
 
@@ -71,7 +74,9 @@ def page(path):
 @pytest.mark.filterwarnings("ignore:.*autoreset mode is same-step")  # Gymnasium's, as the page says
 @pytest.mark.parametrize("path", [page(path) for path in WITH_CODE])
 def test_code_runs_and_prints_what_the_page_says(path, tmp_path, monkeypatch):
-    """All blocks of a page, in order, in one namespace and an empty folder."""
+    """All blocks of a page, in order, in one namespace and a folder with the files that it offers."""
+    for file in FILES.get(str(path.relative_to(ROOT)), ()):
+        shutil.copy(path.with_name(file), tmp_path)
     for package in NEEDS.get(str(path.relative_to(ROOT)), ()):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)

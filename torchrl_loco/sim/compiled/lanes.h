@@ -1621,8 +1621,13 @@ struct Step : Math {
         UNROLLED for (int k = 0; k < 3; ++k) force[k] += push.component(k);
         touched = true;
       }
+//IF CONTACT_HISTORY
+      touched = ballot(touched) != 0;
+      if (touched) sum(force, 3);  // most geoms have no contact in most substeps
+//ELSE
       sum(force, 3);
       touched = ballot(touched) != 0;
+//END
       if (lane > 0) continue;
       UNROLLED for (int k = 0; k < 3; ++k) forces[3 * g + k] = force[k];
       touches[g] = touched;
