@@ -211,18 +211,14 @@ def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> 
     return path
 
 
-def check_run(path: Path, or_group: bool = False) -> Path:
-    """Returns ``path`` as that of a run folder, or of a folder with the runs of several seeds if that will do.
+def check_run(path: Path) -> Path:
+    """Returns ``path`` as that of a run folder.
 
     Raises:
         FileNotFoundError: it is no folder with a ``config.json``.
     """
-    if is_run_group(path):
-        if or_group:
-            return Path(path)
-        raise FileNotFoundError(f"{path} holds the runs of several seeds: name the folder of one of them, in it")
     if not is_run(path):
-        inside = [entry for entry in Path(path).glob("*/") if is_run(entry) or (or_group and is_run_group(entry))]
+        inside = [entry for entry in Path(path).glob("*/") if is_run(entry)]
         newest = sorted(inside, key=lambda entry: (entry.stat().st_mtime, entry.name))[-5:]
         hint = f"; name one of those in it, such as {', '.join(entry.name for entry in newest)}" if newest else ""
         raise FileNotFoundError(f"{path} is not a run folder: it has no config.json{hint}")
@@ -232,11 +228,6 @@ def check_run(path: Path, or_group: bool = False) -> Path:
 def is_run(path: Path) -> bool:
     """Returns whether ``path`` is a run folder."""
     return (Path(path) / "config.json").is_file()
-
-
-def is_run_group(path: Path) -> bool:
-    """Returns whether ``path`` is a folder with the runs of several seeds."""
-    return (Path(path) / "group.json").is_file()
 
 
 def check_packages(purpose: str, packages: Collection[str], extra: str) -> None:

@@ -1,5 +1,6 @@
-"""Tensors and settings in a file without code."""
+"""Tensors and settings in a file without code; files that are replaced whole, and that replace none."""
 
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -64,3 +65,10 @@ def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]
 
 def _format(kind: str) -> str:
     return f"torchrl_loco {kind} {VERSION}"
+
+
+def unused_path(path: Path) -> Path:
+    """Returns ``path`` if it is free, else the first free of ``-2``, ``-3``, ... (before the suffix of a file)."""
+    stem, suffix = (path.name, "") if path.is_dir() else (path.stem, path.suffix)
+    numbered = (path.with_name(f"{stem}-{i}{suffix}") for i in itertools.count(2))
+    return next(candidate for candidate in itertools.chain([path], numbered) if not candidate.exists())

@@ -6,12 +6,41 @@ from pathlib import Path
 import imageio.v3 as imageio
 import pytest
 import torch
-from small_runs import SMALL
+from compare import assert_same
+from small_runs import SMALL, networks, trained
 
 from torchrl_loco import cli, training
 from torchrl_loco.policy import Policy, load_policy
 from torchrl_loco.training import RunFolder
 from torchrl_loco.training.algorithm import Algorithm
+
+
+@pytest.mark.slow
+def test_each_seed_is_as_if_it_were_alone(tmp_path, capsys):
+    small = [f"--{key}={value}" for key, value in SMALL.items() if key != "hidden"]
+    options = [*small, "--hidden=16", "--device=cpu", f"--out={tmp_path / 'seeds'}"]
+    assert cli.main(["train", "walker_stand", *options, "--seeds", "3", "1"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    runs = {run.load_config().seed: run for run in map(RunFolder, (tmp_path / "seeds").iterdir())}
+    assert said[-1] == f"all seeds in one picture: torchrl-loco plot {runs[3].path} {runs[1].path}"
+    assert_same(networks(runs[1]), networks(trained(tmp_path / "alone", seed=1)))
+    assert all(run.is_finished for run in runs.values())
+    first, other = (networks(run)["actor.module.0.module.1.0.weight"] for run in runs.values())
+    assert (first != other).any()
+
+
+def test_wrong_seeds(tmp_path, capsys):
+    for options, message in {
+        "--seeds 1 1": "1 is named twice",
+        "--seeds 0 -1": "each of seeds must lie in [0, 2**32)",
+        "--seeds 1 x": "Error parsing --seeds",
+        "--seed=3 --seeds 0 1": "pass one of them",
+    }.items():
+        with pytest.raises(SystemExit, match="2"):
+            cli.main(["train", "walker_stand", "--device=cpu", f"--out={tmp_path}", *options.split()])
+        said = capsys.readouterr()
+        assert message in " ".join((said.out + said.err).replace("│", " ").split())
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -15,14 +15,14 @@ import torch
 from compare import assert_same
 from small_runs import made, networks
 
-from torchrl_loco import cli
-from torchrl_loco.training import RunFolder, Trainer, unused_path
+from torchrl_loco import cli, storage
+from torchrl_loco.training import RunFolder, Trainer
 
 
 def test_unused_path(tmp_path):
     names = []
     for _ in range(3):
-        path = unused_path(tmp_path / "video.mp4")
+        path = storage.unused_path(tmp_path / "video.mp4")
         path.touch()
         names.append(path.name)
     assert names == ["video.mp4", "video-2.mp4", "video-3.mp4"]

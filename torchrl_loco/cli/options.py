@@ -90,7 +90,9 @@ GPUS = Annotated[
         help="Train on so many GPUs of this machine, each with num_envs worlds; on a CPU, in so many processes."
     ),
 ]
-SEEDS = Annotated[tuple[int, ...], tyro.conf.arg(help="Train these seeds one after the other, into one folder.")]
+SEEDS = Annotated[
+    tuple[int, ...], tyro.conf.arg(help="Train these seeds one after the other, each in a run folder of its own.")
+]
 
 
 def _options(config: "training.TrainingConfig") -> "training.TrainingConfig":

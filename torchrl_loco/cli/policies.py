@@ -150,9 +150,9 @@ class Video:
 
     def make(self, policy: "torchrl_loco.Policy", default: Path) -> None:
         """Records the policy into ``out``, or into ``default`` or a numbered sibling of it, and prints the path."""
-        from torchrl_loco import training
+        from torchrl_loco import storage, training
 
-        out = check_output_file("out", training.unused_path(default)) if self.out is None else self.out
+        out = check_output_file("out", storage.unused_path(default)) if self.out is None else self.out
         print(f"recording {self.seconds:g} s; on a CPU this takes a while", file=sys.stderr)  # logs have no bar
         training.record(policy, self.env(policy), out, self.seconds, policy.info["action_repeat"], self.camera)
         print(out)
@@ -350,14 +350,14 @@ def export(
     """
     with user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
         policy, beside = _policy(run_or_task, protocol, "cpu")
-        from torchrl_loco import training
+        from torchrl_loco import storage
         from torchrl_loco.deployment import why_not
         from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy
 
         suffix = SUFFIXES[format]
         if out is not None:
             check_output_file("out", out, (suffix,))
-        out = training.unused_path(beside.with_suffix(suffix)) if out is None else out
+        out = storage.unused_path(beside.with_suffix(suffix)) if out is None else out
         error = export_policy(policy, out)
     if reason := why_not(policy):
         print(f"the file holds the network alone: {reason}")
@@ -417,7 +417,7 @@ def verify(
 
 def _exported_for(run_or_task: str, protocol: str, folder: Path) -> tuple[Path, Path | None]:
     """Exports a policy into a folder. Returns the file, and where figures belong in its run folder, if it has one."""
-    from torchrl_loco import training
+    from torchrl_loco import storage
     from torchrl_loco.deployment import why_not
     from torchrl_loco.export import export_policy
 
@@ -427,4 +427,4 @@ def _exported_for(run_or_task: str, protocol: str, folder: Path) -> tuple[Path, 
     path = folder / "policy.onnx"
     with user_errors(RuntimeError):  # of the export alone
         export_policy(policy, path)
-    return path, training.unused_path(beside.with_name("verify.json")) if is_run(beside.parent) else None
+    return path, storage.unused_path(beside.with_name("verify.json")) if is_run(beside.parent) else None

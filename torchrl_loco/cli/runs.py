@@ -1,15 +1,15 @@
 """Commands that train, and what they leave: train, resume and plot."""
 
 import contextlib
+import dataclasses
 import os
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from torchrl_loco.checks import check_int, check_run, is_run_group
+from torchrl_loco.checks import SEED, check_int, check_run
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.options import settings
 
@@ -28,52 +28,45 @@ def train(options: Any, args: list[str]) -> None:
         if {"--seed", "--seeds"} <= {arg.partition("=")[0] for arg in args}:
             raise ValueError("--seed trains one seed, --seeds several: pass one of them")
         config, seeds, gpus = settings(options)
-        if seeds:
-            _refuse_seeds_of_ranks(gpus)
-            group = _begin_group(config, seeds)
+        _check_seeds(seeds, gpus)
         missing = missing_processes(gpus, config.device)
-    if seeds:
-        _train_group(group)
-    elif missing:
+    if missing:
         from torchrl_loco.training import distributed
 
         distributed.launch(missing, args)
-    else:
-        with _joined(config.device):
+        return
+    runs = []
+    with _joined(config.device):
+        for seed in seeds or (config.seed,):
             with user_errors():
                 from torchrl_loco import training
 
-                trainer = training.begin(config)
+                trainer = training.begin(dataclasses.replace(config, seed=seed))
             train_to_end(trainer)
+            trainer.env.close()  # its memory is for the next seed
+            runs.append(str(trainer.run.path))
+    if seeds:
+        print(f"all seeds in one picture: torchrl-loco plot {' '.join(runs)}")
 
 
 def resume(run: tyro.conf.Positional[Path], /, gpus: int | None = None, total_frames: int | None = None) -> None:
     """Continue a run that was stopped, from its last checkpoint, as if it had not been stopped.
 
     Args:
-        run: folder of the run, or of the runs of several seeds, of which all that is missing is trained.
+        run: folder of the run.
         gpus: as in train: pass the same number to continue exactly.
-        total_frames: train one run to another number of frames, also if it is complete. The learning rate follows the
+        total_frames: train the run to another number of frames, also if it is complete. The learning rate follows the
             new number from here on. Trials keep the length with which they began.
     """
     with user_errors():
-        check_run(run, or_group=True)
+        check_run(run)
         from torchrl_loco import training
 
-        if is_run_group(run):
-            if total_frames is not None:
-                raise ValueError(f"{run} holds the runs of several seeds: total_frames is for one of them")
-            _refuse_seeds_of_ranks(gpus)
-            group = training.RunGroup(run)
-            group.check()
-        else:
-            folder = training.RunFolder(run)
-            training.Given().check(folder)
-            device = folder.load_config().device
-            missing = missing_processes(gpus, device)
-    if is_run_group(run):
-        _train_group(group)
-    elif missing:
+        folder = training.RunFolder(run)
+        training.Given().check(folder)
+        device = folder.load_config().device
+        missing = missing_processes(gpus, device)
+    if missing:
         more = [] if total_frames is None else [f"--total_frames={total_frames}"]
         training.distributed.launch(missing, ["resume", str(run), f"--gpus={gpus}", *more])
     else:
@@ -91,26 +84,29 @@ def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("lear
     """Plot the learning curves of runs; runs that differ only in their seed become a mean and a band.
 
     Args:
-        runs: folders of the runs, or of the runs of several seeds.
+        runs: folders of the runs.
         out: the picture; an existing one is replaced.
     """
     with user_errors():
+        for run in runs:
+            check_run(run)  # before what takes seconds to import
         from torchrl_loco import training
 
-        folders: list[training.RunFolder] = []
-        for run in runs:
-            check_run(run, or_group=True)
-            folders += training.RunGroup(run).plotted if is_run_group(run) else [training.RunFolder(run)]
-        training.plot_runs(folders, out)
+        training.plot_runs([training.RunFolder(run) for run in runs], out)
     print(out)
 
 
-def _refuse_seeds_of_ranks(gpus: int | None) -> None:
-    """Checks that several seeds are trained by one process.
+def _check_seeds(seeds: tuple[int, ...], gpus: int | None) -> None:
+    """Checks the seeds that are trained one after the other, by one process: ranks have not been tried with several.
 
-    A seed that fails must not end the others, but ranks that wait for a failed one cannot go on.
+    Raises:
+        ValueError: one is out of range or named twice, or there are several processes.
     """
-    if (gpus or 1) > 1 or int(os.environ.get("WORLD_SIZE", "1")) > 1:
+    for seed in seeds:
+        check_int("each of seeds", seed, SEED)
+    if twice := [seed for seed in seeds if seeds.count(seed) > 1]:
+        raise ValueError(f"seeds must differ, but {twice[0]} is named twice")
+    if seeds and ((gpus or 1) > 1 or int(os.environ.get("WORLD_SIZE", "1")) > 1):
         raise ValueError("several seeds are trained one after the other by one process: pass --seed with several GPUs")
 
 
@@ -140,32 +136,6 @@ def _joined(device: str) -> Iterator[None]:
         with user_errors():
             ranks.enter_context(distributed.joined(device))
         yield
-
-
-def _begin_group(config: "training.TrainingConfig", seeds: tuple[int, ...]) -> "training.RunGroup":
-    """Makes the folder for the runs of several seeds."""
-    from torchrl_loco import training
-
-    group = training.RunGroup.create(config, seeds)
-    if note := training.tuning_note(config):
-        print(note)
-    print(f"folder of the runs: {group.path}")
-    return group
-
-
-def _train_group(group: "training.RunGroup") -> None:
-    """Trains the seeds that are missing and prints where the results are; exits with 1 if some failed."""
-    way = f"to continue: torchrl-loco resume {group.path}"
-    try:
-        with user_errors(OSError):  # as of a run
-            failed = group.train()
-    except (KeyboardInterrupt, SystemExit):
-        print(way, file=sys.stderr)
-        raise
-    if failed:
-        print(way, file=sys.stderr)
-        raise SystemExit(1)
-    print(f"policies, curves, videos and logs: {group.path}")
 
 
 def train_to_end(trainer: "training.Trainer") -> None:

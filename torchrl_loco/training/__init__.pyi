@@ -16,8 +16,6 @@ from .presets import preset as preset
 from .presets import tuning_note as tuning_note
 from .reppo import REPPO as REPPO
 from .run_folder import RunFolder as RunFolder
-from .run_folder import unused_path as unused_path
-from .run_group import RunGroup as RunGroup
 from .spaces import Spaces as Spaces
 from .start import begin as begin
 from .start import train as train

@@ -10,7 +10,6 @@ from typing import Any
 
 from torchrl.record.loggers import Logger, MLFlowLogger, TensorboardLogger, WandbLogger
 
-from torchrl_loco.checks import is_run_group
 from torchrl_loco.training.run_folder import RunFolder
 
 PROJECT = "torchrl_loco"
@@ -98,8 +97,7 @@ class _Tensorboard(TensorboardLogger):
 
 def _open_wandb(folder: Path, frames: int, id: str | None) -> Logger:
     project = os.environ.get("WANDB_PROJECT", PROJECT)
-    group = folder.absolute().parent.name if is_run_group(folder.parent) else None
-    return WandbLogger(folder.name, save_dir=str(folder), project=project, id=id, group=group)
+    return WandbLogger(folder.name, save_dir=str(folder), project=project, id=id)
 
 
 class MLflow(MLFlowLogger):

@@ -4,7 +4,6 @@ import contextlib
 import csv
 import dataclasses
 import io
-import itertools
 import json
 import pickle
 from collections.abc import Collection
@@ -26,39 +25,6 @@ CHECKPOINT_VERSION = 7
 
 _UNREADABLE = (pickle.UnpicklingError, RuntimeError, OSError, EOFError, LookupError, TypeError, ValueError)
 """Errors that reading a damaged checkpoint may raise."""
-
-
-def unused_path(path: Path) -> Path:
-    """Returns ``path`` if it is free, else the first free of ``-2``, ``-3``, ... (before the suffix of a file)."""
-    stem, suffix = (path.name, "") if path.is_dir() else (path.stem, path.suffix)
-    numbered = (path.with_name(f"{stem}-{i}{suffix}") for i in itertools.count(2))
-    return next(candidate for candidate in itertools.chain([path], numbered) if not candidate.exists())
-
-
-def new_folder(config: TrainingConfig, ending: str) -> Path:
-    """Makes a new folder in ``config.out``, named after task and time, if runs with these settings can begin here.
-
-    Returns:
-        The folder.
-
-    Raises:
-        ValueError: this machine does not have the device.
-        ImportError: the package of a logger is missing, or the module of the environment is broken.
-        OSError: the folder cannot be made, or the file of the environment is missing.
-    """
-    check_device(config.device)
-    resolve(config.task)
-    check_loggers(config.logger)
-    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    try:
-        config.out.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise OSError(f"out must be a folder for runs, but {config.out} is a file or lies below one") from None
-    while True:  # runs may start within the same second
-        path = unused_path(config.out / f"{config.label}-{stamp}-{ending}")
-        with contextlib.suppress(FileExistsError):
-            path.mkdir()
-            return path
 
 
 def _as_json(config: TrainingConfig) -> bytes:
@@ -106,7 +72,19 @@ class RunFolder:
             ImportError: the package of a logger is missing, or the module of the environment is broken.
             OSError: the folder cannot be made, or the file of the environment is missing.
         """
-        path = new_folder(config, f"seed{config.seed}")
+        check_device(config.device)
+        resolve(config.task)
+        check_loggers(config.logger)
+        name = f"{config.label}-{datetime.now():%Y%m%d-%H%M%S}-seed{config.seed}"
+        try:
+            config.out.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError):
+            raise OSError(f"out must be a folder for runs, but {config.out} is a file or lies below one") from None
+        while True:  # runs may start within the same second
+            path = storage.unused_path(config.out / name)
+            with contextlib.suppress(FileExistsError):
+                path.mkdir()
+                break
         (path / "config.json").write_bytes(_as_json(config))
         if given:
             (path / "given.json").write_text(f"{json.dumps(list(given))}\n")
@@ -192,11 +170,6 @@ class RunFolder:
     def nan_dump(self) -> Path:
         """State and action from which a world first became non-finite, if any."""
         return self.path / "nan_dump.safetensors"
-
-    @property
-    def has_metrics(self) -> bool:
-        """Whether a batch was collected."""
-        return bool(self._read("metrics.csv"))
 
     @property
     def is_finished(self) -> bool:
