@@ -64,14 +64,14 @@ def test_actor_and_critic_see_the_same_normalised_observations(trainer):
         return algorithm.prepare(batch)[values], algorithm.actor[0].module(batch["observation"])[0]
 
     before = now()
-    algorithm.norm.update(torch.randn(100, 24) * 5 + 3)
+    algorithm.norms["observation"].update(torch.randn(100, 24) * 5 + 3)
     assert all((new != old).any() for new, old in zip(now(), before, strict=True))
 
 
 def test_gradient_steps_see_what_the_actor_sees(trainer):
     """Whether they normalise observations themselves, or get them normalised."""
     algorithm, batch = trainer.algorithm, trainer.collector.rollout()
-    algorithm.norm.update(torch.randn(100, 24) * 5 + 3)
+    algorithm.norms["observation"].update(torch.randn(100, 24) * 5 + 3)
     with torch.no_grad():
         data = algorithm.prepare(batch)
         own = (

@@ -93,7 +93,7 @@ def test_the_critic_reads_what_is_privileged():
     ppo.update(td, progress=0.0)
     assert not torch.equal(ppo.critic(td.clone())["state_value"], value)
     torch.testing.assert_close(ppo.norms["privileged"].mean, seen.mean((0, 1)))
-    torch.testing.assert_close(ppo.norm.mean, td["observation"].mean((0, 1)))
+    torch.testing.assert_close(ppo.norms["observation"].mean, td["observation"].mean((0, 1)))
     assert ppo.norms["privileged"] in list(ppo.networks.modules())
     changed = td.clone().set("privileged", seen + 50.0)
     assert torch.equal(*(ppo.actor.get_dist(one).deterministic_sample for one in (changed, td)))
@@ -208,9 +208,9 @@ def test_a_remainder_smaller_than_a_minibatch_is_left_out():
 def test_the_norm_is_updated_after_the_gradient_steps():
     """Else probabilities would be compared with those that were computed with another norm."""
     ppo, seen = made(num_envs=2, num_steps=4), []
-    ppo.gradient_step = lambda minibatch: seen.append(ppo.norm.count.item()) or [torch.zeros(())] * 6
+    ppo.gradient_step = lambda minibatch: seen.append(ppo.norms["observation"].count.item()) or [torch.zeros(())] * 6
     ppo.update(collected(ppo, 2), progress=0.0)
-    assert (seen, ppo.norm.count) == ([0.0, 0.0], 8.0)
+    assert (seen, ppo.norms["observation"].count) == ([0.0, 0.0], 8.0)
 
 
 def test_gradients_are_clipped_to_a_norm():

@@ -11,6 +11,14 @@ from torchrl_loco.training import Spaces, preset
 from torchrl_loco.training.reppo import REPPO, kl, sample
 
 
+def observed(reppo, batch):
+    return reppo.norms["observation"](batch["observation"])
+
+
+def distribution(reppo, batch):
+    return reppo.distribution(observed(reppo, batch))
+
+
 def made(**overrides):
     settings = {"num_envs": 1, "num_steps": 4, "minibatch_size": 4, "total_frames": 10_000, "epochs": 1, **overrides}
     torch.manual_seed(0)
@@ -76,7 +84,7 @@ def test_negative_returns_are_learned_with_bins_below_zero():
         for _ in range(60):
             reppo.update(batch, progress=0.0)
         with torch.no_grad():
-            found.append(reppo.critic.value_and_features(reppo.norm(batch["observation"]), batch["action"])[0].mean())
+            found.append(reppo.critic.value_and_features(observed(reppo, batch), batch["action"])[0].mean())
     assert found[0] > -1.0
     assert -11.5 < found[1] < -8.5
 
@@ -123,12 +131,12 @@ def test_the_actor_returns_where_the_kl_bound_is_exceeded():
     reppo = made(num_envs=16, num_steps=8, minibatch_size=128, kl_bound=1e-12, init_kl_weight=1.0, lr=1e-3)
     batch = collected(reppo, 16)
     batch["loc"] += 0.3  # as if the policy that collected had been another
-    before = kl(batch["loc"], batch["scale"], *reppo.distribution(reppo.norm(batch["observation"]))).mean()
+    before = kl(batch["loc"], batch["scale"], *distribution(reppo, batch)).mean()
     data = reppo.prepare(batch).detach().reshape(-1)
     reppo.critic.value_and_features = lambda observation, action: (1e6 * action.sum(-1), None)
     for _ in range(20):
         reppo.actor_step(data)
-    after = kl(batch["loc"], batch["scale"], *reppo.distribution(reppo.norm(batch["observation"]))).mean()
+    after = kl(batch["loc"], batch["scale"], *distribution(reppo, batch)).mean()
     assert after < before / 2
 
 
@@ -144,7 +152,7 @@ def test_the_actor_ascends_value_and_entropy(slope, temperature):
 
     def now():
         torch.manual_seed(1)
-        loc, scale = reppo.distribution(reppo.norm(batch["observation"]))
+        loc, scale = distribution(reppo, batch)
         return loc.mean().item() if slope else -sample(loc, scale, torch.randn_like(loc))[1].mean().item()
 
     before = now()

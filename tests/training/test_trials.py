@@ -60,7 +60,7 @@ def test_the_best_goes_on(algorithm, best, tmp_path):
         if number < 2:
             begun.append(knowledge(trainer))
             assert not any(value.any() for value in moments(trainer))
-            assert trainer.algorithm.norm.count == 0
+            assert trainer.algorithm.norms["observation"].count == 0
     assert not trials.running
     assert_same(knowledge(trainer), ended[best])
     for one, other in itertools.combinations(begun, 2):

@@ -55,11 +55,6 @@ class Algorithm(ABC):
         on_cuda = self.device.type == "cuda"
         self._step = TorchGraph(self._minibatch_step, self.device, warmup=WARMUP) if on_cuda else self._minibatch_step
 
-    @property
-    def norm(self) -> ObservationNorm:
-        """The norm of what the actor reads."""
-        return self.norms["observation"]
-
     @abstractmethod
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns what gradient steps need of a ``batch`` of shape ``(num_envs, num_steps)``, in the same shape."""
