@@ -16,7 +16,7 @@ pytest.importorskip("mjviser", reason="the extra viewer is not installed")
 from browser_client import open_page
 
 from torchrl_loco.viewer.player import Player
-from torchrl_loco.viewer.viewer import Viewer
+from torchrl_loco.viewer.viewer import Viewer, cores
 
 
 class Led(loco.WalkerStand):
@@ -181,6 +181,15 @@ def test_a_newer_policy_goes_on_where_the_last_one_was(led):
         assert (led.sim.ctrl == 1).all()
 
 
+def test_it_takes_no_more_of_the_cpu_than_it_may(led):
+    share = 0.02 / cores()
+    with Viewer(led, still, cpu_share=share) as viewer, open_page(viewer):
+        played(viewer, 1)
+        spent, began = time.process_time(), time.monotonic()
+        played(viewer, 40)
+        assert time.process_time() - spent < 0.03 * (time.monotonic() - began)
+
+
 def test_no_tunnel_is_opened_and_other_machines_do_not_reach_it(viewer):
     assert viewer.page.server.get_host() == "127.0.0.1"
     with open_page(viewer) as page:
@@ -213,6 +222,7 @@ def test_errors(led, tmp_path, capsys):
     for command, message in {
         "play walker_walk --viewer browser --num_envs 65": "num_envs must lie in [1, 64], got 65",
         "play walker_walk --viewer browser --port 0": "port must lie in [1, 65536)",
+        "play walker_walk --viewer browser --host nowhere": "'nowhere' does not appear to be an IPv4 or IPv6 address",
         f"watch {tmp_path}": "is not a run folder",
     }.items():
         with pytest.raises(SystemExit, match="2"):

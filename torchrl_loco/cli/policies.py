@@ -27,7 +27,7 @@ from torchrl_loco.checks import (
 )
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.verification.conditions import DEFAULT, Conditions
-from torchrl_loco.viewer.settings import LOOPBACK, PORT, WORLDS, check_viewer
+from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_viewer
 
 CONTAINERS = (".mp4", ".mkv", ".mov")
 """Suffixes of a video."""
@@ -181,6 +181,7 @@ class Browser:
     def check(self) -> None:
         """Checks all options before anything is printed or made."""
         check_viewer()
+        ipaddress.ip_address(self.host)
         check_int("num_envs", self.num_envs, WORLDS)
         check_int("port", self.port, Interval(1, 2**16))
 
@@ -189,15 +190,17 @@ class Browser:
         env: "torchrl_loco.LocoEnv",
         policy: "torchrl_loco.Policy | None",
         newer: "Callable[[], torchrl_loco.Policy | None] | None" = None,
+        cpu_share: float = 1.0,
     ) -> None:
         """Serves the page until it is interrupted, and prints its address."""
         from torchrl_loco.training.algorithm import settings_for_small_networks
         from torchrl_loco.viewer.viewer import Viewer
 
         with settings_for_small_networks():
-            viewer = Viewer(env, policy, newer=newer, host=self.host, port=self.port)
+            viewer = Viewer(env, policy, newer=newer, cpu_share=cpu_share, host=self.host, port=self.port)
             if not ipaddress.ip_address(self.host).is_loopback:
-                print(f"warning: whoever reaches {self.host} can see and steer the worlds, without a password")
+                warning = f"warning: whoever reaches {self.host} can see and steer the worlds, without a password"
+                print(warning, file=sys.stderr)
             print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
             viewer.run()
 
@@ -296,6 +299,7 @@ def watch(
     /,
     device: str = "cpu",
     seed: int = 0,
+    cpu_share: float = 0.02,
     browser: BrowserOptions = Browser(),
 ) -> None:
     """Show a running training in the browser: its newest policy, swapped in as it appears.
@@ -306,19 +310,21 @@ def watch(
         run: folder of the run.
         device: where the worlds that are shown compute; on CUDA they would share the GPU with the training.
         seed: seed of the worlds.
+        cpu_share: how much of the machine's CPU time it may take; pictures come slower where that is little.
         browser: how many worlds are shown, and at which address.
     """
     with user_errors():
         check_run(run)
         browser.check()
         check_int("seed", seed, SEED)
+        check_float("cpu_share", cpu_share, SHARE)
         check_device(device)
         _yield_to_others()
         from torchrl_loco import training
         from torchrl_loco.training.watching import Watched
 
         watched = Watched(training.RunFolder(run), browser.num_envs, device, seed)
-        browser.show(watched.env, watched.newer(), watched.newer)
+        browser.show(watched.env, watched.newer(), watched.newer, cpu_share)
 
 
 def _yield_to_others() -> None:

@@ -96,7 +96,7 @@ class Page:
 
     def _make_choice(self) -> None:
         gui, n = self.server.gui, self._player.env.num_envs
-        self.choice = gui.add_slider("World", 0, max(1, n - 1), 1, 0, disabled=n == 1)
+        self.choice = gui.add_slider("World", 0, max(1, n - 1), 1, 0, visible=n > 1)
         self.follow = gui.add_checkbox("Follow", True, hint="Keep the chosen world in the middle of the picture.")
         self.alone = gui.add_checkbox("Hide other worlds", False, visible=n > 1)
         self.forces = gui.add_checkbox("Contacts and forces", False, hint="Of the chosen world, by C MuJoCo.")

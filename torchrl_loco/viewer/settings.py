@@ -7,6 +7,8 @@ LOOPBACK = "127.0.0.1"
 PORT = 8080
 WORLDS = Interval(1, 64, with_high=True)
 """How many worlds a page shows."""
+SHARE = Interval(0, 1, with_low=False, with_high=True)
+"""Shares of the machine's CPU time that a viewer may take."""
 
 
 def check_viewer() -> None:

@@ -1,14 +1,15 @@
 """Worlds and their page together: in real time, in a loop or beside a notebook."""
 
+import os
 import queue
 import threading
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from torchrl_loco.checks import check_int
+from torchrl_loco.checks import check_float, check_int
 from torchrl_loco.viewer.player import Player
-from torchrl_loco.viewer.settings import LOOPBACK, PORT, WORLDS, check_viewer
+from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_viewer
 
 if TYPE_CHECKING:
     from torchrl_loco.envs.base import LocoEnv
@@ -19,6 +20,11 @@ PICTURE, CURVES, LOOK_FOR_POLICY, IDLE = 1 / 30, 0.25, 1.0, 0.1
 """Time between two pictures, two updates of curves, two looks for a newer policy, and two looks for a page (s)."""
 
 
+def cores() -> int:
+    """Returns the number of cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class Viewer:
     """Shows 1 to 64 worlds in the browser, live, under a policy; the page serves to steer and understand them.
 
@@ -27,10 +33,12 @@ class Viewer:
 
     Args:
         env: the worlds. Nobody else may step them meanwhile. With ``reward_terms=True`` there are curves of the terms,
-            with ``play=True`` sliders for the commands that the task declares.
+            with ``play=True`` sliders for the commands that the task declares. Arrows of forces are of the model's
+            nominal numbers, where worlds differ in them.
         policy: reads ``observation`` and writes ``action``; ``None`` waits for ``newer``.
         action_repeat: control steps for which an action is held; ``None`` takes that of ``policy.info``, else 1.
         newer: called now and then, returns another policy to go on with, or ``None``.
+        cpu_share: how much of the machine's CPU time this process may take; pictures come slower when it takes more.
         host: address that the server listens on. There is no password: whoever reaches it can steer the worlds.
         port: its port; the next free one if it is taken.
 
@@ -46,15 +54,18 @@ class Viewer:
         action_repeat: int | None = None,
         *,
         newer: Callable[[], Callable[[Any], Any] | None] | None = None,
+        cpu_share: float = 1.0,
         host: str = LOOPBACK,
         port: int = PORT,
     ) -> None:
         check_viewer()
         check_int("num_envs", env.num_envs, WORLDS)
+        check_float("cpu_share", cpu_share, SHARE)
         from torchrl_loco.viewer.page import Page
 
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._newer, self._host = newer, host
+        self._allowed = cpu_share * cores()
         self.player = Player(env, policy, action_repeat)
         self.page = Page(self.player, host, port, type(env).__name__, self._requests.put)
         clock = {"Play/Pause": self._pause, "Step": self._step_once, "Reset": self._reset}
@@ -67,6 +78,7 @@ class Viewer:
         self._last, self._owed, self._measured = time.perf_counter(), 0.0, (time.perf_counter(), 0)
         self._real_speed = 0.0
         self._show()
+        self._spent, self._awake = time.process_time(), time.perf_counter()
 
     @property
     def url(self) -> str:
@@ -96,7 +108,9 @@ class Viewer:
     def close(self) -> None:
         """Ends :meth:`run` or what :meth:`start` began, and the page with it; the worlds stay."""
         self._ends.set()
-        if self._thread is not None:
+        if self._thread is None:
+            self.page.server.stop()
+        else:
             self._thread.join()
 
     def __enter__(self) -> "Viewer":
@@ -104,7 +118,6 @@ class Viewer:
 
     def __exit__(self, *error: object) -> None:
         self.close()
-        self.page.server.stop()
 
     def _repr_html_(self) -> str:
         """Returns the page as a frame of a notebook."""
@@ -120,7 +133,7 @@ class Viewer:
             self._swap(self._newer())
         elapsed, self._last = now - self._last, now
         if not self.page.watched:
-            self._ends.wait(IDLE)
+            self._rest(IDLE)
             return
         if self._plays:
             self._owed += elapsed * self.speed
@@ -133,7 +146,15 @@ class Viewer:
             self.page.show_worlds()
         if self._is_due("curves", now, CURVES):
             self._show_numbers()
-        self._ends.wait(max(0.001, min(self._due["picture"], now + self.player.dt) - time.perf_counter()))
+        self._rest(min(self._due["picture"], now + self.player.dt) - time.perf_counter())
+
+    def _rest(self, seconds: float) -> None:
+        """Waits, and longer if this process has taken more of the CPU since the last time than it may."""
+        spent = time.process_time()
+        owed = (spent - self._spent) / self._allowed - (time.perf_counter() - self._awake)
+        self._spent = spent
+        self._ends.wait(max(0.001, seconds, owed))
+        self._awake = time.perf_counter()
 
     def _is_due(self, what: str, now: float, every: float) -> bool:
         if now < self._due[what]:
