@@ -336,6 +336,15 @@ def test_a_table_is_read_again_in_a_subclass_of_a_class_with_one():
     assert (env.get_state()["qpos"] == 0.125).all()
 
 
+def test_a_name_that_is_almost_a_hook_is_said():
+    class Falls(torchrl_loco.WalkerWalk):
+        def terminate(self, s):
+            return s.xpos("torso")[:, 2] < 0.7
+
+    with pytest.warns(UserWarning, match="Falls defines terminate, which nothing reads: did you mean terminated?"):
+        Falls.check_class()
+
+
 def test_wrong_attributes_are_named(monkeypatch):
     for name, value, message in [
         ("observation_size", 1.0, "observation_size must be an integer"),

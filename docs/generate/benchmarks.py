@@ -206,7 +206,7 @@ def speed() -> str:
         re.search(r"Go1 .* ([\d,]+) frames per second", (RESULTS / MJLAB).read_text()),
     )
     ours_go1, mjlab = (f"{int(found[1].replace(',', '')) / 1e6:.3g}" for found in rates if found)
-    rows.append(("Go1 learns a velocity command (million frames/s, H100)", ours_go1, "", mjlab, ""))
+    rows.append(("training a Go1 to follow velocity commands (million frames/s, H100)", ours_go1, "", mjlab, ""))
     return table(("", "torchrl_loco", "`mujoco_warp`", "mjlab 1.6", "Playground 0.2"), rows)
 
 

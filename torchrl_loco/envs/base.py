@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import difflib
 import inspect
 import math
 import multiprocessing
@@ -31,7 +32,7 @@ from torchrl_loco.checks import (
     check_output_file,
 )
 from torchrl_loco.config import SimConfig, sim_config
-from torchrl_loco.envs.hooks import Hooks, check_commands, memory_shapes, own_hooks
+from torchrl_loco.envs.hooks import HOOKS, Hooks, check_commands, memory_shapes, own_hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.state import State, without_state, write_state
 from torchrl_loco.envs.variation import Variation, constant_of
@@ -223,6 +224,7 @@ class LocoEnv(EnvBase):
             ValueError: ``observation_size`` is less than 1, or an attribute is none of the valid values.
         """
         name, own = cls.__name__, own_hooks(cls)
+        _warn_of_misspelt_names(cls)
         missing = [attribute for attribute in ("model", "config") if not hasattr(cls, attribute)]
         if missing:
             raise TypeError(f"{name} must set {', '.join(missing)}: see help(torchrl_loco.LocoEnv)")
@@ -808,6 +810,19 @@ class LocoEnv(EnvBase):
         if not strict:
             state_dict = {name: value for name, value in state_dict.items() if not name.endswith("_extra_state")}
         return super().load_state_dict(state_dict, strict=strict, **kwargs)
+
+
+def _warn_of_misspelt_names(cls: type[LocoEnv]) -> None:
+    """Warns of what a class defines by a name that is almost that of a hook or an attribute: nobody would call it."""
+    meant = {*HOOKS, *LocoEnv.__annotations__}
+    for base in cls.__mro__[: cls.__mro__.index(LocoEnv)]:
+        if base.__module__.startswith("torchrl_loco."):
+            continue
+        inherited = {name for other in base.__mro__[1:] for name in vars(other)}
+        for name in vars(base).keys() - inherited:
+            near = difflib.get_close_matches(name, meant - {name}, n=1, cutoff=0.85)
+            if near and name not in meant:
+                warn(f"torchrl_loco: {base.__name__} defines {name}, which nothing reads: did you mean {near[0]}?")
 
 
 def _warn_if_worlds_repeat() -> None:
