@@ -98,8 +98,9 @@ class Velocity(LocoEnv):
 
     The command is a velocity forward and to the left (m/s) and a yaw rate (rad/s), drawn anew every 3 to 8 s. The base
     must have the first joint, a free one; actuators must be servos of joints with a range; the pose is kept around the
-    keyframe ``home``. A robot also sets ``memory = velocity.memory(joints=..., feet=...)``, and ``randomize``, for
-    which :func:`sliding`, :func:`soft` and :func:`com` make entries.
+    keyframe ``home``. A robot also sets ``memory`` and ``randomize``, for which
+    :func:`~torchrl_loco.tasks.velocity.memory`, :func:`~torchrl_loco.tasks.velocity.sliding`,
+    :func:`~torchrl_loco.tasks.velocity.soft` and :func:`~torchrl_loco.tasks.velocity.com` make entries.
 
     Observation:
         ``observation``: linear and angular velocity of the base and gravity in its frame (9), joint positions relative
