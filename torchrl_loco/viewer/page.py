@@ -65,7 +65,7 @@ class Page:
         self._spacing = SPACING * self._model.stat.extent
         rows, columns = np.divmod(np.arange(player.env.num_envs), side)
         self._places = self._spacing * np.stack([-rows, columns, 0 * rows], axis=1)
-        self._look(2.2 * self._model.stat.extent + 0.4 * (side - 1) * self._spacing)
+        self._look(1.6 * self._model.stat.extent + 0.4 * (side - 1) * self._spacing)
         gui = self.server.gui
         gui.add_markdown(f"**{title}**")
         self._status = gui.add_markdown("")
@@ -184,7 +184,7 @@ class Page:
         for entry, (by_hand, *sliders) in self._sliders.items():
             if not by_hand.value:
                 for slider, value in zip(sliders, self._player.command(entry, self.world), strict=True):
-                    slider.value = min(max(value, slider.min), slider.max)
+                    slider.value = round(min(max(value, slider.min), slider.max), 2)
 
     def show_status(self, text: str) -> None:
         """Shows a line of Markdown above the controls."""
