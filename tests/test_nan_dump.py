@@ -94,7 +94,10 @@ def test_of_a_body_with_activations(file, actions):
     assert torch.equal(dump.tensors["act"], state["act"][1])
     assert dump.tensors["act"].abs().max() > 0.1
     dump.tensors["action"][2] = 0.5
-    np.testing.assert_allclose(nan_dump.warp_trace(dump, "cpu"), nan_dump.mujoco_trace(dump), atol=1e-3)
+    warp, c = nan_dump.warp_trace(dump, "cpu"), nan_dump.mujoco_trace(dump)
+    np.testing.assert_allclose(warp, c, atol=1e-3)
+    last = [line for line in nan_dump.describe(dump, "cpu") if line.split()[0].isdigit()][-1].split()
+    assert float(last[3]) == pytest.approx(np.abs(warp[-1] - c[-1]).max(), rel=0.01, abs=1e-9)
 
 
 def test_of_two_in_one_step_the_lower_is_kept(file):

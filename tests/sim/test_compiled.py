@@ -346,6 +346,19 @@ def test_a_tolerance_below_single_precision_counts_as_the_least(form):
     assert torch.equal(torch.cat(ends[0]), torch.cat(ends[1]))
 
 
+def test_moving_bodies_touch_within_their_margin(form):
+    ball = '<body name="{}" pos="0 0 {}"><joint type="slide" axis="0 0 1"/><geom size="0.1" margin="0.05"/></body>'
+    model = scene(ball.format("root", 0), ball.format("upper", 0.23), gravity="0 0 0")
+    sim = simulated(model)
+    sim.qvel.copy_(torch.tensor([[1.0, -1.0]]))
+    data = in_c_mujoco(model, sim)
+    assert data.ncon == 1
+    mujoco.mj_step(model, data, sim.config.substeps)
+    sim.step()
+    assert data.qvel[0] < 0.0 < data.qvel[1]  # they bounce off each other
+    np.testing.assert_allclose(sim.qvel[0], data.qvel, atol=1e-3)
+
+
 def test_friction_holds_a_stack(form):
     """A capsule on one across it, which lies on two that are fixed, under gravity that leans by 0.2."""
     for friction, stays in ((0.6, True), (0.05, False)):
