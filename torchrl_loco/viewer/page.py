@@ -26,10 +26,15 @@ OVER_TIME = {"x": uplot.Scale(time=False, auto=True)}
 
 
 class _Server(viser.ViserServer):
-    """A server that opens no tunnel: any client could ask for one, and the page would be public."""
+    """A quiet server that opens no tunnel: any client could ask for one, and the page would be public."""
 
     def request_share_url(self, verbose: bool = True) -> None:
         """Does nothing."""
+
+    def stop(self) -> None:
+        """Stops the server."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().stop()
 
 
 class Page:
