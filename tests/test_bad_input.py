@@ -25,6 +25,7 @@ BAD = {
     "stagger": (1, TypeError),
     "randomize": (3, TypeError),
     "compile_hooks": (1, TypeError),
+    "play": ("yes", TypeError),
     "on_overflow": ("shout", ValueError),
     "nan_dump": ("no/such/folder/file", ValueError),
     "ctrl_dt": (0.003, ValueError),

@@ -327,7 +327,7 @@ def test_the_most_derived_definition_wins_hook_by_hook():
     assert torch.equal(env.sim.qpos, torch.tensor(env.mj_model.qpos0).float().expand(2, -1))
 
 
-@pytest.mark.parametrize("way", ["kernel", pytest.param("torch.compile", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("way", ["kernel", pytest.param("torch.compile", marks=pytest.mark.ci)])
 def test_compiled_hooks_do_the_same(actions, monkeypatch, way):
     """With the same random numbers, up to rounding; torch.compile takes over on CUDA where there can be no kernel."""
     plain = WalkBackwardsInNoise(5, "cpu", seed=0, episode_length=20, compile_hooks=False)
