@@ -140,6 +140,8 @@ def test_a_runner_earns_the_same_in_c_mujoco(capsys, tmp_path):
     assert there == pytest.approx(here, rel=0.01)
     status, said = verify(capsys, tmp_path / "policy.safetensors", *options, "--seconds", 1, "--min_return", 1.1)
     assert (status, "DOES NOT HOLD: return" in said) == (1, True)
+    _, said = verify(capsys, "humanoid_walk", "--episodes", 4, "--seconds", 0.5, "--device", "cpu")
+    assert "1 episode, since all begin alike, of 20 control steps" in said
 
 
 @pytest.mark.slow

@@ -125,6 +125,12 @@ class TrainingSimulator:
         self.failed |= ~np.isfinite(self.state.qpos).all(1)
 
 
+def begin_alike(env: LocoEnv) -> bool:
+    """Returns whether the next episodes of all worlds begin in the same state."""
+    env.reset()
+    return all(bool((view == view[:1]).all()) for view in (env.sim.qpos, env.sim.qvel))
+
+
 @dataclasses.dataclass(frozen=True)
 class Returns:
     """Returns of the same episodes, by their starts, each ``(n,)``.

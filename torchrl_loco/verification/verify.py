@@ -107,6 +107,10 @@ def _returns(exported: Exported, conditions: Conditions, device: str | None) -> 
     n = conditions.episodes
     env = training_simulator.make(exported, n, conditions.seed, device)
     training_simulator.check_layout(exported, env, conditions.seed)
+    alike = n > 1 and training_simulator.begin_alike(env)
+    if alike:
+        env.close()
+        env, n = training_simulator.make(exported, 1, conditions.seed, device), 1
     env.set_seed(conditions.seed)
     steps = env.config.episode_length
     if conditions.seconds is not None:
@@ -115,7 +119,8 @@ def _returns(exported: Exported, conditions: Conditions, device: str | None) -> 
     there, here = returns.there.mean(), returns.here.mean()
     least = here - (1.0 - conditions.min_return) * abs(here)
     bound = f"return {there:.1f}, at least {least:.1f} is asked for"
-    lines = [f"{exported.task} in C MuJoCo {mujoco.__version__}, {n} episodes of {steps} control steps"]
+    episodes = "1 episode, since all begin alike," if alike else f"{n} episodes"
+    lines = [f"{exported.task} in C MuJoCo {mujoco.__version__}, {episodes} of {steps} control steps"]
     figures = {}
     for name, values in (("C MuJoCo", returns.there), ("training simulator", returns.here)):
         figures[name] = {"mean": values.mean(), "std": values.std(), "min": values.min(), "max": values.max()}
