@@ -819,9 +819,9 @@ def _warn_of_misspelt_names(cls: type[LocoEnv]) -> None:
         if base.__module__.startswith("torchrl_loco."):
             continue
         inherited = {name for other in base.__mro__[1:] for name in vars(other)}
-        for name in vars(base).keys() - inherited:
-            near = difflib.get_close_matches(name, meant - {name}, n=1, cutoff=0.85)
-            if near and name not in meant:
+        for name in vars(base).keys() - inherited - meant:
+            near = difflib.get_close_matches(name, meant, n=1, cutoff=0.85)
+            if near:
                 warn(f"torchrl_loco: {base.__name__} defines {name}, which nothing reads: did you mean {near[0]}?")
 
 

@@ -129,8 +129,8 @@ class Softness:
         return 1 / regularisation, self.stiffness * impedance * position
 
     @classmethod
-    def functions(cls) -> str:
-        """Returns :meth:`row` as C++, a member of a struct that has the attributes."""
+    def row_as_cpp(cls) -> str:
+        """Returns :meth:`row` as C++, a member function of a struct that has the attributes."""
         softness = cls(*(name(field.name) for field in dataclasses.fields(cls)))
         results = softness.row(name("inverse_inertia"), name("position"), name("least"))
         block = Block()

@@ -1574,7 +1574,7 @@ struct Step : Math {
       SHARED_LOOP(i, first_limit() - first_single()) {
         const int r = first_single() + i;
         const bool felt = w.zones[place_of(contact_of_row(r))] >> s & 1;
-        if (felt) force -= w.weight[r] * smaller(w.x[r], 0.0f);
+        if (felt) force -= OneSided::gradient(w.x[r], w.weight[r]);
       }
       sum(&force, 1);
       if (lane == 0) sensordata[Model::touch_address(s)] = force;
@@ -1599,7 +1599,7 @@ struct Step : Math {
   INLINE Vec contact_force(int i, const OwnContact& c) const {
     if (i >= frictional) {
       const int r = first_frictionless() + i - frictional;
-      return c.normal * (-w.weight[r] * smaller(w.x[r], 0.0f));
+      return c.normal * -OneSided::gradient(w.x[r], w.weight[r]);
     }
     const Law cost = law(i);
     return c.normal * -cost.gradient[0] + c.tangent * -cost.gradient[1] +

@@ -108,6 +108,7 @@ struct Interval {  // of a ray's parameter: the part that lies in a convex shape
 
 struct OneSided {  // costs D x^2 / 2 where x < 0
   static INLINE float cost(float x, float weight) { return x < 0.0f ? 0.5f * weight * x * x : 0.0f; }
+  static INLINE float gradient(float x, float weight) { return weight * Math::smaller(x, 0.0f); }
   static INLINE float curvature(float x, float weight) { return x < 0.0f ? weight : 0.0f; }
   static INLINE bool crosses(float x, float next) { return (x < 0.0f) != (next < 0.0f); }
   static INLINE void add(float x, float v, float weight, float alpha, float* sums) {
