@@ -160,7 +160,7 @@ def test_random_steps_stay_finite_and_have_the_shapes_of_the_specs(robot, name, 
     env, joints, feet = robot(name), JOINTS[name], FEET[name]
     td = env.rollout(100, break_when_any_done=False)
     assert td["next", "observation"].shape == (WORLDS, 100, 12 + 3 * joints)
-    assert td["next", "privileged"].shape == (WORLDS, 100, 12 + 3 * joints + 6 * feet)
+    assert td["next", "privileged"].shape == (WORLDS, 100, 12 + 3 * joints + 6 * feet + 1)
     assert td["action"].shape == (WORLDS, 100, joints)
     for key in ("observation", "privileged", "reward"):
         assert td["next", key].isfinite().all()
@@ -250,7 +250,7 @@ def test_reward_is_the_sum_of_its_terms_by_formula(robot, name):
         before, action = with_memory(env.get_state(), until_push=9.0), 0.7 * torch.randn(env.action_spec.shape)
         after, state = stepped(env, before, action)
         privileged = after["privileged"].double().numpy()[:, 12 + 3 * joints :]
-        contacts, forces = privileged[:, 2 * feet : 3 * feet], privileged[:, 3 * feet :].reshape(WORLDS, feet, 3)
+        contacts, forces = privileged[:, 2 * feet : 3 * feet], privileged[:, 3 * feet : -1].reshape(WORLDS, feet, 3)
         for world in range(WORLDS):
             row = {key: before["memory", key][world].double().numpy() for key in ("command", "last_action", "air_time")}
             row |= {key: state[key][world].double().numpy() for key in ("qpos", "qvel")}
@@ -314,7 +314,7 @@ def test_actions_are_targets_around_home(robot):
         env.reset()
         action = torch.zeros(env.action_spec.shape)
         action[:, 2] = 2.0
-        stepped(env, env.get_state(), action)
+        stepped(env, with_memory(env.get_state(), delay=0.0), action)
         target = torch.tensor(env.mj_model.key("home").qpos[7:], dtype=torch.float32).repeat(WORLDS, 1)
         target[:, 2] += 2.0 * scale
         torch.testing.assert_close(env.sim.ctrl, target)
@@ -400,6 +400,21 @@ def test_pushes_change_the_velocity_of_the_base_alone(many):
     wait = pushed["memory", "until_push"]
     assert wait.min() >= 1.0
     assert wait.max() == pytest.approx(3.0, abs=0.03)
+
+
+def test_actions_are_late_by_the_delay_of_the_episode(many):
+    td = many.reset()
+    delay = many.get_state()["memory", "delay"]
+    torch.testing.assert_close(td["privileged"][:, -1], delay)
+    for steps in range(3):
+        assert share(delay == steps) == pytest.approx(1 / 3, abs=0.03)
+    home = torch.tensor(many.mj_model.key("home").qpos[7:], dtype=torch.float32)
+    sent = torch.randn(4, *many.action_spec.shape)
+    sent[:2] = 0.0  # as before the first step
+    for step in range(2, 4):
+        td = many.step(td.set("action", sent[step]))["next"]
+        arrived = sent[step - delay.long(), torch.arange(len(delay))]
+        torch.testing.assert_close(many.sim.ctrl, home + 0.25 * arrived)
 
 
 def test_the_policy_sees_noise_and_a_bias_that_the_critic_does_not(many):
@@ -526,6 +541,8 @@ def test_a_table_makes_a_task_of_a_users_robot(caplog):
     assert "meshes without contacts are drawn and touch nothing: shell" in caplog.text
     with pytest.raises(TypeError, match="Bare must set base, trunk, feet, stand, walk, run"):
         type("Bare", (velocity.Velocity,), {"model": Table.model})(1, "cpu")
+    with pytest.raises(ValueError, match="delay of Slow must be 0, 1 or 2 control steps, not 3"):
+        type("Slow", (Table,), {"delay": 3})(1, "cpu")
 
 
 UNFIT = [

@@ -71,7 +71,8 @@ def memory(joints: int, feet: int) -> dict[str, int | tuple[int, ...]]:
     """Returns what a robot with so many actuated joints and feet remembers."""
     return {
         **commands.ROWS,
-        **{"until_push": (), "last_action": joints, "bias": joints},  # time until it (s); rad
+        **{"until_push": (), "bias": joints, "delay": ()},  # time until it (s); rad; control steps
+        **{"last_action": joints, "earlier_action": joints},
         **{"air_time": feet, "peak": feet},  # s; m
     }
 
@@ -105,10 +106,11 @@ class Velocity(LocoEnv):
     Observation:
         ``observation``: linear and angular velocity of the base and gravity in its frame (9), joint positions relative
         to home, joint velocities, last action, command (3); with noise. ``privileged``: the same without noise, then
-        height, time in the air, contact and contact force of the feet.
+        height, time in the air, contact and contact force of the feet, and the delay of actions (control steps).
 
     Action:
-        Changes of the joints' targets from home, scaled, without bounds.
+        Changes of the joints' targets from home, scaled, without bounds; in each episode by a number of control steps
+        late, up to :attr:`delay`.
 
     Reward:
         :meth:`terms` times :attr:`weights` and the control step.
@@ -120,7 +122,7 @@ class Velocity(LocoEnv):
         When the trunk is tilted by more than 70 degrees; truncation after 1000 steps.
 
     Source:
-        mjlab 1.6.0, flat velocity task.
+        mjlab 1.6.0, flat velocity task, where actions are never late.
     """
 
     config = SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=10, ls_iterations=20)
@@ -166,6 +168,8 @@ class Velocity(LocoEnv):
     """Ranges of the commands by the control step of training from which they hold."""
     step_height: ClassVar[float] = 0.1
     """Height of a foot in mid-swing (m)."""
+    delay: ClassVar[int] = 2
+    """Greatest delay of an action in training (control steps), at most 2."""
     own_geoms: ClassVar[str] = ""
     """Regular expression of the geoms of which ``self_collision`` counts the contacts."""
 
@@ -175,10 +179,13 @@ class Velocity(LocoEnv):
 
         Raises:
             TypeError: an attribute is missing.
+            ValueError: the delay is not 0, 1 or 2.
         """
         missing = [name for name in TABLE if not hasattr(cls, name)]
         if missing:
             raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.Velocity)")
+        if cls.delay not in (0, 1, 2):
+            raise ValueError(f"delay of {cls.__name__} must be 0, 1 or 2 control steps, not {cls.delay!r}")
         super().check_class()
 
     @classmethod
@@ -280,11 +287,13 @@ class Velocity(LocoEnv):
     # The hooks, in the order in which they are called.
 
     def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
-        """Returns the targets of the joints (rad): the home pose and a multiple of the action."""
+        """Returns the targets of the joints (rad): the home pose and a multiple of the action that arrives."""
+        late = s.delay.unsqueeze(-1)
+        arrived = torch.where(late < 1.0, action, torch.where(late < 2.0, s.last_action, s.earlier_action))
         if self.action_scale is not None:
-            return self.home(s) + self.action_scale * action
+            return self.home(s) + self.action_scale * arrived
         greatest, stiffness = s.model("actuator_forcerange")[..., 1], s.model("actuator_gainprm")[..., 0]
-        return self.home(s) + 0.25 * greatest / stiffness * action
+        return self.home(s) + 0.25 * greatest / stiffness * arrived
 
     def update(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the greatest height of each foot since it left the ground."""
@@ -347,6 +356,7 @@ class Velocity(LocoEnv):
             **({} if self.play else self.pushed(s)),
             "trained": s.trained + 1.0,
             "last_action": s.action,
+            "earlier_action": s.last_action,
             "air_time": torch.where(touching, 0.0, s.air_time + s.dt),
             "peak": torch.where(touching, 0.0, s.peak),
         }
@@ -374,8 +384,8 @@ class Velocity(LocoEnv):
             noisy = torch.cat([clean[:, : sum(sizes)] + torch.cat(noise, dim=-1), clean[:, sum(sizes) :]], dim=-1)
         forces = self.forces(s).flatten(1)
         forces = forces.sign() * torch.log1p(forces.abs())
-        feet = [self.heights(s), s.air_time, self.touching(s).float(), forces]
-        return {"observation": noisy, "privileged": torch.cat([clean, *feet], dim=-1)}
+        hidden = [self.heights(s), s.air_time, self.touching(s).float(), forces, s.delay.unsqueeze(-1)]
+        return {"observation": noisy, "privileged": torch.cat([clean, *hidden], dim=-1)}
 
     def begin(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the home pose, somewhere within half a meter and just above the ground, and a command."""
@@ -388,6 +398,7 @@ class Velocity(LocoEnv):
             "qpos": torch.cat([place, height, turn, s.home[:, 7:]], dim=-1),
             "until_push": s.uniform(*PUSH_EVERY),
             "bias": s.uniform(-BIAS, BIAS, len(self.joints)),
+            "delay": torch.zeros_like(yaw) if self.play else s.uniform(0.0, self.delay + 1.0).floor(),
             "trained": s.trained,  # it counts on over all episodes
         }
 
