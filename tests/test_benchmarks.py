@@ -9,16 +9,21 @@ import threading
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 from hook_tasks import FollowVelocity
 
 from benchmarks import cases, coverage, fidelity, plot, rollouts, scaling, soak, suite, timing
 from benchmarks.cases import until_interrupted
+from benchmarks.peers import mjlab_policy
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
 from benchmarks.throughput import phases
+from torchrl_loco.registry import env_class
+from torchrl_loco.tasks.velocity import actuated
 from torchrl_loco.training.reppo import REPPO
+from torchrl_loco.verification.layout import Layout, State
 
 RESULTS = Path(__file__).parents[1] / "benchmarks/results/2026-11-21-h200"
 
@@ -209,3 +214,56 @@ def test_coverage_tells_what_is_missing(tmp_path):
     errors = {row["model"]: row["p90"] for row in rows}
     assert errors["own/fluid.xml"] is None
     assert 0 < max(errors["own/plain.xml"], errors["own/boxes.xml"]) < 1e-5
+
+
+def test_a_policy_of_mjlab_moves_the_same_joints_to_the_same_targets(tmp_path):
+    """Its actor, computed from sensors at a tilted IMU and with joints in another order, beside ours from its file."""
+    rng, order = np.random.default_rng(0), np.random.default_rng(1).permutation(12)
+    spec = mujoco.MjSpec.from_file(str(env_class("go1_velocity").model))
+    imu = spec.body("trunk").add_site(name="tilted", pos=[0.1, -0.2, 0.05], quat=[0.8, 0.6, 0, 0])
+    of_imu = {"objtype": mujoco.mjtObj.mjOBJ_SITE, "objname": imu.name}
+    for name, kind in (("linear", mujoco.mjtSensor.mjSENS_VELOCIMETER), ("angular", mujoco.mjtSensor.mjSENS_GYRO)):
+        spec.add_sensor(name=name, type=kind, **of_imu)
+    m = spec.compile()
+    d, joints = mujoco.MjData(m), actuated(m)
+    theirs = [joints[k] for k in order]
+    home, scale = rng.uniform(-1, 1, 12), rng.uniform(0.1, 1, 12)
+    facts = {
+        **{"robot": "go1", "base": "trunk", "control_timestep": 0.02, "device": "H100"},
+        **{"seed": 42, "frames": 10, "worlds": 1, "seconds": 1.0},
+        "terms": ["base_ang_vel", "base_lin_vel", "projected_gravity", "joint_pos", "joint_vel", "actions", "command"],
+        **{"sizes": [3, 3, 3, 12, 12, 12, 3], "joints": joints, "home": home.tolist(), "actions": theirs},
+        **{"scale": scale.tolist(), "offset": home[order].tolist()},
+        **{"imu_position": imu.pos.tolist(), "imu_quaternion": imu.quat.tolist()},
+    }
+    weights = [rng.normal(0, 0.1, shape) for shape in ((16, 48), (8, 16), (12, 8))]
+    biases, mean, std = [rng.normal(size=len(w)) for w in weights], rng.normal(size=48), rng.uniform(0.5, 2, 48)
+    layers = {f"mlp.{2 * k}.{what}": a[k] for what, a in (("weight", weights), ("bias", biases)) for k in range(3)}
+    norm = {"obs_normalizer._mean": mean[None], "obs_normalizer._std": std[None], "std_epsilon": 0.01}
+    np.savez(tmp_path / "go1.npz", facts=json.dumps(facts), **layers, **norm)
+    policy = mjlab_policy.convert(tmp_path / "go1.npz")
+    own = env_class("go1_velocity").layout(m, policy.info)
+
+    d.qpos[:], d.qvel[:] = rng.normal(size=m.nq), rng.normal(size=m.nv)
+    d.qpos[3:7] /= np.linalg.norm(d.qpos[3:7])
+    mujoco.mj_forward(m, d)
+    last, command = rng.normal(size=12), rng.normal(size=3)
+    targets = np.array(own["action_offset"]) + own["action_scale"] * last
+    last_of_theirs = (targets[order] - home[order]) / scale
+    seen = [d.sensor("angular").data, d.sensor("linear").data, -d.body("trunk").xmat.reshape(3, 3)[2]]
+    seen += [d.qpos[7:] - home, d.qvel[6:], last_of_theirs, command]
+    hidden = (np.concatenate(seen) - mean) / (std + 0.01)
+    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+        hidden = weight @ hidden + bias
+        hidden = np.where(hidden > 0, hidden, np.expm1(hidden))
+    expected = dict(zip(theirs, home[order] + scale * (weights[-1] @ hidden + biases[-1]), strict=True))
+
+    state = State.zeros(m, 1)
+    state.write(0, d)
+    observation = Layout(own["observation"], m)(state, last[None], command[None])
+    action = policy.module(torch.tensor(observation, dtype=torch.float32)).numpy()[0]
+    ours = np.array(own["action_offset"]) + own["action_scale"] * action
+    assert np.allclose(ours, [expected[name] for name in joints], atol=1e-4)
+    np.savez(tmp_path / "go1.npz", facts=json.dumps(facts | {"base": "pelvis"}), **layers, **norm)
+    with pytest.raises(ValueError, match="is of a robot on pelvis"):
+        mjlab_policy.convert(tmp_path / "go1.npz")
