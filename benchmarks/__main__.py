@@ -41,14 +41,22 @@ add("hooks", "what a task in plain torch costs beside the physics", small)
 commands.choices["hooks"].add_argument("--task", required=True, help="id, or file.py:Class")
 add("soak", "millions of steps under hostile actions and states", small)
 commands.choices["soak"].add_argument("--frames", type=float, default=1e5 if DEVICE == "cpu" else 5e7)
+followers = [task for task in list_envs() if task.endswith("_velocity")]
 falls = commands.add_parser(
     "rollouts", help="episodes of random actions that no fall ends: what is lost, how fast it gets"
 )
-falls.add_argument("--tasks", nargs="+", choices=list_envs(), default=[t for t in list_envs() if "velocity" in t])
+falls.add_argument("--tasks", nargs="+", choices=list_envs(), default=followers)
 falls.add_argument("--worlds", type=int, default=small[0])
 falls.add_argument("--frames", type=float, default=1e7, help="steps of each task, over all worlds")
 falls.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 falls.add_argument("--out", type=Path, help="file for the results as JSON")
+walk = commands.add_parser("robots", help="robots that follow commands: training, mjlab's reward, falls in C MuJoCo")
+walk.add_argument("folder", type=Path, help="where each run's small files are; what is there is not done again")
+walk.add_argument("--tasks", nargs="+", choices=followers, default=followers)
+walk.add_argument("--seeds", type=int, nargs="+", default=[], help="default: none, verify what is there")
+walk.add_argument("--settings", nargs="+", default=[], metavar="NAME=VALUE", help="further ones of train")
+walk.add_argument("--episodes", type=int, default=256, help="in which a policy is verified")
+walk.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 for name, further, default in (("throughput", {}, list(CASES)), ("profile", LEARNING, ["env_step_and_maybe_reset"])):
     commands.choices[name].add_argument("--cases", nargs="+", choices=[*CASES, *VARIANTS, *further], default=default)
 commands.choices["peers"].add_argument("--path", type=Path, help="folder that the peers' packages were installed in")
@@ -135,6 +143,11 @@ elif args.command == "rollouts":
     from benchmarks.rollouts import COLUMNS, rollouts
 
     rows = rollouts(args.tasks, args.worlds, int(args.frames), args.device)
+elif args.command == "robots":
+    from benchmarks.robots import COLUMNS, robots
+
+    rows = robots(args.folder, args.tasks, args.seeds, args.device, args.settings, args.episodes)
+    args.out = args.folder / "results.json"
 elif args.command == "scaling":
     from benchmarks.scaling import COLUMNS, scaling
 

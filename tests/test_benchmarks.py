@@ -14,12 +14,13 @@ import pytest
 import torch
 from hook_tasks import FollowVelocity
 
-from benchmarks import cases, coverage, fidelity, plot, rollouts, scaling, soak, suite, timing
+from benchmarks import cases, coverage, fidelity, plot, robots, rollouts, scaling, soak, suite, timing
 from benchmarks.cases import until_interrupted
 from benchmarks.peers import mjlab_policy
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import save, show
 from benchmarks.throughput import phases
+from torchrl_loco.policy import ObservationNorm, Policy
 from torchrl_loco.registry import env_class
 from torchrl_loco.tasks.velocity import actuated
 from torchrl_loco.training.reppo import REPPO
@@ -267,3 +268,30 @@ def test_a_policy_of_mjlab_moves_the_same_joints_to_the_same_targets(tmp_path):
     np.savez(tmp_path / "go1.npz", facts=json.dumps(facts | {"base": "pelvis"}), **layers, **norm)
     with pytest.raises(ValueError, match="is of a robot on pelvis"):
         mjlab_policy.convert(tmp_path / "go1.npz")
+
+
+def test_a_robots_row_counts_from_its_first_iteration_to_mjlabs_reward(tmp_path):
+    network = torch.nn.Sequential(ObservationNorm(48), torch.nn.Linear(48, 12))
+    info = {"task": "go1_velocity", "algorithm": "ppo", "trained_on": "H100", "seed": 3, "num_envs": 10}
+    Policy(network, info).save(tmp_path / "policy.safetensors")
+    curve = [(30.0, 90.0, 0), (31.0, 20.0, 100), (32.0, 64.5, 200), (34.0, 99.0, 300)]  # the first is an estimate
+    metrics = [
+        dict(zip(robots.KEPT, (i, 240 * i, seconds, earned, 999.0, episodes), strict=True))
+        for i, (seconds, earned, episodes) in enumerate(curve, 1)
+    ]
+    robots.write_metrics(tmp_path, metrics)
+    row = robots.row(tmp_path)
+    assert (row["first iteration (s)"], row["to mjlab's (s)"], row["seconds"]) == (30.0, 2.0, 4.0)
+    assert (row["frames/s"], row["return"]) == (3 * 240 / 4.0, 99.0)
+    robots.write_metrics(tmp_path, metrics[:2])
+    assert robots.row(tmp_path)["to mjlab's (s)"] is None
+
+
+@pytest.mark.ci
+def test_robots_are_trained_and_verified_once(tmp_path, monkeypatch):
+    small = ["total_frames=1536", "num_envs=32", "num_steps=24", "minibatch_size=384", "eval_episodes=2"]
+    (row,) = robots.robots(tmp_path, ["go1_velocity"], [1], torch.device("cpu"), small, 2)
+    assert (row["task"], row["seed"], row["frames"], row["episodes"]) == ("go1_velocity", 1, 1536, 2)
+    assert not (tmp_path / "unfinished").exists()
+    monkeypatch.setattr(robots.subprocess, "run", None)  # nothing is left to do
+    assert robots.robots(tmp_path, ["go1_velocity"], [1], torch.device("cpu"), small, 2) == [row]

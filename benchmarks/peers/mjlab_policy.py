@@ -1,7 +1,7 @@
 """A policy of mjlab's as one of ours, from the file of :mod:`benchmarks.peers.mjlab_ppo`.
 
-    python -m benchmarks.peers.mjlab_policy go1.npz go1-mjlab.safetensors
-    torchrl-loco verify go1-mjlab.safetensors
+    python -m benchmarks.peers.mjlab_policy go1.npz FOLDER/mjlab-go1
+    torchrl-loco verify FOLDER/mjlab-go1/policy.safetensors
 
 mjlab measures velocities at the robot's IMU, and orders joints in its own way. Both are linear in our observation, so
 they go into the first layer, and the order and scale of its actions into the last; all else is the network that it
@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from benchmarks.robots import KEPT, write_metrics
 from torchrl_loco.policy import ObservationNorm, Policy
 from torchrl_loco.registry import env_class
 from torchrl_loco.sim import models
@@ -149,5 +150,18 @@ def _order(wanted: list[str], joints: list[str]) -> np.ndarray:
     return np.array([joints.index(name) for name in wanted])
 
 
+def metrics(path: Path) -> list[dict[str, float]]:
+    """Returns the curve of a file, as the metrics of a run; mjlab's means are over 100 episodes."""
+    file = np.load(path)
+    curve, frames = file["curve"], json.loads(str(file["facts"]))["frames"]
+    return [
+        dict(zip(KEPT, (i, frames * i / len(curve), *of_iteration, 100), strict=True))
+        for i, of_iteration in enumerate(curve.tolist(), 1)
+    ]
+
+
 if __name__ == "__main__":
-    convert(Path(sys.argv[1])).save(Path(sys.argv[2]))
+    source, folder = map(Path, sys.argv[1:])
+    folder.mkdir(parents=True)
+    write_metrics(folder, metrics(source))
+    convert(source).save(folder / "policy.safetensors")

@@ -168,7 +168,7 @@ def train(robot: str, seconds: float, out: Path, worlds: int, device: str) -> No
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("robot", choices=list(TASKS))
-    parser.add_argument("seconds", type=float, help="of training, kernels and worlds not counted")
+    parser.add_argument("seconds", type=float, help="of training; making the worlds does not count")
     parser.add_argument("out", type=Path, help="the file, .npz")
     parser.add_argument("--worlds", type=int, default=4096)
     parser.add_argument("--device", default="cuda:0")
