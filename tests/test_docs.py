@@ -3,6 +3,7 @@
 import contextlib
 import doctest
 import io
+import json
 import re
 import shutil
 import subprocess
@@ -13,7 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 from cases import BODIES, PROTOCOLS
-from generate import benchmarks, bodies, rewards
+from generate import benchmarks, bodies, rewards, robots
 from generate.tasks import RUNNERS
 from oracle import tolerance
 from sybil import Example, Sybil
@@ -21,6 +22,7 @@ from sybil.evaluators.python import PythonEvaluator
 from sybil.parsers.markdown import CodeBlockParser
 
 import torchrl_loco
+from benchmarks.robots import KEPT, write_metrics
 from torchrl_loco import registry
 from torchrl_loco.registry import env_class
 
@@ -176,6 +178,26 @@ def test_tables_are_those_of_the_results():
     assert "process (s, H200) | 18 |  |  | 228 |" in made["speed"]
     assert "| `env.step_and_maybe_reset` | 0.254 | 1.03 | 0.347 | 0.294 |  |" in made["steps"]
     assert "| walker, collected (million frames/s) |  | 34.9 | 82.4 | 99.3 |" in made["worlds"]
+
+
+def test_robots_have_the_mean_and_the_worst_of_their_seeds_beside_mjlab(tmp_path):
+    seeds = [
+        {"task": "go1_velocity", "algorithm": "ppo", "run": f"run{seed}", "frames/s": rate, "to mjlab's (s)": seconds}
+        | {"episodes": 256, "falls": falls, "error (m/s)": 0.1, "falls, training simulator": 1}
+        for seed, (rate, seconds, falls) in enumerate([(4.2e6, 8.0, 0), (4.0e6, 9.0, 3), (4.1e6, None, 0)])
+    ]
+    (tmp_path / "results.json").write_text(json.dumps({"rows": seeds}))
+    for seed in range(3):
+        (tmp_path / f"run{seed}").mkdir()
+        lines = ((1, 100, 30.0, -3.0, 1000, 0), (2, 200, 32.0, 5.0, 100, 10), (3, 300, 42.0, 70.0, 990, 50))
+        metrics = [dict(zip(KEPT, line, strict=True)) for line in lines]
+        write_metrics(tmp_path / f"run{seed}", metrics)
+    made = robots.tables(tmp_path)
+    assert "| Go1 | torchrl_loco, PPO | 3 |  | 4.1 (4) | 8.5 (9.0), 1 without |" in made["robots-training"]
+    assert "| Go1 | mjlab 1.6 | 1 |  | 0.107 | 151.0 |" in made["robots-training"]  # measured before
+    assert "| Go1 | torchrl_loco, PPO | 3 | 1.0 (3.0) | 0.100 |  | 1.0 |  |  |" in made["robots-verified"]
+    robots.draw(tmp_path / "curves.png", tmp_path)
+    assert (tmp_path / "curves.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("draw", [benchmarks.draw, benchmarks.draw_steps])

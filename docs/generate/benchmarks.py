@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.published import PUBLISHED, read
 from benchmarks.variation import plot_variation
-from generate import address, tasks
+from generate import address, robots, tasks
 from generate.markdown import table
 
 Row = dict[str, Any]
@@ -107,6 +107,7 @@ def tables() -> dict[str, str]:
         "speed": speed(),
         "speed-sources": sources([(TO_950, BRAX_TO_950, GO1, MJLAB)]),
         "variation": variation(),
+        **robots.tables(),
         "badges": address.badges(),
         "colab": address.colab(),
     }
@@ -299,7 +300,7 @@ def draw(picture: Path) -> None:
 PAGES = (
     ROOT / "README.md",
     ROOT / "notebooks" / "README.md",
-    *(ROOT / "docs" / name for name in ("benchmarks.md", "tasks/index.md", "guides/your-own-task.md")),
+    *(ROOT / "docs" / name for name in ("benchmarks.md", "robots.md", "tasks/index.md", "guides/your-own-task.md")),
 )
 
 if __name__ == "__main__":
@@ -307,4 +308,6 @@ if __name__ == "__main__":
         page.write_text(filled(page.read_text()))
     draw_steps(PICTURES / "steps.png")
     draw(PICTURES / "returns.png")
+    if (robots.RESULTS / "results.json").exists():
+        robots.draw(robots.CURVES)
     plot_variation(json.loads((RESULTS / VARIATION).read_text())["returns"], PICTURES / "variation.png")

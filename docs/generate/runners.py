@@ -1,42 +1,54 @@
-"""The moving picture of README and home page: ``make runners``. It is kept in the repository for GitHub and PyPI."""
+"""The moving pictures of README, home page and robots: ``make runners``. They are kept for GitHub and PyPI."""
 
-from collections.abc import Sequence
 from pathlib import Path
-
-import torch
+from typing import NamedTuple
 
 from generate.tasks import frames, joined, save_moving
 
-PICTURE = Path(__file__).parent.parent / "_static" / "runners.webp"
-SHOWN = (
+STATIC = Path(__file__).parent.parent / "_static"
+SECONDS = 6.0
+"""Time that passes in a picture."""
+ROBOTS = (
+    ("go1_velocity", "playground"),
+    ("g1_velocity", "playground"),
+    ("h1_velocity", "playground"),
+    ("go2_velocity", "playground"),
+)
+RUNNERS = (
     ("humanoid_run", "playground"),
     ("walker_run", "playground"),
     ("cheetah_run", "playground"),
     ("quadruped_run", "playground"),
-    ("hopper_hop", "playground"),
     ("humanoid_walk", "dm_control"),  # gets up first
 )
-"""Task and protocol of each cell, row by row. Any task that has a shipped policy can be added."""
-COLUMNS = 3
-WIDTH, HEIGHT, SECONDS = 272, 204, 6.0
-"""Size of a cell in pixels, and time that passes."""
 
 
-def draw(path: Path, shown: Sequence[tuple[str, str]] = SHOWN, seconds: float = SECONDS) -> None:
+class Grid(NamedTuple):
+    """A picture of cells: task and protocol of each, row by row, of which the last must be full; pixels of a cell."""
+
+    shown: tuple[tuple[str, str], ...]
+    columns: int
+    width: int
+    height: int
+
+
+PICTURES = {"runners.webp": Grid((*ROBOTS, *RUNNERS), 3, 272, 204), "robots.webp": Grid(ROBOTS, 2, 360, 270)}
+"""Any task that has a shipped policy can be added."""
+
+
+def draw(path: Path, grid: Grid, seconds: float = SECONDS) -> None:
     """Draws every cell's shipped policy from a reset on, all at the same time.
 
     Raises:
         ValueError: a task has no policy under its protocol.
     """
-    cells = [frames(task, WIDTH, HEIGHT, seconds, protocol) for task, protocol in shown]
-    save_moving(path, [_grid(moment) for moment in zip(*cells, strict=True)])
-
-
-def _grid(cells: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Returns cells in rows of ``COLUMNS``; the last row must be full."""
-    rows = [joined(cells[i : i + COLUMNS], dim=1, gap=4) for i in range(0, len(cells), COLUMNS)]
-    return joined(rows, dim=0, gap=4)
+    cells = [frames(task, grid.width, grid.height, seconds, protocol) for task, protocol in grid.shown]
+    moments = zip(*cells, strict=True)
+    starts = range(0, len(cells), grid.columns)
+    rows = ([joined(list(moment[i : i + grid.columns]), dim=1, gap=4) for i in starts] for moment in moments)
+    save_moving(path, [joined(row, dim=0, gap=4) for row in rows])
 
 
 if __name__ == "__main__":
-    draw(PICTURE)
+    for name, grid in PICTURES.items():
+        draw(STATIC / name, grid)

@@ -23,6 +23,8 @@ CLASSES = {env_class(name).body: env_class(name) for name in RUNNERS}
 
 WIDTH, HEIGHT, SECONDS = 440, 330, 4.0
 """Size of a task's moving picture in pixels, and time that passes."""
+COMMAND = (0.8, 0.0, 0.15)
+"""Velocity forward and to the left (m/s) and yaw rate (rad/s) of robots in moving pictures."""
 RATE, QUALITY = 20, 60
 """Frames a second of moving pictures, and their quality in percent."""
 
@@ -124,16 +126,22 @@ def frames(
 ) -> list[torch.Tensor]:
     """Returns what the shipped policy of a task does after a reset, ``RATE`` times a second.
 
-    Each frame is ``(height, width, 3)``, in [0, 255], and the mean of four pixels each, which smooths the edges.
+    Each frame is ``(height, width, 3)``, in [0, 255], and the mean of four pixels each, which smooths the edges. Robots
+    look to the right and follow ``COMMAND``.
 
     Raises:
         ValueError: the task has no policy under the protocol.
     """
-    policy = torchrl_loco.load_policy(name, device="cpu", protocol=protocol)
-    env = torchrl_loco.make(name, num_envs=1, device="cpu", seed=seed, protocol=protocol)
+    policy, commanded = torchrl_loco.load_policy(name, device="cpu", protocol=protocol), not is_runner(name)
+    env = torchrl_loco.make(name, num_envs=1, device="cpu", seed=seed, protocol=protocol, play=commanded)
     dt, repeat = env.config.ctrl_dt, policy.info.get("action_repeat", 1)
     wanted = [round(i / RATE / dt) for i in range(round(seconds * RATE))]
     td, found = env.reset(), []
+    if commanded:
+        env.set_command(COMMAND)
+        state = env.get_state()
+        state["qpos"][:, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+        td = env.reset(state, set_state=True)
     for step in range(wanted[-1] + 1):
         if step == wanted[len(found)]:
             pixels = env.render("side", 2 * width, 2 * height)[0].float()

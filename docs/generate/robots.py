@@ -1,0 +1,155 @@
+"""What docs/robots.md says of the robots in numbers and curves, from a folder of ``python -m benchmarks robots``."""
+
+import json
+import re
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from matplotlib.figure import Figure
+
+import torchrl_loco
+from benchmarks.robots import MJLAB, metrics_of
+from generate.markdown import table
+from torchrl_loco.policy import shipped_policies
+
+Row = dict[str, Any]
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "benchmarks" / "results" / "2026-11-25-h100-robots"
+BEFORE = ROOT / "benchmarks" / "results" / "2026-11-24-h100" / "mjlab.txt"
+"""mjlab's own training, where the folder has none."""
+CURVES = ROOT / "docs" / "_static" / "robots.png"
+MOVING = ROOT / "docs" / "_static" / "robots.webp"
+NAMES = {"go1_velocity": "Go1", "g1_velocity": "G1", "go2_velocity": "Go2", "h1_velocity": "H1"}
+
+
+class Column(NamedTuple):
+    """A column of a table: its label, the key of its figures, by what they are divided, how shown, and the worst."""
+
+    label: str
+    key: str
+    unit: float
+    shown: str
+    worst: Callable[[Iterable[float]], float]
+
+
+TRAINING = (
+    Column("worlds", "worlds", 1, ".0f", max),
+    Column("million frames/s", "frames/s", 1e6, ".3g", min),
+    Column("to mjlab's reward (s)", "to mjlab's (s)", 1, ".1f", max),
+    Column("training (s)", "seconds", 1, ".0f", max),
+    Column("return", "return", 1, ".1f", min),
+    Column("all, from the start of the process (s)", "wall", 1, ".0f", max),
+)
+VERIFIED = (
+    Column("falls", "falls", 1, ".1f", max),
+    Column("error (m/s)", "error (m/s)", 1, ".3f", max),
+    Column("error (rad/s)", "error (rad/s)", 1, ".3f", max),
+)
+THERE = tuple(column._replace(key=f"{column.key}, training simulator") for column in VERIFIED)
+
+
+def tables(folder: Path = RESULTS) -> dict[str, str]:
+    """Returns what the page takes from a folder, by the names that its comments give them."""
+    shown = "![A Go1, a G1, a Go2 and an H1 walk as they are told](_static/robots.webp)\n" if MOVING.exists() else ""
+    of_page = {"robots-moving": shown, "robots-shipped": shipped()}
+    if not (folder / "results.json").exists():
+        none = "There are no figures in this copy of the repository.\n"
+        return {**of_page, "robots-training": none, "robots-curves": "", "robots-verified": none}
+    found = json.loads((folder / "results.json").read_text())["rows"]
+    ours = by_trainer(found)
+    episodes = " or ".join(sorted({f"{row['episodes']}" for row in found if "episodes" in row}))
+    link = f"[{folder.name}/results.json](../benchmarks/results/{folder.name}/results.json)"
+    earlier = {key: rows for key, rows in before().items() if key not in ours}
+    source = (
+        f", mjlab's from [{BEFORE.parent.name}/{BEFORE.name}](../benchmarks/results/{BEFORE.parent.name}/{BEFORE.name})"
+    )
+    return {
+        **of_page,
+        "robots-training": _table({**ours, **earlier}, TRAINING) + f"\nFrom {link}{source if earlier else ''}.\n",
+        "robots-curves": "![Return against seconds of training, a line for each seed](_static/robots.png)\n",
+        "robots-verified": _table(ours, VERIFIED, THERE) + f"\n{episodes} episodes of each policy. From {link}.\n",
+    }
+
+
+def shipped() -> str:
+    """Returns which robots have a policy in the package, and what is known of each."""
+    lines = []
+    for task in [task for task in NAMES if task in shipped_policies("playground")]:
+        info = torchrl_loco.load_policy(task, "cpu").info
+        earned = f"return {info['mean']:.1f} ± {info['std']:.1f} in {info['episodes']} new episodes"
+        how = f"{info['frames'] / 1e6:.0f} million frames, {info['seconds']:.0f} s on one {info['trained_on']}"
+        lines.append(f"- `torchrl-loco play {task}`: {earned}, after {how}, seed {info['seed']}\n")
+    return (
+        f"Policies in the package, for `play`, `verify`, `export` and `load_policy`:\n\n{''.join(lines)}"
+        if lines
+        else ""
+    )
+
+
+def by_trainer(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Returns the rows of the seeds of each robot, by robot and by who trained it, in the order of the page."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for task in NAMES:
+        for row in rows:
+            if row["task"] == task:
+                trainer = "mjlab 1.6" if "mjlab" in row["algorithm"] else f"torchrl_loco, {row['algorithm'].upper()}"
+                groups.setdefault((task, trainer), []).append(row)
+    return {key: groups[key] for key in sorted(groups, key=lambda key: ([*NAMES].index(key[0]), "mjlab" in key[1]))}
+
+
+def before() -> dict[tuple[str, str], list[Row]]:
+    """Returns what was measured of mjlab's own training earlier: rates, and when it had its reward."""
+    rates = re.findall(r"^(\w+) .* ([\d,]+) frames per second", BEFORE.read_text(), re.MULTILINE)
+    rows = {name: {"frames/s": float(rate.replace(",", ""))} for name, rate in rates}
+    column, value = MJLAB["go1_velocity"]
+    if reached := re.search(rf"{value} after (\d+) s", BEFORE.read_text()):
+        rows["Go1"] |= {"to mjlab's (s)": float(reached[1]), column: value}
+    return {(task, "mjlab 1.6"): [rows[name]] for task, name in NAMES.items() if name in rows}
+
+
+def _table(groups: dict[tuple[str, str], list[Row]], columns: Sequence[Column], there: Sequence[Column] = ()) -> str:
+    """Returns a row for each robot and trainer: the mean over seeds, and the worst of them."""
+    rows = []
+    for (task, trainer), seeds in sorted(groups.items(), key=lambda item: [*NAMES].index(item[0][0])):
+        figures = [_figure(seeds, column) for column in (*columns, *there)]
+        rows.append((NAMES[task], trainer, len(seeds), *figures))
+    labels = [column.label for column in columns] + [f"{column.label}, training simulator" for column in there]
+    return table(("robot", "trained by", "seeds", *labels), rows)
+
+
+def _figure(seeds: Sequence[Row], column: Column) -> str:
+    """Returns the mean of a figure and the worst of several; what some seeds lack is said."""
+    values = [row[column.key] / column.unit for row in seeds if row.get(column.key) is not None]
+    if not values:
+        return ""
+    mean = f"{statistics.mean(values):{column.shown}}"
+    worst = f" ({column.worst(values):{column.shown}})" if len({*values}) > 1 else ""
+    return f"{mean}{worst}{f', {len(seeds) - len(values)} without' if len(values) < len(seeds) else ''}"
+
+
+def draw(picture: Path, folder: Path = RESULTS) -> None:
+    """Draws the return of each seed against seconds of training, a panel for each robot."""
+    groups = by_trainer(json.loads((folder / "results.json").read_text())["rows"])
+    tasks = list(dict.fromkeys(task for task, _ in groups))
+    figure = Figure(figsize=(9, 3.2 * -(-len(tasks) // 2)), layout="constrained")
+    panels = figure.subplots(-(-len(tasks) // 2), 2, squeeze=False).flat
+    for task, axes in zip(tasks, panels, strict=False):
+        for (name, trainer), seeds in groups.items():
+            for seed, row in enumerate(seeds if name == task else ()):
+                lines = [line for line in metrics_of(folder / row["run"])[1:] if line["episodes"] > 0]
+                points = [(line["seconds"], line["return"]) for line in lines]
+                color = "#9aa7ad" if "mjlab" in trainer else "#f5a623"
+                axes.plot(*zip(*points, strict=True), color=color, linewidth=1, label=None if seed else trainer)
+        column, value = MJLAB.get(task, ("", 0.0))
+        if column == "return":
+            axes.axhline(value, color="black", linestyle=":", linewidth=1, label=f"mjlab after 151 s: {value}")
+        axes.set(title=NAMES[task], xscale="log", xlim=(1, None))
+        axes.grid(alpha=0.3)
+        axes.legend(loc="lower right", fontsize="small")
+    for axes in panels:  # what is left
+        axes.remove()
+    figure.supxlabel("seconds of training")
+    figure.supylabel("return of 1000 steps")
+    figure.savefig(picture, dpi=110)
