@@ -5,10 +5,11 @@ BIN := $(VENV)/bin
 TASK ?= walker_stand
 ARGS ?=
 PYTEST_ARGS ?= --numprocesses auto --dist loadfile
+PICTURES ?=
 NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
 PYTEST := $(BIN)/python -m pytest $(PYTEST_ARGS)
 
-.PHONY: help train test test-fast test-all tests tests-ci lint format docs runners tables notebooks report dist clean
+.PHONY: help train test test-fast test-all tests tests-ci lint format docs runners viewer tables notebooks report dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*##/\t/' | expand -t 12
@@ -48,8 +49,11 @@ dist: $(VENV)/installed  ## wheel and sdist, checked and tried out, into dist/
 docs: $(VENV)/installed  ## the site, into docs/_build/html; warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
 
-runners: $(VENV)/installed  ## draw the moving picture of the README anew, with the shipped policies
-	PYTHONPATH=docs $(BIN)/python -m generate.runners
+runners: $(VENV)/installed  ## draw the moving pictures anew, with the shipped policies; PICTURES=robots.webp for some
+	PYTHONPATH=docs $(BIN)/python -m generate.runners $(PICTURES)
+
+viewer: $(VENV)/installed  ## draw the moving picture of the viewer anew, in Chromium
+	PYTHONPATH=docs $(BIN)/python -m generate.viewer go1_velocity
 
 tables: $(VENV)/installed  ## write tables and pictures of README and docs from benchmarks/results
 	PYTHONPATH=docs $(BIN)/python -m generate.benchmarks

@@ -138,12 +138,12 @@ def row(run: Path) -> Row:
     if (run / "about.json").exists():
         found["wall"] = json.loads((run / "about.json").read_text())["wall"]
     if (run / "verify.json").exists():
-        figures = json.loads((run / "verify.json").read_text())
-        for where, table in figures["outcomes"].items():
-            all_of_them, label = table["all"], "" if where == "C MuJoCo" else f", {where}"
-            found |= {f"{key}{label}": all_of_them[key] for key in ("falls", "episodes")}
-            for key, unit in (("linear_error", "m/s"), ("angular_error", "rad/s")):
-                found[f"error ({unit}){label}"] = all_of_them[key]
+        outcomes = json.loads((run / "verify.json").read_text())["outcomes"]
+        for simulator, where in (("C MuJoCo", ""), ("training simulator", ", training simulator")):
+            for episodes, which in (("all", ""), ("delay 0", ", on time")):
+                figures = outcomes.get(simulator, {}).get(episodes, {})
+                names = {"linear_error": "error (m/s)", "angular_error": "error (rad/s)"}
+                found |= {f"{names.get(key, key)}{which}{where}": value for key, value in figures.items()}
     return found
 
 

@@ -32,6 +32,7 @@ nitpick_ignore = [("py:class", "torchrl_loco.sim.graph.ScratchPool")]  # interna
 # Notebooks are shown as they are: the tests run them.
 nb_execution_mode = "off"
 myst_enable_extensions = ["dollarmath"]
+myst_fence_as_directive = ["math"]  # as GitHub shows them
 myst_heading_anchors = 3
 
 # The sections of an environment's docstring, as they are written in torchrl_loco/tasks.

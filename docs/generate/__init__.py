@@ -1,11 +1,9 @@
-"""What the site takes from the package instead of repeating it."""
+"""What the site and its pages take from the package instead of repeating it."""
 
 import shutil
 from pathlib import Path
 
-from generate import benchmarks, bodies, fields, rewards, tasks
 from generate.markdown import write
-from torchrl_loco.policy import shipped_policies
 
 DOCS = Path(__file__).parent.parent
 OUT = DOCS / "generated"
@@ -14,20 +12,7 @@ NOTEBOOKS = DOCS.parent / "notebooks"
 
 def everything() -> None:
     """Writes all that pages include to docs/generated, and leaves alone what has not changed."""
-    fragments = OUT / "fragments"
-    for name in tasks.RUNNERS:  # not for the plug-ins that happen to be installed
-        write(fragments / f"{name}_properties.md", tasks.properties(name, benchmarks.training(name)))
-        write(fragments / f"{name}_reward.md", rewards.formula(name))
-        write(fragments / f"{name}_policy.md", tasks.shipped_policy(name))
-    for name in shipped_policies("playground"):
-        tasks.picture(name, OUT / "pictures" / f"{name}.webp")
-    for body in tasks.CLASSES:
-        write(fragments / f"{body}_observation.md", bodies.observation_table(body))
-        write(fragments / f"{body}_action.md", bodies.action_table(body))
-        write(fragments / f"{body}_protocols.md", tasks.protocols(body))
-    write(fragments / "velocity_weights.md", tasks.velocity_weights())
-    write(fragments / "fields.md", fields.fields())
-    write(fragments / "notebooks.md", notebooks(NOTEBOOKS, OUT / "notebooks"))
+    write(OUT / "fragments" / "notebooks.md", notebooks(NOTEBOOKS, OUT / "notebooks"))
 
 
 def notebooks(source: Path, target: Path) -> str:

@@ -1,8 +1,9 @@
-"""The tables and pictures of README, docs/benchmarks.md and guides that show results, from benchmarks/results.
+"""The tables and pictures of README and docs: results, from benchmarks/results, and what the package says of its tasks.
 
 ``make tables`` writes them into the pages, between two comments each, because GitHub shows the pages as they are.
 """
 
+import functools
 import json
 import re
 import statistics
@@ -14,7 +15,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.published import PUBLISHED, read
 from benchmarks.variation import plot_variation
-from generate import address, robots, tasks
+from generate import address, bodies, fields, rewards, robots, tasks
 from generate.markdown import table
 
 Row = dict[str, Any]
@@ -97,6 +98,7 @@ RUNS = {
 TASKS = [task for task, protocol in RUNS if protocol == "playground"]
 
 
+@functools.cache
 def tables() -> dict[str, str]:
     """Returns the tables as Markdown, by the names that the comments in the pages give them."""
     return {
@@ -107,10 +109,27 @@ def tables() -> dict[str, str]:
         "speed": speed(),
         "speed-sources": sources([(TO_950, BRAX_TO_950, GO1, MJLAB)]),
         "variation": variation(),
+        "fields": fields.fields(),
         **robots.tables(),
+        **of_tasks(),
         "badges": address.badges(),
         "colab": address.colab(),
     }
+
+
+def of_tasks() -> dict[str, str]:
+    """Returns what the pages of tasks and bodies take from the package; not of plug-ins that happen to be installed."""
+    made = {"velocity-weights": tasks.velocity_weights()}
+    for name in tasks.RUNNERS:
+        label = name.replace("_", "-")
+        made[f"{label}-properties"] = tasks.properties(name, training(name))
+        made[f"{label}-reward"] = rewards.formula(name)
+        made[f"{label}-policy"] = tasks.shipped_policy(name)
+    for body in tasks.CLASSES:
+        made[f"{body}-observation"] = bodies.observation_table(body)
+        made[f"{body}-action"] = bodies.action_table(body)
+        made[f"{body}-protocols"] = tasks.protocols(body)
+    return made
 
 
 def filled(text: str) -> str:
@@ -300,7 +319,11 @@ def draw(picture: Path) -> None:
 PAGES = (
     ROOT / "README.md",
     ROOT / "notebooks" / "README.md",
-    *(ROOT / "docs" / name for name in ("benchmarks.md", "robots.md", "tasks/index.md", "guides/your-own-task.md")),
+    *(
+        ROOT / "docs" / name
+        for name in ("benchmarks.md", "robots.md", "api/model-numbers.md", "guides/your-own-task.md")
+    ),
+    *sorted((ROOT / "docs" / "tasks").glob("*.md")),
 )
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ class Tolerance:
         """Returns the call as LaTeX: bounds, margin, and the sigmoid if it is not the Gaussian."""
         bounds = rf"[{self.lower:g}, \infty)" if math.isinf(self.upper) else f"[{self.lower:g}, {self.upper:g}]"
         kind = "" if self.sigmoid == "gaussian" else rf",\ \text{{{self.sigmoid}}},\ {self.value:g}"
-        return rf"\operatorname{{tol}}\left({self.of};\ {bounds},\ {self.margin:g}{kind}\right)"
+        return rf"\mathrm{{tol}}\left({self.of};\ {bounds},\ {self.margin:g}{kind}\right)"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,8 +135,8 @@ def formula(task: str) -> str:
     terms = ", ".join(f"`{term}`" for term in names)
     listed = f"Terms under `reward_terms=True`, which multiply to the reward: {terms}."
     return (
-        f"$$\n\\begin{{aligned}}\n{aligned}\n\\end{{aligned}}\n$$\n\n"
-        f"with {made.symbols}. $\\operatorname{{tol}}$ is dm_control's "
+        f"```math\n\\begin{{aligned}}\n{aligned}\n\\end{{aligned}}\n```\n\n"
+        f"with {made.symbols}. $\\mathrm{{tol}}$ is dm_control's "
         "[tolerance](../api/rewards.md): 1 within the bounds; outside it decreases to 0.1 at the margin, as a Gaussian "
         "unless another sigmoid and value are given, and is 0 without a margin.\n\n"
         f"{listed if len(names) > 1 else f'The only term under `reward_terms=True` is {terms}.'}\n"

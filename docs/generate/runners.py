@@ -1,13 +1,13 @@
-"""The moving pictures of README, home page and robots: ``make runners``. They are kept for GitHub and PyPI."""
+"""The moving pictures of README, home page, robots and tasks: ``make runners``. They are kept for GitHub and PyPI."""
 
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
+from generate import tasks
 from generate.tasks import frames, joined, save_moving
 
 STATIC = Path(__file__).parent.parent / "_static"
-SECONDS = 6.0
-"""Time that passes in a picture."""
 ROBOTS = (
     ("go1_velocity", "playground"),
     ("g1_velocity", "playground"),
@@ -24,31 +24,47 @@ RUNNERS = (
 
 
 class Grid(NamedTuple):
-    """A picture of cells: task and protocol of each, row by row, of which the last must be full; pixels of a cell."""
+    """A picture of cells.
+
+    Attributes:
+        shown: task and protocol of each, row by row; the last row must be full.
+        columns: how many are side by side.
+        width: of a cell, in pixels.
+        height: of a cell, in pixels.
+        seconds: time that passes.
+    """
 
     shown: tuple[tuple[str, str], ...]
     columns: int
     width: int
     height: int
+    seconds: float = 6.0
 
 
-PICTURES = {"runners.webp": Grid((*ROBOTS, *RUNNERS), 3, 272, 204), "robots.webp": Grid(ROBOTS, 2, 360, 270)}
-"""Any task that has a shipped policy can be added."""
+SHOWN = {
+    "runners.webp": Grid((*ROBOTS, *RUNNERS), 3, 272, 204),
+    "robots.webp": Grid(ROBOTS, 2, 360, 270),
+    **{f"tasks/{name}.webp": Grid(((name, "playground"),), 1, 340, 255, 4.0) for name in tasks.RUNNERS},
+}
+"""What each file shows. Any task that has a shipped policy can be added."""
 
 
-def draw(path: Path, grid: Grid, seconds: float = SECONDS) -> None:
+def draw(path: Path, grid: Grid) -> None:
     """Draws every cell's shipped policy from a reset on, all at the same time.
 
     Raises:
         ValueError: a task has no policy under its protocol.
     """
-    cells = [frames(task, grid.width, grid.height, seconds, protocol) for task, protocol in grid.shown]
-    moments = zip(*cells, strict=True)
+    cells = [frames(task, grid.width, grid.height, grid.seconds, protocol) for task, protocol in grid.shown]
     starts = range(0, len(cells), grid.columns)
-    rows = ([joined(list(moment[i : i + grid.columns]), dim=1, gap=4) for i in starts] for moment in moments)
-    save_moving(path, [joined(row, dim=0, gap=4) for row in rows])
+    moments = [
+        [joined(list(moment[i : i + grid.columns]), dim=1, gap=4) for i in starts]
+        for moment in zip(*cells, strict=True)
+    ]
+    path.parent.mkdir(exist_ok=True)
+    save_moving(path, [joined(rows, dim=0, gap=4) for rows in moments])
 
 
 if __name__ == "__main__":
-    for name, grid in PICTURES.items():
-        draw(STATIC / name, grid)
+    for name in sys.argv[1:] or SHOWN:
+        draw(STATIC / name, SHOWN[name])

@@ -21,8 +21,6 @@ RUNNERS = [name for name in OURS if is_runner(name)]  # the others have pages of
 CLASSES = {env_class(name).body: env_class(name) for name in RUNNERS}
 """A class of each body."""
 
-WIDTH, HEIGHT, SECONDS = 440, 330, 4.0
-"""Size of a task's moving picture in pixels, and time that passes."""
 COMMAND = (0.8, 0.0, 0.15)
 """Velocity forward and to the left (m/s) and yaw rate (rad/s) of robots in moving pictures."""
 RATE, QUALITY = 20, 60
@@ -42,7 +40,7 @@ def properties(name: str, more: Sequence[tuple[str, str]]) -> str:
     rows = [
         ("id", f"`{name}`"),
         ("alias", _aliases(name)),
-        ("class", f"{{py:class}}`torchrl_loco.{cls.__name__}`"),
+        ("class", f"[`torchrl_loco.{cls.__name__}`](../api/environments.md)"),
         ("action", f"`(num_envs, {nu})`, float32, in [-1, 1]"),
         ("observation", f"`(num_envs, {cls.observation_size})`, float32"),
         ("reward", "`(num_envs, 1)`, float32, in [0, 1]"),
@@ -53,7 +51,7 @@ def properties(name: str, more: Sequence[tuple[str, str]]) -> str:
         ("protocols", ", ".join(f"`{protocol}`" for protocol in PROTOCOLS)),
         *more,
     ]
-    shown = f"![{name}: the shipped policy after a reset](../generated/pictures/{name}.webp)"
+    shown = f"![{name}: the shipped policy after a reset](../_static/tasks/{name}.webp)"
     return f"{shown}\n\n{table(('property', 'value'), rows)}"
 
 
@@ -76,7 +74,7 @@ def protocols(body: str) -> str:
     rows = [(f"`{field}`", *(f"`{settings[p][field]}`" for p in PROTOCOLS)) for field in settings[PROTOCOLS[0]]]
     note = (
         f"\n`naconmax` is for {NACONMAX_WORLDS} worlds and is scaled with `num_envs`, with a minimum of "
-        f"{NACONMAX_FLOOR}. {{py:class}}`~torchrl_loco.SimConfig` says what each setting is.\n"
+        f"{NACONMAX_FLOOR}. [`SimConfig`](../api/simulation.md) says what each setting is.\n"
     )
     return table(("setting", *(f"`{protocol}`" for protocol in PROTOCOLS)), rows) + note
 
@@ -92,7 +90,7 @@ def shipped_policy(name: str) -> str:
     """Returns how well the shipped policies of a task do, if there are any."""
     found = {protocol: info for protocol in PROTOCOLS if (info := _info(name, protocol))}
     if not found:
-        return "No policy is shipped for this task. The [benchmarks](/benchmarks.md) list its training runs.\n"
+        return "No policy is shipped for this task. The [benchmarks](../benchmarks.md) list its training runs.\n"
     return "\n".join(_about_policy(name, protocol, info) for protocol, info in found.items())
 
 
@@ -111,13 +109,6 @@ def _about_policy(name: str, protocol: str, info: dict[str, Any]) -> str:
         f"{info['algorithm'].upper()} for {info['frames'] / 1e6:.0f} million frames on one {info['trained_on']}, with "
         f"{info['num_envs']} worlds and seed {info['seed']}.\n"
     )
-
-
-def picture(name: str, path: Path) -> None:
-    """Draws the first seconds of an episode under the task's policy, unless the file is there and newer than that."""
-    if not path.is_file() or path.stat().st_mtime < shipped_policies("playground")[name].stat().st_mtime:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_moving(path, frames(name, WIDTH, HEIGHT, SECONDS))
 
 
 @torch.no_grad()
@@ -152,10 +143,10 @@ def frames(
     return found
 
 
-def save_moving(path: Path, pictures: Sequence[torch.Tensor]) -> None:
-    """Writes pictures of shape ``(height, width, 3)`` as a WebP file that repeats without end."""
+def save_moving(path: Path, pictures: Sequence[torch.Tensor], rate: int = RATE) -> None:
+    """Writes pictures of shape ``(height, width, 3)``, so many a second, as a WebP file that repeats without end."""
     first, *others = (Image.fromarray(picture.round().to(torch.uint8).numpy()) for picture in pictures)
-    options = {"quality": QUALITY, "method": 5, "duration": round(1000 / RATE), "loop": 0}
+    options = {"quality": QUALITY, "method": 5, "duration": round(1000 / rate), "loop": 0}
     first.save(path, save_all=True, append_images=others, **options)
 
 

@@ -1,4 +1,4 @@
-"""The tasks: a folder for each body, with its model, its tasks and their settings, and its page of the documentation.
+"""The tasks: a folder for each body, with its model, its tasks and their settings.
 
 A task is a class whose name begins or ends with that of its folder: ``WalkerWalk`` in ``walker`` has the id
 ``walker_walk``, ``Go1Velocity`` in ``velocity`` the id ``go1_velocity``.
