@@ -13,7 +13,7 @@ from variation import all_varied
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.compiled import collision, lanes, step, unsupported
-from torchrl_loco.sim.compiled.constraints import Softness
+from torchrl_loco.sim.compiled.constraints import MANY_ITERATIONS, Softness
 from torchrl_loco.sim.compiled.engine import Chain, _kernel
 from torchrl_loco.sim.compiled.parameters import VariedModel
 from torchrl_loco.sim.compiled.symbols import array, names, scalar
@@ -343,7 +343,7 @@ def test_the_limit_of_iterations_is_flagged_where_it_is_reached(form):
     """One iteration fewer than a world needs is flagged; as many are not, and give what more of them give."""
     model, reached, flags = limbs(), [], []
     states = falling(model, count=40)
-    for iterations in [*range(1, 9), 100]:
+    for iterations in range(1, MANY_ITERATIONS):  # with more, searches end earlier
         model.opt.iterations = iterations
         sim = compiled_step(model, states)
         reached.append(sim.qacc_warmstart.numpy().copy())

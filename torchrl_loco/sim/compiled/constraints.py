@@ -45,6 +45,10 @@ DEFAULT_SOLREF = 0.02, 1.0
 MIN_TOLERANCE = 1e-6
 """Tolerance below which a solver in single precision would only see rounding; mujoco_warp has the same bound."""
 
+NEAR, MANY_ITERATIONS = 0.1, 10
+"""Share of its first slope at which a line search may end, and iterations that nearly always converge: with fewer, what
+is left depends on where the searches end, which is then where those of MuJoCo-Warp do."""
+
 Variables = tuple[list[Scalar], list[Scalar], list[Scalar]]
 """Symbols of qpos, qvel and qacc."""
 
@@ -52,6 +56,11 @@ Variables = tuple[list[Scalar], list[Scalar], list[Scalar]]
 def tolerance(m: mujoco.MjModel) -> float:
     """Returns the tolerance of the solver, relative to the inertia of the model."""
     return max(m.opt.tolerance, MIN_TOLERANCE)
+
+
+def near(m: mujoco.MjModel) -> float:
+    """Returns the share of its first slope at which a line search may end, besides where the slope vanishes."""
+    return NEAR if m.opt.iterations >= MANY_ITERATIONS else 0.0
 
 
 @dataclasses.dataclass(frozen=True)

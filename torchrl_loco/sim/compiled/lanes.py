@@ -33,7 +33,7 @@ from torchrl_loco.sim.compiled.collision import (
     least_regularisation,
     pairs,
 )
-from torchrl_loco.sim.compiled.constraints import Softness, both_sides, tolerance
+from torchrl_loco.sim.compiled.constraints import Softness, both_sides, near, tolerance
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, MINVAL, SLIDE, acting
 from torchrl_loco.sim.compiled.links import Mass, matrix, moving_bodies, places
 from torchrl_loco.sim.compiled.parameters import Number, VariedModel, nominal, present, varies
@@ -42,7 +42,7 @@ from torchrl_loco.sim.models import NEVER, home_pose
 from torchrl_loco.sim.overflow import Overflow
 
 TEMPLATE = pathlib.Path(__file__).with_name("lanes.h")
-LINE_SEARCH = shared.line_search("Model::scale()", "Model::ls_tolerance()", "Model::LS_ITERATIONS")
+LINE_SEARCH = shared.line_search("Model::scale()", "Model::ls_tolerance()", "Model::ls_near()", "Model::LS_ITERATIONS")
 TRANSLATION, ROTATION = 0, 1
 """Kinds of a degree of freedom in ``lanes.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
 UNLIMITED = 1e30
@@ -324,6 +324,7 @@ class Description:
             scale=1 / (m.stat.meaninertia * m.nv),
             tolerance=tolerance(m),
             ls_tolerance=tolerance(m) * m.opt.ls_tolerance,
+            ls_near=near(m),
             least_aligned=collision.UPRIGHT,
         )
         tables.vector("gravity", m.opt.gravity)

@@ -139,8 +139,8 @@ struct DryFriction {  // costs D x^2 / 2 while |x| is below a bound, and grows l
   }
 };
 
-// ---- Newton's method. Bracketing, tolerances and stopping tests are those of mujoco_warp, so that both engines stop at
-// the same iteration.
+// ---- Newton's method. Brackets, tolerances and stopping tests are those of mujoco_warp, but for two that save up to
+// half of the brackets: the first tries the secant, and a search may end near its minimum.
 
 struct Point {  // on the search direction: the cost relative to alpha = 0
   float alpha, cost, slope, curvature;
@@ -150,8 +150,18 @@ struct Point {  // on the search direction: the cost relative to alpha = 0
     return {alpha, cost, slope + alpha * curvature + sums[1], curvature + sums[2]};
   }
   INLINE float newton() const { return curvature == 0.0f ? alpha : alpha - Math::divide(slope, curvature); }
+  // Where the line through two slopes is zero.
+  INLINE float secant(const Point& p) const {
+    return slope == p.slope ? alpha : alpha - Math::divide(slope * (p.alpha - alpha), p.slope - slope);
+  }
   // Whether this improves on alpha = 0 and is nearly a minimum.
   INLINE bool flat(float tolerance) const { return fabsf(slope) < tolerance && cost < 0.0f; }
+  // Whether a search may end here. Near the minimum is enough, if most is gained: the next direction gains the rest, and
+  // close to the solution the first point is a Newton step of the whole.
+  INLINE bool ends(const Point& start, float tolerance, float near) const {
+    const float whole = fabsf(start.slope);  // twice what a parabola gains
+    return flat(tolerance) || (fabsf(slope) < near * whole && cost < -0.05f * whole);
+  }
   // Whether p lies between this and the minimum: its slope has the same sign, and is smaller.
   INLINE bool outside(const Point& p) const {
     return (slope < p.slope && p.slope < 0.0f) || (slope > p.slope && p.slope > 0.0f);

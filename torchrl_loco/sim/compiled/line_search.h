@@ -17,24 +17,27 @@ float sums[9] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
 const float whole[1] = {start.newton()};
 add_rows(whole, 1, sums);
 const Point first = Point::at(whole[0], slope, curvature, sums);
-result.take(first, first.flat(accept));
+result.take(first, first.ends(start, accept, LS_NEAR));
 const bool less = first.slope < start.slope;
 Point low = less ? first : start, high = less ? start : first;
 bool found = result.improvement > 0.0f;
 ROLLED for (int i = 0; i < LS_ITERATIONS && !found; ++i) {
-  const float alphas[3] = {low.newton(), high.newton(), 0.5f * (low.alpha + high.alpha)};
+  // Newton's step from the start led here.
+  const float from_low = i > 0 ? low.newton() : low.secant(high);
+  const float alphas[3] = {from_low, high.newton(), 0.5f * (low.alpha + high.alpha)};
   UNROLLED for (int k = 0; k < 9; ++k) sums[k] = 0.0f;
   add_rows(alphas, 3, sums);
   const Point next_low = Point::at(alphas[0], slope, curvature, sums);
   const Point next_high = Point::at(alphas[1], slope, curvature, sums + 3);
   const Point middle = Point::at(alphas[2], slope, curvature, sums + 6);
-  const bool flat_low = next_low.flat(accept), flat_high = next_high.flat(accept), flat_middle = middle.flat(accept);
-  found = flat_low || flat_high || flat_middle;
+  const bool low_ends = next_low.ends(start, accept, LS_NEAR), high_ends = next_high.ends(start, accept, LS_NEAR);
+  const bool middle_ends = middle.ends(start, accept, LS_NEAR);
+  found = low_ends || high_ends || middle_ends;
   if (found) {
     result = {0.0f, 0.0f};
-    result.take(next_low, flat_low);
-    result.take(next_high, flat_high);
-    result.take(middle, flat_middle);
+    result.take(next_low, low_ends);
+    result.take(next_high, high_ends);
+    result.take(middle, middle_ends);
   } else {
     bool moved = low.move(next_low, low.outside(next_low));
     moved |= low.move(middle, low.outside(middle));

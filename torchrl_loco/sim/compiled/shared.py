@@ -8,15 +8,16 @@ LAWS = "".join((FOLDER / f"{name}.h").read_text() + "\n" for name in ("arithmeti
 _LINE_SEARCH = (FOLDER / "line_search.h").read_text()
 
 
-def line_search(scale: str, tolerance: str, iterations: str) -> str:
+def line_search(scale: str, tolerance: str, near: str, iterations: str) -> str:
     """Returns the body of the function of the line search.
 
     Args:
         scale: C++ expression of one over the inertia of the model.
         tolerance: of the slope, relative to it.
+        near: the share of its first slope at which it may end.
         iterations: how many brackets are tried.
     """
-    values = {"LS_TOLERANCE": tolerance, "LS_ITERATIONS": iterations, "SCALE": scale}
+    values = {"LS_TOLERANCE": tolerance, "LS_NEAR": near, "LS_ITERATIONS": iterations, "SCALE": scale}
     text = _LINE_SEARCH
     for word, value in values.items():
         text = text.replace(word, value)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from torchrl_loco.sim.compiled import shared
 from torchrl_loco.sim.compiled.collision import Pair
-from torchrl_loco.sim.compiled.constraints import DryFriction, JointLimits, Variables, tolerance
+from torchrl_loco.sim.compiled.constraints import DryFriction, JointLimits, Variables, near, tolerance
 from torchrl_loco.sim.compiled.dense_contacts import DenseContacts
 from torchrl_loco.sim.compiled.dynamics import Dynamics
 from torchrl_loco.sim.compiled.ground_contacts import GroundContacts
@@ -155,8 +155,8 @@ class NewtonSolver:
         block(self._each_row(STEPS, STEPS_FRICTION))
         block("};")
         block("const auto line_search = [&]() {")
-        tolerances = literal(scale), literal(tolerance(m) * option.ls_tolerance), str(option.ls_iterations)
-        block(shared.line_search(*tolerances))
+        tolerances = literal(scale), literal(tolerance(m) * option.ls_tolerance), literal(near(m))
+        block(shared.line_search(*tolerances, str(option.ls_iterations)))
         block("};")
         block("taken = line_search();")
 
