@@ -14,6 +14,7 @@ from torchrl_loco import cli
 pytest.importorskip("mjviser", reason="the extra viewer is not installed")
 
 from browser_client import open_page
+from generate.viewer import chrome
 
 from torchrl_loco.viewer.player import Player
 from torchrl_loco.viewer.viewer import Viewer, cores
@@ -235,22 +236,11 @@ def test_errors(led, tmp_path, capsys):
 
 @pytest.fixture
 def browser(tmp_path):
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    binary, driver = (shutil.which(name) for name in ("chromium", "chromedriver"))
-    if binary is None or driver is None:
+    pytest.importorskip("selenium", reason="selenium is not installed")
+    if not all(map(shutil.which, ("chromium", "chromedriver"))):
         pytest.skip("there is no chromium with its chromedriver here")
-    options = webdriver.ChromeOptions()
-    options.binary_location = binary
-    for argument in (
-        *("headless", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-background-networking"),
-        *("disable-component-update", "disable-sync", f"user-data-dir={tmp_path / 'profile'}", "window-size=1000,700"),
-        *("use-gl=angle", "use-angle=swiftshader", "enable-unsafe-swiftshader"),  # WebGL without a GPU
-    ):
-        options.add_argument(f"--{argument}")
-    browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
-    browser.set_page_load_timeout(60)
-    yield browser
-    browser.quit()
+    with chrome(tmp_path / "profile", 1000, 700) as browser:
+        yield browser
 
 
 def picture(browser):
