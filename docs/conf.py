@@ -42,7 +42,9 @@ autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 
 html_theme = "pydata_sphinx_theme"
-html_sidebars = {page: [] for page in ("benchmarks", "changelog", "comparison", "fidelity")}  # without subpages
+html_sidebars = {
+    page: [] for page in ("benchmarks", "changelog", "comparison", "fidelity", "robots")
+}  # without subpages
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_title = f"torchrl_loco {release}"
