@@ -112,7 +112,8 @@ def before() -> dict[tuple[str, str], list[Row]]:
 
 def _table(groups: dict[tuple[str, str], list[Row]], columns: Sequence[Column]) -> str:
     """Returns a row for each robot and trainer: the mean over seeds, and the worst; empty columns are left out."""
-    columns = [column for column in columns if any(column.key in row for seeds in groups.values() for row in seeds)]
+    every = [row for seeds in groups.values() for row in seeds]
+    columns = [column for column in columns if any(row.get(column.key) is not None for row in every)]
     rows = []
     for (task, trainer), seeds in sorted(groups.items(), key=lambda item: [*NAMES].index(item[0][0])):
         rows.append((NAMES[task], trainer, len(seeds), *(_figure(seeds, column) for column in columns)))
