@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import functools
 import os
 import threading
 import zlib
@@ -33,13 +34,21 @@ def compile_kernels(launches: Iterable[Callable[[], None]], device: wp.Device) -
     with wp.ScopedDevice(device), _collecting() as variants:
         for launch in launches:
             launch()
-    with (
-        ThreadPoolExecutor(max_workers=os.cpu_count()) as pool,
-        tqdm(total=len(variants), desc=f"compiling for {device}", unit="module", delay=SHOW_AFTER, leave=False) as bar,
-    ):
+    pool = _threads(os.getpid())
+    with tqdm(total=len(variants), desc=f"compiling for {device}", unit="module", delay=SHOW_AFTER, leave=False) as bar:
         for loaded in as_completed([pool.submit(_load, module, device, block_dim) for module, block_dim in variants]):
             loaded.result()
             bar.update()
+
+
+@functools.cache
+def _threads(process: int) -> ThreadPoolExecutor:
+    """Returns the threads that compile in a process; a child that was forked has none of its parent's.
+
+    They are kept, because Warp parses its own header anew in each thread: on a CPU that takes as long as compiling a
+    small kernel ten times.
+    """
+    return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="compile")
 
 
 def _load(module: wp.Module, device: wp.Device, block_dim: int) -> None:
