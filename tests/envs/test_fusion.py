@@ -14,11 +14,6 @@ CPU = torch.device("cpu")
 PARTS = ("control", "judge", "observe", "begin", "observe_begun")
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    monkeypatch.setattr(wp.config, "optimization_level", 0)
-
-
 def copies(arrays):
     return {name: values.clone() for name, values in arrays.items()}
 

@@ -1,5 +1,4 @@
 import pytest
-import warp as wp
 
 from torchrl_loco.sim.compiled import step
 
@@ -14,7 +13,6 @@ def texts_anew():
 
 @pytest.fixture(params=[31, 0], ids=["traced", "lanes"])
 def form(request, monkeypatch):
-    """Takes one of the two forms of the compiled step for any model; compiled without optimisation, it is quick."""
+    """Takes one of the two forms of the compiled step for any model."""
     monkeypatch.setattr(step, "TRACED_DOFS", request.param)
-    monkeypatch.setattr(wp.config, "optimization_level", 0)
     return "traced" if request.param else "lanes"

@@ -47,10 +47,8 @@ def device():
 
 @pytest.fixture(params=["traced", "lanes", "mujoco_warp"])
 def simulated(request, monkeypatch, device):
-    """Makes simulations with each engine, and with both forms of the compiled step; quickly compiled."""
+    """Makes simulations with each engine, and with both forms of the compiled step."""
     monkeypatch.setattr(step, "TRACED_DOFS", 31 if request.param == "traced" else 0)
-    if request.param != "mujoco_warp":
-        monkeypatch.setattr(wp.config, "optimization_level", 0)
     engine = "mujoco_warp" if request.param == "mujoco_warp" else "compiled"
 
     def make(xml, num_envs=1, ctrl_dt=0.002, **asked):

@@ -4,7 +4,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-import warp as wp
 from cases import COMPILED, ENGINES, MODELS, PROTOCOLS
 
 import torchrl_loco
@@ -13,6 +12,8 @@ from torchrl_loco.sim import models
 from torchrl_loco.sim.compiled import collision
 from torchrl_loco.sim.compiled.step import texts
 from torchrl_loco.sim.simulation import set_options
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
 
 WORLDS, AGES = 128, (10, 30, 50, 80)
 
@@ -62,7 +63,6 @@ def assert_agree(ours, theirs):
     assert (error.max(axis=1) > 1e-4).sum() <= len(error) / 300
 
 
-@pytest.mark.slow
 def test_both_engines_agree(shared, states):
     task, state, action = states
     for protocol in PROTOCOLS:
@@ -70,7 +70,6 @@ def test_both_engines_agree(shared, states):
         assert_agree(*(after(env, state, action) for env in envs))
 
 
-@pytest.mark.slow
 def test_converged_steps_agree_with_c_mujoco(shared, states, monkeypatch):
     """With its rule for the contact frames of upright capsules, such as the humanoid's shins.
 
@@ -84,6 +83,5 @@ def test_converged_steps_agree_with_c_mujoco(shared, states, monkeypatch):
         assert np.quantile(np.abs(after(env, state, action) - expected), 0.95) > 1e-5
         monkeypatch.setattr(collision, "UPRIGHT", 1e-6)
         texts.clear()
-        monkeypatch.setattr(wp.config, "optimization_level", 0)  # it is compiled for this test alone
         env = torchrl_loco.make(task, len(state), "cpu", protocol="dm_control")
     assert_agree(after(env, state, action), expected)

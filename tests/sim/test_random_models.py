@@ -57,10 +57,9 @@ SETTINGS = {
 
 
 @pytest.fixture(autouse=True)
-def c_mujocos_frames_and_quick_compilation(monkeypatch):
+def c_mujocos_frames(monkeypatch):
     """Contact frames of upright capsules are as in C MuJoCo, not as in MuJoCo-Warp."""
     monkeypatch.setattr(collision, "UPRIGHT", 1e-6)
-    monkeypatch.setattr(wp.config, "optimization_level", 0)
     mujoco.set_mju_user_warning(lambda message: None)  # else it writes a log into the working directory
     yield
     mujoco.set_mju_user_warning(None)
