@@ -79,6 +79,7 @@ def test_only_the_first_is_kept(file, actions):
     assert torch.equal(nan_dump.load(file).tensors["qvel"], state["qvel"][BAD])
 
 
+@pytest.mark.slow
 def test_of_a_body_with_activations(file, actions):
     """They are kept, and both simulators step with them and with scaled actions."""
     env = torchrl_loco.make("quadruped_run", 3, "cpu", 0, protocol="dm_control", nan_dump=file)

@@ -126,6 +126,7 @@ def test_layouts_of_the_other_bodies(task, tmp_path):
     check_layout(exported, make(exported, 8, 0, "cpu"), seed=0)
 
 
+@pytest.mark.slow
 def test_a_runner_earns_the_same_in_c_mujoco(capsys, tmp_path):
     """From the same starts, under the model's own solver; what is asked for decides on the status."""
     policy = torchrl_loco.load_policy("walker_walk", "cpu", "dm_control")

@@ -63,8 +63,8 @@ def test_the_cpu_always_repeats(shared, task, protocol, engine, actions):
 def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protocol, count, device, actions):
     """Under ``compiled``, bit for bit, whatever their number, its place, and what happens in the others."""
     many, few = (shared(task, n, device, protocol=protocol, episode_length=500) for n in (count, 3))
-    td, moves = many.reset(), actions(many, 70)
-    for action in moves[:60]:  # until most lie on the ground
+    td, moves = many.reset(), actions(many, 50)
+    for action in moves[:40]:  # until most lie on the ground
         td = many.step(td.set("action", action))["next"].exclude("reward")
     state, places = many.get_state(), torch.tensor([130, 64, 7])
     picked = State({key: value[places.to(device)] for key, value in state.items()}, batch_size=[3])
@@ -74,7 +74,7 @@ def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protoc
     others[places] = False
     bad = many.sim.qvel.new_tensor([torch.nan, 1e9]).repeat(count)
     many.sim.qvel[others.to(device)] = bad[: count - 3].unsqueeze(-1)
-    for action in moves[60:]:
+    for action in moves[40:]:
         spoilt = action.clone()
         spoilt[others.to(device)] *= torch.inf
         beside = many.step(beside.set("action", spoilt))["next"].exclude("reward")

@@ -146,6 +146,7 @@ def test_nothing_is_reported_if_nothing_was_dropped(shared, engine):
             assert found["total", "iteration_limit"] > 0
 
 
+@pytest.mark.slow
 def test_bodies_that_lie_on_the_floor_lose_hardly_a_contact():
     """Under ``compiled``, whose places are fixed: flat on their backs or faces, bodies touch the floor everywhere."""
     for task in COMPILED:

@@ -31,7 +31,7 @@ def run_of(tmp_path_factory):
     def get(algorithm):
         if algorithm not in runs:
             with small_walker():
-                runs[algorithm] = trained(tmp_path_factory.mktemp("runs"), algorithm, video_seconds=0.1)
+                runs[algorithm] = trained(tmp_path_factory.mktemp("runs"), algorithm, video_seconds=0.05)
         return runs[algorithm]
 
     return get

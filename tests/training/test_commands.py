@@ -107,6 +107,7 @@ def test_the_policy_of_the_package_is_evaluated(capsys):
     assert capsys.readouterr().out == f"{training.describe(expected)}\n"
 
 
+@pytest.mark.slow
 def test_a_run_is_exported_into_its_folder(ppo_run, tmp_path, capsys):
     path = shutil.copytree(ppo_run.path, tmp_path / "run")
     (path / "policy.pt2").write_text("mine")
