@@ -98,6 +98,7 @@ def test_a_control_step_ends_where_c_mujoco_does(name, engine):
     m.opt.tolerance = 1e-12
     config = dataclasses.replace(cls.config, iterations=200, ls_iterations=100, engine=engine)
     sim = Simulation(m, config, len(steps["qpos"]), torch.device("cpu"))
+    sim.compile(sim.step)  # in parallel, and not beside another worker
     for ours, theirs in {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart", "ctrl": "ctrl"}.items():
         getattr(sim, ours).copy_(torch.tensor(steps[theirs]))
     sim.step()
