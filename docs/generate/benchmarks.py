@@ -5,6 +5,7 @@
 
 import functools
 import json
+import math
 import re
 import statistics
 from collections.abc import Iterable, Sequence
@@ -31,7 +32,7 @@ SUITE = "2026-11-24-cpu/suite.json"
 VARIATION = "2026-11-25-h100-third/variation.json"
 TO_950 = "2026-11-23-h200-presets/time-to-return.csv"
 BRAX_TO_950 = "2026-11-21-h200/training/time-to-return.json"
-GO1 = "2026-11-25-h100/library-go1.txt"
+ROBOTS = "2026-11-25-h100-robots/results.json"
 MJLAB = "2026-11-24-h100/mjlab.txt"
 
 
@@ -107,7 +108,7 @@ def tables() -> dict[str, str]:
         "returns": returns() + sources([[f"{path}/results.csv" for path in runs.folders] for runs in RUNS.values()]),
         "tasks": tasks.overview(),
         "speed": speed(),
-        "speed-sources": sources([(TO_950, BRAX_TO_950, GO1, MJLAB)]),
+        "speed-sources": sources([(TO_950, BRAX_TO_950, ROBOTS, MJLAB)]),
         "variation": variation(),
         "fields": fields.fields(),
         **robots.tables(),
@@ -221,11 +222,10 @@ def speed() -> str:
         for found, key in ((run, "wall"), (brax, "seconds"))
     ]
     rows.append(("walker walks, return 950, from the start of the process (s, H200)", seconds[0], "", "", seconds[1]))
-    rates = (
-        re.search(r'"frames_per_second": (\d+)', (RESULTS / GO1).read_text()),
-        re.search(r"Go1 .* ([\d,]+) frames per second", (RESULTS / MJLAB).read_text()),
-    )
-    ours_go1, mjlab = (f"{int(found[1].replace(',', '')) / 1e6:.3g}" for found in rates if found)
+    robot = [row for row in _json(ROBOTS) if row["task"] == "go1_velocity" and row["algorithm"] == "ppo"]
+    theirs = re.search(r"Go1 .* ([\d,]+) frames per second", (RESULTS / MJLAB).read_text())
+    rates = _mean(robot, "frames/s"), float(theirs[1].replace(",", "")) if theirs else math.nan
+    ours_go1, mjlab = (f"{rate / 1e6:.3g}" for rate in rates)
     rows.append(("training a Go1 to follow velocity commands (million frames/s, H100)", ours_go1, "", mjlab, ""))
     return table(("", "torchrl_loco", "`mujoco_warp`", "mjlab 1.6", "Playground 0.2"), rows)
 

@@ -80,7 +80,7 @@ def shipped() -> str:
     for task in [task for task in NAMES if task in shipped_policies("playground")]:
         info = torchrl_loco.load_policy(task, "cpu").info
         earned = f"return {info['mean']:.1f} ± {info['std']:.1f} in {info['episodes']} new episodes"
-        how = f"{info['frames'] / 1e6:.0f} million frames, {info['seconds']:.0f} s on one {info['trained_on']}"
+        how = f"{info['frames'] / 1e6:.0f} million frames on one {info['trained_on']}"
         lines.append(f"- `torchrl-loco play {task}`: {earned}, after {how}, seed {info['seed']}\n")
     return (
         f"Policies in the package, for `play`, `verify`, `export` and `load_policy`:\n\n{''.join(lines)}"

@@ -131,15 +131,15 @@ class Velocity(LocoEnv):
     command_ranges = {"command": commands.greatest(CURRICULUM)}
     presets = {
         "ppo": {
-            "num_envs": 8192,
+            "num_envs": 4096,
             "num_steps": 24,
-            "total_frames": 200_000_000,
+            "total_frames": 100_000_000,
             "reward_scale": 1.0,
             "gamma": 0.99,
             "lr": 1e-3,
             "target_kl": 0.01,
             "epochs": 5,
-            "minibatch_size": 49_152,
+            "minibatch_size": 24_576,
             "hidden": (512, 256, 128),
             "entropy_coeff": 0.01,
             "eval_interval": 20_000_000,
@@ -468,6 +468,7 @@ class G1Velocity(Velocity):
     base, trunk = "pelvis", "torso_link"
     feet = {side: rf"{side}\d_collision" for side in ("left_foot", "right_foot")}
     own_geoms = "(?!.*foot).*_collision"
+    presets = {"ppo": {**Velocity.presets["ppo"], "total_frames": 300_000_000, "entropy_coeff": 0.005}}
     stand = {".*": 0.05}
     walk = {
         ".*hip_pitch.*": 0.3,
@@ -512,6 +513,7 @@ class H1Velocity(Velocity):
     base, trunk = "pelvis", "torso_link"
     feet = {side: rf"{side}\d" for side in ("left_foot", "right_foot")}
     action_scale = 0.25
+    presets = {"ppo": {**Velocity.presets["ppo"], "total_frames": 150_000_000}}
     stand = {".*": 0.05}
     walk = {
         ".*hip_pitch": 0.3,
