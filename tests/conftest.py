@@ -23,7 +23,7 @@ def quickly_compiled(f=None, **options):
     """
     if f is None:
         return functools.partial(quickly_compiled, **options)
-    if f.__module__.startswith("torchrl_loco.") and options.get("module") == "unique":
+    if (f.__module__ or "").startswith("torchrl_loco.") and options.get("module") == "unique":
         options["module_options"] = {"optimization_level": 0}
     return warp_kernel(f, **options)
 
