@@ -50,6 +50,9 @@ session = onnxruntime.InferenceSession(args.file)
 words, text = session.get_modelmeta().custom_metadata_map, ("task", "protocol", "torchrl_loco", "mjcf")
 facts = {name: word if name in text else json.loads(word) for name, word in words.items()}
 offset, scale = np.array(facts["action_offset"]), np.array(facts["action_scale"])
+low, high = (facts["velocity"][f"command_{end}"] for end in ("low", "high"))
+if (np.array(args.command) < low).any() or (np.array(args.command) > high).any():
+    parser.error(f"the policy was trained for commands from {low} to {high}, and may fall beyond")
 robot, action = Robot(facts), np.zeros(len(scale))
 for step in range(round(args.seconds / facts["control_timestep"])):
     if step % facts["action_repeat"] == 0:

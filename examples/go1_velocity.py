@@ -2,9 +2,10 @@
 
     torchrl-loco train examples/go1_velocity.py:Go1Velocity
 
-``go1.xml`` is not part of this repository: put the MJCF of a Go1 without meshes beside this file, with position
-actuators in joint order and sites FR, FL, RR, RL at the soles. The task is mjlab's flat one for the Go1, but for
-contact forces and the variation of the model.
+How a whole task reads in one file; the package's own ``go1_velocity`` is what to train. Put the MJCF of a Go1 without
+meshes beside this file as ``go1.xml``, with position actuators in joint order and sites FR, FL, RR, RL at the soles:
+``torchrl_loco/tasks/velocity/go1.xml`` has them. The task is mjlab's flat one for the Go1, but for contact forces and
+the variation of the model.
 """
 
 import math

@@ -37,7 +37,7 @@ class Column(NamedTuple):
 TRAINING = (
     Column("worlds", "worlds", 1, ".0f", max),
     Column("million frames/s", "frames/s", 1e6, ".3g", min),
-    Column("to mjlab's reward (s)", "to mjlab's (s)", 1, ".1f", max),
+    Column("to the level (s)", "to mjlab's (s)", 1, ".1f", max),
     Column("training (s)", "seconds", 1, ".0f", max),
     Column("return", "return", 1, ".1f", min),
     Column("all, from the start of the process (s)", "wall", 1, ".0f", max),
@@ -52,7 +52,7 @@ VERIFIED = (
 
 def tables(folder: Path = RESULTS) -> dict[str, str]:
     """Returns what the page takes from a folder, by the names that its comments give them."""
-    shown = "![A Go1, a G1, a Go2 and an H1 walk as they are told](_static/robots.webp)\n" if MOVING.exists() else ""
+    shown = "![A Go1, a G1, an H1 and a Go2 walk as they are told](_static/robots.webp)\n" if MOVING.exists() else ""
     of_page = {"robots-moving": shown, "robots-shipped": shipped()}
     if not (folder / "results.json").exists():
         none = "There are no figures in this copy of the repository.\n"
@@ -70,7 +70,7 @@ def tables(folder: Path = RESULTS) -> dict[str, str]:
         "robots-training": _table({**ours, **earlier}, TRAINING) + f"\nFrom {link}{source if earlier else ''}.\n",
         "robots-curves": "![Return against seconds of training, a line for each seed](_static/robots.png)\n",
         "robots-verified": _table(ours, VERIFIED)
-        + f"\n{episodes} episodes of each policy, a third of them on time. From {link}.\n",
+        + f"\nFalls are episodes, of {episodes} of each policy; a third of them are on time. From {link}.\n",
     }
 
 

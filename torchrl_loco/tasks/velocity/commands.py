@@ -58,9 +58,9 @@ def reached(curriculum: dict[int, Ranges], steps: int) -> tuple[list[float], lis
     return [low for low, _ in ranges], [high for _, high in ranges]
 
 
-def greatest(curriculum: dict[int, Ranges]) -> dict[str, tuple[float, float]]:
-    """Returns the ranges of commands at the end of a curriculum, by name."""
-    return dict(zip(NAMES, list(curriculum.values())[-1], strict=True))
+def first(curriculum: dict[int, Ranges]) -> dict[str, tuple[float, float]]:
+    """Returns the ranges of commands at the start of a curriculum, by name."""
+    return dict(zip(NAMES, next(iter(curriculum.values())), strict=True))
 
 
 def draw(s: "View", curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
