@@ -182,6 +182,7 @@ def test_a_newer_policy_goes_on_where_the_last_one_was(led):
         assert (led.sim.ctrl == 1).all()
 
 
+@pytest.mark.slow
 def test_it_takes_no_more_of_the_cpu_than_it_may(led):
     share = 0.02 / cores()
     with Viewer(led, still, cpu_share=share) as viewer, open_page(viewer):

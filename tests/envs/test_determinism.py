@@ -55,7 +55,7 @@ def test_the_cpu_always_repeats(shared, task, protocol, engine, actions):
     ("device", "task", "protocol", "count"),
     [
         ("cpu", "walker_run", "playground", 131),
-        ("cpu", "humanoid_run", "dm_control", 131),
+        pytest.param("cpu", "humanoid_run", "dm_control", 131, marks=pytest.mark.slow),
         pytest.param("cuda", "humanoid_run", "dm_control", 131, marks=pytest.mark.gpu),
         pytest.param("cuda", "walker_run", "playground", 20_000, marks=pytest.mark.gpu),  # in three kernels, not one
     ],

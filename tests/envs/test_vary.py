@@ -449,7 +449,8 @@ def test_c_mujoco_steps_the_model_of_a_world(engine, actions):
         env.mujoco_model(4)
 
 
-@pytest.mark.parametrize("engine", ["compiled", pytest.param("mujoco_warp", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["compiled", "mujoco_warp"])
 def test_a_nan_dump_replays_them(tmp_path, engine, actions):
     file = tmp_path / "dump.safetensors"
     env = made(*FAR, engine=engine, protocol="dm_control", nan_dump=file)
