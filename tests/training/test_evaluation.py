@@ -78,6 +78,20 @@ def test_actions_are_held_in_evaluations_and_videos(tmp_path):
     assert len(calls) == 1  # of 2
 
 
+def test_a_video_that_is_cut_off_leaves_no_file(tmp_path):
+    calls = []
+
+    def policy(td):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return td.set("action", torch.zeros(1, 6))
+
+    with pytest.raises(KeyboardInterrupt):
+        record(policy, torchrl_loco.make("walker_stand", 1, "cpu", 0), tmp_path / "video.mp4", 0.2)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_run_from_another_device(ppo_run, tmp_path):
     """It can be evaluated where its device is not, if another one is named."""
     folder = tmp_path / "from_cuda"

@@ -1,5 +1,6 @@
 """Videos and the viewer."""
 
+import io
 import os
 import sys
 import time
@@ -7,6 +8,7 @@ import warnings
 from pathlib import Path
 
 from torchrl_loco.envs import LocoEnv
+from torchrl_loco.storage import replace_file
 from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.evaluation import PolicyFunc, play
 
@@ -19,18 +21,22 @@ def record(
     Args:
         policy: reads ``observation`` and writes ``action``.
         env: where it plays.
-        path: the video file; its suffix chooses the container, the codec is H.264.
+        path: the video file, written whole or not at all; its suffix chooses the container, the codec is H.264.
         seconds: length of the video (s).
         action_repeat: frames for which an action is held.
         camera: name of one of the model's cameras.
     """
     import imageio.v3 as imageio  # of the extra "train"
 
-    frame_rate = round(1 / env.config.ctrl_dt)
-    with settings_for_small_networks(), imageio.imopen(path, "w", plugin="pyav") as video:
+    frame_rate, content = round(1 / env.config.ctrl_dt), io.BytesIO()
+    with (
+        settings_for_small_networks(),
+        imageio.imopen(content, "w", plugin="pyav", extension=path.suffix) as video,
+    ):
         video.init_video_stream("h264", fps=frame_rate)
         for _ in play(policy, env, action_repeat, round(seconds * frame_rate), "video"):
             video.write_frame(env.render(camera, 480, 360)[0].cpu().numpy())
+    replace_file(path, content.getvalue())
 
 
 def has_display() -> bool:
