@@ -211,11 +211,13 @@ def test_what_cannot_be_verified(tmp_path, capsys):
     assert "OtherObservation has no layout() of its own observation and control" in why_not(policy)
     policy.save(tmp_path / "policy.safetensors")
     export_policy(policy, tmp_path / "policy.onnx")
+    export_policy(torchrl_loco.load_policy("walker_walk", "cpu"), tmp_path / "runner.onnx")
     for name, message in {
         "policy.safetensors": "OtherObservation has no layout()",
         "policy.onnx": "does not say what the policy observes",
         "none.onnx": "there is no file",
+        "runner.onnx": "only robots with a velocity command can be played alone",
     }.items():
         with pytest.raises(SystemExit, match="2"):
-            cli.main(["verify", str(tmp_path / name)])
-        assert message in capsys.readouterr().err
+            cli.main(["verify", str(tmp_path / name), "--alone"])
+        assert message in " ".join(capsys.readouterr().err.split())

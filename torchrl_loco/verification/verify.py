@@ -48,7 +48,7 @@ def verify(path: Path, conditions: Conditions = DEFAULT, device: str | None = No
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: it does not say how to play it, its layout is not what the task observes, or the task cannot be
-            verified.
+            verified, or not alone.
         ImportError: onnxruntime is missing, or the task of a policy without a velocity is.
     """
     check_packages("verifying", ("onnxruntime",), "onnx")
@@ -57,6 +57,11 @@ def verify(path: Path, conditions: Conditions = DEFAULT, device: str | None = No
     exported = Exported(path)
     if "velocity" in exported.facts:
         return _velocity(exported, conditions, device, alone)
+    if alone:
+        raise ValueError(
+            "only robots with a velocity command can be played alone: what others earn is found by their own code, in "
+            "the simulator of the training"
+        )
     return _returns(exported, conditions, device)
 
 
