@@ -24,10 +24,7 @@ ROBOTS = {
     "g1": velocity.G1Velocity,
     "h1": velocity.H1Velocity,
 }
-ENGINES = [
-    *((name, "compiled") for name in ROBOTS),
-    *(pytest.param(name, "mujoco_warp", marks=pytest.mark.slow) for name in ROBOTS),
-]
+ENGINES = [(name, engine) for engine in ("compiled", "mujoco_warp") for name in ROBOTS]
 JOINTS = {"go1": 12, "go2": 12, "g1": 29, "h1": 19}
 FEET = {"go1": 4, "go2": 4, "g1": 2, "h1": 2}
 WORLDS = 16
