@@ -5,7 +5,6 @@
 
 import functools
 import json
-import math
 import re
 import statistics
 from collections.abc import Iterable, Sequence
@@ -32,8 +31,8 @@ SUITE = "2026-11-24-cpu/suite.json"
 VARIATION = "2026-11-25-h100-third/variation.json"
 TO_950 = "2026-11-23-h200-presets/time-to-return.csv"
 BRAX_TO_950 = "2026-11-21-h200/training/time-to-return.json"
-ROBOTS = "2026-11-25-h100-robots/results.json"
-MJLAB = "2026-11-24-h100/mjlab.txt"
+ROBOTS = f"{robots.RESULTS.name}/results.json"
+MJLAB = f"{robots.BEFORE.parent.name}/{robots.BEFORE.name}"
 
 
 class Measured(NamedTuple):
@@ -222,10 +221,10 @@ def speed() -> str:
         for found, key in ((run, "wall"), (brax, "seconds"))
     ]
     rows.append(("walker walks, return 950, from the start of the process (s, H200)", seconds[0], "", "", seconds[1]))
-    robot = [row for row in _json(ROBOTS) if row["task"] == "go1_velocity" and row["algorithm"] == "ppo"]
-    theirs = re.search(r"Go1 .* ([\d,]+) frames per second", (RESULTS / MJLAB).read_text())
-    rates = _mean(robot, "frames/s"), float(theirs[1].replace(",", "")) if theirs else math.nan
-    ours_go1, mjlab = (f"{rate / 1e6:.3g}" for rate in rates)
+    ours_go1, mjlab = (
+        f"{_mean(seeds['go1_velocity', trainer], 'frames/s') / 1e6:.3g}"
+        for seeds, trainer in ((robots.by_trainer(_json(ROBOTS)), "torchrl_loco, PPO"), (robots.before(), "mjlab 1.6"))
+    )
     rows.append(("training a Go1 to follow velocity commands (million frames/s, H100)", ours_go1, "", mjlab, ""))
     return table(("", "torchrl_loco", "`mujoco_warp`", "mjlab 1.6", "Playground 0.2"), rows)
 

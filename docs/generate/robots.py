@@ -92,11 +92,10 @@ def shipped() -> str:
 def by_trainer(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
     """Returns the rows of the seeds of each robot, by robot and by who trained it, in the order of the page."""
     groups: dict[tuple[str, str], list[Row]] = {}
-    for task in NAMES:
-        for row in rows:
-            if row["task"] == task:
-                trainer = "mjlab 1.6" if "mjlab" in row["algorithm"] else f"torchrl_loco, {row['algorithm'].upper()}"
-                groups.setdefault((task, trainer), []).append(row)
+    for row in rows:
+        if row["task"] in NAMES:
+            trainer = "mjlab 1.6" if "mjlab" in row["algorithm"] else f"torchrl_loco, {row['algorithm'].upper()}"
+            groups.setdefault((row["task"], trainer), []).append(row)
     return {key: groups[key] for key in sorted(groups, key=lambda key: ([*NAMES].index(key[0]), "mjlab" in key[1]))}
 
 
