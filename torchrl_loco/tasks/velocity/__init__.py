@@ -128,7 +128,7 @@ class Velocity(LocoEnv):
     config = SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=10, ls_iterations=20)
     episode_length = 1000
     action_range = (-math.inf, math.inf)
-    command_ranges = {"command": commands.first(CURRICULUM)}  # those of all training by the presets, which ends sooner
+    command_ranges = {"command": commands.first(CURRICULUM)}  # presets end before they widen
     presets = {
         "ppo": {
             "num_envs": 4096,
