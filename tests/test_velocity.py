@@ -543,7 +543,7 @@ def test_a_table_makes_a_task_of_a_users_robot(caplog):
     with pytest.raises(TypeError, match="Bare must set base, trunk, feet, stand, walk, run"):
         type("Bare", (velocity.Velocity,), {"model": Table.model})(1, "cpu")
     with pytest.raises(ValueError, match="delay of Slow must be 0, 1 or 2 control steps, not 3"):
-        type("Slow", (Table,), {"delay": 3})(1, "cpu")
+        type("Slow", (Table,), {"max_delay": 3})(1, "cpu")
 
 
 UNFIT = [

@@ -110,7 +110,7 @@ class Velocity(LocoEnv):
 
     Action:
         Changes of the joints' targets from home, scaled, without bounds; in each episode by a number of control steps
-        late, up to :attr:`delay`.
+        late, up to :attr:`max_delay`.
 
     Reward:
         :meth:`terms` times :attr:`weights` and the control step.
@@ -168,7 +168,7 @@ class Velocity(LocoEnv):
     """Ranges of the commands by the control step of training from which they hold."""
     step_height: ClassVar[float] = 0.1
     """Height of a foot in mid-swing (m)."""
-    delay: ClassVar[int] = 2
+    max_delay: ClassVar[int] = 2
     """Greatest delay of an action in training (control steps), at most 2."""
     own_geoms: ClassVar[str] = ""
     """Regular expression of the geoms of which ``self_collision`` counts the contacts."""
@@ -179,13 +179,13 @@ class Velocity(LocoEnv):
 
         Raises:
             TypeError: an attribute is missing.
-            ValueError: the delay is not 0, 1 or 2.
+            ValueError: the greatest delay is not 0, 1 or 2.
         """
         missing = [name for name in TABLE if not hasattr(cls, name)]
         if missing:
             raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.Velocity)")
-        if cls.delay not in (0, 1, 2):
-            raise ValueError(f"delay of {cls.__name__} must be 0, 1 or 2 control steps, not {cls.delay!r}")
+        if cls.max_delay not in (0, 1, 2):
+            raise ValueError(f"max_delay of {cls.__name__} must be 0, 1 or 2 control steps, not {cls.max_delay!r}")
         super().check_class()
 
     @classmethod
@@ -398,7 +398,7 @@ class Velocity(LocoEnv):
             "qpos": torch.cat([place, height, turn, s.home[:, 7:]], dim=-1),
             "until_push": s.uniform(*PUSH_EVERY),
             "bias": s.uniform(-BIAS, BIAS, len(self.joints)),
-            "delay": torch.zeros_like(yaw) if self.play else s.uniform(0.0, self.delay + 1.0).floor(),
+            "delay": torch.zeros_like(yaw) if self.play else s.uniform(0.0, self.max_delay + 1.0).floor(),
             "trained": s.trained,  # it counts on over all episodes
         }
 
