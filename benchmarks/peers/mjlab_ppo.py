@@ -53,8 +53,12 @@ def _empty_class(name: str) -> type:
 
 sys.meta_path.append(Absent())  # last: what is installed comes first
 
-import mjlab.tasks  # noqa: E402, F401  it registers the tasks
 import mujoco  # noqa: E402
+
+if not hasattr(mujoco, "Renderer"):  # where no window can be opened; mjlab names it in a signature
+    setattr(mujoco, "Renderer", object)  # noqa: B010
+
+import mjlab.tasks  # noqa: E402, F401  it registers the tasks
 import torch  # noqa: E402
 from mjlab.envs import ManagerBasedRlEnv  # noqa: E402
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper  # noqa: E402

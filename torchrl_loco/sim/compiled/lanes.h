@@ -934,10 +934,15 @@ struct Step : Math {
       const Vec origin = w.geoms[g].center, size = Model::geom_size(g);
       const Mat axes = geom_axes(g);
       const Vec center = axes.transposed_times(geom.center - origin), half = axes.transposed_times(geom.half_axis);
+      const float reach = geom.radius + Model::margin(pair);
+      bool near = valid;  // bounding spheres of a trunk hold its legs: most are still clear of one of its faces
+      UNROLLED for (int i = 0; i < 3; ++i)
+        near = near && fabsf(center.component(i)) - fabsf(half.component(i)) < size.component(i) + reach;
+      if (!ballot(near)) continue;
       const Ends ends = half.dot(half) > MINVAL ? capsule_and_box(center, half, size) : Ends{0.0f, 0.0f, 1};
       ROLLED for (int i = 0; i < 2; ++i) {
         const Depth depth = sphere_and_box(center + half * (i ? ends.second : ends.first), geom.radius, size);
-        add_contact(valid && i < ends.points && depth.distance < Model::margin(pair), friction, pair,
+        add_contact(near && i < ends.points && depth.distance < Model::margin(pair), friction, pair,
                     origin + axes * depth.point, depth.distance, axes * depth.normal, {0.0f, 0.0f, 0.0f});
       }
     }
