@@ -6,8 +6,10 @@ import pytest
 import torch
 from small_runs import WALKER, collected
 from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_loco.training import Spaces, preset
+from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.reppo import REPPO, kl, sample
 
 
@@ -19,10 +21,10 @@ def distribution(reppo, batch):
     return reppo.distribution(observed(reppo, batch))
 
 
-def made(**overrides):
+def made(spaces=WALKER, **overrides):
     settings = {"num_envs": 1, "num_steps": 4, "minibatch_size": 4, "total_frames": 10_000, "epochs": 1, **overrides}
     torch.manual_seed(0)
-    return REPPO(preset("walker_stand", "cpu", "reppo", hidden=(32,), **settings), WALKER)
+    return REPPO(preset("walker_stand", "cpu", "reppo", hidden=(32,), **settings), spaces)
 
 
 def test_critic_begins_at_zero():
@@ -67,11 +69,6 @@ def test_soft_returns_by_hand(monkeypatch):
     g0 = 2 * 0.5 + gamma * (temperature * 1.0 + (1 - lmbda) * 2.0 + lmbda * g1)
     torch.testing.assert_close(data["returns"], torch.tensor([[g0, g1, g2, g3]]))
     assert data["alive"].tolist() == [[1.0, 1.0, 0.0, 1.0]]
-
-
-def test_actions_without_bounds_are_refused():
-    with pytest.raises(ValueError, match=r"set action_range = \(-1, 1\) in the class, or train with algorithm 'ppo'"):
-        REPPO(made().config, Spaces(24, 6, bounded=False))
 
 
 def test_negative_returns_are_learned_with_bins_below_zero():
@@ -223,3 +220,16 @@ def test_weights_do_not_fall_below_their_minima():
     reppo.update(collected(reppo, 16), progress=0.0)
     weights = torch.stack([reppo.dual.temperature, reppo.dual.kl_weight]).detach()
     torch.testing.assert_close(weights, torch.tensor([0.02, 0.03]), rtol=1e-6, atol=0)
+
+
+def test_unbounded_actions_are_bounded_by_a_setting():
+    """The critic sees them in [-1, 1]; a saved policy gives what the actor does, which is checked as it is made."""
+    reppo = made(Spaces(24, 6, bounded=False), action_bound=3.0)
+    batch = TensorDict({"observation": 10.0 * torch.randn(200, 24)}, [200])
+    with set_exploration_type(ExplorationType.RANDOM):
+        batch = reppo.actor(batch).detach()
+    assert 2.9 < batch["action"].abs().max() <= 3.0
+    batch["next"] = TensorDict({"observation": batch["observation"], "reward": torch.zeros(200, 1)}, [200])
+    batch["next", "done"] = batch["next", "terminated"] = torch.zeros(200, 1, dtype=torch.bool)
+    torch.testing.assert_close(3.0 * reppo.prepare(batch.unsqueeze(-1))["action"].squeeze(-2), batch["action"])
+    assert 1.0 < deterministic_policy(reppo.actor, reppo.config, {}).module(batch["observation"]).abs().max() <= 3.0

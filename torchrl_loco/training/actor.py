@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import AddStateIndependentNormalScale, NormalParamExtractor, TensorDictModule
 from torch import nn
-from torch.distributions import Independent, Normal, TransformedDistribution
+from torch.distributions import AffineTransform, Independent, Normal, TransformedDistribution
 from torchrl.data import Bounded, Unbounded
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.modules.distributions.continuous import SafeTanhTransform
@@ -27,7 +27,7 @@ TOLERANCE = 1e-4
 
 
 class SquashedNormal(TransformedDistribution):
-    """Independent normal variables under tanh.
+    """Independent normal variables under tanh, times a bound.
 
     TorchRL's ``TanhNormal`` is the same, but reads its bounds at every construction: on CUDA the host would wait for
     that at every step, and gradient steps could not be recorded.
@@ -35,16 +35,19 @@ class SquashedNormal(TransformedDistribution):
     Args:
         loc: means before tanh, shape ``(..., n)``.
         scale: standard deviations before tanh, of the same shape.
+        bound: of all entries.
     """
 
-    def __init__(self, loc: torch.Tensor, scale: torch.Tensor) -> None:
+    def __init__(self, loc: torch.Tensor, scale: torch.Tensor, bound: float = 1.0) -> None:
         normal = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
-        super().__init__(normal, SafeTanhTransform(cache_size=1), validate_args=False)
+        wider = [] if bound == 1.0 else [AffineTransform(0.0, bound)]
+        super().__init__(normal, [SafeTanhTransform(cache_size=1), *wider], validate_args=False)
+        self.bound = bound
 
     @property
     def deterministic_sample(self) -> torch.Tensor:
         """The image of the mean, shape ``(..., n)``."""
-        return self.base_dist.mean.tanh()
+        return self.bound * self.base_dist.mean.tanh()
 
 
 def network_of(make: Network, inputs: int, outputs: int) -> nn.Module:
@@ -75,19 +78,32 @@ def network_of(make: Network, inputs: int, outputs: int) -> nn.Module:
     return network
 
 
-def make_actor(spaces: Spaces, device: torch.device | str, network: nn.Module, log_prob: bool) -> ProbabilisticActor:
+def make_actor(
+    spaces: Spaces, device: torch.device | str, network: nn.Module, log_prob: bool, bound: float | None = None
+) -> ProbabilisticActor:
     """Returns a Gaussian actor around a network that gives means and standard deviations, under tanh if it is bounded.
 
     It reads ``observation`` and writes ``loc``, ``scale``, ``action`` and, if asked to, ``action_log_prob``.
+
+    Args:
+        spaces: what it reads and writes.
+        device: where it computes.
+        network: gives means and standard deviations.
+        log_prob: whether it writes the log-probability of the action.
+        bound: of actions that the environment does not bound; ``None`` leaves them without.
     """
     shape = (spaces.action,)
-    spec = Bounded(-1.0, 1.0, shape, device=device) if spaces.bounded else Unbounded(shape, device=device)
+    if spaces.bounded:
+        bound = 1.0
+    spec = Unbounded(shape, device=device) if bound is None else Bounded(-bound, bound, shape, device=device)
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         spec=spec,
-        distribution_class=SquashedNormal if spaces.bounded else IndependentNormal,
-        distribution_kwargs={} if spaces.bounded else {"validate_args": False},  # which waits for the device
+        distribution_class=IndependentNormal if bound is None else SquashedNormal,
+        distribution_kwargs={"validate_args": False}
+        if bound is None
+        else {"bound": bound},  # checks wait for the device
         return_log_prob=log_prob,
     ).to(device)
 
@@ -107,13 +123,27 @@ def deterministic_policy(actor: ProbabilisticActor, config: TrainingConfig, info
     *layers, last = (copied(layer) for part in parts for layer in layers_of(part))
     if not any(isinstance(part, AddStateIndependentNormalScale) for part in network):
         last = _first_half(last)
-    tanh = [nn.Tanh()] if actor[-1].distribution_class is SquashedNormal else []
+    squashed = (
+        _squashed(actor[-1].distribution_kwargs["bound"], last)
+        if actor[-1].distribution_class is SquashedNormal
+        else []
+    )
     settings = {
         name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "device", "logger")
     }
-    policy = Policy(nn.Sequential(*layers, last, *tanh), {"algorithm": config.algorithm, **settings, **info})
+    policy = Policy(nn.Sequential(*layers, last, *squashed), {"algorithm": config.algorithm, **settings, **info})
     _check_that_they_agree(policy, actor)
     return policy
+
+
+def _squashed(bound: float, last: Any) -> list[nn.Module]:
+    """Returns the layers of :class:`SquashedNormal`: a tanh, and what multiplies by the bound."""
+    if bound == 1.0:
+        return [nn.Tanh()]
+    size, weight = last.out_features, last.weight
+    wider = nn.utils.skip_init(nn.Linear, size, size, bias=False, device=weight.device)
+    wider.load_state_dict({"weight": bound * torch.eye(size)})
+    return [nn.Tanh(), wider]
 
 
 def _first_half(last: nn.Module) -> nn.Module:

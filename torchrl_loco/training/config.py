@@ -305,6 +305,8 @@ class REPPOConfig(TrainingConfig):
     max_value: float = 150.0
     """Return at the center of the last bin. Rewards in [0, 1] give returns of up to reward_scale * action_repeat /
     (1 - gamma): the critic cannot tell those above max_value apart."""
+    action_bound: float = 4.0
+    """Largest absolute value of an action where the task's actions are unbounded."""
     aux_coeff: float = 1.0
     """Weight of the critic's auxiliary loss, the prediction of its own features at the next step."""
 

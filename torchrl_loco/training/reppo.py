@@ -28,11 +28,7 @@ from torchrl_loco.training.value_bins import ValueBins
 
 
 class REPPO(Algorithm):
-    """Soft lambda-returns, then epochs of minibatches: the critic's cross entropy, the actor's constrained ascent.
-
-    Raises:
-        ValueError: actions are unbounded.
-    """
+    """Soft lambda-returns, then epochs of minibatches: the critic's cross entropy, the actor's constrained ascent."""
 
     config_type = REPPOConfig
     metric_names = (
@@ -52,12 +48,8 @@ class REPPO(Algorithm):
     config: REPPOConfig
 
     def __init__(self, config: REPPOConfig, spaces: Spaces, network: Network | None = None) -> None:
-        if not spaces.bounded:
-            raise ValueError(
-                f"reppo needs actions in [-1, 1], and those of {config.task} are unbounded: set action_range = (-1, 1) "
-                "in the class, or train with algorithm 'ppo'"
-            )
         super().__init__(config, spaces, network)
+        self.action_bound = 1.0 if spaces.bounded else config.action_bound
         self.actor, self.critic, self.norms = make_actor_q(config, spaces, network)
         self.distribution = self.actor[0].module[1:]  # from normalised observations to means and standard deviations
         self.dual = DualVariables(config).to(self.device)
@@ -90,7 +82,8 @@ class REPPO(Algorithm):
             config.gamma, config.lmbda, value.unsqueeze(-1), reward, after["done"], after["terminated"]
         )
         estimates = {"returns": returns.squeeze(-1), "features": features, "alive": alive.squeeze(-1).float()}
-        return batch.select("action", "loc", "scale").update({**now, **estimates})
+        action = batch["action"] / self.action_bound  # what the losses see lies in [-1, 1]
+        return batch.select("loc", "scale").update({"action": action, **now, **estimates})
 
     def batch_metrics(self, data: TensorDictBase) -> torch.Tensor:
         """Returns least and largest return of a batch, and the fraction beyond the critic's bins by more than a bin."""
@@ -309,7 +302,7 @@ def make_actor_q(
     else:
         layers = layers_of(network_of(network, spaces.observation, outputs))
     whole = nn.Sequential(norms["observation"], *layers, NormalParamExtractor("exp"))
-    actor = make_actor(spaces, config.device, whole, log_prob=False)
+    actor = make_actor(spaces, config.device, whole, log_prob=False, bound=config.action_bound)
     if spaces.privileged is not None:
         norms["privileged"] = ObservationNorm(spaces.privileged).to(config.device)
     bins = ValueBins(config.min_value, config.max_value, config.num_bins)

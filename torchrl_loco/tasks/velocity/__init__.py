@@ -145,7 +145,20 @@ class Velocity(LocoEnv):
             "eval_interval": 20_000_000,
             "compile": True,
             "bf16": True,
-        }
+        },
+        "reppo": {
+            "num_envs": 8192,
+            "num_steps": 16,
+            "total_frames": 30_000_000,
+            "reward_scale": 10.0,
+            "gamma": 0.97,
+            "minibatch_size": 8192,
+            "hidden": (512, 512),
+            "min_value": -60.0,
+            "max_value": 60.0,
+            "bf16": True,
+            "eval_interval": 10_000_000,
+        },
     }
 
     base: ClassVar[str]
@@ -468,7 +481,10 @@ class G1Velocity(Velocity):
     base, trunk = "pelvis", "torso_link"
     feet = {side: rf"{side}\d_collision" for side in ("left_foot", "right_foot")}
     own_geoms = "(?!.*foot).*_collision"
-    presets = {"ppo": {**Velocity.presets["ppo"], "total_frames": 300_000_000, "entropy_coeff": 0.005}}
+    presets = {
+        **Velocity.presets,
+        "ppo": {**Velocity.presets["ppo"], "total_frames": 300_000_000, "entropy_coeff": 0.005},
+    }
     stand = {".*": 0.05}
     walk = {
         ".*hip_pitch.*": 0.3,
@@ -513,7 +529,7 @@ class H1Velocity(Velocity):
     base, trunk = "pelvis", "torso_link"
     feet = {side: rf"{side}\d" for side in ("left_foot", "right_foot")}
     action_scale = 0.25
-    presets = {"ppo": {**Velocity.presets["ppo"], "total_frames": 150_000_000}}
+    presets = {**Velocity.presets, "ppo": {**Velocity.presets["ppo"], "total_frames": 150_000_000}}
     stand = {".*": 0.05}
     walk = {
         ".*hip_pitch": 0.3,
