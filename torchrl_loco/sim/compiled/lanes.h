@@ -180,6 +180,12 @@ struct Cone {
     UNROLLED for (int j = 1; j < DIRECTIONS; ++j) product[j] = common * way[j] + across * v[j];
   }
 
+  static INLINE float cost(const float* x, float weight, float mu) {
+    const float n = x[0], t = length(x);
+    const float beside = Math::smaller(n - mu * t, 0.0f), beyond = Math::smaller(mu * n + t, 0.0f);
+    return Math::divide(0.5f * weight, 1.0f + mu * mu) * (beside * beside + beyond * beyond);
+  }
+
   // The change of y^2, where it counts below zero, as y goes `by` from one value to another.
   static INLINE float grown(float from, float to, float by) {
     if (to < 0.0f) return from < 0.0f ? by * (from + to) : to * to;
@@ -1363,10 +1369,10 @@ struct Step : Math {
   INLINE void add_rows(const float* alphas, const int n, float* sums) const {
 //IF ELLIPTIC
     SHARED_LOOP(task, n * frictional) {  // a contact at one of the steps
-      const int step = n == 1 ? 0 : task % n;
+      const int step = task % n;
       float alpha = alphas[0], part[3] = {0.0f, 0.0f, 0.0f};
       UNROLLED for (int k = 1; k < n; ++k) alpha = step == k ? alphas[k] : alpha;
-      add_cone(n == 1 ? task : task / n, alpha, part);
+      add_cone(task / n, alpha, part);
       UNROLLED for (int k = 0; k < 3 * n; ++k) sums[k] += k / 3 == step ? part[k % 3] : 0.0f;
     }
 //END
@@ -1383,8 +1389,8 @@ struct Step : Math {
     sum(sums, 3 * n);
   }
 
-  INLINE Search line_search() {
-    float t[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+  INLINE Search line_search(const float decrement) {
+    float t[7] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
     OWN_DOFS(slot, d) {
       if (d >= DOFS) continue;
       const float s = w.search[d];
@@ -1394,15 +1400,9 @@ struct Step : Math {
     }
 //IF ELLIPTIC
     SHARED_LOOP(k, frictional) {
-      const Law cost = law(k);
-      const float *const x = w.x + CONTACT_ROWS * k, *const v = w.change + CONTACT_ROWS * k;
-      float bent[DIRECTIONS];
-      cost.times(v, bent);
-      UNROLLED for (int j = 0; j < DIRECTIONS; ++j) {
-        t[3] += 0.5f * cost.gradient[j] * x[j];
-        t[4] += cost.gradient[j] * v[j];
-        t[5] += bent[j] * v[j];
-      }
+      const float* const weight = w.weight + CONTACT_ROWS * k;
+      t[3] += Cone::cost(w.x + CONTACT_ROWS * k, weight[0], weight[1]);
+      add_cone(k, 1.0f, t + 4);
     }
 //END
     SHARED_LOOP(i, rows() - first_single()) {
@@ -1411,14 +1411,14 @@ struct Step : Math {
       if (Model::FRICTION_LOSSES && r >= first_friction()) {
         const float bound = Model::friction_bound(r - first_friction());
         t[3] += DryFriction::cost(x, weight, bound);
-        DryFriction::add(x, v, weight, bound, 0.0f, t + 3);
+        DryFriction::add(x, v, weight, bound, 1.0f, t + 4);
       } else {
         t[3] += OneSided::cost(x, weight);
-        OneSided::add(x, v, weight, 0.0f, t + 3);
+        OneSided::add(x, v, weight, 1.0f, t + 4);
       }
     }
-    sum(t, 6);
-    const float *const quadratic = t, *const begin = t + 3;
+    sum(t, 7);
+    const float *const quadratic = t, *const whole = t + 3;
     const auto add_rows = [this](const float* alphas, const int n, float* sums) { this->add_rows(alphas, n, sums); };
 //LINE_SEARCH
   }
@@ -1488,7 +1488,7 @@ struct Step : Math {
       if (iteration == ACCELERATION) SHARED_LOOP(d, DOFS) w.residual[d] += w.mass_search[d];
       sync();
       if (iteration < 0) continue;
-      step = line_search();
+      step = line_search(decrement);
       if (step.alpha == 0.0f) {
         stop = true;
         continue;

@@ -1,22 +1,21 @@
 // The line search of both schedules, the body of a function: the cost along the search direction is convex, and
-// quadratic in pieces. It starts from what is known at alpha = 0, and reads the rows by two functions:
+// quadratic in pieces. The direction is a step of Newton's method, so its slope at alpha = 0 is minus the decrement, its
+// curvature there the decrement, and the first point that is tried is alpha = 1. It reads:
+//   decrement                   gradient' H^-1 gradient
 //   quadratic[3]                slope and curvature of the quadratic form, and the squared length of the direction
-//   begin[3]                    cost, slope and curvature of the rows
+//   whole[4]                    of all rows the cost at alpha = 0, and at alpha = 1 what add_rows adds
 //   add_rows(alphas, n, sums)   adds three numbers for each of n steps, over all rows
 
 const float slope = quadratic[0], curvature = quadratic[1];
-const Point start = {0.0f, 0.0f, slope + begin[1], curvature + begin[2]};
+const Point start = {0.0f, 0.0f, -decrement, fabsf(decrement)};
 // Slopes below `noise` are rounding: the sums behind them are that large.
 const float tolerance = Math::larger(LS_TOLERANCE * Math::divide(Math::root(quadratic[2]), SCALE), 1e-6f);
-const float sizes = Math::root(2.0f * Math::larger(begin[0], 0.0f) * Math::larger(begin[2], 0.0f)) + fabsf(slope);
+const float sizes = Math::root(2.0f * whole[0] * Math::larger(start.curvature - curvature, 0.0f)) + fabsf(slope);
 const float noise = 8.0f * 1.1920929e-7f * sizes, accept = Math::larger(tolerance, noise);
 Search result = {0.0f, 0.0f};
 if (fabsf(start.slope) < noise) return result;
 
-float sums[9] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
-const float whole[1] = {start.newton()};
-add_rows(whole, 1, sums);
-const Point first = Point::at(whole[0], slope, curvature, sums);
+const Point first = Point::at(1.0f, slope, curvature, whole + 1);
 result.take(first, first.ends(start, accept, LS_NEAR));
 const bool less = first.slope < start.slope;
 Point low = less ? first : start, high = less ? start : first;
@@ -25,7 +24,7 @@ ROLLED for (int i = 0; i < LS_ITERATIONS && !found; ++i) {
   // Newton's step from the start led here.
   const float from_low = i > 0 ? low.newton() : low.secant(high);
   const float alphas[3] = {from_low, high.newton(), 0.5f * (low.alpha + high.alpha)};
-  UNROLLED for (int k = 0; k < 9; ++k) sums[k] = 0.0f;
+  float sums[9] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
   add_rows(alphas, 3, sums);
   const Point next_low = Point::at(alphas[0], slope, curvature, sums);
   const Point next_high = Point::at(alphas[1], slope, curvature, sums + 3);

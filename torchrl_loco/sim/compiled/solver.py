@@ -18,8 +18,8 @@ from torchrl_loco.sim.compiled.ground_contacts import GroundContacts
 from torchrl_loco.sim.compiled.sensors import ContactForces, TouchSensors
 from torchrl_loco.sim.compiled.symbols import Block, cell, cells, dot, literal, total
 
-ZERO = "begin[0] += OneSided::cost(x, D); OneSided::add(x, v, D, 0.0f, begin);"
-ZERO_FRICTION = "begin[0] += DryFriction::cost(x, D, bound); DryFriction::add(x, v, D, bound, 0.0f, begin);"
+WHOLE = "whole[0] += OneSided::cost(x, D); OneSided::add(x, v, D, 1.0f, whole + 1);"
+WHOLE_FRICTION = "whole[0] += DryFriction::cost(x, D, bound); DryFriction::add(x, v, D, bound, 1.0f, whole + 1);"
 STEPS = "UNROLLED for (int s = 0; s < n; ++s) OneSided::add(x, v, D, alphas[s], sums + 3 * s);"
 STEPS_FRICTION = "UNROLLED for (int s = 0; s < n; ++s) DryFriction::add(x, v, D, bound, alphas[s], sums + 3 * s);"
 """What the line search does with each row."""
@@ -149,8 +149,8 @@ class NewtonSolver:
         residual = [cell(f"M_qacc[{i}]") - cell(f"force[{i}]") for i in range(nv)]
         sums = (dot(search, residual), dot(search, cells("M_search", nv)), dot(search, search))
         block(f"const float quadratic[3] = {{{', '.join([block.value(x) for x in sums])}}};")
-        block("float begin[3] = {0.0f, 0.0f, 0.0f};")
-        block(self._each_row(ZERO, ZERO_FRICTION))
+        block("float whole[4] = {0.0f, 0.0f, 0.0f, 0.0f};")
+        block(self._each_row(WHOLE, WHOLE_FRICTION))
         block("const auto add_rows = [&](const float* alphas, const int n, float* sums) {")
         block(self._each_row(STEPS, STEPS_FRICTION))
         block("};")
