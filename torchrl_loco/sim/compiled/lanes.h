@@ -299,6 +299,7 @@ struct Step : Math {
   INLINE void sync() const { __syncwarp(); }
   INLINE unsigned ballot(bool x) const { return __ballot_sync(~0u, x); }
   INLINE float read(float x, int from) const { return __shfl_sync(~0u, x, from); }
+  INLINE int read(int x, int from) const { return __shfl_sync(~0u, x, from); }
 
   // Replaces each of n values by its sum over the lanes. With many of them, pairs of lanes first exchange halves, so
   // that each lane goes on with a quarter of the values.
@@ -337,6 +338,7 @@ struct Step : Math {
   INLINE void sync() const {}
   INLINE unsigned ballot(bool x) const { return x; }
   INLINE float read(float x, int) const { return x; }
+  INLINE int read(int x, int) const { return x; }
   INLINE void sum(float*, const int) const {}
   INLINE void largest(float&, int&) const {}
 #endif
@@ -1611,31 +1613,43 @@ struct Step : Math {
            second_tangent(c.normal, c.tangent, c.pair) * -cost.gradient[2];
   }
 
-  // The sum of the contact forces on each geom, and whether there is a contact.
+  // The sum of the contact forces on each geom, and whether there is a contact. A lane adds up those of its geoms.
   INLINE void write_contact_forces(float* forces, bool* touches) const {
-    ROLLED for (int g = 0; g < Model::CONTACT_GEOMS; ++g) {
-      float force[3] = {0.0f, 0.0f, 0.0f};
-      bool touched = false;
-      UNROLLED for (int own = 0; own < OWN_CONTACTS; ++own) {
-        const int i = lane + LANES * own;
-        if (i >= frictional + frictionless) continue;
+    enum { OWN_GEOMS = (Model::CONTACT_GEOMS + LANES - 1) / LANES };
+    Vec total[OWN_GEOMS];
+    bool touched[OWN_GEOMS];
+    UNROLLED for (int own = 0; own < OWN_GEOMS; ++own) {
+      total[own] = {0.0f, 0.0f, 0.0f};
+      touched[own] = false;
+    }
+    UNROLLED for (int own = 0; own < OWN_CONTACTS; ++own) {
+      const int left = frictional + frictionless - LANES * own, i = lane + LANES * own;
+      if (left <= 0) break;
+      Vec push = {0.0f, 0.0f, 0.0f};
+      int first = -1, second = -1;
+      if (lane < left) {
         const OwnContact c = own_contacts[own];
-        const bool first = Model::first_contact_geom(c.pair) == g, second = Model::second_contact_geom(c.pair) == g;
-        if (!first && !second) continue;
-        const Vec push = contact_force(i, c) * (second ? 1.0f : -1.0f);
-        UNROLLED for (int k = 0; k < 3; ++k) force[k] += push.component(k);
-        touched = true;
+        push = contact_force(i, c);
+        first = Model::first_contact_geom(c.pair);
+        second = Model::second_contact_geom(c.pair);
       }
-//IF CONTACT_HISTORY
-      touched = ballot(touched) != 0;
-      if (touched) sum(force, 3);  // most geoms have no contact in most substeps
-//ELSE
-      sum(force, 3);
-      touched = ballot(touched) != 0;
-//END
-      if (lane > 0) continue;
-      UNROLLED for (int k = 0; k < 3; ++k) forces[3 * g + k] = force[k];
-      touches[g] = touched;
+      const int end = left < LANES ? left : LANES;
+      ROLLED for (int from = 0; from < end; ++from) {
+        const Vec force = {read(push.x, from), read(push.y, from), read(push.z, from)};
+        const int minus = read(first, from), plus = read(second, from);
+        UNROLLED for (int own_geom = 0; own_geom < OWN_GEOMS; ++own_geom) {
+          const int g = lane + LANES * own_geom;
+          if (minus != g && plus != g) continue;
+          total[own_geom] = total[own_geom] + force * (plus == g ? 1.0f : -1.0f);
+          touched[own_geom] = true;
+        }
+      }
+    }
+    UNROLLED for (int own = 0; own < OWN_GEOMS; ++own) {
+      const int g = lane + LANES * own;
+      if (g >= Model::CONTACT_GEOMS) break;
+      UNROLLED for (int k = 0; k < 3; ++k) forces[3 * g + k] = total[own].component(k);
+      touches[g] = touched[own];
     }
   }
 
