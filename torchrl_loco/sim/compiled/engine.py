@@ -368,7 +368,8 @@ class CompiledEngine:
             asked |= {"contact_geoms": contact_geoms, "contact_rows": self._contact_rows}
             text = kept_source(self._mj_model, substeps, **asked)
             start, end = Chain(before), Chain(after)
-            self._kernels[key] = _kernel(text, start.func, start.struct, end.func, end.struct), start, end
+            funcs = start.func, start.struct, end.func, end.struct
+            self._kernels[key] = _kernel(text, *funcs, self._launch_size.registers), start, end
         kernel, start, end = self._kernels[key]
         size = self._launch_size
         wp.launch(
@@ -381,7 +382,14 @@ class CompiledEngine:
         )
 
 
-def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, After: Any) -> wp.Kernel:  # noqa: N803
+def _kernel(
+    text: str,
+    before: wp.Function,
+    Before: Any,  # noqa: N803
+    after: wp.Function,
+    After: Any,  # noqa: N803
+    registers: int | None = None,
+) -> wp.Kernel:
     """Returns a kernel that calls ``before``, the C++ of a control step and ``after`` in each world.
 
     Args:
@@ -390,6 +398,7 @@ def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, Aft
         Before: a ``wp.struct``.
         after: the function that is called last, of the world and of an ``After``.
         After: a ``wp.struct``.
+        registers: of a thread of a GPU, at most.
     """
 
     @wp.func_native(text)
@@ -413,7 +422,7 @@ def _kernel(text: str, before: wp.Function, Before: Any, after: wp.Function, Aft
         overflow_out: wp.array[int],
     ): ...
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", cuda_max_registers=registers)
     def compiled_step(
         # In:
         worlds_per_warp: int,

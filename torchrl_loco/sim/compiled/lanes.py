@@ -62,6 +62,10 @@ WORLD_BYTES = (
 )
 """Shared memory that a world may fill: the first that leaves room for enough contacts. So 20 and 16 worlds in blocks of
 4, 12, 10 and 8 in blocks of 2, and 4 fit a multiprocessor of an H100 or H200."""
+MULTIPROCESSOR_BYTES, SYSTEM_BYTES = 228 * 1024, 1024
+"""Shared memory of a multiprocessor of an H100 or H200, and what the system takes of it for each block."""
+SCHEDULERS, REGISTERS = 4, 16 * 1024
+"""Of a multiprocessor, and the registers of each, which it deals out to whole warps."""
 MOST_WORLDS = 4
 """Worlds of a block, at most."""
 LOCKSTEP = True
@@ -640,6 +644,12 @@ class Description:
         fit = max(1, BLOCK_BYTES // (self.layout.bytes + WARP_BYTES))
         return min(MOST_WORLDS, 1 << int(math.log2(fit)))
 
+    def registers(self) -> int:
+        """Returns how many registers of a thread leave a multiprocessor as many worlds as its shared memory does."""
+        worlds = self.worlds_per_block()
+        worlds *= MULTIPROCESSOR_BYTES // (worlds * (self.layout.bytes + WARP_BYTES) + SYSTEM_BYTES)
+        return min(REGISTERS // (32 * math.ceil(worlds / SCHEDULERS)) // 8 * 8, 255)
+
     def elimination(self) -> str:
         """Returns calls that eliminate all rows, two by two, in parts: the fewer rows are left, the fewer columns."""
         last = self.m.nv - 1
@@ -719,3 +729,8 @@ def _parts(text: str, asked: dict[str, bool]) -> str:
 def worlds_per_block(m: mujoco.MjModel) -> int:
     """Returns how many worlds share a block of threads on a GPU: a block has 32 times as many, and all must be full."""
     return Description(m).worlds_per_block()
+
+
+def registers(m: mujoco.MjModel) -> int:
+    """Returns how many registers a thread of a GPU may have."""
+    return Description(m).registers()

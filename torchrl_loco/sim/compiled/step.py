@@ -134,6 +134,7 @@ class LaunchSize(NamedTuple):
         worlds_per_warp: worlds that share a warp.
         lanes: threads that share a world.
         one_kernel: whether the functions of a world run in the kernel of the physics, and not as kernels of their own.
+        registers: of a thread, at most, or ``None``.
     """
 
     threads: int
@@ -141,6 +142,7 @@ class LaunchSize(NamedTuple):
     worlds_per_warp: int
     lanes: int
     one_kernel: bool
+    registers: int | None = None
 
 
 def launch_size(m: mujoco.MjModel, num_envs: int, device: wp.Device) -> LaunchSize:
@@ -148,7 +150,8 @@ def launch_size(m: mujoco.MjModel, num_envs: int, device: wp.Device) -> LaunchSi
     if device.is_cuda and not is_traced(m):
         block = lanes.worlds_per_block(m)
         # One lane would do what is not physics, while 31 wait.
-        return LaunchSize(WARP * block * math.ceil(num_envs / block), WARP * block, 1, WARP, one_kernel=False)
+        threads, registers = WARP * block * math.ceil(num_envs / block), lanes.registers(m)
+        return LaunchSize(threads, WARP * block, 1, WARP, one_kernel=False, registers=registers)
     worlds, one_kernel = WARP, True
     if device.is_cuda:
         share = num_envs / (WARPS * device.sm_count)
