@@ -12,6 +12,7 @@ from mujoco_warp import OverflowType
 
 import torchrl_loco
 from torchrl_loco.config import SimConfig, sim_config
+from torchrl_loco.registry import env_class
 from torchrl_loco.sim import Simulation, models
 from torchrl_loco.sim.compiled import collision, dense_contacts, lanes, step, unsupported
 from torchrl_loco.sim.simulation import choose_engine
@@ -480,3 +481,24 @@ def test_contact_parameters_are_mixed_as_in_mujoco():
         assert (pair.condim, pair.solref) == (data.contact.dim[0], tuple(data.contact.solref[0])), (first, second)
         np.testing.assert_allclose(pair.solimp, data.contact.solimp[0], err_msg=f"{first} {second}")
         assert pair.condim == 1 or pair.friction == data.contact.friction[0, 0], (first, second)
+
+
+def test_limbs_share_no_column_but_the_trunk_s():
+    """So the mass matrix has no number where rows of the Hessian have no room."""
+    for task, trunk, limbs in (("go1_velocity", 6, [3, 3, 3, 3]), ("h1_velocity", 7, [5, 5, 4, 4])):
+        m = models.load(env_class(task).model)
+        data = mujoco.MjData(m)
+        mujoco.mj_forward(m, data)
+        mass = np.zeros((m.nv, m.nv))
+        mujoco.mj_fullM(m, data, mass)
+        found = lanes.Description(m).limbs
+        assert (len(found.trunk), list(map(len, found.limbs))) == (trunk, limbs)
+        assert sorted(found.rows) == list(range(m.nv))
+        for one, other in itertools.permutations(found.limbs, 2):
+            assert not mass[np.ix_(one, other)].any()
+            assert found.crosses(1 << one[0] | 1 << other[0])
+            assert not found.crosses(1 << one[0] | 1 << one[-1] | 1 << found.trunk[0])
+    assert lanes.Limbs.of([-1, 0, 1, 2]) is None  # a chain
+    trunk = list(range(-1, lanes.MOST_TRUNK - 1))
+    assert lanes.Limbs.of([*trunk, trunk[-1] + 1, trunk[-1] + 1]) is not None
+    assert lanes.Limbs.of([*trunk, trunk[-1] + 1, trunk[-1] + 2, trunk[-1] + 2]) is None  # a longer trunk

@@ -78,6 +78,13 @@ enum {
   CONTACTS = Model::FRICTIONAL + Model::FRICTIONLESS,
   DIRECTIONS = Model::DIRECTIONS,  // in which a contact with friction acts, each with a row of the Jacobian
   CONTACT_ROWS = Model::CONTACT_ROWS,  // the constraint rows of such a contact
+//IF LIMBS
+  TRUNK = Model::TRUNK,  // degrees of freedom that several limbs share, and those of the longest limb
+  LIMB = Model::LIMB,
+  PIVOT = (TRUNK + LIMB + 4) / 4 * 4,  // a row of a limb: columns of the trunk, the gradient, columns of the limb
+  LOWER = TRUNK * (TRUNK + 1) / 2,
+  CORNER = LOWER + TRUNK,  // the rows of the trunk: their lower triangle, then their gradient
+//END
 };
 #define OWN_DOFS(slot, dof) UNROLLED for (int slot = 0, dof = lane; slot < SLOTS; ++slot, dof += LANES)
 #define SHARED_LOOP(i, count) ROLLED for (int i = lane; i < (count); i += LANES)
@@ -105,7 +112,13 @@ struct alignas(16) World {
       Vec tangents[Model::FRICTIONAL + 1];
     };
     struct {  // while solving
-      float pivots[2][2][STRIDE + 4], couplings[DOFS / 2 + 1], change[Model::ROWS];
+      union {
+        struct { float pivots[2][2][STRIDE + 4], couplings[DOFS / 2 + 1]; };
+//IF LIMBS
+        struct { float limb_pivots[2][Model::LIMBS * PIVOT], corner[CORNER]; };
+//END
+      };
+      float change[Model::ROWS];
     };
     Motion velocity[Model::LINKS];  // of each link relative to its parent; with a single lane, to the world
   };
@@ -261,6 +274,9 @@ struct Step : Math {
   int frictional, frictionless;  // contacts
   int limits;                    // violated limits of hinges and slides
   int limit_row[Model::LIMIT_SIDES][SLOTS];  // the row of the limit of each own degree of freedom, or -1
+//IF LIMBS
+  bool crossing;  // whether a contact couples two limbs
+//END
 //IF IMPLICIT_ACTUATORS
   float implicit_damping[SLOTS];  // minus the derivative of the force of each own degree of freedom by its velocity
 //END
@@ -1015,10 +1031,16 @@ struct Step : Math {
     float own_friction = 0.0f;  // of the lane's contact: in the loop, all would wait for one after the other
     if (own && lane < frictional) own_friction = Model::friction(w.contacts[lane].pair);
 //END
+//IF LIMBS
+    crossing = false;
+//END
     ROLLED for (int i = 0; i < frictional + frictionless; ++i) {
       const Contact c = contact(i);
       const bool friction = i < frictional, ball = c.pair >= Model::PAIRS;
       const int pair = ball ? 0 : c.pair;
+//IF LIMBS
+      crossing = crossing || (!ball && Model::crosses(pair));
+//END
       const Model::Dofs against = Model::first_dofs(pair), with = Model::second_dofs(pair);
       Vec tangent = {0.0f, 0.0f, 0.0f}, other = tangent;
       if (friction) {
@@ -1178,6 +1200,40 @@ struct Step : Math {
   static INLINE Quad read4(const float* p) { return *reinterpret_cast<const Quad*>(p); }
   static INLINE void write4(float* p, Quad q) { *reinterpret_cast<Quad*>(p) = q; }
 
+  // What acts on a degree of freedom alone: its residual, limits and dry friction; and instead, in the end, what implicit
+  // damping adds: (M + h D) a = M qacc, solved for the difference of a and qacc.
+  INLINE void own_terms(const bool damping_alone, float* diagonal, float* gradient) const {
+    OWN_DOFS(slot, d) {
+      diagonal[slot] = 0.0f;
+      gradient[slot] = d < DOFS ? w.residual[d] : 0.0f;
+      if (damping_alone) {
+//IF IMPLICIT_ACTUATORS
+        diagonal[slot] = d < DOFS ? Model::timestep() * implicit_damping[slot] : 0.0f;
+//ELSE
+        diagonal[slot] = d < DOFS ? Model::timestep() * Model::damping(d) : 0.0f;
+//END
+        gradient[slot] = d < DOFS ? diagonal[slot] * w.qacc[d] : 0.0f;
+        continue;
+      }
+      UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
+        const int r = limit_row[side][slot];
+        if (r < 0) continue;
+        const float x = w.x[r], weight = w.weight[r];
+        if (x < 0.0f) {
+          diagonal[slot] += weight;
+          gradient[slot] += (w.limits[r - first_limit()] < 128 ? weight : -weight) * x;
+        }
+      }
+      const int loss = Model::friction_row(d < DOFS ? d : 0);
+      if (Model::FRICTION_LOSSES && d < DOFS && loss >= 0) {
+        const int r = first_friction() + loss;
+        const float bound = Model::friction_bound(loss);
+        diagonal[slot] += DryFriction::curvature(w.x[r], w.weight[r], bound);
+        gradient[slot] += DryFriction::gradient(w.x[r], w.weight[r], bound);
+      }
+    }
+  }
+
   INLINE void start_from_mass(Slots& h) const {
     OWN_DOFS(slot, d) {
       const int e = d < DOFS ? d : DOFS - 1;
@@ -1186,31 +1242,12 @@ struct Step : Math {
         const Quad m = read4(w.mass + STRIDE * e + 4 * i);
         UNROLLED for (int k = 0; k < 4; ++k) h.row[slot][4 * i + k] = m.v[k];
       }
-      h.diagonal[slot] = w.mass[STRIDE * e + e];
-      h.gradient[slot] = d < DOFS ? w.residual[d] : 0.0f;
+      h.diagonal[slot] += w.mass[STRIDE * e + e];
     }
   }
 
-  // M + J' D J over the active rows, and the gradient.
-  INLINE void add_constraints(Slots& h) const {
-    OWN_DOFS(slot, d) {
-      UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
-        const int r = limit_row[side][slot];
-        if (r < 0) continue;
-        const float x = w.x[r], weight = w.weight[r];
-        if (x < 0.0f) {
-          h.diagonal[slot] += weight;
-          h.gradient[slot] += (w.limits[r - first_limit()] < 128 ? weight : -weight) * x;
-        }
-      }
-      const int loss = Model::friction_row(d < DOFS ? d : 0);
-      if (Model::FRICTION_LOSSES && d < DOFS && loss >= 0) {
-        const int r = first_friction() + loss;
-        const float bound = Model::friction_bound(loss);
-        h.diagonal[slot] += DryFriction::curvature(w.x[r], w.weight[r], bound);
-        h.gradient[slot] += DryFriction::gradient(w.x[r], w.weight[r], bound);
-      }
-    }
+  // J' D J over the active rows of contacts, and their gradient.
+  INLINE void add_contacts(Slots& h) const {
     ROLLED for (int k = 0; k < frictional; ++k) {
       const Law cost = law(k);
       if (cost.open()) continue;
@@ -1348,6 +1385,249 @@ struct Step : Math {
     }
   }
 
+//IF LIMBS
+#ifdef __CUDA_ARCH__
+  // The Hessian without its zeros. The trunk is what several limbs share, a limb what branches off and does not branch
+  // again. While no contact couples two limbs, a row of a limb has the columns of the trunk and those of its limb, and
+  // the limbs are eliminated side by side, from their ends. What they leave of the trunk is small enough for each lane
+  // to solve it alone.
+  enum {
+    LIMB_ROWS = Model::LIMB_ROWS,  // of limbs, in one hold; the rows of the trunk follow
+    HOLDS = (LIMB_ROWS + TRUNK + LANES - 1) / LANES,
+    ENTRIES = (CORNER + LANES - 1) / LANES,
+    KEPT = TRUNK < 6 ? TRUNK : 6,  // rows of the trunk that each lane eliminates alone
+  };
+#define OWN_ROWS(hold, row) UNROLLED for (int hold = 0, row = lane; hold < HOLDS; ++hold, row += LANES)
+
+  struct Branches {
+    float trunk[HOLDS][TRUNK], limb[LIMB];  // the last LIMB columns up to the end of the limb
+    float diagonal[HOLDS], gradient[HOLDS];
+  };
+
+  struct Factors { float of[DIRECTIONS]; };  // of rows of the Jacobian for a row of the Hessian
+
+  static INLINE int dof_of_row(int row) { return Model::limb_row_dof(row < LIMB_ROWS + TRUNK ? row : 0); }
+  static INLINE int limb_columns(int row) { return Model::limb_row_end(row < LIMB_ROWS ? row : 0) - LIMB; }
+
+  // A number of each degree of freedom, from its owner.
+  INLINE float of_dof(const float* x, int d) const {
+    float value = read(x[0], d % LANES);
+    UNROLLED for (int slot = 1; slot < SLOTS; ++slot) {
+      const float other = read(x[slot], d % LANES);
+      if (d / LANES == slot) value = other;
+    }
+    return value;
+  }
+
+  static INLINE void read_trunk(const float* row, float* columns) {
+    UNROLLED for (int i = 0; i < QUADS; ++i) {
+      bool some = false;
+      UNROLLED for (int k = 4 * i; k < 4 * i + 4; ++k) some = some || Model::trunk_place(k) >= 0;
+      if (!some) continue;
+      const Quad q = read4(row + 4 * i);
+      UNROLLED for (int k = 0; k < 4; ++k) {
+        const int t = Model::trunk_place(4 * i + k);
+        if (t >= 0) columns[t] = q.v[k];
+      }
+    }
+  }
+
+  // Adds sums over n rows of the Jacobian, each times its factor for a row of the Hessian.
+  INLINE void add_products(Branches& h, const float* rows, const Factors* factors, const int n) const {
+    UNROLLED for (int l = 0; l < n; ++l) {
+      float columns[TRUNK];
+      read_trunk(rows + STRIDE * l, columns);
+      OWN_ROWS(hold, row) {
+        UNROLLED for (int t = 0; t < TRUNK; ++t)
+          h.trunk[hold][t] = h.trunk[hold][t] + factors[hold].of[l] * columns[t];
+      }
+      const float* const own = rows + STRIDE * l + limb_columns(lane);
+      UNROLLED for (int j = 0; j < LIMB; ++j) h.limb[j] = h.limb[j] + factors[0].of[l] * own[j];
+    }
+  }
+
+  INLINE void assemble(Branches& h, const bool with_contacts, const float* diagonal, const float* gradient) const {
+    OWN_ROWS(hold, row) {
+      const int d = dof_of_row(row);
+      const float* const mass = w.mass + STRIDE * d;
+      read_trunk(mass, h.trunk[hold]);
+      if (hold == 0) UNROLLED for (int j = 0; j < LIMB; ++j) h.limb[j] = mass[limb_columns(row) + j];
+      h.diagonal[hold] = mass[d] + of_dof(diagonal, d);
+      h.gradient[hold] = of_dof(gradient, d);
+    }
+    if (!with_contacts) return;
+    Factors factors[HOLDS];
+    ROLLED for (int k = 0; k < frictional; ++k) {
+      const Law cost = law(k);
+      if (cost.open()) continue;
+      const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
+      OWN_ROWS(hold, row) {
+        float own[DIRECTIONS];
+        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + dof_of_row(row)];
+        cost.times(own, factors[hold].of);
+        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
+          h.gradient[hold] = h.gradient[hold] + cost.gradient[i] * own[i];
+          h.diagonal[hold] = h.diagonal[hold] + factors[hold].of[i] * own[i];
+        }
+      }
+      add_products(h, rows, factors, DIRECTIONS);
+    }
+    ROLLED for (int k = 0; k < frictionless; ++k) {
+      const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
+      if (!(x < 0.0f)) continue;
+      const float* const row_of_contact = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
+      OWN_ROWS(hold, row) {
+        const float own = row_of_contact[dof_of_row(row)];
+        factors[hold].of[0] = weight * own;
+        h.gradient[hold] = h.gradient[hold] + factors[hold].of[0] * x;
+        h.diagonal[hold] = h.diagonal[hold] + factors[hold].of[0] * own;
+      }
+      add_products(h, row_of_contact, factors, 1);
+    }
+  }
+
+  // Solves H x = gradient, sets the search direction to -x, and adds x times the gradient before.
+  INLINE void factor_and_solve(Branches& h, float& decrement) const {
+    const bool limb = lane < LIMB_ROWS;
+    const int end = Model::limb_row_end(limb ? lane : 0), skipped = LIMB - Model::limb_length(Model::limb_of_row(limb ? lane : 0));
+    const int above = limb ? end - 1 - dof_of_row(lane) : -1, place = LIMB - 1 - above;  // rows to eliminate before
+    const int base = PIVOT * Model::limb_of_row(limb ? lane : 0);
+    UNROLLED for (int j = 0; j < LIMB; ++j) if (j < skipped) h.limb[j] = 0.0f;
+    float before[HOLDS], left[ENTRIES];
+    OWN_ROWS(hold, row) {
+      before[hold] = h.gradient[hold];
+      const int t = row - LIMB_ROWS;
+      if (t < 0 || t >= TRUNK) continue;
+      float* const corner = w.corner + t * (t + 1) / 2;
+      UNROLLED for (int j = 0; j < TRUNK; ++j) if (j < t) corner[j] = h.trunk[hold][j];
+      corner[t] = h.diagonal[hold];
+      w.corner[LOWER + t] = h.gradient[hold];
+    }
+    UNROLLED for (int i = 0; i < ENTRIES; ++i) left[i] = 0.0f;
+    ROLLED for (int step = 0; step < LIMB; ++step) {
+      float* const pivots = w.limb_pivots[step & 1];
+      if (above == step) {
+        const float scale = divide(1.0f, root(h.diagonal[0]));
+        float row[PIVOT];
+        UNROLLED for (int t = 0; t < TRUNK; ++t) row[t] = h.trunk[0][t] * scale;
+        row[TRUNK] = h.gradient[0] * scale;
+        UNROLLED for (int j = 0; j + TRUNK + 1 < PIVOT; ++j) row[TRUNK + 1 + j] = j < LIMB ? h.limb[j] * scale : 0.0f;
+        UNROLLED for (int i = 0; i < PIVOT; i += 4) write4(pivots + base + i, {row[i], row[i + 1], row[i + 2], row[i + 3]});
+      }
+      sync();
+      if (above > step) {
+        const float c = pivots[base + TRUNK + 1 + place];
+        float row[PIVOT];
+        UNROLLED for (int i = 0; i < PIVOT; i += 4) {
+          const Quad q = read4(pivots + base + i);
+          UNROLLED for (int k = 0; k < 4; ++k) row[i + k] = q.v[k];
+        }
+        UNROLLED for (int t = 0; t < TRUNK; ++t) h.trunk[0][t] = h.trunk[0][t] - c * row[t];
+        h.gradient[0] = h.gradient[0] - c * row[TRUNK];
+        UNROLLED for (int j = 0; j < LIMB; ++j) h.limb[j] = h.limb[j] - c * row[TRUNK + 1 + j];
+        h.diagonal[0] = h.diagonal[0] - c * c;
+      }
+      UNROLLED for (int i = 0; i < ENTRIES; ++i) {
+        const int e = lane + LANES * i < CORNER ? lane + LANES * i : 0;
+        const float *const a = pivots + Model::corner_row(e), *const b = pivots + Model::corner_column(e);
+        UNROLLED for (int l = 0; l < Model::LIMBS; ++l)
+          if (step < Model::limb_length(l)) left[i] = left[i] + a[PIVOT * l] * b[PIVOT * l];
+      }
+    }
+    UNROLLED for (int i = 0; i < ENTRIES; ++i)
+      if (lane + LANES * i < CORNER) w.corner[lane + LANES * i] -= left[i];
+    sync();
+    ROLLED for (int k = TRUNK - 1; k >= KEPT; --k) {  // an entry a lane
+      const float* const row = w.corner + k * (k + 1) / 2;
+      const float inverse = divide(1.0f, row[k]);
+      UNROLLED for (int n = 0; n < ENTRIES; ++n) {
+        const int e = lane + LANES * n;
+        if (e >= CORNER) continue;
+        const int i = Model::corner_row(e), j = Model::corner_column(e);
+        if (i < k) w.corner[e] -= row[i] * inverse * (j < TRUNK ? row[j] : w.corner[LOWER + k]);
+      }
+      sync();
+    }
+
+    // H = L' D L of the rest of the trunk, and its solution.
+    float corner[KEPT * (KEPT + 1) / 2], rest[KEPT], inverse[KEPT], x[TRUNK];
+    UNROLLED for (int i = 0; i < KEPT * (KEPT + 1) / 2; ++i) corner[i] = w.corner[i];
+    UNROLLED for (int k = 0; k < KEPT; ++k) rest[k] = w.corner[LOWER + k];
+    UNROLLED for (int k = KEPT - 1; k >= 0; --k) {
+      const float* const row = corner + k * (k + 1) / 2;
+      inverse[k] = divide(1.0f, row[k]);
+      UNROLLED for (int i = 0; i < k; ++i) {
+        const float c = row[i] * inverse[k];
+        UNROLLED for (int j = 0; j <= i; ++j)
+          corner[i * (i + 1) / 2 + j] = corner[i * (i + 1) / 2 + j] - c * row[j];
+        rest[i] = rest[i] - c * rest[k];
+      }
+    }
+    UNROLLED for (int k = 0; k < KEPT; ++k) {
+      x[k] = rest[k];
+      UNROLLED for (int j = 0; j < k; ++j) x[k] = x[k] - corner[k * (k + 1) / 2 + j] * x[j];
+      x[k] = x[k] * inverse[k];
+    }
+    UNROLLED for (int k = KEPT; k < TRUNK; ++k) {
+      const float* const row = w.corner + k * (k + 1) / 2;
+      x[k] = w.corner[LOWER + k];
+      UNROLLED for (int j = 0; j < k; ++j) x[k] = x[k] - row[j] * x[j];
+      x[k] = divide(x[k], row[k]);
+    }
+    float solution[HOLDS];
+    OWN_ROWS(hold, row) {
+      solution[hold] = 0.0f;
+      UNROLLED for (int t = 0; t < TRUNK; ++t) if (row == LIMB_ROWS + t) solution[hold] = x[t];
+    }
+    // The limbs, outwards. All subtract; those who are done take no harm.
+    float y = h.gradient[0];
+    UNROLLED for (int t = 0; t < TRUNK; ++t) y = y - h.trunk[0][t] * x[t];
+    const float own_inverse = divide(1.0f, h.diagonal[0]);
+    UNROLLED for (int j = 0; j < LIMB; ++j) {
+      const float own = y * own_inverse, found = read(own, (lane - place + j) % LANES);
+      if (limb && j == place) solution[0] = own;
+      y = y - h.limb[j] * found;
+    }
+    OWN_ROWS(hold, row) {
+      if (row >= LIMB_ROWS + TRUNK) continue;
+      w.search[dof_of_row(row)] = -solution[hold];
+      decrement = decrement + solution[hold] * before[hold];
+    }
+  }
+#endif
+
+//END
+  // Sets the search direction, and adds what the own degrees of freedom have of the gradient squared and of minus its
+  // product with the direction; in the end, the direction is what implicit damping adds to qacc.
+  INLINE void turn(const bool damping_alone, float* sums) {
+    float diagonal[SLOTS], gradient[SLOTS];
+    own_terms(damping_alone, diagonal, gradient);
+//IF LIMBS
+#ifdef __CUDA_ARCH__
+    if (damping_alone || !crossing) {
+      Branches h;
+      assemble(h, !damping_alone, diagonal, gradient);
+      OWN_ROWS(hold, row) if (row < LIMB_ROWS + TRUNK) sums[0] += h.gradient[hold] * h.gradient[hold];
+      factor_and_solve(h, sums[1]);
+      return;
+    }
+#endif
+//END
+    Slots h;
+    OWN_DOFS(slot, d) {
+      h.diagonal[slot] = diagonal[slot];
+      h.gradient[slot] = gradient[slot];
+    }
+    start_from_mass(h);
+    if (!damping_alone) add_contacts(h);
+    OWN_DOFS(slot, d) {
+      gradient[slot] = d < DOFS ? h.gradient[slot] : 0.0f;
+      sums[0] += gradient[slot] * gradient[slot];
+    }
+    factor_and_solve(h);
+    OWN_DOFS(slot, d) if (d < DOFS) sums[1] -= gradient[slot] * w.search[d];
+  }
+
   // A row of a matrix times the search direction, in four sums that do not wait for each other.
   INLINE float times_search(const float* matrix_row) const {
     float sums[4] = {0.0f, 0.0f, 0.0f, 0.0f};
@@ -1448,29 +1728,9 @@ struct Step : Math {
       if (iteration < 0) {
         SHARED_LOOP(d, DOFS) w.search[d] = iteration == VELOCITY ? w.qvel[d] : w.qacc[d];
       } else {
-        Slots h;
-        start_from_mass(h);
-        if (Model::IMPLICIT_DAMPING && stop) {  // (M + h D) a = M qacc, solved for the difference of a and qacc
-          OWN_DOFS(slot, d) {
-//IF IMPLICIT_ACTUATORS
-            const float damping = d < DOFS ? Model::timestep() * implicit_damping[slot] : 0.0f;
-//ELSE
-            const float damping = d < DOFS ? Model::timestep() * Model::damping(d) : 0.0f;
-//END
-            h.diagonal[slot] += damping;
-            h.gradient[slot] = d < DOFS ? damping * w.qacc[d] : 0.0f;
-          }
-        } else {
-          add_constraints(h);
-        }
-        float gradient[SLOTS], t[2] = {0.0f, 0.0f};
-        OWN_DOFS(slot, d) gradient[slot] = d < DOFS ? h.gradient[slot] : 0.0f;
-        factor_and_solve(h);
+        float t[2] = {0.0f, 0.0f};  // gradient squared, and minus its product with the new direction
+        turn(stop, t);
         if (stop) break;
-        OWN_DOFS(slot, d) {
-          t[0] += gradient[slot] * gradient[slot];
-          if (d < DOFS) t[1] -= gradient[slot] * w.search[d];
-        }
         sum(t, 2);
         gradient_squared = t[0];
         decrement = t[1];
@@ -1837,4 +2097,5 @@ if (live) {
 #undef UNROLLED
 #undef OWN_DOFS
 #undef SHARED_LOOP
+#undef OWN_ROWS
 #undef LOCKSTEP

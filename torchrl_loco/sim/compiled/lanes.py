@@ -70,6 +70,11 @@ MOST_WORLDS = 4
 """Worlds of a block, at most."""
 LOCKSTEP = True
 """Whether the worlds of a block wait for each other twice a substep, so that they share what they fetch of the text."""
+MOST_TRUNK, MOST_LIMB = 8, 8
+"""Degrees of freedom of the trunk, and of a limb, of a body whose limbs are eliminated side by side.
+
+With 9 of the trunk (G1, the humanoid), a longer text costs more than the shorter elimination saves (measured).
+"""
 ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 28, 16
 """Places for contacts with friction, which a world should have and may have, and for those without.
 
@@ -84,6 +89,7 @@ class Layout:
     """Sizes of the state of a world, as ``struct World`` has them.
 
     Attributes:
+        limb_numbers: what the elimination by limbs holds for all lanes.
         directions: in which a contact with friction acts, each with a row of the Jacobian: the normal, two tangents,
             and turning about these three as far as any contact resists it.
         contact_rows: constraint rows of such a contact.
@@ -103,6 +109,7 @@ class Layout:
     frictional: int
     frictionless: int
     jacobian_rows: int
+    limb_numbers: int
 
     @property
     def stride(self) -> int:
@@ -122,13 +129,69 @@ class Layout:
         contacts = self.frictional + self.frictionless
         vectors = pad(self.positions, 4) + 5 * self.stride + 8 * self.dofs + self.dofs * self.stride + 2 * self.rows
         before = 32 * contacts + 12 * (self.frictional + 1)
-        solving = 4 * (4 * (self.stride + 4) + self.dofs // 2 + 1 + self.rows)
+        solving = 4 * (max(4 * (self.stride + 4) + self.dofs // 2 + 1, self.limb_numbers) + self.rows)
         kinematics = 144 * self.links + 32 * (self.geoms + 1) + 2 * self.candidates
         total = 4 * vectors + pad(max(before, solving, 32 * self.links), 16)
         total = pad(total + 4 * self.jacobian_rows, 16)
         total += pad(max(kinematics, 4 * self.jacobian_rows * self.stride), 16)
         total += 12 * self.trees + self.limits + 1
         return pad(pad(total, 4) + 4 * (contacts if self.touch else 1), 16)
+
+
+@dataclasses.dataclass(frozen=True)
+class Limbs:
+    """The degrees of freedom of a body whose limbs are eliminated side by side.
+
+    Attributes:
+        trunk: those with several ends of limbs below them.
+        limbs: the others, those of each limb from the trunk to its end: they are neighbours.
+    """
+
+    trunk: list[int]
+    limbs: list[range]
+
+    @classmethod
+    def of(cls, parents: Sequence[int]) -> "Limbs | None":
+        """Returns them, or ``None`` where rows of the whole Hessian are as good, or all that fits.
+
+        Args:
+            parents: the parent of each degree of freedom, or -1.
+        """
+        ends = [0] * len(parents)
+        for d in reversed(range(len(parents))):
+            ends[d] = ends[d] or 1
+            if parents[d] >= 0:
+                ends[parents[d]] += ends[d]
+        trunk = [d for d, count in enumerate(ends) if count > 1]
+        limbs: list[range] = []
+        for d in sorted(set(range(len(parents))) - set(trunk)):
+            if limbs and parents[d] == limbs[-1][-1]:
+                limbs[-1] = range(limbs[-1].start, d + 1)
+            else:
+                limbs.append(range(d, d + 1))
+        found = cls(trunk, limbs)
+        fits = 0 < len(trunk) <= MOST_TRUNK and found.longest <= MOST_LIMB and len(found.rows) - len(trunk) <= 32
+        return found if len(limbs) > 1 and fits and min(limb.stop for limb in limbs) >= found.longest else None
+
+    @property
+    def longest(self) -> int:
+        """Degrees of freedom of the longest limb."""
+        return max(map(len, self.limbs))
+
+    @property
+    def rows(self) -> list[int]:
+        """All degrees of freedom, those of limbs first."""
+        return [*itertools.chain(*self.limbs), *self.trunk]
+
+    @property
+    def numbers(self) -> int:
+        """Numbers that the lanes share: two pivots of each limb, and what they leave of the trunk."""
+        trunk = len(self.trunk)
+        return 2 * len(self.limbs) * pad(trunk + self.longest + 1, 4) + trunk * (trunk + 3) // 2
+
+    def crosses(self, dofs: int) -> bool:
+        """Returns whether several limbs are among the bits of degrees of freedom."""
+        return sum(any(dofs >> d & 1 for d in limb) for limb in self.limbs) > 1
 
 
 def pad(x: int, unit: int) -> int:
@@ -188,6 +251,7 @@ class Description:
         self.touch = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_TOUCH)]
         self.implicit_actuators = is_implicitfast(m) and present(affine_bias(m)[acting(m), 2])
         self.joint_force_limits = self.implicit_actuators or m.jnt_actfrclimited.any()
+        self.limbs = Limbs.of(m.dof_parentid.tolist())
         self.layout = self._layout()
 
     def _dofs_to_root(self, dof: int) -> Iterator[int]:
@@ -264,6 +328,7 @@ class Description:
             frictional=0,
             frictionless=frictionless,
             jacobian_rows=0,
+            limb_numbers=self.limbs.numbers if self.limbs else 0,
         )
 
         def sized(places: int, more_rows: int = 0) -> Layout:
@@ -334,6 +399,7 @@ class Description:
         tables.vector("gravity", m.opt.gravity)
         self._add_links(tables)
         self._add_joints(tables)
+        self._add_limbs(tables)
         self._add_forces(tables, mask)
         self._add_geoms(tables, mask)
         self._add_limits(tables)
@@ -396,6 +462,25 @@ class Description:
         tables.size(QUATERNIONS=len(quaternions))
         tables.integers("quaternion_qpos", [m.jnt_qposadr[j] + s for j, s in zip(quaternions, shift, strict=True)])
         tables.integers("quaternion_dof", [m.jnt_dofadr[j] + s for j, s in zip(quaternions, shift, strict=True)])
+
+    def _add_limbs(self, tables: Tables) -> None:
+        if self.limbs is None:
+            return
+        limbs, trunk, rows = self.limbs.limbs, self.limbs.trunk, self.limbs.rows
+        of = [i for i, limb in enumerate(limbs) for _ in limb]
+        tables.size(TRUNK=len(trunk), LIMBS=len(limbs), LIMB=self.limbs.longest, LIMB_ROWS=len(of))
+        tables.integers("limb_row_dof", rows)
+        tables.integers("limb_row_end", [limbs[i].stop for i in of])
+        tables.integers("limb_of_row", of)
+        tables.integers("limb_length", list(map(len, limbs)))
+        places = {d: t for t, d in enumerate(trunk)}
+        tables.integers("trunk_place", [places.get(d, -1) for d in range(self.layout.stride)])
+        lower = [(i, j) for i in range(len(trunk)) for j in range(i + 1)]
+        corner = [*lower, *((i, len(trunk)) for i in range(len(trunk)))]
+        tables.integers("corner_row", [i for i, _ in corner])
+        tables.integers("corner_column", [j for _, j in corner])
+        dofs = [self._dofs_of_geom(p.geoms[0]) ^ self._dofs_of_geom(p.geoms[1]) for p in self.pairs]
+        tables.integers("crosses", [self.limbs.crosses(x) for x in dofs])
 
     def _add_forces(self, tables: Tables, mask: str) -> None:
         m = self.m
@@ -691,6 +776,7 @@ def source(
         "JOINT_FORCE_LIMITS": description.joint_force_limits,
         "MESHES": bool(description.meshes),
         "SOLIDS": any(map(description.is_solid, description.pairs)),
+        "LIMBS": description.limbs is not None,
         "BOXES": any(description.is_solid(p) and not description.is_plane(p) for p in description.pairs),
     }
     text = tables.use(_parts(TEMPLATE.read_text(), asked))
