@@ -41,6 +41,7 @@ class PPO(Algorithm):
             critic_coeff=0.5,
             loss_critic_type="smooth_l1",
             normalize_advantage=True,
+            functional=False,  # else torch.compile would trace for seconds how parameters enter the modules
         )
         self.optimizer = self.make_optimizer("actor and critic", self.loss.parameters())
         self._compiled_losses, self._compiled_estimates = self.fused(self.loss), self.fused(self._estimates)
