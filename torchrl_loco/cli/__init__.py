@@ -3,6 +3,8 @@
 Modules that take seconds to import are imported where they are used, so that help and errors appear at once.
 """
 
+import atexit
+import gc
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -17,10 +19,13 @@ from torchrl_loco.cli.diagnosis import diagnose, inspect, list_tasks
 from torchrl_loco.cli.errors import process_name, user_errors
 from torchrl_loco.cli.options import VALUES, task_options
 from torchrl_loco.cli.policies import evaluate, export, play, record, verify, watch
+from torchrl_loco.garbage import no_collection
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Runs the command line. Returns 0, or 130 when interrupted; exits with 2 for errors of the user."""
+    if args is None:  # the process ends: Python would look for garbage in all that it imported, for seconds
+        atexit.register(gc.freeze)
     try:
         _run(sys.argv[1:] if args is None else list(args))
     except KeyboardInterrupt:
@@ -37,7 +42,8 @@ def _run(args: list[str]) -> None:
         print(torchrl_loco.__version__)
         return
     complete = list(args)
-    options_type = task_options(args) if args[:1] == ["train"] else None
+    with no_collection():  # what is imported stays, and to look through it takes a third of the time
+        options_type = task_options(args) if args[:1] == ["train"] else None
 
     def train(options: Annotated[options_type, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]
         """Train a policy: evaluation, learning curve and video included. All settings: train TASK --help."""

@@ -12,6 +12,7 @@ import tyro
 from torchrl_loco.checks import SEED, check_int, check_run
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.options import settings
+from torchrl_loco.garbage import no_collection
 
 if TYPE_CHECKING:
     from torchrl_loco import training
@@ -129,11 +130,11 @@ def missing_processes(gpus: int | None, device: str) -> int:
 
 @contextlib.contextmanager
 def _joined(device: str) -> Iterator[None]:
-    """Connects the ranks of torchrun, if there are several, while the block lasts."""
-    from torchrl_loco.training import distributed
-
+    """Imports what a training needs, and connects the ranks of torchrun while the block lasts, if there are several."""
     with contextlib.ExitStack() as ranks:
         with user_errors():
+            with no_collection():
+                from torchrl_loco.training import distributed, start  # noqa: F401
             ranks.enter_context(distributed.joined(device))
         yield
 

@@ -1,11 +1,9 @@
 """A part of the control step that hooks make: as one kernel, by torch.compile, or as plain torch."""
 
-import contextlib
-import gc
 import logging
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -17,6 +15,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 import torchrl_loco
 from torchrl_loco.envs.fusion import CannotFuse, fuse
 from torchrl_loco.envs.hooks import Arrays
+from torchrl_loco.garbage import no_collection
 from torchrl_loco.sim import Recorded, Simulation
 
 COMPARED = 64
@@ -71,7 +70,8 @@ class Part:
         """
         on = torch.device(wp.device_to_torch(device))
         try:
-            # Torch notes a fake of each result, and makes a mode for each if there is none: a fourth of the time.
+            # An environment that is dropped meanwhile computes, which would be traced too. Torch notes a fake of each
+            # result, and makes a mode for each if there is none: a fourth of the time.
             with no_collection(), tracing(TracingContext(FakeTensorMode())):
                 traced = constants_on(on, make_fx(lambda arrays: self._work(arrays))(self._arrays))
             self._check_on_other_numbers(traced)
@@ -153,18 +153,6 @@ def changed(rows: torch.Tensor, generator: torch.Generator, flags: bool) -> torc
         return torch.full_like(rows, flags)
     noise = torch.rand(rows.shape, generator=generator, device=rows.device)
     return rows.clone() + (4 * noise - 2 if rows.is_floating_point() else (10 * noise).to(rows.dtype))
-
-
-@contextlib.contextmanager
-def no_collection() -> Iterator[None]:
-    """Keeps garbage from being collected: an environment that is dropped computes, which would be traced too."""
-    was = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was:
-            gc.enable()
 
 
 def constants_on(device: torch.device, traced: torch.fx.GraphModule) -> torch.fx.GraphModule:
