@@ -88,8 +88,10 @@ class RolloutCollector:
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
         """Returns the next batch, of shape ``(num_envs, steps)``, in memory of its own."""
-        if self._carried is None or self._base.is_closed:
-            self._carried, self._recording, self._warm = self._env.reset(), None, False
+        if self._base.is_closed:
+            self._carried, self._recording, self._warm = None, None, False
+        if self._carried is None:
+            self._carried = self._env.reset()
         with set_exploration_type(self._exploration_type):
             steps = self._recorded_steps() if self._can_replay() else self._direct_steps()
         return stack(steps).refine_names(..., "time")
@@ -162,7 +164,10 @@ class RolloutCollector:
         return {"carried": self._carried.clone().to_dict(), "env": self._base.get_state().to_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from a ``state`` that :meth:`state_dict` returned, in an environment of the same settings."""
+        """Continues from a ``state`` that :meth:`state_dict` returned, in an environment of the same settings.
+
+        An empty one begins anew, with a reset of all worlds.
+        """
         if not state:
             self._carried = None
             return

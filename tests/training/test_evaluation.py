@@ -1,5 +1,6 @@
 """Evaluations: full episodes, the same ones again, apart from those of training."""
 
+import copy
 import itertools
 import json
 import math
@@ -8,12 +9,13 @@ import shutil
 import pytest
 import torch
 from small_runs import EPISODE, made
+from torch import nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 import torchrl_loco
-from torchrl_loco.policy import Policy
+from torchrl_loco.policy import ObservationNorm, Policy
 from torchrl_loco.training import RunFolder, evaluate_run, preset
-from torchrl_loco.training.evaluation import describe, episode_returns, evaluation_seed, shipped_return, summarize
+from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, shipped_return, summarize
 from torchrl_loco.training.playback import record
 
 
@@ -44,7 +46,7 @@ def test_evaluation_plays_full_episodes():
     expected = env.rollout(10 * EPISODE, lambda td: td.set("action", env.action_spec.zero()))["next", "reward"].sum(1)
     own = torchrl_loco.make("walker_stand", 2, "cpu")
     for action_repeat in (1, 7):
-        evaluated = lambda policy: episode_returns(policy, own, 11, action_repeat)  # noqa: B023, E731
+        evaluated = lambda policy: Evaluator(policy, own, action_repeat).returns(11)  # noqa: B023, E731
         returns, again = (evaluated(lambda td: td.set("action", torch.zeros(2, 6))) for _ in range(2))
         assert torch.equal(returns, again)
         torch.testing.assert_close(returns, expected.squeeze(-1), rtol=1e-4, atol=0)
@@ -63,6 +65,19 @@ def test_evaluation_plays_full_episodes():
     torch.testing.assert_close(returns[1], expected[1, 0], rtol=1e-4, atol=0)
 
 
+@pytest.mark.parametrize("action_repeat", [1, 2])
+def test_an_evaluator_follows_the_weights_of_its_policy(device, action_repeat):
+    """On CUDA what was recorded with other weights is replayed; a policy that is no module is played step by step."""
+    env = torchrl_loco.make("walker_stand", 3, device)
+    made = [Policy(nn.Sequential(ObservationNorm(24), nn.Linear(24, 6), nn.Tanh()).to(device), {}) for _ in range(2)]
+    expected = [Evaluator(lambda td, one=one: one(td), env, action_repeat).returns(5) for one in made]
+    assert (expected[0] != expected[1]).all()
+    evaluator = Evaluator(copy.deepcopy(made[0]), env, action_repeat)
+    for one, returns in 3 * list(zip(made, expected, strict=True)):
+        evaluator.policy.load_state_dict(one.state_dict())
+        assert torch.equal(evaluator.returns(5), returns)
+
+
 def test_actions_are_held_in_evaluations_and_videos(tmp_path):
     calls = []
 
@@ -71,7 +86,7 @@ def test_actions_are_held_in_evaluations_and_videos(tmp_path):
         return td.set("action", torch.zeros(1, 6))
 
     env = torchrl_loco.make("walker_stand", 1, "cpu", 0)
-    episode_returns(policy, env, 0, action_repeat=7)
+    Evaluator(policy, env, 7).returns(0)
     assert len(calls) == 6  # of 40 frames
     calls.clear()
     record(policy, env, tmp_path / "video.mp4", 0.05, action_repeat=2)

@@ -19,6 +19,7 @@ from torchrl_loco.policy import Policy
 from torchrl_loco.tasks.walker import Walker
 from torchrl_loco.training import RunFolder, Trainer, evaluate_run, preset, trainer
 from torchrl_loco.training.algorithm import Algorithm
+from torchrl_loco.training.evaluation import Evaluator
 from torchrl_loco.training.interrupts import interruptible
 from torchrl_loco.training.trainer import ALGORITHMS
 
@@ -187,11 +188,11 @@ def test_the_best_policy_is_kept(tmp_path, monkeypatch, capsys):
     """Of three evaluations the second is the best: its policy is what the run leaves, evaluated in new episodes."""
     means, seeds = iter([10.0, 30.0, 20.0, 25.0]), []
 
-    def fake(policy, env, seed, action_repeat):
+    def fake(self, seed):
         seeds.append(seed)
         return torch.full((3,), next(means))
 
-    monkeypatch.setattr(trainer, "episode_returns", fake)
+    monkeypatch.setattr(Evaluator, "returns", fake)
     run = trained(tmp_path, total_frames=768, eval_interval=256)
     assert [row["frames"] for row in run.read_evaluations()] == [256, 512, 768]
     info = Policy.load(run.policy, "cpu").info
@@ -218,7 +219,7 @@ def test_returns_that_the_critic_cannot_represent_are_said(tmp_path, capsys):
 def test_a_resumed_run_keeps_the_policy_of_a_better_evaluation_after_the_checkpoint(tmp_path, monkeypatch):
     """The evaluation is repeated, and on CUDA not exactly."""
     means = iter([10.0, 30.0, 20.0])
-    monkeypatch.setattr(trainer, "episode_returns", lambda *args: torch.full((3,), next(means)))
+    monkeypatch.setattr(Evaluator, "returns", lambda *args: torch.full((3,), next(means)))
     run = made(tmp_path, total_frames=768, eval_interval=256)
     first = Trainer(run)
     for save in (True, False):

@@ -1,15 +1,18 @@
 """Evaluation: what a policy earns over full episodes, and what to say of it."""
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import nn
 from torchrl.envs import EnvBase, step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import trange
 
 from torchrl_loco.checks import SEED, check_int
+from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.policy import Policy, load_policy, shipped_policies
 from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.config import TrainingConfig
@@ -20,25 +23,63 @@ PolicyFunc = Callable[[TensorDictBase], TensorDictBase]
 """Reads ``observation`` and writes ``action``."""
 
 
-def episode_returns(policy: PolicyFunc, env: Any, seed: int, action_repeat: int = 1) -> torch.Tensor:
+PIECE = 25
+"""Frames that are taken, and recorded, at a time, or somewhat less: a whole number of actions."""
+
+
+class Evaluator:
     """Plays full episodes without exploration, for the same seed the same ones.
 
-    Args:
-        policy: what is evaluated.
-        env: the worlds, one for each episode.
-        seed: decides their initial states.
-        action_repeat: frames for which an action is held.
+    On CUDA the steps are recorded in the first evaluation, and then replayed.
 
-    Returns:
-        The return of each episode, shape ``(episodes,)``.
+    Args:
+        policy: what is evaluated; for another one of its kind, load its weights into this one.
+        env: the worlds, one for each episode.
+        action_repeat: frames for which an action is held.
     """
-    env.set_seed(seed)
-    returns = torch.zeros(env.num_envs, 1, device=env.device)
-    alive = torch.ones_like(returns, dtype=torch.bool)
-    for after in play(policy, env, action_repeat, env.config.episode_length, "evaluation"):
-        returns += after["reward"] * alive
-        alive &= ~after["done"]
-    return returns.squeeze(-1)
+
+    def __init__(self, policy: PolicyFunc, env: Any, action_repeat: int = 1) -> None:
+        self.policy: Any = policy
+        self.env = env
+        self._frames = action_repeat * max(1, PIECE // action_repeat)
+        self._collector = RolloutCollector(
+            env,
+            policy if action_repeat == 1 else _Held(policy, action_repeat),
+            frames_per_batch=env.num_envs * self._frames,
+            exploration_type=ExplorationType.DETERMINISTIC,
+        )
+
+    def returns(self, seed: int) -> torch.Tensor:
+        """Returns the return of each episode, shape ``(episodes,)``; ``seed`` decides their initial states."""
+        env = self.env
+        env.set_seed(seed)
+        self._collector.load_state_dict({})
+        returns = torch.zeros(env.num_envs, 1, device=env.device)
+        alive = torch.ones_like(returns, dtype=torch.bool)
+        pieces = math.ceil(env.config.episode_length / self._frames)
+        for _ in trange(pieces, desc="evaluation", leave=False, disable=None):  # no bar in logs
+            after = self._collector.rollout()["next"]
+            for reward, done in zip(after["reward"].unbind(1), after["done"].unbind(1), strict=True):
+                returns += reward * alive
+                alive &= ~done
+        return returns.squeeze(-1)
+
+
+class _Held(nn.Module):
+    """A policy each of whose actions is held for several frames; recordings have whole numbers of actions."""
+
+    out_keys = ("action",)
+
+    def __init__(self, policy: PolicyFunc, action_repeat: int) -> None:
+        super().__init__()
+        self._policy, self._repeat, self._frame = policy, action_repeat, 0
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Returns ``td`` with the action, which the policy chooses in the first of its frames."""
+        if self._frame % self._repeat == 0:
+            self._action = self._policy(td.copy())["action"]
+        self._frame += 1
+        return td.set("action", self._action)
 
 
 def summarize(returns: torch.Tensor) -> dict[str, float]:
@@ -90,7 +131,7 @@ def evaluate_policy(policy: Policy, episodes: int | None = None, seed: int | Non
     device = str(next(policy.parameters()).device)
     with settings_for_small_networks():
         env = make_for(policy, episodes, device, seed)
-        return summarize(episode_returns(policy, env, seed, info["action_repeat"]))
+        return summarize(Evaluator(policy, env, info["action_repeat"]).returns(seed))
 
 
 def evaluate_run(

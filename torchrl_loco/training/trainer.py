@@ -19,7 +19,7 @@ from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networ
 from torchrl_loco.training.config import check_loggers
 from torchrl_loco.training.environments import Environments, source_of, unwrapped
 from torchrl_loco.training.episodes import Episodes
-from torchrl_loco.training.evaluation import describe, episode_returns, evaluation_seed, shipped_return, summarize
+from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, shipped_return, summarize
 from torchrl_loco.training.given import Given
 from torchrl_loco.training.interrupts import interruptible
 from torchrl_loco.training.lock import lock, unlock
@@ -103,6 +103,7 @@ class Trainer:
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
         self._non_finite, self._said = 0, set[str]()
         self._best = -math.inf  # the evaluation that selected the policy
+        self._evaluator: Evaluator | None = None
         if not first:  # the networks began alike, from here on each rank draws actions of its own
             torch.manual_seed(distributed.own_seed(config.seed))
         if checkpoint is not None:
@@ -273,7 +274,10 @@ class Trainer:
         """Returns what a policy earns in the episodes that select the best policy, or in those at the end."""
         config, seed = self.config, evaluation_seed(self.config.seed, final)
         env = self.environments.evaluation(config.eval_episodes, seed)
-        return summarize(episode_returns(policy, env, seed, config.action_repeat))
+        if self._evaluator is None or self._evaluator.env is not env:  # with transforms it is a new one
+            self._evaluator = Evaluator(policy, env, config.action_repeat)
+        self._evaluator.policy.load_state_dict(policy.state_dict())
+        return summarize(self._evaluator.returns(seed))
 
     def _finish(self) -> None:
         """Evaluates the best policy in episodes that did not select it, plots the learning curve, records a video."""
