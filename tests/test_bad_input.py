@@ -99,6 +99,7 @@ def test_pictures(env):
         ("camera", "front", ValueError),
         ("width", 0, ValueError),
         ("height", 1.5, TypeError),
+        ("worlds", env.num_envs + 1, ValueError),
     ]:
         with pytest.raises(error, match="choose one of side, back, egocentric" if argument == "camera" else argument):
             env.render(**{argument: value})

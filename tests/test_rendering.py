@@ -28,6 +28,7 @@ def test_every_camera_sees_its_world_and_changes_nothing(shared, task, device):
         assert pixels.device == env.device
         assert len(pixels[0].flatten(0, 1).unique(dim=0)) > 20
         pictures[camera] = pixels, pixels.clone()
+        assert torch.equal(env.render(camera, 64, 48, worlds=1), pixels[:1])
     assert orange(pictures["side"][0]).float().mean() > 0.01
     assert (env.get_state() == before).all()
     env.rollout(3)

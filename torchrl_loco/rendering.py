@@ -7,36 +7,37 @@ from torchrl_loco.sim import EXCLUSIVE, Simulation, current_stream, mjw
 
 
 class Renderer:
-    """Renders the worlds of a simulation through one camera.
+    """Renders the first worlds of a simulation through one camera.
 
     Args:
         sim: the simulation whose current state is shown.
         camera: name of a camera of the model.
         width: pixels in a row, at least 1.
         height: rows, at least 1.
+        worlds: how many worlds.
     """
 
-    def __init__(self, sim: Simulation, camera: str, width: int, height: int) -> None:
-        self._sim = sim
+    def __init__(self, sim: Simulation, camera: str, width: int, height: int, worlds: int) -> None:
+        self._sim, self._worlds = sim, worlds
         with EXCLUSIVE, wp.ScopedDevice(sim.device):
             self._context = mjw.create_render_context(
                 sim.mj_model,
-                nworld=sim.num_envs,
+                nworld=worlds,
                 cam_res=(width, height),
                 render_rgb=True,
                 use_shadows=True,
                 render_skybox=True,
                 cam_active=[camera],
             )
-            self._rgb = wp.zeros((sim.num_envs, height, width), dtype=wp.vec3)
+            self._rgb = wp.zeros((worlds, height, width), dtype=wp.vec3)
         self._pixels = wp.to_torch(self._rgb)
         wp.synchronize_device(sim.device)  # made on Warp's stream, used on torch's
 
     def render(self) -> torch.Tensor:
-        """Returns the current state of all worlds as uint8 pixels, shape ``(num_envs, height, width, 3)``."""
+        """Returns the current state of the worlds as uint8 pixels, shape ``(worlds, height, width, 3)``."""
         sim = self._sim
         with EXCLUSIVE, wp.ScopedDevice(sim.device), wp.ScopedStream(current_stream(sim.device)):
-            data = sim.mujoco_data()
+            data = sim.mujoco_data(worlds=self._worlds)
             mjw.camlight(sim.model, data)
             mjw.refit_bvh(sim.model, data, self._context)
             mjw.render(sim.model, data, self._context)

@@ -25,6 +25,7 @@ from torchrl_loco.checks import (
     ANY,
     COUNT,
     SEED,
+    Interval,
     check_bool,
     check_choice,
     check_device,
@@ -671,25 +672,30 @@ class LocoEnv(EnvBase):
             "another, or env.get_state() to copy its worlds"
         )
 
-    def render(self, camera: str = "side", width: int = 320, height: int = 240) -> torch.Tensor:
-        """Ray-traces every world, on the CPU or CUDA, without OpenGL.
+    def render(
+        self, camera: str = "side", width: int = 320, height: int = 240, worlds: int | None = None
+    ) -> torch.Tensor:
+        """Ray-traces worlds, on the CPU or CUDA, without OpenGL.
 
         Args:
             camera: name of one of the model's cameras; those of the package have ``"side"``, ``"back"`` and
                 ``"egocentric"``.
             width: pixels in a row.
             height: rows.
+            worlds: how many worlds, the first of all; ``None`` is all.
 
         Returns:
-            uint8 tensor of shape ``(num_envs, height, width, 3)``.
+            uint8 tensor of shape ``(worlds, height, width, 3)``.
 
         Raises:
-            ValueError: the model has no such camera, or a size is not positive.
-            TypeError: a size is not an integer.
+            ValueError: the model has no such camera, a size is not positive, or there are not so many worlds.
+            TypeError: a size or number is not an integer.
         """
         model = self.mj_model
         check_choice("camera", camera, [model.camera(i).name for i in range(model.ncam)])
-        pixels = self.world.render(camera, check_int("width", width), check_int("height", height))
+        size = check_int("width", width), check_int("height", height)
+        worlds = self.num_envs if worlds is None else check_int("worlds", worlds, Interval(1, self.num_envs + 1))
+        pixels = self.world.render(camera, *size, worlds)
         return pixels if self.batch_size else pixels[0]
 
     def health(self) -> TensorDict:

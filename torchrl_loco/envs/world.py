@@ -167,7 +167,7 @@ class World:
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
             for monitor in self._monitors:
                 monitor.restart()
-        self._renderers: dict[tuple[str, int, int], Renderer] = {}
+        self._renderers: dict[tuple[str, int, int, int], Renderer] = {}
         self._pid, self._closed = os.getpid(), False
         _WORLDS.add(self)
 
@@ -523,9 +523,9 @@ class World:
         self.seed.torch.fill_(seed)
         self._seed_of_hooks.fill_(seed)
 
-    def render(self, camera: str, width: int, height: int) -> torch.Tensor:
-        """Returns pixels of all worlds, uint8 of shape ``(nworld, height, width, 3)``."""
-        key = (camera, width, height)
+    def render(self, camera: str, width: int, height: int, worlds: int) -> torch.Tensor:
+        """Returns pixels of the first worlds, uint8 of shape ``(worlds, height, width, 3)``."""
+        key = (camera, width, height, worlds)
         if key not in self._renderers:
             with self.sim.qpos.device:
                 self._renderers[key] = Renderer(self.sim, *key)

@@ -143,7 +143,7 @@ class Simulation:
         engines: dict[str, type] = {"compiled": compiled.CompiledEngine, "mujoco_warp": mujoco_warp.MujocoWarpEngine}
         self.engine = engines[name](mj_model, config, num_envs, self.device, geoms, differing, rows)
         self.model, self.data = self.engine.model, self.engine.data
-        self._mujoco_data: mjw.Data | None = None
+        self._mujoco_data: dict[int, mjw.Data] = {}
         self._batched: BatchedModel | None = None
         self._every = wp.ones(num_envs, dtype=bool, device=self.device)
         self._kernels: dict[tuple[wp.Function, ...], WorldKernel] = {}
@@ -248,7 +248,7 @@ class Simulation:
         """
         self.engine.forward(mask, after=after, contacts=contacts)
 
-    def mujoco_data(self, *, contacts: bool = False) -> "mjw.Data":
+    def mujoco_data(self, *, contacts: bool = False, worlds: int | None = None) -> "mjw.Data":
         """Returns the present state as ``mjData`` of MuJoCo-Warp, with poses of geoms, sites and cameras.
 
         Under the engine ``compiled`` it is made at the first call, and takes the memory of the other engine: several
@@ -256,21 +256,23 @@ class Simulation:
 
         Args:
             contacts: whether contacts and constraints are found too; that takes a part of a physics step.
+            worlds: how many of the first worlds it has; ``None`` is all.
         """
-        if isinstance(self.data, mjw.Data):
+        worlds = self.num_envs if worlds is None else worlds
+        if isinstance(self.data, mjw.Data) and worlds == self.num_envs:
             data = self.data
         else:
-            if self._mujoco_data is None:
+            if worlds not in self._mujoco_data:
                 with wp.ScopedDevice(self.device):
-                    self._mujoco_data = mjw.make_data(
+                    self._mujoco_data[worlds] = mjw.make_data(
                         with_every_row(self.mj_model, self.varied),
-                        nworld=self.num_envs,
+                        nworld=worlds,
                         naconmax=self.config.naconmax,
                         njmax=self.config.njmax,
                     )
-            data = self._mujoco_data
+            data = self._mujoco_data[worlds]
             for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time"):
-                wp.copy(getattr(data, name), getattr(self.data, name))
+                wp.copy(getattr(data, name), getattr(self.data, name)[:worlds])
             model = self._model_of_each_world()
             mjw.kinematics(model, data)
             mjw.com_pos(model, data)

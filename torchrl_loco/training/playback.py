@@ -35,7 +35,7 @@ def record(
     ):
         video.init_video_stream("h264", fps=frame_rate)
         for _ in play(policy, env, action_repeat, round(seconds * frame_rate), "video"):
-            video.write_frame(env.render(camera, 480, 360)[0].cpu().numpy())
+            video.write_frame(env.render(camera, 480, 360, worlds=1)[0].cpu().numpy())
     replace_file(path, content.getvalue())
 
 

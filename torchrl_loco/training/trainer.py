@@ -286,7 +286,7 @@ class Trainer:
         summary = self._summary(policy, final=True)
         plot_runs([self.run], self.run.path / "learning_curve.png")
         if config.video_seconds > 0:
-            env = self.environments.evaluation(1, evaluation_seed(config.seed, final=True))
+            env = self.environments.evaluation(config.eval_episodes, evaluation_seed(config.seed, final=True))
             record(policy, env, self.run.video, config.video_seconds, config.action_repeat)
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
