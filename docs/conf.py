@@ -76,12 +76,18 @@ def sign_environment(app, what, name, thing, options, signature, returns):
     return None
 
 
-def find_notebooks(app, page, source):
-    """Points links to notebooks, which are right on GitHub, to where the site has them."""
-    source[0] = re.sub(r"\]\((?:\.\./)+notebooks/(\w+\.ipynb)\)", r"](/generated/notebooks/\1)", source[0])
+def from_github(app, page, source):
+    """Makes a page of the site of one that GitHub shows.
+
+    Comments that begin with ``{directive}`` are directives, what stands between ``on GitHub`` and ``end`` is left out,
+    and links to notebooks point to where the site has them.
+    """
+    text = re.sub(r"<!-- on GitHub -->.*?<!-- end -->\n", "", source[0], flags=re.DOTALL)
+    text = re.sub(r"<!-- (\{[\w-]+\}.*?)-->", r"```\1```", text, flags=re.DOTALL)
+    source[0] = re.sub(r"\]\((?:\.\./)+notebooks/(\w+\.ipynb)\)", r"](/generated/notebooks/\1)", text)
 
 
 def setup(app):
     """Registers what Sphinx calls."""
-    app.connect("source-read", find_notebooks)
+    app.connect("source-read", from_github)
     app.connect("autodoc-process-signature", sign_environment)
