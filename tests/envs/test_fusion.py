@@ -1,5 +1,9 @@
 """Parts of a step as one kernel: the numbers of plain torch, for any number of worlds, or a refusal that says why."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
 import warp as wp
@@ -409,3 +413,25 @@ def test_a_world_does_the_same_among_few_and_many():
         ends.append([arrays[name][:3] for name in arrays if name.startswith("out")])
     for few, among_many in zip(*ends, strict=True):
         assert torch.equal(few.view(torch.int32), among_many.view(torch.int32))
+
+
+TELL = """
+import hashlib, torchrl_loco
+from torchrl_loco.envs import fusion
+
+plain = fusion._kernel
+fusion._kernel = lambda text, *args: print(hashlib.sha256(text.encode()).hexdigest()) or plain(text, *args)
+torchrl_loco.make("go1_velocity", 2, "cpu", seed=0)
+"""
+
+
+@pytest.mark.slow
+def test_kernels_are_found_in_the_cache_by_every_process():
+    """Whatever the order of Python's sets in it."""
+    texts = set()
+    for seed in ("0", "3"):  # between which the order of the arrays of contacts differs
+        env = {**os.environ, "PYTHONHASHSEED": seed}
+        made = subprocess.run([sys.executable, "-c", TELL], env=env, capture_output=True, text=True, check=True)
+        texts.add(made.stdout)
+    assert len(texts) == 1
+    assert len(texts.pop().split()) == 6

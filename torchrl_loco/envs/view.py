@@ -16,7 +16,7 @@ from torchrl_loco.sim import models
 
 OF_A_STEP = frozenset({"action", "ctrl"})
 """What belongs to a step: an observation is also made after a reset, where there was none."""
-CONTACT_HISTORY = frozenset({"contact_force_history", "in_contact_history"})
+CONTACT_HISTORY = ("contact_force_history", "in_contact_history")
 """Arrays of contacts with a row for each substep."""
 
 

@@ -123,7 +123,7 @@ class World:
             asked: dict[str, Any] = {}
             if hooks and hooks.catalog.contact_geoms:
                 asked["contact_geoms"] = hooks.catalog.contact_geoms
-                asked["contact_history"] = bool(hooks.catalog.arrays & CONTACT_HISTORY)
+                asked["contact_history"] = not hooks.catalog.arrays.isdisjoint(CONTACT_HISTORY)
             if self._variation is not None:
                 asked["varied"] = self._variation.varied
             self.sim = Simulation(mj_model, task.config, n, task.device, **asked)
@@ -352,12 +352,12 @@ class World:
         """Returns the other arrays that hooks read and write, by name."""
         sim, catalog = self.sim, hooks.catalog
         arrays = {name: getattr(sim, name) for name in ("qvel", "ctrl", "xpos", "xmat")}
-        arrays |= {name: getattr(sim, name) for name in catalog.arrays & {"cvel", "subtree_com"}}
+        arrays |= {name: getattr(sim, name) for name in ("cvel", "subtree_com") if name in catalog.arrays}
         if "sensordata" in catalog.arrays:
             arrays["sensordata"] = wp.to_torch(sim.data.sensordata)
         if catalog.contact_geoms:
             arrays |= {"contact_force": sim.contact_force, "in_contact": sim.in_contact}
-            arrays |= {name: getattr(sim, name) for name in catalog.arrays & CONTACT_HISTORY}
+            arrays |= {name: getattr(sim, name) for name in CONTACT_HISTORY if name in catalog.arrays}
         arrays |= {
             "action": self.action.torch,
             "elapsed_steps": self.elapsed_steps.torch,
