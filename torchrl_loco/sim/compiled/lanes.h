@@ -314,6 +314,7 @@ struct Step : Math {
 #ifdef __CUDA_ARCH__
   INLINE void sync() const { __syncwarp(); }
   INLINE unsigned ballot(bool x) const { return __ballot_sync(~0u, x); }
+  INLINE bool any_of_block(bool x) const { return Model::LOCKSTEP && Model::SUBSTEPS ? __syncthreads_or(x) : x; }
   INLINE float read(float x, int from) const { return __shfl_sync(~0u, x, from); }
   INLINE int read(int x, int from) const { return __shfl_sync(~0u, x, from); }
 
@@ -353,6 +354,7 @@ struct Step : Math {
 #else
   INLINE void sync() const {}
   INLINE unsigned ballot(bool x) const { return x; }
+  INLINE bool any_of_block(bool x) const { return x; }
   INLINE float read(float x, int) const { return x; }
   INLINE int read(int x, int) const { return x; }
   INLINE void sum(float*, const int) const {}
@@ -1713,72 +1715,88 @@ struct Step : Math {
     return Converged::flat(gradient_squared, decrement, Model::scale(), Model::tolerance());
   }
 
-  // Leaves the acceleration in qacc; with implicit damping, search is what has to be added to it before integration.
-  INLINE void solve() {
-    enum { VELOCITY = -2, ACCELERATION = -1 };  // two passes first, which bring both into the rows
-    float gradient_squared = 0.0f, decrement = 0.0f;  // where the current direction begins
-    Search step = {0.0f, 0.0f};
-    bool same = false, stop = false;  // whether the last step left all rows on their sides; whether qacc is final
-    ROLLED for (int iteration = VELOCITY;; ++iteration) {
-      if (!stop && iteration == Model::ITERATIONS) {
-        stop = true;
-        if (lane == 0 && Model::SUBSTEPS && !small(step)) overflow[world] |= Model::LIMIT_REACHED;
-      }
-      if (stop && !Model::IMPLICIT_DAMPING) break;
-      if (iteration < 0) {
-        SHARED_LOOP(d, DOFS) w.search[d] = iteration == VELOCITY ? w.qvel[d] : w.qacc[d];
-      } else {
-        float t[2] = {0.0f, 0.0f};  // gradient squared, and minus its product with the new direction
-        turn(stop, t);
-        if (stop) break;
-        sum(t, 2);
-        gradient_squared = t[0];
-        decrement = t[1];
-      }
-      if (iteration > 0 && (small(step) || flat(gradient_squared, decrement))) {
-        stop = true;
-        continue;
-      }
-      sync();
-      project_search();
-      SHARED_LOOP(r, rows()) {
-        const float v = row_velocity(r);
-        if (iteration == VELOCITY) w.x[r] += row_damping(r) * v;
-        else if (iteration == ACCELERATION) w.x[r] += v;
-        else w.change[r] = v;
-      }
-      if (iteration == ACCELERATION) SHARED_LOOP(d, DOFS) w.residual[d] += w.mass_search[d];
-      sync();
-      if (iteration < 0) continue;
-      step = line_search(decrement);
-      if (step.alpha == 0.0f) {
-        stop = true;
-        continue;
-      }
-      OWN_DOFS(slot, d) {
-        if (d >= DOFS) continue;
-        w.qacc[d] += step.alpha * w.search[d];
-        w.residual[d] += step.alpha * w.mass_search[d];
-      }
-      bool crossed = false;
+  enum { VELOCITY = -2, ACCELERATION = -1 };  // two passes first, which bring both into the rows
+
+  struct Newton {
+    float gradient_squared, decrement;  // where the current direction begins
+    Search step;
+    bool same;  // whether the last step left all rows on their sides
+    bool stop, runs;  // whether qacc is final; whether anything is left to do
+  };
+
+  // Sets the direction, and how all changes along it; returns whether it is to be searched.
+  INLINE bool set_direction(const int iteration, Newton& n) {
+    n.stop = n.stop || (iteration > 0 && small(n.step));
+    if (!n.stop && iteration == Model::ITERATIONS) {
+      n.stop = true;
+      if (lane == 0 && Model::SUBSTEPS) overflow[world] |= Model::LIMIT_REACHED;
+    }
+    n.runs = !n.stop || Model::IMPLICIT_DAMPING;
+    if (!n.runs) return false;
+    if (iteration < 0) {
+      SHARED_LOOP(d, DOFS) w.search[d] = iteration == VELOCITY ? w.qvel[d] : w.qacc[d];
+    } else {
+      float t[2] = {0.0f, 0.0f};  // gradient squared, and minus its product with the new direction
+      turn(n.stop, t);
+      n.runs = !n.stop;
+      if (n.stop) return false;
+      sum(t, 2);
+      n.gradient_squared = t[0];
+      n.decrement = t[1];
+    }
+    n.stop = iteration > 0 && flat(n.gradient_squared, n.decrement);
+    if (n.stop) return false;
+    sync();
+    project_search();
+    SHARED_LOOP(r, rows()) {
+      const float v = row_velocity(r);
+      if (iteration == VELOCITY) w.x[r] += row_damping(r) * v;
+      else if (iteration == ACCELERATION) w.x[r] += v;
+      else w.change[r] = v;
+    }
+    if (iteration == ACCELERATION) SHARED_LOOP(d, DOFS) w.residual[d] += w.mass_search[d];
+    sync();
+    return iteration >= 0;
+  }
+
+  // Searches the direction, and moves along it.
+  INLINE void move(Newton& n) {
+    const Search step = n.step = line_search(n.decrement);
+    n.stop = step.alpha == 0.0f;
+    if (n.stop) return;
+    OWN_DOFS(slot, d) {
+      if (d >= DOFS) continue;
+      w.qacc[d] += step.alpha * w.search[d];
+      w.residual[d] += step.alpha * w.mass_search[d];
+    }
+    bool crossed = false;
 //IF ELLIPTIC
-      SHARED_LOOP(k, frictional) crossed = move_cone(k, step.alpha) || crossed;
+    SHARED_LOOP(k, frictional) crossed = move_cone(k, step.alpha) || crossed;
 //END
-      SHARED_LOOP(i, rows() - first_single()) {
-        const int r = first_single() + i;
-        const float x = w.x[r], next = x + step.alpha * w.change[r];
-        const bool dry = Model::FRICTION_LOSSES && r >= first_friction();
-        const float bound = dry ? Model::friction_bound(r - first_friction()) : 0.0f;
-        crossed = crossed || (dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next));
-        w.x[r] = next;
-      }
-      sync();
-      const bool repeated = same;
-      same = ballot(crossed) == 0;
-      if (same) {  // what is left of a Newton step; of a second one on the same parabola, rounding
-        const float left = (1.0f - step.alpha) * (1.0f - step.alpha);
-        stop = repeated || small(step) || flat(gradient_squared * left, decrement * left);
-      }
+    SHARED_LOOP(i, rows() - first_single()) {
+      const int r = first_single() + i;
+      const float x = w.x[r], next = x + step.alpha * w.change[r];
+      const bool dry = Model::FRICTION_LOSSES && r >= first_friction();
+      const float bound = dry ? Model::friction_bound(r - first_friction()) : 0.0f;
+      crossed = crossed || (dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next));
+      w.x[r] = next;
+    }
+    sync();
+    const bool repeated = n.same;
+    n.same = ballot(crossed) == 0;
+    if (n.same) {  // what is left of a Newton step; of a second one on the same parabola, rounding
+      const float left = (1.0f - step.alpha) * (1.0f - step.alpha);
+      n.stop = repeated || small(step) || flat(n.gradient_squared * left, n.decrement * left);
+    }
+  }
+
+  // Leaves the acceleration in qacc; with implicit damping, search is what has to be added to it before integration.
+  // The worlds of a block begin each iteration together, those that are done too.
+  INLINE void solve(const bool live) {
+    Newton n = {0.0f, 0.0f, {0.0f, 0.0f}, false, false, live};
+    ROLLED for (int iteration = VELOCITY; any_of_block(n.runs); ++iteration) {
+      const bool searches = n.runs && set_direction(iteration, n);
+      if (searches) move(n);
     }
     sync();
   }
@@ -2030,7 +2048,7 @@ if (live && Model::SUBSTEPS == 0) {  // a step that is not taken finds forces
   step.kinematics();
   step.dynamics();
   step.keep_contacts();
-  step.solve();
+  step.solve(true);
   step.write_touch(sensors);
 //IF CONTACT_HISTORY
   ROLLED for (int row = 0; row < Model::HISTORY; ++row)
@@ -2043,7 +2061,7 @@ if (live && Model::SUBSTEPS == 0) {  // a step that is not taken finds forces
 if (live && Model::TOUCH && Model::SUBSTEPS == 0) {  // touch is a force: a step that is not taken finds it
   step.kinematics();
   step.dynamics();
-  step.solve();
+  step.solve(true);
   step.write_touch(sensors);
 }
 //END
@@ -2051,9 +2069,8 @@ ROLLED for (int substep = 0;; ++substep) {
   LOCKSTEP();
   if (live) step.kinematics();
   if (substep == Model::SUBSTEPS) break;
-  if (live) step.dynamics();
-  LOCKSTEP();
   if (live) {
+    step.dynamics();
 //IF CONTACT_HISTORY
     step.keep_contacts();
 //ELSE
@@ -2061,7 +2078,9 @@ ROLLED for (int substep = 0;; ++substep) {
     if (substep == Model::SUBSTEPS - 1) step.keep_contacts();
 //END
 //END
-    step.solve();
+  }
+  step.solve(live);
+  if (live) {
     if (Model::TOUCH && substep == Model::SUBSTEPS - 1) step.write_touch(sensors);
 //IF CONTACT_HISTORY
     const int first = Model::CONTACT_GEOMS * substep;

@@ -69,7 +69,8 @@ SCHEDULERS, REGISTERS = 4, 16 * 1024
 MOST_WORLDS = 4
 """Worlds of a block, at most."""
 LOCKSTEP = True
-"""Whether the worlds of a block wait for each other twice a substep, so that they share what they fetch of the text."""
+"""Whether the worlds of a block begin each substep, and each iteration of its solver, together, so that they share what
+they fetch of the text."""
 MOST_TRUNK, MOST_LIMB = 8, 8
 """Degrees of freedom of the trunk, and of a limb, of a body whose limbs are eliminated side by side.
 
