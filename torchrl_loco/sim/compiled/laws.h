@@ -139,8 +139,8 @@ struct DryFriction {  // costs D x^2 / 2 while |x| is below a bound, and grows l
   }
 };
 
-// ---- Newton's method. Brackets, tolerances and stopping tests are those of mujoco_warp, but for two that save up to
-// half of the brackets: the first tries the secant, and a search may end near its minimum.
+// ---- Newton's method. Brackets, tolerances and stopping tests are those of mujoco_warp, but for two that save brackets:
+// the first tries the secant, and where iterations are many, a search may end near its minimum.
 
 struct Point {  // on the search direction: the cost relative to alpha = 0
   float alpha, cost, slope, curvature;

@@ -17,6 +17,25 @@ if (fabsf(start.slope) < noise) return result;
 
 const Point first = Point::at(1.0f, slope, curvature, whole + 1);
 result.take(first, first.ends(start, accept, LS_NEAR));
+if (LS_NEAR > 0.0f) {  // a step at a time: most searches end with the first or the second
+  Point low = start, high = start, last = first;
+  bool ends = result.improvement > 0.0f, between = false;  // whether the minimum lies between low and high
+  result.take(first, true);
+  ROLLED for (int i = 0; i < LS_ITERATIONS && !ends; ++i) {
+    if (last.slope < 0.0f) low = last;
+    else high = last;
+    between = between || !(last.slope < 0.0f);
+    float alphas[1] = {i == 0 && between ? low.secant(high) : last.newton()};
+    if (between && !(alphas[0] > low.alpha && alphas[0] < high.alpha)) alphas[0] = 0.5f * (low.alpha + high.alpha);
+    if (alphas[0] == last.alpha || alphas[0] == low.alpha || alphas[0] == high.alpha) break;
+    float sums[3] = {0.0f, 0.0f, 0.0f};
+    add_rows(alphas, 1, sums);
+    last = Point::at(alphas[0], slope, curvature, sums);
+    ends = last.ends(start, accept, LS_NEAR);
+    result.take(last, true);
+  }
+  return result;
+}
 const bool less = first.slope < start.slope;
 Point low = less ? first : start, high = less ? start : first;
 bool found = result.improvement > 0.0f;
