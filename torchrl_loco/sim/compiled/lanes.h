@@ -128,6 +128,7 @@ struct alignas(16) World {
       union {
         LocalPose local[Model::LINKS];
         Motion acceleration[Model::LINKS];
+        Motion momentum[DOFS];  // of the subtree that a degree of freedom moves, at unit velocity
       };
       Pose pose[Model::LINKS];
       Body bodies[Model::LINKS];
@@ -574,30 +575,25 @@ struct Step : Math {
   }
 
   // The mass matrix, and the residual: minus the smooth forces, until M qacc is added. Entries of degrees of freedom of
-  // which neither is an ancestor of the other stay zero.
+  // which neither is an ancestor of the other stay zero; of the others each is a lane's, the diagonal first.
   INLINE void mass_matrix() {
     OWN_DOFS(slot, d) {
       if (d >= DOFS) continue;
       const Body body = w.bodies[Model::dof_link(d)];
-      const Motion axis = w.axes[d], momentum = body.inertia * axis, bias = {body.torque, body.force};
+      const Motion axis = w.axes[d], bias = {body.torque, body.force};
+      w.momentum[d] = body.inertia * axis;
 //IF IMPLICIT_ACTUATORS
       w.residual[d] = axis.dot(bias) - joint_force(d, implicit_damping[slot]);
 //ELSE
       w.residual[d] = axis.dot(bias) - joint_force(d);
 //END
-//IF VARIED
-      const float armature = Model::armature(d);  // in the loop, lanes would wait for theirs in turn
-//END
-      ROLLED for (Model::Dofs left = Model::ancestors(d); left; left &= left - 1) {
-        const int j = lowest_bit(left);
-//IF VARIED
-        const float m = w.axes[j].dot(momentum) + (j == d ? armature : 0.0f);
-//ELSE
-        const float m = w.axes[j].dot(momentum) + (j == d ? Model::armature(d) : 0.0f);
-//END
-        w.mass[STRIDE * d + j] = m;
-        w.mass[STRIDE * j + d] = m;
-      }
+    }
+    sync();
+    SHARED_LOOP(i, Model::MASS_ENTRIES) {
+      const int entry = Model::mass_entry(i), d = entry / 64, j = entry % 64;
+      const float product = w.axes[j].dot(w.momentum[d]), m = i < DOFS ? product + Model::armature(d) : product;
+      w.mass[STRIDE * d + j] = m;
+      w.mass[STRIDE * j + d] = m;
     }
     sync();
   }

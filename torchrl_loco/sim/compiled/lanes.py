@@ -131,7 +131,7 @@ class Layout:
         vectors = pad(self.positions, 4) + 5 * self.stride + 8 * self.dofs + self.dofs * self.stride + 2 * self.rows
         before = 32 * contacts + 12 * (self.frictional + 1)
         solving = 4 * (max(4 * (self.stride + 4) + self.dofs // 2 + 1, self.limb_numbers) + self.rows)
-        kinematics = 144 * self.links + 32 * (self.geoms + 1) + 2 * self.candidates
+        kinematics = 32 * max(self.links, self.dofs) + 112 * self.links + 32 * (self.geoms + 1) + 2 * self.candidates
         total = 4 * vectors + pad(max(before, solving, 32 * self.links), 16)
         total = pad(total + 4 * self.jacobian_rows, 16)
         total += pad(max(kinematics, 4 * self.jacobian_rows * self.stride), 16)
@@ -401,7 +401,7 @@ class Description:
         self._add_links(tables)
         self._add_joints(tables)
         self._add_limbs(tables)
-        self._add_forces(tables, mask)
+        self._add_forces(tables)
         self._add_geoms(tables, mask)
         self._add_limits(tables)
         self._add_outputs(tables)
@@ -483,7 +483,7 @@ class Description:
         dofs = [self._dofs_of_geom(p.geoms[0]) ^ self._dofs_of_geom(p.geoms[1]) for p in self.pairs]
         tables.integers("crosses", [self.limbs.crosses(x) for x in dofs])
 
-    def _add_forces(self, tables: Tables, mask: str) -> None:
+    def _add_forces(self, tables: Tables) -> None:
         m = self.m
         stiffness, damping = m.jnt_stiffness[m.dof_jntid], m.dof_damping
         explicit = m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP) and not is_implicitfast(m)
@@ -493,7 +493,9 @@ class Description:
         tables.floats("spring", m.qpos_spring)
         tables.floats("damping", damping)
         tables.floats("armature", m.dof_armature)
-        tables.integers("ancestors", self.ancestors, mask)
+        above = [64 * d + j for d in range(m.nv) for j in self._dofs_to_root(m.dof_parentid[d])]
+        tables.size(MASS_ENTRIES=m.nv + len(above))
+        tables.integers("mass_entry", [*(64 * d + d for d in range(m.nv)), *above])
         dofs = m.jnt_dofadr[m.actuator_trnid[:, 0]]
         used = sorted(acting(m), key=lambda a: dofs[a])
         bias = affine_bias(m)[used]
