@@ -1689,10 +1689,13 @@ struct Step : Math {
     return (sums[0] + sums[1]) + (sums[2] + sums[3]);
   }
 
-  // M and J times the search direction.
+  // M and J times the search direction, a row a lane.
   INLINE void project_search() {
-    OWN_DOFS(slot, d) if (d < DOFS) w.mass_search[d] = times_search(w.mass + STRIDE * d);
-    SHARED_LOOP(r, jacobian_rows()) w.projected[r] = times_search(w.jacobian + STRIDE * r);
+    SHARED_LOOP(i, DOFS + jacobian_rows()) {
+      const int r = i - DOFS;
+      const float product = times_search(r < 0 ? w.mass + STRIDE * i : w.jacobian + STRIDE * r);
+      *(r < 0 ? w.mass_search + i : w.projected + r) = product;
+    }
     sync();
   }
 
