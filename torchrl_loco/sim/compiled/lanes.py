@@ -48,9 +48,11 @@ TRANSLATION, ROTATION = 0, 1
 UNLIMITED = 1e30
 MOST_VERTICES = 4000
 """Vertices of all meshes that touch something: tables count their corners with 16 bits."""
+LANES = 32
+"""Threads of a GPU that step a world."""
 BLOCK_BYTES = 48 * 1024
 """Static shared memory that a block of a GPU may have."""
-WARP_BYTES = 4 * 32
+WARP_BYTES = 4 * LANES
 """What Warp takes of it for the threads of a world, 4 bytes each, whether a kernel has tiles or not."""
 WORLD_BYTES = (
     11136,
@@ -736,13 +738,17 @@ class Description:
         """Returns how many registers of a thread leave a multiprocessor as many worlds as its shared memory does."""
         worlds = self.worlds_per_block()
         worlds *= MULTIPROCESSOR_BYTES // (worlds * (self.layout.bytes + WARP_BYTES) + SYSTEM_BYTES)
-        return min(REGISTERS // (32 * math.ceil(worlds / SCHEDULERS)) // 8 * 8, 255)
+        return min(REGISTERS // (LANES * math.ceil(worlds / SCHEDULERS)) // 8 * 8, 255)
 
     def elimination(self) -> str:
         """Returns calls that eliminate all rows, two by two, in parts: the fewer rows are left, the fewer columns."""
         last = self.m.nv - 1
         shares = () if last < 8 else (0.5,) if last < 16 else (0.25, 0.55)
-        edges = [last, *(last - 2 * int(last * share / 2) for share in shares), -(last % 2)]
+        edges = [last - 2 * int(last * share / 2) for share in shares]
+        if last >= LANES:  # where one row a lane is left
+            single = LANES - 1 - (LANES - 1 - last) % 2
+            edges[min(range(len(edges)), key=lambda i: abs(edges[i] - single))] = single
+        edges = [last, *edges, -(last % 2)]
         return "\n".join(f"    eliminate(h, {first}, {end});" for first, end in itertools.pairwise(edges))
 
 
