@@ -275,6 +275,8 @@ struct Step : Math {
   int frictional, frictionless;  // contacts
   int limits;                    // violated limits of hinges and slides
   int limit_row[Model::LIMIT_SIDES][SLOTS];  // the row of the limit of each own degree of freedom, or -1
+  // Of this lane's contacts, with friction and without, the quads of columns in which the Jacobian has numbers.
+  unsigned frictional_quads, frictionless_quads;
 //IF LIMBS
   bool crossing;  // whether a contact couples two limbs
 //END
@@ -318,6 +320,7 @@ struct Step : Math {
   INLINE bool any_of_block(bool x) const { return Model::LOCKSTEP && Model::SUBSTEPS ? __syncthreads_or(x) : x; }
   INLINE float read(float x, int from) const { return __shfl_sync(~0u, x, from); }
   INLINE int read(int x, int from) const { return __shfl_sync(~0u, x, from); }
+  INLINE unsigned read(unsigned x, int from) const { return __shfl_sync(~0u, x, from); }
 
   // Replaces each of n values by its sum over the lanes. With many of them, pairs of lanes first exchange halves, so
   // that each lane goes on with a quarter of the values.
@@ -358,6 +361,7 @@ struct Step : Math {
   INLINE bool any_of_block(bool x) const { return x; }
   INLINE float read(float x, int) const { return x; }
   INLINE int read(int x, int) const { return x; }
+  INLINE unsigned read(unsigned x, int) const { return x; }
   INLINE void sum(float*, const int) const {}
   INLINE void largest(float&, int&) const {}
 #endif
@@ -1074,7 +1078,24 @@ struct Step : Math {
     return normal.cross(first) * Model::friction_ratio(pair);
   }
 
+  static INLINE unsigned quads_of(int pair) {
+    Model::Dofs dofs = Model::first_dofs(pair) ^ Model::second_dofs(pair);
+    dofs |= dofs >> 1;
+    dofs |= dofs >> 2;
+    unsigned quads = 0;
+    UNROLLED for (int i = 0; i < QUADS; ++i) quads |= (unsigned)(dofs >> 4 * i & 1) << i;
+    return quads;
+  }
+
+  // Those of the contact whose number is the lane's; a lane that steps a world alone looks at each number itself.
+  INLINE unsigned own_quads(const Contact* contacts, const int count) const {
+    const int pair = lane < count ? contacts[lane].pair : Model::PAIRS;
+    return LANES > 1 && pair < Model::PAIRS ? quads_of(pair) : ~0u;
+  }
+
   INLINE void jacobians() {
+    frictional_quads = own_quads(w.contacts, frictional);
+    frictionless_quads = own_quads(w.contacts + Model::FRICTIONAL, frictionless);
     Motion axes[SLOTS];
     OWN_DOFS(slot, d) axes[slot] = w.axes[d < DOFS ? d : 0];
 //IF VARIED
@@ -1303,7 +1324,9 @@ struct Step : Math {
       const Law cost = law(k);
       if (cost.open()) continue;
       const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
+      const unsigned quads = k < LANES ? read(frictional_quads, k) : ~0u;
       OWN_DOFS(slot, dof) {
+        if (LANES > 1 && slot > 0 && !(quads >> LANES / 4 * slot)) break;
         const int e = dof < STRIDE ? dof : STRIDE - 1;
         float own[DIRECTIONS], c[DIRECTIONS];
         UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + e];
@@ -1317,6 +1340,7 @@ struct Step : Math {
         if (LANES == 1 && !some) continue;
         UNROLLED for (int i = 0; i < QUADS; ++i) {
           if (4 * i >= LANES * (slot + 1)) break;
+          if (LANES > 1 && !(quads >> i & 1)) continue;
           Quad columns[DIRECTIONS];
           UNROLLED for (int l = 0; l < DIRECTIONS; ++l) columns[l] = read4(rows + STRIDE * l + 4 * i);
           UNROLLED for (int j = 0; j < 4; ++j)
@@ -1329,13 +1353,16 @@ struct Step : Math {
       const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
       if (!(x < 0.0f)) continue;
       const float* n = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
+      const unsigned quads = k < LANES ? read(frictionless_quads, k) : ~0u;
       OWN_DOFS(slot, dof) {
+        if (LANES > 1 && slot > 0 && !(quads >> LANES / 4 * slot)) break;
         const float n0 = n[dof < STRIDE ? dof : STRIDE - 1], c = weight * n0;
         h.gradient[slot] += c * x;
         h.diagonal[slot] += c * n0;
         if (LANES == 1 && c == 0.0f) continue;
         UNROLLED for (int i = 0; i < QUADS; ++i) {
           if (4 * i >= LANES * (slot + 1)) break;
+          if (LANES > 1 && !(quads >> i & 1)) continue;
           const Quad a = read4(n + 4 * i);
           UNROLLED for (int j = 0; j < 4; ++j) h.row[slot][4 * i + j] += c * a.v[j];
         }
