@@ -429,7 +429,7 @@ torchrl_loco.make("go1_velocity", 2, "cpu", seed=0)
 def test_kernels_are_found_in_the_cache_by_every_process():
     """Whatever the order of Python's sets in it."""
     texts = set()
-    for seed in ("0", "3"):  # between which the order of the arrays of contacts differs
+    for seed in ("0", "1"):  # between which the order of the arrays of contacts differs
         env = {**os.environ, "PYTHONHASHSEED": seed}
         made = subprocess.run([sys.executable, "-c", TELL], env=env, capture_output=True, text=True, check=True)
         texts.add(made.stdout)
