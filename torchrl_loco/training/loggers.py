@@ -94,6 +94,14 @@ class _Tensorboard(TensorboardLogger):
 
         return SummaryWriter(os.path.join(self.log_dir, self.exp_name), purge_step=self._first)
 
+    def log_metrics(self, metrics: Any, step: int | None = None, *, keys_sep: str = "/") -> dict[str, Any]:
+        """Returns the metrics, which become one event: TorchRL's becomes one for each, and takes a millisecond."""
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        values = [Summary.Value(tag=name, simple_value=value) for name, value in metrics.items()]
+        self.experiment.file_writer.add_summary(Summary(value=values), step)
+        return metrics
+
 
 def _open_wandb(folder: Path, frames: int, id: str | None) -> Logger:
     project = os.environ.get("WANDB_PROJECT", PROJECT)
