@@ -652,14 +652,12 @@ struct Step : Math {
                           Vec hint) {
     const int left = Model::JACOBIAN_ROWS - DIRECTIONS * frictional;
     const int places = friction ? Model::FRICTIONAL : left < Model::FRICTIONLESS ? left : Model::FRICTIONLESS;
+    int& count = friction ? frictional : frictionless;
     const unsigned hits = ballot(touches);
-    int count = friction ? frictional : frictionless, place = count + bits(hits & lanes_below());
+    int place = count + bits(hits & lanes_below());
     count += bits(hits);
-    const bool full = count > places;
-    if (full) count = places;
-    if (friction) frictional = count;
-    else frictionless = count;
-    if (full) {
+    if (count > places) {
+      count = places;
       if (lane == 0 && Model::SUBSTEPS) overflow[world] |= Model::NO_PLACE;
       place = make_room(touches, w.contacts + (friction ? 0 : Model::FRICTIONAL), place, places, pair,
                         distance - Model::margin(pair));
@@ -857,50 +855,10 @@ struct Step : Math {
 
   struct Ends { float first, second; int points; };  // on a capsule's segment, in half axes from its center
 
-  // The point of a capsule's segment that is nearest to an edge of a box: its squared distance, where it lies on both,
-  // and on which part of the edge: its start, between, or its end.
-  struct OnEdge { float squared, at, on_edge; int part; };
-  enum { EDGES = 12, EDGE_LANES = 16 };  // of a box, and of the lanes that share a capsule
-
-  static INLINE int start_of_edge(int e) {
-    const int below = (1 << e / 4) - 1;
-    return (e & 3 & below) | (e & 3 & ~below) << 1;
-  }
-
-  static INLINE OnEdge nearest_on_edge(int e, Vec center, Vec half, Vec size, float length_squared) {
-    const int axis = e / 4, start = start_of_edge(e);
-    const Vec h = from_axis(half, axis), s = from_axis(size, axis), c = from_axis(center, axis);
-    const bool up = start >> (axis < 2 ? axis + 1 : 0) & 1, out = start >> (axis ? axis - 1 : 2) & 1;
-    const Vec gap = {-c.x, (up ? s.y : -s.y) - c.y, (out ? s.z : -s.z) - c.z};
-    const float across = h.y * h.y + h.z * h.z;
-    if (s.x * s.x * across < MINVAL) return {1e38f, 0.0f, 0.0f, 1};  // parallel
-    float q = divide(h.y * gap.y + h.z * gap.z, across), p = divide(h.x * q - gap.x, s.x);
-    int part = 1;
-    if (fabsf(p) > 1.0f) {
-      part = p > 0.0f ? 2 : 0;
-      p = p > 0.0f ? 1.0f : -1.0f;
-      q = divide(h.dot(gap) + p * s.x * h.x, length_squared);
-    }
-    if (fabsf(q) > 1.0f) {
-      q = q > 0.0f ? 1.0f : -1.0f;
-      p = divide(q * h.x - gap.x, s.x);
-      if (fabsf(p) > 1.0f) {
-        part = p > 0.0f ? 2 : 0;
-        p = p > 0.0f ? 1.0f : -1.0f;
-      }
-    }
-    const Vec apart = gap - h * q + Vec{p * s.x, 0.0f, 0.0f};
-    return {apart.dot(apart), q, p, part};
-  }
-
   // The point of a capsule's segment that is nearest to a box; and if the capsule lies along a face or an edge, the
-  // point up to which it does. The choices, and their order where several are as near, are MuJoCo's. Of 16 lanes that
-  // share a capsule, each looks at an edge.
-  INLINE Ends capsule_and_box(Vec center, Vec half, Vec size) const {
+  // point up to which it does. The choices, and their order where several are as near, are MuJoCo's.
+  static INLINE Ends capsule_and_box(Vec center, Vec half, Vec size) {
     const float length_squared = half.dot(half);
-    const int own_edge = lane % EDGE_LANES, others = lane - own_edge;
-    OnEdge own = {};
-    if (LANES > 1) own = nearest_on_edge(own_edge < EDGES ? own_edge : 0, center, half, size, length_squared);
     float nearest = 1e30f, at = 0.0f, on_edge = 0.0f;
     int face = -1, edge = -1, side = 1, corner = 0;
     ROLLED for (int end = 0; end < 2; ++end) {  // an end that is beyond one face, or inside
@@ -914,24 +872,40 @@ struct Step : Math {
       at = sign;
       face = beyond ? beyond / 2 : -1;
     }
-    ROLLED for (int e = 0; e < EDGES; ++e) {  // a point between the ends, or the end of an edge
-      OnEdge found;
-      if (LANES == 1) {
-        found = nearest_on_edge(e, center, half, size, length_squared);
-      } else {
-        const int from = others + e;
-        found = {read(own.squared, from), read(own.at, from), read(own.on_edge, from), read(own.part, from)};
+    ROLLED for (int e = 0; e < 12; ++e) {  // a point between the ends, or the end of an edge
+      const int axis = e / 4, below = (1 << axis) - 1, start = (e & 3 & below) | (e & 3 & ~below) << 1;
+      const Vec h = from_axis(half, axis), s = from_axis(size, axis), c = from_axis(center, axis);
+      const bool up = start >> (axis < 2 ? axis + 1 : 0) & 1, out = start >> (axis ? axis - 1 : 2) & 1;
+      const Vec gap = {-c.x, (up ? s.y : -s.y) - c.y, (out ? s.z : -s.z) - c.z};
+      const float across = h.y * h.y + h.z * h.z;
+      if (s.x * s.x * across < MINVAL) continue;  // parallel
+      float q = divide(h.y * gap.y + h.z * gap.z, across), p = divide(h.x * q - gap.x, s.x);
+      int part = 1;  // of the edge: its start, between, or its end
+      if (fabsf(p) > 1.0f) {
+        part = p > 0.0f ? 2 : 0;
+        p = p > 0.0f ? 1.0f : -1.0f;
+        q = divide(h.dot(gap) + p * s.x * h.x, length_squared);
       }
+      if (fabsf(q) > 1.0f) {
+        q = q > 0.0f ? 1.0f : -1.0f;
+        p = divide(q * h.x - gap.x, s.x);
+        if (fabsf(p) > 1.0f) {
+          part = p > 0.0f ? 2 : 0;
+          p = p > 0.0f ? 1.0f : -1.0f;
+        }
+      }
+      const Vec apart = gap - h * q + Vec{p * s.x, 0.0f, 0.0f};
+      const float squared = apart.dot(apart);
       // Rounding does not decide: of points that are as near, the first counts, but a point within an edge before a
       // corner, which is never nearer than what is within its edges.
-      const float least = found.part == 1 && side != 1 ? 1.00001f : 0.99999f;
-      if (!(found.squared < nearest * least - MINVAL)) continue;
-      nearest = found.squared;
-      at = found.at;
-      on_edge = found.on_edge;
-      edge = e / 4;
-      side = found.part;
-      corner = start_of_edge(e) | (side == 2) << edge;
+      const float least = part == 1 && side != 1 ? 1.00001f : 0.99999f;
+      if (!(squared < nearest * least - MINVAL)) continue;
+      nearest = squared;
+      at = q;
+      on_edge = p;
+      edge = axis;
+      side = part;
+      corner = start | (part == 2) << axis;
     }
 
     const float level = 1e-6f * root(length_squared);  // what is aligned but for rounding does not rise
@@ -977,46 +951,25 @@ struct Step : Math {
     return {at, at + sign * further, 2};
   }
 
-  struct BoxPair { Vec origin, size, center, half; Mat axes; float radius; int pair; };  // the capsule in the box's frame
-
-  INLINE BoxPair box_pair(int pair) const {
-    const int g = Model::second_geom(pair);
-    const Geom geom = w.geoms[Model::first_geom(pair)];
-    const Vec origin = w.geoms[g].center;
-    const Mat axes = geom_axes(g);
-    return {origin, Model::geom_size(g), axes.transposed_times(geom.center - origin),
-            axes.transposed_times(geom.half_axis), axes, geom.radius, pair};
-  }
-
-  // Whether a capsule is clear of one face of a box. Bounding spheres of a trunk hold its legs: most are.
-  INLINE bool beyond_a_face(const BoxPair& x) const {
-    const float reach = x.radius + Model::margin(x.pair);
-    bool beyond = false;
-    UNROLLED for (int i = 0; i < 3; ++i)
-      beyond = beyond || !(fabsf(x.center.component(i)) - fabsf(x.half.component(i)) < x.size.component(i) + reach);
-    return beyond;
-  }
-
   INLINE void collide_boxes(const int begin, const int end, const bool friction) {
     const int candidates = near_pairs(begin, end);
     ROLLED for (int base = 0; base < candidates; base += LANES) {
-      const bool listed = base + lane < candidates;
-      unsigned left = ballot(listed && !beyond_a_face(box_pair(listed ? w.candidates[base + lane] : begin)));
-      ROLLED for (; left; left &= left - 1) {  // two at a time, each by half of the lanes
-        const int first = lowest_bit(left);
-        left &= left - 1;
-        const bool upper = lane >= EDGE_LANES, some = !upper || left;
-        const int from = upper && left ? lowest_bit(left) : first;
-        const BoxPair x = box_pair(w.candidates[base + from]);
-        const bool is_capsule = x.half.dot(x.half) > MINVAL;
-        Ends ends;
-        if (LANES > 1 || is_capsule) ends = capsule_and_box(x.center, x.half, x.size);
-        if (!is_capsule) ends = {0.0f, 0.0f, 1};
-        ROLLED for (int i = lane % EDGE_LANES, turn = 0; turn < (LANES == 1 ? 2 : 1); ++i, ++turn) {  // of the points
-          const Depth depth = sphere_and_box(x.center + x.half * (i ? ends.second : ends.first), x.radius, x.size);
-          add_contact(some && i < ends.points && depth.distance < Model::margin(x.pair), friction, x.pair,
-                      x.origin + x.axes * depth.point, depth.distance, x.axes * depth.normal, {0.0f, 0.0f, 0.0f});
-        }
+      const bool valid = base + lane < candidates;
+      const int pair = valid ? w.candidates[base + lane] : begin, g = Model::second_geom(pair);
+      const Geom geom = w.geoms[Model::first_geom(pair)];
+      const Vec origin = w.geoms[g].center, size = Model::geom_size(g);
+      const Mat axes = geom_axes(g);
+      const Vec center = axes.transposed_times(geom.center - origin), half = axes.transposed_times(geom.half_axis);
+      const float reach = geom.radius + Model::margin(pair);
+      bool near = valid;  // bounding spheres of a trunk hold its legs: most are still clear of one of its faces
+      UNROLLED for (int i = 0; i < 3; ++i)
+        near = near && fabsf(center.component(i)) - fabsf(half.component(i)) < size.component(i) + reach;
+      if (!ballot(near)) continue;
+      const Ends ends = half.dot(half) > MINVAL ? capsule_and_box(center, half, size) : Ends{0.0f, 0.0f, 1};
+      ROLLED for (int i = 0; i < 2; ++i) {
+        const Depth depth = sphere_and_box(center + half * (i ? ends.second : ends.first), geom.radius, size);
+        add_contact(near && i < ends.points && depth.distance < Model::margin(pair), friction, pair,
+                    origin + axes * depth.point, depth.distance, axes * depth.normal, {0.0f, 0.0f, 0.0f});
       }
     }
     sync();
@@ -1039,29 +992,23 @@ struct Step : Math {
   INLINE void find_contacts() {
     frictional = frictionless = 0;
     if (Model::GEOMS > 0) place_geoms();
-    enum {
-      ALL_SLIDE = Model::PLANE_FRICTIONAL_END == Model::PLANE_END && Model::SOLID_FRICTIONAL_END == Model::SOLID_END &&
-                  Model::GEOM_FRICTIONAL_END == Model::GEOM_END && Model::BOX_FRICTIONAL_END == Model::PAIRS,
-    };
-    ROLLED for (int turn = 0; turn < (ALL_SLIDE ? 1 : 2); ++turn) {  // contacts with friction, then those without
-      const bool friction = ALL_SLIDE || turn == 0;
-      const auto find = [&](const auto collide, const int begin, const int middle, const int end) {
-        if (begin < end) collide(friction ? begin : middle, friction ? middle : end);
-      };
-      find([&](int i, int end) { collide_with_planes(i, end, friction); }, 0, Model::PLANE_FRICTIONAL_END,
-           Model::PLANE_END);
+    collide_with_planes(0, Model::PLANE_FRICTIONAL_END, true);
 //IF SOLIDS
-      find([&](int i, int end) { collide_solids_with_planes(i, end, friction); }, Model::PLANE_END,
-           Model::SOLID_FRICTIONAL_END, Model::SOLID_END);
+    collide_solids_with_planes(Model::PLANE_END, Model::SOLID_FRICTIONAL_END, true);
 //END
-      find([&](int i, int end) { collide_geoms(i, end, friction); }, Model::SOLID_END, Model::GEOM_FRICTIONAL_END,
-           Model::GEOM_END);
+    collide_geoms(Model::SOLID_END, Model::GEOM_FRICTIONAL_END, true);
 //IF BOXES
-      find([&](int i, int end) { collide_boxes(i, end, friction); }, Model::GEOM_END, Model::BOX_FRICTIONAL_END,
-           Model::PAIRS);
+    collide_boxes(Model::GEOM_END, Model::BOX_FRICTIONAL_END, true);
 //END
-      if (turn == 0) limit_balls();
-    }
+    limit_balls();
+    collide_with_planes(Model::PLANE_FRICTIONAL_END, Model::PLANE_END, false);
+//IF SOLIDS
+    collide_solids_with_planes(Model::SOLID_FRICTIONAL_END, Model::SOLID_END, false);
+//END
+    collide_geoms(Model::GEOM_FRICTIONAL_END, Model::GEOM_END, false);
+//IF BOXES
+    collide_boxes(Model::BOX_FRICTIONAL_END, Model::PAIRS, false);
+//END
     sync();
     if (Model::TOUCH) feel_contacts();
     sync();
