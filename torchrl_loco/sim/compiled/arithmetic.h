@@ -28,11 +28,13 @@ struct Math {
   }
   static INLINE int bits(unsigned x) { return __popc(x); }
   static INLINE int lowest_bit(unsigned x) { return __ffs(x) - 1; }
+  static INLINE int lowest_bit(unsigned long long x) { return __ffsll(x) - 1; }
 #else
   static INLINE float divide(float a, float b) { return a / b; }
   static INLINE float root(float x) { return sqrtf(x); }
   static INLINE int bits(unsigned x) { return __builtin_popcount(x); }
   static INLINE int lowest_bit(unsigned x) { return __builtin_ctz(x); }
+  static INLINE int lowest_bit(unsigned long long x) { return __builtin_ctzll(x); }
 #endif
 
   // x > 0 to a power, which is mostly 1 or 2.

@@ -75,6 +75,8 @@ enum {
   STRIDE = (DOFS + 3) / 4 * 4,  // of a row of a matrix; the columns beyond DOFS are zero
   QUADS = STRIDE / 4,
   SLOTS = (STRIDE + LANES - 1) / LANES,
+  SEVERAL_ROWS = SLOTS > 1,  // a lane has some: then what spares rounds pays for a longer text
+  SKIPS_QUADS = SEVERAL_ROWS && LANES > 1,  // a lane that steps a world alone looks at each number itself
   CONTACTS = Model::FRICTIONAL + Model::FRICTIONLESS,
   DIRECTIONS = Model::DIRECTIONS,  // in which a contact with friction acts, each with a row of the Jacobian
   CONTACT_ROWS = Model::CONTACT_ROWS,  // the constraint rows of such a contact
@@ -579,27 +581,37 @@ struct Step : Math {
   }
 
   // The mass matrix, and the residual: minus the smooth forces, until M qacc is added. Entries of degrees of freedom of
-  // which neither is an ancestor of the other stay zero; of the others each is a lane's, the diagonal first.
+  // which neither is an ancestor of the other stay zero. A lane has a row of the others or, where it has several rows, an
+  // entry off the diagonal.
   INLINE void mass_matrix() {
     OWN_DOFS(slot, d) {
       if (d >= DOFS) continue;
       const Body body = w.bodies[Model::dof_link(d)];
-      const Motion axis = w.axes[d], bias = {body.torque, body.force};
-      w.momentum[d] = body.inertia * axis;
+      const Motion axis = w.axes[d], momentum = body.inertia * axis, bias = {body.torque, body.force};
 //IF IMPLICIT_ACTUATORS
       w.residual[d] = axis.dot(bias) - joint_force(d, implicit_damping[slot]);
 //ELSE
       w.residual[d] = axis.dot(bias) - joint_force(d);
 //END
+      w.mass[STRIDE * d + d] = axis.dot(momentum) + Model::armature(d);
+      if (SEVERAL_ROWS) {
+        w.momentum[d] = momentum;
+        continue;
+      }
+      ROLLED for (Model::Dofs left = Model::ancestors(d); left; left &= left - 1)
+        set_mass(d, lowest_bit(left), momentum);
     }
     sync();
+    if (!SEVERAL_ROWS) return;
     SHARED_LOOP(i, Model::MASS_ENTRIES) {
-      const int entry = Model::mass_entry(i), d = entry / 64, j = entry % 64;
-      const float product = w.axes[j].dot(w.momentum[d]), m = i < DOFS ? product + Model::armature(d) : product;
-      w.mass[STRIDE * d + j] = m;
-      w.mass[STRIDE * j + d] = m;
+      const unsigned entry = Model::mass_entry(i), d = entry / 64;
+      set_mass(d, entry % 64, w.momentum[d]);
     }
     sync();
+  }
+
+  INLINE void set_mass(int d, int ancestor, Motion momentum) {
+    w.mass[STRIDE * d + ancestor] = w.mass[STRIDE * ancestor + d] = w.axes[ancestor].dot(momentum);
   }
 
   // ---- Contacts. Points are relative to the centre of mass of the first tree.
@@ -1025,19 +1037,9 @@ struct Step : Math {
     return normal.cross(first) * Model::friction_ratio(pair);
   }
 
-  static INLINE unsigned quads_of(int pair) {
-    Model::Dofs dofs = Model::first_dofs(pair) ^ Model::second_dofs(pair);
-    dofs |= dofs >> 1;
-    dofs |= dofs >> 2;
-    unsigned quads = 0;
-    UNROLLED for (int i = 0; i < QUADS; ++i) quads |= (unsigned)(dofs >> 4 * i & 1) << i;
-    return quads;
-  }
-
-  // Those of the contact whose number is the lane's; a lane that steps a world alone looks at each number itself.
+  // Those of the contact whose number is the lane's.
   INLINE unsigned own_quads(const Contact* contacts, const int count) const {
-    const int pair = lane < count ? contacts[lane].pair : Model::PAIRS;
-    return LANES > 1 && pair < Model::PAIRS ? quads_of(pair) : ~0u;
+    return SKIPS_QUADS && lane < count ? Model::quads(contacts[lane].pair) : ~0u;
   }
 
   INLINE void jacobians() {
@@ -1271,9 +1273,9 @@ struct Step : Math {
       const Law cost = law(k);
       if (cost.open()) continue;
       const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
-      const unsigned quads = k < LANES ? read(frictional_quads, k) : ~0u;
+      const unsigned quads = SKIPS_QUADS && k < LANES ? read(frictional_quads, k) : ~0u;
       OWN_DOFS(slot, dof) {
-        if (LANES > 1 && slot > 0 && !(quads >> LANES / 4 * slot)) break;
+        if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
         const int e = dof < STRIDE ? dof : STRIDE - 1;
         float own[DIRECTIONS], c[DIRECTIONS];
         UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + e];
@@ -1287,7 +1289,7 @@ struct Step : Math {
         if (LANES == 1 && !some) continue;
         UNROLLED for (int i = 0; i < QUADS; ++i) {
           if (4 * i >= LANES * (slot + 1)) break;
-          if (LANES > 1 && !(quads >> i & 1)) continue;
+          if (SKIPS_QUADS && !(quads >> i & 1)) continue;
           Quad columns[DIRECTIONS];
           UNROLLED for (int l = 0; l < DIRECTIONS; ++l) columns[l] = read4(rows + STRIDE * l + 4 * i);
           UNROLLED for (int j = 0; j < 4; ++j)
@@ -1300,16 +1302,16 @@ struct Step : Math {
       const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
       if (!(x < 0.0f)) continue;
       const float* n = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
-      const unsigned quads = k < LANES ? read(frictionless_quads, k) : ~0u;
+      const unsigned quads = SKIPS_QUADS && k < LANES ? read(frictionless_quads, k) : ~0u;
       OWN_DOFS(slot, dof) {
-        if (LANES > 1 && slot > 0 && !(quads >> LANES / 4 * slot)) break;
+        if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
         const float n0 = n[dof < STRIDE ? dof : STRIDE - 1], c = weight * n0;
         h.gradient[slot] += c * x;
         h.diagonal[slot] += c * n0;
         if (LANES == 1 && c == 0.0f) continue;
         UNROLLED for (int i = 0; i < QUADS; ++i) {
           if (4 * i >= LANES * (slot + 1)) break;
-          if (LANES > 1 && !(quads >> i & 1)) continue;
+          if (SKIPS_QUADS && !(quads >> i & 1)) continue;
           const Quad a = read4(n + 4 * i);
           UNROLLED for (int j = 0; j < 4; ++j) h.row[slot][4 * i + j] += c * a.v[j];
         }
@@ -1665,11 +1667,13 @@ struct Step : Math {
 
   // M and J times the search direction, a row a lane.
   INLINE void project_search() {
-    SHARED_LOOP(i, DOFS + jacobian_rows()) {
+    const int together = SEVERAL_ROWS ? jacobian_rows() : 0;  // rows of J in the rounds of those of M
+    SHARED_LOOP(i, DOFS + together) {
       const int r = i - DOFS;
-      const float product = times_search(r < 0 ? w.mass + STRIDE * i : w.jacobian + STRIDE * r);
-      *(r < 0 ? w.mass_search + i : w.projected + r) = product;
+      const float product = times_search(SEVERAL_ROWS && r >= 0 ? w.jacobian + STRIDE * r : w.mass + STRIDE * i);
+      *(SEVERAL_ROWS && r >= 0 ? w.projected + r : w.mass_search + i) = product;
     }
+    if (!SEVERAL_ROWS) SHARED_LOOP(r, jacobian_rows()) w.projected[r] = times_search(w.jacobian + STRIDE * r);
     sync();
   }
 

@@ -403,7 +403,7 @@ class Description:
         self._add_links(tables)
         self._add_joints(tables)
         self._add_limbs(tables)
-        self._add_forces(tables)
+        self._add_forces(tables, mask)
         self._add_geoms(tables, mask)
         self._add_limits(tables)
         self._add_outputs(tables)
@@ -485,7 +485,7 @@ class Description:
         dofs = [self._dofs_of_geom(p.geoms[0]) ^ self._dofs_of_geom(p.geoms[1]) for p in self.pairs]
         tables.integers("crosses", [self.limbs.crosses(x) for x in dofs])
 
-    def _add_forces(self, tables: Tables) -> None:
+    def _add_forces(self, tables: Tables, mask: str) -> None:
         m = self.m
         stiffness, damping = m.jnt_stiffness[m.dof_jntid], m.dof_damping
         explicit = m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP) and not is_implicitfast(m)
@@ -495,9 +495,11 @@ class Description:
         tables.floats("spring", m.qpos_spring)
         tables.floats("damping", damping)
         tables.floats("armature", m.dof_armature)
-        above = [64 * d + j for d in range(m.nv) for j in self._dofs_to_root(m.dof_parentid[d])]
-        tables.size(MASS_ENTRIES=m.nv + len(above))
-        tables.integers("mass_entry", [*(64 * d + d for d in range(m.nv)), *above])
+        above = [list(self._dofs_to_root(parent)) for parent in m.dof_parentid]
+        entries = [64 * d + j for d, ancestors in enumerate(above) for j in ancestors]
+        tables.integers("ancestors", [sum(1 << j for j in ancestors) for ancestors in above], mask)
+        tables.size(MASS_ENTRIES=len(entries))
+        tables.integers("mass_entry", entries, "unsigned")
         dofs = m.jnt_dofadr[m.actuator_trnid[:, 0]]
         used = sorted(acting(m), key=lambda a: dofs[a])
         bias = affine_bias(m)[used]
@@ -567,6 +569,10 @@ class Description:
         tables.integers("second_geom", [index[p.geoms[1]] for p in found])
         tables.integers("first_dofs", [self._dofs_of_geom(p.geoms[0]) for p in found], mask)
         tables.integers("second_dofs", [self._dofs_of_geom(p.geoms[1]) for p in found], mask)
+        apart = [self._dofs_of_geom(p.geoms[0]) ^ self._dofs_of_geom(p.geoms[1]) for p in found]
+        of_balls = [-1] * len(self.limited_balls)  # all of them
+        quads = [sum(1 << i for i in range(self.layout.stride // 4) if dofs >> 4 * i & 15) for dofs in apart + of_balls]
+        tables.integers("quads", quads, "unsigned")
         frames = [self._geom(p.geoms[0]) for p in planes]
         tables.structs("Vec", "plane_normal", [normal for _, _, normal in frames])
         tables.floats("plane_offset", [normal @ center for _, center, normal in frames])
