@@ -3,41 +3,21 @@ import os
 if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads than one each would slow them down
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import functools
 import gc
 
 import pytest
+import quickly  # noqa: F401, before anything makes a kernel
 import torch
 import warp as wp
 from cases import ENGINES, KINDS
 
 import torchrl_loco
 
-warp_kernel = wp.kernel
 
-
-def quickly_compiled(f=None, **options):
-    """Leaves kernels that the package generates unoptimised: compiling them takes longer than they run in tests.
-
-    MuJoCo-Warp's stay as they are for users: few compilations, and most of what runs.
-    """
-    if f is None:
-        return functools.partial(quickly_compiled, **options)
-    if (f.__module__ or "").startswith("torchrl_loco.") and options.get("module") == "unique":
-        options["module_options"] = {"optimization_level": 0}
-    return warp_kernel(f, **options)
-
-
-if not torch.cuda.is_available():
-    wp.kernel = quickly_compiled
-
-
-@pytest.fixture(scope="module")
-def optimised():
+@pytest.fixture
+def optimised(monkeypatch):
     """Lets all kernels be compiled as they are for users."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wp, "kernel", warp_kernel)
-        yield
+    monkeypatch.setattr(wp.config, "optimization_level", None)
 
 
 def pytest_collection_modifyitems(items):

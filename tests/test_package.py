@@ -70,6 +70,8 @@ import pickle, torchrl_loco.registry as registry
 assert pickle.loads(pickle.dumps(registry.make)) is torchrl_loco.make
 assert torchrl_loco.envs.LocoEnv is torchrl_loco.LocoEnv
 from torchrl_loco import *
+import warp
+warp.config.optimization_level = 0
 env = make("walker_walk", 1, "cpu")
 assert RolloutCollector and training.PPOConfig("walker_walk")
 assert torchrl_loco.wrappers.GymnasiumVectorEnv

@@ -1,10 +1,17 @@
 """Pixels against where the bodies are, and rendering changes nothing but pixels."""
 
 import pytest
+import quickly
 import torch
 from cases import BODIES
 
 from torchrl_loco import State
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    """They are rendered sooner than the renderer of each body is optimised."""
+    monkeypatch.setattr(quickly, "HOT", ())
 
 
 def orange(pixels):

@@ -24,7 +24,7 @@ ROBOTS = {
     "g1": velocity.G1Velocity,
     "h1": velocity.H1Velocity,
 }
-ENGINES = [(name, engine) for engine in ("compiled", "mujoco_warp") for name in ROBOTS]
+ENGINES = [*((name, "compiled") for name in ROBOTS), ("go1", "mujoco_warp")]
 JOINTS = {"go1": 12, "go2": 12, "g1": 29, "h1": 19}
 FEET = {"go1": 4, "go2": 4, "g1": 2, "h1": 2}
 WORLDS = 16

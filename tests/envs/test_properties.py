@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 WORLDS = 5
 SETTINGS = hypothesis.settings(
-    max_examples=100,
+    max_examples=50,
     deadline=None,
     derandomize=True,
     suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture],  # the environment is shared anyway

@@ -1,6 +1,7 @@
 """Several environments at once: side by side, in threads, in forked processes, on other streams and devices."""
 
 import functools
+import os
 import pickle
 import subprocess
 import sys
@@ -25,8 +26,9 @@ def made(device="cpu", seed=0, **options):
 
 def run(program, *args):
     """Runs a program in an interpreter of its own."""
-    command = [sys.executable, "-c", textwrap.dedent(program), *args]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+    command = [sys.executable, "-c", "import quickly\n" + textwrap.dedent(program), *args]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=300)
 
 
 def test_two_on_one_device_do_not_mix(device, actions):

@@ -450,10 +450,9 @@ def test_c_mujoco_steps_the_model_of_a_world(engine, actions):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["compiled", "mujoco_warp"])
-def test_a_nan_dump_replays_them(tmp_path, engine, actions):
+def test_a_nan_dump_replays_them(tmp_path, actions):
     file = tmp_path / "dump.safetensors"
-    env = made(*FAR, engine=engine, protocol="dm_control", nan_dump=file)
+    env = made(*FAR, engine="compiled", protocol="dm_control", nan_dump=file)
     td = env.reset()
     for action in actions(env, 4):
         td = env.step(td.set("action", action))["next"].exclude("reward")

@@ -360,8 +360,12 @@ def test_moving_bodies_touch_within_their_margin(form):
     np.testing.assert_allclose(sim.qvel[0], data.qvel, atol=1e-3)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_friction_holds_a_stack(form):
-    """A capsule on one across it, which lies on two that are fixed, under gravity that leans by 0.2."""
+    """A capsule on one across it, which lies on two that are fixed, under gravity that leans by 0.2.
+
+    Both forms of the step, as they are compiled for users.
+    """
     for friction, stays in ((0.6, True), (0.05, False)):
         geom = f'<geom type="capsule" size="0.05 0.3" friction="{friction}" '
         slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))  # none rolls

@@ -13,9 +13,9 @@ from torchrl_loco.sim.compiled import collision
 from torchrl_loco.sim.compiled.step import texts
 from torchrl_loco.sim.simulation import set_options
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
+pytestmark = pytest.mark.slow
 
-WORLDS, AGES = 128, (10, 30, 50, 80)
+WORLDS, AGES = 80, (10, 30, 50, 80)
 
 
 @pytest.fixture(scope="module", params=COMPILED)
@@ -63,6 +63,7 @@ def assert_agree(ours, theirs):
     assert (error.max(axis=1) > 1e-4).sum() <= len(error) / 300
 
 
+@pytest.mark.parametrize("states", ["walker_run", "humanoid_run"], indirect=True)
 def test_both_engines_agree(shared, states):
     task, state, action = states
     for protocol in PROTOCOLS:
@@ -80,7 +81,7 @@ def test_converged_steps_agree_with_c_mujoco(shared, states, monkeypatch):
     expected, touching = of_c_mujoco(env, state, action)
     assert touching > 0.5
     if task.startswith("humanoid"):
-        assert np.quantile(np.abs(after(env, state, action) - expected), 0.95) > 1e-5
+        assert np.quantile(np.abs(after(env, state, action) - expected), 0.95) > 5e-6
         monkeypatch.setattr(collision, "UPRIGHT", 1e-6)
         texts.clear()
         env = torchrl_loco.make(task, len(state), "cpu", protocol="dm_control")

@@ -66,11 +66,6 @@ KINDS = {"traced": 31, "lanes": 0, "mujoco_warp": 31}
 """Ways of stepping, and the largest body that is traced."""
 
 
-@pytest.fixture(autouse=True)
-def quick_compilation(monkeypatch):
-    monkeypatch.setattr(wp.config, "optimization_level", 0)
-
-
 @pytest.fixture(params=KINDS)
 def kind(request, monkeypatch):
     monkeypatch.setattr(step, "TRACED_DOFS", KINDS[request.param])

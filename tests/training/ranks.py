@@ -23,6 +23,7 @@ def in_ranks(function, *args, count=2):
         rdzv_backend="c10d",
         rdzv_endpoint="localhost:0",
         max_restarts=0,
+        start_method="fork",  # a new interpreter takes seconds to import all
     )
     with distributed.handlers_restored():
         results = elastic_launch(config, _connected)(function, *args)
@@ -115,4 +116,4 @@ def of_ranks(out):
     """Returns all of the above."""
     with small_walker():
         runs = {algorithm: whole_and_resumed(out / algorithm, algorithm) for algorithm in ("ppo", "reppo")}
-    return {"messages": messages(), "learnt": learnt(out), **runs}
+        return {"messages": messages(), "learnt": learnt(out), **runs}

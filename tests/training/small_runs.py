@@ -10,7 +10,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torchrl_loco
 from torchrl_loco.tasks.walker import Walker
-from torchrl_loco.training import RunFolder, Spaces, Trainer, preset
+from torchrl_loco.training import RunFolder, Spaces, Trainer, playback, preset
 
 EPISODE = 40
 """Control steps of an episode of the small walker."""
@@ -31,10 +31,11 @@ SMALL = {
 
 @contextlib.contextmanager
 def small_walker():
-    """Makes the walker's tasks cheap: short episodes, which evaluations play in full, and coarse physics."""
+    """Makes the walker's tasks cheap: short episodes, which evaluations play in full, coarse physics, small videos."""
     with pytest.MonkeyPatch.context() as patch:
         small = dataclasses.replace(Walker.config, episode_length=EPISODE, sim_dt=0.0125)
         patch.setattr(Walker, "config", small)
+        patch.setattr(playback, "SIZE", (64, 48))
         yield
 
 

@@ -52,7 +52,7 @@ def test_run_folder_is_complete(run):
 @pytest.mark.slow
 def test_pictures(ppo_run):
     video = imageio.imread(ppo_run.video, plugin="pyav")
-    assert video.shape == (2, 360, 480, 3)  # a twentieth of a second at 40 frames a second
+    assert video.shape == (2, 48, 64, 3)  # a twentieth of a second at 40 frames a second
     assert video.std() > 10
     assert (video[0] != video[-1]).any()
     assert min(imageio.imread(ppo_run.path / "learning_curve.png").shape[:2]) > 400

@@ -12,6 +12,9 @@ from torchrl_loco.storage import replace_file
 from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.evaluation import PolicyFunc, play
 
+SIZE = 480, 360
+"""Width and height of videos."""
+
 
 def record(
     policy: PolicyFunc, env: LocoEnv, path: Path, seconds: float, action_repeat: int = 1, camera: str = "side"
@@ -35,7 +38,7 @@ def record(
     ):
         video.init_video_stream("h264", fps=frame_rate)
         for _ in play(policy, env, action_repeat, round(seconds * frame_rate), "video"):
-            video.write_frame(env.render(camera, 480, 360, worlds=1)[0].cpu().numpy())
+            video.write_frame(env.render(camera, *SIZE, worlds=1)[0].cpu().numpy())
     replace_file(path, content.getvalue())
 
 
