@@ -24,7 +24,7 @@ SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
 """Formats and the suffixes of their files."""
 
 TOLERANCE = 1e-5
-"""Largest difference of an action from the policy's own that an exported policy may have."""
+"""Largest difference from the policy's own actions, a fraction of those above 1, that an exported policy may have."""
 
 BATCH_SIZES = (1, 2, 1000)
 """Batches of random observations on which they are compared."""
@@ -46,7 +46,7 @@ def export_policy(policy: Policy, path: Path) -> float:
         path: a new file; ``.onnx`` or ``.pt2`` chooses the format.
 
     Returns:
-        The largest difference of an entry of an action from the policy's own.
+        The largest difference of an entry of an action from the policy's own, as a fraction of those above 1.
 
     Raises:
         ValueError: the file exists, its folder does not, or its suffix is none of the valid ones.
@@ -118,8 +118,10 @@ def _facts(policy: Policy, n: int, m: int) -> dict[str, Any]:
 
 
 def _difference(actions: torch.Tensor, expected: torch.Tensor) -> float:
-    """Returns the largest difference, infinity if the shapes differ."""
-    return (actions - expected).abs().max().item() if actions.shape == expected.shape else math.inf
+    """Returns the largest difference, as a fraction of actions above 1; infinity if the shapes differ."""
+    if actions.shape != expected.shape:
+        return math.inf
+    return ((actions - expected).abs() / expected.abs().clamp(min=1.0)).max().item()
 
 
 Exported = tuple[bytes, Callable[[torch.Tensor], torch.Tensor]]
