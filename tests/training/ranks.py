@@ -23,7 +23,7 @@ def in_ranks(function, *args, count=2):
         rdzv_backend="c10d",
         rdzv_endpoint="localhost:0",
         max_restarts=0,
-        start_method="fork",  # a new interpreter takes seconds to import all
+        start_method="spawn" if torch.cuda.is_available() else "fork",  # a new interpreter takes seconds to import all
     )
     with distributed.handlers_restored():
         results = elastic_launch(config, _connected)(function, *args)
