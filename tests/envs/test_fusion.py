@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -415,8 +416,9 @@ def test_a_world_does_the_same_among_few_and_many():
         assert torch.equal(few.view(torch.int32), among_many.view(torch.int32))
 
 
+TESTS = Path(__file__).parents[1]
 TELL = """
-import hashlib, torchrl_loco
+import hashlib, quickly, torchrl_loco
 from torchrl_loco.envs import fusion
 
 plain = fusion._kernel
@@ -431,7 +433,8 @@ def test_kernels_are_found_in_the_cache_by_every_process():
     texts = set()
     for seed in ("0", "1"):  # between which the order of the arrays of contacts differs
         env = {**os.environ, "PYTHONHASHSEED": seed}
-        made = subprocess.run([sys.executable, "-c", TELL], env=env, capture_output=True, text=True, check=True)
+        command = [sys.executable, "-c", TELL]
+        made = subprocess.run(command, env=env, cwd=TESTS, capture_output=True, text=True, check=True)
         texts.add(made.stdout)
     assert len(texts) == 1
     assert len(texts.pop().split()) == 6
