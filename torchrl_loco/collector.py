@@ -130,7 +130,7 @@ class RolloutCollector:
         if self._recording is None:
             return False
         if self._recording.world is not self._base.world:
-            self._recording = None  # the environment was closed and opened again
+            self._recording, self._warm = None, False  # the environment was closed and opened again
         elif self._recording.has_other_weights():
             self._go_step_by_step(
                 "the policy's weights were replaced, or it changed between training and evaluation mode; update "

@@ -52,7 +52,7 @@ def export_policy(policy: Policy, path: Path) -> float:
         ValueError: the file exists, its folder does not, or its suffix is none of the valid ones.
         TypeError: the policy does not begin by normalising observations.
         ImportError: a package of the extra "onnx" is missing; the message says how to install it.
-        RuntimeError: the difference is larger than 1e-5; nothing is written.
+        RuntimeError: that is more than 1e-5; nothing is written.
     """
     path = check_output_file("path", path, tuple(SUFFIXES.values()))
     if path.suffix == ".onnx":

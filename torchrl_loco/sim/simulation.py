@@ -281,7 +281,8 @@ class Simulation:
                         njmax=self.config.njmax,
                     )
             data = self._mujoco_data[worlds]
-            for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time"):
+            moved = ("mocap_pos", "mocap_quat") if self.mj_model.nmocap else ()
+            for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time", *moved):
                 wp.copy(getattr(data, name), getattr(self.data, name)[:worlds])
             model = self._model_of_each_world()
             mjw.kinematics(model, data)

@@ -96,14 +96,14 @@ def make_actor(
     if spaces.bounded:
         bound = 1.0
     spec = Unbounded(shape, device=device) if bound is None else Bounded(-bound, bound, shape, device=device)
+    # Checks of arguments would wait for the device.
+    settings = {"validate_args": False} if bound is None else {"bound": bound}
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         spec=spec,
         distribution_class=IndependentNormal if bound is None else SquashedNormal,
-        distribution_kwargs={"validate_args": False}
-        if bound is None
-        else {"bound": bound},  # checks wait for the device
+        distribution_kwargs=settings,
         return_log_prob=log_prob,
     ).to(device)
 

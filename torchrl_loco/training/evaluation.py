@@ -24,7 +24,7 @@ PolicyFunc = Callable[[TensorDictBase], TensorDictBase]
 
 
 PIECE = 25
-"""Frames that are taken, and recorded, at a time, or somewhat less: a whole number of actions."""
+"""About how many frames are taken, and recorded, at a time: a whole number of actions."""
 
 
 class Evaluator:
@@ -42,9 +42,12 @@ class Evaluator:
         self.policy: Any = policy
         self.env = env
         self._frames = action_repeat * max(1, PIECE // action_repeat)
+        self._held = _Held(policy, action_repeat)
+        # A function is not watched for other weights, so it must not be recorded as if it were a module.
+        held = self._held if isinstance(policy, nn.Module) else self._held.forward
         self._collector = RolloutCollector(
             env,
-            policy if action_repeat == 1 else _Held(policy, action_repeat),
+            policy if action_repeat == 1 else held,
             frames_per_batch=env.num_envs * self._frames,
             exploration_type=ExplorationType.DETERMINISTIC,
         )
@@ -58,6 +61,7 @@ class Evaluator:
         alive = torch.ones_like(returns, dtype=torch.bool)
         pieces = math.ceil(env.config.episode_length / self._frames)
         for _ in trange(pieces, desc="evaluation", leave=False, disable=None):  # no bar in logs
+            self._held.begin()
             after = self._collector.rollout()["next"]
             for reward, done in zip(after["reward"].unbind(1), after["done"].unbind(1), strict=True):
                 returns += reward * alive
@@ -73,6 +77,10 @@ class _Held(nn.Module):
     def __init__(self, policy: PolicyFunc, action_repeat: int) -> None:
         super().__init__()
         self._policy, self._repeat, self._frame = policy, action_repeat, 0
+
+    def begin(self) -> None:
+        """Lets the next frame be the first of an action, also after an evaluation that was interrupted."""
+        self._frame = 0
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Returns ``td`` with the action, which the policy chooses in the first of its frames."""

@@ -95,7 +95,7 @@ class _Tensorboard(TensorboardLogger):
         return SummaryWriter(os.path.join(self.log_dir, self.exp_name), purge_step=self._first)
 
     def log_metrics(self, metrics: Any, step: int | None = None, *, keys_sep: str = "/") -> dict[str, Any]:
-        """Returns the metrics, which become one event: TorchRL's becomes one for each, and takes a millisecond."""
+        """Returns the metrics, which become one event: TorchRL makes one of each, which takes a millisecond."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         values = [Summary.Value(tag=name, simple_value=value) for name, value in metrics.items()]

@@ -175,7 +175,7 @@ struct Point {  // on the search direction: the cost relative to alpha = 0
 struct Search {  // the result of a line search
   float alpha, improvement;
   INLINE void take(const Point& p, bool acceptable) {
-    if (!acceptable || -p.cost <= improvement) return;
+    if (!(acceptable && -p.cost > improvement)) return;  // nor what is no number
     alpha = p.alpha;
     improvement = -p.cost;
   }

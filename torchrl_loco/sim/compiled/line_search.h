@@ -17,7 +17,7 @@ if (fabsf(start.slope) < noise) return result;
 
 const Point first = Point::at(1.0f, slope, curvature, whole + 1);
 result.take(first, first.ends(start, accept, LS_NEAR));
-if (LS_NEAR > 0.0f) {  // a step at a time: most searches end with the first or the second
+if (LS_NEAR > 0.0f && LS_ITERATIONS > 3) {  // a step at a time: most searches end with the first or the second
   Point low = start, high = start, last = first;
   bool ends = result.improvement > 0.0f, between = false;  // whether the minimum lies between low and high
   result.take(first, true);

@@ -15,7 +15,7 @@ def line_search(scale: str, tolerance: str, near: str, iterations: str) -> str:
         scale: C++ expression of one over the inertia of the model.
         tolerance: of the slope, relative to it.
         near: the share of its first slope at which it may end.
-        iterations: how many brackets are tried.
+        iterations: how many steps are tried, or brackets of three where ``near`` is 0 or there are at most 3.
     """
     values = {"LS_TOLERANCE": tolerance, "LS_NEAR": near, "LS_ITERATIONS": iterations, "SCALE": scale}
     text = _LINE_SEARCH
