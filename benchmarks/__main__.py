@@ -55,7 +55,7 @@ walk.add_argument("folder", type=Path, help="where each run's small files are; w
 walk.add_argument("--tasks", nargs="+", choices=followers, default=followers)
 walk.add_argument("--seeds", type=int, nargs="+", default=[], help="default: none, verify what is there")
 walk.add_argument("--settings", nargs="+", default=[], metavar="NAME=VALUE", help="further ones of train")
-walk.add_argument("--episodes", type=int, default=256, help="in which a policy is verified")
+walk.add_argument("--episodes", type=int, default=256, help="in which a policy is verified, 0 for later")
 walk.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 for name, further, default in (("throughput", {}, list(CASES)), ("profile", LEARNING, ["env_step_and_maybe_reset"])):
     commands.choices[name].add_argument("--cases", nargs="+", choices=[*CASES, *VARIANTS, *further], default=default)

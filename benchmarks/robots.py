@@ -38,7 +38,8 @@ def robots(
     """Trains what a folder of results lacks, verifies its policies, and returns a row for each.
 
     It can be stopped and called again: runs go on from their last checkpoint, and what is done is not done again.
-    Without onnxruntime nothing is verified, which can be made up for elsewhere: call it there without seeds.
+    Without onnxruntime, or with no episodes, nothing is verified, which can be made up for elsewhere: call it there
+    without seeds.
 
     Args:
         folder: where each run has a folder of small files.
@@ -46,14 +47,14 @@ def robots(
         seeds: all tasks are trained with the first of them, then with the next.
         device: where to train, and where the simulator of the training plays.
         settings: further settings of a training, as ``name=value``.
-        episodes: how many episodes a policy is verified in.
+        episodes: how many episodes a policy is verified in, 0 for later.
     """
     jobs = [(task, seed) for seed in seeds for task in tasks]
     missing = [job for job in jobs if not (folder / _name(*job) / "policy.safetensors").exists()]
     for task, seed in until_interrupted(missing, "robots"):
         train(folder, task, seed, device, settings)
     runs = [path.parent for path in sorted(folder.glob("*/policy.safetensors"))]
-    unverified = [run for run in runs if not (run / "verify.json").exists()]
+    unverified = [run for run in runs if episodes and not (run / "verify.json").exists()]
     if unverified and importlib.util.find_spec("onnxruntime") is None:
         print("onnxruntime is not installed: nothing is verified", file=sys.stderr)
         unverified = []

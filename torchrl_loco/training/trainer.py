@@ -319,11 +319,12 @@ class Trainer:
 
     def _identity(self) -> dict[str, Any]:
         """Returns the settings that must not change while a run is stopped."""
-        return {name: getattr(self.config, name) for name in ("algorithm", "task", "protocol", "num_envs", "hidden")}
+        names = "algorithm", "task", "protocol", "num_envs", "hidden", "action_bound"
+        return {name: getattr(self.config, name) for name in names if hasattr(self.config, name)}
 
     def _load(self, checkpoint: dict[str, Any]) -> None:
         for name, value in self._identity().items():
-            if checkpoint["settings"][name] != value:
+            if checkpoint["settings"].get(name, value) != value:  # one of an earlier revision may lack a setting
                 raise ValueError(
                     f"the checkpoint in {self.run.path} is of a run with {name}={checkpoint['settings'][name]!r}, but "
                     f"its config.json has {name}={value!r}"
