@@ -1,4 +1,4 @@
-"""Python's search for garbage, put off where there is little to find."""
+"""Python's garbage collection, put off."""
 
 import contextlib
 import gc

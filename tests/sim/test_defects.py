@@ -326,9 +326,10 @@ def test_a_body_builds_for_a_gpu(form, dofs, kind, varied, asked, tmp_path):
     assert unsupported(model) == []
     start, end = Chain(()), Chain(())
     text = step.source(VariedModel(model, all_varied(model)) if varied else model, 2, **asked)
-    kernel = _kernel(text, start.func, start.struct, end.func, end.struct, lanes.registers(model))
+    description = lanes.Description(model)
+    kernel = _kernel(text, start.func, start.struct, end.func, end.struct, description.registers())
     kernel.module.options["optimization_level"] = 3  # as for users
-    kernel.module.options["block_dim"] = 32 * lanes.worlds_per_block(model)
+    kernel.module.options["block_dim"] = 32 * description.worlds_per_block()
     (built,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=False, strip_hash=True)
     assert built.suffix == ".cubin"
 

@@ -24,7 +24,7 @@ from torchrl_loco.garbage import no_collection
 
 def main(args: Sequence[str] | None = None) -> int:
     """Runs the command line. Returns 0, or 130 when interrupted; exits with 2 for errors of the user."""
-    if args is None:  # the process ends: Python would look for garbage in all that it imported, for seconds
+    if args is None:  # the process ends: collecting garbage among all that was imported would take seconds
         atexit.register(gc.freeze)
     try:
         _run(sys.argv[1:] if args is None else list(args))
@@ -42,7 +42,7 @@ def _run(args: list[str]) -> None:
         print(torchrl_loco.__version__)
         return
     complete = list(args)
-    with no_collection():  # what is imported stays, and to look through it takes a third of the time
+    with no_collection():  # what is imported stays, and garbage collection takes a third of the time
         options_type = task_options(args) if args[:1] == ["train"] else None
 
     def train(options: Annotated[options_type, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]

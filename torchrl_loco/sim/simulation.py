@@ -28,7 +28,8 @@ DETERMINISTIC_SCRATCH = 11.0
 
 
 PIECE = wp.constant(8)
-_Piece = wp.types.vector(length=8, dtype=float)
+"""Numbers of the default pose that are read at a time."""
+_Piece = wp.types.vector(length=PIECE, dtype=float)
 
 
 @wp.struct

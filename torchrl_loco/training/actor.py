@@ -123,11 +123,7 @@ def deterministic_policy(actor: ProbabilisticActor, config: TrainingConfig, info
     *layers, last = (copied(layer) for part in parts for layer in layers_of(part))
     if not any(isinstance(part, AddStateIndependentNormalScale) for part in network):
         last = _first_half(last)
-    squashed = (
-        _squashed(actor[-1].distribution_kwargs["bound"], last)
-        if actor[-1].distribution_class is SquashedNormal
-        else []
-    )
+    squashed = _squashed(actor[-1].distribution_kwargs.get("bound"), last)
     settings = {
         name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "device", "logger")
     }
@@ -136,8 +132,10 @@ def deterministic_policy(actor: ProbabilisticActor, config: TrainingConfig, info
     return policy
 
 
-def _squashed(bound: float, last: Any) -> list[nn.Module]:
-    """Returns the layers of :class:`SquashedNormal`: a tanh, and what multiplies by the bound."""
+def _squashed(bound: float | None, last: Any) -> list[nn.Module]:
+    """Returns the layers of :class:`SquashedNormal`: a tanh, and what multiplies by the bound; none without a bound."""
+    if bound is None:
+        return []
     if bound == 1.0:
         return [nn.Tanh()]
     size, weight = last.out_features, last.weight

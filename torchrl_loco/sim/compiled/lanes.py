@@ -825,13 +825,3 @@ def _parts(text: str, asked: dict[str, bool]) -> str:
             case _ if all(keep):
                 lines.append(line)
     return "".join(lines)
-
-
-def worlds_per_block(m: mujoco.MjModel) -> int:
-    """Returns how many worlds share a block of threads on a GPU: a block has 32 times as many, and all must be full."""
-    return Description(m).worlds_per_block()
-
-
-def registers(m: mujoco.MjModel) -> int:
-    """Returns how many registers a thread of a GPU may have."""
-    return Description(m).registers()

@@ -22,9 +22,12 @@ if (LS_NEAR > 0.0f && LS_ITERATIONS > 3) {  // a step at a time: most searches e
   bool ends = result.improvement > 0.0f, between = false;  // whether the minimum lies between low and high
   result.take(first, true);
   ROLLED for (int i = 0; i < LS_ITERATIONS && !ends; ++i) {
-    if (last.slope < 0.0f) low = last;
-    else high = last;
-    between = between || !(last.slope < 0.0f);
+    if (last.slope < 0.0f) {
+      low = last;
+    } else {
+      high = last;
+      between = true;
+    }
     float alphas[1] = {i == 0 && between ? low.secant(high) : last.newton()};
     if (between && !(alphas[0] > low.alpha && alphas[0] < high.alpha)) alphas[0] = 0.5f * (low.alpha + high.alpha);
     if (alphas[0] == last.alpha || alphas[0] == low.alpha || alphas[0] == high.alpha) break;

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -27,8 +27,8 @@ MANY = 2
 """Above this multiple of the worlds that fill those warps, observation and bookkeeping run in kernels of their own:
 they wait for memory, and the registers of the physics leave too few warps to hide that."""
 
-MOST_TEXTS = 64
-"""Texts of steps, and rows of numbers, that a process keeps."""
+MOST_KEPT = 64
+"""Texts of steps that a process keeps, and rows of nominal numbers."""
 
 texts: dict[tuple, str] = {}
 """The texts that were written last, by all that they depend on but the constants of this package."""
@@ -106,11 +106,16 @@ def kept_source(m: mujoco.MjModel, substeps: int, **options: Any) -> str:
         options: those of :func:`source`, which can be hashed.
     """
     key = is_traced(m), _fingerprint(m), substeps, *sorted(options.items())
-    if key not in texts:
-        texts[key] = source(m, substeps, **options)
-        if len(texts) > MOST_TEXTS:
-            del texts[next(iter(texts))]
-    return texts[key]
+    return _kept(texts, key, lambda: source(m, substeps, **options))
+
+
+def _kept(kept: dict[tuple, Any], key: tuple, make: Callable[[], Any]) -> Any:
+    """Returns what is kept under a key, made if it is not; the oldest is dropped where there are too many."""
+    if key not in kept:
+        kept[key] = make()
+        if len(kept) > MOST_KEPT:
+            del kept[next(iter(kept))]
+    return kept[key]
 
 
 def _fingerprint(m: mujoco.MjModel) -> bytes:
@@ -128,13 +133,13 @@ def nominal_row(m: VariedModel) -> np.ndarray:
 
     It is found once for environments of the same model: for a robot it takes a tenth of a second.
     """
-    key = is_traced(m), _fingerprint(m)
-    if key not in rows:
-        rows[key] = m.varied.nominal() if is_traced(m) else lanes.nominal_row(m)
-        rows[key].flags.writeable = False
-        if len(rows) > MOST_TEXTS:
-            del rows[next(iter(rows))]
-    return rows[key]
+    row = _kept(
+        rows,
+        (is_traced(m), _fingerprint(m)),
+        lambda: m.varied.nominal() if is_traced(m) else lanes.nominal_row(m),
+    )
+    row.flags.writeable = False
+    return row
 
 
 class LaunchSize(NamedTuple):
@@ -160,9 +165,10 @@ class LaunchSize(NamedTuple):
 def launch_size(m: mujoco.MjModel, num_envs: int, device: wp.Device) -> LaunchSize:
     """Returns how the worlds are spread over threads."""
     if device.is_cuda and not is_traced(m):
-        block = lanes.worlds_per_block(m)
+        description = lanes.Description(m)
+        block = description.worlds_per_block()
+        threads, registers = WARP * block * math.ceil(num_envs / block), description.registers()
         # One lane would do what is not physics, while 31 wait.
-        threads, registers = WARP * block * math.ceil(num_envs / block), lanes.registers(m)
         return LaunchSize(threads, WARP * block, 1, WARP, one_kernel=False, registers=registers)
     worlds, one_kernel = WARP, True
     if device.is_cuda:
