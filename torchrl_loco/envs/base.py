@@ -515,8 +515,13 @@ class LocoEnv(EnvBase):
             result.get("reward_terms").zero_()  # nothing was rewarded yet
         return result
 
-    def _outputs(self, *, with_reward: bool = False) -> TensorDict:
-        """Returns a copy of what the kernels wrote: the buffers themselves change at the next step."""
+    def _outputs(self, *, with_reward: bool = False, unrewarded: torch.Tensor | None = None) -> TensorDict:
+        """Returns a copy of what the kernels wrote: the buffers themselves change at the next step.
+
+        Args:
+            with_reward: whether the reward is in it.
+            unrewarded: worlds ``(*batch, 1)`` whose terms of the reward are zero.
+        """
         outputs, batch = self.world.outputs, self.batch_size
         *groups, reward, terms, flags = outputs.parts(outputs.memory.clone())
         done, terminated, truncated = flags.view(3, *batch, 1).unbind()
@@ -527,7 +532,10 @@ class LocoEnv(EnvBase):
             entries["reward"] = reward.view(*batch, 1)
         result = TensorDict._new_unsafe(entries, batch_size=batch, device=self.device)  # they need no checks
         if self.reward_terms:
-            columns = terms.view(*batch, len(self.term_names), 1).unbind(-2)
+            terms = terms.view(*batch, len(self.term_names))
+            if unrewarded is not None:
+                terms.masked_fill_(unrewarded, 0.0)
+            columns = terms.unsqueeze(-1).unbind(-2)
             result["reward_terms"] = dict(zip(self.term_names, columns, strict=True))
         return result
 
@@ -549,10 +557,8 @@ class LocoEnv(EnvBase):
             return super()._step_and_maybe_reset(tensordict)
         after = self._step(tensordict)
         self.world.reset_masked()
-        begin = self._outputs()  # in the worlds that go on, nothing has changed
         done = after.get("done")
-        if self.reward_terms:
-            begin.get("reward_terms").masked_fill_(done, 0.0)
+        begin = self._outputs(unrewarded=done)  # in the worlds that go on, nothing has changed
         # As in TorchRL, the policy's outputs are zero where a world was reset.
         for key, value in tensordict.items():
             if key not in begin and key not in rewritten and key != "reward":
