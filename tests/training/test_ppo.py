@@ -1,6 +1,7 @@
 """Advantages and normalisation against values computed by hand, and what an update does."""
 
 import dataclasses
+import functools
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_loco.training import Spaces, preset
 from torchrl_loco.training.actor import deterministic_policy
+from torchrl_loco.training.adam import CompiledAdam
 from torchrl_loco.training.algorithm import clip_and_step
 from torchrl_loco.training.ppo import PPO
 
@@ -211,6 +213,23 @@ def test_the_norm_is_updated_after_the_gradient_steps():
     ppo.gradient_step = lambda minibatch: seen.append(ppo.norms["observation"].count.item()) or [torch.zeros(())] * 6
     ppo.update(collected(ppo, 2), progress=0.0)
     assert (seen, ppo.norms["observation"].count) == ([0.0, 0.0], 8.0)
+
+
+def test_compiled_steps_are_those_of_adam(monkeypatch):
+    """As torch.compile traces them; the kernels that it makes of them on CUDA are not made here."""
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
+    torch.manual_seed(0)
+    ours, theirs = ([torch.nn.Parameter(torch.ones(shape)) for shape in ((3, 2), (3,), ())] for _ in range(2))
+    optimizers = []
+    for kind, parameters in ((CompiledAdam, ours), (functools.partial(torch.optim.Adam, fused=True), theirs)):
+        groups = [{"params": parameters[:2]}, {"params": parameters[2:], "eps": 1e-2}]
+        optimizers.append(kind(groups, lr=torch.tensor(0.1), eps=1e-5))
+    for scale in (1.0, 10.0, 0.01, 1.0):  # clipped, and not
+        for own, other in zip(ours, theirs, strict=True):
+            own.grad = scale * torch.randn(own.shape)
+            other.grad = own.grad.clone()
+        torch.testing.assert_close(*(clip_and_step(optimizer, 0.5) for optimizer in optimizers))
+    torch.testing.assert_close(ours, theirs)
 
 
 def test_gradients_are_clipped_to_a_norm():

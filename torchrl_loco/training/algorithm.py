@@ -14,6 +14,7 @@ from torchrl_loco.policy import ObservationNorm, moments
 from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
+from torchrl_loco.training.adam import CompiledAdam
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.spaces import Spaces
 
@@ -53,6 +54,7 @@ class Algorithm(ABC):
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
         self._data: TensorDictBase | None = None
         on_cuda = self.device.type == "cuda"
+        self._rows_of = self.fused(rows_of)
         self._step = TorchGraph(self._minibatch_step, self.device, warmup=WARMUP) if on_cuda else self._minibatch_step
 
     @abstractmethod
@@ -109,9 +111,13 @@ class Algorithm(ABC):
         Returns:
             The optimizer, which is kept as ``optimizers[name]``.
         """
-        on_cuda = self.device.type == "cuda"
-        lr = torch.tensor(self.config.lr, device=self.device)
-        optimizer = torch.optim.Adam(parameters, lr=lr, eps=1e-5, capturable=on_cuda, fused=True)
+        settings: dict[str, Any] = {"lr": torch.tensor(self.config.lr, device=self.device), "eps": 1e-5}
+        if self.device.type != "cuda":
+            optimizer = torch.optim.Adam(parameters, **settings, fused=True)
+        elif self.config.compile:
+            optimizer = CompiledAdam(parameters, **settings)
+        else:
+            optimizer = torch.optim.Adam(parameters, **settings, capturable=True, fused=True)
         self.optimizers[name] = optimizer
         return optimizer
 
@@ -157,7 +163,8 @@ class Algorithm(ABC):
 
     def _minibatch_step(self) -> None:
         assert self._data is not None
-        self._totals += torch.stack([metric.detach() for metric in self.gradient_step(self._data[self._indices])])
+        minibatch = self._rows_of(self._data, self._indices)
+        self._totals += torch.stack([metric.detach() for metric in self.gradient_step(minibatch)])
 
     def release(self) -> None:
         """Forgets the recorded gradient step: NCCL's communicators wait at their end for graphs that contain them."""
@@ -205,9 +212,16 @@ def clip_and_step(optimizer: torch.optim.Optimizer, max_norm: float) -> torch.Te
     """
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     distributed.average_gradients(parameters)
+    if isinstance(optimizer, CompiledAdam):
+        return optimizer.clipped_step(max_norm)
     norm = nn.utils.clip_grad_norm_(parameters, max_norm)
     optimizer.step()
     return norm
+
+
+def rows_of(data: TensorDictBase, indices: torch.Tensor) -> TensorDictBase:
+    """Returns the rows of ``data`` ``(n, ...)`` that ``indices`` ``(m,)`` name."""
+    return data[indices]
 
 
 @contextlib.contextmanager

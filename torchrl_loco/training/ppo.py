@@ -45,6 +45,7 @@ class PPO(Algorithm):
         )
         self.optimizer = self.make_optimizer("actor and critic", self.loss.parameters())
         self._compiled_losses, self._compiled_estimates = self.fused(self.loss), self.fused(self._estimates)
+        self._compiled_lr = self.fused(self._following_lr)
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns what the loss reads, of shape ``(num_envs, num_steps)``, with advantages and value targets."""
@@ -97,11 +98,14 @@ class PPO(Algorithm):
 
         A divergence that is not positive, as that of the first step of a batch, says nothing.
         """
-        kl, target = distributed.mean_of_ranks(kl), self.config.target_kl
+        kl = distributed.mean_of_ranks(kl)
         for group in self.optimizer.param_groups:
-            raised = torch.where((kl > 0.0) & (kl < 0.5 * target), 1.5 * group["lr"], group["lr"])
-            lr = torch.where(kl > 2.0 * target, group["lr"] / 1.5, raised)
-            group["lr"].copy_(lr.clamp(*LR_RANGE))
+            group["lr"].copy_(self._compiled_lr(kl, group["lr"]))
+
+    def _following_lr(self, kl: torch.Tensor, lr: torch.Tensor) -> torch.Tensor:
+        target = self.config.target_kl
+        raised = torch.where((kl > 0.0) & (kl < 0.5 * target), 1.5 * lr, lr)
+        return torch.where(kl > 2.0 * target, lr / 1.5, raised).clamp(*LR_RANGE)
 
 
 class InBFloat16(nn.Sequential):
