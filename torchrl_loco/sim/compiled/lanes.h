@@ -1106,7 +1106,7 @@ struct Step : Math {
     }
   }
 
-  // A row from the inverse inertia along it and how far it is violated. Velocity and acceleration follow in solve().
+  // A row from the inverse inertia along it and how far it is violated. Velocity and acceleration follow.
   INLINE void set_row(int r, Softness softness, float inverse_inertia, float position, float least) {
     softness.row(inverse_inertia, position, least, w.weight[r], w.x[r]);
   }
@@ -1159,14 +1159,13 @@ struct Step : Math {
     sync();
   }
 
-  INLINE float row_damping(int r) const {
-    if (r < first_limit()) return Model::contact_softness(contact(contact_of_row(r)).pair).damping;
+  INLINE float row_damping(int r) const {  // of a row without a contact
     if (r < first_friction()) return Model::limit_softness(w.limits[r - first_limit()] & 127).damping;
     return Model::friction_damping(Model::FRICTION_LOSSES ? r - first_friction() : 0);
   }
 
-  // Row r of J times the search direction.
-  INLINE float row_velocity(int r) const {
+  // Row r of J times a vector, of whose products with the rows of the Jacobian w.projected has those of the contacts.
+  INLINE float row_velocity(int r, const float* vector) const {
     if (!Model::ELLIPTIC && r < first_frictionless()) {  // edges of a pyramid: the normal, plus or minus another
       const float* const p = w.projected + DIRECTIONS * (r / CONTACT_ROWS);
       const float other = p[1 + (unsigned)r % CONTACT_ROWS / 2];
@@ -1175,9 +1174,9 @@ struct Step : Math {
     if (r < first_limit()) return w.projected[r - (CONTACT_ROWS - DIRECTIONS) * frictional];
     if (r < first_friction()) {
       const int limit = w.limits[r - first_limit()];
-      return limit < 128 ? w.search[limit] : -w.search[limit - 128];
+      return limit < 128 ? vector[limit] : -vector[limit - 128];
     }
-    return w.search[Model::friction_dof(Model::FRICTION_LOSSES ? r - first_friction() : 0)];
+    return vector[Model::friction_dof(Model::FRICTION_LOSSES ? r - first_friction() : 0)];
   }
 
   // The law of a contact with friction at the residuals of now. The first of its rows has the weight of all; of a cone,
@@ -1655,11 +1654,11 @@ struct Step : Math {
     OWN_DOFS(slot, d) if (d < DOFS) sums[1] -= gradient[slot] * w.search[d];
   }
 
-  // A row of a matrix times the search direction, in four sums that do not wait for each other.
-  INLINE float times_search(const float* matrix_row) const {
+  // A row of a matrix times a vector, in four sums that do not wait for each other.
+  static INLINE float times(const float* matrix_row, const float* vector) {
     float sums[4] = {0.0f, 0.0f, 0.0f, 0.0f};
     UNROLLED for (int i = 0; i < QUADS; ++i) {
-      const Quad a = read4(matrix_row + 4 * i), s = read4(w.search + 4 * i);
+      const Quad a = read4(matrix_row + 4 * i), s = read4(vector + 4 * i);
       UNROLLED for (int k = 0; k < 4; ++k) sums[k] = sums[k] + a.v[k] * s.v[k];
     }
     return (sums[0] + sums[1]) + (sums[2] + sums[3]);
@@ -1670,10 +1669,34 @@ struct Step : Math {
     const int together = SEVERAL_ROWS ? jacobian_rows() : 0;  // rows of J in the rounds of those of M
     SHARED_LOOP(i, DOFS + together) {
       const int r = i - DOFS;
-      const float product = times_search(SEVERAL_ROWS && r >= 0 ? w.jacobian + STRIDE * r : w.mass + STRIDE * i);
-      *(SEVERAL_ROWS && r >= 0 ? w.projected + r : w.mass_search + i) = product;
+      const bool of_jacobian = SEVERAL_ROWS && r >= 0;
+      const float product = times(of_jacobian ? w.jacobian + STRIDE * r : w.mass + STRIDE * i, w.search);
+      *(of_jacobian ? w.projected + r : w.mass_search + i) = product;
     }
-    if (!SEVERAL_ROWS) SHARED_LOOP(r, jacobian_rows()) w.projected[r] = times_search(w.jacobian + STRIDE * r);
+    if (!SEVERAL_ROWS) SHARED_LOOP(r, jacobian_rows()) w.projected[r] = times(w.jacobian + STRIDE * r, w.search);
+    sync();
+  }
+
+  // Brings velocity and acceleration into the rows, and the acceleration into the residual of M.
+  INLINE void complete_rows() {
+    SHARED_LOOP(i, DOFS + jacobian_rows()) {
+      const int r = i - DOFS;
+      const float* const row = r < 0 ? w.mass + STRIDE * i : w.jacobian + STRIDE * r;
+      const float product = times(row, w.qacc);
+      if (r < 0) {
+        w.residual[i] += product;
+        continue;
+      }
+      const int contact_of_row = r < DIRECTIONS * frictional ? r / DIRECTIONS : r - (DIRECTIONS - 1) * frictional;
+      const float damping = Model::contact_softness(contact(contact_of_row).pair).damping;
+      w.projected[r] = product + damping * times(row, w.qvel);
+    }
+    sync();
+    SHARED_LOOP(r, rows()) {
+      float v = row_velocity(r, w.qacc);
+      if (r >= first_limit()) v += row_damping(r) * row_velocity(r, w.qvel);
+      w.x[r] += v;
+    }
     sync();
   }
 
@@ -1745,8 +1768,6 @@ struct Step : Math {
     return Converged::flat(gradient_squared, decrement, Model::scale(), Model::tolerance());
   }
 
-  enum { VELOCITY = -2, ACCELERATION = -1 };  // two passes first, which bring both into the rows
-
   struct Newton {
     float gradient_squared, decrement;  // where the current direction begins
     Search step;
@@ -1763,30 +1784,20 @@ struct Step : Math {
     }
     n.runs = !n.stop || Model::IMPLICIT_DAMPING;
     if (!n.runs) return false;
-    if (iteration < 0) {
-      SHARED_LOOP(d, DOFS) w.search[d] = iteration == VELOCITY ? w.qvel[d] : w.qacc[d];
-    } else {
-      float t[2] = {0.0f, 0.0f};  // gradient squared, and minus its product with the new direction
-      turn(n.stop, t);
-      n.runs = !n.stop;
-      if (n.stop) return false;
-      sum(t, 2);
-      n.gradient_squared = t[0];
-      n.decrement = t[1];
-    }
+    float t[2] = {0.0f, 0.0f};  // gradient squared, and minus its product with the new direction
+    turn(n.stop, t);
+    n.runs = !n.stop;
+    if (n.stop) return false;
+    sum(t, 2);
+    n.gradient_squared = t[0];
+    n.decrement = t[1];
     n.stop = iteration > 0 && flat(n.gradient_squared, n.decrement);
     if (n.stop) return false;
     sync();
     project_search();
-    SHARED_LOOP(r, rows()) {
-      const float v = row_velocity(r);
-      if (iteration == VELOCITY) w.x[r] += row_damping(r) * v;
-      else if (iteration == ACCELERATION) w.x[r] += v;
-      else w.change[r] = v;
-    }
-    if (iteration == ACCELERATION) SHARED_LOOP(d, DOFS) w.residual[d] += w.mass_search[d];
+    SHARED_LOOP(r, rows()) w.change[r] = row_velocity(r, w.search);
     sync();
-    return iteration >= 0;
+    return true;
   }
 
   // Searches the direction, and moves along it.
@@ -1824,7 +1835,8 @@ struct Step : Math {
   // The worlds of a block begin each iteration together, those that are done too.
   INLINE void solve(const bool live) {
     Newton n = {0.0f, 0.0f, {0.0f, 0.0f}, false, false, live};
-    ROLLED for (int iteration = VELOCITY; any_of_block(n.runs); ++iteration) {
+    if (live) complete_rows();
+    ROLLED for (int iteration = 0; any_of_block(n.runs); ++iteration) {
       const bool searches = n.runs && set_direction(iteration, n);
       if (searches) move(n);
     }
