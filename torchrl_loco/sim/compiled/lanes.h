@@ -84,8 +84,8 @@ enum {
   TRUNK = Model::TRUNK,  // degrees of freedom that several limbs share, and those of the longest limb
   LIMB = Model::LIMB,
   PIVOT = (TRUNK + LIMB + 4) / 4 * 4,  // a row of a limb: columns of the trunk, the gradient, columns of the limb
-  LOWER = TRUNK * (TRUNK + 1) / 2,
-  CORNER = LOWER + TRUNK,  // the rows of the trunk: their lower triangle, then their gradient
+  LOWER = (TRUNK + 3) / 4 * 4,
+  CORNER = (LOWER + TRUNK * (TRUNK + 1) / 2 + 3) / 4 * 4,  // of the trunk: the gradient, then the lower triangle
 //END
 };
 #define OWN_DOFS(slot, dof) UNROLLED for (int slot = 0, dof = lane; slot < SLOTS; ++slot, dof += LANES)
@@ -1422,6 +1422,7 @@ struct Step : Math {
     HOLDS = (LIMB_ROWS + TRUNK + LANES - 1) / LANES,
     ENTRIES = (CORNER + LANES - 1) / LANES,
     KEPT = TRUNK < 6 ? TRUNK : 6,  // rows of the trunk that each lane eliminates alone
+    KEPT_QUADS = (KEPT * (KEPT + 1) / 2 + 3) / 4,
   };
 #define OWN_ROWS(hold, row) UNROLLED for (int hold = 0, row = lane; hold < HOLDS; ++hold, row += LANES)
 
@@ -1524,10 +1525,10 @@ struct Step : Math {
       before[hold] = h.gradient[hold];
       const int t = row - LIMB_ROWS;
       if (t < 0 || t >= TRUNK) continue;
-      float* const corner = w.corner + t * (t + 1) / 2;
+      float* const corner = w.corner + LOWER + t * (t + 1) / 2;
       UNROLLED for (int j = 0; j < TRUNK; ++j) if (j < t) corner[j] = h.trunk[hold][j];
       corner[t] = h.diagonal[hold];
-      w.corner[LOWER + t] = h.gradient[hold];
+      w.corner[t] = h.gradient[hold];
     }
     UNROLLED for (int i = 0; i < ENTRIES; ++i) left[i] = 0.0f;
     ROLLED for (int step = 0; step < LIMB; ++step) {
@@ -1564,21 +1565,24 @@ struct Step : Math {
       if (lane + LANES * i < CORNER) w.corner[lane + LANES * i] -= left[i];
     sync();
     ROLLED for (int k = TRUNK - 1; k >= KEPT; --k) {  // an entry a lane
-      const float* const row = w.corner + k * (k + 1) / 2;
+      const float* const row = w.corner + LOWER + k * (k + 1) / 2;
       const float inverse = divide(1.0f, row[k]);
       UNROLLED for (int n = 0; n < ENTRIES; ++n) {
         const int e = lane + LANES * n;
         if (e >= CORNER) continue;
         const int i = Model::corner_row(e), j = Model::corner_column(e);
-        if (i < k) w.corner[e] -= row[i] * inverse * (j < TRUNK ? row[j] : w.corner[LOWER + k]);
+        if (i < k) w.corner[e] -= row[i] * inverse * (j < TRUNK ? row[j] : w.corner[k]);
       }
       sync();
     }
 
     // H = L' D L of the rest of the trunk, and its solution.
-    float corner[KEPT * (KEPT + 1) / 2], rest[KEPT], inverse[KEPT], x[TRUNK];
-    UNROLLED for (int i = 0; i < KEPT * (KEPT + 1) / 2; ++i) corner[i] = w.corner[i];
-    UNROLLED for (int k = 0; k < KEPT; ++k) rest[k] = w.corner[LOWER + k];
+    float kept[LOWER + KEPT_QUADS * 4], inverse[KEPT], x[TRUNK];
+    UNROLLED for (int i = 0; i < LOWER + KEPT_QUADS * 4; i += 4) {
+      const Quad q = read4(w.corner + i);
+      UNROLLED for (int k = 0; k < 4; ++k) kept[i + k] = q.v[k];
+    }
+    float *const rest = kept, *const corner = kept + LOWER;
     UNROLLED for (int k = KEPT - 1; k >= 0; --k) {
       const float* const row = corner + k * (k + 1) / 2;
       inverse[k] = divide(1.0f, row[k]);
@@ -1595,8 +1599,8 @@ struct Step : Math {
       x[k] = x[k] * inverse[k];
     }
     UNROLLED for (int k = KEPT; k < TRUNK; ++k) {
-      const float* const row = w.corner + k * (k + 1) / 2;
-      x[k] = w.corner[LOWER + k];
+      const float* const row = w.corner + LOWER + k * (k + 1) / 2;
+      x[k] = w.corner[k];
       UNROLLED for (int j = 0; j < k; ++j) x[k] = x[k] - row[j] * x[j];
       x[k] = divide(x[k], row[k]);
     }

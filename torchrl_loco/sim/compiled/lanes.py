@@ -190,7 +190,8 @@ class Limbs:
     def numbers(self) -> int:
         """Numbers that the lanes share: two pivots of each limb, and what they leave of the trunk."""
         trunk = len(self.trunk)
-        return 2 * len(self.limbs) * pad(trunk + self.longest + 1, 4) + trunk * (trunk + 3) // 2
+        corner = pad(pad(trunk, 4) + trunk * (trunk + 1) // 2, 4)
+        return 2 * len(self.limbs) * pad(trunk + self.longest + 1, 4) + corner
 
     def crosses(self, dofs: int) -> bool:
         """Returns whether several limbs are among the bits of degrees of freedom."""
@@ -478,8 +479,10 @@ class Description:
         tables.integers("limb_length", list(map(len, limbs)))
         places = {d: t for t, d in enumerate(trunk)}
         tables.integers("trunk_place", [places.get(d, -1) for d in range(self.layout.stride)])
+        gradient = [(i, len(trunk)) for i in range(len(trunk))]
         lower = [(i, j) for i in range(len(trunk)) for j in range(i + 1)]
-        corner = [*lower, *((i, len(trunk)) for i in range(len(trunk)))]
+        unused = [(0, 0)] * 3
+        corner = [*gradient, *unused[: -len(trunk) % 4], *lower, *unused[: -len(lower) % 4]]
         tables.integers("corner_row", [i for i, _ in corner])
         tables.integers("corner_column", [j for _, j in corner])
         dofs = [self._dofs_of_geom(p.geoms[0]) ^ self._dofs_of_geom(p.geoms[1]) for p in self.pairs]
