@@ -74,6 +74,7 @@ enum {
   DOFS = Model::DOFS,
   STRIDE = (DOFS + 3) / 4 * 4,  // of a row of a matrix; the columns beyond DOFS are zero
   QUADS = STRIDE / 4,
+  PITCH = 4 * (QUADS | 1),  // of rows that several lanes write at once: they begin in different banks
   SLOTS = (STRIDE + LANES - 1) / LANES,
   SEVERAL_ROWS = SLOTS > 1,  // a lane has some: then what spares rounds pays for a longer text
   SKIPS_QUADS = SEVERAL_ROWS && LANES > 1,  // a lane that steps a world alone looks at each number itself
@@ -113,15 +114,14 @@ struct alignas(16) World {
       Contact contacts[CONTACTS];
       Vec tangents[Model::FRICTIONAL + 1];
     };
-    struct {  // while solving
-      union {
-        struct { float pivots[2][2][STRIDE + 4], couplings[DOFS / 2 + 1]; };
-//IF LIMBS
-        struct { float limb_pivots[2][Model::LIMBS * PIVOT], corner[CORNER]; };
-//END
-      };
-      float change[Model::ROWS];
+    struct {  // while a direction is sought
+      float pivots[4][PITCH], pivot_damping[4], pivot_gradient[4];
+      float blocks[QUADS][12];
     };
+//IF LIMBS
+    struct { float limb_pivots[2][Model::LIMBS * PIVOT], corner[CORNER]; };
+//END
+    float change[Model::ROWS];  // of the residuals, along the direction
     Motion velocity[Model::LINKS];  // of each link relative to its parent; with a single lane, to the world
   };
   float projected[Model::JACOBIAN_ROWS];  // Jacobian times the search direction
@@ -1212,9 +1212,9 @@ struct Step : Math {
 
   // ---- Newton's method: the minimum over qacc of  (qacc - smooth)' M (qacc - smooth) / 2  +  the cost of the rows.
 
-  struct Slots {  // of the Hessian (or of M + h D) and of its factor: the rows that this lane owns
-    float row[SLOTS][STRIDE];  // left of the diagonal
-    float diagonal[SLOTS], gradient[SLOTS];
+  struct Slots {  // of the Hessian (or of M + h D): the rows that this lane owns
+    float row[SLOTS][STRIDE];
+    float diagonal[SLOTS], gradient[SLOTS];  // what has yet to be added to the diagonal; the right-hand side
   };
 
   static INLINE Quad read4(const float* p) { return *reinterpret_cast<const Quad*>(p); }
@@ -1254,15 +1254,16 @@ struct Step : Math {
     }
   }
 
+  // Rows beyond the degrees of freedom are zero, so that those of a block that they fill up go through nothing else.
   INLINE void start_from_mass(Slots& h) const {
     OWN_DOFS(slot, d) {
-      const int e = d < DOFS ? d : DOFS - 1;
       UNROLLED for (int i = 0; i < QUADS; ++i) {
         if (4 * i >= LANES * (slot + 1)) break;
-        const Quad m = read4(w.mass + STRIDE * e + 4 * i);
+        Quad m = {0.0f, 0.0f, 0.0f, 0.0f};
+        if (d < DOFS) m = read4(w.mass + STRIDE * d + 4 * i);
         UNROLLED for (int k = 0; k < 4; ++k) h.row[slot][4 * i + k] = m.v[k];
       }
-      h.diagonal[slot] += w.mass[STRIDE * e + e];
+      if (d >= DOFS) h.diagonal[slot] = 1.0f;
     }
   }
 
@@ -1282,7 +1283,6 @@ struct Step : Math {
         bool some = false;
         UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
           h.gradient[slot] = h.gradient[slot] + cost.gradient[i] * own[i];
-          h.diagonal[slot] = h.diagonal[slot] + c[i] * own[i];
           some = some || c[i] != 0.0f;
         }
         if (LANES == 1 && !some) continue;
@@ -1306,7 +1306,6 @@ struct Step : Math {
         if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
         const float n0 = n[dof < STRIDE ? dof : STRIDE - 1], c = weight * n0;
         h.gradient[slot] += c * x;
-        h.diagonal[slot] += c * n0;
         if (LANES == 1 && c == 0.0f) continue;
         UNROLLED for (int i = 0; i < QUADS; ++i) {
           if (4 * i >= LANES * (slot + 1)) break;
@@ -1318,45 +1317,91 @@ struct Step : Math {
     }
   }
 
-  // Eliminates rows `first` down to `last` + 1 of H = L' D L, two at a time: their owners hand them to all lanes, which
-  // subtract them from their own rows. The right-hand side, here the gradient, is carried along like a column.
+  // A symmetric matrix of four rows, [A B'; B C], as A^-1, B A^-1 and the inverse of C - B A^-1 B'.
+  struct Block {
+    float upper[3], mixed[2][2], lower[3];
+
+    static INLINE void invert(const float a, const float b, const float c, float* x) {  // [a b; b c]
+      const float inverse = divide(1.0f, a * c - b * b);
+      x[0] = c * inverse;
+      x[1] = -b * inverse;
+      x[2] = a * inverse;
+    }
+    INLINE void factor(const Quad* rows, const Quad damping) {
+      invert(rows[0].v[0] + damping.v[0], rows[1].v[0], rows[1].v[1] + damping.v[1], upper);
+      UNROLLED for (int i = 0; i < 2; ++i) {
+        const float *const b = rows[2 + i].v;
+        mixed[i][0] = b[0] * upper[0] + b[1] * upper[1];
+        mixed[i][1] = b[0] * upper[1] + b[1] * upper[2];
+      }
+      const float *const b = rows[2].v, *const c = rows[3].v;
+      invert(b[2] + damping.v[2] - mixed[0][0] * b[0] - mixed[0][1] * b[1], c[2] - mixed[1][0] * b[0] - mixed[1][1] * b[1],
+             c[3] + damping.v[3] - mixed[1][0] * c[0] - mixed[1][1] * c[1], lower);
+    }
+    INLINE void solve(const float* y, float* x) const {
+      const float t0 = y[2] - mixed[0][0] * y[0] - mixed[0][1] * y[1];
+      const float t1 = y[3] - mixed[1][0] * y[0] - mixed[1][1] * y[1];
+      x[2] = lower[0] * t0 + lower[1] * t1;
+      x[3] = lower[1] * t0 + lower[2] * t1;
+      x[0] = upper[0] * y[0] + upper[1] * y[1] - mixed[0][0] * x[2] - mixed[1][0] * x[3];
+      x[1] = upper[1] * y[0] + upper[2] * y[1] - mixed[0][1] * x[2] - mixed[1][1] * x[3];
+    }
+    INLINE void write(float* p) const {
+      write4(p, {upper[0], upper[1], upper[2], lower[0]});
+      write4(p + 4, {mixed[0][0], mixed[0][1], mixed[1][0], mixed[1][1]});
+      write4(p + 8, {lower[1], lower[2], 0.0f, 0.0f});
+    }
+    INLINE void read(const float* p) {
+      const Quad a = read4(p), b = read4(p + 4), c = read4(p + 8);
+      UNROLLED for (int i = 0; i < 3; ++i) upper[i] = a.v[i];
+      UNROLLED for (int i = 0; i < 4; ++i) mixed[i / 2][i % 2] = b.v[i];
+      lower[0] = a.v[3];
+      lower[1] = c.v[0];
+      lower[2] = c.v[1];
+    }
+  };
+
+  // Eliminates blocks `first` down to `last` + 1 of four rows each, H = L D L': the owners of a block hand its rows to
+  // all lanes, which subtract them from their own rows. The right-hand side, here the gradient, is carried along like a
+  // column.
   INLINE void eliminate(Slots& h, const int first, const int last) {
-    const int quads = first / 4 + 1;
-    ROLLED for (int k = first; k > last; k -= 2) {
-      float *const upper = w.pivots[k >> 1 & 1][0], *const lower = w.pivots[k >> 1 & 1][1];  // rows k and k - 1
+    ROLLED for (int block = first; block > last; --block) {
       OWN_DOFS(slot, d) {
-        if (slot > first / LANES || (d != k && d != k - 1)) continue;
-        float* const row = d == k ? upper : lower;
-        UNROLLED for (int i = 0; i < quads; ++i) {
+        if (slot > first * 4 / LANES || d / 4 != block) continue;
+        float* const row = w.pivots[d % 4];
+        UNROLLED for (int i = 0; i <= first; ++i) {
           const float* const own = h.row[slot] + 4 * i;
           write4(row + 4 * i, {own[0], own[1], own[2], own[3]});
         }
-        row[STRIDE] = h.diagonal[slot];
-        row[STRIDE + 1] = h.gradient[slot];
+        w.pivot_damping[d % 4] = h.diagonal[slot];
+        w.pivot_gradient[d % 4] = h.gradient[slot];
       }
       sync();
-      const float inverse1 = divide(1.0f, upper[STRIDE]), gradient1 = upper[STRIDE + 1];
-      const float coupling = upper[k - 1] * inverse1;
-      const float inverse2 = divide(1.0f, lower[STRIDE] - upper[k - 1] * coupling), gradient2 = lower[STRIDE + 1];
-      if (lane == 0) w.couplings[k / 2] = coupling;
-      float c1[SLOTS], c2[SLOTS];
+      Quad rows[4];
+      UNROLLED for (int i = 0; i < 4; ++i) rows[i] = read4(w.pivots[i] + 4 * block);
+      Block b;
+      b.factor(rows, read4(w.pivot_damping));
+      if (lane == 0) b.write(w.blocks[block]);
+      if (block == 0) break;
+      const Quad gradient = read4(w.pivot_gradient);
+      float c[SLOTS][4];
       OWN_DOFS(slot, d) {
-        if (slot > first / LANES) break;
-        const float x1 = d < k ? upper[d] : 0.0f, x2 = d < k - 1 ? lower[d] - coupling * x1 : 0.0f;
-        c1[slot] = x1 * inverse1;
-        c2[slot] = x2 * inverse2;
-        h.diagonal[slot] = h.diagonal[slot] - c2[slot] * x2 - c1[slot] * x1;
-        c1[slot] = c1[slot] - c2[slot] * coupling;
-        h.gradient[slot] = h.gradient[slot] - c2[slot] * gradient2 - c1[slot] * gradient1;
+        if (4 * first <= LANES * slot) break;
+        float own[4];
+        UNROLLED for (int i = 0; i < 4; ++i) own[i] = d < 4 * block ? w.pivots[i][d] : 0.0f;
+        b.solve(own, c[slot]);
+        UNROLLED for (int i = 0; i < 4; ++i) h.gradient[slot] = h.gradient[slot] - c[slot][i] * gradient.v[i];
       }
-      UNROLLED for (int i = 0; i < quads; ++i) {
-        const Quad a = read4(upper + 4 * i), b = read4(lower + 4 * i);
-        UNROLLED for (int slot = 0; slot <= first / LANES; ++slot) {
+      UNROLLED for (int i = 0; i < first; ++i) {
+        UNROLLED for (int k = 0; k < 4; ++k) rows[k] = read4(w.pivots[k] + 4 * i);
+        UNROLLED for (int slot = 0; LANES * slot < 4 * first; ++slot) {
           if (4 * i >= LANES * (slot + 1)) continue;
-          UNROLLED for (int j = 0; j < 4; ++j)
-            h.row[slot][4 * i + j] = h.row[slot][4 * i + j] - c2[slot] * b.v[j] - c1[slot] * a.v[j];
+          UNROLLED for (int k = 0; k < 4; ++k)
+            UNROLLED for (int j = 0; j < 4; ++j)
+              h.row[slot][4 * i + j] = h.row[slot][4 * i + j] - c[slot][k] * rows[k].v[j];
         }
       }
+      sync();
     }
   }
 
@@ -1368,31 +1413,24 @@ struct Step : Math {
     }
 //ELIMINATE
     sync();
-    // Substitution from the first row to the last, in the same pairs. All subtract; those who are done take no harm.
-    float inverse[SLOTS], solution[SLOTS];
-    OWN_DOFS(slot, d) {
-      inverse[slot] = divide(1.0f, h.diagonal[slot]);
-      solution[slot] = 0.0f;
+    // Substitution from the first block to the last. All subtract; those who are done take no harm.
+    UNROLLED for (int block = 0; block < QUADS; ++block) {
+      const int first = 4 * block, own = first / LANES;
+      Block b;
+      b.read(w.blocks[block]);
+      float y[4], x[4];
+      UNROLLED for (int i = 0; i < 4; ++i) y[i] = read(h.gradient[own], (first + i) % LANES);
+      b.solve(y, x);
+      if (lane == 0) write4(w.search + first, {-x[0], -x[1], -x[2], -x[3]});
+      UNROLLED for (int slot = own; slot < SLOTS; ++slot)
+        UNROLLED for (int i = 0; i < 4; ++i) h.gradient[slot] = h.gradient[slot] - h.row[slot][first + i] * x[i];
     }
-    if (DOFS % 2) {
-      const float x = read(h.gradient[0] * inverse[0], 0);
-      if (lane == 0) solution[0] = x;
-      OWN_DOFS(slot, d) h.gradient[slot] -= h.row[slot][0] * x;
-    }
-    UNROLLED for (int j = DOFS % 2; j + 1 < DOFS; j += 2) {
-      const int a = j / LANES, b = (j + 1) / LANES;
-      const float x1 = read(h.gradient[a] * inverse[a], j % LANES);
-      const float x2 = read(h.gradient[b] * inverse[b], (j + 1) % LANES) - w.couplings[(j + 1) / 2] * x1;
-      if (lane == j % LANES) solution[a] = x1;
-      if (lane == (j + 1) % LANES) solution[b] = x2;
-      UNROLLED for (int slot = a; slot < SLOTS; ++slot)
-        h.gradient[slot] = h.gradient[slot] - h.row[slot][j + 1] * x2 - h.row[slot][j] * x1;
-    }
-    OWN_DOFS(slot, d) if (d < DOFS) w.search[d] = -solution[slot];
+    sync();
   }
 
   // The same with a single lane, which can skip what is zero: branches of the tree that do not meet.
   INLINE void factor_and_solve_alone(Slots& h) {
+    for (int k = 0; k < DOFS; ++k) h.diagonal[k] += h.row[k][k];
     for (int k = DOFS - 1; k > 0; --k) {
       const float inverse = divide(1.0f, h.diagonal[k]);
       for (int i = 0; i < k; ++i) {

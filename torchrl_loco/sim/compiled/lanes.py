@@ -132,7 +132,8 @@ class Layout:
         contacts = self.frictional + self.frictionless
         vectors = pad(self.positions, 4) + 5 * self.stride + 8 * self.dofs + self.dofs * self.stride + 2 * self.rows
         before = 32 * contacts + 12 * (self.frictional + 1)
-        solving = 4 * (max(4 * (self.stride + 4) + self.dofs // 2 + 1, self.limb_numbers) + self.rows)
+        quads = self.stride // 4
+        solving = 4 * max(16 * (quads | 1) + 8 + 12 * quads, self.limb_numbers, self.rows)
         kinematics = 32 * max(self.links, self.dofs) + 112 * self.links + 32 * (self.geoms + 1) + 2 * self.candidates
         total = 4 * vectors + pad(max(before, solving, 32 * self.links), 16)
         total = pad(total + 4 * self.jacobian_rows, 16)
@@ -750,14 +751,10 @@ class Description:
         return min(REGISTERS // (LANES * math.ceil(worlds / SCHEDULERS)) // 8 * 8, 255)
 
     def elimination(self) -> str:
-        """Returns calls that eliminate all rows, two by two, in parts: the fewer rows are left, the fewer columns."""
-        last = self.m.nv - 1
-        shares = () if last < 8 else (0.5,) if last < 16 else (0.25, 0.55)
-        edges = [last - 2 * int(last * share / 2) for share in shares]
-        if last >= LANES:  # where one row a lane is left
-            single = LANES - 1 - (LANES - 1 - last) % 2
-            edges[min(range(len(edges)), key=lambda i: abs(edges[i] - single))] = single
-        edges = [last, *edges, -(last % 2)]
+        """Returns calls that eliminate all rows, in blocks of four, in parts: the fewer rows are left, the fewer columns."""
+        last = self.layout.stride // 4 - 1
+        half = LANES // 4 if last > LANES // 4 else last // 2  # beyond, lanes have several rows
+        edges = [last, *([half] if half else []), -1]
         return "\n".join(f"    eliminate(h, {first}, {end});" for first, end in itertools.pairwise(edges))
 
 
