@@ -1362,12 +1362,12 @@ struct Step : Math {
   };
 
   // Eliminates blocks `first` down to `last` + 1 of four rows each, H = L D L': the owners of a block hand its rows to
-  // all lanes, which subtract them from their own rows. The right-hand side, here the gradient, is carried along like a
-  // column.
+  // all lanes, which subtract them from their own rows, except for columns in which they are zero: those of branches
+  // of the tree that do not meet. The right-hand side, here minus the gradient, is carried along like a column.
   INLINE void eliminate(Slots& h, const int first, const int last) {
     ROLLED for (int block = first; block > last; --block) {
       OWN_DOFS(slot, d) {
-        if (slot > first * 4 / LANES || d / 4 != block) continue;
+        if (slot > 4 * first / LANES || d >> 2 != block) continue;
         float* const row = w.pivots[d % 4];
         UNROLLED for (int i = 0; i <= first; ++i) {
           const float* const own = h.row[slot] + 4 * i;
@@ -1385,20 +1385,29 @@ struct Step : Math {
       if (block == 0) break;
       const Quad gradient = read4(w.pivot_gradient);
       float c[SLOTS][4];
+      unsigned columns[SLOTS];
       OWN_DOFS(slot, d) {
         if (4 * first <= LANES * slot) break;
         float own[4];
-        UNROLLED for (int i = 0; i < 4; ++i) own[i] = d < 4 * block ? w.pivots[i][d] : 0.0f;
+        bool some = false;
+        UNROLLED for (int i = 0; i < 4; ++i) {
+          own[i] = d < 4 * block ? w.pivots[i][d] : 0.0f;
+          some = some || own[i] != 0.0f;
+        }
+        columns[slot] = ballot(some);
         b.solve(own, c[slot]);
         UNROLLED for (int i = 0; i < 4; ++i) h.gradient[slot] = h.gradient[slot] - c[slot][i] * gradient.v[i];
       }
-      UNROLLED for (int i = 0; i < first; ++i) {
-        UNROLLED for (int k = 0; k < 4; ++k) rows[k] = read4(w.pivots[k] + 4 * i);
-        UNROLLED for (int slot = 0; LANES * slot < 4 * first; ++slot) {
-          if (4 * i >= LANES * (slot + 1)) continue;
-          UNROLLED for (int k = 0; k < 4; ++k)
-            UNROLLED for (int j = 0; j < 4; ++j)
-              h.row[slot][4 * i + j] = h.row[slot][4 * i + j] - c[slot][k] * rows[k].v[j];
+      UNROLLED for (int pair = 0; 2 * pair < first; ++pair) {  // of quads
+        if (!(columns[8 * pair / LANES] >> 8 * pair % LANES & 255)) continue;
+        UNROLLED for (int i = 2 * pair; i < 2 * pair + 2 && i < first; ++i) {
+          UNROLLED for (int k = 0; k < 4; ++k) rows[k] = read4(w.pivots[k] + 4 * i);
+          UNROLLED for (int slot = 0; LANES * slot < 4 * first; ++slot) {
+            if (4 * i >= LANES * (slot + 1)) continue;
+            UNROLLED for (int k = 0; k < 4; ++k)
+              UNROLLED for (int j = 0; j < 4; ++j)
+                h.row[slot][4 * i + j] = h.row[slot][4 * i + j] - c[slot][k] * rows[k].v[j];
+          }
         }
       }
       sync();

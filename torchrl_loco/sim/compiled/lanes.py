@@ -751,10 +751,9 @@ class Description:
         return min(REGISTERS // (LANES * math.ceil(worlds / SCHEDULERS)) // 8 * 8, 255)
 
     def elimination(self) -> str:
-        """Returns calls that eliminate all rows, in blocks of four, in parts: the fewer rows are left, the fewer columns."""
+        """Returns calls that eliminate all rows, in blocks of four: first those of which a lane has several."""
         last = self.layout.stride // 4 - 1
-        half = LANES // 4 if last > LANES // 4 else last // 2  # beyond, lanes have several rows
-        edges = [last, *([half] if half else []), -1]
+        edges = [last, *([LANES // 4] if last > LANES // 4 else []), -1]
         return "\n".join(f"    eliminate(h, {first}, {end});" for first, end in itertools.pairwise(edges))
 
 
