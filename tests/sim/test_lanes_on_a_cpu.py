@@ -16,7 +16,11 @@ from torchrl_loco.sim.compiled.engine import LATER
 COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 WORLDS, MOTION = 16, 100
 WAITING = r"(INLINE \w+ (?:sync|ballot|any_of_block|read|sum|largest)\()(.*)\) const"
-PTX = {r'asm\("div\..*': "x = a / b;", r'asm\("rsqrt\..*': "y = 1.0f / sqrtf(larger(x, 1e-30f));"}
+PTX = {
+    r'asm\("div\..*': "x = a / b;",
+    r'asm\("rcp\..*': "x = 1.0f / a;",
+    r'asm\("rsqrt\..*': "y = 1.0f / sqrtf(larger(x, 1e-30f));",
+}
 
 SEEN = {
     "go1_velocity": {"qpos": 5.5e-7, "qvel": 2.8e-5, "contact_force": 1.6e-3},

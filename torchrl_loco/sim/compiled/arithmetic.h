@@ -21,6 +21,11 @@ struct Math {
     asm("div.approx.ftz.f32 %0, %1, %2;" : "=f"(x) : "f"(a), "f"(b));
     return x;
   }
+  static INLINE float inverse(float a) {
+    float x;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(x) : "f"(a));
+    return x;
+  }
   static INLINE float root(float x) {
     float y;
     asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(larger(x, 1e-30f)));
@@ -31,6 +36,7 @@ struct Math {
   static INLINE int lowest_bit(unsigned long long x) { return __ffsll(x) - 1; }
 #else
   static INLINE float divide(float a, float b) { return a / b; }
+  static INLINE float inverse(float a) { return 1.0f / a; }
   static INLINE float root(float x) { return sqrtf(x); }
   static INLINE int bits(unsigned x) { return __builtin_popcount(x); }
   static INLINE int lowest_bit(unsigned x) { return __builtin_ctz(x); }

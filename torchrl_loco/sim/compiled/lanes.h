@@ -1254,16 +1254,14 @@ struct Step : Math {
     }
   }
 
-  // Rows beyond the degrees of freedom are zero, so that those of a block that they fill up go through nothing else.
   INLINE void start_from_mass(Slots& h) const {
     OWN_DOFS(slot, d) {
+      const int e = d < DOFS ? d : DOFS - 1;
       UNROLLED for (int i = 0; i < QUADS; ++i) {
         if (4 * i >= LANES * (slot + 1)) break;
-        Quad m = {0.0f, 0.0f, 0.0f, 0.0f};
-        if (d < DOFS) m = read4(w.mass + STRIDE * d + 4 * i);
+        const Quad m = read4(w.mass + STRIDE * e + 4 * i);
         UNROLLED for (int k = 0; k < 4; ++k) h.row[slot][4 * i + k] = m.v[k];
       }
-      if (d >= DOFS) h.diagonal[slot] = 1.0f;
     }
   }
 
@@ -1321,18 +1319,18 @@ struct Step : Math {
   struct Block {
     float upper[3], mixed[2][2], lower[3];
 
-    static INLINE void invert(const float a, const float b, const float c, float* x) {  // [a b; b c]
-      const float inverse = divide(1.0f, a * c - b * b);
-      x[0] = c * inverse;
-      x[1] = -b * inverse;
-      x[2] = a * inverse;
+    static INLINE void invert(const float a, const float b, const float c, float* x) {  // [a b; b c], to [x0 -x1; -x1 x2]
+      const float k = inverse(a * c - b * b);
+      x[0] = c * k;
+      x[1] = b * k;
+      x[2] = a * k;
     }
     INLINE void factor(const Quad* rows, const Quad damping) {
       invert(rows[0].v[0] + damping.v[0], rows[1].v[0], rows[1].v[1] + damping.v[1], upper);
       UNROLLED for (int i = 0; i < 2; ++i) {
         const float *const b = rows[2 + i].v;
-        mixed[i][0] = b[0] * upper[0] + b[1] * upper[1];
-        mixed[i][1] = b[0] * upper[1] + b[1] * upper[2];
+        mixed[i][0] = b[0] * upper[0] - b[1] * upper[1];
+        mixed[i][1] = b[1] * upper[2] - b[0] * upper[1];
       }
       const float *const b = rows[2].v, *const c = rows[3].v;
       invert(b[2] + damping.v[2] - mixed[0][0] * b[0] - mixed[0][1] * b[1], c[2] - mixed[1][0] * b[0] - mixed[1][1] * b[1],
@@ -1341,10 +1339,10 @@ struct Step : Math {
     INLINE void solve(const float* y, float* x) const {
       const float t0 = y[2] - mixed[0][0] * y[0] - mixed[0][1] * y[1];
       const float t1 = y[3] - mixed[1][0] * y[0] - mixed[1][1] * y[1];
-      x[2] = lower[0] * t0 + lower[1] * t1;
-      x[3] = lower[1] * t0 + lower[2] * t1;
-      x[0] = upper[0] * y[0] + upper[1] * y[1] - mixed[0][0] * x[2] - mixed[1][0] * x[3];
-      x[1] = upper[1] * y[0] + upper[2] * y[1] - mixed[0][1] * x[2] - mixed[1][1] * x[3];
+      x[2] = lower[0] * t0 - lower[1] * t1;
+      x[3] = lower[2] * t1 - lower[1] * t0;
+      x[0] = upper[0] * y[0] - upper[1] * y[1] - mixed[0][0] * x[2] - mixed[1][0] * x[3];
+      x[1] = upper[2] * y[1] - upper[1] * y[0] - mixed[0][1] * x[2] - mixed[1][1] * x[3];
     }
     INLINE void write(float* p) const {
       write4(p, {upper[0], upper[1], upper[2], lower[0]});
@@ -1367,14 +1365,14 @@ struct Step : Math {
   INLINE void eliminate(Slots& h, const int first, const int last) {
     ROLLED for (int block = first; block > last; --block) {
       OWN_DOFS(slot, d) {
-        if (slot > 4 * first / LANES || d >> 2 != block) continue;
-        float* const row = w.pivots[d % 4];
+        if (slot > 4 * first / LANES || d >> 2 != block || d >= DOFS) continue;
+        float* const row = w.pivots[d & 3];
         UNROLLED for (int i = 0; i <= first; ++i) {
           const float* const own = h.row[slot] + 4 * i;
           write4(row + 4 * i, {own[0], own[1], own[2], own[3]});
         }
-        w.pivot_damping[d % 4] = h.diagonal[slot];
-        w.pivot_gradient[d % 4] = h.gradient[slot];
+        w.pivot_damping[d & 3] = h.diagonal[slot];
+        w.pivot_gradient[d & 3] = h.gradient[slot];
       }
       sync();
       Quad rows[4];
@@ -1414,11 +1412,19 @@ struct Step : Math {
     }
   }
 
-  // Solves H x = gradient and sets the search direction to -x.
+  // Solves H x = -gradient for the search direction x.
   INLINE void factor_and_solve(Slots& h) {
+    OWN_DOFS(slot, d) h.gradient[slot] = -h.gradient[slot];
     if (LANES == 1) {
       factor_and_solve_alone(h);
       return;
+    }
+    if (DOFS < STRIDE && lane < QUADS) {  // rows that fill up the first block, and go through nothing else
+      UNROLLED for (int i = DOFS % 4; i < 4; ++i) {
+        write4(w.pivots[i] + 4 * lane, {0.0f, 0.0f, 0.0f, 0.0f});
+        w.pivot_damping[i] = 1.0f;
+        w.pivot_gradient[i] = 0.0f;
+      }
     }
 //ELIMINATE
     sync();
@@ -1428,9 +1434,9 @@ struct Step : Math {
       Block b;
       b.read(w.blocks[block]);
       float y[4], x[4];
-      UNROLLED for (int i = 0; i < 4; ++i) y[i] = read(h.gradient[own], (first + i) % LANES);
+      UNROLLED for (int i = 0; i < 4; ++i) y[i] = first + i < DOFS ? read(h.gradient[own], (first + i) % LANES) : 0.0f;
       b.solve(y, x);
-      if (lane == 0) write4(w.search + first, {-x[0], -x[1], -x[2], -x[3]});
+      if (lane == 0) write4(w.search + first, {x[0], x[1], x[2], x[3]});
       UNROLLED for (int slot = own; slot < SLOTS; ++slot)
         UNROLLED for (int i = 0; i < 4; ++i) h.gradient[slot] = h.gradient[slot] - h.row[slot][first + i] * x[i];
     }
@@ -1453,8 +1459,8 @@ struct Step : Math {
     }
     for (int i = 0; i < DOFS; ++i) {
       float x = h.gradient[i];
-      for (int j = 0; j < i; ++j) x += h.row[i][j] * w.search[j];
-      w.search[i] = divide(-x, h.diagonal[i]);
+      for (int j = 0; j < i; ++j) x -= h.row[i][j] * w.search[j];
+      w.search[i] = divide(x, h.diagonal[i]);
     }
   }
 
