@@ -196,45 +196,59 @@ struct Cone {
     UNROLLED for (int j = 1; j < DIRECTIONS; ++j) product[j] = common * way[j] + across * v[j];
   }
 
-  static INLINE float cost(const float* x, float weight, float mu) {
-    const float n = x[0], t = length(x);
-    const float beside = Math::smaller(n - mu * t, 0.0f), beyond = Math::smaller(mu * n + t, 0.0f);
-    return Math::divide(0.5f * weight, 1.0f + mu * mu) * (beside * beside + beyond * beyond);
-  }
+  // A contact along a search direction v: its residual is x + alpha v.
+  struct Line {
+    float n, n_speed;                 // along the normal, and how it changes
+    float t, forward, speed_squared;  // off it: the length of x, its product with v, the square of v
+    float nearest_squared, per_speed;  // the shortest length on the way; one over the square of v, or 0
+    float weight, parabola, mu;
 
-  // The change of y^2, where it counts below zero, as y goes `by` from one value to another.
-  static INLINE float grown(float from, float to, float by) {
-    if (to < 0.0f) return from < 0.0f ? by * (from + to) : to * to;
-    return from < 0.0f ? -from * from : 0.0f;
-  }
-  // Adds to three sums how the cost changes from x to x + alpha v, and its slope and curvature there.
-  static INLINE void add(const float* x, const float* v, float weight, float mu, float alpha, float* sums) {
-    float start = 0.0f, squared = 0.0f, gained = 0.0f, forward = 0.0f, speed = 0.0f;
-    UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
-      const float next = x[j] + alpha * v[j];
-      start += x[j] * x[j];
-      squared += next * next;
-      gained += (x[j] + next) * v[j];
-      forward += next * v[j];
-      speed += v[j] * v[j];
+    INLINE void set(const float* x, const float* v, float own_weight, float own_mu) {
+      float squared = forward = speed_squared = 0.0f;
+      UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
+        squared += x[j] * x[j];
+        forward += x[j] * v[j];
+        speed_squared += v[j] * v[j];
+      }
+      n = x[0];
+      n_speed = v[0];
+      t = Math::root(squared);
+      per_speed = speed_squared > 0.0f ? Math::inverse(speed_squared) : 0.0f;
+      nearest_squared = Math::larger(squared - forward * forward * per_speed, 0.0f);
+      weight = own_weight;
+      mu = own_mu;
+      parabola = Math::divide(weight, 1.0f + mu * mu);
     }
-    const float t0 = Math::root(start), t = Math::root(squared), inverse = t > 0.0f ? Math::divide(1.0f, t) : 0.0f;
-    const float by_t = t0 + t > 0.0f ? Math::divide(alpha * gained, t0 + t) : 0.0f;
-    const float by_n = alpha * v[0], n = x[0] + by_n, beside = n - mu * t;
-    const float parabola = Math::divide(weight, 1.0f + mu * mu);
-    sums[0] += 0.5f * parabola * (grown(x[0] - mu * t0, beside, by_n - mu * by_t) +
-                                  grown(mu * x[0] + t0, mu * n + t, mu * by_n + by_t));
-    const State in = state(n, t, mu);
-    if (in == STICKING) {
-      sums[1] += weight * (n * v[0] + forward);
-      sums[2] += weight * (v[0] * v[0] + speed);
-    } else if (in == SLIDING) {
-      const float towards = forward * inverse, sideways = Math::larger(speed - towards * towards, 0.0f);
-      const float rate = v[0] - mu * towards;
-      sums[1] += parabola * beside * rate;
-      sums[2] += parabola * (rate * rate - mu * beside * sideways * inverse);
+    INLINE float cost() const {
+      const float beside = Math::smaller(n - mu * t, 0.0f), beyond = Math::smaller(mu * n + t, 0.0f);
+      return 0.5f * parabola * (beside * beside + beyond * beyond);
     }
-  }
+    // The change of y^2, where it counts below zero, as y goes `by` from one value to another.
+    static INLINE float grown(float from, float to, float by) {
+      if (to < 0.0f) return from < 0.0f ? by * (from + to) : to * to;
+      return from < 0.0f ? -from * from : 0.0f;
+    }
+    // Adds to three sums how the cost changes from x to x + alpha v, and its slope and curvature there.
+    INLINE void add(float alpha, float* sums) const {
+      const float next_forward = forward + alpha * speed_squared;
+      const float squared = nearest_squared + next_forward * next_forward * per_speed;
+      const float next_t = Math::root(squared), inverse = next_t > 0.0f ? Math::inverse(next_t) : 0.0f;
+      const float by_t = t + next_t > 0.0f ? Math::divide(alpha * (forward + next_forward), t + next_t) : 0.0f;
+      const float by_n = alpha * n_speed, next_n = n + by_n, beside = next_n - mu * next_t;
+      sums[0] += 0.5f * parabola * (grown(n - mu * t, beside, by_n - mu * by_t) +
+                                    grown(mu * n + t, mu * next_n + next_t, mu * by_n + by_t));
+      const State in = state(next_n, next_t, mu);
+      if (in == STICKING) {
+        sums[1] += weight * (next_n * n_speed + next_forward);
+        sums[2] += weight * (n_speed * n_speed + speed_squared);
+      } else if (in == SLIDING) {
+        const float towards = next_forward * inverse, rate = n_speed - mu * towards;
+        const float sideways = Math::larger(speed_squared - towards * towards, 0.0f);
+        sums[1] += parabola * beside * rate;
+        sums[2] += parabola * (rate * rate - mu * beside * sideways * inverse);
+      }
+    }
+  };
 };
 typedef Cone Law;
 //ELSE
@@ -1193,11 +1207,6 @@ struct Step : Math {
   }
 //IF ELLIPTIC
 
-  INLINE void add_cone(int contact, float alpha, float* sums) const {
-    const int first = CONTACT_ROWS * contact;
-    Cone::add(w.x + first, w.change + first, w.weight[first], w.weight[first + 1], alpha, sums);
-  }
-
   // Moves the residuals of a cone, and returns whether the Hessian of its cost changes.
   INLINE bool move_cone(int contact, float alpha) {
     const int first = CONTACT_ROWS * contact;
@@ -1759,15 +1768,19 @@ struct Step : Math {
 
   // ---- Line search
 
-  // Adds what n steps change of the costs of all rows, and slopes and curvatures there, to three sums each.
-  INLINE void add_rows(const float* alphas, const int n, float* sums) const {
 //IF ELLIPTIC
-    SHARED_LOOP(task, n * frictional) {  // a contact at one of the steps
-      const int step = task % n;
-      float alpha = alphas[0], part[3] = {0.0f, 0.0f, 0.0f};
-      UNROLLED for (int k = 1; k < n; ++k) alpha = step == k ? alphas[k] : alpha;
-      add_cone(task / n, alpha, part);
-      UNROLLED for (int k = 0; k < 3 * n; ++k) sums[k] += k / 3 == step ? part[k % 3] : 0.0f;
+  enum { OWN_CONES = (Model::FRICTIONAL + LANES - 1) / LANES };
+  struct Lines { Cone::Line of[OWN_CONES]; };  // of the contacts lane, lane + LANES, ...
+//ELSE
+  struct Lines {};
+//END
+
+  // Adds what n steps change of the costs of all rows, and slopes and curvatures there, to three sums each.
+  INLINE void add_rows(const Lines& lines, const float* alphas, const int n, float* sums) const {
+//IF ELLIPTIC
+    UNROLLED for (int own = 0; own < OWN_CONES; ++own) {
+      if (lane + LANES * own >= frictional) break;
+      UNROLLED for (int k = 0; k < n; ++k) lines.of[own].add(alphas[k], sums + 3 * k);
     }
 //END
     SHARED_LOOP(i, rows() - first_single()) {
@@ -1792,11 +1805,15 @@ struct Step : Math {
       t[1] += s * w.mass_search[d];
       t[2] += s * s;
     }
+    Lines lines;
 //IF ELLIPTIC
-    SHARED_LOOP(k, frictional) {
-      const float* const weight = w.weight + CONTACT_ROWS * k;
-      t[3] += Cone::cost(w.x + CONTACT_ROWS * k, weight[0], weight[1]);
-      add_cone(k, 1.0f, t + 4);
+    UNROLLED for (int own = 0; own < OWN_CONES; ++own) {
+      const int first = CONTACT_ROWS * (lane + LANES * own);
+      if (first >= first_frictionless()) break;
+      Cone::Line& line = lines.of[own];
+      line.set(w.x + first, w.change + first, w.weight[first], w.weight[first + 1]);
+      t[3] += line.cost();
+      line.add(1.0f, t + 4);
     }
 //END
     SHARED_LOOP(i, rows() - first_single()) {
@@ -1813,7 +1830,7 @@ struct Step : Math {
     }
     sum(t, 7);
     const float *const quadratic = t, *const whole = t + 3;
-    const auto add_rows = [this](const float* alphas, const int n, float* sums) { this->add_rows(alphas, n, sums); };
+    const auto add_rows = [&](const float* alphas, const int n, float* sums) { this->add_rows(lines, alphas, n, sums); };
 //LINE_SEARCH
   }
 
