@@ -26,17 +26,19 @@ struct Math {
     asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(x) : "f"(a));
     return x;
   }
-  static INLINE float root(float x) {
+  static INLINE float inverse_root(float x) {
     float y;
     asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(larger(x, 1e-30f)));
-    return x * y;
+    return y;
   }
+  static INLINE float root(float x) { return x * inverse_root(x); }
   static INLINE int bits(unsigned x) { return __popc(x); }
   static INLINE int lowest_bit(unsigned x) { return __ffs(x) - 1; }
   static INLINE int lowest_bit(unsigned long long x) { return __ffsll(x) - 1; }
 #else
   static INLINE float divide(float a, float b) { return a / b; }
   static INLINE float inverse(float a) { return 1.0f / a; }
+  static INLINE float inverse_root(float x) { return 1.0f / sqrtf(larger(x, 1e-30f)); }
   static INLINE float root(float x) { return sqrtf(x); }
   static INLINE int bits(unsigned x) { return __builtin_popcount(x); }
   static INLINE int lowest_bit(unsigned x) { return __builtin_ctz(x); }

@@ -173,7 +173,7 @@ struct Cone {
   static INLINE State state(const float* x, float mu) { return state(x[0], length(x), mu); }
 
   INLINE Cone(const float* x, float weight, float mu) {
-    const float n = x[0], t = length(x), inverse = t > 0.0f ? Math::divide(1.0f, t) : 0.0f, beside = n - mu * t;
+    const float n = x[0], t = length(x), inverse = t > 0.0f ? Math::inverse(t) : 0.0f, beside = n - mu * t;
     const State in = state(n, t, mu);
     const bool slides = in == SLIDING;
     square = in == OPEN ? 0.0f : slides ? Math::divide(weight, 1.0f + mu * mu) : weight;
@@ -232,7 +232,7 @@ struct Cone {
     INLINE void add(float alpha, float* sums) const {
       const float next_forward = forward + alpha * speed_squared;
       const float squared = nearest_squared + next_forward * next_forward * per_speed;
-      const float next_t = Math::root(squared), inverse = next_t > 0.0f ? Math::inverse(next_t) : 0.0f;
+      const float inverse = squared > 0.0f ? Math::inverse_root(squared) : 0.0f, next_t = squared * inverse;
       const float by_t = t + next_t > 0.0f ? Math::divide(alpha * (forward + next_forward), t + next_t) : 0.0f;
       const float by_n = alpha * n_speed, next_n = n + by_n, beside = next_n - mu * next_t;
       sums[0] += 0.5f * parabola * (grown(n - mu * t, beside, by_n - mu * by_t) +
@@ -1596,7 +1596,7 @@ struct Step : Math {
     ROLLED for (int step = 0; step < LIMB; ++step) {
       float* const pivots = w.limb_pivots[step & 1];
       if (above == step) {
-        const float scale = divide(1.0f, root(h.diagonal[0]));
+        const float scale = inverse_root(h.diagonal[0]);
         float row[PIVOT];
         UNROLLED for (int t = 0; t < TRUNK; ++t) row[t] = h.trunk[0][t] * scale;
         row[TRUNK] = h.gradient[0] * scale;
@@ -1628,12 +1628,12 @@ struct Step : Math {
     sync();
     ROLLED for (int k = TRUNK - 1; k >= KEPT; --k) {  // an entry a lane
       const float* const row = w.corner + LOWER + k * (k + 1) / 2;
-      const float inverse = divide(1.0f, row[k]);
+      const float pivot = inverse(row[k]);
       UNROLLED for (int n = 0; n < ENTRIES; ++n) {
         const int e = lane + LANES * n;
         if (e >= CORNER) continue;
         const int i = Model::corner_row(e), j = Model::corner_column(e);
-        if (i < k) w.corner[e] -= row[i] * inverse * (j < TRUNK ? row[j] : w.corner[k]);
+        if (i < k) w.corner[e] -= row[i] * pivot * (j < TRUNK ? row[j] : w.corner[k]);
       }
       sync();
     }
@@ -1647,7 +1647,7 @@ struct Step : Math {
     float *const rest = kept, *const corner = kept + LOWER;
     UNROLLED for (int k = KEPT - 1; k >= 0; --k) {
       const float* const row = corner + k * (k + 1) / 2;
-      inverse[k] = divide(1.0f, row[k]);
+      inverse[k] = Math::inverse(row[k]);
       UNROLLED for (int i = 0; i < k; ++i) {
         const float c = row[i] * inverse[k];
         UNROLLED for (int j = 0; j <= i; ++j)
@@ -1674,7 +1674,7 @@ struct Step : Math {
     // The limbs, outwards. All subtract; those who are done take no harm.
     float y = h.gradient[0];
     UNROLLED for (int t = 0; t < TRUNK; ++t) y = y - h.trunk[0][t] * x[t];
-    const float own_inverse = divide(1.0f, h.diagonal[0]);
+    const float own_inverse = Math::inverse(h.diagonal[0]);
     UNROLLED for (int j = 0; j < LIMB; ++j) {
       const float own = y * own_inverse, found = read(own, (lane - place + j) % LANES);
       if (limb && j == place) solution[0] = own;
