@@ -142,6 +142,8 @@ struct DryFriction {  // costs D x^2 / 2 while |x| is below a bound, and grows l
 // ---- Newton's method. Brackets, tolerances and stopping tests are those of mujoco_warp, but for two that save brackets:
 // the first tries the secant, and where iterations are many, a search may end near its minimum.
 
+// Conditions are joined by | and &: by || and &&, each would be a branch.
+
 struct Point {  // on the search direction: the cost relative to alpha = 0
   float alpha, cost, slope, curvature;
   // Where the rows add three sums to a quadratic form with a slope and a curvature at alpha = 0.
@@ -155,16 +157,16 @@ struct Point {  // on the search direction: the cost relative to alpha = 0
     return slope == p.slope ? alpha : alpha - Math::divide(slope * (p.alpha - alpha), p.slope - slope);
   }
   // Whether this improves on alpha = 0 and is nearly a minimum.
-  INLINE bool flat(float tolerance) const { return fabsf(slope) < tolerance && cost < 0.0f; }
+  INLINE bool flat(float tolerance) const { return (fabsf(slope) < tolerance) & (cost < 0.0f); }
   // Whether a search may end here. Near the minimum is enough, if most is gained: the next direction gains the rest, and
   // close to the solution the first point is a Newton step of the whole.
   INLINE bool ends(const Point& start, float tolerance, float near) const {
     const float whole = fabsf(start.slope);  // twice what a parabola gains
-    return flat(tolerance) || (fabsf(slope) < near * whole && cost < -0.05f * whole);
+    return flat(tolerance) | ((fabsf(slope) < near * whole) & (cost < -0.05f * whole));
   }
   // Whether p lies between this and the minimum: its slope has the same sign, and is smaller.
   INLINE bool outside(const Point& p) const {
-    return (slope < p.slope && p.slope < 0.0f) || (slope > p.slope && p.slope > 0.0f);
+    return ((slope < p.slope) & (p.slope < 0.0f)) | ((slope > p.slope) & (p.slope > 0.0f));
   }
   INLINE bool move(const Point& p, bool wanted) {
     if (wanted) *this = p;
@@ -175,17 +177,17 @@ struct Point {  // on the search direction: the cost relative to alpha = 0
 struct Search {  // the result of a line search
   float alpha, improvement;
   INLINE void take(const Point& p, bool acceptable) {
-    if (!(acceptable && -p.cost > improvement)) return;  // nor what is no number
-    alpha = p.alpha;
-    improvement = -p.cost;
+    const bool better = acceptable & (-p.cost > improvement);  // which what is no number is not
+    alpha = better ? p.alpha : alpha;
+    improvement = better ? -p.cost : improvement;
   }
 };
 
 struct Converged {  // scale is one over the inertia of the model
   static INLINE bool small(Search step, float scale, float tolerance) {
-    return step.improvement > 0.0f && step.improvement * scale < tolerance;
+    return (step.improvement > 0.0f) & (step.improvement * scale < tolerance);
   }
   static INLINE bool flat(float gradient_squared, float decrement, float scale, float tolerance) {
-    return scale * Math::root(gradient_squared) < tolerance || 0.5f * scale * decrement < tolerance;
+    return (scale * Math::root(gradient_squared) < tolerance) | (0.5f * scale * decrement < tolerance);
   }
 };

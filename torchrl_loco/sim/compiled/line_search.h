@@ -53,7 +53,7 @@ ROLLED for (int i = 0; i < LS_ITERATIONS && !found; ++i) {
   const Point middle = Point::at(alphas[2], slope, curvature, sums + 6);
   const bool low_ends = next_low.ends(start, accept, LS_NEAR), high_ends = next_high.ends(start, accept, LS_NEAR);
   const bool middle_ends = middle.ends(start, accept, LS_NEAR);
-  found = low_ends || high_ends || middle_ends;
+  found = low_ends | high_ends | middle_ends;
   if (found) {
     result = {0.0f, 0.0f};
     result.take(next_low, low_ends);
@@ -63,14 +63,14 @@ ROLLED for (int i = 0; i < LS_ITERATIONS && !found; ++i) {
     bool moved = low.move(next_low, low.outside(next_low));
     moved |= low.move(middle, low.outside(middle));
     moved |= low.move(next_high, low.outside(next_high));
-    moved |= high.move(next_high, high.outside(next_high) || (high.slope < 0.0f && next_high.slope > 0.0f));
+    moved |= high.move(next_high, high.outside(next_high) | ((high.slope < 0.0f) & (next_high.slope > 0.0f)));
     moved |= high.move(middle, high.outside(middle));
     moved |= high.move(next_low, high.outside(next_low));
-    if (low.cost < 0.0f || high.cost < 0.0f) {
+    if ((low.cost < 0.0f) | (high.cost < 0.0f)) {
       const bool lower = low.cost < high.cost;
       result = {lower ? low.alpha : high.alpha, -Math::smaller(low.cost, high.cost)};
     }
-    found = !moved || (low.flat(tolerance) && low.slope < 0.0f) || (high.flat(tolerance) && high.slope > 0.0f);
+    found = !moved | (low.flat(tolerance) & (low.slope < 0.0f)) | (high.flat(tolerance) & (high.slope > 0.0f));
   }
 }
 return result;
