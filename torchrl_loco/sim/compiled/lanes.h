@@ -1368,21 +1368,24 @@ struct Step : Math {
     }
   };
 
+  // The owners of a block hand its rows, up to a quad of columns, to all lanes.
+  INLINE void hand_over(const Slots& h, const int slot, const int block, const int quads) {
+    const int d = lane + LANES * slot;
+    if (d >> 2 != block || d >= DOFS) return;
+    UNROLLED for (int i = 0; i <= quads; ++i) {
+      const float* const own = h.row[slot] + 4 * i;
+      write4(w.pivots[d & 3] + 4 * i, {own[0], own[1], own[2], own[3]});
+    }
+    w.pivot_damping[d & 3] = h.diagonal[slot];
+    w.pivot_gradient[d & 3] = h.gradient[slot];
+  }
+
   // Eliminates blocks `first` down to `last` + 1 of four rows each, H = L D L': the owners of a block hand its rows to
   // all lanes, which subtract them from their own rows, except for columns in which they are zero: those of branches
   // of the tree that do not meet. The right-hand side, here minus the gradient, is carried along like a column.
   INLINE void eliminate(Slots& h, const int first, const int last) {
-    ROLLED for (int block = first; block > last; --block) {
-      OWN_DOFS(slot, d) {
-        if (slot > 4 * first / LANES || d >> 2 != block || d >= DOFS) continue;
-        float* const row = w.pivots[d & 3];
-        UNROLLED for (int i = 0; i <= first; ++i) {
-          const float* const own = h.row[slot] + 4 * i;
-          write4(row + 4 * i, {own[0], own[1], own[2], own[3]});
-        }
-        w.pivot_damping[d & 3] = h.diagonal[slot];
-        w.pivot_gradient[d & 3] = h.gradient[slot];
-      }
+    hand_over(h, 4 * first / LANES, first, first);
+    ROLLED for (int block = first;; --block) {
       sync();
       Quad rows[4];
       UNROLLED for (int i = 0; i < 4; ++i) rows[i] = read4(w.pivots[i] + 4 * block);
@@ -1418,6 +1421,8 @@ struct Step : Math {
         }
       }
       sync();
+      if (block - 1 == last) break;
+      hand_over(h, (4 * first - 1) / LANES, block - 1, first - 1);
     }
   }
 
