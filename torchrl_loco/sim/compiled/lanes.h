@@ -987,9 +987,17 @@ struct Step : Math {
       const Mat axes = geom_axes(g);
       const Vec center = axes.transposed_times(geom.center - origin), half = axes.transposed_times(geom.half_axis);
       const float reach = geom.radius + Model::margin(pair);
-      bool near = valid;  // bounding spheres of a trunk hold its legs: most are still clear of one of its faces
-      UNROLLED for (int i = 0; i < 3; ++i)
+      // Bounding spheres of a trunk hold its legs. Most are clear of one of its faces, nearly all others along a normal of
+      // an edge and the capsule, of length root(width). Rounding does not decide, as the exact test follows.
+      bool near = valid;
+      UNROLLED for (int i = 0; i < 3; ++i) {
+        const int j = (i + 1) % 3, k = (i + 2) % 3;
         near = near && fabsf(center.component(i)) - fabsf(half.component(i)) < size.component(i) + reach;
+        const float y = half.component(j), z = half.component(k), width = y * y + z * z;
+        const float apart = fabsf(center.component(j) * z - center.component(k) * y) -
+                            (size.component(j) * fabsf(z) + size.component(k) * fabsf(y));
+        near = near && !(apart > 0.0f && apart * apart > 1.001f * reach * reach * width);
+      }
       if (!ballot(near)) continue;
       const Ends ends = half.dot(half) > MINVAL ? capsule_and_box(center, half, size) : Ends{0.0f, 0.0f, 1};
       ROLLED for (int i = 0; i < 2; ++i) {
