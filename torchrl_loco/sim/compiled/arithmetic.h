@@ -44,6 +44,10 @@ struct Math {
   static INLINE int lowest_bit(unsigned x) { return __builtin_ctz(x); }
   static INLINE int lowest_bit(unsigned long long x) { return __builtin_ctzll(x); }
 #endif
+  static INLINE float from_bits(unsigned x) {
+    union { unsigned bits; float value; } same = {x};
+    return same.value;
+  }
 
   // x > 0 to a power, which is mostly 1 or 2.
   static INLINE float raised(float x, float power) {

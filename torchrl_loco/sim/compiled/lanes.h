@@ -811,28 +811,46 @@ struct Step : Math {
   }
 
 //END
-  // Lists the pairs whose bounding spheres are within their margin, and returns how many there are.
-  INLINE int near_pairs(const int begin, const int end) {
-    int candidates = 0;
-    ROLLED for (int base = begin; base < end; base += LANES) {
-      const bool valid = base + lane < end;
-      const int pair = valid ? base + lane : begin;
-      const Vec between = w.geoms[Model::first_geom(pair)].center - w.geoms[Model::second_geom(pair)].center;
-      const bool near = valid && between.dot(between) < Model::reach_squared(pair);
-      const unsigned hits = ballot(near);
-      if (near) w.candidates[candidates + bits(hits & lanes_below())] = (unsigned short)pair;
-      candidates += bits(hits);
+  // Lists the pairs of moving geoms whose bounding spheres are within their margin, in their order, and ends the list.
+  // A pair is one number: the square of what is within, with the geoms in its lowest bits.
+  INLINE void near_pairs() {
+    enum { ROUNDS = LANES > 1 ? Model::NEAR_ROUNDS : 1 };  // side by side, as few find a pair
+    const unsigned geom = (1u << Model::GEOM_BITS) - 1;
+    int count = 0;
+    ROLLED for (int base = Model::SOLID_END; base < Model::PAIRS; base += ROUNDS * LANES) {
+      unsigned near = 0;
+      UNROLLED for (int k = 0; k < ROUNDS; ++k) {
+        const unsigned pair = Model::near_pair(base - Model::SOLID_END + LANES * k + lane);
+        const Vec between = w.geoms[pair & geom].center - w.geoms[pair >> Model::GEOM_BITS & geom].center;
+        if (between.dot(between) < from_bits(pair)) near |= 1u << k;
+      }
+      if (!ballot(near)) continue;
+      ROLLED for (int k = 0; k < ROUNDS; ++k) {
+        const bool own = near >> k & 1;
+        const unsigned hits = ballot(own);
+        if (own) w.candidates[count + bits(hits & lanes_below())] = (unsigned short)(base + LANES * k + lane);
+        count += bits(hits);
+      }
     }
+    w.candidates[count + lane] = 0xffff;
     sync();
-    return candidates;
+  }
+
+  // This lane's pair of those that are listed from `at` on, up to `end`; moves on by all that the lanes have.
+  struct Listed { int pair; bool valid; };
+  INLINE Listed listed(int& at, const int end) const {
+    const int pair = w.candidates[at + lane];
+    const bool valid = pair < end;
+    at += bits(ballot(valid));
+    return {valid ? pair : Model::SOLID_END, valid};
   }
 
   // Spheres and capsules against each other: the nearest points of the two segments.
-  INLINE void collide_geoms(const int begin, const int end, const bool friction) {
-    const int candidates = near_pairs(begin, end);
-    ROLLED for (int base = 0; base < candidates; base += LANES) {
-      const bool valid = base + lane < candidates;
-      const int pair = valid ? w.candidates[base + lane] : begin;
+  INLINE void collide_geoms(int& at, const int begin, const int end, const bool friction) {
+    if (begin == end) return;
+    ROLLED for (; w.candidates[at] < end;) {
+      const Listed own = listed(at, end);
+      const int pair = own.pair;
       const Geom a = w.geoms[Model::first_geom(pair)], b = w.geoms[Model::second_geom(pair)];
       const Segment first = {a.center - a.half_axis, a.half_axis * 2.0f};
       const Segment second = {b.center - b.half_axis, b.half_axis * 2.0f};
@@ -843,11 +861,10 @@ struct Step : Math {
         float length;
         const Vec normal = Frame::normal(gap, length);
         const float distance = length - (a.radius + b.radius);
-        add_contact(valid && i < nearest.points && distance < Model::margin(pair), friction, pair,
+        add_contact(own.valid && i < nearest.points && distance < Model::margin(pair), friction, pair,
                     point + normal * (a.radius + 0.5f * distance), distance, normal, {0.0f, 0.0f, 0.0f});
       }
     }
-    sync();
   }
 
 //IF BOXES
@@ -977,11 +994,11 @@ struct Step : Math {
     return {at, at + sign * further, 2};
   }
 
-  INLINE void collide_boxes(const int begin, const int end, const bool friction) {
-    const int candidates = near_pairs(begin, end);
-    ROLLED for (int base = 0; base < candidates; base += LANES) {
-      const bool valid = base + lane < candidates;
-      const int pair = valid ? w.candidates[base + lane] : begin, g = Model::second_geom(pair);
+  INLINE void collide_boxes(int& at, const int begin, const int end, const bool friction) {
+    if (begin == end) return;
+    ROLLED for (; w.candidates[at] < end;) {
+      const Listed own = listed(at, end);
+      const int pair = own.pair, g = Model::second_geom(pair);
       const Geom geom = w.geoms[Model::first_geom(pair)];
       const Vec origin = w.geoms[g].center, size = Model::geom_size(g);
       const Mat axes = geom_axes(g);
@@ -989,7 +1006,7 @@ struct Step : Math {
       const float reach = geom.radius + Model::margin(pair);
       // Bounding spheres of a trunk hold its legs. Most are clear of one of its faces, nearly all others along a normal of
       // an edge and the capsule, of length root(width). Rounding does not decide, as the exact test follows.
-      bool near = valid;
+      bool near = own.valid;
       UNROLLED for (int i = 0; i < 3; ++i) {
         const int j = (i + 1) % 3, k = (i + 2) % 3;
         near = near && fabsf(center.component(i)) - fabsf(half.component(i)) < size.component(i) + reach;
@@ -1006,7 +1023,6 @@ struct Step : Math {
                     origin + axes * depth.point, depth.distance, axes * depth.normal, {0.0f, 0.0f, 0.0f});
       }
     }
-    sync();
   }
 
 //END
@@ -1026,22 +1042,24 @@ struct Step : Math {
   INLINE void find_contacts() {
     frictional = frictionless = 0;
     if (Model::GEOMS > 0) place_geoms();
+    if (Model::PAIRS > Model::SOLID_END) near_pairs();
+    int at = 0;  // in the list
     collide_with_planes(0, Model::PLANE_FRICTIONAL_END, true);
 //IF SOLIDS
-    collide_solids_with_planes(Model::PLANE_END, Model::SOLID_FRICTIONAL_END, true);
+    collide_solids_with_planes(Model::PLANE_FRICTIONAL_END, Model::SOLID_FRICTIONAL_END, true);
 //END
-    collide_geoms(Model::SOLID_END, Model::GEOM_FRICTIONAL_END, true);
+    collide_geoms(at, Model::SOLID_END, Model::GEOM_FRICTIONAL_END, true);
 //IF BOXES
-    collide_boxes(Model::GEOM_END, Model::BOX_FRICTIONAL_END, true);
+    collide_boxes(at, Model::GEOM_FRICTIONAL_END, Model::BOX_FRICTIONAL_END, true);
 //END
     limit_balls();
-    collide_with_planes(Model::PLANE_FRICTIONAL_END, Model::PLANE_END, false);
+    collide_with_planes(Model::SOLID_FRICTIONAL_END, Model::PLANE_END, false);
 //IF SOLIDS
-    collide_solids_with_planes(Model::SOLID_FRICTIONAL_END, Model::SOLID_END, false);
+    collide_solids_with_planes(Model::PLANE_END, Model::SOLID_END, false);
 //END
-    collide_geoms(Model::GEOM_FRICTIONAL_END, Model::GEOM_END, false);
+    collide_geoms(at, Model::BOX_FRICTIONAL_END, Model::GEOM_END, false);
 //IF BOXES
-    collide_boxes(Model::BOX_FRICTIONAL_END, Model::PAIRS, false);
+    collide_boxes(at, Model::GEOM_END, Model::BOX_END, false);
 //END
     sync();
     if (Model::TOUCH) feel_contacts();

@@ -83,6 +83,8 @@ ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 28, 16
 
 A body that touches the floor in more places when it stands should have, and has, those.
 """
+MOST_ROUNDS = 4
+"""Pairs of geoms whose bounding spheres a lane compares side by side, at most."""
 STANDING, FAR = 0.01, 1e3
 """Height over its lowest point of what a body stands on, and a height that no pose exceeds (m)."""
 
@@ -273,8 +275,8 @@ class Description:
         return self.m.geom_type[pair.geoms[1]] in SOLID
 
     def _sorted_pairs(self, found: list[Pair]) -> list[Pair]:
-        """Returns planes before others, in both parts solids last, and in all parts those with friction first."""
-        return sorted(found, key=lambda p: (not self.is_plane(p), self.is_solid(p), p.condim == 1))
+        """Returns planes before others, in both parts those with friction first, and in all parts solids last."""
+        return sorted(found, key=lambda p: (not self.is_plane(p), p.condim == 1, self.is_solid(p)))
 
     def points(self, pair: Pair) -> int:
         """Returns how many contacts a pair can have."""
@@ -327,7 +329,7 @@ class Description:
             limits=self.limit_sides * len(self.limited),
             friction_losses=len(self.losses),
             touch=len(self.touch),
-            candidates=max(1, sum(not self.is_plane(p) for p in self.pairs)),
+            candidates=sum(not self.is_plane(p) for p in self.pairs) + LANES,
             directions=directions,
             contact_rows=directions if self.elliptic else 2 * (directions - 1),
             frictional=0,
@@ -549,19 +551,13 @@ class Description:
         tables.floats("geom_radius", [self._radius(g) for g in self.geoms])
         planes = [p for p in found if self.is_plane(p)]
         others = found[len(planes) :]
-        solids, boxes = ([p for p in part if self.is_solid(p)] for part in (planes, others))
-        first_solid, first_box = len(planes) - len(solids), len(found) - len(boxes)
-        tables.size(
-            PLANE_FRICTIONAL_END=sum(p.condim != 1 for p in planes[:first_solid]),
-            PLANE_END=first_solid,
-            SOLID_FRICTIONAL_END=first_solid + sum(p.condim != 1 for p in solids),
-            SOLID_END=len(planes),
-            GEOM_FRICTIONAL_END=len(planes) + sum(p.condim != 1 for p in found[len(planes) : first_box]),
-            GEOM_END=first_box,
-            BOX_FRICTIONAL_END=first_box + sum(p.condim != 1 for p in boxes),
-            PAIRS=len(found),
-        )
-        if solids or boxes:
+        of_part = dict.fromkeys(itertools.product((True, False), repeat=3), 0)  # in the order of the pairs
+        for pair in found:
+            of_part[self.is_plane(pair), pair.condim != 1, not self.is_solid(pair)] += 1
+        shapes = (("PLANE", "SOLID"), ("GEOM", "BOX"))
+        names = [f"{x}{friction}_END" for part in shapes for friction in ("_FRICTIONAL", "") for x in part]
+        tables.size(PAIRS=len(found), **dict(zip(names, itertools.accumulate(of_part.values()), strict=True)))
+        if any(map(self.is_solid, found)):
             tables.integers("geom_shape", [SHAPES.index(m.geom_type[g]) for g in self.geoms])
             tables.structs("Vec", "geom_size", m.geom_size[self.geoms])
             turns = [self.places[m.geom_bodyid[g]].turn(m.geom_quat[g]) for g in self.geoms]
@@ -583,7 +579,7 @@ class Description:
         half = [self._half_length(p.geoms[1]) for p in planes]
         tables.floats("inverse_half_length", [1 / h if h else 0.0 for h in half])
         reach = [sum(self._radius(g) + self._half_length(g) for g in p.geoms) + p.margin for p in others]
-        tables.floats("reach_squared", [0.0] * len(planes) + [r * r for r in reach])
+        self._add_near_pairs(tables, [(index[a], index[b]) for a, b in (p.geoms for p in others)], reach)
         self._add_friction(tables)
         # The limits of ball joints follow the pairs.
         balls = self.limited_balls
@@ -604,6 +600,20 @@ class Description:
             least = [MINVAL if self.elliptic else least_regularisation(pair) for pair in found]
             tables.floats("least_regularisation", [*least, *(MINVAL for _ in balls)])
             tables.floats("inverse_inertia", [*weights, *inertias])
+
+    def _add_near_pairs(self, tables: Tables, of: list[tuple[int, int]], reach: list[float]) -> None:
+        """Adds a number for each pair of moving geoms: the square of its reach, with the geoms in its lowest bits.
+
+        The square is rounded up, as the exact tests follow. Pairs beside them, which are none, fill the last rounds.
+        """
+        bits, rounds = max(1, (len(self.geoms) - 1).bit_length()), -(-len(of) // LANES)
+        together = -(-rounds // max(1, -(-rounds // MOST_ROUNDS)))
+        tables.size(GEOM_BITS=bits, NEAR_ROUNDS=together)
+        lowest = (1 << 2 * bits) - 1
+        squared = [(int(np.float32(r * r).view(np.uint32)) + lowest) & ~lowest for r in reach]
+        near = [r | a | b << bits for r, (a, b) in zip(squared, of, strict=True)]
+        none = pad(len(near), max(1, together) * LANES) - len(near)
+        tables.integers("near_pair", near + [0] * none, "unsigned")
 
     def _add_formulas(self, tables: Tables, pair: Pair) -> None:
         """Adds what follows from friction: the row of a world has less to read without it, as pairs are many."""
