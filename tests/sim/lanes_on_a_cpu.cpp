@@ -61,6 +61,8 @@ static T shuffle_at(int line, T x, int from) {
 #define __popc __builtin_popcount
 #define __ffs __builtin_ffs
 #define __ffsll __builtin_ffsll
+#define __clz __builtin_clz
+#define __clzll __builtin_clzll
 #define __syncwarp() wait(line, 0)
 #define __syncthreads() wait(__LINE__, 0)
 #define __syncthreads_or(x) (ballot_at(line, x) != 0)

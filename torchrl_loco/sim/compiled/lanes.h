@@ -385,13 +385,17 @@ struct Step : Math {
 
   // ---- Kinematics
 
-  // The next link to visit when something is summed over a link and its ancestors. A single lane visits the links in
-  // their order, parents first, so that what it finds at the parent already includes the parent's ancestors.
-  static INLINE int next_ancestor(int link) { return LANES == 1 ? -1 : Model::parent(link); }
+  // The links to visit when something is summed over the ancestors of a link, or over these and itself: the highest
+  // bit, which is the nearest, first. A single lane visits the links in their order, parents first, so that what it
+  // finds at the parent already includes the parent's ancestors.
+  typedef Model::Links Links;
+  static INLINE Links bit(int link) { return link < 0 ? 0 : (Links)1 << link; }
+  static INLINE Links to_root(int link) { return link < 0 || LANES == 1 ? bit(link) : Model::to_root(link); }
+  static INLINE Links ancestors(int link) { return LANES == 1 ? bit(Model::parent(link)) : to_root(link) ^ bit(link); }
 
-  INLINE Motion sum_to_root(const Motion* own, int link) const {
+  INLINE Motion sum_over(const Links links, const Motion* own) const {
     Motion total = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
-    ROLLED for (int a = link; a >= 0; a = next_ancestor(a)) total = total + own[a];
+    ROLLED for (Links left = links; left; left = below_highest(left)) total = total + own[highest_bit(left)];
     return total;
   }
 
@@ -412,11 +416,12 @@ struct Step : Math {
         orientation = qpos_quat(q + 3);
         continue;
       }
-      const Vec offset = Model::joint_position(j), anchor = position + orientation.rotate(offset);
+      const Vec offset = Model::joint_position(j);
+      const Vec anchor = Model::JOINTS_ASIDE ? position + orientation.rotate(offset) : position;
       if (Model::HAS_BALL && kind == BALL) {
         orientation = orientation * qpos_quat(q);
       } else {
-        const Vec axis = Model::joint_axis(j), direction = orientation.rotate(axis);
+        const Vec axis = Model::joint_axis(j), direction = Model::JOINTS_TURNED ? orientation.rotate(axis) : axis;
         const float displacement = w.qpos[q] - Model::joint_qpos0(j);
         w.axes[Model::joint_dof(j)] = {direction, anchor};
         if (Model::HAS_SLIDE && kind == SLIDE_JOINT) {
@@ -425,9 +430,10 @@ struct Step : Math {
         }
         float sine, cosine;
         sincos(0.5f * displacement, sine, cosine);
-        orientation = orientation * Quat{cosine, sine * axis.x, sine * axis.y, sine * axis.z};
+        const Quat turn = {cosine, sine * axis.x, sine * axis.y, sine * axis.z};
+        orientation = Model::JOINTS_TURNED ? orientation * turn : turn;
       }
-      position = anchor - orientation.rotate(offset);
+      if (Model::JOINTS_ASIDE) position = anchor - orientation.rotate(offset);
     }
     return {orientation, position};
   }
@@ -445,19 +451,22 @@ struct Step : Math {
   INLINE void poses() {
     SHARED_LOOP(b, Model::LINKS) w.local[b] = local_pose(b);
     sync();
+    Vec moment = {0.0f, 0.0f, 0.0f};  // of the only tree, or of one after the other
     SHARED_LOOP(b, Model::LINKS) {
       LocalPose pose = w.local[b];
-      ROLLED for (int a = Model::parent(b); a >= 0; a = next_ancestor(a)) {
-        const LocalPose parent = w.local[a];
+      ROLLED for (Links left = ancestors(b); left; left = below_highest(left)) {
+        const LocalPose parent = w.local[highest_bit(left)];
         pose.position = parent.position + parent.orientation.rotate(pose.position);
         pose.orientation = parent.orientation * pose.orientation;
       }
       if (LANES == 1) w.local[b] = pose;
-      w.pose[b] = {Mat::from(pose.orientation), pose.position};
+      const Pose own = {Mat::from(pose.orientation), pose.position};
+      w.pose[b] = own;
+      if (Model::TREES == 1) moment = moment + center_of_mass(b, own) * Model::link_mass(b);
     }
     ROLLED for (int t = 0; t < Model::TREES; ++t) {
-      Vec moment = {0.0f, 0.0f, 0.0f};
-      SHARED_LOOP(b, Model::LINKS)
+      if (Model::TREES > 1) moment = {0.0f, 0.0f, 0.0f};
+      SHARED_LOOP(b, Model::TREES > 1 ? Model::LINKS : 0)
         if (Model::tree(b) == t) moment = moment + center_of_mass(b, w.pose[b]) * Model::link_mass(b);
       float total[3] = {moment.x, moment.y, moment.z};
       sum(total, 3);
@@ -491,9 +500,14 @@ struct Step : Math {
     sync();
     SHARED_LOOP(b, Model::LINKS) {
       const int parent = Model::parent(b), end = Model::first_dof(b + 1);
+      int d = Model::first_dof(b);
       Motion velocity = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
       if (LANES == 1 && parent >= 0) velocity = w.velocity[parent];
-      ROLLED for (int d = Model::first_dof(b); d < end; ++d) velocity = velocity + w.axes[d] * w.qvel[d];
+      if (Model::HAS_FREE && Model::dof_kind(d) == TRANSLATION) {  // along the axes of the world
+        velocity.linear = velocity.linear + Vec{w.qvel[d], w.qvel[d + 1], w.qvel[d + 2]};
+        d += 3;
+      }
+      ROLLED for (; d < end; ++d) velocity = velocity + w.axes[d] * w.qvel[d];
       w.velocity[b] = velocity;
     }
     sync();
@@ -506,7 +520,7 @@ struct Step : Math {
   INLINE void subtrees() {
     SHARED_LOOP(b, Model::LINKS) {  // accelerations that the velocities cause
       const int parent = Model::parent(b), end = Model::first_joint(b + 1);
-      Motion velocity = sum_to_root(w.velocity, parent), acceleration = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
+      Motion velocity = sum_over(ancestors(b), w.velocity), acceleration = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
       if (LANES == 1 && parent >= 0) acceleration = w.acceleration[parent];
       ROLLED for (int j = Model::first_joint(b); j < end; ++j) {
         int d = Model::joint_dof(j);
@@ -525,8 +539,11 @@ struct Step : Math {
     }
     sync();
     SHARED_LOOP(b, Model::LINKS) {
-      const Motion velocity = sum_to_root(w.velocity, b);
-      Motion acceleration = sum_to_root(w.acceleration, b);
+      Motion velocity = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}}, acceleration = velocity;
+      ROLLED for (Links left = to_root(b); left; left = below_highest(left)) {
+        velocity = velocity + w.velocity[highest_bit(left)];
+        acceleration = acceleration + w.acceleration[highest_bit(left)];
+      }
       acceleration.linear = acceleration.linear - Model::gravity();
       const Pose pose = w.pose[b];
       const float mass = Model::link_mass(b);
@@ -612,8 +629,8 @@ struct Step : Math {
         w.momentum[d] = momentum;
         continue;
       }
-      ROLLED for (Model::Dofs left = Model::ancestors(d); left; left &= left - 1)
-        set_mass(d, lowest_bit(left), momentum);
+      ROLLED for (Model::Dofs left = Model::ancestors(d); left; left = below_highest(left))
+        set_mass(d, highest_bit(left), momentum);
     }
     sync();
     if (!SEVERAL_ROWS) return;
@@ -2101,7 +2118,7 @@ struct Step : Math {
       const Pose pose = pose_of(link);
       const Vec position = pose.position + pose.orientation * Model::body_position(b);
       const Mat orientation = Model::body_orientation(b);
-      const Motion velocity = sum_to_root(w.velocity, link);
+      const Motion velocity = sum_over(to_root(link), w.velocity);
       xpos[3 * b] = position.x;
       xpos[3 * b + 1] = position.y;
       xpos[3 * b + 2] = position.z;
@@ -2134,7 +2151,7 @@ struct Step : Math {
         const int link = Model::part_link(i);
         const Pose pose = w.pose[link];
         const Vec offset = pose.position + pose.orientation * Model::part_center(i) - w.com[Model::tree(link)];
-        const Motion velocity = sum_to_root(w.velocity, link);
+        const Motion velocity = sum_over(to_root(link), w.velocity);
         const Vec v = velocity.linear + velocity.angular.cross(offset);
         UNROLLED for (int k = 0; k < 3; ++k) total[k] += Model::part_share(i) * v.component(k);
       }

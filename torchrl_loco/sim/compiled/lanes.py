@@ -424,8 +424,16 @@ class Description:
         parents = [self.places[m.body_parentid[b]] for b in moving]
         attached = list(zip(parents, moving, strict=True))
         tables.integers("parent", [p.link for p in parents])
+        to_root: list[int] = []  # each link and its ancestors
+        for i, place in enumerate(parents):
+            to_root.append(1 << i | (to_root[place.link] if place.link >= 0 else 0))
+        links = "unsigned" if len(moving) <= 32 else "unsigned long long"
+        tables.lines.append(f"  typedef {links} Links;  // a bit for each link")
+        tables.integers("to_root", to_root, links)
         tables.structs("Vec", "link_position", [p.point(m.body_pos[b]) for p, b in attached])
-        tables.structs("Quat", "link_orientation", [p.turn(m.body_quat[b]) for p, b in attached])
+        turns = [p.turn(m.body_quat[b]) for p, b in attached]
+        tables.structs("Quat", "link_orientation", turns)
+        tables.size(JOINTS_TURNED=max(m.body_jntnum[moving]) > 1 or any(abs(turn[0]) < 1 for turn in turns))
         tables.floats("link_mass", [x.mass for x in self.masses])
         tables.structs("Vec", "link_center", [x.center for x in self.masses])
         tables.structs("Symmetric", "link_inertia", [x.moments[np.triu_indices(3)] for x in self.masses])
@@ -452,6 +460,7 @@ class Description:
         tables.integers("joint_dof", m.jnt_dofadr)
         tables.structs("Vec", "joint_axis", m.jnt_axis)
         tables.structs("Vec", "joint_position", m.jnt_pos)
+        tables.size(JOINTS_ASIDE=m.jnt_pos.any())
         tables.floats("joint_qpos0", m.qpos0[m.jnt_qposadr])
         of_dof = m.dof_jntid
         component = np.arange(m.nv) - m.jnt_dofadr[of_dof]
