@@ -733,6 +733,7 @@ struct Step : Math {
 //IF SOLIDS
   INLINE Mat geom_axes(int g) const {  // by rows
     const Mat link = pose_of(Model::geom_link(g)).orientation, own = Model::geom_orientation(g);
+    if (!Model::SOLIDS_TURNED) return link;
     return {own.transposed_times(link.row0), own.transposed_times(link.row1), own.transposed_times(link.row2)};
   }
 

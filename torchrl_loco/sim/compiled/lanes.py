@@ -571,6 +571,8 @@ class Description:
             tables.structs("Vec", "geom_size", m.geom_size[self.geoms])
             turns = [self.places[m.geom_bodyid[g]].turn(m.geom_quat[g]) for g in self.geoms]
             tables.structs("Mat", "geom_orientation", [matrix(turn).ravel() for turn in turns])
+            solid = np.isin(m.geom_type[self.geoms], SOLID)
+            tables.size(SOLIDS_TURNED=any(abs(turn[0]) < 1 for turn in itertools.compress(turns, solid)))
         if self.meshes:
             self._add_meshes(tables)
         index = {g: i for i, g in enumerate(self.geoms)}
