@@ -829,9 +829,9 @@ struct Step : Math {
   }
 
 //END
-  // Lists the pairs of moving geoms whose bounding spheres are within their margin, in their order, and ends the list.
-  // A pair is one number: the square of what is within, with the geoms in its lowest bits.
-  INLINE void near_pairs() {
+  // Lists the pairs of moving geoms whose bounding spheres are within their margin, in their order, and returns how many
+  // there are. A pair is one number: the square of what is within, with the geoms in its lowest bits.
+  INLINE int near_pairs() {
     enum { ROUNDS = LANES > 1 ? Model::NEAR_ROUNDS : 1 };  // side by side, as few find a pair
     const unsigned geom = (1u << Model::GEOM_BITS) - 1;
     int count = 0;
@@ -850,24 +850,24 @@ struct Step : Math {
         count += bits(hits);
       }
     }
-    w.candidates[count + lane] = 0xffff;
     sync();
+    return count;
   }
 
-  // This lane's pair of those that are listed from `at` on, up to `end`; moves on by all that the lanes have.
+  // This lane's pair of those that are listed from `at` on, up to pair `end`; `at` moves on by all that the lanes have.
   struct Listed { int pair; bool valid; };
-  INLINE Listed listed(int& at, const int end) const {
-    const int pair = w.candidates[at + lane];
+  INLINE Listed listed(int& at, const int count, const int end) const {
+    const int pair = at + lane < count ? w.candidates[at + lane] : end;
     const bool valid = pair < end;
     at += bits(ballot(valid));
     return {valid ? pair : Model::SOLID_END, valid};
   }
 
   // Spheres and capsules against each other: the nearest points of the two segments.
-  INLINE void collide_geoms(int& at, const int begin, const int end, const bool friction) {
+  INLINE void collide_geoms(int& at, const int count, const int begin, const int end, const bool friction) {
     if (begin == end) return;
-    ROLLED for (; w.candidates[at] < end;) {
-      const Listed own = listed(at, end);
+    ROLLED for (; at < count && w.candidates[at] < end;) {
+      const Listed own = listed(at, count, end);
       const int pair = own.pair;
       const Geom a = w.geoms[Model::first_geom(pair)], b = w.geoms[Model::second_geom(pair)];
       const Segment first = {a.center - a.half_axis, a.half_axis * 2.0f};
@@ -1012,10 +1012,10 @@ struct Step : Math {
     return {at, at + sign * further, 2};
   }
 
-  INLINE void collide_boxes(int& at, const int begin, const int end, const bool friction) {
+  INLINE void collide_boxes(int& at, const int count, const int begin, const int end, const bool friction) {
     if (begin == end) return;
-    ROLLED for (; w.candidates[at] < end;) {
-      const Listed own = listed(at, end);
+    ROLLED for (; at < count && w.candidates[at] < end;) {
+      const Listed own = listed(at, count, end);
       const int pair = own.pair, g = Model::second_geom(pair);
       const Geom geom = w.geoms[Model::first_geom(pair)];
       const Vec origin = w.geoms[g].center, size = Model::geom_size(g);
@@ -1060,24 +1060,24 @@ struct Step : Math {
   INLINE void find_contacts() {
     frictional = frictionless = 0;
     if (Model::GEOMS > 0) place_geoms();
-    if (Model::PAIRS > Model::SOLID_END) near_pairs();
+    const int count = Model::PAIRS > Model::SOLID_END ? near_pairs() : 0;
     int at = 0;  // in the list
     collide_with_planes(0, Model::PLANE_FRICTIONAL_END, true);
 //IF SOLIDS
     collide_solids_with_planes(Model::PLANE_FRICTIONAL_END, Model::SOLID_FRICTIONAL_END, true);
 //END
-    collide_geoms(at, Model::SOLID_END, Model::GEOM_FRICTIONAL_END, true);
+    collide_geoms(at, count, Model::SOLID_END, Model::GEOM_FRICTIONAL_END, true);
 //IF BOXES
-    collide_boxes(at, Model::GEOM_FRICTIONAL_END, Model::BOX_FRICTIONAL_END, true);
+    collide_boxes(at, count, Model::GEOM_FRICTIONAL_END, Model::BOX_FRICTIONAL_END, true);
 //END
     limit_balls();
     collide_with_planes(Model::SOLID_FRICTIONAL_END, Model::PLANE_END, false);
 //IF SOLIDS
     collide_solids_with_planes(Model::PLANE_END, Model::SOLID_END, false);
 //END
-    collide_geoms(at, Model::BOX_FRICTIONAL_END, Model::GEOM_END, false);
+    collide_geoms(at, count, Model::BOX_FRICTIONAL_END, Model::GEOM_END, false);
 //IF BOXES
-    collide_boxes(at, Model::GEOM_END, Model::BOX_END, false);
+    collide_boxes(at, count, Model::GEOM_END, Model::BOX_END, false);
 //END
     sync();
     if (Model::TOUCH) feel_contacts();

@@ -329,7 +329,7 @@ class Description:
             limits=self.limit_sides * len(self.limited),
             friction_losses=len(self.losses),
             touch=len(self.touch),
-            candidates=sum(not self.is_plane(p) for p in self.pairs) + LANES,
+            candidates=max(1, sum(not self.is_plane(p) for p in self.pairs)),
             directions=directions,
             contact_rows=directions if self.elliptic else 2 * (directions - 1),
             frictional=0,
