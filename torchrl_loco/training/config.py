@@ -113,8 +113,8 @@ class TrainingConfig:
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers of actor and critic."""
     compile: bool = False
-    """Whether torch.compile makes kernels of the losses on CUDA. Gradient steps are up to twice as fast then, after
-    half a minute at the first start on a machine."""
+    """Whether torch.compile makes kernels of losses, optimizer and acting policy on CUDA. Gradient steps are up to
+    twice as fast then, after half a minute at the first start on a machine."""
     bf16: bool = False
     """Whether networks compute in bfloat16 on CUDA."""
 
@@ -281,8 +281,8 @@ class REPPOConfig(TrainingConfig):
     of_others: ClassVar[Settings] = {**TrainingConfig.of_others, "num_bins": 301}
 
     compile: bool = True
-    """Whether torch.compile makes kernels of the losses on CUDA; the first start on a machine takes half a minute
-    longer then."""
+    """Whether torch.compile makes kernels of losses, optimizer and acting policy on CUDA; the first start on a machine
+    takes half a minute longer then."""
     kl_bound: float = 0.1
     """Bound of the KL divergence from the policy that collected the batch, in one state (nats)."""
     init_kl_weight: float = 0.01
