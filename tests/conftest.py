@@ -1,37 +1,65 @@
 import os
 
+os.environ.setdefault("HYPOTHESIS_NO_PLUGINS", "1")  # trio's, which is imported for nothing
 if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads than one each would slow them down
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import collections
 import gc
 
 import pytest
-import quickly  # noqa: F401, before anything makes a kernel
-import torch
-import warp as wp
 from cases import ENGINES, KINDS
 
-import torchrl_loco
+gc.disable()  # until all is imported: see pytest_collection_finish
+
+# torch and Warp are imported in functions: the process that distributes tests to workers reads this file, too.
+
+
+def pytest_collectstart():
+    """Prepares the process in which tests will run."""
+    import hook_tasks  # noqa: F401, registers its tasks
+    import quickly  # noqa: F401, before anything makes a kernel
+
+
+def pytest_collection_finish():
+    """Lets Python search for garbage again, but rarely, and not among what was imported, which takes it a second."""
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
+    gc.enable()
 
 
 @pytest.fixture
 def optimised(monkeypatch):
     """Lets all kernels be compiled as they are for users."""
+    import warp as wp
+
     monkeypatch.setattr(wp.config, "optimization_level", None)
 
 
 def pytest_collection_modifyitems(items):
-    """Leaves what cannot run here, and MuJoCo-Warp's engine, which the quadruped takes, out of the everyday part."""
+    """Leaves what cannot run here, and MuJoCo-Warp's engine, which the quadruped takes, out of the everyday part.
+
+    Files with many slow tests come first, so that at the end no process is left alone with one.
+    """
+    import torch
+
+    slow, every = collections.Counter(), collections.Counter()
     for item in items:
         if hasattr(item, "callspec") and ("mujoco_warp" in item.callspec.id or "quadruped" in item.callspec.id):
             item.add_marker(pytest.mark.slow)
         if "gpu" in item.keywords and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason="no CUDA device here"))
+        elif "ci" not in item.keywords:
+            slow[item.path] += "slow" in item.keywords
+            every[item.path] += 1
+    items.sort(key=lambda item: (-slow[item.path], -every[item.path], item.path))
 
 
 @pytest.fixture(autouse=True)
 def torch_generator():
     """Seeds torch, so that random actions are the same whichever tests ran before in the same process."""
+    import torch
+
     torch.manual_seed(0)
 
 
@@ -43,6 +71,8 @@ def device(request):
 @pytest.fixture
 def cuda_memory():
     """Returns a function that gives the bytes in use on the GPU by this process, whatever others have there."""
+    import torch
+    import warp as wp
 
     def used():
         gc.collect()
@@ -70,6 +100,8 @@ def shared():
     Each use starts the random streams again, so that after a reset the environment does what a new one does. Pass
     ``copy`` for a second one of the same settings. A test that writes to the environment's internals makes its own.
     """
+    import torchrl_loco
+
     made = {}
 
     def get(task="walker_run", num_envs=4, device="cpu", seed=0, *, copy=0, **options):
@@ -87,6 +119,7 @@ def shared():
 @pytest.fixture(scope="session")
 def actions():
     """Draws reproducible actions for an environment: ``actions(env, steps)`` has shape (steps, num_envs, nu)."""
+    import torch
 
     def draw(env, steps, seed=0):
         generator = torch.Generator().manual_seed(seed)

@@ -1,8 +1,9 @@
-"""Tasks in plain torch that tests share."""
+"""Tasks in plain torch, wholly or in part, that tests share under ids of their own."""
 
 import torch
 
 import torchrl_loco as loco
+from torchrl_loco import registry
 
 LEG = """
 <body name="{name}_thigh" pos="{x} {y} 0">
@@ -163,3 +164,9 @@ class Unsteady(loco.WalkerStand):
     def begin(self, s):
         drawn = s.uniform(-0.1, 0.1, 10)
         return {"qpos": s.home + drawn[:, :9], "until_push": 0.1 + drawn[:, 9]}
+
+
+registry.register("dog_follow", FollowVelocity)
+registry.register("walker_backwards", WalkBackwards)
+registry.register("walker_blindly", WalkBlindly)
+registry.register("walker_unsteady", Unsteady)

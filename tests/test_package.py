@@ -70,8 +70,7 @@ import pickle, torchrl_loco.registry as registry
 assert pickle.loads(pickle.dumps(registry.make)) is torchrl_loco.make
 assert torchrl_loco.envs.LocoEnv is torchrl_loco.LocoEnv
 from torchrl_loco import *
-import warp
-warp.config.optimization_level = 0
+import quickly
 env = make("walker_walk", 1, "cpu")
 assert RolloutCollector and training.PPOConfig("walker_walk")
 assert torchrl_loco.wrappers.GymnasiumVectorEnv
@@ -87,4 +86,4 @@ except ImportError as error:
 else:
     raise AssertionError("a trainer without matplotlib would fail at the end of its run")
 """
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120, cwd=Path(__file__).parent)
