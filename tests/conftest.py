@@ -28,14 +28,6 @@ def pytest_collection_finish():
     gc.enable()
 
 
-@pytest.fixture
-def optimised(monkeypatch):
-    """Lets all kernels be compiled as they are for users."""
-    import warp as wp
-
-    monkeypatch.setattr(wp.config, "optimization_level", None)
-
-
 def pytest_collection_modifyitems(items):
     """Leaves what cannot run here, and MuJoCo-Warp's engine, which the quadruped takes, out of the everyday part.
 

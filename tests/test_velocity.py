@@ -123,8 +123,8 @@ def robot():
 
 @pytest.fixture(scope="module")
 def many():
-    """Many worlds of the robot that the compiled step does, for what is counted."""
-    return velocity.H1Velocity(2000, "cpu", 0)
+    """Many worlds of a robot, for what is counted: one physics step each time, as the physics does not matter."""
+    return velocity.H1Velocity(2000, "cpu", 0, sim_dt=0.02)
 
 
 @pytest.fixture(scope="module")

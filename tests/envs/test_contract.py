@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cases import ENGINES, KINDS, TASKS, coarse
+from cases import ENGINES, KINDS, TASKS
 from compare import assert_repeats
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv, check_env_specs
@@ -72,7 +72,7 @@ def test_a_step_returns_no_live_buffer(shared, kind, device, actions):
 
 def test_truncation_is_exact_and_the_terminal_observation_true(shared, kind, device):
     task, protocol, engine = kind
-    options = {"protocol": protocol, "engine": engine, "reward_terms": True, **coarse(task)}
+    options = {"protocol": protocol, "engine": engine, "reward_terms": True}
     env = shared(task, 4, device, 3, episode_length=7, **options)
     twin = shared(task, 4, device, 3, **options)  # not truncated here
     carried, td = env.reset(), twin.reset()

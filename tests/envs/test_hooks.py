@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from cases import COARSE
 from hook_tasks import DOG, WalkBackwards, WalkBlindly
 from oracle import tolerance as numpy_tolerance
 from torch.fx.experimental.proxy_tensor import make_fx
@@ -283,7 +284,7 @@ def test_draws_depend_on_seed_world_episode_and_step_alone():
             return torch.cat([s.uniform(-1.0, 1.0, 2), s.normal(3), s.uniform(-1.0, 1.0, 2)], dim=-1)
 
     def played(num_envs, seed=0, **options):
-        env = Draws(num_envs, "cpu", seed, episode_length=50, **options)
+        env = Draws(num_envs, "cpu", seed, episode_length=50, **COARSE, **options)
         td = env.rollout(120, Still(env), break_when_any_done=False)
         return torch.cat([td["observation"], td["next", "reward"]], dim=-1)
 

@@ -123,6 +123,7 @@ def test_forks_and_the_end_of_a_program(tmp_path):
             del env
             gc.collect()
             raise SystemExit
+        going = False
         deadline, done = time.time() + 60, 0
         while not done and time.time() < deadline:
             done, status = os.waitpid(pid, os.WNOHANG)
@@ -130,7 +131,6 @@ def test_forks_and_the_end_of_a_program(tmp_path):
         if not done:
             os.kill(pid, 9)
             print("the child hangs", flush=True)
-        going = False
         thread.join()
         show("parent")
         """

@@ -482,7 +482,7 @@ class HeavyOrLight(loco.WalkerWalk):
 def test_of_a_class_the_doctor_and_evaluations_know_them(varied, device):
     _, error, _ = doctor.self_test(HeavyOrLight, device)
     assert error < doctor.TOLERANCE
-    check_env_specs(HeavyOrLight(2, device, **COARSE))
+    check_env_specs(HeavyOrLight(2, device))
     env = varied(device=device)
     config = PPOConfig("walker_walk", num_envs=4, minibatch_size=8, device=device)
     assert Environments(config, env).evaluation(2, seed=7).randomize == VARYS

@@ -75,48 +75,38 @@ def in_c_mujoco(sim, world, substeps=0):
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def test_forces_of_a_last_substep_and_of_a_state_are_those_of_c_mujoco(simulated):
+def test_forces_of_each_substep_and_of_a_state_are_those_of_c_mujoco(simulated):
     """From where everything lies and leans, with a velocity that differs from world to world."""
-    geoms = [6, 0, 3, 1, 4]
-    sim = simulated(SCENE, 6, ctrl_dt=0.004, contact_geoms=geoms)
-    sim.reset(every_world(sim))
-    for _ in range(100):
-        sim.step()
-    sim.qvel.add_(0.3 * torch.randn(sim.qvel.shape).to(sim.qvel.device))
-    contacts = set()
-    for state in (False, True):
-        expected = [net_forces(sim.mj_model, in_c_mujoco(sim, world, substeps=0 if state else 1)) for world in range(6)]
-        sim.forward(every_world(sim)) if state else sim.step()
-        for world, (net, size, touches) in enumerate(expected):
-            error = np.abs(sim.contact_force[world].cpu().numpy() - net[geoms]).max(axis=1)
-            assert (error <= 2e-3 * size[geoms] + 1e-2).all(), (world, sim.contact_force[world], net[geoms])
-            assert sim.in_contact[world].tolist() == touches[geoms].tolist()
-            contacts.update(np.flatnonzero(touches[geoms]))
-    assert len(contacts) == 4  # all but the arm
-
-
-@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def test_history_has_the_forces_of_each_substep(simulated):
-    """As C MuJoCo finds them step by step; of a state, all rows are its own."""
-    geoms = [6, 0, 3, 1]
-    sim = simulated(SCENE, 4, ctrl_dt=0.008, contact_geoms=geoms, contact_history=True)
+    geoms, worlds, contacts = [6, 0, 3, 1, 4], range(6), set()
+    sim = simulated(SCENE, len(worlds), ctrl_dt=0.008, contact_geoms=geoms, contact_history=True)
     sim.reset(every_world(sim))
     for _ in range(50):
         sim.step()
     sim.qvel.add_(0.5 * torch.randn(sim.qvel.shape).to(sim.qvel.device))
-    expected = [[net_forces(sim.mj_model, in_c_mujoco(sim, world, substeps=k)) for k in range(4)] for world in range(4)]
+
+    def in_c(substeps):
+        return [net_forces(sim.mj_model, in_c_mujoco(sim, world, substeps)) for world in worlds]
+
+    def check(forces, touching, expected, relative, absolute):
+        for world, (net, size, touches) in enumerate(expected):
+            error = np.abs(forces[world].cpu().numpy() - net[geoms]).max(axis=1)
+            assert (error <= relative * size[geoms] + absolute).all(), (world, forces[world], net[geoms])
+            assert touching[world].tolist() == touches[geoms].tolist()
+            contacts.update(np.flatnonzero(touches[geoms]))
+
+    substeps = [in_c(k) for k in range(4)]
     sim.step()
-    touches = np.array([[row[2][geoms] for row in rows] for rows in expected])
-    assert sim.in_contact_history.tolist() == touches.tolist()
-    for found, rows in zip(sim.contact_force_history.cpu().numpy(), expected, strict=True):
-        for force, (net, size, _) in zip(found, rows, strict=True):
-            error = np.abs(force - net[geoms]).max(axis=1)
-            assert (error <= 5e-3 * size[geoms] + 5e-2).all(), (force, net[geoms])
-    assert (touches.any(axis=1) & ~touches[:, -1]).any()  # a contact that ended before the last substep
+    for k, expected in enumerate(substeps):
+        check(sim.contact_force_history[:, k], sim.in_contact_history[:, k], expected, 5e-3, 5e-2)
+    touches = np.array([[touches[geoms] for _, _, touches in expected] for expected in substeps])
+    assert (touches.any(axis=0) & ~touches[-1]).any()  # a contact that ended before the last substep
     assert torch.equal(sim.contact_force, sim.contact_force_history[:, -1])
+    state = in_c(0)
     sim.forward(every_world(sim))
+    check(sim.contact_force, sim.in_contact, state, 2e-3, 1e-2)
     for history, last in ((sim.contact_force_history, sim.contact_force), (sim.in_contact_history, sim.in_contact)):
-        assert torch.equal(history, last.unsqueeze(1).expand_as(history))
+        assert torch.equal(history, last.unsqueeze(1).expand_as(history))  # of a state, all rows are its own
+    assert len(contacts) == 4  # all but the arm
 
 
 def test_what_lies_still_feels_what_lies_on_it(simulated):
@@ -138,7 +128,7 @@ def test_what_lies_still_feels_what_lies_on_it(simulated):
 
 
 def test_other_worlds_keep_their_forces(simulated):
-    sim = simulated(STACK.format(condim=3), 3, ctrl_dt=0.02, contact_geoms=[3, 0])
+    sim = simulated(STACK.format(condim=3), 3, ctrl_dt=0.02, contact_geoms=range(5))
     sim.reset(every_world(sim))
     for _ in range(10):
         sim.step()
@@ -146,9 +136,9 @@ def test_other_worlds_keep_their_forces(simulated):
     wp.to_torch(mask)[1] = False
     sim.qpos[:, 10] += 1.0
     sim.forward(mask)
-    assert before[1, 0, 2] > 5.0
+    assert before[1, 3, 2] > 5.0
     assert torch.equal(sim.contact_force[1], before[1])
-    assert sim.in_contact[:, 0].tolist() == [False, True, False]
+    assert sim.in_contact[:, 3].tolist() == [False, True, False]
 
 
 def test_asking_for_forces_does_not_change_the_physics(simulated):

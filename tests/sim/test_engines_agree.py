@@ -57,15 +57,15 @@ def of_c_mujoco(env, state, action):
 
 
 def assert_agree(ours, theirs):
-    """Positions differ by rounding, except where rounding takes a solver to another branch: in one world of 300."""
+    """Positions differ by rounding, except where rounding takes a solver to another branch: in one world at most."""
     error = np.abs(ours - theirs)
     assert np.quantile(error, 0.95) < 1e-6
-    assert (error.max(axis=1) > 1e-4).sum() <= len(error) / 300
+    assert (error.max(axis=1) > 1e-4).sum() <= 1
 
 
 @pytest.mark.parametrize("states", ["walker_run", "humanoid_run"], indirect=True)
 def test_both_engines_agree(shared, states):
-    task, state, action = states
+    task, state, action = states[0], states[1][::2], states[2][::2]
     for protocol in PROTOCOLS:
         envs = (shared(task, len(state), protocol=protocol, engine=engine) for engine in ENGINES)
         assert_agree(*(after(env, state, action) for env in envs))
