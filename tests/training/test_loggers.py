@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import sys
+import time
 
 import pytest
 from small_runs import made, trained
@@ -37,12 +38,19 @@ def test_csv_alone(tmp_path):
     assert not {"tensorboard", "wandb", "mlflow.db", "loggers.json"} & files(run)
 
 
+def in_the_next_second():
+    """Waits: files of one second are read in the order of their names, where a process's tenth is before its ninth."""
+    time.sleep(1.01 - time.time() % 1)
+
+
 def test_tensorboard_shows_what_was_kept(tmp_path, monkeypatch):
     """What a run has logged after its last checkpoint is replaced when it is resumed."""
     run = made(tmp_path)
     stopped_after_a_batch(run, monkeypatch)
+    in_the_next_second()
     with loggers.Loggers(run, 128) as lost:
         lost.log({"return": 999.0}, 256)
+    in_the_next_second()
     Trainer(run, resume=True).train()
     board = EventAccumulator(str(run.path / "tensorboard")).Reload()
     seen = {name: [(event.step, event.value) for event in board.Scalars(name)] for name in ("return", "evaluation")}
