@@ -6,10 +6,14 @@ import re
 import shutil
 import subprocess
 
+import mujoco
 import numpy as np
 import pytest
+import torch
 
 import torchrl_loco
+from torchrl_loco.config import SimConfig
+from torchrl_loco.sim import Simulation
 from torchrl_loco.sim.compiled import step
 from torchrl_loco.sim.compiled.engine import LATER
 
@@ -21,6 +25,16 @@ PTX = {
     r'asm\("rcp\..*': "x = 1.0f / a;",
     r'asm\("rsqrt\..*': "y = 1.0f / sqrtf(larger(x, 1e-30f));",
 }
+
+STIFF_LINK = """<body pos="{x} 0 {z}"><joint axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 {to} 0 -{down}" size="0.02" mass="{mass}" condim="1" solimp="0.999 0.999 0.001"/>"""
+STIFF = f"""<mujoco><option timestep="0.002" iterations="50"><flag eulerdamp="disable"/></option><worldbody>
+<geom type="plane" size="5 5 1" condim="1" solimp="0.999 0.999 0.001"/>
+{STIFF_LINK.format(x=0, z=0.55, to=0.175, down=0.175, mass=1)}
+{STIFF_LINK.format(x=0.175, z=-0.175, to=-0.175, down=0.175, mass=1)}
+{STIFF_LINK.format(x=-0.175, z=-0.175, to=0.14, down=0.14, mass=1)}
+{STIFF_LINK.format(x=0.14, z=-0.14, to=-0.077, down=0.077, mass=0.1)}
+</body></body></body></body></worldbody></mujoco>"""
 
 SEEN = {
     "go1_velocity": {"qpos": 5.5e-7, "qvel": 2.8e-5, "contact_force": 1.6e-3},
@@ -62,6 +76,18 @@ def stepped(library, text, before, *, last_first):
     return arrays
 
 
+def with_lanes(sim, folder):
+    """Returns the library of a simulation's step, its text, what it begins with, and where the simulation writes."""
+    engine, outputs = sim.engine, sim.engine.data.outputs()
+    asked = {f"with_{name}": outputs[name] is not None for name in LATER}
+    asked |= {"contact_geoms": engine._contact_geoms, "contact_rows": engine._contact_rows}
+    text = step.source(engine._mj_model, engine._substeps, **asked)
+    outputs = {name: array.numpy() for name, array in outputs.items() if array is not None and array.size}
+    before = {"ctrl_in": engine.data.ctrl.numpy(), "numbers_out": engine._rows.numpy()}
+    before |= {f"{name}_out": array.copy() for name, array in outputs.items()}
+    return built(text, folder), text, before, outputs
+
+
 @pytest.mark.ci
 @pytest.mark.skipif(COMPILER is None, reason="needs a compiler of C++: c++, g++ or clang++")
 @pytest.mark.parametrize("task", SEEN)
@@ -71,15 +97,7 @@ def test_the_lanes_of_a_warp_agree_with_one_lane(task, actions, tmp_path):
     state = env.reset()
     for action in actions(env, MOTION):
         state = env.step_and_maybe_reset(state.set("action", action))[1]
-    engine, outputs = env.sim.engine, env.sim.engine.data.outputs()
-    asked = {f"with_{name}": outputs[name] is not None for name in LATER}
-    asked |= {"contact_geoms": engine._contact_geoms, "contact_rows": engine._contact_rows}
-    text = step.source(engine._mj_model, engine._substeps, **asked)
-    library = built(text, tmp_path)
-
-    outputs = {name: array.numpy() for name, array in outputs.items() if array is not None and array.size}
-    before = {"ctrl_in": engine.data.ctrl.numpy(), "numbers_out": engine._rows.numpy()}
-    before |= {f"{name}_out": array.copy() for name, array in outputs.items()}
+    library, text, before, outputs = with_lanes(env.sim, tmp_path)
     env.sim.step()  # into outputs
     after = stepped(library, text, before, last_first=False)
     for name, array in stepped(library, text, before, last_first=True).items():
@@ -90,3 +108,25 @@ def test_the_lanes_of_a_warp_agree_with_one_lane(task, actions, tmp_path):
             assert not error.any(), name
         elif name != "qacc_warmstart":
             assert np.sort(error)[-2] < MARGIN * SEEN[task][ALIKE.get(name, name)], name
+
+
+@pytest.mark.ci
+@pytest.mark.skipif(COMPILER is None, reason="needs a compiler of C++: c++, g++ or clang++")
+def test_stiff_contacts_of_coupled_hinges(monkeypatch, tmp_path):
+    """Four parallel hinges whose links press on each other and the ground, beside C MuJoCo."""
+    monkeypatch.setattr(step, "TRACED_DOFS", 0)
+    model, generator = mujoco.MjModel.from_xml_string(STIFF), np.random.default_rng(0)
+    sim = Simulation(model, SimConfig(ctrl_dt=0.002, sim_dt=0.002, engine="compiled"), WORLDS, torch.device("cpu"))
+    expected = []
+    for world in range(WORLDS):
+        data = mujoco.MjData(model)
+        data.qvel[:] = 0.1 * generator.normal(size=model.nv)
+        for _ in range(generator.integers(200)):
+            mujoco.mj_step(model, data)
+        for name in ("qpos", "qvel", "qacc_warmstart"):
+            getattr(sim, name)[world] = torch.from_numpy(getattr(data, name))
+        mujoco.mj_step(model, data)
+        expected.append(data.qvel.copy())
+    library, text, before, _ = with_lanes(sim, tmp_path)
+    found = stepped(library, text, before, last_first=False)["qvel_out"]
+    assert np.abs(found - expected).max() < 5e-4

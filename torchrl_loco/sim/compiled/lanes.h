@@ -213,7 +213,7 @@ struct Cone {
       n = x[0];
       n_speed = v[0];
       t = Math::root(squared);
-      per_speed = speed_squared > 0.0f ? Math::inverse(speed_squared) : 0.0f;
+      per_speed = speed_squared > 1e-30f ? Math::inverse(speed_squared) : 0.0f;  // of less, it could be infinite
       nearest_squared = Math::larger(squared - forward * forward * per_speed, 0.0f);
       weight = own_weight;
       mu = own_mu;
@@ -1372,30 +1372,30 @@ struct Step : Math {
   struct Block {
     float upper[3], mixed[2][2], lower[3];
 
-    static INLINE void invert(const float a, const float b, const float c, float* x) {  // [a b; b c], to [x0 -x1; -x1 x2]
-      const float k = inverse(a * c - b * b);
-      x[0] = c * k;
-      x[1] = b * k;
-      x[2] = a * k;
+    // [a b; b c] = L' D L: the inverse of what is left of a, L, the inverse of c. An inverse by the determinant is
+    // shorter, but loses what stiff contacts leave of coupled hinges.
+    static INLINE void factor_two(const float a, const float b, const float c, float* f) {
+      f[2] = inverse(c);
+      f[1] = b * f[2];
+      f[0] = inverse(a - b * f[1]);
+    }
+    static INLINE void solve_two(const float* f, const float y0, const float y1, float& x0, float& x1) {
+      x0 = (y0 - f[1] * y1) * f[0];
+      x1 = y1 * f[2] - f[1] * x0;
     }
     INLINE void factor(const Quad* rows, const Quad damping) {
-      invert(rows[0].v[0] + damping.v[0], rows[1].v[0], rows[1].v[1] + damping.v[1], upper);
-      UNROLLED for (int i = 0; i < 2; ++i) {
-        const float *const b = rows[2 + i].v;
-        mixed[i][0] = b[0] * upper[0] - b[1] * upper[1];
-        mixed[i][1] = b[1] * upper[2] - b[0] * upper[1];
-      }
       const float *const b = rows[2].v, *const c = rows[3].v;
-      invert(b[2] + damping.v[2] - mixed[0][0] * b[0] - mixed[0][1] * b[1], c[2] - mixed[1][0] * b[0] - mixed[1][1] * b[1],
-             c[3] + damping.v[3] - mixed[1][0] * c[0] - mixed[1][1] * c[1], lower);
+      factor_two(b[2] + damping.v[2], c[2], c[3] + damping.v[3], lower);
+      UNROLLED for (int j = 0; j < 2; ++j) solve_two(lower, b[j], c[j], mixed[0][j], mixed[1][j]);
+      factor_two(rows[0].v[0] + damping.v[0] - mixed[0][0] * b[0] - mixed[1][0] * c[0],
+                 rows[1].v[0] - mixed[0][1] * b[0] - mixed[1][1] * c[0],
+                 rows[1].v[1] + damping.v[1] - mixed[0][1] * b[1] - mixed[1][1] * c[1], upper);
     }
     INLINE void solve(const float* y, float* x) const {
-      const float t0 = y[2] - mixed[0][0] * y[0] - mixed[0][1] * y[1];
-      const float t1 = y[3] - mixed[1][0] * y[0] - mixed[1][1] * y[1];
-      x[2] = lower[0] * t0 - lower[1] * t1;
-      x[3] = lower[2] * t1 - lower[1] * t0;
-      x[0] = upper[0] * y[0] - upper[1] * y[1] - mixed[0][0] * x[2] - mixed[1][0] * x[3];
-      x[1] = upper[2] * y[1] - upper[1] * y[0] - mixed[0][1] * x[2] - mixed[1][1] * x[3];
+      solve_two(upper, y[0] - mixed[0][0] * y[2] - mixed[1][0] * y[3], y[1] - mixed[0][1] * y[2] - mixed[1][1] * y[3],
+                x[0], x[1]);
+      solve_two(lower, y[2], y[3], x[2], x[3]);
+      UNROLLED for (int i = 0; i < 2; ++i) x[2 + i] = x[2 + i] - mixed[i][0] * x[0] - mixed[i][1] * x[1];
     }
     INLINE void write(float* p) const {
       write4(p, {upper[0], upper[1], upper[2], lower[0]});
