@@ -4,7 +4,6 @@ os.environ.setdefault("HYPOTHESIS_NO_PLUGINS", "1")  # trio's, which is imported
 if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads than one each would slow them down
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import collections
 import gc
 
 import pytest
@@ -29,22 +28,14 @@ def pytest_collection_finish():
 
 
 def pytest_collection_modifyitems(items):
-    """Leaves what cannot run here, and MuJoCo-Warp's engine, which the quadruped takes, out of the everyday part.
-
-    Files with many slow tests come first, so that at the end no process is left alone with one.
-    """
+    """Leaves what cannot run here, and MuJoCo-Warp's engine, which the quadruped takes, out of the everyday part."""
     import torch
 
-    slow, every = collections.Counter(), collections.Counter()
     for item in items:
         if hasattr(item, "callspec") and ("mujoco_warp" in item.callspec.id or "quadruped" in item.callspec.id):
             item.add_marker(pytest.mark.slow)
         if "gpu" in item.keywords and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason="no CUDA device here"))
-        elif "ci" not in item.keywords:
-            slow[item.path] += "slow" in item.keywords
-            every[item.path] += 1
-    items.sort(key=lambda item: (-slow[item.path], -every[item.path], item.path))
 
 
 @pytest.fixture(autouse=True)
