@@ -9,6 +9,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchrl_loco.training import Trainer
 from torchrl_loco.training.actor import SquashedNormal
+from torchrl_loco.training.compiling import compiled
 
 HOST = ("_local_scalar_dense", "lift_fresh", "nonzero", "aten.equal")
 """Operations that read a tensor's value, or make a tensor from a value of Python's."""
@@ -111,3 +112,12 @@ def test_squashed_normal_is_a_normal_under_tanh():
     drawn = squashed.rsample((500,)).clamp(-1 + 1e-12, 1 - 1e-12).atanh()
     torch.testing.assert_close(drawn.mean(), loc.mean(), atol=0.01, rtol=0)
     torch.testing.assert_close(drawn.std(0).mean(), scale.mean(), atol=0.01, rtol=0)
+
+
+def test_a_process_may_compile_more_often_than_torch_lets_one_function():
+    """Eight versions are what it keeps of one, and what it cannot follow is said with the way out."""
+    sizes = range(1, 11)
+    doubled = [compiled(lambda x: 2 * x, "it", backend="eager")(torch.ones(size)) for size in sizes]
+    assert [len(x) for x in doubled] == list(sizes)
+    with pytest.raises(TypeError, match="cannot follow what is asked; train with compile=False"):
+        compiled(lambda x: 2 * x if x.sum() > 0 else x, "what is asked", backend="eager")(torch.ones(2))

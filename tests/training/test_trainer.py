@@ -323,6 +323,7 @@ def test_a_run_on_cuda(algorithm, compiled, tmp_path):
     with settings_for_small_networks():
         for _ in range(3):
             first.iterate()
+    assert first.collector.step_by_step is None
     first.save()
     second = Trainer(run, resume=True)
     assert_same(first.algorithm.networks.state_dict(), second.algorithm.networks.state_dict())

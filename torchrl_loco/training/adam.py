@@ -7,6 +7,11 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
+from torchrl_loco.training.compiling import compiled
+
+SETTINGS = "lr", "betas", "eps", "weight_decay", "maximize"
+"""Of a group of parameters, which a step follows."""
+
 
 class CompiledAdam(torch.optim.Adam):
     """Adam whose step clips the gradients of all parameters together, both compiled.
@@ -16,12 +21,13 @@ class CompiledAdam(torch.optim.Adam):
 
     Args:
         parameters: parameters, or groups of them, on CUDA.
-        settings: those of ``torch.optim.Adam``.
+        lr: the learning rate, a tensor.
+        eps: what is added to the root of the second moment.
     """
 
-    def __init__(self, parameters: Iterable[Any], **settings: Any) -> None:
-        super().__init__(parameters, **settings, capturable=True, fused=True)
-        self._clipped_step = torch.compile(clipped_step, fullgraph=True, dynamic=False)
+    def __init__(self, parameters: Iterable[Any], lr: Tensor, eps: float) -> None:
+        super().__init__(parameters, lr=lr, eps=eps, capturable=True, fused=True)
+        self._clipped_step = compiled(clipped_step, "a step of Adam")
 
     @torch.no_grad()
     def clipped_step(self, max_norm: float) -> Tensor:
@@ -39,7 +45,7 @@ class CompiledAdam(torch.optim.Adam):
         gradients = [[parameter.grad for parameter in group] for group in groups]
         names = "exp_avg", "exp_avg_sq", "step"
         moments = [[[self.state[parameter][name] for parameter in group] for name in names] for group in groups]
-        settings = [{name: group[name] for name in ("lr", "betas", "eps")} for group in self.param_groups]
+        settings = [{name: group[name] for name in SETTINGS} for group in self.param_groups]
         return self._clipped_step(groups, gradients, moments, settings, max_norm)
 
 
@@ -56,7 +62,7 @@ def clipped_step(
         parameters: those of each group, of any shape.
         gradients: theirs.
         moments: of each group the first and second moments, and the numbers of steps.
-        settings: of each group ``lr``, ``betas`` and ``eps``.
+        settings: of each group the :data:`SETTINGS`.
         max_norm: of all gradients together.
 
     Returns:
@@ -66,7 +72,7 @@ def clipped_step(
     factor = (max_norm / (norm + 1e-6)).clamp(max=1.0)  # that of clip_grad_norm_
     for group, slopes, (first, second, steps), own in zip(parameters, gradients, moments, settings, strict=True):
         clipped, (beta1, beta2) = [slope * factor for slope in slopes], own["betas"]
-        kind: dict[str, Any] = {"foreach": True, "capturable": True, "amsgrad": False, "maximize": False}
-        numbers = {"lr": own["lr"], "beta1": beta1, "beta2": beta2, "eps": own["eps"], "weight_decay": 0.0}
-        adam(group, clipped, first, second, [], steps, **kind, **numbers)
+        numbers = {name: own[name] for name in SETTINGS if name != "betas"}
+        kind: dict[str, Any] = {"foreach": True, "capturable": True, "amsgrad": False}
+        adam(group, clipped, first, second, [], steps, **kind, **numbers, beta1=beta1, beta2=beta2)
     return norm

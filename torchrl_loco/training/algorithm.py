@@ -15,6 +15,7 @@ from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.adam import CompiledAdam
+from torchrl_loco.training.compiling import compiled
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.spaces import Spaces
 
@@ -103,7 +104,12 @@ class Algorithm(ABC):
         if not self.config.compile:
             return chosen
         # Rows whose length is no multiple of 8 are slow to multiply: those that a Go1's critic reads have 73 numbers.
-        return torch.compile(chosen, fullgraph=True, dynamic=False, options={"force_shape_pad": True})
+        what = getattr(function, "__name__", type(function).__name__)
+        return compiled(chosen, what, options={"force_shape_pad": True})
+
+    def acting(self) -> nn.Module:
+        """Returns the actor as a policy for collectors, which shares its parameters and is compiled likewise."""
+        return Acting(self.actor, self.fused(self.actor))
 
     def make_optimizer(self, name: str, parameters: Iterable[Any]) -> torch.optim.Adam:
         """Makes an optimizer of ``parameters`` or groups, whose learning rate recorded steps follow.
@@ -202,6 +208,24 @@ class Algorithm(ABC):
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
         self.generator.set_state(state["generator"].cpu())
+
+
+class Acting(nn.Module):
+    """A policy that acts by a function.
+
+    Args:
+        actor: the policy, whose parameters and keys it has.
+        act: what it does.
+    """
+
+    def __init__(self, actor: ProbabilisticActor, act: Callable[[TensorDictBase], TensorDictBase]) -> None:
+        super().__init__()
+        self.actor, self._act = actor, act
+        self.in_keys, self.out_keys = actor.in_keys, actor.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns ``tensordict`` with the actor's entries."""
+        return self._act(tensordict)
 
 
 def clip_and_step(optimizer: torch.optim.Optimizer, max_norm: float) -> torch.Tensor:

@@ -99,8 +99,7 @@ class Trainer:
         self._terms = () if terms is None else tuple(terms.keys())
         self._source = source_of(config.task)
         self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
-        actor = self.algorithm.fused(self.algorithm.actor)
-        self.collector = RolloutCollector(self.env, actor, frames_per_batch=config.batch_size)
+        self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.batch_size)
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
         self._non_finite, self._said = 0, set[str]()
         self._best = -math.inf  # the evaluation that selected the policy
