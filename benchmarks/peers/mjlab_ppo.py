@@ -12,6 +12,7 @@ import argparse
 import importlib.abc
 import importlib.machinery
 import json
+import signal
 import sys
 import time
 import types
@@ -145,6 +146,7 @@ def train(robot: str, seconds: float, out: Path, worlds: int, device: str) -> No
     runner.logger.init_logging_writer, runner.logger.log = lambda: None, curve.note
     save, runner.save = runner.save, lambda *args: None
     if not rows or rows[-1][0] < seconds:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # a time limit loses nothing
         try:
             runner.learn(rl.max_iterations - len(rows), init_at_random_ep_len=True)
         except KeyboardInterrupt:
