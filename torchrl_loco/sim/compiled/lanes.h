@@ -1368,12 +1368,12 @@ struct Step : Math {
     }
   }
 
-  // A symmetric matrix of four rows, [A B'; B C], as A^-1, B A^-1 and the inverse of C - B A^-1 B'.
+  // A symmetric matrix of four rows, [A B'; B C]: the factors of A - B' C^-1 B and of C, and C^-1 B.
   struct Block {
     float upper[3], mixed[2][2], lower[3];
 
-    // [a b; b c] = L' D L: the inverse of what is left of a, L, the inverse of c. An inverse by the determinant is
-    // shorter, but loses what stiff contacts leave of coupled hinges.
+    // [a b; b c] = L' D L, as the inverse of D, with the entry of L between its two. An inverse by the determinant takes
+    // one division less, but cancels where stiff contacts couple hinges.
     static INLINE void factor_two(const float a, const float b, const float c, float* f) {
       f[2] = inverse(c);
       f[1] = b * f[2];
@@ -1802,8 +1802,8 @@ struct Step : Math {
         w.residual[i] += product;
         continue;
       }
-      const int contact_of_row = r < DIRECTIONS * frictional ? r / DIRECTIONS : r - (DIRECTIONS - 1) * frictional;
-      const float damping = Model::contact_softness(contact(contact_of_row).pair).damping;
+      const int c = r < DIRECTIONS * frictional ? r / DIRECTIONS : r - (DIRECTIONS - 1) * frictional;
+      const float damping = Model::contact_softness(contact(c).pair).damping;
       w.projected[r] = product + damping * times(row, w.qvel);
     }
     sync();
