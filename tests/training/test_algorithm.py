@@ -115,9 +115,9 @@ def test_squashed_normal_is_a_normal_under_tanh():
 
 
 def test_a_process_may_compile_more_often_than_torch_lets_one_function():
-    """Eight versions are what it keeps of one, and what it cannot follow is said with the way out."""
+    """It keeps eight versions of one. The error of what it cannot trace names the way out."""
     sizes = range(1, 11)
     doubled = [compiled(lambda x: 2 * x, "it", backend="eager")(torch.ones(size)) for size in sizes]
     assert [len(x) for x in doubled] == list(sizes)
-    with pytest.raises(TypeError, match="cannot follow what is asked; train with compile=False"):
+    with pytest.raises(TypeError, match="cannot trace what is asked; train with compile=False"):
         compiled(lambda x: 2 * x if x.sum() > 0 else x, "what is asked", backend="eager")(torch.ones(2))

@@ -1,6 +1,7 @@
 """What all algorithms share: gradient steps over the minibatches of a batch, recorded as a graph on CUDA."""
 
 import contextlib
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
@@ -55,7 +56,7 @@ class Algorithm(ABC):
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
         self._data: TensorDictBase | None = None
         on_cuda = self.device.type == "cuda"
-        self._rows_of = self.fused(rows_of)
+        self._index = self.fused(operator.getitem)
         self._step = TorchGraph(self._minibatch_step, self.device, warmup=WARMUP) if on_cuda else self._minibatch_step
 
     @abstractmethod
@@ -108,7 +109,7 @@ class Algorithm(ABC):
         return compiled(chosen, what, options={"force_shape_pad": True})
 
     def acting(self) -> nn.Module:
-        """Returns the actor as a policy for collectors, which shares its parameters and is compiled likewise."""
+        """Returns the actor as a policy for collectors, compiled on CUDA if the settings ask for that."""
         return Acting(self.actor, self.fused(self.actor))
 
     def make_optimizer(self, name: str, parameters: Iterable[Any]) -> torch.optim.Adam:
@@ -118,14 +119,12 @@ class Algorithm(ABC):
             The optimizer, which is kept as ``optimizers[name]``.
         """
         settings: dict[str, Any] = {"lr": torch.tensor(self.config.lr, device=self.device), "eps": 1e-5}
-        if self.device.type != "cuda":
-            optimizer = torch.optim.Adam(parameters, **settings, fused=True)
-        elif self.config.compile:
-            optimizer = CompiledAdam(parameters, **settings)
+        on_cuda = self.device.type == "cuda"
+        if on_cuda and self.config.compile:
+            self.optimizers[name] = CompiledAdam(parameters, **settings)
         else:
-            optimizer = torch.optim.Adam(parameters, **settings, capturable=True, fused=True)
-        self.optimizers[name] = optimizer
-        return optimizer
+            self.optimizers[name] = torch.optim.Adam(parameters, **settings, capturable=on_cuda, fused=True)
+        return self.optimizers[name]
 
     def update(self, batch: TensorDictBase, progress: float) -> torch.Tensor:
         """Updates on one batch, without synchronising with the device.
@@ -169,7 +168,7 @@ class Algorithm(ABC):
 
     def _minibatch_step(self) -> None:
         assert self._data is not None
-        minibatch = self._rows_of(self._data, self._indices)
+        minibatch = self._index(self._data, self._indices)
         self._totals += torch.stack([metric.detach() for metric in self.gradient_step(minibatch)])
 
     def release(self) -> None:
@@ -211,11 +210,11 @@ class Algorithm(ABC):
 
 
 class Acting(nn.Module):
-    """A policy that acts by a function.
+    """An actor that is called through another function of the same result: a compiled one.
 
     Args:
-        actor: the policy, whose parameters and keys it has.
-        act: what it does.
+        actor: the actor, whose parameters and keys this has.
+        act: the function.
     """
 
     def __init__(self, actor: ProbabilisticActor, act: Callable[[TensorDictBase], TensorDictBase]) -> None:
@@ -241,11 +240,6 @@ def clip_and_step(optimizer: torch.optim.Optimizer, max_norm: float) -> torch.Te
     norm = nn.utils.clip_grad_norm_(parameters, max_norm)
     optimizer.step()
     return norm
-
-
-def rows_of(data: TensorDictBase, indices: torch.Tensor) -> TensorDictBase:
-    """Returns the rows of ``data`` ``(n, ...)`` that ``indices`` ``(m,)`` name."""
-    return data[indices]
 
 
 @contextlib.contextmanager

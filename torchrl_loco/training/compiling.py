@@ -7,21 +7,21 @@ import torch
 
 
 def compiled(function: Callable[..., Any], what: str, **settings: Any) -> Callable[..., Any]:
-    """Returns kernels of a whole function of tensors, which are made at its first call.
+    """Returns a function that torch.compile makes of another one, as a whole and for one shape, at the first call.
 
     Args:
-        function: the function, or a module.
-        what: it is, for the error.
+        function: a function of tensors, or a module.
+        what: its name in the error.
         settings: further ones of ``torch.compile``.
 
     Returns:
-        A function. It raises a ``TypeError`` where torch.compile cannot follow the function.
+        The compiled function, which raises a ``TypeError`` if torch.compile cannot trace it.
     """
 
     def call(*args: Any) -> Any:
         return function(*args)
 
-    # Of one code object torch.compile makes 8 versions at most, and a process may train more often than that.
+    # torch.compile limits a code object to 8 versions, which further trainings of a process would exceed.
     call.__code__ = call.__code__.replace()
     kernels = torch.compile(call, fullgraph=True, dynamic=False, **settings)
 
@@ -29,6 +29,6 @@ def compiled(function: Callable[..., Any], what: str, **settings: Any) -> Callab
         try:
             return kernels(*args)
         except torch._dynamo.exc.Unsupported as error:
-            raise TypeError(f"torch.compile cannot follow {what}; train with compile=False: {error}") from error
+            raise TypeError(f"torch.compile cannot trace {what}; train with compile=False: {error}") from error
 
     return run
