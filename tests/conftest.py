@@ -60,7 +60,9 @@ def cuda_memory():
     def used():
         gc.collect()
         torch.cuda.synchronize()
-        return torch.cuda.memory_allocated() + wp.get_mempool_used_mem_current("cuda")
+        # What is requested, not what is allocated for it: torch does not split a block to save less than 1 MB.
+        requested = torch.cuda.memory_stats()["requested_bytes.all.current"]
+        return requested + wp.get_mempool_used_mem_current("cuda")
 
     return used
 

@@ -311,6 +311,7 @@ def test_what_cannot_be_recorded_is_told_and_runs_step_by_step(caplog):
         assert told in collector.step_by_step
         assert told in caplog.text
         assert (batch == expected).all()
+        assert torch.cuda.current_stream() == torch.cuda.default_stream()
 
     env = on_cuda("walker_walk")
     chosen = Noisy(env)

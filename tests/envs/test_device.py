@@ -1,11 +1,14 @@
 """The loop stays on its device: graphs, synchronisation, streams, memory, and agreement of CUDA with the CPU."""
 
+import gc
+
 import pytest
 import torch
 import warp as wp
 from cases import KINDS
 
 import torchrl_loco
+from torchrl_loco.sim import TorchGraph
 
 
 @pytest.mark.parametrize("task", ["walker_run", "quadruped_run"])  # with hooks there are more
@@ -107,3 +110,25 @@ def test_device_memory_is_flat_over_10000_steps(cuda_memory):
 
     used(100)
     assert used(100) == used(9_900)
+
+
+@pytest.mark.gpu
+def test_garbage_is_not_collected_while_torch_records():
+    """The memory of an environment in it could not be freed, and the recording would be lost."""
+    recording = []
+
+    class Lost:
+        def __init__(self):
+            self.itself = self
+
+        def __del__(self):
+            recording.append(torch.cuda.is_current_stream_capturing())
+
+    thresholds = gc.get_threshold()
+    gc.set_threshold(1)
+    try:
+        TorchGraph(lambda: [Lost() for _ in range(10)], torch.device("cuda"))()
+    finally:
+        gc.set_threshold(*thresholds)
+    gc.collect()
+    assert recording == 10 * [False]

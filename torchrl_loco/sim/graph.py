@@ -1,6 +1,7 @@
 """Work recorded once and replayed at every step: CUDA graphs on the GPU, Warp's recorder on the CPU."""
 
 import contextlib
+import gc
 import os
 import threading
 import weakref
@@ -105,6 +106,18 @@ class Recorded:
             self._graph.replay()
 
 
+@contextlib.contextmanager
+def without_collection() -> Iterator[None]:
+    """Lets Python collect no garbage: memory of a lost environment cannot be freed while torch records a stream."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
 class TorchGraph:
     """A function without arguments, recorded as a CUDA graph of torch after some warm-up calls.
 
@@ -135,12 +148,15 @@ class TorchGraph:
             graph = torch.cuda.CUDAGraph()
             side = torch.cuda.Stream(self._device)  # else torch takes one of its current device
             recording = torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local")
-            with EXCLUSIVE, torch.cuda.device(self._device):
+            with EXCLUSIVE, without_collection(), torch.cuda.device(self._device):
+                before = torch.cuda.current_stream()
                 try:
                     with recording:
                         self._work()
                 except BaseException:
-                    # torch's random numbers would wait for the end of the recording: let an empty one end.
+                    # torch leaves its stream of the recording current where that cannot end, and its random numbers
+                    # would wait for the end of it: let an empty one end.
+                    torch.cuda.set_stream(before)
                     with torch.cuda.graph(torch.cuda.CUDAGraph(), stream=side):
                         torch.zeros(1, device=self._device)
                     raise
