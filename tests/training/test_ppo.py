@@ -16,10 +16,10 @@ from torchrl_loco.training.algorithm import clip_and_step
 from torchrl_loco.training.ppo import PPO
 
 
-def made(**overrides):
+def made(spaces=WALKER, **overrides):
     settings = {"num_envs": 1, "num_steps": 4, "minibatch_size": 4, "total_frames": 10_000, "epochs": 1, **overrides}
     torch.manual_seed(0)
-    return PPO(preset("walker_stand", "cpu", "ppo", **settings), WALKER)
+    return PPO(preset("walker_stand", "cpu", "ppo", **settings), spaces)
 
 
 def test_truncation_bootstraps_and_termination_does_not():
@@ -142,13 +142,20 @@ def test_advantages_are_normalised():
     torch.testing.assert_close(ppo.loss(data)["loss_objective"], loss, rtol=1e-3, atol=0)
 
 
-def test_entropy_is_rewarded():
+@pytest.mark.parametrize("bounded", [True, False])
+def test_entropy_is_rewarded(bounded):
     """With nothing else to gain, actions spread."""
-    ppo = made(num_envs=8, num_steps=8, minibatch_size=64, entropy_coeff=1.0, init_std=0.3, lr=1e-2)
+    settings = {"num_envs": 8, "num_steps": 8, "minibatch_size": 64, "entropy_coeff": 1.0, "init_std": 0.3, "lr": 1e-2}
+    ppo = made(dataclasses.replace(WALKER, bounded=bounded), **settings)
     batch = collected(ppo, 8)
     batch["next", "reward"].zero_()
     before = batch["scale"].mean()
-    for _ in range(5):
+    metrics = dict(zip(ppo.metric_names, ppo.update(batch, progress=0.0), strict=True))
+    if not bounded:
+        torch.testing.assert_close(
+            metrics["entropy"], torch.distributions.Normal(0.0, batch["scale"][0, 0]).entropy().sum()
+        )
+    for _ in range(4):
         ppo.update(batch, progress=0.0)
     assert ppo.actor.get_dist(batch).base_dist.stddev.mean() > 1.02 * before
 

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale
 from torch import nn
-from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_loco.policy import ObservationNorm
@@ -37,6 +37,7 @@ class PPO(Algorithm):
             self.actor,
             self.critic,
             clip_epsilon=config.clip_epsilon,
+            entropy_bonus=spaces.bounded,
             entropy_coeff=config.entropy_coeff,
             critic_coeff=0.5,
             loss_critic_type="smooth_l1",
@@ -44,7 +45,7 @@ class PPO(Algorithm):
             functional=False,  # else torch.compile would trace for seconds how parameters enter the modules
         )
         self.optimizer = self.make_optimizer("actor and critic", self.loss.parameters())
-        self._compiled_losses, self._compiled_estimates = self.fused(self.loss), self.fused(self._estimates)
+        self._compiled_losses, self._compiled_estimates = self.fused(self._losses), self.fused(self._estimates)
         self._compiled_lr = self.fused(self._following_lr)
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
@@ -80,13 +81,26 @@ class PPO(Algorithm):
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
         """Returns the metrics, a scalar each, of a step down the clipped loss, the critic's and the entropy's."""
-        losses = self._compiled_losses(minibatch)
+        loss, metrics = self._compiled_losses(minibatch)
         self.optimizer.zero_grad()
-        (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
+        loss.backward()
         if self.config.target_kl:
-            self._follow(losses["kl_approx"].detach())
-        grad_norm = clip_and_step(self.optimizer, self.config.max_grad_norm)
-        return [*(losses[name] for name in self.metric_names[:-1]), grad_norm]
+            self._follow(metrics[self.metric_names.index("kl_approx")])
+        return [*metrics, clip_and_step(self.optimizer, self.config.max_grad_norm)]
+
+    def _losses(self, minibatch: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the loss, a scalar, and the metrics but for the norm of its gradient, ``(len(metric_names) - 1,)``.
+
+        torch.compile leaves out what else TorchRL's loss finds. That samples the entropy, which needs no sample where
+        actions are unbounded: it is that of the deviations, which are the same in all states.
+        """
+        losses = self.loss(minibatch)
+        if not self.spaces.bounded:
+            scale: Any = self.actor[0].module[-1]
+            entropy = IndependentNormal(*scale(torch.zeros_like(minibatch["action"][0]))).entropy()
+            losses.update({"entropy": entropy.detach(), "loss_entropy": -self.config.entropy_coeff * entropy})
+        loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+        return loss, torch.stack([losses[name].detach() for name in self.metric_names[:-1]])
 
     def schedule(self, progress: float) -> None:
         """Sets the learning rate, unless it follows the divergence."""
