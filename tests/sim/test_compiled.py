@@ -98,7 +98,7 @@ def test_what_the_quadruped_needs_is_named_in_full():
         "spheres and capsules with each other and with boxes, and with planes of the world all of these, cylinders, "
         "ellipsoids and meshes; contacts='ground' leaves out those of moving bodies with each other",
         "sensor 'imu_accel', 'imu_gyro', 'velocimeter' and 8 more: "
-        "anything but touch and the velocity of a subtree, as they are",
+        "anything but touch, and velocity and angular momentum of a moving subtree, as they are",
     ]
 
 
@@ -159,8 +159,9 @@ def test_an_environment_falls_back_and_says_why(tmp_path, caplog):
 # Physics.
 
 
-def scene(*elements, gravity="0 0 -9.81", actuator="", body="root", touch=None):
+def scene(*elements, gravity="0 0 -9.81", actuator="", body="root", touch=None, momenta=()):
     sensors = f'<subtreelinvel body="{body}"/>' + (f'<touch site="{touch}"/>' if touch else "")
+    sensors += "".join(f'<subtreeangmom body="{one}"/>' for one in momenta)
     return mujoco.MjModel.from_xml_string(
         f'<mujoco><option gravity="{gravity}"/><worldbody>{"".join(elements)}</worldbody>'
         f"<actuator>{actuator}</actuator><sensor>{sensors}</sensor></mujoco>"
@@ -226,7 +227,8 @@ def test_a_free_body_keeps_its_momentum(form):
     hand = link("hand", '<joint name="wrist" axis="0 1 0" range="-20 20" limited="true"/>')
     leg = link("leg", '<joint name="hip" axis="1 0 0" stiffness="5" frictionloss="0.1"/>', pos="0.1 0 0")
     arm = link("arm", '<joint type="ball" damping="0.1"/>', hand)
-    model = scene(link("root", "<freejoint/>", arm + leg), gravity="0 0 0", actuator='<motor joint="wrist" gear="2"/>')
+    actuator, momenta = '<motor joint="wrist" gear="2"/>', ("root", "arm", "hand")
+    model = scene(link("root", "<freejoint/>", arm + leg), gravity="0 0 0", actuator=actuator, momenta=momenta)
     sim = simulated(model, ctrl_dt=0.02, sim_dt=0.0001)
     sim.qvel[0] = torch.linspace(-2.0, 2.0, model.nv)
     sim.qpos[0] = torch.as_tensor(model.qpos0)
@@ -238,7 +240,8 @@ def test_a_free_body_keeps_its_momentum(form):
     assert np.abs(end.qvel - start.qvel).max() > 1.0
     np.testing.assert_allclose(end.subtree_linvel[1], start.subtree_linvel[1], atol=1e-3)
     np.testing.assert_allclose(end.subtree_angmom[1], start.subtree_angmom[1], atol=1e-3)
-    np.testing.assert_allclose(sim.data.sensordata.numpy()[0], end.subtree_linvel[1], atol=1e-5)
+    expected = [end.subtree_linvel[1], *(end.subtree_angmom[model.body(name).id] for name in momenta)]
+    np.testing.assert_allclose(sim.data.sensordata.numpy()[0].reshape(-1, 3), expected, atol=1e-5)
 
 
 def test_constraints_are_no_stiffer_than_the_time_step_allows(form):

@@ -285,8 +285,8 @@ class View:
     def sensor(self, name: str) -> torch.Tensor:
         """Returns a sensor of the model, ``(num_envs, size)``, in MuJoCo's units.
 
-        Those of poses and velocities (gyro, velocimeter, frame*, joint*) are computed here; touch and the velocity of a
-        subtree by either engine; any other by ``engine="mujoco_warp"``.
+        Those of poses and velocities (gyro, velocimeter, frame*, joint*) are computed here; touch, and velocity and
+        angular momentum of a subtree, by either engine; any other by ``engine="mujoco_warp"``.
         """
         (sensor,), _ = self._catalog.ids("sensor", _one("sensor", name))
         derived = sensors.evaluate(self, sensor)

@@ -2160,6 +2160,31 @@ struct Step : Math {
       SHARED_LOOP(k, 3) sensordata[Model::subtree_address(s) + k] = k == 0 ? total[0] : k == 1 ? total[1] : total[2];
     }
   }
+
+//IF MOMENTA
+  // Angular momentum of a subtree about its centre of mass: that about the centre of its tree, less that of the whole.
+  INLINE void write_angular_momenta(float* sensordata) const {
+    ROLLED for (int s = 0; s < Model::MOMENTA; ++s) {
+      Vec momentum = {0.0f, 0.0f, 0.0f}, linear = momentum, center = momentum;
+      const int end = Model::first_momentum_part(s + 1);
+      ROLLED for (int i = Model::first_momentum_part(s) + lane; i < end; i += LANES) {
+        const int link = Model::momentum_link(i);
+        const Pose pose = w.pose[link];
+        const Vec offset = pose.position + pose.orientation * Model::momentum_center(i) - w.com[Model::tree(link)];
+        const Motion velocity = sum_over(to_root(link), w.velocity);
+        const Vec first = offset * Model::momentum_mass(i), push = (velocity.linear + velocity.angular.cross(offset)) * Model::momentum_mass(i);
+        momentum = momentum + Model::momentum_inertia(i).turned(pose.orientation) * velocity.angular + offset.cross(push);
+        linear = linear + push;
+        center = center + first;
+      }
+      float total[9] = {momentum.x, momentum.y, momentum.z, linear.x, linear.y, linear.z, center.x, center.y, center.z};
+      sum(total, 9);
+      const Vec about = Vec{total[6], total[7], total[8]} * Model::momentum_inverse_mass(s);
+      const Vec found = Vec{total[0], total[1], total[2]} - about.cross({total[3], total[4], total[5]});
+      SHARED_LOOP(k, 3) sensordata[Model::momentum_address(s) + k] = found.component(k);
+    }
+  }
+//END
 };
 
 // ---- The control step ----------------------------------------------------------------------------------------------
@@ -2266,6 +2291,9 @@ if (live) {
   step.write_centers(reinterpret_cast<float*>(subtree_com_out.data + first_body));
 //END
   step.write_subtree_velocities(sensors);
+//IF MOMENTA
+  step.write_angular_momenta(sensors);
+//END
   if (Model::SUBSTEPS > 0) {
     SHARED_LOOP(i, Model::POSITIONS) qpos_out.data[world * Model::POSITIONS + i] = w.qpos[i];
     SHARED_LOOP(i, DOFS) {

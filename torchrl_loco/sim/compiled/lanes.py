@@ -255,6 +255,7 @@ class Description:
         self.losses = [d for d in range(m.nv) if varies(losses[d]) or losses[d] > 0]
         sensors = [(int(m.sensor_type[i]), int(m.sensor_objid[i]), int(m.sensor_adr[i])) for i in range(m.nsensor)]
         self.subtrees = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL)]
+        self.momenta = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_SUBTREEANGMOM)]
         self.touch = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_TOUCH)]
         self.implicit_actuators = is_implicitfast(m) and present(affine_bias(m)[acting(m), 2])
         self.joint_force_limits = self.implicit_actuators or m.jnt_actfrclimited.any()
@@ -718,12 +719,10 @@ class Description:
         tables.integers("body_link", [p.link for p in self.places])
         tables.structs("Vec", "body_position", [p.position for p in self.places])
         tables.structs("Mat", "body_orientation", [matrix(p.quaternion).ravel() for p in self.places])
-        parts: list[list[tuple[int, np.ndarray, float]]] = []
-        for _, body, _ in self.subtrees:
-            inside = {b for b in range(1, m.nbody) if self._is_below(b, body)}
-            by_link = [(i, [b for b in bodies if b in inside]) for i, bodies in enumerate(self.members)]
-            joined = [(i, Mass.join(m, self.places, bodies)) for i, bodies in by_link if bodies]
-            parts.append([(i, x.center, x.mass / m.body_subtreemass[body]) for i, x in joined])
+        parts = [
+            [(i, x.center, x.mass / m.body_subtreemass[body]) for i, x in self._parts_below(body)]
+            for _, body, _ in self.subtrees
+        ]
         flat = [part for group in parts for part in group]
         tables.size(SUBTREES=len(self.subtrees), TOUCH=len(self.touch))
         tables.integers("subtree_address", [address for _, _, address in self.subtrees])
@@ -731,7 +730,26 @@ class Description:
         tables.integers("part_link", [link for link, _, _ in flat])
         tables.structs("Vec", "part_center", [center for _, center, _ in flat])
         tables.floats("part_share", [share for _, _, share in flat])
+        self._add_momenta(tables)
         self._add_touch(tables)
+
+    def _parts_below(self, body: int) -> list[tuple[int, Mass]]:
+        """Returns links of a subtree, and what of each belongs to it."""
+        inside = {b for b in range(1, self.m.nbody) if self._is_below(b, body)}
+        by_link = [(i, [b for b in bodies if b in inside]) for i, bodies in enumerate(self.members)]
+        return [(i, Mass.join(self.m, self.places, bodies)) for i, bodies in by_link if bodies]
+
+    def _add_momenta(self, tables: Tables) -> None:
+        parts = [self._parts_below(body) for _, body, _ in self.momenta]
+        flat = [part for group in parts for part in group]
+        tables.size(MOMENTA=len(self.momenta))
+        tables.integers("momentum_address", [address for _, _, address in self.momenta])
+        tables.floats("momentum_inverse_mass", [1 / self.m.body_subtreemass[body] for _, body, _ in self.momenta])
+        tables.integers("first_momentum_part", np.cumsum([0, *map(len, parts)]))
+        tables.integers("momentum_link", [link for link, _ in flat])
+        tables.structs("Vec", "momentum_center", [x.center for _, x in flat])
+        tables.structs("Symmetric", "momentum_inertia", [x.moments[np.triu_indices(3)] for _, x in flat])
+        tables.floats("momentum_mass", [x.mass for _, x in flat])
 
     def _add_touch(self, tables: Tables) -> None:
         m, sites = self.m, [site for _, site, _ in self.touch]
@@ -800,6 +818,7 @@ def source(
     tables = description.tables(substeps, with_subtree_com=with_subtree_com, **contacts)
     asked = {
         "SUBTREE_COM": with_subtree_com,
+        "MOMENTA": len(description.momenta) > 0,
         "CONTACT_GEOMS": len(contact_geoms) > 0,
         "CONTACT_HISTORY": len(contact_geoms) > 0 and contact_rows > 1,
         "ELLIPTIC": description.elliptic,

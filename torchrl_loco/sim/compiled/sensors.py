@@ -1,7 +1,8 @@
-"""Sensors of one world, traced for one model: velocities of subtrees, touch, and contact forces of geoms.
+"""Sensors of one world, traced for one model: motions of subtrees, touch, and contact forces of geoms.
 
 ===========================  ===========================================================================
 :func:`subtree_velocity`     of the present state
+:func:`angular_momentum`     likewise
 :class:`TouchSensors`        of the forces of the last substep, as acceleration sensors are in MuJoCo
 :class:`ContactForces`       likewise
 ===========================  ===========================================================================
@@ -14,28 +15,36 @@ import numpy as np
 
 from torchrl_loco.sim.compiled.collision import SHAPES, SPHERE
 from torchrl_loco.sim.compiled.dynamics import Dynamics, Poses, constant_matrix
-from torchrl_loco.sim.compiled.symbols import (
-    Block,
-    Scalar,
-    array,
-    name,
-    scalar,
-    zeros,
+from torchrl_loco.sim.compiled.symbols import Block, Scalar, array, cross, name, scalar, total
+
+SUBTREE_VELOCITY, ANGULAR_MOMENTUM, TOUCH = (
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}")) for kind in ("SUBTREELINVEL", "SUBTREEANGMOM", "TOUCH")
 )
 
-SUBTREE_VELOCITY, TOUCH = (int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}")) for kind in ("SUBTREELINVEL", "TOUCH"))
+
+def subtree(m: mujoco.MjModel, root: int) -> list[int]:
+    """Returns a body and all bodies below it."""
+    below = [root]
+    for body in range(root + 1, m.nbody):
+        if m.body_parentid[body] in below:
+            below.append(body)
+    return below
 
 
 def subtree_velocity(m: mujoco.MjModel, tree: Dynamics, root: int) -> list[Scalar]:
     """Returns the velocity of the center of mass of a body and all bodies below it (m/s)."""
-    momentum, below = zeros(3), {root}
-    for body in range(root, m.nbody):
-        if body != root and m.body_parentid[body] not in below:
-            continue
-        below.add(body)
-        if body:
-            momentum = momentum + (tree.inertia[body] @ tree.cvel[body])[3:]
+    momentum = total((tree.inertia[body] @ tree.cvel[body])[3:] for body in subtree(m, root) if body)
     return list(momentum / m.body_subtreemass[root])
+
+
+def angular_momentum(m: mujoco.MjModel, tree: Dynamics, root: int) -> list[Scalar]:
+    """Returns the angular momentum of a moving body and all bodies below it, about their center of mass (kg m^2/s)."""
+    bodies = subtree(m, root)
+    momentum = total(tree.inertia[body] @ tree.cvel[body] for body in bodies)  # about the center of the whole tree
+    if m.body_rootid[root] == root:
+        return list(momentum[:3])
+    center = total(tree.inertia[body].first for body in bodies) / m.body_subtreemass[root]
+    return list(momentum[:3] - cross(center, momentum[3:]))
 
 
 class TouchSensors:
@@ -157,6 +166,9 @@ def read(m: mujoco.MjModel, tree: Dynamics, touch: TouchSensors) -> list[Scalar 
         if m.sensor_type[sensor] == SUBTREE_VELOCITY:
             first = m.sensor_adr[sensor]
             row[first : first + 3] = subtree_velocity(m, tree, int(m.sensor_objid[sensor]))
+        elif m.sensor_type[sensor] == ANGULAR_MOMENTUM:
+            first = m.sensor_adr[sensor]
+            row[first : first + 3] = angular_momentum(m, tree, int(m.sensor_objid[sensor]))
     for address, force in touch.outputs().items():
         row[address] = scalar(force)
     return row

@@ -6,7 +6,7 @@ from torchrl_loco.sim.compiled import lanes
 from torchrl_loco.sim.compiled.collision import BOX, PLANE, ROUND, SOLID, Pair, is_elliptic, pairs
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE
 from torchrl_loco.sim.compiled.parameters import VariedModel
-from torchrl_loco.sim.compiled.sensors import SUBTREE_VELOCITY, TOUCH
+from torchrl_loco.sim.compiled.sensors import ANGULAR_MOMENTUM, SUBTREE_VELOCITY, TOUCH
 from torchrl_loco.sim.compiled.step import is_traced
 from torchrl_loco.sim.varied import Varied
 
@@ -161,12 +161,17 @@ def _sensors(m: mujoco.MjModel) -> list[str]:
     names = [
         m.sensor(i).name
         for i in range(m.nsensor)
-        if m.sensor_type[i] not in (SUBTREE_VELOCITY, TOUCH)
+        if m.sensor_type[i] not in (SUBTREE_VELOCITY, ANGULAR_MOMENTUM, TOUCH)
+        or (m.sensor_type[i] == ANGULAR_MOMENTUM and m.body_weldid[m.sensor_objid[i]] == 0)
         or m.sensor_cutoff[i]
         or m.sensor_interval[i].any()
         or m.sensor_delay[i]
     ]
-    found = {"anything but touch and the velocity of a subtree, as they are": names} if names else {}
+    found = (
+        {"anything but touch, and velocity and angular momentum of a moving subtree, as they are": names}
+        if names
+        else {}
+    )
     touch = [m.sensor(i).name for i in range(m.nsensor) if m.sensor_type[i] == TOUCH]
     if len(touch) > MAX_TOUCH:
         found[f"more than {MAX_TOUCH} sensors of touch"] = touch[MAX_TOUCH:]

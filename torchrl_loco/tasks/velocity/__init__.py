@@ -16,7 +16,6 @@ from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.vary import Vary
 from torchrl_loco.sim import models
 from torchrl_loco.tasks.velocity import commands
-from torchrl_loco.tasks.velocity.momentum import angular_momentum
 
 if TYPE_CHECKING:
     from torchrl_loco.envs.view import View
@@ -345,7 +344,7 @@ class Velocity(LocoEnv):
         if "trunk_rotation" in self.weights:
             terms["trunk_rotation"] = squares(s.to_body(self.trunk, s.angvel(self.trunk))[:, :2])
         if "angular_momentum" in self.weights:
-            terms["angular_momentum"] = squares(angular_momentum(s))
+            terms["angular_momentum"] = squares(s.sensor("angular_momentum"))
         if "self_collision" in self.weights:
             hard = s.contact_force([self.own_geoms], history=True).norm(dim=-1) > HARD_CONTACT
             terms["self_collision"] = hard.any(-1).float().sum(-1)
