@@ -1894,14 +1894,15 @@ struct Step : Math {
   struct Newton {
     float gradient_squared, decrement;  // where the current direction begins
     Search step;
-    bool same;  // whether the last step left all rows on their sides
-    bool stop, runs;  // whether qacc is final; whether anything is left to do
+    // Not bool, which would be packed and unpacked:
+    int same;  // whether the last step left all rows on their sides
+    int stop, runs;  // whether qacc is final; whether anything is left to do
   };
 
   // Sets the direction, and how all changes along it; returns whether it is to be searched.
-  INLINE bool set_direction(const int iteration, Newton& n) {
-    n.stop = n.stop || (iteration > 0 && small(n.step));
-    if (!n.stop && iteration == Model::ITERATIONS) {
+  INLINE int set_direction(const int iteration, Newton& n) {
+    n.stop |= (iteration > 0) & small(n.step);
+    if (!n.stop & (iteration == Model::ITERATIONS)) {
       n.stop = true;
       if (lane == 0 && Model::SUBSTEPS) overflow[world] |= Model::LIMIT_REACHED;
     }
@@ -1914,7 +1915,7 @@ struct Step : Math {
     sum(t, 2);
     n.gradient_squared = t[0];
     n.decrement = t[1];
-    n.stop = iteration > 0 && flat(n.gradient_squared, n.decrement);
+    n.stop = (iteration > 0) & flat(n.gradient_squared, n.decrement);
     if (n.stop) return false;
     sync();
     project_search();
@@ -1935,23 +1936,22 @@ struct Step : Math {
     }
     bool crossed = false;
 //IF ELLIPTIC
-    SHARED_LOOP(k, frictional) crossed = move_cone(k, step.alpha) || crossed;
+    SHARED_LOOP(k, frictional) crossed |= move_cone(k, step.alpha);
 //END
     SHARED_LOOP(i, rows() - first_single()) {
       const int r = first_single() + i;
       const float x = w.x[r], next = x + step.alpha * w.change[r];
       const bool dry = Model::FRICTION_LOSSES && r >= first_friction();
       const float bound = dry ? Model::friction_bound(r - first_friction()) : 0.0f;
-      crossed = crossed || (dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next));
+      crossed |= (dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next));
       w.x[r] = next;
     }
     sync();
-    const bool repeated = n.same;
+    const int repeated = n.same;
     n.same = ballot(crossed) == 0;
-    if (n.same) {  // what is left of a Newton step; of a second one on the same parabola, rounding
-      const float left = (1.0f - step.alpha) * (1.0f - step.alpha);
-      n.stop = repeated || small(step) || flat(n.gradient_squared * left, n.decrement * left);
-    }
+    // What is left of a Newton step; of a second one on the same parabola, rounding.
+    const float left = (1.0f - step.alpha) * (1.0f - step.alpha);
+    n.stop = n.same & (repeated | small(step) | flat(n.gradient_squared * left, n.decrement * left));
   }
 
   // Leaves the acceleration in qacc; with implicit damping, search is what has to be added to it before integration.
@@ -1960,8 +1960,8 @@ struct Step : Math {
     Newton n = {0.0f, 0.0f, {0.0f, 0.0f}, false, false, live};
     if (live) complete_rows();
     ROLLED for (int iteration = 0; any_of_block(n.runs); ++iteration) {
-      const bool searches = n.runs && set_direction(iteration, n);
-      if (searches) move(n);
+      if (!n.runs || !set_direction(iteration, n)) continue;
+      move(n);
     }
     sync();
   }
