@@ -1320,31 +1320,34 @@ struct Step : Math {
 
   // J' D J over the active rows of contacts, and their gradient.
   INLINE void add_contacts(Slots& h) const {
-    ROLLED for (int k = 0; k < frictional; ++k) {
-      const Law cost = law(k);
-      if (cost.open()) continue;
-      const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
-      const unsigned quads = SKIPS_QUADS && k < LANES ? read(frictional_quads, k) : ~0u;
-      OWN_DOFS(slot, dof) {
-        if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
-        const int e = dof < STRIDE ? dof : STRIDE - 1;
-        float own[DIRECTIONS], c[DIRECTIONS];
-        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + e];
-        cost.times(own, c);
-        bool some = false;
-        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
-          h.gradient[slot] = h.gradient[slot] + cost.gradient[i] * own[i];
-          some = some || c[i] != 0.0f;
-        }
-        if (LANES == 1 && !some) continue;
-        UNROLLED for (int i = 0; i < QUADS; ++i) {
-          if (4 * i >= LANES * (slot + 1)) break;
-          if (SKIPS_QUADS && !(quads >> i & 1)) continue;
-          Quad columns[DIRECTIONS];
-          UNROLLED for (int l = 0; l < DIRECTIONS; ++l) columns[l] = read4(rows + STRIDE * l + 4 * i);
-          UNROLLED for (int j = 0; j < 4; ++j)
-            UNROLLED for (int l = 0; l < DIRECTIONS; ++l)
-              h.row[slot][4 * i + j] = h.row[slot][4 * i + j] + c[l] * columns[l].v[j];
+    ROLLED for (int from = 0; from < frictional; from += LANES) {
+      const bool closed = from + lane < frictional && !law(from + lane).open();
+      ROLLED for (unsigned left = ballot(closed); left; left &= left - 1) {
+        const int k = from + lowest_bit(left);
+        const Law cost = law(k);
+        const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
+        const unsigned quads = SKIPS_QUADS && k < LANES ? read(frictional_quads, k) : ~0u;
+        OWN_DOFS(slot, dof) {
+          if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
+          const int e = dof < STRIDE ? dof : STRIDE - 1;
+          float own[DIRECTIONS], c[DIRECTIONS];
+          UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + e];
+          cost.times(own, c);
+          bool some = false;
+          UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
+            h.gradient[slot] = h.gradient[slot] + cost.gradient[i] * own[i];
+            some = some || c[i] != 0.0f;
+          }
+          if (LANES == 1 && !some) continue;
+          UNROLLED for (int i = 0; i < QUADS; ++i) {
+            if (4 * i >= LANES * (slot + 1)) break;
+            if (SKIPS_QUADS && !(quads >> i & 1)) continue;
+            Quad columns[DIRECTIONS];
+            UNROLLED for (int l = 0; l < DIRECTIONS; ++l) columns[l] = read4(rows + STRIDE * l + 4 * i);
+            UNROLLED for (int j = 0; j < 4; ++j)
+              UNROLLED for (int l = 0; l < DIRECTIONS; ++l)
+                h.row[slot][4 * i + j] = h.row[slot][4 * i + j] + c[l] * columns[l].v[j];
+          }
         }
       }
     }
