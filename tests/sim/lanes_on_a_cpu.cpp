@@ -44,6 +44,13 @@ static unsigned ballot_at(int line, bool x) {
   return votes;
 }
 
+static unsigned any_at(int line, unsigned x) {
+  const uint32_t* const all = wait(line, x);
+  unsigned bits = 0;
+  for (int lane = 0; lane < WARP; ++lane) bits |= all[lane];
+  return bits;
+}
+
 template <class T>
 static T shuffle_at(int line, T x, int from) {
   uint32_t bits;
@@ -67,6 +74,7 @@ static T shuffle_at(int line, T x, int from) {
 #define __syncthreads() wait(__LINE__, 0)
 #define __syncthreads_or(x) (ballot_at(line, x) != 0)
 #define __ballot_sync(mask, x) ballot_at(line, x)
+#define __reduce_or_sync(mask, x) any_at(line, x)
 #define __shfl_sync(mask, x, from) shuffle_at(line, x, from)
 #define __shfl_xor_sync(mask, x, bits) shuffle_at(line, x, lane ^ (bits))
 static const struct { unsigned x; } threadIdx = {0};  // of a block with one world, where only x / 32 counts

@@ -19,7 +19,7 @@ from torchrl_loco.sim.compiled.engine import LATER
 
 COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 WORLDS, MOTION = 16, 100
-WAITING = r"(INLINE \w+ (?:sync|ballot|any_of_block|read|sum|largest)\()(.*)\) const"
+WAITING = r"(INLINE \w+ (?:sync|ballot|any_of_block|read|agreed|sum|largest)\()(.*)\) const"
 PTX = {
     r'asm\("div\..*': "x = a / b;",
     r'asm\("rcp\..*': "x = 1.0f / a;",

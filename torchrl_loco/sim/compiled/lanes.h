@@ -77,8 +77,9 @@ enum {
   PITCH = 4 * (QUADS | 1),  // of rows that several lanes write at once: they begin in different banks
   SLOTS = (STRIDE + LANES - 1) / LANES,
   SEVERAL_ROWS = SLOTS > 1,  // a lane has some: then what spares rounds pays for a longer text
-  SKIPS_QUADS = SEVERAL_ROWS && LANES > 1,  // a lane that steps a world alone looks at each number itself
   CONTACTS = Model::FRICTIONAL + Model::FRICTIONLESS,
+  // Columns are left out where a lane knows those of a contact of each kind; alone, it looks at each number itself.
+  SKIPS_QUADS = SEVERAL_ROWS && LANES > 1 && Model::FRICTIONAL <= LANES && Model::FRICTIONLESS <= LANES,
   DIRECTIONS = Model::DIRECTIONS,  // in which a contact with friction acts, each with a row of the Jacobian
   CONTACT_ROWS = Model::CONTACT_ROWS,  // the constraint rows of such a contact
 //IF LIMBS
@@ -336,7 +337,8 @@ struct Step : Math {
   INLINE bool any_of_block(bool x) const { return Model::LOCKSTEP && Model::SUBSTEPS ? __syncthreads_or(x) : x; }
   INLINE float read(float x, int from) const { return __shfl_sync(~0u, x, from); }
   INLINE int read(int x, int from) const { return __shfl_sync(~0u, x, from); }
-  INLINE unsigned read(unsigned x, int from) const { return __shfl_sync(~0u, x, from); }
+  // The number of a lane, which the compiler knows to be the same in all.
+  INLINE unsigned agreed(unsigned x, int from) const { return __reduce_or_sync(~0u, lane == from ? x : 0u); }
 
   // Replaces each of n values by its sum over the lanes. With many of them, pairs of lanes first exchange halves, so
   // that each lane goes on with a quarter of the values.
@@ -377,7 +379,7 @@ struct Step : Math {
   INLINE bool any_of_block(bool x) const { return x; }
   INLINE float read(float x, int) const { return x; }
   INLINE int read(int x, int) const { return x; }
-  INLINE unsigned read(unsigned x, int) const { return x; }
+  INLINE unsigned agreed(unsigned x, int) const { return x; }
   INLINE void sum(float*, const int) const {}
   INLINE void largest(float&, int&) const {}
 #endif
@@ -1326,7 +1328,7 @@ struct Step : Math {
         const int k = from + lowest_bit(left);
         const Law cost = law(k);
         const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
-        const unsigned quads = SKIPS_QUADS && k < LANES ? read(frictional_quads, k) : ~0u;
+        const unsigned quads = SKIPS_QUADS ? agreed(frictional_quads, k) : ~0u;
         OWN_DOFS(slot, dof) {
           if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
           const int e = dof < STRIDE ? dof : STRIDE - 1;
@@ -1355,7 +1357,7 @@ struct Step : Math {
       const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
       if (!(x < 0.0f)) continue;
       const float* n = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
-      const unsigned quads = SKIPS_QUADS && k < LANES ? read(frictionless_quads, k) : ~0u;
+      const unsigned quads = SKIPS_QUADS ? agreed(frictionless_quads, k) : ~0u;
       OWN_DOFS(slot, dof) {
         if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
         const float n0 = n[dof < STRIDE ? dof : STRIDE - 1], c = weight * n0;
