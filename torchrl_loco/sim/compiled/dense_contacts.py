@@ -33,7 +33,7 @@ float length;
 const Vec n = Frame::normal(gap, length);
 const float distance = length - (p_radius + q_radius), position = distance - margin;
 if (!(position < 0.0f)) continue;
-if (contacts >= MAX_CONTACTS) { overflow |= NO_PLACE; continue; }
+if (contacts >= MAX_CONTACTS) { flag(NO_PLACE); continue; }
 const Vec tangent = Frame::tangent(n), other_tangent = n.cross(tangent), at = from + n * (p_radius + 0.5f * distance);
 const int k = contacts++;
 """

@@ -384,6 +384,9 @@ struct Step : Math {
   INLINE void largest(float&, int&) const {}
 #endif
   INLINE unsigned lanes_below() const { return (1u << lane) - 1; }
+  INLINE void flag(int bit) const {
+    if (lane == 0 && Model::SUBSTEPS) overflow[world] |= bit;
+  }
 
   // ---- Kinematics
 
@@ -703,7 +706,7 @@ struct Step : Math {
     count += bits(hits);
     if (count > places) {
       count = places;
-      if (lane == 0 && Model::SUBSTEPS) overflow[world] |= Model::NO_PLACE;
+      flag(NO_PLACE);
       place = make_room(touches, w.contacts + (friction ? 0 : Model::FRICTIONAL), place, places, pair,
                         distance - Model::margin(pair));
     }
@@ -1265,7 +1268,7 @@ struct Step : Math {
   }
 //END
 
-  // ---- Newton's method: the minimum over qacc of  (qacc - smooth)' M (qacc - smooth) / 2  +  the cost of the rows.
+  // ---- Newton's method
 
   struct Slots {  // of the Hessian (or of M + h D): the rows that this lane owns
     float row[SLOTS][STRIDE];
@@ -1774,6 +1777,16 @@ struct Step : Math {
     OWN_DOFS(slot, d) if (d < DOFS) sums[1] -= gradient[slot] * w.search[d];
   }
 
+  // The same, and the sums over all degrees of freedom.
+  INLINE void set_direction(const bool damping_alone, float& gradient_squared, float& decrement) {
+    float sums[2] = {0.0f, 0.0f};
+    turn(damping_alone, sums);
+    if (damping_alone) return;
+    sum(sums, 2);
+    gradient_squared = sums[0];
+    decrement = sums[1];
+  }
+
   // A row of a matrix times a vector, in four sums that do not wait for each other.
   static INLINE float times(const float* matrix_row, const float* vector) {
     float sums[4] = {0.0f, 0.0f, 0.0f, 0.0f};
@@ -1784,8 +1797,9 @@ struct Step : Math {
     return (sums[0] + sums[1]) + (sums[2] + sums[3]);
   }
 
-  // M and J times the search direction, a row a lane.
-  INLINE void project_search() {
+  // M and J times the search direction, a row a lane, and how the residuals change along it.
+  INLINE void project() {
+    sync();
     const int together = SEVERAL_ROWS ? jacobian_rows() : 0;  // rows of J in the rounds of those of M
     SHARED_LOOP(i, DOFS + together) {
       const int r = i - DOFS;
@@ -1794,6 +1808,8 @@ struct Step : Math {
       *(of_jacobian ? w.projected + r : w.mass_search + i) = product;
     }
     if (!SEVERAL_ROWS) SHARED_LOOP(r, jacobian_rows()) w.projected[r] = times(w.jacobian + STRIDE * r, w.search);
+    sync();
+    SHARED_LOOP(r, rows()) w.change[r] = row_velocity(r, w.search);
     sync();
   }
 
@@ -1888,86 +1904,33 @@ struct Step : Math {
 //LINE_SEARCH
   }
 
-  INLINE bool small(Search step) const {
-    return Converged::small(step, Model::scale(), Model::tolerance());
-  }
-
-  static INLINE bool flat(float gradient_squared, float decrement) {
-    return Converged::flat(gradient_squared, decrement, Model::scale(), Model::tolerance());
-  }
-
-  struct Newton {
-    float gradient_squared, decrement;  // where the current direction begins
-    Search step;
-    // Not bool, which would be packed and unpacked:
-    int same;  // whether the last step left all rows on their sides
-    int stop, runs;  // whether qacc is final; whether anything is left to do
-  };
-
-  // Sets the direction, and how all changes along it; returns whether it is to be searched.
-  INLINE int set_direction(const int iteration, Newton& n) {
-    n.stop |= (iteration > 0) & small(n.step);
-    if (!n.stop & (iteration == Model::ITERATIONS)) {
-      n.stop = true;
-      if (lane == 0 && Model::SUBSTEPS) overflow[world] |= Model::LIMIT_REACHED;
-    }
-    n.runs = !n.stop || Model::IMPLICIT_DAMPING;
-    if (!n.runs) return false;
-    float t[2] = {0.0f, 0.0f};  // gradient squared, and minus its product with the new direction
-    turn(n.stop, t);
-    n.runs = !n.stop;
-    if (n.stop) return false;
-    sum(t, 2);
-    n.gradient_squared = t[0];
-    n.decrement = t[1];
-    n.stop = (iteration > 0) & flat(n.gradient_squared, n.decrement);
-    if (n.stop) return false;
-    sync();
-    project_search();
-    SHARED_LOOP(r, rows()) w.change[r] = row_velocity(r, w.search);
-    sync();
-    return true;
-  }
-
-  // Searches the direction, and moves along it.
-  INLINE void move(Newton& n) {
-    const Search step = n.step = line_search(n.decrement);
-    n.stop = step.alpha == 0.0f;
-    if (n.stop) return;
+  // Moves along the direction, and returns whether a row changed sides.
+  INLINE bool move(const float alpha) {
     OWN_DOFS(slot, d) {
       if (d >= DOFS) continue;
-      w.qacc[d] += step.alpha * w.search[d];
-      w.residual[d] += step.alpha * w.mass_search[d];
+      w.qacc[d] += alpha * w.search[d];
+      w.residual[d] += alpha * w.mass_search[d];
     }
     bool crossed = false;
 //IF ELLIPTIC
-    SHARED_LOOP(k, frictional) crossed |= move_cone(k, step.alpha);
+    SHARED_LOOP(k, frictional) crossed |= move_cone(k, alpha);
 //END
     SHARED_LOOP(i, rows() - first_single()) {
       const int r = first_single() + i;
-      const float x = w.x[r], next = x + step.alpha * w.change[r];
+      const float x = w.x[r], next = x + alpha * w.change[r];
       const bool dry = Model::FRICTION_LOSSES && r >= first_friction();
       const float bound = dry ? Model::friction_bound(r - first_friction()) : 0.0f;
       crossed |= (dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next));
       w.x[r] = next;
     }
     sync();
-    const int repeated = n.same;
-    n.same = ballot(crossed) == 0;
-    // What is left of a Newton step; of a second one on the same parabola, rounding.
-    const float left = (1.0f - step.alpha) * (1.0f - step.alpha);
-    n.stop = n.same & (repeated | small(step) | flat(n.gradient_squared * left, n.decrement * left));
+    return ballot(crossed) != 0;
   }
 
   // Leaves the acceleration in qacc; with implicit damping, search is what has to be added to it before integration.
-  // The worlds of a block begin each iteration together, those that are done too.
   INLINE void solve(const bool live) {
-    Newton n = {0.0f, 0.0f, {0.0f, 0.0f}, false, false, live};
     if (live) complete_rows();
-    ROLLED for (int iteration = 0; any_of_block(n.runs); ++iteration) {
-      if (!n.runs || !set_direction(iteration, n)) continue;
-      move(n);
-    }
+//NEWTON
     sync();
   }
 

@@ -39,10 +39,10 @@ from torchrl_loco.sim.compiled.links import Mass, matrix, moving_bodies, places
 from torchrl_loco.sim.compiled.parameters import Number, VariedModel, nominal, present, varies
 from torchrl_loco.sim.compiled.tables import Tables
 from torchrl_loco.sim.models import NEVER, home_pose
-from torchrl_loco.sim.overflow import Overflow
 
 TEMPLATE = pathlib.Path(__file__).with_name("lanes.h")
 LINE_SEARCH = shared.line_search("Model::scale()", "Model::ls_tolerance()", "Model::ls_near()", "Model::LS_ITERATIONS")
+NEWTON = shared.newton("Model::scale()", "Model::tolerance()", "Model::ITERATIONS", "Model::IMPLICIT_DAMPING")
 TRANSLATION, ROTATION = 0, 1
 """Kinds of a degree of freedom in ``lanes.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
 UNLIMITED = 1e30
@@ -372,8 +372,6 @@ class Description:
             SUBSTEPS=substeps,
             ITERATIONS=m.opt.iterations,
             LS_ITERATIONS=m.opt.ls_iterations,
-            NO_PLACE=int(Overflow.NARROWPHASE),
-            LIMIT_REACHED=int(Overflow.ITERATIONS),
             WORLD_BYTES=layout.bytes,
             WORLDS_PER_BLOCK=self.worlds_per_block(),
             LOCKSTEP=LOCKSTEP,
@@ -835,7 +833,7 @@ def source(
     }
     text = tables.use(_parts(TEMPLATE.read_text(), asked))
     text = text.replace("//SHARED", shared.LAWS).replace("//SOFTNESS", Softness.row_as_cpp())
-    text = text.replace("//LINE_SEARCH", LINE_SEARCH)
+    text = text.replace("//LINE_SEARCH", LINE_SEARCH).replace("//NEWTON", NEWTON)
     text = text.replace("//MODEL", tables.text()).replace("//ELIMINATE", description.elimination())
     return text.replace("//VARYING", tables.varied_text()).replace("//DERIVE", tables.row.derive())
 

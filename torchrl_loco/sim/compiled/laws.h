@@ -1,4 +1,4 @@
-// Laws of both schedules: where shapes touch, what constraint rows cost, and when Newton's method has converged.
+// Laws of both schedules: where shapes touch, what constraint rows cost, and where a line search may end.
 
 // ---- Contacts
 
@@ -139,8 +139,8 @@ struct DryFriction {  // costs D x^2 / 2 while |x| is below a bound, and grows l
   }
 };
 
-// ---- Newton's method. Brackets, tolerances and stopping tests are those of mujoco_warp, but for two that save brackets:
-// the first tries the secant, and where iterations are many, a search may end near its minimum.
+// ---- The line search. Brackets and tolerances are those of mujoco_warp, but for two things that save brackets: the
+// first tries the secant, and where iterations are many, a search may end near its minimum.
 
 // Conditions are joined by | and &: by || and &&, each would be a branch.
 
@@ -180,14 +180,5 @@ struct Search {  // the result of a line search
     const bool better = acceptable & (-p.cost > improvement);  // which what is no number is not
     alpha = better ? p.alpha : alpha;
     improvement = better ? -p.cost : improvement;
-  }
-};
-
-struct Converged {  // scale is one over the inertia of the model
-  static INLINE bool small(Search step, float scale, float tolerance) {
-    return (step.improvement > 0.0f) & (step.improvement * scale < tolerance);
-  }
-  static INLINE bool flat(float gradient_squared, float decrement, float scale, float tolerance) {
-    return (scale * Math::root(gradient_squared) < tolerance) | (0.5f * scale * decrement < tolerance);
   }
 };

@@ -1,11 +1,14 @@
-"""The C++ that both schedules share: ``arithmetic.h``, ``laws.h`` and ``line_search.h``."""
+"""The C++ that both schedules share: ``arithmetic.h``, ``laws.h``, ``newton.h`` and ``line_search.h``."""
 
 import pathlib
 
+from torchrl_loco.sim.overflow import Overflow
+
 FOLDER = pathlib.Path(__file__).parent
-LAWS = "".join((FOLDER / f"{name}.h").read_text() + "\n" for name in ("arithmetic", "laws"))
+FLAGS = f"enum {{ NO_PLACE = {Overflow.NARROWPHASE:d}, LIMIT_REACHED = {Overflow.ITERATIONS:d} }};\n"  # of overflow
+LAWS = "".join((FOLDER / f"{name}.h").read_text() + "\n" for name in ("arithmetic", "laws")) + FLAGS
 """Declarations, for the head of a function."""
-_LINE_SEARCH = (FOLDER / "line_search.h").read_text()
+_LINE_SEARCH, _NEWTON = ((FOLDER / f"{name}.h").read_text() for name in ("line_search", "newton"))
 
 
 def line_search(scale: str, tolerance: str, near: str, iterations: str) -> str:
@@ -17,8 +20,23 @@ def line_search(scale: str, tolerance: str, near: str, iterations: str) -> str:
         near: the share of its first slope at which it may end.
         iterations: how many steps are tried, or brackets of three where ``near`` is 0 or there are at most 3.
     """
-    values = {"LS_TOLERANCE": tolerance, "LS_NEAR": near, "LS_ITERATIONS": iterations, "SCALE": scale}
-    text = _LINE_SEARCH
+    return _filled(_LINE_SEARCH, LS_TOLERANCE=tolerance, LS_NEAR=near, LS_ITERATIONS=iterations, SCALE=scale)
+
+
+def newton(scale: str, tolerance: str, iterations: str, implicit_damping: str) -> str:
+    """Returns the body of the function of Newton's method.
+
+    Args:
+        scale: C++ expression of one over the inertia of the model.
+        tolerance: of improvement and gradient, relative to it.
+        iterations: at most.
+        implicit_damping: whether it ends with what implicit damping adds.
+    """
+    values = {"SCALE": scale, "TOLERANCE": tolerance, "ITERATIONS": iterations, "IMPLICIT_DAMPING": implicit_damping}
+    return _filled(_NEWTON, **values)
+
+
+def _filled(text: str, **values: str) -> str:
     for word, value in values.items():
         text = text.replace(word, value)
     return text

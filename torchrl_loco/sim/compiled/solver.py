@@ -1,10 +1,6 @@
-"""The Newton solver of one world: minimises the cost of constraints over accelerations, traced for one model.
+"""The Newton solver of one world, traced for one model.
 
-    minimise  1/2 (a - a_smooth)' M (a - a_smooth) + the cost of the rows
-
-Each iteration solves H s = -gradient with H = M + J' D J over the active rows, and searches along s for the minimum of
-the cost, which is piecewise quadratic and convex there. Source: MuJoCo's documentation, chapter Computation ("Solver
-algorithms", Newton). What rows cost, the line search and the stopping tests are in ``laws.h`` and ``line_search.h``.
+The method is in ``newton.h`` and ``line_search.h``, and what rows cost in ``laws.h``; here is what they work on.
 """
 
 from collections.abc import Sequence
@@ -71,24 +67,16 @@ class NewtonSolver:
         for i, product in enumerate(self.tree.mass_times(cells("qacc", m.nv))):
             block.set(f"M_qacc[{i}]", product)
         scale = 1 / (m.stat.meaninertia * max(m.nv, 1))
-        block("float gradient2 = 0.0f, decrement = 0.0f; Search taken = {0.0f, 0.0f};")
-        block("bool converged = false, same = false;  // whether the last step left all rows on their sides")
-        with block.loop("iteration", option.iterations) as iteration:
-            self._direction(iteration)
-            limits = f"{literal(scale)}, {literal(tolerance(m))}"
-            small = f"Converged::small(taken, {limits})"
-            begins = f"{small} || Converged::flat(gradient2, decrement, {limits})"
-            iteration(f"if (iteration > 0 && ({begins})) {{ converged = true; break; }}")
-            self._project(iteration)
-            self._line_search(iteration, scale)
-            iteration("const float alpha = taken.alpha;")
-            iteration("if (alpha == 0.0f) { converged = true; break; }")
-            self._advance(iteration)
-            # What is left of a Newton step; of a second one on the same parabola, rounding.
-            iteration("const float left = (1.0f - alpha) * (1.0f - alpha);")
-            ends = f"repeated || {small} || Converged::flat(gradient2 * left, decrement * left, {limits})"
-            iteration(f"if (same && ({ends})) {{ converged = true; break; }}")
-        block(f"if (!converged && !{small}) overflow |= LIMIT_REACHED;")
+        with block.function("set_direction", "bool, float& gradient_squared, float& decrement") as direction:
+            self._set_direction(direction)
+        with block.function("project") as projection:
+            self._project(projection)
+        with block.function("line_search", "const float decrement") as search:
+            self._line_search(search, scale)
+        with block.function("move", "const float alpha") as step:
+            self._move(step)
+        block("const auto any_of_block = [](bool x) { return x; };")
+        block(shared.newton(literal(scale), literal(tolerance(m)), str(option.iterations), "false"))
 
     def read_touch(self, block: Block) -> None:
         """Sets the touch sensors from the forces that were found."""
@@ -105,8 +93,8 @@ class NewtonSolver:
             if rows.count:
                 self.contact_forces.add(block, (first, end), rows.pyramid.force(rows.directions), row)
 
-    def _direction(self, block: Block) -> None:
-        """Sets ``search`` to -H^-1 gradient, and the two measures of convergence."""
+    def _set_direction(self, block: Block) -> None:
+        """Sets ``search`` to -H^-1 gradient, and ``gradient_squared`` and ``decrement``."""
         m, tree, nv = self.m, self.tree, self.m.nv
         forces, stiffness = self.ground.gather(block)
         for body in reversed(range(1, m.nbody)):
@@ -128,7 +116,7 @@ class NewtonSolver:
         else:
             gradient = [block.keep(entry) for entry in gradient]
             solution = factor.solve(gradient)
-        block.set("gradient2", dot(gradient, gradient))
+        block.set("gradient_squared", dot(gradient, gradient))
         block.set("decrement", dot(gradient, solution))
         for i, entry in enumerate([block.keep(entry) for entry in solution]):
             block.set(f"search[{i}]", -entry)
@@ -144,6 +132,7 @@ class NewtonSolver:
             block.set(f"M_search[{i}]", product)
 
     def _line_search(self, block: Block, scale: float) -> None:
+        """Returns a step along the direction."""
         m, nv, option = self.m, self.m.nv, self.m.opt
         search = cells("search", nv)
         residual = [cell(f"M_qacc[{i}]") - cell(f"force[{i}]") for i in range(nv)]
@@ -154,11 +143,8 @@ class NewtonSolver:
         block("const auto add_rows = [&](const float* alphas, const int n, float* sums) {")
         block(self._each_row(STEPS, STEPS_FRICTION))
         block("};")
-        block("const auto line_search = [&]() {")
         tolerances = literal(scale), literal(tolerance(m) * option.ls_tolerance), literal(near(m))
         block(shared.line_search(*tolerances, str(option.ls_iterations)))
-        block("};")
-        block("taken = line_search();")
 
     def _each_row(self, body: str, of_friction: str) -> str:
         """Returns C++ that runs ``body`` for each row, with its x, v and D; of dry friction another, with its bound."""
@@ -171,8 +157,8 @@ class NewtonSolver:
             loops.append(f"{{ {self.friction.loop(of_friction)} }}")
         return "\n".join(loops)
 
-    def _advance(self, block: Block) -> None:
-        """Moves along the direction, and notes whether a row changed sides."""
+    def _move(self, block: Block) -> None:
+        """Moves along the direction, and returns whether a row changed sides."""
         for i in range(self.m.nv):
             block(f"qacc[{i}] += alpha * search[{i}]; M_qacc[{i}] += alpha * M_search[{i}];")
         block("bool changed = false;")
@@ -182,5 +168,4 @@ class NewtonSolver:
             block(self.ground.pyramid.advance("0", "ground"))
         if self.dense.count:
             block(self.dense.pyramid.advance("ground", "contacts"))
-        block("const bool repeated = same;")
-        block("same = !changed;")
+        block("return changed;")

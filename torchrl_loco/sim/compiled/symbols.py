@@ -366,6 +366,13 @@ class Block:
         self._names = {node: text for node, text in self._names.items() if not self._cells[node]}
 
     @contextmanager
+    def function(self, title: str, parameters: str = "") -> Iterator["Block"]:
+        """Yields the body of a function that sees what is here, which is appended at the end."""
+        with self.scope(f"const auto {title} = [&]({parameters})") as body:
+            yield body
+        self.lines[-1] = "};"
+
+    @contextmanager
     def loop(self, variable: str, count: int | str) -> Iterator["Block"]:
         """Yields the body of a loop of ``variable`` from 0 to ``count``, which is not unrolled."""
         self("#pragma unroll 1")

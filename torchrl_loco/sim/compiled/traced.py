@@ -19,7 +19,6 @@ from torchrl_loco.sim.compiled.symbols import (
     scalar,
     zeros,
 )
-from torchrl_loco.sim.overflow import Overflow
 
 PRELUDE = """
 #define ROLLED _Pragma("unroll 1")
@@ -59,6 +58,7 @@ def source(
         world(f"float {title}[{max(count, 1)}];")
         world(f"for (int i = 0; i < {count}; ++i) {title}[i] = wp::index({argument}, world, i);")
     world("int overflow = 0;")
+    world("const auto flag = [&](int bit) { overflow |= bit; };")
     if substeps or TOUCH in m.sensor_type or contact_geoms:
         if not substeps:
             world("// Touch is a force: a step that is not taken finds it, without actuation.")
@@ -80,8 +80,7 @@ def source(
         world(f"time_out.data[world] += {literal(substeps * m.opt.timestep)};")
         world("overflow_out.data[world] |= overflow;")
     _outputs(world, m, with_cvel, with_subtree_com)
-    bits = f"#define NO_PLACE {int(Overflow.NARROWPHASE)}\n#define LIMIT_REACHED {int(Overflow.ITERATIONS)}\n"
-    return shared.LAWS + PRELUDE + bits + world.text() + "\n"
+    return shared.LAWS + PRELUDE + world.text() + "\n"
 
 
 def _argument(title: str) -> str:

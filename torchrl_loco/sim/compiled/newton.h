@@ -1,0 +1,45 @@
+// Newton's method of both schedules, the body of a function. From a start in qacc, it leaves there the minimum of
+//   1/2 (qacc - qacc_smooth)' M (qacc - qacc_smooth) + the cost of the rows.
+// An iteration solves H s = -gradient, H = M + J' D J over the active rows, and searches along s. Source: MuJoCo's
+// documentation, chapter Computation ("Solver algorithms", Newton); the stopping tests are those of mujoco_warp. It reads:
+//   live                    whether there is a world
+//   any_of_block(x)         whether x holds here, or in a world that begins its iterations together with this one
+//   set_direction(found, gradient_squared, decrement)
+//                           sets s and, at its start, gradient' gradient and gradient' H^-1 gradient; once qacc is found,
+//                           which is asked for if IMPLICIT_DAMPING, instead what that adds to qacc
+//   project()               sets how all changes along s
+//   line_search(decrement)  returns a step along s
+//   move(alpha)             takes it, and returns whether a row changed sides
+//   flag(bit)               reports what was cut short
+// SCALE is one over the inertia of the model.
+
+float gradient_squared = 0.0f, decrement = 0.0f;
+const auto flat = [&](const float left) {  // with so much of both left
+  return (SCALE * Math::root(gradient_squared * left) < TOLERANCE) | (0.5f * SCALE * (decrement * left) < TOLERANCE);
+};
+bool found = false, done = !live;  // whether qacc is final; whether there is nothing left to do
+bool same = false;                 // whether the last step left all rows on their sides
+ROLLED for (int iteration = 0; any_of_block(!done); ++iteration) {
+  if (done) continue;
+  if (!found && iteration == ITERATIONS) {
+    found = true;
+    flag(LIMIT_REACHED);
+  }
+  done = found;
+  if (done && !IMPLICIT_DAMPING) continue;
+  set_direction(found, gradient_squared, decrement);
+  if (done) continue;
+  found = iteration > 0 && flat(1.0f);
+  if (found) continue;
+  project();
+  const Search step = line_search(decrement);
+  found = step.alpha == 0.0f;
+  if (found) continue;
+  const bool repeated = same;
+  same = !move(step.alpha);
+  found = (step.improvement > 0.0f) & (step.improvement * SCALE < TOLERANCE);
+  if (same && !found) {  // what is left of a Newton step; of a second one on the same parabola, rounding
+    const float left = (1.0f - step.alpha) * (1.0f - step.alpha);
+    found = repeated || flat(left);
+  }
+}
