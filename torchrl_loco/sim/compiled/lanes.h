@@ -2194,59 +2194,39 @@ if (live) {
   step.sync();
 }
 //IF CONTACT_GEOMS
-//IF CONTACT_HISTORY
 const int contact_row = world * Model::HISTORY * Model::CONTACT_GEOMS;
 float* const contact_forces = reinterpret_cast<float*>(contact_force_out.data + contact_row);
 bool* const in_contact = in_contact_out.data + contact_row;
-//ELSE
-float* const contact_forces = reinterpret_cast<float*>(contact_force_out.data + world * Model::CONTACT_GEOMS);
-bool* const in_contact = in_contact_out.data + world * Model::CONTACT_GEOMS;
 //END
-if (live && Model::SUBSTEPS == 0) {  // a step that is not taken finds forces
+if (live && Model::SUBSTEPS == 0 && (Model::TOUCH || Model::CONTACT_GEOMS)) {  // a step that is not taken finds forces
   step.kinematics();
   step.dynamics();
+//IF CONTACT_GEOMS
   step.keep_contacts();
+//END
   step.solve(true);
   step.write_touch(sensors);
-//IF CONTACT_HISTORY
+//IF CONTACT_GEOMS
   ROLLED for (int row = 0; row < Model::HISTORY; ++row)
     step.write_contact_forces(contact_forces + 3 * Model::CONTACT_GEOMS * row, in_contact + Model::CONTACT_GEOMS * row);
-//ELSE
-  step.write_contact_forces(contact_forces, in_contact);
 //END
 }
-//ELSE
-if (live && Model::TOUCH && Model::SUBSTEPS == 0) {  // touch is a force: a step that is not taken finds it
-  step.kinematics();
-  step.dynamics();
-  step.solve(true);
-  step.write_touch(sensors);
-}
-//END
 ROLLED for (int substep = 0;; ++substep) {
   LOCKSTEP();
   if (live) step.kinematics();
   if (substep == Model::SUBSTEPS) break;
   if (live) {
     step.dynamics();
-//IF CONTACT_HISTORY
-    step.keep_contacts();
-//ELSE
 //IF CONTACT_GEOMS
-    if (substep == Model::SUBSTEPS - 1) step.keep_contacts();
-//END
+    if (substep >= Model::SUBSTEPS - Model::HISTORY) step.keep_contacts();
 //END
   }
   step.solve(live);
   if (live) {
     if (Model::TOUCH && substep == Model::SUBSTEPS - 1) step.write_touch(sensors);
-//IF CONTACT_HISTORY
-    const int first = Model::CONTACT_GEOMS * substep;
-    step.write_contact_forces(contact_forces + 3 * first, in_contact + first);
-//ELSE
 //IF CONTACT_GEOMS
-    if (substep == Model::SUBSTEPS - 1) step.write_contact_forces(contact_forces, in_contact);
-//END
+    const int first = Model::CONTACT_GEOMS * (substep - (Model::SUBSTEPS - Model::HISTORY));
+    if (first >= 0) step.write_contact_forces(contact_forces + 3 * first, in_contact + first);
 //END
     step.integrate();
   }

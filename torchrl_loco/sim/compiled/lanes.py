@@ -412,10 +412,9 @@ class Description:
         self._add_outputs(tables)
         if with_subtree_com:
             tables.integers("root_body", self.roots)
+        tables.size(CONTACT_GEOMS=len(contact_geoms), HISTORY=contact_rows)
         if contact_geoms:
             self._add_contact_geoms(tables, contact_geoms)
-            if contact_rows > 1:
-                tables.size(HISTORY=contact_rows)
         return tables
 
     def _add_links(self, tables: Tables) -> None:
@@ -767,7 +766,6 @@ class Description:
 
     def _add_contact_geoms(self, tables: Tables, geoms: Sequence[int]) -> None:
         index, balls = {geom: i for i, geom in enumerate(geoms)}, [-1] * len(self.limited_balls)
-        tables.size(CONTACT_GEOMS=len(geoms))
         for i, title in enumerate(("first", "second")):
             tables.integers(f"{title}_contact_geom", [*(index.get(p.geoms[i], -1) for p in self.pairs), *balls])
 
@@ -818,7 +816,6 @@ def source(
         "SUBTREE_COM": with_subtree_com,
         "MOMENTA": len(description.momenta) > 0,
         "CONTACT_GEOMS": len(contact_geoms) > 0,
-        "CONTACT_HISTORY": len(contact_geoms) > 0 and contact_rows > 1,
         "ELLIPTIC": description.elliptic,
         "TURNING": description.layout.directions > 3,
         "SOME_LACK_EDGES": description.some_lack_edges,
