@@ -3,9 +3,11 @@
 #ifdef __CUDA_ARCH__
 #define INLINE __device__ __forceinline__
 #define UNROLLED _Pragma("unroll")
+#define ROLLED _Pragma("unroll 1")
 #else
 #define INLINE inline
 #define UNROLLED
+#define ROLLED
 #endif
 
 static constexpr float MINVAL = 1e-15f;  // MuJoCo's mjMINVAL

@@ -10,10 +10,8 @@
 
 //SHARED
 #ifdef __CUDA_ARCH__
-#define ROLLED _Pragma("unroll 1")
 enum { LANES = 32 };
 #else
-#define ROLLED
 enum { LANES = 1 };
 #endif
 

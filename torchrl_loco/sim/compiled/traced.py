@@ -20,10 +20,6 @@ from torchrl_loco.sim.compiled.symbols import (
     zeros,
 )
 
-PRELUDE = """
-#define ROLLED _Pragma("unroll 1")
-"""
-
 INPUTS = {"qpos": "nq", "qvel": "nv", "qacc": "nv", "ctrl": "nu"}
 """What a world reads, and how many numbers of it. ``qacc`` starts as the warm start."""
 
@@ -80,7 +76,7 @@ def source(
         world(f"time_out.data[world] += {literal(substeps * m.opt.timestep)};")
         world("overflow_out.data[world] |= overflow;")
     _outputs(world, m, with_cvel, with_subtree_com)
-    return shared.LAWS + PRELUDE + world.text() + "\n"
+    return shared.LAWS + world.text() + "\n"
 
 
 def _argument(title: str) -> str:
