@@ -67,7 +67,6 @@ static T shuffle_at(int line, T x, int from) {
 #define __ldg(pointer) (*(pointer))
 #define __popc __builtin_popcount
 #define __ffs __builtin_ffs
-#define __ffsll __builtin_ffsll
 #define __clz __builtin_clz
 #define __clzll __builtin_clzll
 #define __syncwarp() wait(line, 0)

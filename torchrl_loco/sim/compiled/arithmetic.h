@@ -36,7 +36,6 @@ struct Math {
   static INLINE float root(float x) { return x * inverse_root(x); }
   static INLINE int bits(unsigned x) { return __popc(x); }
   static INLINE int lowest_bit(unsigned x) { return __ffs(x) - 1; }
-  static INLINE int lowest_bit(unsigned long long x) { return __ffsll(x) - 1; }
   static INLINE int highest_bit(unsigned x) { return 31 - __clz(x); }
   static INLINE int highest_bit(unsigned long long x) { return 63 - __clzll(x); }
 #else
@@ -46,7 +45,6 @@ struct Math {
   static INLINE float root(float x) { return sqrtf(x); }
   static INLINE int bits(unsigned x) { return __builtin_popcount(x); }
   static INLINE int lowest_bit(unsigned x) { return __builtin_ctz(x); }
-  static INLINE int lowest_bit(unsigned long long x) { return __builtin_ctzll(x); }
   static INLINE int highest_bit(unsigned x) { return 31 - __builtin_clz(x); }
   static INLINE int highest_bit(unsigned long long x) { return 63 - __builtin_clzll(x); }
 #endif

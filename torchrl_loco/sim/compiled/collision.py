@@ -20,9 +20,9 @@ PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
     for kind in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
 )
 ROUND, SOLID = (SPHERE, CAPSULE), (ELLIPSOID, CYLINDER, BOX, MESH)
+"""Shapes that are a segment with a radius, which both schedules know; and those that only lanes know."""
 SHAPES = (*ROUND, *SOLID)
 """In the order of ``enum Shape`` in ``laws.h``."""
-"""Shapes that are a segment with a radius, which both schedules know; and those that only lanes know."""
 MINMU = 1e-5
 """MuJoCo's mjMINMU."""
 SLIPPERY, LEAST = 0.03, 1e-4

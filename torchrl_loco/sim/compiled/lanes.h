@@ -2175,9 +2175,7 @@ Step step(w, lane, ctrl_in.data, overflow_out.data, world);
 //END
 //IF DERIVED
 if (live && lane == 0) {  // numbers may have changed
-#define DIV(a, b) Math::divide(a, b)
 //DERIVE
-#undef DIV
 }
 //END
 if (live) {
