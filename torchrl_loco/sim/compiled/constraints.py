@@ -138,15 +138,16 @@ class Softness:
         return 1 / regularisation, self.stiffness * impedance * position
 
     @classmethod
-    def row_as_cpp(cls) -> str:
-        """Returns :meth:`row` as C++, a member function of a struct that has the attributes."""
-        softness = cls(*(name(field.name) for field in dataclasses.fields(cls)))
-        results = softness.row(name("inverse_inertia"), name("position"), name("least"))
+    def as_cpp(cls) -> str:
+        """Returns a C++ struct with these members, and :meth:`row` as a function."""
+        fields = [field.name for field in dataclasses.fields(cls)]
+        results = cls(*map(name, fields)).row(name("inverse_inertia"), name("position"), name("least"))
         block = Block()
         for target, result in zip(("weight", "residual"), results, strict=True):
             block.set(target, result)
         arguments = "float inverse_inertia, float position, float least, float& weight, float& residual"
-        return f"INLINE void row({arguments}) const {{\n{block.text()}\n}}"
+        row = f"INLINE void row({arguments}) const {{\n{block.text()}\n}}"
+        return f"struct Softness {{\nfloat {', '.join(fields)};\n{row}\n}};"
 
 
 def raised(x: Scalar, power: float | Scalar) -> Scalar:

@@ -39,10 +39,8 @@ struct Inertia {
   }
 };
 
-struct Softness {  // of a constraint: solref and solimp
-  float stiffness, damping, dmin, rise, per_width, midpoint, power, lower, upper;
+// Of a constraint: solref and solimp.
 //SOFTNESS
-};
 
 // ---- The model -----------------------------------------------------------------------------------------------------
 

@@ -829,7 +829,7 @@ def source(
         "BOXES": any(description.is_solid(p) and not description.is_plane(p) for p in description.pairs),
     }
     text = tables.use(_parts(TEMPLATE.read_text(), asked))
-    text = text.replace("//SHARED", shared.LAWS).replace("//SOFTNESS", Softness.row_as_cpp())
+    text = text.replace("//SHARED", shared.LAWS).replace("//SOFTNESS", Softness.as_cpp())
     text = text.replace("//LINE_SEARCH", LINE_SEARCH).replace("//NEWTON", NEWTON)
     text = text.replace("//MODEL", tables.text()).replace("//ELIMINATE", description.elimination())
     return text.replace("//VARYING", tables.varied_text()).replace("//DERIVE", tables.row.derive())
