@@ -91,7 +91,7 @@ STANDING, FAR = 0.01, 1e3
 
 @dataclasses.dataclass
 class Layout:
-    """Sizes of the state of a world, as ``struct World`` has them.
+    """Sizes of the state of a world, as ``struct World`` has them; each is a constant of ``struct Model``, too.
 
     Attributes:
         limb_numbers: what the elimination by limbs holds for all lanes.
@@ -375,24 +375,12 @@ class Description:
             WORLD_BYTES=layout.bytes,
             WORLDS_PER_BLOCK=self.worlds_per_block(),
             LOCKSTEP=LOCKSTEP,
-            POSITIONS=m.nq,
-            DOFS=m.nv,
             CONTROLS=m.nu,
             BODIES=m.nbody,
             SENSOR_VALUES=m.nsensordata,
-            LINKS=layout.links,
-            TREES=layout.trees,
-            GEOMS=layout.geoms,
-            LIMITS=layout.limits,
             LIMIT_SIDES=self.limit_sides,
-            FRICTION_LOSSES=layout.friction_losses,
-            CANDIDATES=layout.candidates,
-            FRICTIONAL=layout.frictional,
-            FRICTIONLESS=layout.frictionless,
-            DIRECTIONS=layout.directions,
-            CONTACT_ROWS=layout.contact_rows,
-            JACOBIAN_ROWS=layout.jacobian_rows,
             ROWS=layout.rows,
+            **{name.upper(): size for name, size in dataclasses.asdict(layout).items()},
         )
         tables.constant(
             timestep=m.opt.timestep,
@@ -721,7 +709,7 @@ class Description:
             for _, body, _ in self.subtrees
         ]
         flat = [part for group in parts for part in group]
-        tables.size(SUBTREES=len(self.subtrees), TOUCH=len(self.touch))
+        tables.size(SUBTREES=len(self.subtrees))
         tables.integers("subtree_address", [address for _, _, address in self.subtrees])
         tables.integers("first_part", np.cumsum([0, *map(len, parts)]))
         tables.integers("part_link", [link for link, _, _ in flat])
