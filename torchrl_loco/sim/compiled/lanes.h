@@ -1292,11 +1292,9 @@ struct Step : Math {
       UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
         const int r = limit_row[side][slot];
         if (r < 0) continue;
-        const float x = w.x[r], weight = w.weight[r];
-        if (x < 0.0f) {
-          diagonal[slot] += weight;
-          gradient[slot] += (w.limits[r - first_limit()] < 128 ? weight : -weight) * x;
-        }
+        const float push = OneSided::gradient(w.x[r], w.weight[r]);
+        diagonal[slot] += OneSided::curvature(w.x[r], w.weight[r]);
+        gradient[slot] += w.limits[r - first_limit()] < 128 ? push : -push;
       }
       const int loss = Model::friction_row(d < DOFS ? d : 0);
       if (Model::FRICTION_LOSSES && d < DOFS && loss >= 0) {
