@@ -293,9 +293,7 @@ struct Step : Math {
 //IF LIMBS
   bool crossing;  // whether a contact couples two limbs
 //END
-//IF IMPLICIT_ACTUATORS
   float implicit_damping[SLOTS];  // minus the derivative of the force of each own degree of freedom by its velocity
-//END
 //IF VARIED
   const Varied varied;
 //END
@@ -572,21 +570,14 @@ struct Step : Math {
     sync();
   }
 
-  // Passive and actuator forces of a degree of freedom.
-//IF IMPLICIT_ACTUATORS
-  // Minus their derivative by its velocity is its damping. MuJoCo leaves out actuators whose force a limit holds.
+  // Passive and actuator forces of a degree of freedom, and its damping: minus the derivative of the force by its
+  // velocity. MuJoCo leaves out of that actuators whose force a limit holds.
   INLINE float joint_force(int d, float& damping) const {
-    damping = Model::damping(d);
-//ELSE
-  INLINE float joint_force(int d) const {
-//END
     const int q = Model::dof_qpos(d);
-    float force = -Model::damping(d) * w.qvel[d];
+    damping = Model::damping(d);
+    float force = -damping * w.qvel[d], actuation = 0.0f;
     if (Model::HAS_SPRINGS) force = force - Model::stiffness(d) * (w.qpos[q] - Model::spring(q));
     const int end = Model::first_actuator(d + (Model::SUBSTEPS > 0));  // a step that is not taken has no actuation
-//IF JOINT_FORCE_LIMITS
-    float actuation = 0.0f;
-//END
     ROLLED for (int a = Model::first_actuator(d); a < end; ++a) {
       const float gear = Model::gear(a);
       const float control = ctrl[world * Model::CONTROLS + Model::control(a)];
@@ -594,22 +585,15 @@ struct Step : Math {
       if (Model::HAS_ACTUATOR_BIAS)
         f = f + Model::bias(a) + gear * (Model::bias_position(a) * w.qpos[q] + Model::bias_velocity(a) * w.qvel[d]);
       if (Model::HAS_FORCE_LIMITS) f = clamp(f, Model::force_low(a), Model::force_high(a));
-//IF IMPLICIT_ACTUATORS
-      if (Model::force_low(a) < f && f < Model::force_high(a)) damping = damping - gear * gear * Model::bias_velocity(a);
-//END
-//IF JOINT_FORCE_LIMITS
-      actuation = actuation + gear * f;
+      if (Model::IMPLICIT_ACTUATORS && Model::force_low(a) < f && f < Model::force_high(a))
+        damping = damping - gear * gear * Model::bias_velocity(a);
+      if (Model::JOINT_FORCE_LIMITS) actuation = actuation + gear * f;
+      else force = force + gear * f;
     }
+    if (!Model::JOINT_FORCE_LIMITS) return force;
     const float low = Model::joint_force_low(d), high = Model::joint_force_high(d);
-    force = force + clamp(actuation, low, high);
-//ELSE
-      force = force + gear * f;
-    }
-//END
-//IF IMPLICIT_ACTUATORS
     if (!(low < actuation && actuation < high)) damping = Model::damping(d);
-//END
-    return force;
+    return force + clamp(actuation, low, high);
   }
 
   // The mass matrix, and the residual: minus the smooth forces, until M qacc is added. Entries of degrees of freedom of
@@ -620,11 +604,7 @@ struct Step : Math {
       if (d >= DOFS) continue;
       const Body body = w.bodies[Model::dof_link(d)];
       const Motion axis = w.axes[d], momentum = body.inertia * axis, bias = {body.torque, body.force};
-//IF IMPLICIT_ACTUATORS
       w.residual[d] = axis.dot(bias) - joint_force(d, implicit_damping[slot]);
-//ELSE
-      w.residual[d] = axis.dot(bias) - joint_force(d);
-//END
       w.mass[STRIDE * d + d] = axis.dot(momentum) + Model::armature(d);
       if (SEVERAL_ROWS) {
         w.momentum[d] = momentum;
@@ -1281,11 +1261,8 @@ struct Step : Math {
       diagonal[slot] = 0.0f;
       gradient[slot] = d < DOFS ? w.residual[d] : 0.0f;
       if (damping_alone) {
-//IF IMPLICIT_ACTUATORS
-        diagonal[slot] = d < DOFS ? Model::timestep() * implicit_damping[slot] : 0.0f;
-//ELSE
-        diagonal[slot] = d < DOFS ? Model::timestep() * Model::damping(d) : 0.0f;
-//END
+        const float damping = Model::IMPLICIT_ACTUATORS ? implicit_damping[slot] : Model::damping(d < DOFS ? d : 0);
+        diagonal[slot] = d < DOFS ? Model::timestep() * damping : 0.0f;
         gradient[slot] = d < DOFS ? diagonal[slot] * w.qacc[d] : 0.0f;
         continue;
       }

@@ -518,11 +518,11 @@ class Description:
         for k, name in enumerate(("low", "high")):
             tables.floats(f"control_{name}", limits[:, k])
             tables.floats(f"force_{name}", forces[:, k])
-        if self.joint_force_limits:
-            limited = m.jnt_actfrclimited.astype(bool)
-            forces = np.where(limited[:, None], m.jnt_actfrcrange, [-UNLIMITED, UNLIMITED])[m.dof_jntid]
-            for k, name in enumerate(("low", "high")):
-                tables.floats(f"joint_force_{name}", forces[:, k])
+        tables.size(IMPLICIT_ACTUATORS=self.implicit_actuators, JOINT_FORCE_LIMITS=self.joint_force_limits)
+        limited = m.jnt_actfrclimited.astype(bool)
+        forces = np.where(limited[:, None], m.jnt_actfrcrange, [-UNLIMITED, UNLIMITED])[m.dof_jntid]
+        for k, name in enumerate(("low", "high")):
+            tables.floats(f"joint_force_{name}", forces[:, k])
 
     def _geom(self, g: int) -> tuple[int, np.ndarray, np.ndarray]:
         """Returns the link of a geom, and its center and z axis in the frame of the link."""
@@ -809,8 +809,6 @@ def source(
         "SOME_LACK_EDGES": description.some_lack_edges,
         "VARIED": tables.row.numbers > 0,
         "DERIVED": tables.row.numbers > 0 and substeps == 0,
-        "IMPLICIT_ACTUATORS": description.implicit_actuators,
-        "JOINT_FORCE_LIMITS": description.joint_force_limits,
         "MESHES": bool(description.meshes),
         "SOLIDS": any(map(description.is_solid, description.pairs)),
         "LIMBS": description.limbs is not None,
