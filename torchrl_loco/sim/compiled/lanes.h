@@ -1717,41 +1717,38 @@ struct Step : Math {
 #endif
 
 //END
-  // Sets the search direction, and adds what the own degrees of freedom have of the gradient squared and of minus its
-  // product with the direction; in the end, the direction is what implicit damping adds to qacc.
-  INLINE void turn(const bool damping_alone, float* sums) {
-    float diagonal[SLOTS], gradient[SLOTS];
+  // Sets the search direction, gradient' gradient and gradient' H^-1 gradient; or as the direction what implicit damping
+  // adds to qacc.
+  INLINE void set_direction(const bool damping_alone, float& gradient_squared, float& decrement) {
+    float diagonal[SLOTS], gradient[SLOTS], sums[2] = {0.0f, 0.0f};
     own_terms(damping_alone, diagonal, gradient);
+    bool by_limbs = false;
 //IF LIMBS
 #ifdef __CUDA_ARCH__
-    if (damping_alone || !crossing) {
+    by_limbs = damping_alone || !crossing;
+    if (by_limbs) {
       Branches h;
       assemble(h, !damping_alone, diagonal, gradient);
       OWN_ROWS(hold, row) if (row < LIMB_ROWS + TRUNK) sums[0] += h.gradient[hold] * h.gradient[hold];
       factor_and_solve(h, sums[1]);
-      return;
     }
 #endif
 //END
-    Slots h;
-    OWN_DOFS(slot, d) {
-      h.diagonal[slot] = diagonal[slot];
-      h.gradient[slot] = gradient[slot];
+    if (!by_limbs) {
+      Slots h;
+      OWN_DOFS(slot, d) {
+        h.diagonal[slot] = diagonal[slot];
+        h.gradient[slot] = gradient[slot];
+      }
+      start_from_mass(h);
+      if (!damping_alone) add_contacts(h);
+      OWN_DOFS(slot, d) {
+        gradient[slot] = d < DOFS ? h.gradient[slot] : 0.0f;
+        sums[0] += gradient[slot] * gradient[slot];
+      }
+      factor_and_solve(h);
+      OWN_DOFS(slot, d) if (d < DOFS) sums[1] -= gradient[slot] * w.search[d];
     }
-    start_from_mass(h);
-    if (!damping_alone) add_contacts(h);
-    OWN_DOFS(slot, d) {
-      gradient[slot] = d < DOFS ? h.gradient[slot] : 0.0f;
-      sums[0] += gradient[slot] * gradient[slot];
-    }
-    factor_and_solve(h);
-    OWN_DOFS(slot, d) if (d < DOFS) sums[1] -= gradient[slot] * w.search[d];
-  }
-
-  // The same, and the sums over all degrees of freedom.
-  INLINE void set_direction(const bool damping_alone, float& gradient_squared, float& decrement) {
-    float sums[2] = {0.0f, 0.0f};
-    turn(damping_alone, sums);
     if (damping_alone) return;
     sum(sums, 2);
     gradient_squared = sums[0];
