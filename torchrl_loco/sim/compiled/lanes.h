@@ -48,7 +48,6 @@ enum Joint { FREE, BALL, SLIDE_JOINT, HINGE_JOINT };
 enum Dof { TRANSLATION, ROTATION, SLIDE, HINGE };  // of a free joint; of a free or ball joint; the two others
 
 //MODEL
-//IF VARIED
 
 // The numbers of the model of a world, and what follows from them.
 struct Row {
@@ -62,7 +61,6 @@ struct Row {
 };
 
 //VARYING
-//END
 
 // ---- The state of a world ------------------------------------------------------------------------------------------
 
@@ -294,22 +292,15 @@ struct Step : Math {
   bool crossing;  // whether a contact couples two limbs
 //END
   float implicit_damping[SLOTS];  // minus the derivative of the force of each own degree of freedom by its velocity
-//IF VARIED
   const Varied varied;
-//END
 //IF CONTACT_GEOMS
   // What the solver overwrites of the contacts that this lane adds up: number lane, lane + LANES, ...
   enum { OWN_CONTACTS = (CONTACTS + LANES - 1) / LANES };
   struct OwnContact { Vec normal, tangent; int pair; } own_contacts[OWN_CONTACTS];
 //END
 
-//IF VARIED
   INLINE Step(World& w, int lane, const float* ctrl, int* overflow, int world, const float* row)
       : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world), varied{{row}} {}
-//ELSE
-  INLINE Step(World& w, int lane, const float* ctrl, int* overflow, int world)
-      : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world) {}
-//END
 
   // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for each direction
   // (all but the normal times a factor), and a constraint row for each edge of its pyramid, or each direction of its
@@ -1086,11 +1077,9 @@ struct Step : Math {
     frictionless_quads = own_quads(w.contacts + Model::FRICTIONAL, frictionless);
     Motion axes[SLOTS];
     OWN_DOFS(slot, d) axes[slot] = w.axes[d < DOFS ? d : 0];
-//IF VARIED
-    const bool own = LANES > 1 && Model::FRICTIONAL <= LANES;
+    const bool own = Model::VARIED && LANES > 1 && Model::FRICTIONAL <= LANES;
     float own_friction = 0.0f;  // of the lane's contact: in the loop, all would wait for one after the other
     if (own && lane < frictional) own_friction = Model::friction(w.contacts[lane].pair);
-//END
 //IF LIMBS
     crossing = false;
 //END
@@ -1104,11 +1093,7 @@ struct Step : Math {
       const Model::Dofs against = Model::first_dofs(pair), with = Model::second_dofs(pair);
       Vec tangent = {0.0f, 0.0f, 0.0f}, other = tangent;
       if (friction) {
-//IF VARIED
         tangent = w.tangents[i] * (own ? read(own_friction, i) : Model::friction(pair));
-//ELSE
-        tangent = w.tangents[i] * Model::friction(pair);
-//END
         other = second_tangent(c.normal, tangent, pair);
       }
 //IF TURNING
@@ -2137,17 +2122,11 @@ World& w = storage;
 #define LOCKSTEP()
 #endif
 float* const sensors = sensordata_out.data + (live ? world : 0) * Model::SENSOR_VALUES;
-//IF VARIED
 float* const row = numbers_out.data + static_cast<size_t>(live ? world : 0) * numbers_out.shape[1];
 Step step(w, lane, ctrl_in.data, overflow_out.data, world, row);
-//ELSE
-Step step(w, lane, ctrl_in.data, overflow_out.data, world);
-//END
-//IF DERIVED
-if (live && lane == 0) {  // numbers may have changed
+if (live && lane == 0) {  // in a step that is not taken, numbers may have changed
 //DERIVE
 }
-//END
 if (live) {
   step.sync();  // the first lane may have written the state
   SHARED_LOOP(i, Model::POSITIONS) w.qpos[i] = qpos_out.data[world * Model::POSITIONS + i];

@@ -379,6 +379,7 @@ class Description:
             BODIES=m.nbody,
             SENSOR_VALUES=m.nsensordata,
             LIMIT_SIDES=self.limit_sides,
+            VARIED=isinstance(m, VariedModel),
             ROWS=layout.rows,
             **{name.upper(): size for name, size in dataclasses.asdict(layout).items()},
         )
@@ -807,8 +808,6 @@ def source(
         "ELLIPTIC": description.elliptic,
         "TURNING": description.layout.directions > 3,
         "SOME_LACK_EDGES": description.some_lack_edges,
-        "VARIED": tables.row.numbers > 0,
-        "DERIVED": tables.row.numbers > 0 and substeps == 0,
         "MESHES": bool(description.meshes),
         "SOLIDS": any(map(description.is_solid, description.pairs)),
         "LIMBS": description.limbs is not None,
@@ -818,7 +817,7 @@ def source(
     text = text.replace("//SHARED", shared.LAWS).replace("//SOFTNESS", Softness.as_cpp())
     text = text.replace("//LINE_SEARCH", LINE_SEARCH).replace("//NEWTON", NEWTON)
     text = text.replace("//MODEL", tables.text()).replace("//ELIMINATE", description.elimination())
-    return text.replace("//VARYING", tables.varied_text()).replace("//DERIVE", tables.row.derive())
+    return text.replace("//VARYING", tables.varied_text()).replace("//DERIVE", "" if substeps else tables.row.derive())
 
 
 def nominal_row(m: VariedModel) -> np.ndarray:
