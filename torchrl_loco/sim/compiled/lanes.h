@@ -1791,6 +1791,24 @@ struct Step : Math {
 
   // ---- Line search
 
+  // A row that has a cost of its own, and how it changes along the search direction.
+  struct Single {
+    float x, v, weight, bound;
+    bool dry;
+    INLINE float cost() const { return dry ? DryFriction::cost(x, weight, bound) : OneSided::cost(x, weight); }
+    INLINE void add(float alpha, float* sums) const {
+      if (dry) DryFriction::add(x, v, weight, bound, alpha, sums);
+      else OneSided::add(x, v, weight, alpha, sums);
+    }
+    INLINE bool crosses(float next) const {
+      return dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next);
+    }
+  };
+  INLINE Single single(int r) const {
+    const bool dry = Model::FRICTION_LOSSES && r >= first_friction();
+    return {w.x[r], w.change[r], w.weight[r], dry ? Model::friction_bound(r - first_friction()) : 0.0f, dry};
+  }
+
 //IF ELLIPTIC
   enum { OWN_CONES = (Model::FRICTIONAL + LANES - 1) / LANES };
   struct Lines { Cone::Line of[OWN_CONES]; };  // of the contacts lane, lane + LANES, ...
@@ -1807,14 +1825,8 @@ struct Step : Math {
     }
 //END
     SHARED_LOOP(i, rows() - first_single()) {
-      const int r = first_single() + i;
-      const float x = w.x[r], v = w.change[r], weight = w.weight[r];
-      if (Model::FRICTION_LOSSES && r >= first_friction()) {
-        const float bound = Model::friction_bound(r - first_friction());
-        UNROLLED for (int k = 0; k < n; ++k) DryFriction::add(x, v, weight, bound, alphas[k], sums + 3 * k);
-      } else {
-        UNROLLED for (int k = 0; k < n; ++k) OneSided::add(x, v, weight, alphas[k], sums + 3 * k);
-      }
+      const Single row = single(first_single() + i);
+      UNROLLED for (int k = 0; k < n; ++k) row.add(alphas[k], sums + 3 * k);
     }
     sum(sums, 3 * n);
   }
@@ -1840,16 +1852,9 @@ struct Step : Math {
     }
 //END
     SHARED_LOOP(i, rows() - first_single()) {
-      const int r = first_single() + i;
-      const float x = w.x[r], v = w.change[r], weight = w.weight[r];
-      if (Model::FRICTION_LOSSES && r >= first_friction()) {
-        const float bound = Model::friction_bound(r - first_friction());
-        t[3] += DryFriction::cost(x, weight, bound);
-        DryFriction::add(x, v, weight, bound, 1.0f, t + 4);
-      } else {
-        t[3] += OneSided::cost(x, weight);
-        OneSided::add(x, v, weight, 1.0f, t + 4);
-      }
+      const Single row = single(first_single() + i);
+      t[3] += row.cost();
+      row.add(1.0f, t + 4);
     }
     sum(t, 7);
     const float *const quadratic = t, *const whole = t + 3;
@@ -1870,10 +1875,9 @@ struct Step : Math {
 //END
     SHARED_LOOP(i, rows() - first_single()) {
       const int r = first_single() + i;
-      const float x = w.x[r], next = x + alpha * w.change[r];
-      const bool dry = Model::FRICTION_LOSSES && r >= first_friction();
-      const float bound = dry ? Model::friction_bound(r - first_friction()) : 0.0f;
-      crossed |= (dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next));
+      const Single row = single(r);
+      const float next = row.x + alpha * row.v;
+      crossed |= row.crosses(next);
       w.x[r] = next;
     }
     sync();
