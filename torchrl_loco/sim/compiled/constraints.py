@@ -251,18 +251,16 @@ class JointLimits:
             diagonal[d] = diagonal[d] + weight
 
     def loop(self, body: str) -> str:
-        """Returns a C++ loop over the rows, with x, v and D."""
-        head = f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i)"
-        return f"{head} {{ const float x = limit_x[i], v = limit_v[i], D = limit_D[i]; {body} }}" if self.count else ""
+        """Returns a C++ loop over the rows, each a ``row``."""
+        if not self.count:
+            return ""
+        row = "const ConstraintRow row = {limit_x[i], limit_v[i], limit_D[i], 0.0f, false};"
+        return f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ {row} {body} }}"
 
     def advance(self) -> str:
         """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides."""
-        if not self.count:
-            return ""
-        return (
-            f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ "
-            "const float x = limit_x[i] + alpha * limit_v[i]; "
-            "changed |= limit_D[i] > 0.0f && OneSided::crosses(limit_x[i], x); limit_x[i] = x; }"
+        return self.loop(
+            "const float next = row.after(alpha); changed |= row.weight > 0.0f && row.crosses(next); limit_x[i] = next;"
         )
 
 
@@ -306,20 +304,19 @@ class DryFriction:
             diagonal[d] = diagonal[d] + call("DryFriction::curvature", *row)
 
     def loop(self, body: str) -> str:
-        """Returns a C++ loop over the rows, with x, v, D and the bound of x beyond which the force is largest."""
+        """Returns a C++ loop over the rows, each a ``row``."""
+        if not self.count:
+            return ""
         listed = [", ".join(map(constant_text, values)) for values in (self.weight, self.bound)]
+        row = "const ConstraintRow row = {friction_x[i], friction_v[i], friction_D[i], friction_bound[i], true};"
         return (
-            f"{self._kept} float friction_D[] = {{{listed[0]}}}, friction_bound[] = {{{listed[1]}}};\n"
-            f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ const float x = friction_x[i], "
-            f"v = friction_v[i], D = friction_D[i], bound = friction_bound[i]; {body} }}"
+            f"{{ {self._kept} float friction_D[] = {{{listed[0]}}}, friction_bound[] = {{{listed[1]}}};\n"
+            f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ {row} {body} }} }}"
         )
 
     def advance(self) -> str:
         """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides."""
-        if not self.count:
-            return ""
-        moves = "const float y = x + alpha * v; changed |= DryFriction::crosses(x, y, bound); friction_x[i] = y;"
-        return f"{{ {self.loop(moves)} }}"
+        return self.loop("const float next = row.after(alpha); changed |= row.crosses(next); friction_x[i] = next;")
 
 
 def constant_text(x: Number) -> str:

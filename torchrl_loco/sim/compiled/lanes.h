@@ -1791,20 +1791,8 @@ struct Step : Math {
 
   // ---- Line search
 
-  // A row that has a cost of its own, and how it changes along the search direction.
-  struct Single {
-    float x, v, weight, bound;
-    bool dry;
-    INLINE float cost() const { return dry ? DryFriction::cost(x, weight, bound) : OneSided::cost(x, weight); }
-    INLINE void add(float alpha, float* sums) const {
-      if (dry) DryFriction::add(x, v, weight, bound, alpha, sums);
-      else OneSided::add(x, v, weight, alpha, sums);
-    }
-    INLINE bool crosses(float next) const {
-      return dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next);
-    }
-  };
-  INLINE Single single(int r) const {
+  // A row that has a cost of its own.
+  INLINE ConstraintRow single(int r) const {
     const bool dry = Model::FRICTION_LOSSES && r >= first_friction();
     return {w.x[r], w.change[r], w.weight[r], dry ? Model::friction_bound(r - first_friction()) : 0.0f, dry};
   }
@@ -1825,7 +1813,7 @@ struct Step : Math {
     }
 //END
     SHARED_LOOP(i, rows() - first_single()) {
-      const Single row = single(first_single() + i);
+      const ConstraintRow row = single(first_single() + i);
       UNROLLED for (int k = 0; k < n; ++k) row.add(alphas[k], sums + 3 * k);
     }
     sum(sums, 3 * n);
@@ -1852,7 +1840,7 @@ struct Step : Math {
     }
 //END
     SHARED_LOOP(i, rows() - first_single()) {
-      const Single row = single(first_single() + i);
+      const ConstraintRow row = single(first_single() + i);
       t[3] += row.cost();
       row.add(1.0f, t + 4);
     }
@@ -1875,8 +1863,8 @@ struct Step : Math {
 //END
     SHARED_LOOP(i, rows() - first_single()) {
       const int r = first_single() + i;
-      const Single row = single(r);
-      const float next = row.x + alpha * row.v;
+      const ConstraintRow row = single(r);
+      const float next = row.after(alpha);
       crossed |= row.crosses(next);
       w.x[r] = next;
     }

@@ -139,6 +139,20 @@ struct DryFriction {  // costs D x^2 / 2 while |x| is below a bound, and grows l
   }
 };
 
+struct ConstraintRow {  // of either kind, along a search direction
+  float x, v, weight, bound;
+  bool dry;  // or one-sided, without a bound
+  INLINE float after(float alpha) const { return x + alpha * v; }
+  INLINE float cost() const { return dry ? DryFriction::cost(x, weight, bound) : OneSided::cost(x, weight); }
+  INLINE bool crosses(float next) const {
+    return dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next);
+  }
+  INLINE void add(float alpha, float* sums) const {
+    if (dry) DryFriction::add(x, v, weight, bound, alpha, sums);
+    else OneSided::add(x, v, weight, alpha, sums);
+  }
+};
+
 // ---- The line search. Brackets and tolerances are those of mujoco_warp, but for two things that save brackets: the
 // first tries the secant, and where iterations are many, a search may end near its minimum.
 

@@ -77,7 +77,7 @@ class Pyramid:
         return self.response(cell("contact_D[k]"), [cell(f"contact_x{d}[k]") for d in self.directions])[0]
 
     def loop(self, first: str, count: str, body: str) -> str:
-        """Returns a C++ loop over the edges of contacts, with x, v and D."""
+        """Returns a C++ loop over the edges of contacts, each a ``row``."""
         lines = [f"#pragma unroll 1\nfor (int k = {first}; k < {count}; ++k) {{"]
         for sign, direction, copies in self.edges:
             x, v = (
@@ -86,12 +86,12 @@ class Pyramid:
                 for field in "xv"
             )
             weight = f"{literal(copies)} * contact_D[k]" if copies > 1 else "contact_D[k]"
-            lines.append(f"  {{ const float x = {x}, v = {v}, D = {weight}; {body} }}")
+            lines.append(f"  {{ const ConstraintRow row = {{{x}, {v}, {weight}, 0.0f, false}}; {body} }}")
         return "\n".join([*lines, "}"])
 
     def advance(self, first: str, count: str) -> str:
         """Returns C++ that moves the residuals along the search direction, and notes whether an edge changed sides."""
-        edges = self.loop(first, count, "changed |= OneSided::crosses(x, x + alpha * v);").removesuffix("}")
+        edges = self.loop(first, count, "changed |= row.crosses(row.after(alpha));").removesuffix("}")
         moves = " ".join(f"contact_x{d}[k] += alpha * contact_v{d}[k];" for d in self.directions)
         return f"{edges}  {moves}\n}}"
 

@@ -14,10 +14,8 @@ from torchrl_loco.sim.compiled.ground_contacts import GroundContacts
 from torchrl_loco.sim.compiled.sensors import ContactForces, TouchSensors
 from torchrl_loco.sim.compiled.symbols import Block, cell, cells, dot, literal, total
 
-WHOLE = "whole[0] += OneSided::cost(x, D); OneSided::add(x, v, D, 1.0f, whole + 1);"
-WHOLE_FRICTION = "whole[0] += DryFriction::cost(x, D, bound); DryFriction::add(x, v, D, bound, 1.0f, whole + 1);"
-STEPS = "UNROLLED for (int s = 0; s < n; ++s) OneSided::add(x, v, D, alphas[s], sums + 3 * s);"
-STEPS_FRICTION = "UNROLLED for (int s = 0; s < n; ++s) DryFriction::add(x, v, D, bound, alphas[s], sums + 3 * s);"
+WHOLE = "whole[0] += row.cost(); row.add(1.0f, whole + 1);"
+STEPS = "UNROLLED for (int s = 0; s < n; ++s) row.add(alphas[s], sums + 3 * s);"
 """What the line search does with each row."""
 
 
@@ -139,22 +137,21 @@ class NewtonSolver:
         sums = (dot(search, residual), dot(search, cells("M_search", nv)), dot(search, search))
         block(f"const float quadratic[3] = {{{', '.join([block.value(x) for x in sums])}}};")
         block("float whole[4] = {0.0f, 0.0f, 0.0f, 0.0f};")
-        block(self._each_row(WHOLE, WHOLE_FRICTION))
+        block(self._each_row(WHOLE))
         block("const auto add_rows = [&](const float* alphas, const int n, float* sums) {")
-        block(self._each_row(STEPS, STEPS_FRICTION))
+        block(self._each_row(STEPS))
         block("};")
         tolerances = literal(scale), literal(tolerance(m) * option.ls_tolerance), literal(near(m))
         block(shared.line_search(*tolerances, str(option.ls_iterations)))
 
-    def _each_row(self, body: str, of_friction: str) -> str:
-        """Returns C++ that runs ``body`` for each row, with its x, v and D; of dry friction another, with its bound."""
+    def _each_row(self, body: str) -> str:
+        """Returns C++ that runs ``body`` for each row, ``row``."""
         loops = [self.limits.loop(body)]
         if self.ground.count:
             loops.append(self.ground.pyramid.loop("0", "ground", body))
         if self.dense.count:
             loops.append(self.dense.pyramid.loop("ground", "contacts", body))
-        if self.friction.count:
-            loops.append(f"{{ {self.friction.loop(of_friction)} }}")
+        loops.append(self.friction.loop(body))
         return "\n".join(loops)
 
     def _move(self, block: Block) -> None:
