@@ -484,8 +484,7 @@ class Description:
         corner = [*gradient, *unused[: -len(trunk) % 4], *lower, *unused[: -len(lower) % 4]]
         tables.integers("corner_row", [i for i, _ in corner])
         tables.integers("corner_column", [j for _, j in corner])
-        dofs = [self._dofs_of_geom(p.geoms[0]) ^ self._dofs_of_geom(p.geoms[1]) for p in self.pairs]
-        tables.integers("crosses", [self.limbs.crosses(x) for x in dofs])
+        tables.integers("crosses", [self.limbs.crosses(self._apart(pair)) for pair in self.pairs])
 
     def _add_forces(self, tables: Tables, mask: str) -> None:
         m = self.m
@@ -567,7 +566,7 @@ class Description:
         tables.integers("second_geom", [index[p.geoms[1]] for p in found])
         tables.integers("first_dofs", [self._dofs_of_geom(p.geoms[0]) for p in found], mask)
         tables.integers("second_dofs", [self._dofs_of_geom(p.geoms[1]) for p in found], mask)
-        apart = [self._dofs_of_geom(p.geoms[0]) ^ self._dofs_of_geom(p.geoms[1]) for p in found]
+        apart = [self._apart(pair) for pair in found]
         of_balls = [-1] * len(self.limited_balls)  # all of them
         quads = [sum(1 << i for i in range(self.layout.stride // 4) if dofs >> 4 * i & 15) for dofs in apart + of_balls]
         tables.integers("quads", quads, "unsigned")
@@ -669,11 +668,14 @@ class Description:
     def _dofs_of_geom(self, g: int) -> int:
         """Returns a bit for each degree of freedom that moves a geom."""
         link = self.places[self.m.geom_bodyid[g]].link
-        return (
-            0
-            if link < 0
-            else self.ancestors[self.m.body_dofadr[self.moving[link]] + self.m.body_dofnum[self.moving[link]] - 1]
-        )
+        if link < 0:
+            return 0
+        body = self.moving[link]
+        return self.ancestors[self.m.body_dofadr[body] + self.m.body_dofnum[body] - 1]
+
+    def _apart(self, pair: Pair) -> int:
+        """Returns a bit for each degree of freedom that moves one geom of a pair alone."""
+        return self._dofs_of_geom(pair.geoms[0]) ^ self._dofs_of_geom(pair.geoms[1])
 
     def _softness(self, solref: Sequence[float], solimp: Sequence[float]) -> list[float]:
         """Returns the members of struct Softness."""

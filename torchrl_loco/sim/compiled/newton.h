@@ -1,7 +1,8 @@
 // Newton's method of both schedules, the body of a function. From a start in qacc, it leaves there the minimum of
 //   1/2 (qacc - qacc_smooth)' M (qacc - qacc_smooth) + the cost of the rows.
 // An iteration solves H s = -gradient, H = M + J' D J over the active rows, and searches along s. Source: MuJoCo's
-// documentation, chapter Computation ("Solver algorithms", Newton); the stopping tests are those of mujoco_warp. It reads:
+// documentation, chapter Computation ("Solver algorithms", Newton). Stopping tests are those of mujoco_warp, and
+// `repeated`. It reads:
 //   live                    whether there is a world
 //   any_of_block(x)         whether x holds here, or in a world that begins its iterations together with this one
 //   set_direction(found, gradient_squared, decrement)
