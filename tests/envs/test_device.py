@@ -115,7 +115,7 @@ def test_device_memory_is_flat_over_10000_steps(cuda_memory):
 @pytest.mark.gpu
 def test_garbage_is_not_collected_while_torch_records():
     """The memory of an environment in it could not be freed, and the recording would be lost."""
-    recording = []
+    recording, numbers = [], torch.zeros(1, device="cuda")
 
     class Lost:
         def __init__(self):
@@ -127,7 +127,7 @@ def test_garbage_is_not_collected_while_torch_records():
     thresholds = gc.get_threshold()
     gc.set_threshold(1)
     try:
-        TorchGraph(lambda: [Lost() for _ in range(10)], torch.device("cuda"))()
+        TorchGraph(lambda: [numbers.add_(1.0) for _ in range(10) if Lost()], torch.device("cuda"))()
     finally:
         gc.set_threshold(*thresholds)
     gc.collect()
