@@ -130,14 +130,14 @@ class Velocity(LocoEnv):
     command_ranges = {"command": commands.first(CURRICULUM)}  # presets end before they widen
     presets = {
         "ppo": {
-            "num_envs": 4096,
-            "num_steps": 24,
-            "total_frames": 100_000_000,
+            "num_envs": 8192,
+            "num_steps": 12,
+            "total_frames": 130_000_000,
             "reward_scale": 1.0,
             "gamma": 0.99,
             "lr": 1e-3,
             "target_kl": 0.01,
-            "epochs": 5,
+            "epochs": 4,
             "minibatch_size": 24_576,
             "hidden": (512, 256, 128),
             "entropy_coeff": 0.01,
