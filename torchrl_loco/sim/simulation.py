@@ -18,18 +18,13 @@ from torchrl_loco.sim.compilation import compile_kernels
 from torchrl_loco.sim.graph import Graph, ScratchPool
 from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.warp_init import init_warp
-from torchrl_loco.sim.world_func import WorldFunc, WorldKernel, fill
+from torchrl_loco.sim.world_func import WorldFunc, WorldKernel, copy_row, fill, zero_row
 
 SCRATCH = 1.4
 """Memory of a simulation as a multiple of its ``mjData``; the rest is scratch memory (measured: 1.3 to 1.4)."""
 
 DETERMINISTIC_SCRATCH = 11.0
 """The same with ``deterministic=True`` on CUDA (measured: 6 to 8 times the memory of a world)."""
-
-
-PIECE = wp.constant(8)
-"""Numbers of the default pose that are read at a time."""
-_Piece = wp.types.vector(length=PIECE, dtype=float)
 
 
 @wp.struct
@@ -48,21 +43,11 @@ class Rest:
 @wp.func
 def put_at_rest(world: int, args: Rest):
     """Puts a world at rest in the default pose."""
-    last = args.qpos.shape[1] - 1
-    for first in range(0, last + 1, PIECE):
-        piece = _Piece()  # several reads on their way at once: a write between them would wait for each
-        for i in range(PIECE):
-            piece[i] = args.qpos0[0, wp.min(first + i, last)]
-        for i in range(PIECE):
-            if first + i <= last:
-                args.qpos[world, first + i] = piece[i]
-    for i in range(args.qvel.shape[1]):
-        args.qvel[world, i] = 0.0
-        args.qacc_warmstart[world, i] = 0.0
-    for i in range(args.act.shape[1]):
-        args.act[world, i] = 0.0
-    for i in range(args.ctrl.shape[1]):
-        args.ctrl[world, i] = 0.0
+    copy_row(args.qpos0[0], args.qpos[world])
+    zero_row(args.qvel[world])
+    zero_row(args.qacc_warmstart[world])
+    zero_row(args.act[world])
+    zero_row(args.ctrl[world])
     args.time[world] = 0.0
 
 

@@ -161,6 +161,30 @@ def write_rows(row: wp.array[float], out: wp.array[float]):
     """
 
 
+# The next two stay loops: a launch fetches each instruction anew, which takes longer than to execute it.
+
+
+@wp.func_native("""
+const int PIECE = 8, last = row.shape[0] - 1;  // several reads on their way at once: a write would wait for each
+#pragma unroll 1
+for (int first = 0; first <= last; first += PIECE) {
+  float piece[PIECE];
+  for (int i = 0; i < PIECE; ++i) piece[i] = wp::index(row, first + i < last ? first + i : last);
+  for (int i = 0; i < PIECE; ++i) if (first + i <= last) wp::index(out, first + i) = piece[i];
+}
+""")
+def copy_row(row: wp.array[float], out: wp.array[float]):
+    """Copies a row."""
+
+
+@wp.func_native("""
+#pragma unroll 1
+for (int i = 0; i < row.shape[0]; ++i) wp::index(row, i) = 0.0f;
+""")
+def zero_row(row: wp.array[float]):
+    """Zeroes a row."""
+
+
 @wp.struct
 class Nothing:
     """A struct needs a field."""
