@@ -182,7 +182,14 @@ def test_tables_are_those_of_the_results():
 def test_robots_have_the_mean_and_the_worst_of_their_seeds_beside_mjlab(tmp_path):
     seeds = [
         {"task": "go1_velocity", "algorithm": "ppo", "run": f"run{seed}", "frames/s": rate, "to mjlab's (s)": seconds}
-        | {"episodes": 256, "falls": falls, "error (m/s)": 0.1, "falls, on time": 0, "falls, training simulator": 1}
+        | {
+            "device": "NVIDIA H100 80GB HBM3",
+            "episodes": 256,
+            "falls": falls,
+            "error (m/s)": 0.1,
+            "falls, on time": 0,
+            "falls, training simulator": 1,
+        }
         for seed, (rate, seconds, falls) in enumerate([(4.2e6, 8.0, 0), (4.0e6, 9.0, 3), (4.1e6, None, 0)])
     ]
     (tmp_path / "results.json").write_text(json.dumps({"rows": seeds}))
@@ -191,11 +198,11 @@ def test_robots_have_the_mean_and_the_worst_of_their_seeds_beside_mjlab(tmp_path
         lines = ((1, 100, 30.0, -3.0, 1000, 0), (2, 200, 32.0, 5.0, 100, 10), (3, 300, 42.0, 70.0, 990, 50))
         metrics = [dict(zip(KEPT, line, strict=True)) for line in lines]
         write_metrics(tmp_path / f"run{seed}", metrics)
-    made = robots.tables(tmp_path)
-    assert "| Go1 | torchrl_loco, PPO | 3 | 4.1 (4) | 8.5 (9.0), 1 without |" in made["robots-training"]
-    assert "| Go1 | mjlab 1.6 | 1 | 0.107 | 151.0 |" in made["robots-training"]  # measured before
-    assert "| Go1 | torchrl_loco, PPO | 3 | 1.0 (3.0) | 0.100 | 0.0 | 1.0 |" in made["robots-verified"]
-    robots.draw(tmp_path / "curves.png", tmp_path)
+    made = robots.tables([tmp_path])
+    assert "| Go1 | torchrl_loco, PPO | H100 | 3 | 4.1 (4) | 8.5 (9.0), 1 without |" in made["robots-training"]
+    assert "| Go1 | mjlab 1.6 | H100 | 1 | 0.107 | 151.0 |" in made["robots-training"]  # measured before
+    assert "| Go1 | torchrl_loco, PPO | H100 | 3 | 1.0 (3.0) | 0.100 | 0.0 | 1.0 |" in made["robots-verified"]
+    robots.draw(tmp_path / "curves.png", [tmp_path])
     assert (tmp_path / "curves.png").stat().st_size > 10_000
 
 

@@ -31,7 +31,7 @@ SUITE = "2026-11-24-cpu/suite.json"
 VARIATION = "2026-11-25-h100-third/variation.json"
 TO_950 = "2026-11-23-h200-presets/time-to-return.csv"
 BRAX_TO_950 = "2026-11-21-h200/training/time-to-return.json"
-ROBOTS = f"{robots.RESULTS.name}/results.json"
+ROBOTS = f"{robots.RESULTS[-1].name}/results.json"
 MJLAB = f"{robots.BEFORE.parent.name}/{robots.BEFORE.name}"
 
 
@@ -222,8 +222,11 @@ def speed() -> str:
     ]
     rows.append(("walker walks, return 950, from the start of the process (s, H200)", seconds[0], "", "", seconds[1]))
     ours_go1, mjlab = (
-        f"{_mean(seeds['go1_velocity', trainer], 'frames/s') / 1e6:.3g}"
-        for seeds, trainer in ((robots.by_trainer(_json(ROBOTS)), "torchrl_loco, PPO"), (robots.before(), "mjlab 1.6"))
+        f"{_mean(seeds['go1_velocity', trainer, 'H100'], 'frames/s') / 1e6:.3g}"
+        for seeds, trainer in (
+            (robots.by_trainer(robots.rows_of()), "torchrl_loco, PPO"),
+            (robots.before(), "mjlab 1.6"),
+        )
     )
     rows.append(("training a Go1 to follow velocity commands (million frames/s, H100)", ours_go1, "", mjlab, ""))
     return table(("", "torchrl_loco", "`mujoco_warp`", "mjlab 1.6", "Playground 0.2"), rows)
@@ -330,6 +333,6 @@ if __name__ == "__main__":
         page.write_text(filled(page.read_text()))
     draw_steps(PICTURES / "steps.png")
     draw(PICTURES / "returns.png")
-    if (robots.RESULTS / "results.json").exists():
+    if robots.rows_of():
         robots.draw(robots.CURVES)
     plot_variation(json.loads((RESULTS / VARIATION).read_text())["returns"], PICTURES / "variation.png")

@@ -1,4 +1,4 @@
-"""What docs/robots.md says of the robots in numbers and curves, from a folder of ``python -m benchmarks robots``."""
+"""What docs/robots.md says of the robots in numbers and curves, from folders of ``python -m benchmarks robots``."""
 
 import json
 import re
@@ -16,11 +16,14 @@ from torchrl_loco.policy import shipped_policies
 
 Row = dict[str, Any]
 ROOT = Path(__file__).parents[2]
-RESULTS = ROOT / "benchmarks" / "results" / "2026-11-25-h100-robots"
+RESULTS = tuple(ROOT / "benchmarks" / "results" / name for name in ("2026-11-26-h200-robots", "2026-11-25-h100-robots"))
+"""The first trained by today's presets."""
 BEFORE = ROOT / "benchmarks" / "results" / "2026-11-24-h100" / "mjlab.txt"
 """mjlab's own training, where the folder has none."""
 CURVES = ROOT / "docs" / "_static" / "robots.png"
 MOVING = ROOT / "docs" / "_static" / "robots.webp"
+GPUS = {"H100": "#f5a623", "H200": "#c2571a"}
+"""The color of what was trained on each."""
 NAMES = {"go1_velocity": "Go1", "g1_velocity": "G1", "go2_velocity": "Go2", "h1_velocity": "H1"}
 
 
@@ -50,28 +53,36 @@ VERIFIED = (
 )
 
 
-def tables(folder: Path = RESULTS) -> dict[str, str]:
-    """Returns what the page takes from a folder, by the names that its comments give them."""
+def tables(folders: Sequence[Path] = RESULTS) -> dict[str, str]:
+    """Returns what the page takes from folders, by the names that its comments give them."""
     shown = "![A Go1, a G1, an H1 and a Go2 walk as they are told](_static/robots.webp)\n" if MOVING.exists() else ""
     of_page = {"robots-moving": shown, "robots-shipped": shipped()}
-    if not (folder / "results.json").exists():
+    found = rows_of(folders)
+    if not found:
         none = "There are no figures in this copy of the repository.\n"
         return {**of_page, "robots-training": none, "robots-curves": "", "robots-verified": none}
-    found = json.loads((folder / "results.json").read_text())["rows"]
     ours = by_trainer(found)
     episodes = " or ".join(sorted({f"{row['episodes']}" for row in found if "episodes" in row}))
-    link = f"[{folder.name}/results.json](../benchmarks/results/{folder.name}/results.json)"
-    earlier = {key: rows for key, rows in before().items() if key not in ours}
+    used = dict.fromkeys(row["folder"].name for row in found)
+    links = " and ".join(f"[{name}/results.json](../benchmarks/results/{name}/results.json)" for name in used)
+    robots = {task for task, trainer, _ in ours if "mjlab" in trainer}
+    earlier = {key: rows for key, rows in before().items() if key[0] not in robots}
     source = (
         f", mjlab's from [{BEFORE.parent.name}/{BEFORE.name}](../benchmarks/results/{BEFORE.parent.name}/{BEFORE.name})"
     )
     return {
         **of_page,
-        "robots-training": _table({**ours, **earlier}, TRAINING) + f"\nFrom {link}{source if earlier else ''}.\n",
+        "robots-training": _table({**ours, **earlier}, TRAINING) + f"\nFrom {links}{source if earlier else ''}.\n",
         "robots-curves": "![Return against seconds of training, a line for each seed](_static/robots.png)\n",
         "robots-verified": _table(ours, VERIFIED)
-        + f"\nFalls are episodes, of {episodes} of each policy; a third of them are on time. From {link}.\n",
+        + f"\nFalls are episodes, of {episodes} of each policy; a third of them are on time. From {links}.\n",
     }
+
+
+def rows_of(folders: Sequence[Path] = RESULTS) -> list[Row]:
+    """Returns the rows of the folders that are there, each with its ``folder``."""
+    files = [file for folder in folders if (file := folder / "results.json").exists()]
+    return [{**row, "folder": file.parent} for file in files for row in json.loads(file.read_text())["rows"]]
 
 
 def shipped() -> str:
@@ -89,34 +100,39 @@ def shipped() -> str:
     )
 
 
-def by_trainer(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
-    """Returns the rows of the seeds of each robot, by robot and by who trained it, in the order of the page."""
-    groups: dict[tuple[str, str], list[Row]] = {}
+Group = tuple[str, str, str]
+"""Task, trainer and GPU."""
+
+
+def by_trainer(rows: Sequence[Row]) -> dict[Group, list[Row]]:
+    """Returns the rows of the seeds of each robot, by robot, by who trained it and where, in the order of the page."""
+    groups: dict[Group, list[Row]] = {}
     for row in rows:
         if row["task"] in NAMES:
             trainer = "mjlab 1.6" if "mjlab" in row["algorithm"] else f"torchrl_loco, {row['algorithm'].upper()}"
-            groups.setdefault((row["task"], trainer), []).append(row)
+            gpu = next((name for name in row["device"].split() if name in GPUS), row["device"])
+            groups.setdefault((row["task"], trainer, gpu), []).append(row)
     return {key: groups[key] for key in sorted(groups, key=lambda key: ([*NAMES].index(key[0]), "mjlab" in key[1]))}
 
 
-def before() -> dict[tuple[str, str], list[Row]]:
+def before() -> dict[Group, list[Row]]:
     """Returns what was measured of mjlab's own training earlier: rates, and when it had its reward."""
     rates = re.findall(r"^(\w+) .* ([\d,]+) frames per second", BEFORE.read_text(), re.MULTILINE)
     rows = {name: {"frames/s": float(rate.replace(",", ""))} for name, rate in rates}
     column, value = MJLAB["go1_velocity"]
     if reached := re.search(rf"{value} after (\d+) s", BEFORE.read_text()):
         rows["Go1"] |= {"to mjlab's (s)": float(reached[1]), column: value}
-    return {(task, "mjlab 1.6"): [rows[name]] for task, name in NAMES.items() if name in rows}
+    return {(task, "mjlab 1.6", "H100"): [rows[name]] for task, name in NAMES.items() if name in rows}
 
 
-def _table(groups: dict[tuple[str, str], list[Row]], columns: Sequence[Column]) -> str:
+def _table(groups: dict[Group, list[Row]], columns: Sequence[Column]) -> str:
     """Returns a row for each robot and trainer: the mean over seeds, and the worst; empty columns are left out."""
     every = [row for seeds in groups.values() for row in seeds]
     columns = [column for column in columns if any(row.get(column.key) is not None for row in every)]
     rows = []
-    for (task, trainer), seeds in sorted(groups.items(), key=lambda item: [*NAMES].index(item[0][0])):
-        rows.append((NAMES[task], trainer, len(seeds), *(_figure(seeds, column) for column in columns)))
-    return table(("robot", "trained by", "seeds", *(column.label for column in columns)), rows)
+    for (task, trainer, gpu), seeds in sorted(groups.items(), key=lambda item: [*NAMES].index(item[0][0])):
+        rows.append((NAMES[task], trainer, gpu, len(seeds), *(_figure(seeds, column) for column in columns)))
+    return table(("robot", "trained by", "on", "seeds", *(column.label for column in columns)), rows)
 
 
 def _figure(seeds: Sequence[Row], column: Column) -> str:
@@ -129,19 +145,20 @@ def _figure(seeds: Sequence[Row], column: Column) -> str:
     return f"{mean}{worst}{f', {len(seeds) - len(values)} without' if len(values) < len(seeds) else ''}"
 
 
-def draw(picture: Path, folder: Path = RESULTS) -> None:
+def draw(picture: Path, folders: Sequence[Path] = RESULTS) -> None:
     """Draws the return of each seed against seconds of training, a panel for each robot."""
-    groups = by_trainer(json.loads((folder / "results.json").read_text())["rows"])
-    tasks = list(dict.fromkeys(task for task, _ in groups))
+    groups = by_trainer(rows_of(folders))
+    tasks = list(dict.fromkeys(task for task, _, _ in groups))
     figure = Figure(figsize=(9, 3.2 * -(-len(tasks) // 2)), layout="constrained")
     panels = figure.subplots(-(-len(tasks) // 2), 2, squeeze=False).flat
     for task, axes in zip(tasks, panels, strict=False):
-        for (name, trainer), seeds in groups.items():
+        for (name, trainer, gpu), seeds in groups.items():
             for seed, row in enumerate(seeds if name == task else ()):
-                lines = [line for line in metrics_of(folder / row["run"])[1:] if line["episodes"] > 0]
+                lines = [line for line in metrics_of(row["folder"] / row["run"])[1:] if line["episodes"] > 0]
                 points = [(line["seconds"], line["return"]) for line in lines]
-                color = "#9aa7ad" if "mjlab" in trainer else "#f5a623"
-                axes.plot(*zip(*points, strict=True), color=color, linewidth=1, label=None if seed else trainer)
+                color = "#9aa7ad" if "mjlab" in trainer else GPUS.get(gpu, "#f5a623")
+                label = None if seed else f"{trainer}, {gpu}"
+                axes.plot(*zip(*points, strict=True), color=color, linewidth=1, label=label)
         column, value = MJLAB.get(task, ("", 0.0))
         if column == "return":
             axes.axhline(value, color="black", linestyle=":", linewidth=1, label=f"mjlab after 151 s: {value}")
