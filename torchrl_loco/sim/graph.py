@@ -1,7 +1,6 @@
 """Work recorded once and replayed at every step: CUDA graphs on the GPU, Warp's recorder on the CPU."""
 
 import contextlib
-import gc
 import os
 import threading
 import weakref
@@ -11,6 +10,8 @@ from typing import Any
 
 import torch
 import warp as wp
+
+from torchrl_loco.garbage import no_collection
 
 EXCLUSIVE = threading.RLock()
 """Held while Warp works in the calling thread: a recording includes what other threads launch meanwhile, and on the CPU
@@ -106,18 +107,6 @@ class Recorded:
             self._graph.replay()
 
 
-@contextlib.contextmanager
-def without_collection() -> Iterator[None]:
-    """Lets Python collect no garbage: memory of a lost environment cannot be freed while torch records a stream."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()
-
-
 class TorchGraph:
     """A function without arguments, recorded as a CUDA graph of torch after some warm-up calls.
 
@@ -148,7 +137,8 @@ class TorchGraph:
             graph = torch.cuda.CUDAGraph()
             side = torch.cuda.Stream(self._device)  # else torch takes one of its current device
             recording = torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local")
-            with EXCLUSIVE, without_collection(), torch.cuda.device(self._device):
+            # The memory of an environment that nobody holds cannot be freed meanwhile.
+            with EXCLUSIVE, no_collection(), torch.cuda.device(self._device):
                 before = torch.cuda.current_stream()
                 try:
                     with recording:
