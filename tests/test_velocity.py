@@ -556,6 +556,9 @@ UNFIT = [
 
 
 def test_a_model_that_the_formulas_do_not_fit_is_refused():
+    weights = {**Table.weights, "angular_momentum": -0.02}
+    with pytest.raises(ValueError, match='needs <subtreeangmom name="angular_momentum" body="trunk"/>'):
+        type("Table", (Table,), {"weights": weights})(1, "cpu")
     for old, new, message in UNFIT:
         model = Table.model.replace(old, new)
         if "slide" in new:

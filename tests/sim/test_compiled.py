@@ -18,7 +18,10 @@ from torchrl_loco.sim.compiled import collision, dense_contacts, lanes, step, un
 from torchrl_loco.sim.simulation import choose_engine
 from torchrl_loco.sim.varied import Varied
 
-BODY = '<body name="arm"><joint name="elbow" damping="1"/><geom name="hand" type="capsule" size="0.1 0.2"/></body>'
+BARE = '<body name="bare"/>'
+BODY = (
+    f'<body name="arm"><joint name="elbow" damping="1"/><geom name="hand" type="capsule" size="0.1 0.2"/>{BARE}</body>'
+)
 BALL = '<body name="ball" pos="1 0 1"><freejoint name="loose"/><geom name="marble" size="0.1"/></body>'
 MOTOR = '<motor name="pull" joint="elbow"/>'
 SENSOR = '<subtreelinvel name="speed" body="arm"/>'
@@ -66,6 +69,8 @@ OTHERS = [
     (MOTOR, MOTOR.replace("/>", ' delay="0.01" nsample="2"/>'), "'pull': delay, damping or armature"),
     (SENSOR, '<jointpos name="angle" joint="elbow"/>', "sensor 'angle'"),
     (SENSOR, SENSOR.replace("/>", ' cutoff="1"/>'), "sensor 'speed'"),
+    (SENSOR, '<subtreeangmom name="spin" body="world"/>', "sensor 'spin'"),
+    (SENSOR, SENSOR.replace("arm", "bare"), "sensor 'speed'"),
     ('<joint name="elbow"', '<joint name="elbow" type="ball"', "'pull': a transmission other than a hinge or slide"),
 ]
 
@@ -98,7 +103,7 @@ def test_what_the_quadruped_needs_is_named_in_full():
         "spheres and capsules with each other and with boxes, and with planes of the world all of these, cylinders, "
         "ellipsoids and meshes; contacts='ground' leaves out those of moving bodies with each other",
         "sensor 'imu_accel', 'imu_gyro', 'velocimeter' and 8 more: "
-        "anything but touch, and velocity and angular momentum of a moving subtree, as they are",
+        "anything but touch, and velocity and angular momentum of a moving subtree with mass, as they are",
     ]
 
 

@@ -48,7 +48,9 @@ XML = """
     <position joint="hip" kp="20" kv="1" gear="1.5" ctrlrange="-1 1" forcerange="-8 8"/>
     <motor joint="shoulder" gear="5" ctrlrange="-1 1"/>
   </actuator>
-  <sensor><subtreelinvel body="base"/><subtreelinvel body="leg"/><subtreeangmom body="leg"/></sensor>
+  <sensor>
+    <subtreelinvel body="base"/><subtreelinvel body="leg"/><subtreeangmom body="leg"/><subtreeangmom body="ball"/>
+  </sensor>
 </mujoco>
 """
 PAIR = '<contact><pair geom1="floor" geom2="marble" friction="0.4 0.4 0.01 0.001 0.001"/></contact>'

@@ -91,13 +91,14 @@ class PPO(Algorithm):
     def _losses(self, minibatch: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the loss, a scalar, and the metrics but for the norm of its gradient, ``(len(metric_names) - 1,)``.
 
-        torch.compile leaves out what else TorchRL's loss finds. That samples the entropy, which needs no sample where
-        actions are unbounded: it is that of the deviations, which are the same in all states.
+        torch.compile leaves out what else TorchRL's loss finds. That samples the entropy where it is compiled, and else
+        waits for the device; neither is needed where actions are unbounded: deviations are the same in all states.
         """
         losses = self.loss(minibatch)
         if not self.spaces.bounded:
             scale: Any = self.actor[0].module[-1]
-            entropy = IndependentNormal(*scale(torch.zeros_like(minibatch["action"][0]))).entropy()
+            deviations = scale(torch.zeros_like(minibatch["action"][0]))
+            entropy = IndependentNormal(*deviations, validate_args=False).entropy()
             losses.update({"entropy": entropy.detach(), "loss_entropy": -self.config.entropy_coeff * entropy})
         loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
         return loss, torch.stack([losses[name].detach() for name in self.metric_names[:-1]])

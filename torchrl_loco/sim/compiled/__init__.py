@@ -16,10 +16,10 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 ``pyramid``          rows of a contact
 ``ground_contacts``  contacts with planes of the world: a stiffness of a body each
 ``dense_contacts``   all other contacts, and limits of ball joints
-``solver``           Newton iterations and their line search
-``sensors``          velocities of subtrees, touch, and contact forces of geoms
+``solver``           what Newton's loop, ``newton.h``, calls in traced code
+``sensors``          velocities and momenta of subtrees, touch, and contact forces of geoms
 ``lanes``            a group of lanes a world: what ``lanes.h`` has to know about a model
-``shared``           the C++ of both: arithmetic, laws, line search
+``shared``           the C++ of both: arithmetic, laws, Newton's loop, line search
 ``links``            bodies that are welded together
 ``parameters``       numbers of the model that differ from world to world
 ``tables``           constants and tables as C++

@@ -322,8 +322,12 @@ struct Step : Math {
   INLINE bool any_of_block(bool x) const { return Model::LOCKSTEP && Model::SUBSTEPS ? __syncthreads_or(x) : x; }
   INLINE float read(float x, int from) const { return __shfl_sync(~0u, x, from); }
   INLINE int read(int x, int from) const { return __shfl_sync(~0u, x, from); }
-  // The number of a lane, which the compiler knows to be the same in all.
+  // The number of a lane, which the compiler knows to be the same in all, except before Ampere.
+#if __CUDA_ARCH__ >= 800
   INLINE unsigned agreed(unsigned x, int from) const { return __reduce_or_sync(~0u, lane == from ? x : 0u); }
+#else
+  INLINE unsigned agreed(unsigned x, int from) const { return __shfl_sync(~0u, x, from); }
+#endif
 
   // Replaces each of n values by its sum over the lanes. With many of them, pairs of lanes first exchange halves, so
   // that each lane goes on with a quarter of the values.
@@ -2085,10 +2089,12 @@ struct Step : Math {
         const Pose pose = w.pose[link];
         const Vec offset = pose.position + pose.orientation * Model::momentum_center(i) - w.com[Model::tree(link)];
         const Motion velocity = sum_over(to_root(link), w.velocity);
-        const Vec first = offset * Model::momentum_mass(i), push = (velocity.linear + velocity.angular.cross(offset)) * Model::momentum_mass(i);
-        momentum = momentum + Model::momentum_inertia(i).turned(pose.orientation) * velocity.angular + offset.cross(push);
+        const float mass = Model::momentum_mass(i);
+        const Vec push = (velocity.linear + velocity.angular.cross(offset)) * mass;
+        const Symmetric inertia = Model::momentum_inertia(i).turned(pose.orientation);
+        momentum = momentum + inertia * velocity.angular + offset.cross(push);
         linear = linear + push;
-        center = center + first;
+        center = center + offset * mass;
       }
       float total[9] = {momentum.x, momentum.y, momentum.z, linear.x, linear.y, linear.z, center.x, center.y, center.z};
       sum(total, 9);
@@ -2135,7 +2141,7 @@ const int contact_row = world * Model::HISTORY * Model::CONTACT_GEOMS;
 float* const contact_forces = reinterpret_cast<float*>(contact_force_out.data + contact_row);
 bool* const in_contact = in_contact_out.data + contact_row;
 //END
-if (live && Model::SUBSTEPS == 0 && (Model::TOUCH || Model::CONTACT_GEOMS)) {  // a step that is not taken finds forces
+if (live && Model::SUBSTEPS == 0 && Model::TOUCH + Model::CONTACT_GEOMS > 0) {  // a step that is not taken finds forces
   step.kinematics();
   step.dynamics();
 //IF CONTACT_GEOMS

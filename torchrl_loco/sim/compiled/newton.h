@@ -6,8 +6,8 @@
 //   live                    whether there is a world
 //   any_of_block(x)         whether x holds here, or in a world that begins its iterations together with this one
 //   set_direction(found, gradient_squared, decrement)
-//                           sets s and, at its start, gradient' gradient and gradient' H^-1 gradient; once qacc is found,
-//                           which is asked for if IMPLICIT_DAMPING, instead what that adds to qacc
+//                           sets s and, at its start, gradient' gradient and gradient' H^-1 gradient; once qacc is
+//                           found, which is asked for if IMPLICIT_DAMPING, instead what that adds to qacc
 //   project()               sets how all changes along s
 //   line_search(decrement)  returns a step along s
 //   move(alpha)             takes it, and returns whether a row changed sides

@@ -5,7 +5,7 @@ import mujoco
 from torchrl_loco.sim.compiled import lanes
 from torchrl_loco.sim.compiled.collision import BOX, PLANE, ROUND, SOLID, Pair, is_elliptic, pairs
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE
-from torchrl_loco.sim.compiled.parameters import VariedModel
+from torchrl_loco.sim.compiled.parameters import VariedModel, nominal
 from torchrl_loco.sim.compiled.sensors import ANGULAR_MOMENTUM, SUBTREE_VELOCITY, TOUCH
 from torchrl_loco.sim.compiled.step import is_traced
 from torchrl_loco.sim.varied import Varied
@@ -163,12 +163,13 @@ def _sensors(m: mujoco.MjModel) -> list[str]:
         for i in range(m.nsensor)
         if m.sensor_type[i] not in (SUBTREE_VELOCITY, ANGULAR_MOMENTUM, TOUCH)
         or (m.sensor_type[i] == ANGULAR_MOMENTUM and m.body_weldid[m.sensor_objid[i]] == 0)
+        or (m.sensor_type[i] != TOUCH and nominal(m).body_subtreemass[m.sensor_objid[i]] == 0)
         or m.sensor_cutoff[i]
         or m.sensor_interval[i].any()
         or m.sensor_delay[i]
     ]
     found = (
-        {"anything but touch, and velocity and angular momentum of a moving subtree, as they are": names}
+        {"anything but touch, and velocity and angular momentum of a moving subtree with mass, as they are": names}
         if names
         else {}
     )

@@ -175,7 +175,7 @@ class Velocity(LocoEnv):
     action_scale: ClassVar[float | None] = None
     """Change of a joint's target by an action of 1 (rad); ``None`` is a quarter of what needs the greatest torque."""
     weights: ClassVar[Mapping[str, float]] = WEIGHTS
-    """Weights of the reward's terms."""
+    """Weights of the reward's terms; that of ``angular_momentum`` needs a sensor ``subtreeangmom`` of this name."""
     curriculum: ClassVar[dict[int, commands.Ranges]] = CURRICULUM
     """Ranges of the commands by the control step of training from which they hold."""
     step_height: ClassVar[float] = 0.1
@@ -206,7 +206,7 @@ class Velocity(LocoEnv):
 
         Raises:
             ValueError: the base does not float first, an actuator is no servo or has no greatest force, a joint has no
-                range, or there is no home pose.
+                range, a sensor is missing, or there is no home pose.
         """
         m, wrong = mj_model, []
         if m.njnt == 0 or m.jnt_type[0] != FREE or m.body(m.jnt_bodyid[0]).name != cls.base:
@@ -224,6 +224,9 @@ class Velocity(LocoEnv):
             moved = m.actuator_trnid[:, 0]
             free = m.jnt_limited[moved] == 0
             wrong += [f"joints need a range{_some(actuated(m), free)}"] if free.any() else []
+        sensors = [m.sensor(i).name for i in range(m.nsensor)]
+        if "angular_momentum" in cls.weights and "angular_momentum" not in sensors:
+            wrong.append(f'it needs <subtreeangmom name="angular_momentum" body="{cls.base}"/>, which has a weight')
         if not models.has_home(m):
             wrong.append("it needs a keyframe 'home', the pose around which actions move the joints")
         if wrong:
