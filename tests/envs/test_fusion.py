@@ -9,10 +9,9 @@ import pytest
 import torch
 import warp as wp
 from hook_tasks import FollowVelocity, WalkBackwards, WalkBlindly
-from torch.fx.experimental.proxy_tensor import make_fx
 from torch.nn import functional as F  # noqa: N812
 
-from torchrl_loco.envs.fusion import CannotFuse, fuse
+from torchrl_loco.envs.fusion import CannotFuse, fuse, trace
 from torchrl_loco.envs.part import Part, constants_on
 
 CPU = torch.device("cpu")
@@ -26,7 +25,7 @@ def copies(arrays):
 def fused(work, arrays, n, fixed=(), device=CPU):
     """Returns ``work`` on arrays as a kernel; tracing runs it on copies."""
     with torch.no_grad():
-        traced = constants_on(device, make_fx(lambda arrays: work(arrays))(copies(arrays)))
+        traced = constants_on(device, trace(work, copies(arrays)))
     return fuse(traced, arrays, n, wp.get_device(str(device)), fixed)
 
 
@@ -271,6 +270,7 @@ OPERATORS = {
         torch.arange(6) * x,
         torch.empty_like(x).fill_(2.0),
         torch.linspace(0, 1, 6) + x,
+        x * (torch.tensor([1.0, 2.0]) * 3).sum().item(),
         torch.eye(3)[1] * x[:, :3],
     ),
     "chosen": lambda x, y, i, b: (

@@ -9,9 +9,9 @@ import torch
 from cases import COARSE
 from hook_tasks import DOG, WalkBackwards, WalkBlindly
 from oracle import tolerance as numpy_tolerance
-from torch.fx.experimental.proxy_tensor import make_fx
 
 from torchrl_loco import LocoEnv, SimConfig, State, Vary, WalkerWalk
+from torchrl_loco.envs.fusion import trace
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.view import View
@@ -348,7 +348,7 @@ def test_compiled_hooks_do_the_same(actions, monkeypatch, way):
 
 def by_torch(part):
     with torch.no_grad():
-        part._compile_by_torch(make_fx(lambda arrays: part._work(arrays))(part._arrays))
+        part._compile_by_torch(trace(part._work, part._arrays))
     return False
 
 
@@ -477,7 +477,7 @@ def test_a_hook_that_cannot_be_compiled_runs_as_it_is_and_says_why(caplog):
             return s.time if bool((s.time > 0).all()) else s.time + 1
 
     env = Looks(2, "cpu", seed=0)
-    assert "Looks: reward: not compiled, runs as plain torch" in caplog.text
+    assert "Looks: reward: not compiled, runs as plain torch: a hook reads a number out of a tensor" in caplog.text
     assert env.rollout(2)["next", "reward"].shape == (2, 2, 1)
 
 

@@ -8,12 +8,9 @@ from pathlib import Path
 
 import torch
 import warp as wp
-from torch._guards import TracingContext, tracing
-from torch._subclasses import FakeTensorMode
-from torch.fx.experimental.proxy_tensor import make_fx
 
 import torchrl_loco
-from torchrl_loco.envs.fusion import CannotFuse, fuse
+from torchrl_loco.envs.fusion import CannotFuse, fuse, trace
 from torchrl_loco.envs.hooks import Arrays
 from torchrl_loco.garbage import no_collection
 from torchrl_loco.sim import Recorded, Simulation
@@ -70,10 +67,8 @@ class Part:
         """
         on = torch.device(wp.device_to_torch(device))
         try:
-            # An environment that is dropped meanwhile computes, which would be traced too. Torch notes a fake of each
-            # result, and makes a mode for each if there is none: a fourth of the time.
-            with no_collection(), tracing(TracingContext(FakeTensorMode())):
-                traced = constants_on(on, make_fx(lambda arrays: self._work(arrays))(self._arrays))
+            with no_collection():  # an environment that is dropped meanwhile computes, which would be traced too
+                traced = constants_on(on, trace(self._work, self._arrays))
             self._check_on_other_numbers(traced)
         except Exception as error:  # whatever hooks and tracing raise
             self._stays_plain(error)
@@ -104,7 +99,7 @@ class Part:
                 self._work(ours)
             except Exception:
                 continue
-            traced(theirs)
+            traced(*theirs.values())
             self._compare(ours, theirs)
 
     def _compare(self, ours: Arrays, theirs: Arrays) -> None:
@@ -125,16 +120,14 @@ class Part:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # those of torch's own code
                 compiled = torch.compile(traced, fullgraph=True, dynamic=False)
-                compiled(self._arrays)
+                compiled(*self._arrays.values())
         except Exception as error:  # whatever the compiler raises
             self._stays_plain(error)
         else:
-            self._run, self.kind = lambda: compiled(self._arrays), "torch.compile"
+            self._run, self.kind = lambda: compiled(*self._arrays.values()), "torch.compile"
 
     def _stays_plain(self, error: Exception) -> None:
         message = " ".join(str(error).split("\n")[:3]).strip()
-        if "get value out of a tracing tensor" in message:
-            message = "a hook reads a number out of a tensor (if, .item(), float())"
         logging.getLogger("torchrl_loco").warning(
             "%s: not compiled, runs as plain torch: %s%s", self._title, message, _line_of_user(error)
         )

@@ -5,6 +5,7 @@ dimension of the worlds has size 1; views of tensors are views of such arrays, s
 What a world does depends on no other world: on neither their number nor their numbers, bit for bit.
 
 ===========  =========================================
+``trace``    the graph of a function of tensors
 ``nodes``    numbers of a world, and operators on them
 ``program``  the interpreter: tensors of nodes
 ``rules``    what each operator of torch does, as data
@@ -25,6 +26,7 @@ from torchrl_loco.envs.fusion.nodes import CannotFuse as CannotFuse
 from torchrl_loco.envs.fusion.program import NoRule, Program
 from torchrl_loco.envs.fusion.rules import RULES
 from torchrl_loco.envs.fusion.source import Source
+from torchrl_loco.envs.fusion.trace import trace as trace
 from torchrl_loco.sim.world_func import BLOCK_DIM, fill
 
 
@@ -49,8 +51,8 @@ def _written(
             if error.target in missing or error.target not in decomposition_table:
                 raise
             missing[error.target] = decomposition_table[error.target]
-        copies = {name: tensor.clone() for name, tensor in arrays.items()}  # tracing runs it
-        graph = make_fx(traced, decomposition_table=missing)(copies)
+        copies = [tensor.clone() for tensor in arrays.values()]  # tracing runs it
+        graph = make_fx(traced, decomposition_table=missing)(*copies)
 
 
 def _kernel(text: str, Args: Any) -> wp.Kernel:  # noqa: N803
@@ -78,7 +80,7 @@ def fuse(
     long as the returned function.
 
     Args:
-        traced: of a function of ``arrays`` that changes them in place, by ``make_fx``.
+        traced: of a function of ``arrays`` that changes them in place, by :func:`trace`.
         arrays: tensors by name, ``(num_envs, ...)`` in any order of memory; others are read only, and so is ``seed``.
         num_envs: number of worlds.
         device: where they live.

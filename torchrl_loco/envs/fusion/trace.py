@@ -1,0 +1,91 @@
+"""A function of arrays as a graph of the operators of torch that it calls.
+
+``make_fx`` gives the same graph, but takes five times as long: it notes what only torch's compilers read.
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+aten = torch.ops.aten
+
+
+class _Tracer(TorchDispatchMode):
+    """Notes each operator while it runs.
+
+    A result bears its node as an attribute, which is dropped with it: all results together may not fit in memory.
+    """
+
+    def __init__(self, arrays: dict[str, torch.Tensor]) -> None:
+        super().__init__()
+        self.graph, self.constants = torch.fx.Graph(), torch.nn.Module()
+        self._known: set[torch.fx.Node] = set()  # whose numbers are the same in each run
+        self._kept = list(arrays.values())  # arrays and constants: no other tensor gets their ids meanwhile
+        self._nodes = {id(array): self.graph.placeholder(f"arg{i}") for i, array in enumerate(self._kept)}
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if func is aten.lift_fresh.default:  # of torch.tensor(...): each run needs a copy
+            func = aten.lift_fresh_copy.default
+        if torch.Tag.data_dependent_output in func.tags:
+            self._check_known(args)
+            return func(*args, **kwargs)
+        node = self.graph.call_function(func, *torch.fx.node.map_aggregate((args, kwargs), self._argument))
+        operands = node.all_input_nodes
+        if func is aten.lift_fresh_copy.default or (operands and self._known.issuperset(operands)):
+            self._known.add(node)
+        result = func(*args, **kwargs)
+        if isinstance(result, tuple | list):
+            for i, each in enumerate(result):
+                self._note(each, self.graph.call_function(operator.getitem, (node, i)))
+        else:
+            self._note(result, node)
+        return result
+
+    def _noted(self, tensor: torch.Tensor) -> torch.fx.Node | None:
+        node = getattr(tensor, "_node", None)
+        return node if node is not None and node.graph is self.graph else self._nodes.get(id(tensor))
+
+    def _argument(self, arg: Any) -> Any:
+        if not isinstance(arg, torch.Tensor):
+            return arg
+        if (node := self._noted(arg)) is not None:
+            return node
+        name = f"constant{len(self._kept)}"
+        self.constants.register_buffer(name, arg.detach(), persistent=False)
+        self._kept.append(arg)
+        self._nodes[id(arg)] = self.graph.get_attr(name)
+        return self._nodes[id(arg)]
+
+    def _note(self, result: Any, node: torch.fx.Node) -> None:
+        if not isinstance(result, torch.Tensor):
+            return
+        node.meta["val"] = torch.empty(result.shape, dtype=result.dtype, device="meta")
+        if self._noted(result) is None:  # else it was changed in place
+            result._node = node  # type: ignore[attr-defined]
+
+    def _check_known(self, args: Any) -> None:
+        for node in filter(None, (self._noted(arg) for arg in args if isinstance(arg, torch.Tensor))):
+            if node.op != "get_attr" and node not in self._known:
+                raise RuntimeError("a hook reads a number out of a tensor (if, .item(), float())")
+
+
+def trace(work: Callable[[dict[str, torch.Tensor]], None], arrays: dict[str, torch.Tensor]) -> torch.fx.GraphModule:
+    """Returns what a function does to arrays, as a module that takes them one after another.
+
+    Args:
+        work: changes the arrays in place; it is called once.
+        arrays: tensors, by name.
+
+    Raises:
+        RuntimeError: what it does depends on a number of an array.
+    """
+    tracer = _Tracer(arrays)
+    with tracer:
+        work(arrays)
+    tracer.graph.output(None)
+    tracer.graph.eliminate_dead_code()
+    return torch.fx.GraphModule(tracer.constants, tracer.graph)
