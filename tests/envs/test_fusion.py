@@ -418,10 +418,12 @@ def test_a_world_does_the_same_among_few_and_many():
 
 TESTS = Path(__file__).parents[1]
 TELL = """
-import hashlib, quickly, torchrl_loco
+import hashlib, sys, torchrl_loco
 from torchrl_loco.envs import fusion
+from torchrl_loco.sim import Simulation
 
 plain = fusion._kernel
+Simulation.compile = lambda *args: sys.exit()  # when all texts are written
 fusion._kernel = lambda text, *args: print(hashlib.sha256(text.encode()).hexdigest()) or plain(text, *args)
 torchrl_loco.make("go1_velocity", 2, "cpu", seed=0)
 """
