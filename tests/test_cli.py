@@ -55,19 +55,17 @@ def test_help_and_wrong_options_wait_for_nothing():
 
 @pytest.mark.slow
 def test_settings_of_a_task_wait_for_torch_alone(tmp_path):
-    """It knows whether there is CUDA, which decides on the preset. Where the extra is missing, it is named."""
+    """It knows whether there is CUDA, which decides on the preset."""
     (tmp_path / "config.json").write_text("{}")
     lines = ["train walker_walk --help", "train walker_walk --num_env 8", f"plot {tmp_path}"]
-    lines.append(f"train walker_stand --device cpu --out {tmp_path / 'runs'}")
     said, exits, imported = in_fresh_process(*lines)
-    assert exits == ["exit 0", "exit 2", "exit 2", "exit 2"], said
+    assert exits == ["exit 0", "exit 2", "exit 2"], said
     assert imported[1] == "imported ['torch']"
     assert "--algorithm, ppo or reppo (here ppo)" in said
     assert "--task" not in said  # the preset is for no other
     assert "did you mean 'num_envs'?" in said
     assert not {"walker_run", "doctor"} & set(said.split())  # other tasks and commands have such an option too
-    assert said.count("install it with: pip install 'torchrl-loco[train]'") == 2
-    assert not (tmp_path / "runs").exists()
+    assert "install it with: pip install 'torchrl-loco[train]'" in said
 
 
 def test_an_unknown_command_names_the_nearest(capsys):

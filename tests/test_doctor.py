@@ -65,13 +65,13 @@ def test_a_body_that_fails_does_not_hide_the_others(monkeypatch):
 @pytest.mark.slow
 def test_size():
     """What is advised is enough for the same run, and a good deal less drops constraints."""
-    sizes = doctor.size("humanoid_run", 8, "cpu", steps=60)
+    sizes = doctor.size("walker_run", 4, "cpu", steps=60)
     assert all(needed < advised < 2 * needed for needed, advised in sizes.values())
     dropped = []
     for share in (1, 3):
         settings = {name: advised // share for name, (_, advised) in sizes.items()}
         settings |= {"engine": "mujoco_warp", "on_overflow": "ignore"}
-        env = torchrl_loco.make("humanoid_run", 8, "cpu", seed=0, world_offset=0, **settings)
+        env = torchrl_loco.make("walker_run", 4, "cpu", seed=0, world_offset=0, **settings)
         td = env.reset()
         for action in doctor.random_actions(env, range(60)):
             td = env.step(td.set("action", action))["next"]

@@ -56,7 +56,7 @@ def test_public_names_have_docstrings():
 
 
 @pytest.mark.slow
-def test_in_a_fresh_interpreter_without_the_extras():
+def test_in_a_fresh_interpreter_without_the_extras(tmp_path):
     """A worker that unpickles imports the module that it needs before the rest."""
     code = """
 import sys
@@ -85,5 +85,11 @@ except ImportError as error:
     assert "matplotlib" in str(error) and "[train]" in str(error)
 else:
     raise AssertionError("a trainer without matplotlib would fail at the end of its run")
+from torchrl_loco.cli import main
+main(["train", "walker_stand", "--device=cpu", "--out", sys.argv[1]])
 """
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120, cwd=Path(__file__).parent)
+    command = [sys.executable, "-c", code, tmp_path / "runs"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=Path(__file__).parent)
+    assert ended.returncode == 2, ended.stderr
+    assert "pip install 'torchrl-loco[train]'" in ended.stderr
+    assert not (tmp_path / "runs").exists()

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import json
-import subprocess
+import runpy
 import sys
 
 import pytest
@@ -220,7 +220,7 @@ def test_a_class_in_a_module(nothing_added, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_class_in_a_script(file):
+def test_a_class_in_a_script(file, capsys, monkeypatch):
     """A script is its own module, here and where its file is looked up; so is a file beside it, under its name."""
     script = file.with_name("script.py")
     script.write_text(
@@ -234,8 +234,11 @@ def test_a_class_in_a_script(file):
         "    print(json.dumps(names))\n"
     )
     file.rename(file.with_name("neighbour.py"))
-    run = subprocess.run([sys.executable, script], check=True, capture_output=True, text=True, timeout=120)
-    names = json.loads(run.stdout)
+    with monkeypatch.context() as patch:
+        patch.syspath_prepend(script.parent)
+        runpy.run_path(str(script), run_name="__main__")
+    del sys.modules["neighbour"]  # as in another process
+    names = json.loads(capsys.readouterr().out)
     assert names == [f"{script}:Own", f"{script.with_name('neighbour.py')}:Slowly"]
     assert [registry.resolve(name).target_speed for name in names] == [0.25, 0.25]
     assert [registry.task_name(name) for name in names] == names

@@ -115,7 +115,7 @@ def test_planar_bodies_start_uniformly(draws, task):
 
 def test_a_hopper_feels_the_ground_before_its_first_step(shared, engine):
     """What C MuJoCo finds without control, and not the forces of the episode before."""
-    env = shared("hopper_hop", 64, protocol="dm_control", engine=engine)
+    env = shared("hopper_hop", 24, protocol="dm_control", engine=engine)
     reference = Oracle("hopper_hop", env.model)
     for lowered in (0.0, 0.2):
         env.rollout(30, break_when_any_done=False)

@@ -15,7 +15,7 @@ from torchrl_loco.sim.simulation import set_options
 
 pytestmark = pytest.mark.slow
 
-WORLDS, AGES = 80, (10, 30, 50, 80)
+WORLDS, AGES = 40, (10, 30, 50, 80)
 
 
 @pytest.fixture(scope="module", params=COMPILED)

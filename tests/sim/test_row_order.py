@@ -14,7 +14,7 @@ from torchrl_loco.sim.row_order import FIRST_CONTACT, ROW_FIELDS, RowOrder
 
 pytestmark = pytest.mark.slow
 
-WORLDS = 8
+WORLDS = 6
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def sim():
     rng = np.random.default_rng(0)
     step = sim.capture(sim.step)
     sim.reset(wp.ones(WORLDS, dtype=bool))
-    for _ in range(200):
+    for _ in range(60):
         sim.ctrl.copy_(sim.ctrl.new_tensor(rng.choice([-1.0, 1.0], sim.ctrl.shape)))
         step.replay()
     assert sim.data.nefc.numpy().sum() > 30
