@@ -30,11 +30,12 @@ SCENE = """
 """
 STACK = """
 <mujoco><worldbody>
-  <geom type="plane" size="5 5 0.1"/>
+  <geom type="plane" size="5 5 0.1" condim="1"/>
   <body pos="0 0 0.1"><freejoint/><geom size="0.1" mass="2"/></body>
   <body pos="0 0 0.3"><joint type="slide" axis="0 0 1"/><geom size="0.1" mass="3"/></body>
-  <body pos="1 0 0.1"><freejoint/><geom type="capsule" size="0.1 0.2" euler="0 90 0" mass="1" condim="{condim}"/></body>
+  <body pos="1 0 0.1"><freejoint/><geom type="capsule" size="0.1 0.2" euler="0 90 0" mass="1"/></body>
   <body pos="2 0 1"><joint type="slide" axis="0 0 1" stiffness="100"/><geom size="0.1" mass="1"/></body>
+  <body pos="1 1 0.1"><freejoint/><geom type="capsule" size="0.1 0.2" euler="0 90 0" mass="1" condim="1"/></body>
 </worldbody></mujoco>
 """
 
@@ -110,25 +111,24 @@ def test_forces_of_each_substep_and_of_a_state_are_those_of_c_mujoco(simulated):
 
 
 def test_what_lies_still_feels_what_lies_on_it(simulated):
-    """A ball with another on it, a capsule with two contacts, and one that hangs on a spring."""
-    for condim in (1, 3):
-        sim = simulated(STACK.format(condim=condim), ctrl_dt=0.02, contact_geoms=range(5))
-        step = sim.capture(sim.step)
-        sim.reset(every_world(sim))
-        for _ in range(60):
-            step.replay()
-        up = 9.81 * np.array([-6, 2, 3, 1, 0])
-        np.testing.assert_allclose(sim.contact_force[0, :, 2], up, atol=2e-2)
-        np.testing.assert_allclose(sim.contact_force[0, :, :2], 0.0, atol=2e-2)
-        assert sim.in_contact.tolist() == [[True, True, True, True, False]]
-        sim.qpos[0, 2] += 1.0  # the lower ball is lifted, and so only the two others touch
-        sim.forward(every_world(sim))
-        assert sim.in_contact.tolist() == [[True, False, False, True, False]]
-        assert sim.contact_force[0, [1, 2, 4]].abs().max() == 0.0
+    """A ball with another on it, capsules with two contacts, with and without friction, and a ball on a spring."""
+    sim = simulated(STACK, ctrl_dt=0.02, contact_geoms=range(6))
+    step = sim.capture(sim.step)
+    sim.reset(every_world(sim))
+    for _ in range(60):
+        step.replay()
+    up = 9.81 * np.array([-7, 2, 3, 1, 0, 1])
+    np.testing.assert_allclose(sim.contact_force[0, :, 2], up, atol=2e-2)
+    np.testing.assert_allclose(sim.contact_force[0, :, :2], 0.0, atol=2e-2)
+    assert sim.in_contact.tolist() == [[True, True, True, True, False, True]]
+    sim.qpos[0, 2] += 1.0  # the lower ball is lifted, and so only the capsules touch
+    sim.forward(every_world(sim))
+    assert sim.in_contact.tolist() == [[True, False, False, True, False, True]]
+    assert sim.contact_force[0, [1, 2, 4]].abs().max() == 0.0
 
 
 def test_other_worlds_keep_their_forces(simulated):
-    sim = simulated(STACK.format(condim=3), 3, ctrl_dt=0.02, contact_geoms=range(5))
+    sim = simulated(STACK, 3, ctrl_dt=0.02, contact_geoms=range(6))
     sim.reset(every_world(sim))
     for _ in range(10):
         sim.step()
@@ -166,7 +166,7 @@ def test_geoms_are_named_once_and_exist():
 
 def test_sums_do_not_depend_on_the_order_of_contacts():
     """Under MuJoCo-Warp, where threads list them as they come: forces that rounding would add up differently."""
-    model = mujoco.MjModel.from_xml_string(STACK.format(condim=3))
+    model = mujoco.MjModel.from_xml_string(STACK)
     config = SimConfig(ctrl_dt=0.002, sim_dt=0.002, naconmax=64, njmax=96, engine="mujoco_warp")
     sim = Simulation(model, config, 1, torch.device("cpu"), contact_geoms=[0, 3])
     data, count, found = sim.data, 60, []
@@ -229,7 +229,7 @@ def test_a_function_after_a_reset_reads_the_center_of_mass(simulated):
 
 def test_it_is_too_late_to_ask_after_a_step():
     config = SimConfig(ctrl_dt=0.002, sim_dt=0.002, engine="compiled")
-    sim = Simulation(mujoco.MjModel.from_xml_string(STACK.format(condim=3)), config, 1, torch.device("cpu"))
+    sim = Simulation(mujoco.MjModel.from_xml_string(STACK), config, 1, torch.device("cpu"))
     sim.step()
     with pytest.raises(RuntimeError, match=r"ask for data\.subtree_com before the first step"):
         _ = sim.subtree_com

@@ -188,13 +188,15 @@ def test_a_joint_may_be_near_both_its_limits(form):
 TILTED = """
 <mujoco>
   <option timestep="0.002" iterations="100" ls_iterations="50"/>
-  <worldbody>
-    <geom type="plane" size="5 5 .1" euler="{plane}"/>
-    <body name="a" pos="0 0 .3"><freejoint/><geom type="capsule" size=".05 .2" euler="{capsule}"/></body>
-  </worldbody>
+  <worldbody>{pairs}</worldbody>
 </mujoco>
 """
-"""A capsule on a plane, within 30 degrees of its normal in the first cases."""
+PAIR = """
+<geom name="plane{bit}" type="plane" size="5 5 .1" euler="{plane}" contype="{bit}" conaffinity="0"/>
+<body pos="0 0 .3"><freejoint/>
+  <geom name="capsule{bit}" type="capsule" size=".05 .2" euler="{capsule}" contype="0" conaffinity="{bit}"/></body>
+"""
+"""A plane and a capsule that touch nothing else; in the first cases it is within 30 degrees of the plane's normal."""
 CASES = [
     ("25 0 0", "35 5 0"),
     ("50 0 0", "45 5 0"),
@@ -207,20 +209,19 @@ CASES = [
 ]
 
 
-def leaning(plane, capsule, count=8):
-    """Returns the model, and states in which an end of the capsule slides, pressed in by 1 mm."""
-    model, rng, rows = (
-        mujoco.MjModel.from_xml_string(TILTED.format(plane=plane, capsule=capsule)),
-        np.random.default_rng(0),
-        [],
-    )
+def leaning(cases, count=8):
+    """Returns the model, and states in which an end of each capsule slides, pressed in by 1 mm."""
+    pairs = "".join(PAIR.format(bit=2**i, plane=plane, capsule=capsule) for i, (plane, capsule) in enumerate(cases))
+    model, rng, rows = mujoco.MjModel.from_xml_string(TILTED.format(pairs=pairs)), np.random.default_rng(0), []
     for _ in range(count):
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        normal, axis = (x.reshape(3, 3)[:, 2] for x in data.geom_xmat)
-        lowest = min((data.geom_xpos[1] + end * axis) @ normal for end in (-0.2, 0.2)) - 0.05
-        data.qpos[:3] -= normal * (lowest + 0.001)
-        data.qvel[:] = 0.5 * rng.normal(size=6)
+        for i in range(len(cases)):
+            plane, capsule = model.geom(f"plane{2**i}").id, model.geom(f"capsule{2**i}").id
+            normal, axis = (data.geom_xmat[geom].reshape(3, 3)[:, 2] for geom in (plane, capsule))
+            lowest = min((data.geom_xpos[capsule] + end * axis) @ normal for end in (-0.2, 0.2)) - 0.05
+            data.qpos[7 * i : 7 * i + 3] -= normal * (lowest + 0.001)
+        data.qvel[:] = 0.5 * rng.normal(size=model.nv)
         rows.append([x.astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)])
     return model, [np.array(column) for column in zip(*rows, strict=True)]
 
@@ -348,13 +349,13 @@ def test_the_limit_of_iterations_is_flagged_where_it_is_reached(form):
     """One iteration fewer than a world needs is flagged; as many are not, and give what more of them give."""
     model, reached, flags = limbs(), [], []
     states = falling(model, count=40)
-    for iterations in (1, 2, 3, MANY_ITERATIONS - 1):  # with more, searches end earlier
+    for iterations in (1, 3, MANY_ITERATIONS - 1):  # with more, searches end earlier
         model.opt.iterations = iterations
         sim = compiled_step(model, states)
         reached.append(sim.qacc_warmstart.numpy().copy())
         flags.append((sim.overflow.numpy() & int(Overflow.ITERATIONS)) != 0)
         assert not (sim.overflow.numpy() & ~int(Overflow.ITERATIONS)).any()
-    assert 40 > flags[0].sum() > flags[1].sum() > flags[2].sum() > 0
+    assert 40 > flags[0].sum() > flags[1].sum() > 0
     assert not flags[-1].any()
     final = np.array([(rows == reached[-1]).all(axis=1) for rows in reached])
     np.testing.assert_array_equal(flags, ~final)
@@ -363,8 +364,8 @@ def test_the_limit_of_iterations_is_flagged_where_it_is_reached(form):
 def test_a_capsule_orients_the_frame_of_its_contact(form, monkeypatch):
     """However steep it is, and however tilted the plane."""
     monkeypatch.setattr(collision, "UPRIGHT", 1e-6)  # C MuJoCo's rule
-    for plane, capsule in CASES:
-        assert errors(*leaning(plane, capsule)).max() < 2e-5, (plane, capsule)
+    for cases in (CASES[:4], CASES[4:]):
+        assert errors(*leaning(cases)).max() < 2e-5, cases
 
 
 def test_a_small_gain_is_found_beside_a_large_cost(form):

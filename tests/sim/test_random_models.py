@@ -1,6 +1,7 @@
 """The compiled step on small random models against C MuJoCo in float64: one physics step along trajectories."""
 
 import collections
+import functools
 
 import hypothesis
 import mujoco
@@ -93,15 +94,22 @@ def compiled_step(model, state, varied=None, rows=None):
     return sim
 
 
-def c_data(model, qpos, qvel, warmstart, ctrl):
-    data = mujoco.MjData(model)
+@functools.lru_cache(maxsize=1)
+def scratch(model):
+    """Returns data for what is read at once: to make it takes longer than a step."""
+    return mujoco.MjData(model)
+
+
+def c_data(model, qpos, qvel, warmstart, ctrl, data=None):
+    data = mujoco.MjData(model) if data is None else data
+    mujoco.mj_resetData(model, data)
     data.qpos[:], data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = qpos, qvel, warmstart, ctrl
     return data
 
 
 def c_steps(model, *state):
     """Returns the velocity that C MuJoCo reaches, and the acceleration that its solver found."""
-    data = c_data(model, *state)
+    data = c_data(model, *state, scratch(model))
     mujoco.mj_step(model, data)
     return data.qvel.copy(), data.qacc.copy()
 
@@ -176,7 +184,7 @@ def forces_in_c(model, state, qacc):
 
     Touch sensors first, then contact forces and normal forces of the geoms, ``(ngeom, 3)`` and ``(ngeom,)``.
     """
-    data = c_data(model, *state)
+    data = c_data(model, *state, scratch(model))
     mujoco.mj_forward(model, data)
     data.qacc[:] = qacc
     slopes = jacobian(model, data)
