@@ -29,18 +29,18 @@ def test_every_camera_sees_its_world_and_changes_nothing(shared, task, device):
     env.rollout(2)
     before, pictures = env.get_state(), {}
     for camera in ("side", "back", "egocentric"):
-        pixels = env.render(camera, width=64, height=48)
-        assert pixels.shape == (2, 48, 64, 3)
+        pixels = env.render(camera, width=48, height=36)
+        assert pixels.shape == (2, 36, 48, 3)
         assert pixels.dtype == torch.uint8
         assert pixels.device == env.device
         assert len(pixels[0].flatten(0, 1).unique(dim=0)) > 20
         pictures[camera] = pixels, pixels.clone()
-        assert torch.equal(env.render(camera, 64, 48, worlds=1), pixels[:1])
+        assert torch.equal(env.render(camera, 48, 36, worlds=1), pixels[:1])
     assert orange(pictures["side"][0]).float().mean() > 0.01
     assert (env.get_state() == before).all()
     env.rollout(3)
     for camera, (pixels, kept) in pictures.items():
-        assert not torch.equal(env.render(camera, 64, 48), kept)
+        assert not torch.equal(env.render(camera, 48, 36), kept)
         assert torch.equal(pixels, kept)  # a later picture does not overwrite an earlier one
 
 

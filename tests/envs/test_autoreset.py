@@ -45,7 +45,7 @@ def test_same_data_as_torchrl(shared, kind, actions):
         if wrap:
             theirs = TorchRLTransformedEnv(theirs, transforms())
             ours = torchrl_loco.TransformedEnv(ours, transforms())
-        moves = actions(ours, 30)
+        moves = actions(ours, 20)
         moves[7, 3] = torch.nan
         expected = play(theirs, moves, step_by_step(theirs, lambda td, env=theirs: EnvBase.maybe_reset(env, td)))
         got = play(ours, moves, ours.step_and_maybe_reset if at_once else step_by_step(ours, ours.maybe_reset))

@@ -104,7 +104,7 @@ def test_returns_beyond_the_bins_are_counted_and_said():
 def test_updates_raise_what_is_rewarded():
     """Rewarded for the first joint alone, the actor moves that joint."""
     reppo = made(num_envs=64, num_steps=8, minibatch_size=128, epochs=8, lr=1e-3, gamma=0.5, reward_scale=10.0)
-    for _ in range(24):
+    for _ in range(16):
         batch = collected(reppo, 64)
         batch["next", "reward"] = batch["action"][..., :1] + 1.0
         reppo.update(batch, progress=0.0)

@@ -124,8 +124,9 @@ def settled_states(model: mujoco.MjModel) -> np.ndarray:
     """Returns states into which random poses of a model have settled, ``(SETTLED_STATES, nq + nv)``."""
     rng, hinges = np.random.default_rng(0), model.jnt_limited.astype(bool)
     states = np.empty((SETTLED_STATES, model.nq + model.nv))
+    data = mujoco.MjData(model)
     for state in states:
-        data = mujoco.MjData(model)
+        mujoco.mj_resetData(model, data)
         data.qpos[hinges] = rng.uniform(*model.jnt_range[hinges].T)
         mujoco.mj_step(model, data, round(SETTLING_TIME / model.opt.timestep))
         state[:] = *data.qpos, *data.qvel
