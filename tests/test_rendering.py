@@ -37,6 +37,7 @@ def test_every_camera_sees_its_world_and_changes_nothing(shared, task, device):
         pictures[camera] = pixels, pixels.clone()
         assert torch.equal(env.render(camera, 48, 36, worlds=1), pixels[:1])
     assert orange(pictures["side"][0]).float().mean() > 0.01
+    assert len({pixels.cpu().numpy().tobytes() for pixels, _ in pictures.values()}) == 3
     assert (env.get_state() == before).all()
     env.rollout(3)
     for camera, (pixels, kept) in pictures.items():
