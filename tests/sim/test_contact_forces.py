@@ -28,16 +28,18 @@ SCENE = """
   </worldbody>
 </mujoco>
 """
-STACK = """
+PLANAR = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint axis="0 1 0"/>'
+STACK = f"""
 <mujoco><worldbody>
   <geom type="plane" size="5 5 0.1" condim="1"/>
-  <body pos="0 0 0.1"><freejoint/><geom size="0.1" mass="2"/></body>
+  <body pos="0 0 0.1"><joint type="slide" axis="0 0 1"/><geom size="0.1" mass="2"/></body>
   <body pos="0 0 0.3"><joint type="slide" axis="0 0 1"/><geom size="0.1" mass="3"/></body>
-  <body pos="1 0 0.1"><freejoint/><geom type="capsule" size="0.1 0.2" euler="0 90 0" mass="1"/></body>
+  <body pos="1 0 0.1">{PLANAR}<geom type="capsule" size="0.1 0.2" euler="0 90 0" mass="1"/></body>
   <body pos="2 0 1"><joint type="slide" axis="0 0 1" stiffness="100"/><geom size="0.1" mass="1"/></body>
-  <body pos="1 1 0.1"><freejoint/><geom type="capsule" size="0.1 0.2" euler="0 90 0" mass="1" condim="1"/></body>
+  <body pos="1 1 0.1">{PLANAR}<geom type="capsule" size="0.1 0.2" euler="0 90 0" mass="1" condim="1"/></body>
 </worldbody></mujoco>
 """
+"""As many degrees of freedom as the walker has: MuJoCo-Warp makes kernels for each number."""
 
 
 @pytest.fixture
@@ -121,7 +123,7 @@ def test_what_lies_still_feels_what_lies_on_it(simulated):
     np.testing.assert_allclose(sim.contact_force[0, :, 2], up, atol=2e-2)
     np.testing.assert_allclose(sim.contact_force[0, :, :2], 0.0, atol=2e-2)
     assert sim.in_contact.tolist() == [[True, True, True, True, False, True]]
-    sim.qpos[0, 2] += 1.0  # the lower ball is lifted, and so only the capsules touch
+    sim.qpos[0, 0] += 1.0  # the lower ball is lifted, and so only the capsules touch
     sim.forward(every_world(sim))
     assert sim.in_contact.tolist() == [[True, False, False, True, False, True]]
     assert sim.contact_force[0, [1, 2, 4]].abs().max() == 0.0
@@ -134,7 +136,7 @@ def test_other_worlds_keep_their_forces(simulated):
         sim.step()
     before, mask = sim.contact_force.clone(), every_world(sim)
     wp.to_torch(mask)[1] = False
-    sim.qpos[:, 10] += 1.0
+    sim.qpos[:, 3] += 1.0
     sim.forward(mask)
     assert before[1, 3, 2] > 5.0
     assert torch.equal(sim.contact_force[1], before[1])
