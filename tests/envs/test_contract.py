@@ -4,6 +4,7 @@ import pytest
 import torch
 from cases import ENGINES, KINDS, TASKS
 from compare import assert_repeats
+from hook_tasks import WalkBackwards
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv, check_env_specs
 
@@ -124,10 +125,11 @@ def test_a_policy_with_gradients_leaves_no_autograd_graph_behind(shared):
 def test_the_callers_default_dtype_and_inference_mode_do_not_matter():
     torch.set_default_dtype(torch.float64)
     try:
-        with torch.inference_mode():
-            env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0, reward_terms=True)
-        check_env_specs(env)
-        assert env.rollout(2)["next", "reward"].dtype == torch.float32
+        for task, options in (("walker_walk", {"reward_terms": True}), (WalkBackwards, {})):
+            with torch.inference_mode():
+                env = torchrl_loco.make(task, 2, "cpu", seed=0, **options)
+            check_env_specs(env)
+            assert env.rollout(2)["next", "reward"].dtype == torch.float32
     finally:
         torch.set_default_dtype(torch.float32)
 

@@ -135,6 +135,7 @@ class Hooks:
         ValueError: a hook returns something of the wrong shape, name or value.
     """
 
+    @torch.inference_mode(False)  # writes of hooks are noticed by versions of tensors
     def __init__(self, env: "LocoEnv", mj_model: mujoco.MjModel) -> None:
         self._env = weakref.ref(env)
         self._title = type(env).__name__
