@@ -220,6 +220,7 @@ def models(draw, max_bodies=8, lanes=False):
         element(
             "sensor",
             element("subtreelinvel", body="body0"),
+            element("subtreeangmom", body=f"body{count - 1}"),
             *(element("touch", site=f"zone{i}") for i in range(count)),
         ),
     )

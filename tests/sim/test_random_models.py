@@ -46,7 +46,7 @@ ROLLING = """
       <geom size="0.06" pos="0.01 0.02 0" condim="1"/></body>
   </worldbody>
   <actuator><motor joint="hinge"/></actuator>
-  <sensor><subtreelinvel body="body0"/><touch site="zone0"/><touch site="zone2"/></sensor>
+  <sensor><subtreelinvel body="body0"/><subtreeangmom body="body2"/><touch site="zone0"/><touch site="zone2"/></sensor>
 </mujoco>
 """
 """Bodies of every condim. None has its center of mass at its origin: MuJoCo keeps the mass of such a one."""
@@ -176,7 +176,10 @@ def assert_poses_belong_to_the_state(model, sim, world):
     roots = sorted(set(model.body_rootid) - {0})
     np.testing.assert_allclose(sim.subtree_com[world, roots], data.subtree_com[roots], rtol=0, atol=far)
     velocity = data.subtree_linvel[model.body("body0").id]
-    np.testing.assert_allclose(sim.data.sensordata.numpy()[world, :3], velocity, rtol=0, atol=fast)
+    sensed, (_, below, *_) = sim.data.sensordata.numpy()[world], model.sensor_objid
+    np.testing.assert_allclose(sensed[:3], velocity, rtol=0, atol=fast)
+    momentum, mass = data.subtree_angmom[below], model.body_subtreemass[below]
+    np.testing.assert_allclose(sensed[3:6], momentum, rtol=0, atol=fast * max(mass, 1.0))
 
 
 def forces_in_c(model, state, qacc):
@@ -192,7 +195,7 @@ def forces_in_c(model, state, qacc):
     mujoco.mj_sensorAcc(model, data)
     terms = np.abs(slopes) @ np.abs(data.qacc) + np.abs(data.efc_aref)
     net, normal, _ = net_forces(model, data)
-    return [data.sensordata[3:].copy(), net, normal], 1e-5 * (data.efc_D * terms).max(initial=0)
+    return [data.sensordata[6:].copy(), net, normal], 1e-5 * (data.efc_D * terms).max(initial=0)
 
 
 def assert_forces_belong_to_the_acceleration(model, state, sim, world, rng):
@@ -209,7 +212,7 @@ def assert_forces_belong_to_the_acceleration(model, state, sim, world, rng):
         mujoco.mj_integratePos(model, near, rng.normal(size=model.nv) * NOISE, 1.0)
         others = forces_in_c(model, (near, *rest), qacc)[0]
         changes = [np.maximum(c, np.abs(a - b)) for c, a, b in zip(changes, others, (touch, net), strict=False)]
-    felt, pushed = sim.data.sensordata.numpy()[world, 3:], sim.contact_force[world].numpy()
+    felt, pushed = sim.data.sensordata.numpy()[world, 6:], sim.contact_force[world].numpy()
     assert (np.abs(felt - touch) <= 0.01 * touch + rounding + 10 * changes[0]).all(), (felt, touch)
     allowed = 0.01 * normal[:, None] + 4 * rounding + 10 * changes[1]
     assert (np.abs(pushed - net) <= allowed).all(), (pushed, net)
