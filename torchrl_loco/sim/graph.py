@@ -137,15 +137,15 @@ class TorchGraph:
             graph = torch.cuda.CUDAGraph()
             side = torch.cuda.Stream(self._device)  # else torch takes one of its current device
             recording = torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local")
-            # The memory of an environment that nobody holds cannot be freed meanwhile.
+            # A collection could free the memory of a dropped environment, which ends the recording with an error.
             with EXCLUSIVE, no_collection(), torch.cuda.device(self._device):
                 before = torch.cuda.current_stream()
                 try:
                     with recording:
                         self._work()
                 except BaseException:
-                    # torch leaves its stream of the recording current where that cannot end, and its random numbers
-                    # would wait for the end of it: let an empty one end.
+                    # A recording that cannot end leaves its stream current, and torch's random numbers waiting for its
+                    # end: let an empty one end.
                     torch.cuda.set_stream(before)
                     with torch.cuda.graph(torch.cuda.CUDAGraph(), stream=side):
                         torch.zeros(1, device=self._device)

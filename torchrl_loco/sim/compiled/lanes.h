@@ -2079,7 +2079,8 @@ struct Step : Math {
   }
 
 //IF MOMENTA
-  // Angular momentum of a subtree about its centre of mass: that about the centre of its tree, less that of the whole.
+  // Angular momentum of a subtree about its centre of mass: that about the centre of its tree, less what its linear
+  // momentum at its own centre has about that.
   INLINE void write_angular_momenta(float* sensordata) const {
     ROLLED for (int s = 0; s < Model::MOMENTA; ++s) {
       Vec momentum = {0.0f, 0.0f, 0.0f}, linear = momentum, center = momentum;

@@ -37,6 +37,7 @@ from torchrl_loco.sim.compiled.constraints import Softness, both_sides, near, to
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, MINVAL, SLIDE, acting
 from torchrl_loco.sim.compiled.links import Mass, matrix, moving_bodies, places
 from torchrl_loco.sim.compiled.parameters import Number, VariedModel, nominal, present, varies
+from torchrl_loco.sim.compiled.sensors import ANGULAR_MOMENTUM, SUBTREE_VELOCITY, TOUCH, subtree
 from torchrl_loco.sim.compiled.tables import Tables
 from torchrl_loco.sim.models import NEVER, home_pose
 
@@ -254,9 +255,9 @@ class Description:
         losses = m.dof_frictionloss
         self.losses = [d for d in range(m.nv) if varies(losses[d]) or losses[d] > 0]
         sensors = [(int(m.sensor_type[i]), int(m.sensor_objid[i]), int(m.sensor_adr[i])) for i in range(m.nsensor)]
-        self.subtrees = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL)]
-        self.momenta = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_SUBTREEANGMOM)]
-        self.touch = [s for s in sensors if s[0] == int(mujoco.mjtSensor.mjSENS_TOUCH)]
+        self.subtrees = [s for s in sensors if s[0] == SUBTREE_VELOCITY]
+        self.momenta = [s for s in sensors if s[0] == ANGULAR_MOMENTUM]
+        self.touch = [s for s in sensors if s[0] == TOUCH]
         self.implicit_actuators = is_implicitfast(m) and present(affine_bias(m)[acting(m), 2])
         self.joint_force_limits = self.implicit_actuators or m.jnt_actfrclimited.any()
         self.limbs = Limbs.of(m.dof_parentid.tolist())
@@ -723,7 +724,7 @@ class Description:
 
     def _parts_below(self, body: int) -> list[tuple[int, Mass]]:
         """Returns links of a subtree, and what of each belongs to it."""
-        inside = {b for b in range(1, self.m.nbody) if self._is_below(b, body)}
+        inside = set(subtree(self.m, body))
         by_link = [(i, [b for b in bodies if b in inside]) for i, bodies in enumerate(self.members)]
         return [(i, Mass.join(self.m, self.places, bodies)) for i, bodies in by_link if bodies]
 
@@ -759,11 +760,6 @@ class Description:
         index, balls = {geom: i for i, geom in enumerate(geoms)}, [-1] * len(self.limited_balls)
         for i, title in enumerate(("first", "second")):
             tables.integers(f"{title}_contact_geom", [*(index.get(p.geoms[i], -1) for p in self.pairs), *balls])
-
-    def _is_below(self, body: int, top: int) -> bool:
-        while body and body != top:
-            body = self.m.body_parentid[body]
-        return body == top
 
     def worlds_per_block(self) -> int:
         """Returns how many worlds share a block of threads: a power of two, as shared memory allows."""

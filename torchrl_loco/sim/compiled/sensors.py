@@ -162,13 +162,10 @@ class ContactForces:
 def read(m: mujoco.MjModel, tree: Dynamics, touch: TouchSensors) -> list[Scalar | None]:
     """Returns the row of ``sensordata``; ``None`` where no sensor of this module writes."""
     row: list[Scalar | None] = [None] * m.nsensordata
-    for sensor in range(m.nsensor):
-        if m.sensor_type[sensor] == SUBTREE_VELOCITY:
-            first = m.sensor_adr[sensor]
-            row[first : first + 3] = subtree_velocity(m, tree, int(m.sensor_objid[sensor]))
-        elif m.sensor_type[sensor] == ANGULAR_MOMENTUM:
-            first = m.sensor_adr[sensor]
-            row[first : first + 3] = angular_momentum(m, tree, int(m.sensor_objid[sensor]))
+    of_subtrees = {SUBTREE_VELOCITY: subtree_velocity, ANGULAR_MOMENTUM: angular_momentum}
+    for kind, body, first in zip(m.sensor_type, m.sensor_objid, m.sensor_adr, strict=True):
+        if kind in of_subtrees:
+            row[first : first + 3] = of_subtrees[kind](m, tree, int(body))
     for address, force in touch.outputs().items():
         row[address] = scalar(force)
     return row

@@ -226,7 +226,8 @@ class Velocity(LocoEnv):
             wrong += [f"joints need a range{_some(actuated(m), free)}"] if free.any() else []
         sensors = [m.sensor(i).name for i in range(m.nsensor)]
         if "angular_momentum" in cls.weights and "angular_momentum" not in sensors:
-            wrong.append(f'it needs <subtreeangmom name="angular_momentum" body="{cls.base}"/>, which has a weight')
+            sensor = f'<subtreeangmom name="angular_momentum" body="{cls.base}"/>'
+            wrong.append(f"the weight of angular_momentum needs {sensor}")
         if not models.has_home(m):
             wrong.append("it needs a keyframe 'home', the pose around which actions move the joints")
         if wrong:
