@@ -189,10 +189,11 @@ struct Point {  // on the search direction: the cost relative to alpha = 0
 };
 
 struct Search {  // the result of a line search
-  float alpha, improvement;
+  float alpha, improvement, slope;
   INLINE void take(const Point& p, bool acceptable) {
     const bool better = acceptable & (-p.cost > improvement);  // which what is no number is not
     alpha = better ? p.alpha : alpha;
     improvement = better ? -p.cost : improvement;
+    slope = better ? p.slope : slope;
   }
 };

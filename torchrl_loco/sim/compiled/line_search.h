@@ -12,7 +12,7 @@ const Point start = {0.0f, 0.0f, -decrement, fabsf(decrement)};
 const float tolerance = Math::larger(LS_TOLERANCE * Math::divide(Math::root(quadratic[2]), SCALE), 1e-6f);
 const float sizes = Math::root(2.0f * whole[0] * Math::larger(start.curvature - curvature, 0.0f)) + fabsf(slope);
 const float noise = 8.0f * 1.1920929e-7f * sizes, accept = Math::larger(tolerance, noise);
-Search result = {0.0f, 0.0f};
+Search result = {0.0f, 0.0f, 0.0f};
 if (fabsf(start.slope) < noise) return result;
 
 const Point first = Point::at(1.0f, slope, curvature, whole + 1);
@@ -55,7 +55,7 @@ ROLLED for (int i = 0; i < LS_ITERATIONS && !found; ++i) {
   const bool middle_ends = middle.ends(start, accept, LS_NEAR);
   found = low_ends | high_ends | middle_ends;
   if (found) {
-    result = {0.0f, 0.0f};
+    result = {0.0f, 0.0f, 0.0f};
     result.take(next_low, low_ends);
     result.take(next_high, high_ends);
     result.take(middle, middle_ends);
@@ -68,7 +68,7 @@ ROLLED for (int i = 0; i < LS_ITERATIONS && !found; ++i) {
     moved |= high.move(next_low, high.outside(next_low));
     if ((low.cost < 0.0f) | (high.cost < 0.0f)) {
       const bool lower = low.cost < high.cost;
-      result = {lower ? low.alpha : high.alpha, -Math::smaller(low.cost, high.cost)};
+      result = {lower ? low.alpha : high.alpha, -Math::smaller(low.cost, high.cost), lower ? low.slope : high.slope};
     }
     found = !moved | (low.flat(tolerance) & (low.slope < 0.0f)) | (high.flat(tolerance) & (high.slope > 0.0f));
   }

@@ -40,7 +40,8 @@ ROLLED for (int iteration = 0; any_of_block(!done); ++iteration) {
   same = !move(step.alpha);
   found = (step.improvement > 0.0f) & (step.improvement * SCALE < TOLERANCE);
   if (same && !found) {  // what is left of a Newton step; of a second one on the same parabola, rounding
-    const float left = (1.0f - step.alpha) * (1.0f - step.alpha);
-    found = repeated || flat(left);
+    // On a parabola the slope shrinks as the step grows to 1: what it differs by is the error of s, more of it across s.
+    const float rest = 1.0f - step.alpha, error = 10.0f * (Math::divide(step.slope, decrement) + rest);
+    found = repeated || flat(Math::larger(rest * rest, error * error));
   }
 }
