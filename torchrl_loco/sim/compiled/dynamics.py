@@ -14,6 +14,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
+from torchrl_loco.sim.compiled.actuators import Actuator, acting
 from torchrl_loco.sim.compiled.links import matrix
 from torchrl_loco.sim.compiled.parameters import nominal, present, varies
 from torchrl_loco.sim.compiled.symbols import (
@@ -23,8 +24,6 @@ from torchrl_loco.sim.compiled.symbols import (
     cross,
     dot,
     identity,
-    maximum,
-    minimum,
     scalar,
     sincos,
     sqrt,
@@ -120,15 +119,6 @@ def cross_force(v: np.ndarray, force: np.ndarray) -> np.ndarray:
 
 
 # The tree.
-
-
-def acting(m: mujoco.MjModel) -> list[int]:
-    """Returns the actuators whose group the options do not disable."""
-    return [
-        i
-        for i in range(m.nu)
-        if not (0 <= m.actuator_group[i] < 31 and m.opt.disableactuator >> m.actuator_group[i] & 1)
-    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -297,19 +287,12 @@ class Dynamics:
         return force
 
     def _actuator_force(self, qpos: list[Scalar], qvel: list[Scalar], ctrl: list[Scalar]) -> list[Scalar]:
-        """Returns the forces of actuators: gain * ctrl + affine bias, each clipped to its range (``qfrc_actuator``)."""
+        """Returns the forces of the actuators at the joints (MuJoCo's ``qfrc_actuator``)."""
         m, force = self.m, [scalar(0)] * self.m.nv
         for i in acting(m):
-            j, gear = m.actuator_trnid[i, 0], m.actuator_gear[i, 0]
+            j, actuator = m.actuator_trnid[i, 0], Actuator.of(m, i)
             q, d = m.jnt_qposadr[j], m.jnt_dofadr[j]
-            control = clip(ctrl[i], m.actuator_ctrlrange[i]) if m.actuator_ctrllimited[i] else ctrl[i]
-            scalar_force = m.actuator_gainprm[i, 0] * control
-            if m.actuator_biastype[i] == int(mujoco.mjtBias.mjBIAS_AFFINE):
-                constant, stiffness, damping = m.actuator_biasprm[i, :3]
-                scalar_force = scalar_force + constant + stiffness * gear * qpos[q] + damping * gear * qvel[d]
-            if m.actuator_forcelimited[i]:
-                scalar_force = clip(scalar_force, m.actuator_forcerange[i])
-            force[d] = force[d] + gear * scalar_force
+            force[d] = force[d] + actuator.gear * actuator.force(ctrl[i], qpos[q], qvel[d])
         return force
 
     def twists(self, x: list[Scalar]) -> list[np.ndarray]:
@@ -400,8 +383,3 @@ def outer(a: np.ndarray, b: np.ndarray | None = None) -> np.ndarray:
     """Returns a symmetric outer product, each entry computed once."""
     b, n = a if b is None else b, len(a)
     return np.array([[a[max(i, j)] * b[min(i, j)] for j in range(n)] for i in range(n)], dtype=object)
-
-
-def clip(x: Scalar, limits: np.ndarray) -> Scalar:
-    """Returns ``x`` within constant limits."""
-    return minimum(maximum(x, limits[0]), limits[1])

@@ -565,6 +565,7 @@ struct Step : Math {
     sync();
   }
 
+//ACTUATOR
   // Passive and actuator forces of a degree of freedom, and its damping: minus the derivative of the force by its
   // velocity. MuJoCo leaves out of that actuators whose force a limit holds.
   INLINE float joint_force(int d, float& damping) const {
@@ -575,11 +576,7 @@ struct Step : Math {
     const int end = Model::first_actuator(d + (Model::SUBSTEPS > 0));  // a step that is not taken has no actuation
     ROLLED for (int a = Model::first_actuator(d); a < end; ++a) {
       const float gear = Model::gear(a);
-      const float control = ctrl[world * Model::CONTROLS + Model::control(a)];
-      float f = Model::gain(a) * clamp(control, Model::control_low(a), Model::control_high(a));
-      if (Model::HAS_ACTUATOR_BIAS)
-        f = f + Model::bias(a) + gear * (Model::bias_position(a) * w.qpos[q] + Model::bias_velocity(a) * w.qvel[d]);
-      if (Model::HAS_FORCE_LIMITS) f = clamp(f, Model::force_low(a), Model::force_high(a));
+      const float f = actuator_force(a, ctrl[world * Model::CONTROLS + Model::control(a)], w.qpos[q], w.qvel[d]);
       if (Model::IMPLICIT_ACTUATORS && Model::force_low(a) < f && f < Model::force_high(a))
         damping = damping - gear * gear * Model::bias_velocity(a);
       if (Model::JOINT_FORCE_LIMITS) actuation = actuation + gear * f;

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled import collision, shared, symbols
+from torchrl_loco.sim.compiled.actuators import Actuator, acting, affine_bias
 from torchrl_loco.sim.compiled.collision import (
     BOX,
     CAPSULE,
@@ -34,7 +35,7 @@ from torchrl_loco.sim.compiled.collision import (
     pairs,
 )
 from torchrl_loco.sim.compiled.constraints import Softness, both_sides, near, tolerance
-from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, MINVAL, SLIDE, acting
+from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, MINVAL, SLIDE
 from torchrl_loco.sim.compiled.links import Mass, matrix, moving_bodies, places
 from torchrl_loco.sim.compiled.parameters import Number, VariedModel, nominal, present, varies
 from torchrl_loco.sim.compiled.sensors import ANGULAR_MOMENTUM, SUBTREE_VELOCITY, TOUCH, subtree
@@ -213,12 +214,6 @@ def is_implicitfast(m: mujoco.MjModel) -> bool:
     With ``euler`` D is that of the dampers alone, or zero.
     """
     return m.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
-
-
-def affine_bias(m: mujoco.MjModel) -> np.ndarray:
-    """Returns the force of each actuator without control: its constant, per length and per velocity, ``(nu, 3)``."""
-    unbiased = m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE)
-    return np.where(unbiased[:, None], 0, m.actuator_biasprm[:, :3])
 
 
 class Description:
@@ -509,7 +504,6 @@ class Description:
         limited = m.actuator_forcelimited.astype(bool)
         limits = np.where(clamped[:, None], m.actuator_ctrlrange, [-UNLIMITED, UNLIMITED])[used]
         forces = np.where(limited[:, None], m.actuator_forcerange, [-UNLIMITED, UNLIMITED])[used]
-        tables.size(HAS_ACTUATOR_BIAS=present(bias), HAS_FORCE_LIMITS=limited[used].any())
         tables.integers("first_actuator", [sum(d < k for d in dofs[used]) for k in range(m.nv + 1)])
         tables.integers("control", used)
         tables.floats("gear", m.actuator_gear[used, 0])
@@ -524,6 +518,22 @@ class Description:
         forces = np.where(limited[:, None], m.jnt_actfrcrange, [-UNLIMITED, UNLIMITED])[m.dof_jntid]
         for k, name in enumerate(("low", "high")):
             tables.floats(f"joint_force_{name}", forces[:, k])
+
+    def actuator(self) -> Actuator:
+        """Returns an actuator that reads the tables."""
+        m, used = self.m, acting(self.m)
+
+        def read(*titles: str) -> list[symbols.Scalar]:
+            return [symbols.name(f"Model::{title}(a)") for title in titles]
+
+        gear, gain = read("gear", "gain")
+        return Actuator(
+            gear,
+            gain,
+            read("bias", "bias_position", "bias_velocity") if present(affine_bias(m)[used]) else None,
+            read("control_low", "control_high") if m.actuator_ctrllimited[used].any() else None,
+            read("force_low", "force_high") if m.actuator_forcelimited[used].any() else None,
+        )
 
     def _geom(self, g: int) -> tuple[int, np.ndarray, np.ndarray]:
         """Returns the link of a geom, and its center and z axis in the frame of the link."""
@@ -811,7 +821,8 @@ def source(
         "LIMBS": description.limbs is not None,
         "BOXES": any(description.is_solid(p) and not description.is_plane(p) for p in description.pairs),
     }
-    text = tables.use(_parts(TEMPLATE.read_text(), asked))
+    text = _parts(TEMPLATE.read_text(), asked).replace("//ACTUATOR", description.actuator().as_cpp())
+    text = tables.use(text)
     text = text.replace("//SHARED", shared.LAWS).replace("//SOFTNESS", Softness.as_cpp())
     text = text.replace("//LINE_SEARCH", LINE_SEARCH).replace("//NEWTON", NEWTON)
     text = text.replace("//MODEL", tables.text()).replace("//ELIMINATE", description.elimination())
