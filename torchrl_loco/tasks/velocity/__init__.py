@@ -132,7 +132,7 @@ class Velocity(LocoEnv):
         "ppo": {
             "num_envs": 8192,
             "num_steps": 12,
-            "total_frames": 130_000_000,
+            "total_frames": 120_000_000,
             "reward_scale": 1.0,
             "gamma": 0.99,
             "lr": 1e-3,
