@@ -368,22 +368,14 @@ def test_a_capsule_orients_the_frame_of_its_contact(form, monkeypatch):
         assert errors(*leaning(cases)).max() < 2e-5, cases
 
 
-@pytest.mark.parametrize(
-    ("form", "name", "allowed"),
-    [
-        pytest.param(64, "stalled", 0.02, id="traced"),
-        pytest.param(0, "stalled", 0.02, id="lanes"),
-        pytest.param(0, "skewed", 1.0, id="direction"),
-    ],
-    indirect=["form"],
-)
-def test_a_small_gain_is_found_beside_a_large_cost(form, name, allowed):
+def test_a_small_gain_is_found_beside_a_large_cost(form):
     """Contacts 0.10 and 0.15 m deep cost 6e9 J, of which the last steps of the solver gain 8 to 70 J.
 
-    In another state a Newton step of single precision misses by 0.4 % and crosses no row: 28 of 2508 rad/s^2 are left.
+    In the other state a Newton step of single precision misses by 0.4 % and crosses no row: 28 of 2508 rad/s^2 are off.
     """
-    model = mujoco.MjModel.from_xml_path(str(DATA / f"{name}.xml"))
-    with np.load(DATA / f"{name}_states.npz") as file:
-        rows = np.array([file[name] for name in file.files], dtype=np.float32)
-    states = np.split(rows, np.cumsum([model.nq, model.nv, model.nv]), axis=1)
-    assert (errors(model, states) / model.opt.timestep).max() < allowed
+    for name, allowed in (("stalled", 0.02), ("skewed", 1.0))[: 1 if form == "traced" else 2]:
+        model = mujoco.MjModel.from_xml_path(str(DATA / f"{name}.xml"))
+        with np.load(DATA / f"{name}_states.npz") as file:
+            rows = np.array([file[name] for name in file.files], dtype=np.float32)
+        states = np.split(rows, np.cumsum([model.nq, model.nv, model.nv]), axis=1)
+        assert (errors(model, states) / model.opt.timestep).max() < allowed, name
