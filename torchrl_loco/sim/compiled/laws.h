@@ -105,6 +105,7 @@ struct Interval {  // of a ray's parameter: the part that lies in a convex shape
 // ---- Constraint rows. A row has a residual x and a weight D, and v is how x changes along the search direction. What a
 // step of alpha changes of its cost, and slope and curvature there, are added to three sums. The change is no difference
 // of costs where the row stays on its side: beside what a deep contact costs, a number has no room for what is gained.
+// Minima and maxima, not conditions: what a predicate guards waits 13 cycles for it on a GPU.
 
 struct OneSided {  // costs D x^2 / 2 where x < 0
   static INLINE float cost(float x, float weight) { return x < 0.0f ? 0.5f * weight * x * x : 0.0f; }
@@ -112,11 +113,11 @@ struct OneSided {  // costs D x^2 / 2 where x < 0
   static INLINE float curvature(float x, float weight) { return x < 0.0f ? weight : 0.0f; }
   static INLINE bool crosses(float x, float next) { return (x < 0.0f) != (next < 0.0f); }
   static INLINE void add(float x, float v, float weight, float alpha, float* sums) {
-    const float y = Math::smaller(fmaf(alpha, v, x), 0.0f), before = Math::smaller(x, 0.0f);
-    const float moved = y < 0.0f && x < 0.0f ? alpha * v : y - before;
-    sums[0] = fmaf(0.5f * weight * (y + before), moved, sums[0]);
+    const float out = Math::larger(x, 0.0f), in = Math::larger(-x, 0.0f);
+    const float moved = Math::smaller(fmaf(alpha, v, out), in), y = moved - in;
+    sums[0] = fmaf(weight * moved, fmaf(0.5f, moved, -in), sums[0]);
     sums[1] = fmaf(weight * v, y, sums[1]);
-    sums[2] += y < 0.0f ? weight * v * v : 0.0f;
+    sums[2] = fmaf(y < 0.0f ? 1.0f : 0.0f, weight * v * v, sums[2]);
   }
 };
 
