@@ -257,11 +257,14 @@ class JointLimits:
         row = "const ConstraintRow row = {limit_x[i], limit_v[i], limit_D[i], 0.0f, false};"
         return f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ {row} {body} }}"
 
-    def advance(self) -> str:
-        """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides."""
-        return self.loop(
-            "const float next = row.after(alpha); changed |= row.weight > 0.0f && row.crosses(next); limit_x[i] = next;"
-        )
+    def advance(self, first: str) -> str:
+        """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides.
+
+        Args:
+            first: what is done with each row before.
+        """
+        moves = "changed |= row.weight > 0.0f && row.crosses(next); limit_x[i] = next;"
+        return self.loop(f"{first}const float next = row.after(alpha); {moves}")
 
 
 class DryFriction:
@@ -314,9 +317,14 @@ class DryFriction:
             f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ {row} {body} }} }}"
         )
 
-    def advance(self) -> str:
-        """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides."""
-        return self.loop("const float next = row.after(alpha); changed |= row.crosses(next); friction_x[i] = next;")
+    def advance(self, first: str) -> str:
+        """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides.
+
+        Args:
+            first: what is done with each row before.
+        """
+        moves = "changed |= row.crosses(next); friction_x[i] = next;"
+        return self.loop(f"{first}const float next = row.after(alpha); {moves}")
 
 
 def constant_text(x: Number) -> str:

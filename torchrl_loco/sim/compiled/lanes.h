@@ -1852,7 +1852,8 @@ struct Step : Math {
   }
 
   // Moves along the direction, and returns whether a row changed sides.
-  INLINE bool move(const float alpha) {
+  INLINE bool move(const Search& step) {
+    const float alpha = step.alpha;
     OWN_DOFS(slot, d) {
       if (d >= DOFS) continue;
       w.qacc[d] += alpha * w.search[d];

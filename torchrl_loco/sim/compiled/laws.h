@@ -103,21 +103,24 @@ struct Interval {  // of a ray's parameter: the part that lies in a convex shape
 };
 
 // ---- Constraint rows. A row has a residual x and a weight D, and v is how x changes along the search direction. What a
-// step of alpha changes of its cost, and slope and curvature there, are added to three sums. The change is no difference
-// of costs where the row stays on its side: beside what a deep contact costs, a number has no room for what is gained.
-// Minima and maxima, not conditions: what a predicate guards waits 13 cycles for it on a GPU.
+// step of alpha changes of its cost, and slope and curvature there (its bend), are added to three sums. The change is no
+// difference of costs where the row stays on its side: beside what a deep contact costs, a number has no room for what
+// is gained. Minima and maxima, not conditions: what a predicate guards waits 13 cycles for it on a GPU.
 
 struct OneSided {  // costs D x^2 / 2 where x < 0
   static INLINE float cost(float x, float weight) { return x < 0.0f ? 0.5f * weight * x * x : 0.0f; }
   static INLINE float gradient(float x, float weight) { return weight * Math::smaller(x, 0.0f); }
   static INLINE float curvature(float x, float weight) { return x < 0.0f ? weight : 0.0f; }
   static INLINE bool crosses(float x, float next) { return (x < 0.0f) != (next < 0.0f); }
-  static INLINE void add(float x, float v, float weight, float alpha, float* sums) {
+  static INLINE float change(float x, float v, float weight, float alpha) {
     const float out = Math::larger(x, 0.0f), in = Math::larger(-x, 0.0f);
-    const float moved = Math::smaller(fmaf(alpha, v, out), in), y = moved - in;
-    sums[0] = fmaf(weight * moved, fmaf(0.5f, moved, -in), sums[0]);
-    sums[1] = fmaf(weight * v, y, sums[1]);
-    sums[2] = fmaf(y < 0.0f ? 1.0f : 0.0f, weight * v * v, sums[2]);
+    const float moved = Math::smaller(fmaf(alpha, v, out), in);
+    return weight * moved * fmaf(0.5f, moved, -in);
+  }
+  static INLINE void bend(float x, float v, float weight, float alpha, float* sums) {
+    const float y = Math::smaller(fmaf(alpha, v, x), 0.0f);
+    sums[0] = fmaf(weight * v, y, sums[0]);
+    sums[1] = fmaf(y < 0.0f ? 1.0f : 0.0f, weight * v * v, sums[1]);
   }
 };
 
@@ -130,13 +133,15 @@ struct DryFriction {  // costs D x^2 / 2 while |x| is below a bound, and grows l
   static INLINE bool crosses(float x, float next, float bound) {
     return bound > 0.0f && ((x < bound) != (next < bound) || (x > -bound) != (next > -bound));
   }
-  static INLINE void add(float x, float v, float weight, float bound, float alpha, float* sums) {
+  static INLINE float change(float x, float v, float weight, float bound, float alpha) {
     const float y = fmaf(alpha, v, x);
-    const bool inside = fabsf(y) < bound;
-    sums[0] += inside && fabsf(x) < bound ? 0.5f * weight * (x + y) * (alpha * v)
-                                          : cost(y, weight, bound) - cost(x, weight, bound);
-    sums[1] += weight * v * Math::clamp(y, -bound, bound);
-    sums[2] += inside ? weight * v * v : 0.0f;
+    const bool inside = fabsf(y) < bound && fabsf(x) < bound;
+    return inside ? 0.5f * weight * (x + y) * (alpha * v) : cost(y, weight, bound) - cost(x, weight, bound);
+  }
+  static INLINE void bend(float x, float v, float weight, float bound, float alpha, float* sums) {
+    const float y = fmaf(alpha, v, x);
+    sums[0] += weight * v * Math::clamp(y, -bound, bound);
+    sums[1] += fabsf(y) < bound ? weight * v * v : 0.0f;
   }
 };
 
@@ -148,14 +153,22 @@ struct ConstraintRow {  // of either kind, along a search direction
   INLINE bool crosses(float next) const {
     return dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next);
   }
+  INLINE float change(float alpha) const {
+    return dry ? DryFriction::change(x, v, weight, bound, alpha) : OneSided::change(x, v, weight, alpha);
+  }
+  INLINE void bend(float alpha, float* sums) const {
+    if (dry) DryFriction::bend(x, v, weight, bound, alpha, sums);
+    else OneSided::bend(x, v, weight, alpha, sums);
+  }
   INLINE void add(float alpha, float* sums) const {
-    if (dry) DryFriction::add(x, v, weight, bound, alpha, sums);
-    else OneSided::add(x, v, weight, alpha, sums);
+    sums[0] += change(alpha);
+    bend(alpha, sums + 1);
   }
 };
 
-// ---- The line search. Brackets and tolerances are those of mujoco_warp, but for two things that save brackets: the
-// first tries the secant, and where iterations are many, a search may end near its minimum.
+// ---- The line search. Brackets and tolerances are those of mujoco_warp, but for what saves evaluations: the first
+// bracket tries the secant, where iterations are many, a search may end near its minimum, and a thread that has a world
+// to itself tries one step at a time.
 
 // Conditions are joined by | and &: by || and &&, each would be a branch.
 

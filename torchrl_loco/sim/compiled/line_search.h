@@ -5,6 +5,7 @@
 //   quadratic[3]                slope and curvature of the quadratic form, and the squared length of the direction
 //   whole[4]                    of all rows the cost at alpha = 0, and at alpha = 1 what add_rows adds
 //   add_rows(alphas, n, sums)   adds three numbers for each of n steps, over all rows
+// With BY_SLOPES nothing adds the first of these three, the change of cost: what a step gains is for who takes it to say.
 
 const float slope = quadratic[0], curvature = quadratic[1];
 const Point start = {0.0f, 0.0f, -decrement, fabsf(decrement)};
@@ -16,6 +17,25 @@ Search result = {0.0f, 0.0f, 0.0f};
 if (fabsf(start.slope) < noise) return result;
 
 const Point first = Point::at(1.0f, slope, curvature, whole + 1);
+if (BY_SLOPES) {  // Newton's method between two slopes of different sign: it is exact once it knows which rows are active
+  const float unknown = Math::from_bits(0x7f800000u);
+  float low = 0.0f, high = unknown;
+  Point last = first;
+  bool flat = fabsf(last.slope) < accept, stuck = false;
+  ROLLED for (int i = 0; i < 3 * LS_ITERATIONS && !(flat | stuck); ++i) {
+    low = last.slope < 0.0f ? last.alpha : low;
+    high = last.slope < 0.0f ? high : last.alpha;
+    const float next = last.alpha - last.slope * Math::inverse(last.curvature);
+    const float alphas[1] = {(next > low) & (next < high) ? next : 0.5f * (low + high)};
+    stuck = (alphas[0] == low) | (alphas[0] == high);
+    float sums[3] = {0.0f, 0.0f, 0.0f};
+    add_rows(alphas, 1, sums);
+    last = Point::at(alphas[0], slope, curvature, sums);
+    flat = fabsf(last.slope) < accept;
+  }
+  result.alpha = flat | (last.slope < 0.0f) ? last.alpha : low;  // up to there the cost falls
+  return result;
+}
 result.take(first, first.ends(start, accept, LS_NEAR));
 if (LS_NEAR > 0.0f && LS_ITERATIONS > 3) {  // a step at a time: most searches end with the first or the second
   Point low = start, high = start, last = first;

@@ -10,7 +10,7 @@
 //                           found, which is asked for if IMPLICIT_DAMPING, instead what that adds to qacc
 //   project()               sets how all changes along s
 //   line_search(decrement)  returns a step along s
-//   move(alpha)             takes it, and returns whether a row changed sides
+//   move(step)              takes it, and returns whether a row changed sides; sets its improvement if the search does not
 //   flag(bit)               reports what was cut short
 // SCALE is one over the inertia of the model.
 
@@ -33,11 +33,11 @@ ROLLED for (int iteration = 0; any_of_block(!done); ++iteration) {
   found = iteration > 0 && flat(1.0f);
   if (found) continue;
   project();
-  const Search step = line_search(decrement);
+  Search step = line_search(decrement);
   found = step.alpha == 0.0f;
   if (found) continue;
   const bool repeated = same;
-  same = !move(step.alpha);
+  same = !move(step);
   found = (step.improvement > 0.0f) & (step.improvement * SCALE < TOLERANCE);
   if (same && !found) {  // what is left of a Newton step; of a second one on the same parabola, rounding
     // On a parabola the slope shrinks as the step grows to 1: what it differs by is the error of s, more of it across s.

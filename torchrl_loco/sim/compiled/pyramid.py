@@ -89,9 +89,15 @@ class Pyramid:
             lines.append(f"  {{ const ConstraintRow row = {{{x}, {v}, {weight}, 0.0f, false}}; {body} }}")
         return "\n".join([*lines, "}"])
 
-    def advance(self, first: str, count: str) -> str:
-        """Returns C++ that moves the residuals along the search direction, and notes whether an edge changed sides."""
-        edges = self.loop(first, count, "changed |= row.crosses(row.after(alpha));").removesuffix("}")
+    def advance(self, first: str, count: str, before: str) -> str:
+        """Returns C++ that moves the residuals along the search direction, and notes whether an edge changed sides.
+
+        Args:
+            first: the first contact.
+            count: one beyond the last.
+            before: what is done with each edge before.
+        """
+        edges = self.loop(first, count, f"{before}changed |= row.crosses(row.after(alpha));").removesuffix("}")
         moves = " ".join(f"contact_x{d}[k] += alpha * contact_v{d}[k];" for d in self.directions)
         return f"{edges}  {moves}\n}}"
 

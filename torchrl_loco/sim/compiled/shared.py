@@ -11,7 +11,7 @@ LAWS = "".join((FOLDER / f"{name}.h").read_text() + "\n" for name in ("arithmeti
 _LINE_SEARCH, _NEWTON = ((FOLDER / f"{name}.h").read_text() for name in ("line_search", "newton"))
 
 
-def line_search(scale: str, tolerance: str, near: str, iterations: str) -> str:
+def line_search(scale: str, tolerance: str, near: str, iterations: str, by_slopes: str = "false") -> str:
     """Returns the body of the function of the line search.
 
     Args:
@@ -19,8 +19,10 @@ def line_search(scale: str, tolerance: str, near: str, iterations: str) -> str:
         tolerance: of the slope, relative to it.
         near: the share of its first slope at which it may end.
         iterations: how many steps are tried, or brackets of three where ``near`` is 0 or there are at most 3.
+        by_slopes: whether costs are left out; three steps are tried then where a bracket would be.
     """
-    return _filled(_LINE_SEARCH, LS_TOLERANCE=tolerance, LS_NEAR=near, LS_ITERATIONS=iterations, SCALE=scale)
+    values = {"LS_TOLERANCE": tolerance, "LS_NEAR": near, "LS_ITERATIONS": iterations, "BY_SLOPES": by_slopes}
+    return _filled(_LINE_SEARCH, SCALE=scale, **values)
 
 
 def newton(scale: str, tolerance: str, iterations: str, implicit_damping: str) -> str:

@@ -17,6 +17,9 @@ from torchrl_loco.sim.compiled.symbols import Block, cell, cells, dot, literal, 
 WHOLE = "whole[0] += row.cost(); row.add(1.0f, whole + 1);"
 STEPS = "UNROLLED for (int s = 0; s < n; ++s) row.add(alphas[s], sums + 3 * s);"
 """What the line search does with each row."""
+WHOLE_BY_SLOPES = "whole[0] += row.cost(); row.bend(1.0f, whole + 2);"
+STEPS_BY_SLOPES = "UNROLLED for (int s = 0; s < n; ++s) row.bend(alphas[s], sums + 3 * s + 1);"
+"""The same without costs."""
 
 
 class NewtonSolver:
@@ -41,6 +44,7 @@ class NewtonSolver:
         self.arrays = dict.fromkeys(("qacc", "force", "search", "M_qacc", "M_search"), m.nv)
         for rows in (self.limits, self.friction, self.ground, self.dense):
             self.arrays.update(rows.arrays)
+        self.by_slopes = near(m) == 0
         self.places = self.ground.count + self.dense.count
         directions = max(len(rows.pyramid.directions) for rows in (self.ground, self.dense))
         self.arrays["contact_D"] = self.places
@@ -69,9 +73,10 @@ class NewtonSolver:
             self._set_direction(direction)
         with block.function("project") as projection:
             self._project(projection)
+        block("float quadratic[3];")
         with block.function("line_search", "const float decrement") as search:
             self._line_search(search, scale)
-        with block.function("move", "const float alpha") as step:
+        with block.function("move", "Search& step") as step:
             self._move(step)
         block("const auto any_of_block = [](bool x) { return x; };")
         block(shared.newton(literal(scale), literal(tolerance(m)), str(option.iterations), "false"))
@@ -130,19 +135,20 @@ class NewtonSolver:
             block.set(f"M_search[{i}]", product)
 
     def _line_search(self, block: Block, scale: float) -> None:
-        """Returns a step along the direction."""
+        """Returns a step along the direction, and sets the quadratic form there."""
         m, nv, option = self.m, self.m.nv, self.m.opt
         search = cells("search", nv)
         residual = [cell(f"M_qacc[{i}]") - cell(f"force[{i}]") for i in range(nv)]
         sums = (dot(search, residual), dot(search, cells("M_search", nv)), dot(search, search))
-        block(f"const float quadratic[3] = {{{', '.join([block.value(x) for x in sums])}}};")
+        for i, x in enumerate(sums):
+            block.set(f"quadratic[{i}]", x)
         block("float whole[4] = {0.0f, 0.0f, 0.0f, 0.0f};")
-        block(self._each_row(WHOLE))
+        block(self._each_row(WHOLE_BY_SLOPES if self.by_slopes else WHOLE))
         block("const auto add_rows = [&](const float* alphas, const int n, float* sums) {")
-        block(self._each_row(STEPS))
+        block(self._each_row(STEPS_BY_SLOPES if self.by_slopes else STEPS))
         block("};")
         tolerances = literal(scale), literal(tolerance(m) * option.ls_tolerance), literal(near(m))
-        block(shared.line_search(*tolerances, str(option.ls_iterations)))
+        block(shared.line_search(*tolerances, str(option.ls_iterations), "true" if self.by_slopes else "false"))
 
     def _each_row(self, body: str) -> str:
         """Returns C++ that runs ``body`` for each row, ``row``."""
@@ -155,14 +161,21 @@ class NewtonSolver:
         return "\n".join(loops)
 
     def _move(self, block: Block) -> None:
-        """Moves along the direction, and returns whether a row changed sides."""
+        """Moves along the direction, and returns whether a row changed sides; says what is gained if no search has."""
+        block("const float alpha = step.alpha;")
+        gained = ""
+        if self.by_slopes:
+            block("float change = alpha * quadratic[0] + 0.5f * alpha * alpha * quadratic[1];")
+            gained = "change += row.change(alpha); "
         for i in range(self.m.nv):
             block(f"qacc[{i}] += alpha * search[{i}]; M_qacc[{i}] += alpha * M_search[{i}];")
         block("bool changed = false;")
-        block(self.limits.advance())
-        block(self.friction.advance())
+        block(self.limits.advance(gained))
+        block(self.friction.advance(gained))
         if self.ground.count:
-            block(self.ground.pyramid.advance("0", "ground"))
+            block(self.ground.pyramid.advance("0", "ground", gained))
         if self.dense.count:
-            block(self.dense.pyramid.advance("ground", "contacts"))
+            block(self.dense.pyramid.advance("ground", "contacts", gained))
+        if self.by_slopes:
+            block("step.improvement = -change;")
         block("return changed;")
