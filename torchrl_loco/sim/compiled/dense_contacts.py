@@ -185,10 +185,10 @@ class DenseContacts:
         nv, (_, qvel, qacc) = self.tree.m.nv, variables
         if len(self.touch):
             block("contact_zones[k] = 0;")
-        block.set("contact_D[k]", weight)
+        block.set("contact[k].D", weight)
         for i, jacobian in enumerate(jacobians):
             velocity = total(jacobian[d] * (qacc[d] + damping * qvel[d]) for d in range(nv))
-            block.set(f"contact_x{i}[k]", (residual if i == 0 else 0) + velocity)
+            block.set(f"contact[k].x{i}", (residual if i == 0 else 0) + velocity)
             for d in range(nv):
                 block.set(f"dense_J{i}[(k - ground) * {nv} + {d}]", jacobian[d])
 
@@ -242,7 +242,7 @@ class DenseContacts:
                 product = total(
                     cell(f"dense_J{d}[(k - ground) * {nv} + {i}]") * cell(f"search[{i}]") for i in range(nv)
                 )
-                contact.set(f"contact_v{d}[k]", product)
+                contact.set(f"contact[k].v{d}", product)
 
     def gather(self, block: Block) -> None:
         """Adds the forces to the gradient, and lists the Hessian as modes: weights and vectors of rank-one terms.
@@ -253,8 +253,8 @@ class DenseContacts:
         nv, directions = self.tree.m.nv, self.pyramid.directions
         block("int modes = 0;")
         with block.scope("for (int k = ground; k < contacts; ++k)") as contact:
-            x = [cell(f"contact_x{d}[k]") for d in directions]
-            gradient, hessian = self.pyramid.response(cell("contact_D[k]"), x)
+            x = [cell(f"contact[k].x{d}") for d in directions]
+            gradient, hessian = self.pyramid.response(cell("contact[k].D"), x)
             gradient = [contact.keep(entry) for entry in gradient]
             hessian = {key: contact.keep(entry) for key, entry in hessian.items()}
             jacobian = [[cell(f"dense_J{d}[(k - ground) * {nv} + {i}]") for i in range(nv)] for d in directions]

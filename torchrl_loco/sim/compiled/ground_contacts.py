@@ -19,7 +19,19 @@ from torchrl_loco.sim.compiled.dynamics import Dynamics
 from torchrl_loco.sim.compiled.parameters import is_of_model
 from torchrl_loco.sim.compiled.pyramid import FLAT, FRICTIONLESS, FULL
 from torchrl_loco.sim.compiled.sensors import TouchSensors
-from torchrl_loco.sim.compiled.symbols import Block, Scalar, cell, cross, dot, literal, names, scalar, total, zeros
+from torchrl_loco.sim.compiled.symbols import (
+    Block,
+    Scalar,
+    cell,
+    cells_of,
+    cross,
+    dot,
+    literal,
+    names,
+    scalar,
+    total,
+    zeros,
+)
 
 
 class GroundContacts:
@@ -29,18 +41,23 @@ class GroundContacts:
         tree: the dynamics.
         found: pairs of geoms that may touch.
         touch: the sensors that may feel them.
+        with_frames: whether their directions are stored where they differ, even if the solver does without.
 
     Attributes:
         directions: of contact ``k``: the normal, and the two tangents times friction, ``(3,)`` each.
+        fields: what a contact stores besides its rows, in C++.
+        response: what a body adds up of its contacts, in C++.
     """
 
-    def __init__(self, tree: Dynamics, found: list[Pair], touch: TouchSensors) -> None:
+    def __init__(self, tree: Dynamics, found: list[Pair], touch: TouchSensors, *, with_frames: bool = False) -> None:
         m, self.tree, self.touch = tree.m, tree, touch
         self.corners = corners(m, found)
         self.count = len(self.corners)
         self.bodies = sorted({self.body(corner) for corner in self.corners})
         twists = tree.twists(names("search", m.nv))
         self.live = [i for i in range(6) if any(scalar(twists[b][i]).constant != 0 for b in self.bodies)]
+        self._weights = [contact_weight(m, corner.pair) for corner in self.corners]
+        self._weights_differ = len(set(map(scalar, self._weights))) > 1
         self._frames = [self._frame(corner) for corner in self.corners]
         self._lever = self._varying("lever", [self._point(corner) for corner in self.corners])
         self.directions = [
@@ -55,13 +72,12 @@ class GroundContacts:
             self.pyramid = FLAT
         else:
             self.pyramid = FULL
-        packed = len(self.live) * (len(self.live) + 1) // 2
-        self.arrays = {
-            "body_twist": len(self.bodies) * len(self.live),
-            "body_gradient": len(self.bodies) * len(self.live),
-            "body_stiffness": len(self.bodies) * packed,
-            **{f"contact_{title}{i}": self.count for title in ("lever", "normal", "tangent") for i in range(3)},
-        }
+        read = [*self._velocity(self._stored_twist()), *(np.concatenate(self.directions) if with_frames else ())]
+        titles = [f"{title}{i}" for title in ("lever", "normal", "tangent") for i in range(3)]
+        self._stored = [title for title in titles if f"contact[k].{title}" in cells_of(map(scalar, read))]
+        self.fields = ["int body", *(f"float {title}" for title in self._stored)] if self.corners else []
+        self.response = [f"float gradient[{len(self.live)}], stiffness[{len(self.live) * (len(self.live) + 1) // 2}]"]
+        self.arrays = {"body_twist": len(self.bodies) * len(self.live)}
 
     def body(self, corner: Corner) -> int:
         """Returns the body of a corner."""
@@ -101,7 +117,7 @@ class GroundContacts:
         def component(i: int) -> Scalar:
             values = {scalar(vector[i]) for vector in vectors}
             agreed = values.pop() if len(values) == 1 else None
-            return agreed if agreed is not None and is_of_model(agreed) else cell(f"contact_{title}{i}[k]")
+            return agreed if agreed is not None and is_of_model(agreed) else cell(f"contact[k].{title}{i}")
 
         return np.array([component(i) for i in range(3)], dtype=object)
 
@@ -109,7 +125,7 @@ class GroundContacts:
         """Returns the twist of the body of contact ``k``, ``(6,)``."""
         twist = zeros(6)
         for i, component in enumerate(self.live):
-            twist[component] = cell(f"body_twist[{len(self.live)} * contact_body[k] + {i}]")
+            twist[component] = cell(f"body_twist[{len(self.live)} * contact[k].body + {i}]")
         return twist
 
     def _velocity(self, twist: np.ndarray) -> list[Scalar]:
@@ -124,11 +140,14 @@ class GroundContacts:
             position = self._distance(corner) - corner.pair.margin
             with block.scope(f"if ({block.value(position)} < 0.0f)") as touching:
                 touching("const int k = ground++;")
-                touching(f"contact_corner[k] = {i}; contact_body[k] = {self.bodies.index(self.body(corner))};")
-                touching.set("contact_x0[k]", position)
+                touching(f"contact_corner[k] = {i}; contact[k].body = {self.bodies.index(self.body(corner))};")
+                touching.set("contact[k].x0", position)
+                if self._weights_differ:
+                    touching.set("contact[k].D", scalar(self._weights[i]))
                 for title, vector in (("lever", self._point(corner)), ("normal", normal), ("tangent", tangent)):
                     for component in range(3):
-                        touching.set(f"contact_{title}{component}[k]", vector[component])
+                        if f"{title}{component}" in self._stored:
+                            touching.set(f"contact[k].{title}{component}", vector[component])
                 self._feel(touching, corner)
         if self.corners:
             self._create_rows(block, variables)
@@ -142,7 +161,7 @@ class GroundContacts:
         table = Table(block, "corner", "contact_corner[k]")
         rows = [Softness.make(m, corner.pair.solref, corner.pair.solimp) for corner in self.corners]
         softness = Softness.from_table(table, rows)
-        weight = table.column("weight", [contact_weight(m, corner.pair) for corner in self.corners])
+        weight = cell("contact[k].D") if self._weights_differ else scalar(self._weights[0])
         least = table.column("least", [least_regularisation(corner.pair) for corner in self.corners])
         share = table.column("share", [self.pyramid.share(corner.pair.condim) for corner in self.corners])
         for damping in sorted({float(np.float32(row.damping)) for row in rows}):
@@ -151,9 +170,9 @@ class GroundContacts:
                 with some.loop("k", "ground") as contact:
                     if scalar(softness.damping).constant is None:
                         contact(f"if ({contact.value(softness.damping)} != {literal(damping)}) continue;")
-                    position = contact.keep(cell("contact_x0[k]"))
+                    position = contact.keep(cell("contact[k].x0"))
                     inertia, residual = softness.row(weight, position, least)
-                    contact.set("contact_D[k]", inertia * share)
+                    contact.set("contact[k].D", inertia * share)
                     self._set(contact, "x", residual)
 
     def _feel(self, block: Block, corner: Corner) -> None:
@@ -177,7 +196,7 @@ class GroundContacts:
     def _set(self, block: Block, field: str, residual: Scalar | float = 0.0) -> None:
         velocity = self._velocity(self._stored_twist())
         for d in self.pyramid.directions:
-            block.set(f"contact_{field}{d}[k]", velocity[d] if d else residual + velocity[d])
+            block.set(f"contact[k].{field}{d}", velocity[d] if d else residual + velocity[d])
 
     def project(self, block: Block, search: list[Scalar]) -> None:
         """Sets how the residuals change along the search direction."""
@@ -198,17 +217,16 @@ class GroundContacts:
         if not self.count:
             return forces, stiffness
         packed = [(i, j) for i in range(len(live)) for j in range(i + 1)]
-        for title in ("body_gradient", "body_stiffness"):
-            block(f"for (int i = 0; i < {self.arrays[title]}; ++i) {title}[i] = 0.0f;")
+        block("for (Response& each : response) each = {};")
         with block.loop("k", "ground") as contact:
-            x = [cell(f"contact_x{d}[k]") for d in pyramid.directions]
-            gradient, hessian = pyramid.response(cell("contact_D[k]"), x)
+            x = [cell(f"contact[k].x{d}") for d in pyramid.directions]
+            gradient, hessian = pyramid.response(cell("contact[k].D"), x)
             wrenches = [
                 np.concatenate([cross(self._lever, self.directions[d]), self.directions[d]]) for d in pyramid.directions
             ]
             force = total(gradient[d] * wrenches[d] for d in pyramid.directions)
             for i, component in enumerate(live):
-                contact.set(f"body_gradient[{len(live)} * contact_body[k] + {i}]", force[component], "+=")
+                contact.set(f"response[contact[k].body].gradient[{i}]", force[component], "+=")
             columns = [
                 total(
                     hessian[min(d, e), max(d, e)] * wrenches[e]
@@ -219,11 +237,11 @@ class GroundContacts:
             ]
             for at, (i, j) in enumerate(packed):
                 entry = total(wrenches[d][live[i]] * columns[d][live[j]] for d in pyramid.directions)
-                contact.set(f"body_stiffness[{len(packed)} * contact_body[k] + {at}]", entry, "+=")
+                contact.set(f"response[contact[k].body].stiffness[{at}]", entry, "+=")
         for b, body in enumerate(self.bodies):
             for i, component in enumerate(live):
-                forces[body][component] = cell(f"body_gradient[{len(live) * b + i}]")
+                forces[body][component] = cell(f"response[{b}].gradient[{i}]")
             for at, (i, j) in enumerate(packed):
-                entry = cell(f"body_stiffness[{len(packed) * b + at}]")
+                entry = cell(f"response[{b}].stiffness[{at}]")
                 stiffness[body][live[i], live[j]] = stiffness[body][live[j], live[i]] = entry
         return forces, stiffness

@@ -74,18 +74,18 @@ class Pyramid:
 
     def _gradient(self) -> list[Scalar]:
         """Returns the gradient of the cost of contact ``k`` with respect to the directions."""
-        return self.response(cell("contact_D[k]"), [cell(f"contact_x{d}[k]") for d in self.directions])[0]
+        return self.response(cell("contact[k].D"), [cell(f"contact[k].x{d}") for d in self.directions])[0]
 
     def loop(self, first: str, count: str, body: str) -> str:
         """Returns a C++ loop over the edges of contacts, each a ``row``."""
         lines = [f"#pragma unroll 1\nfor (int k = {first}; k < {count}; ++k) {{"]
         for sign, direction, copies in self.edges:
             x, v = (
-                f"contact_{field}0[k]"
-                + (f" {'+' if sign > 0 else '-'} contact_{field}{direction}[k]" if direction else "")
+                f"contact[k].{field}0"
+                + (f" {'+' if sign > 0 else '-'} contact[k].{field}{direction}" if direction else "")
                 for field in "xv"
             )
-            weight = f"{literal(copies)} * contact_D[k]" if copies > 1 else "contact_D[k]"
+            weight = f"{literal(copies)} * contact[k].D" if copies > 1 else "contact[k].D"
             lines.append(f"  {{ const ConstraintRow row = {{{x}, {v}, {weight}, 0.0f, false}}; {body} }}")
         return "\n".join([*lines, "}"])
 
@@ -98,7 +98,7 @@ class Pyramid:
             before: what is done with each edge before.
         """
         edges = self.loop(first, count, f"{before}changed |= row.crosses(row.after(alpha));").removesuffix("}")
-        moves = " ".join(f"contact_x{d}[k] += alpha * contact_v{d}[k];" for d in self.directions)
+        moves = " ".join(f"contact[k].x{d} += alpha * contact[k].v{d};" for d in self.directions)
         return f"{edges}  {moves}\n}}"
 
 

@@ -32,6 +32,11 @@ class NewtonSolver:
         tree: the dynamics.
         found: pairs of geoms that may touch.
         contact_geoms: geoms whose contact forces are asked for.
+
+    Attributes:
+        arrays: C++ arrays of floats, and how many each has.
+        structs: C++ arrays of structs, how many each has, and their fields. What a loop over contacts reads of one is a
+            load or two.
     """
 
     def __init__(self, tree: Dynamics, found: list[Pair], contact_geoms: Sequence[int] = ()) -> None:
@@ -39,7 +44,7 @@ class NewtonSolver:
         m = self.m = tree.m
         self.limits, self.friction = JointLimits(m), DryFriction(m)
         self.touch = TouchSensors(m, tree.poses)
-        self.ground = GroundContacts(tree, found, self.touch)
+        self.ground = GroundContacts(tree, found, self.touch, with_frames=bool(contact_geoms))
         self.dense = DenseContacts(tree, found, self.ground, self.touch, with_frames=bool(contact_geoms))
         self.arrays = dict.fromkeys(("qacc", "force", "search", "M_qacc", "M_search"), m.nv)
         for rows in (self.limits, self.friction, self.ground, self.dense):
@@ -47,8 +52,11 @@ class NewtonSolver:
         self.by_slopes = near(m) == 0
         self.places = self.ground.count + self.dense.count
         directions = max(len(rows.pyramid.directions) for rows in (self.ground, self.dense))
-        self.arrays["contact_D"] = self.places
-        self.arrays.update({f"contact_{field}{d}": self.places for field in "xv" for d in range(directions)})
+        rows_of_contact = [f"{field}{d}" for field in "xv" for d in range(directions)]
+        self.structs = {
+            "contact": (self.places, [f"float {', '.join([*rows_of_contact, 'D'])}", *self.ground.fields]),
+            "response": (len(self.ground.bodies), self.ground.response),
+        }
         self.arrays["touch"] = len(self.touch)
         if self.dense.count:
             self.arrays.update({"gradient": m.nv, "solution": m.nv})

@@ -214,6 +214,20 @@ def sincos(x: Any) -> tuple[Scalar, Scalar]:
     return sine, Scalar("cos", sine)
 
 
+def cells_of(expressions: Iterable[Scalar]) -> set[str]:
+    """Returns the C++ of the variables and elements, assigned more than once, that some expressions read."""
+    found, seen, stack = set(), set(), list(expressions)
+    while stack:
+        node = stack.pop()
+        if node in seen:
+            continue
+        seen.add(node)
+        if node.op == "cell":
+            found.add(node.args[0])
+        stack += [arg for arg in node.args if isinstance(arg, Scalar)]
+    return found
+
+
 def select(left: Any, comparison: str, right: Any, if_true: Any, if_false: Any) -> Scalar:
     """Returns ``if_true`` where ``left comparison right`` holds, such as ``a < b``, else ``if_false``."""
     a, b = scalar(if_true), scalar(if_false)

@@ -58,12 +58,16 @@ def source(
     if substeps or TOUCH in m.sensor_type or contact_geoms:
         if not substeps:
             world("// Touch is a force: a step that is not taken finds it, without actuation.")
-        step, arrays = _substep(m, substeps, contact_geoms, contact_rows)
-        for title, count in arrays.items():
+        step, solver = _substep(m, substeps, contact_geoms, contact_rows)
+        for title, count in solver.arrays.items():
             if count and title != "qacc":
                 world(f"float {title}[{count}];")
-        for title in ("contact_corner", "contact_body", *(["contact_zones"] if arrays["touch"] else [])):
-            world(f"int {title}[{max(arrays['contact_D'], 1)}];")
+        for title, (count, fields) in solver.structs.items():
+            if count:
+                world(f"struct alignas(16) {title.title()} {{ {'; '.join(fields)}; }} {title}[{count}];")
+        if solver.places:
+            for title in ("contact_corner", *(["contact_zones"] if solver.touch else [])):
+                world(f"int {title}[{solver.places}];")
         world("#pragma unroll 1")
         world(f"for (int step = 0; step < {max(substeps, 1)}; ++step) {{")
         world.lines += [f"  {line}" for line in "\n".join(step.lines).splitlines()]
@@ -86,8 +90,8 @@ def _argument(title: str) -> str:
 
 def _substep(
     m: mujoco.MjModel, substeps: int, contact_geoms: Sequence[int], contact_rows: int
-) -> tuple[Block, dict[str, int]]:
-    """Returns one of ``substeps`` physics steps, and the arrays that it needs; with 0 it does not integrate."""
+) -> tuple[Block, NewtonSolver]:
+    """Returns one of ``substeps`` physics steps, and its solver; with 0 it does not integrate."""
     block = Block()
     qpos, qvel = names("qpos", m.nq), names("qvel", m.nv)
     tree = Dynamics(m, qpos, qvel, names("ctrl", m.nu) if substeps else None)
@@ -109,7 +113,7 @@ def _substep(
                 solver.read_contact_forces(last)
     if substeps:
         _integrate(block, m, tree)
-    return block, solver.arrays
+    return block, solver
 
 
 def _integrate(block: Block, m: mujoco.MjModel, tree: Dynamics) -> None:
