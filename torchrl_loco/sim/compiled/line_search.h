@@ -18,20 +18,26 @@ if (fabsf(start.slope) < noise) return result;
 
 const Point first = Point::at(1.0f, slope, curvature, whole + 1);
 if (BY_SLOPES) {  // Newton's method between two slopes of different sign: it is exact once it knows which rows are active
-  const float unknown = Math::from_bits(0x7f800000u);
-  float low = 0.0f, high = unknown;
+  const auto step = [](const Point& p) { return -p.slope * Math::inverse(p.curvature); };
+  // Whether p is the minimum, or what is left to it is rounding of alpha.
+  const auto found = [&](const Point& p, float left) {
+    return (fabsf(p.slope) < accept) | (fabsf(left) < 1e-6f * p.alpha);
+  };
+  float low = 0.0f, high = Math::from_bits(0x7f800000u), left = step(first);
   Point last = first;
-  bool flat = fabsf(last.slope) < accept, stuck = false;
-  ROLLED for (int i = 0; i < 3 * LS_ITERATIONS && !(flat | stuck); ++i) {
+  bool flat = found(first, left), ends = flat | (LS_ITERATIONS == 0);
+  ROLLED for (int more = 3 * LS_ITERATIONS; !ends; --more) {
     low = last.slope < 0.0f ? last.alpha : low;
     high = last.slope < 0.0f ? high : last.alpha;
-    const float next = last.alpha - last.slope * Math::inverse(last.curvature);
+    const float next = last.alpha + left;
     const float alphas[1] = {(next > low) & (next < high) ? next : 0.5f * (low + high)};
-    stuck = (alphas[0] == low) | (alphas[0] == high);
+    const bool stuck = (alphas[0] == low) | (alphas[0] == high);
     float sums[3] = {0.0f, 0.0f, 0.0f};
     add_rows(alphas, 1, sums);
     last = Point::at(alphas[0], slope, curvature, sums);
-    flat = fabsf(last.slope) < accept;
+    left = step(last);
+    flat = found(last, left);
+    ends = flat | stuck | (more == 1);
   }
   result.alpha = flat | (last.slope < 0.0f) ? last.alpha : low;  // up to there the cost falls
   return result;
