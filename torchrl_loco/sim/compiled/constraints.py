@@ -134,8 +134,8 @@ class Softness:
             least: least regularisation, one over the largest D.
         """
         impedance = self.impedance(position)
-        regularisation = maximum(scalar(weight) * (1 - impedance) / impedance, least)
-        return 1 / regularisation, self.stiffness * impedance * position
+        regularisation = maximum(scalar(weight) * (1 - impedance), least * impedance)  # times impedance
+        return impedance / regularisation, self.stiffness * impedance * position
 
     @classmethod
     def as_cpp(cls) -> str:
@@ -229,13 +229,11 @@ class JointLimits:
                 position, sign = minimum(below, above) - m.jnt_margin[j], select(below, "<", above, 1, -1)
             else:
                 position, sign = (below if side > 0 else above) - m.jnt_margin[j], scalar(side)
+            softness = Softness.make(m, m.jnt_solref[j], m.jnt_solimp[j])
+            weight, residual = softness.row(m.dof_invweight0[d], position)
             block.set(f"limit_sign[{i}]", sign)
-            block(f"limit_D[{i}] = limit_x[{i}] = 0.0f;")
-            with block.scope(f"if ({block.value(position)} < 0.0f)") as violated:
-                softness = Softness.make(m, m.jnt_solref[j], m.jnt_solimp[j])
-                weight, residual = softness.row(m.dof_invweight0[d], position)
-                violated.set(f"limit_D[{i}]", weight)
-                violated.set(f"limit_x[{i}]", residual + sign * (softness.damping * qvel[d] + qacc[d]))
+            block.set(f"limit_D[{i}]", select(position, "<", 0, weight, 0))
+            block.set(f"limit_x[{i}]", residual + sign * (softness.damping * qvel[d] + qacc[d]))
 
     def project(self, block: Block, search: list[Scalar]) -> None:
         """Sets how the residuals change along the search direction."""
