@@ -198,13 +198,15 @@ class GroundContacts:
         for d in self.pyramid.directions:
             block.set(f"contact[k].{field}{d}", velocity[d] if d else residual + velocity[d])
 
-    def project(self, block: Block, search: list[Scalar]) -> None:
-        """Sets how the residuals change along the search direction."""
+    def project(self, block: Block, search: list[Scalar], body: str) -> None:
+        """Sets how the residuals change along the search direction, then runs ``body`` for each ``row``."""
         if self.count:
             with block.scope("if (ground > 0)") as some:
                 self._store_twists(some, search)
                 with some.loop("k", "ground") as contact:
                     self._set(contact, "v")
+                    for line in self.pyramid.rows(body):
+                        contact(line)
 
     def gather(self, block: Block) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Adds up gradient and Hessian of the cost at each body.

@@ -76,9 +76,9 @@ class Pyramid:
         """Returns the gradient of the cost of contact ``k`` with respect to the directions."""
         return self.response(cell("contact[k].D"), [cell(f"contact[k].x{d}") for d in self.directions])[0]
 
-    def loop(self, first: str, count: str, body: str) -> str:
-        """Returns a C++ loop over the edges of contacts, each a ``row``."""
-        lines = [f"#pragma unroll 1\nfor (int k = {first}; k < {count}; ++k) {{"]
+    def rows(self, body: str) -> list[str]:
+        """Returns C++ statements that run ``body`` for each edge of contact ``k``, ``row``."""
+        lines = []
         for sign, direction, copies in self.edges:
             x, v = (
                 f"contact[k].{field}0"
@@ -86,8 +86,13 @@ class Pyramid:
                 for field in "xv"
             )
             weight = f"{literal(copies)} * contact[k].D" if copies > 1 else "contact[k].D"
-            lines.append(f"  {{ const ConstraintRow row = {{{x}, {v}, {weight}, 0.0f, false}}; {body} }}")
-        return "\n".join([*lines, "}"])
+            lines.append(f"{{ const ConstraintRow row = {{{x}, {v}, {weight}, 0.0f, false}}; {body} }}")
+        return lines
+
+    def loop(self, first: str, count: str, body: str) -> str:
+        """Returns a C++ loop over the edges of contacts, each a ``row``."""
+        lines = "".join(f"  {line}\n" for line in self.rows(body))
+        return f"#pragma unroll 1\nfor (int k = {first}; k < {count}; ++k) {{\n{lines}}}"
 
     def advance(self, first: str, count: str, before: str) -> str:
         """Returns C++ that moves the residuals along the search direction, and notes whether an edge changed sides.

@@ -79,9 +79,9 @@ class NewtonSolver:
         scale = 1 / (m.stat.meaninertia * max(m.nv, 1))
         with block.function("set_direction", "bool, float& gradient_squared, float& decrement") as direction:
             self._set_direction(direction)
+        block("float quadratic[3], whole[4];")
         with block.function("project") as projection:
             self._project(projection)
-        block("float quadratic[3];")
         with block.function("line_search", "const float decrement") as search:
             self._line_search(search, scale)
         with block.function("move", "Search& step") as step:
@@ -133,12 +133,14 @@ class NewtonSolver:
             block.set(f"search[{i}]", -entry)
 
     def _project(self, block: Block) -> None:
-        """Sets how residuals and M qacc change along the search direction."""
-        search = cells("search", self.m.nv)
-        self.ground.project(block, search)
+        """Sets how residuals and M qacc change along the search direction, and what a line search asks of all rows."""
+        search, whole = cells("search", self.m.nv), WHOLE_BY_SLOPES if self.by_slopes else WHOLE
+        block("for (float& sum : whole) sum = 0.0f;")
         self.limits.project(block, search)
         self.friction.project(block, search)
         self.dense.project(block)
+        block(self._each_row(whole, ground=False))
+        self.ground.project(block, search, whole)
         for i, product in enumerate(self.tree.mass_times(search)):
             block.set(f"M_search[{i}]", product)
 
@@ -150,18 +152,16 @@ class NewtonSolver:
         sums = (dot(search, residual), dot(search, cells("M_search", nv)), dot(search, search))
         for i, x in enumerate(sums):
             block.set(f"quadratic[{i}]", x)
-        block("float whole[4] = {0.0f, 0.0f, 0.0f, 0.0f};")
-        block(self._each_row(WHOLE_BY_SLOPES if self.by_slopes else WHOLE))
         block("const auto add_rows = [&](const float* alphas, const int n, float* sums) {")
         block(self._each_row(STEPS_BY_SLOPES if self.by_slopes else STEPS))
         block("};")
         tolerances = literal(scale), literal(tolerance(m) * option.ls_tolerance), literal(near(m))
         block(shared.line_search(*tolerances, str(option.ls_iterations), "true" if self.by_slopes else "false"))
 
-    def _each_row(self, body: str) -> str:
-        """Returns C++ that runs ``body`` for each row, ``row``."""
+    def _each_row(self, body: str, *, ground: bool = True) -> str:
+        """Returns C++ that runs ``body`` for each row, ``row``, with or without contacts with the ground."""
         loops = [self.limits.loop(body)]
-        if self.ground.count:
+        if self.ground.count and ground:
             loops.append(self.ground.pyramid.loop("0", "ground", body))
         if self.dense.count:
             loops.append(self.dense.pyramid.loop("ground", "contacts", body))
