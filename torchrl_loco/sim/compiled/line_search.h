@@ -54,7 +54,7 @@ if (LS_NEAR > 0.0f && LS_ITERATIONS > 3) {  // a step at a time: most searches e
       high = last;
       between = true;
     }
-    float alphas[1] = {i == 0 && between ? low.secant(high) : last.newton()};
+    float alphas[1] = {last.newton()};
     if (between && !(alphas[0] > low.alpha && alphas[0] < high.alpha)) alphas[0] = 0.5f * (low.alpha + high.alpha);
     if (alphas[0] == last.alpha || alphas[0] == low.alpha || alphas[0] == high.alpha) break;
     float sums[3] = {0.0f, 0.0f, 0.0f};
