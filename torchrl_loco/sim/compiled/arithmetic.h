@@ -36,8 +36,6 @@ struct Math {
   static INLINE float root(float x) { return x * inverse_root(x); }
   static INLINE int bits(unsigned x) { return __popc(x); }
   static INLINE int lowest_bit(unsigned x) { return __ffs(x) - 1; }
-  static INLINE int highest_bit(unsigned x) { return 31 - __clz(x); }
-  static INLINE int highest_bit(unsigned long long x) { return 63 - __clzll(x); }
 #else
   static INLINE float divide(float a, float b) { return a / b; }
   static INLINE float inverse(float a) { return 1.0f / a; }
@@ -45,11 +43,7 @@ struct Math {
   static INLINE float root(float x) { return sqrtf(x); }
   static INLINE int bits(unsigned x) { return __builtin_popcount(x); }
   static INLINE int lowest_bit(unsigned x) { return __builtin_ctz(x); }
-  static INLINE int highest_bit(unsigned x) { return 31 - __builtin_clz(x); }
-  static INLINE int highest_bit(unsigned long long x) { return 63 - __builtin_clzll(x); }
 #endif
-  static INLINE unsigned below_highest(unsigned x) { return x ^ 1u << highest_bit(x); }
-  static INLINE unsigned long long below_highest(unsigned long long x) { return x ^ 1ull << highest_bit(x); }
   static INLINE float from_bits(unsigned x) {
     union { unsigned bits; float value; } same = {x};
     return same.value;

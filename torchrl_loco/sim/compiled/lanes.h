@@ -70,6 +70,7 @@ enum {
   QUADS = STRIDE / 4,
   PITCH = 4 * (QUADS | 1),  // of rows that several lanes write at once: they begin in different banks
   SLOTS = (STRIDE + LANES - 1) / LANES,
+  LINK_SLOTS = (Model::LINKS + LANES - 1) / LANES,
   SEVERAL_ROWS = SLOTS > 1,  // a lane has some: then what spares rounds pays for a longer text
   CONTACTS = Model::FRICTIONAL + Model::FRICTIONLESS,
   // Columns are left out where a lane knows those of a contact of each kind; alone, it looks at each number itself.
@@ -85,11 +86,18 @@ enum {
 //END
 };
 #define OWN_DOFS(slot, dof) UNROLLED for (int slot = 0, dof = lane; slot < SLOTS; ++slot, dof += LANES)
+#define OWN_LINKS(slot, link) UNROLLED for (int slot = 0, link = lane; slot < LINK_SLOTS; ++slot, link += LANES)
 #define SHARED_LOOP(i, count) ROLLED for (int i = lane; i < (count); i += LANES)
 
 struct alignas(16) Quad { float v[4]; };
 
-struct alignas(16) LocalPose { Quat orientation; Vec position; };
+struct LocalPose {
+  Quat orientation;
+  Vec position;
+  INLINE LocalPose after(const LocalPose& parent) const {
+    return {parent.orientation * orientation, parent.position + parent.orientation.rotate(position)};
+  }
+};
 struct alignas(16) Pose { Mat orientation; Vec position; };
 struct alignas(16) Body { Inertia inertia; Vec torque, force; };  // 16 floats
 struct alignas(16) Geom { Vec center, half_axis; float radius; };  // only a capsule has a half axis
@@ -99,11 +107,15 @@ struct alignas(16) World {
   float qpos[(Model::POSITIONS + 3) / 4 * 4];
   float qvel[STRIDE], qacc[STRIDE], search[STRIDE];
   float residual[STRIDE];     // M qacc minus the smooth forces
-  float mass_search[STRIDE];  // M times the search direction
-  Motion axes[DOFS];          // motion of the tree for a unit velocity of each degree of freedom (MuJoCo's cdof)
   float mass[DOFS * STRIDE];
-  // Constraint rows: residual J qacc - aref, weight D. They cost D x^2 / 2 where x < 0, all but those of cones.
-  float x[Model::ROWS], weight[Model::ROWS];
+  union {
+    Motion axes[DOFS];  // until the Jacobian is set up: of the tree for a unit velocity of each degree of freedom (cdof)
+    struct {
+      float mass_search[STRIDE];  // M times the search direction
+      // Constraint rows: residual J qacc - aref, weight D. They cost D x^2 / 2 where x < 0, all but those of cones.
+      float x[Model::ROWS], weight[Model::ROWS];
+    };
+  };
   union {
     struct {  // until the rows are set up
       Contact contacts[CONTACTS];
@@ -117,16 +129,12 @@ struct alignas(16) World {
     struct { float limb_pivots[2][Model::LIMBS * PIVOT], corner[CORNER]; };
 //END
     float change[Model::ROWS];  // of the residuals, along the direction
-    Motion velocity[Model::LINKS];  // of each link relative to its parent; with a single lane, to the world
+    Motion velocity[Model::LINKS];  // of each link
   };
   float projected[Model::JACOBIAN_ROWS];  // Jacobian times the search direction
   union {
     struct {  // until the contacts are known
-      union {
-        LocalPose local[Model::LINKS];
-        Motion acceleration[Model::LINKS];
-        Motion momentum[DOFS];  // of the subtree that a degree of freedom moves, at unit velocity
-      };
+      Motion momentum[DOFS];  // of the subtree that a degree of freedom moves, at unit velocity
       Pose pose[Model::LINKS];
       Body bodies[Model::LINKS];
       Geom geoms[Model::GEOMS + 1];
@@ -379,18 +387,64 @@ struct Step : Math {
 
   // ---- Kinematics
 
-  // The links to visit when something is summed over the ancestors of a link, or over these and itself: the highest
-  // bit, which is the nearest, first. A single lane visits the links in their order, parents first, so that what it
-  // finds at the parent already includes the parent's ancestors.
-  typedef Model::Links Links;
-  static INLINE Links bit(int link) { return link < 0 ? 0 : (Links)1 << link; }
-  static INLINE Links to_root(int link) { return link < 0 || LANES == 1 ? bit(link) : Model::to_root(link); }
-  static INLINE Links ancestors(int link) { return LANES == 1 ? bit(Model::parent(link)) : to_root(link) ^ bit(link); }
+  // What each link has, from its owner.
+  INLINE float of_link(const float* own, const int stride, int link) const {
+    float value = read(own[0], (unsigned)link % LANES);
+    UNROLLED for (int i = 1; i < LINK_SLOTS; ++i) {
+      const float other = read(own[stride * i], (unsigned)link % LANES);
+      if (link / LANES == i) value = other;
+    }
+    return value;
+  }
 
-  INLINE Motion sum_over(const Links links, const Motion* own) const {
-    Motion total = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
-    ROLLED for (Links left = links; left; left = below_highest(left)) total = total + own[highest_bit(left)];
-    return total;
+  INLINE Vec of_link(const Vec* own, const int stride, int link) const {
+    return {of_link(&own->x, stride, link), of_link(&own->y, stride, link), of_link(&own->z, stride, link)};
+  }
+  INLINE Motion of_link(const Motion* own, int link) const {
+    enum { SIZE = sizeof(Motion) / sizeof(float) };
+    return {of_link(&own->angular, SIZE, link), of_link(&own->linear, SIZE, link)};
+  }
+  INLINE LocalPose of_link(const LocalPose* own, int link) const {
+    enum { SIZE = sizeof(LocalPose) / sizeof(float) };
+    const Quat& q = own->orientation;
+    return {{of_link(&q.w, SIZE, link), of_link(&q.x, SIZE, link), of_link(&q.y, SIZE, link), of_link(&q.z, SIZE, link)},
+            of_link(&own->position, SIZE, link)};
+  }
+
+  // Adds to what each link has that of its ancestors, or puts its pose after theirs. In each round, a lane asks the
+  // ancestor that is as far away as the round before reached. A single lane visits the links in their order, parents
+  // first.
+  INLINE void sum_to_root(Motion* own) const {
+    if (LANES == 1) {
+      for (int b = 0; b < Model::LINKS; ++b)
+        if (Model::parent(b) >= 0) own[b] = own[b] + own[Model::parent(b)];
+      return;
+    }
+    ROLLED for (int round = 0; round < Model::ROUNDS; ++round) {
+      Motion others[LINK_SLOTS];
+      int above[LINK_SLOTS];
+      OWN_LINKS(slot, b) {
+        above[slot] = Model::above(Model::LINKS * round + (b < Model::LINKS ? b : 0));
+        others[slot] = of_link(own, above[slot]);
+      }
+      OWN_LINKS(slot, b) if (above[slot] >= 0) own[slot] = own[slot] + others[slot];
+    }
+  }
+  INLINE void place_in_world(LocalPose* own) const {
+    if (LANES == 1) {
+      for (int b = 0; b < Model::LINKS; ++b)
+        if (Model::parent(b) >= 0) own[b] = own[b].after(own[Model::parent(b)]);
+      return;
+    }
+    ROLLED for (int round = 0; round < Model::ROUNDS; ++round) {
+      LocalPose others[LINK_SLOTS];
+      int above[LINK_SLOTS];
+      OWN_LINKS(slot, b) {
+        above[slot] = Model::above(Model::LINKS * round + (b < Model::LINKS ? b : 0));
+        others[slot] = of_link(own, above[slot]);
+      }
+      OWN_LINKS(slot, b) if (above[slot] >= 0) own[slot] = own[slot].after(others[slot]);
+    }
   }
 
   INLINE Vec qpos_vec(int i) const { return {w.qpos[i], w.qpos[i + 1], w.qpos[i + 2]}; }
@@ -443,20 +497,15 @@ struct Step : Math {
 
   // Poses of the links, and the centres of mass of the trees.
   INLINE void poses() {
-    SHARED_LOOP(b, Model::LINKS) w.local[b] = local_pose(b);
-    sync();
+    LocalPose own[LINK_SLOTS];
+    OWN_LINKS(slot, b) own[slot] = local_pose(b < Model::LINKS ? b : 0);
+    place_in_world(own);
     Vec moment = {0.0f, 0.0f, 0.0f};  // of the only tree, or of one after the other
-    SHARED_LOOP(b, Model::LINKS) {
-      LocalPose pose = w.local[b];
-      ROLLED for (Links left = ancestors(b); left; left = below_highest(left)) {
-        const LocalPose parent = w.local[highest_bit(left)];
-        pose.position = parent.position + parent.orientation.rotate(pose.position);
-        pose.orientation = parent.orientation * pose.orientation;
-      }
-      if (LANES == 1) w.local[b] = pose;
-      const Pose own = {Mat::from(pose.orientation), pose.position};
-      w.pose[b] = own;
-      if (Model::TREES == 1) moment = moment + center_of_mass(b, own) * Model::link_mass(b);
+    OWN_LINKS(slot, b) {
+      if (b >= Model::LINKS) continue;
+      const Pose pose = {Mat::from(own[slot].orientation), own[slot].position};
+      w.pose[b] = pose;
+      if (Model::TREES == 1) moment = moment + center_of_mass(b, pose) * Model::link_mass(b);
     }
     ROLLED for (int t = 0; t < Model::TREES; ++t) {
       if (Model::TREES > 1) moment = {0.0f, 0.0f, 0.0f};
@@ -469,7 +518,7 @@ struct Step : Math {
     sync();
   }
 
-  // The motion of the tree for a unit velocity of each degree of freedom, and the velocity that each link adds.
+  // The motion of the tree for a unit velocity of each degree of freedom, and the velocity of each link.
   INLINE void velocities() {
     SHARED_LOOP(d, DOFS) {
       const int link = Model::dof_link(d), kind = Model::dof_kind(d), k = Model::dof_component(d);
@@ -492,18 +541,20 @@ struct Step : Math {
       w.axes[d] = axis;
     }
     sync();
-    SHARED_LOOP(b, Model::LINKS) {
-      const int parent = Model::parent(b), end = Model::first_dof(b + 1);
-      int d = Model::first_dof(b);
+    Motion own[LINK_SLOTS];
+    OWN_LINKS(slot, b) {
+      const int end = b < Model::LINKS ? Model::first_dof(b + 1) : 0;
+      int d = b < Model::LINKS ? Model::first_dof(b) : 0;
       Motion velocity = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
-      if (LANES == 1 && parent >= 0) velocity = w.velocity[parent];
       if (Model::HAS_FREE && Model::dof_kind(d) == TRANSLATION) {  // along the axes of the world
         velocity.linear = velocity.linear + Vec{w.qvel[d], w.qvel[d + 1], w.qvel[d + 2]};
         d += 3;
       }
       ROLLED for (; d < end; ++d) velocity = velocity + w.axes[d] * w.qvel[d];
-      w.velocity[b] = velocity;
+      own[slot] = velocity;
     }
+    sum_to_root(own);
+    OWN_LINKS(slot, b) if (b < Model::LINKS) w.velocity[b] = own[slot];
     sync();
   }
 
@@ -512,10 +563,11 @@ struct Step : Math {
   // Bias forces (Coriolis, centrifugal, gravity) and inertias of the links, by recursive Newton-Euler; then both of
   // each subtree, which is all that the mass matrix needs (composite rigid bodies).
   INLINE void subtrees() {
-    SHARED_LOOP(b, Model::LINKS) {  // accelerations that the velocities cause
-      const int parent = Model::parent(b), end = Model::first_joint(b + 1);
-      Motion velocity = sum_over(ancestors(b), w.velocity), acceleration = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
-      if (LANES == 1 && parent >= 0) acceleration = w.acceleration[parent];
+    Motion accelerations[LINK_SLOTS];  // that the velocities cause
+    OWN_LINKS(slot, link) {
+      const int b = link < Model::LINKS ? link : 0, parent = Model::parent(b), end = Model::first_joint(b + 1);
+      Motion velocity = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}}, acceleration = velocity;
+      if (parent >= 0) velocity = w.velocity[parent];
       ROLLED for (int j = Model::first_joint(b); j < end; ++j) {
         int d = Model::joint_dof(j);
         const int kind = Model::joint_kind(j);
@@ -529,15 +581,13 @@ struct Step : Math {
         acceleration = acceleration + velocity.cross_motion(relative);
         velocity = velocity + relative;
       }
-      w.acceleration[b] = acceleration;
+      accelerations[slot] = acceleration;
     }
-    sync();
-    SHARED_LOOP(b, Model::LINKS) {
-      Motion velocity = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}}, acceleration = velocity;
-      ROLLED for (Links left = to_root(b); left; left = below_highest(left)) {
-        velocity = velocity + w.velocity[highest_bit(left)];
-        acceleration = acceleration + w.acceleration[highest_bit(left)];
-      }
+    sum_to_root(accelerations);
+    OWN_LINKS(slot, b) {
+      if (b >= Model::LINKS) continue;
+      const Motion velocity = w.velocity[b];
+      Motion acceleration = accelerations[slot];
       acceleration.linear = acceleration.linear - Model::gravity();
       const Pose pose = w.pose[b];
       const float mass = Model::link_mass(b);
@@ -589,8 +639,7 @@ struct Step : Math {
   }
 
   // The mass matrix, and the residual: minus the smooth forces, until M qacc is added. Entries of degrees of freedom of
-  // which neither is an ancestor of the other stay zero. A lane has a row of the others or, where it has several rows, an
-  // entry off the diagonal.
+  // which neither is an ancestor of the other stay zero. A lane has one of the entries off the diagonal.
   INLINE void mass_matrix() {
     OWN_DOFS(slot, d) {
       if (d >= DOFS) continue;
@@ -598,24 +647,14 @@ struct Step : Math {
       const Motion axis = w.axes[d], momentum = body.inertia * axis, bias = {body.torque, body.force};
       w.residual[d] = axis.dot(bias) - joint_force(d, implicit_damping[slot]);
       w.mass[STRIDE * d + d] = axis.dot(momentum) + Model::armature(d);
-      if (SEVERAL_ROWS) {
-        w.momentum[d] = momentum;
-        continue;
-      }
-      ROLLED for (Model::Dofs left = Model::ancestors(d); left; left = below_highest(left))
-        set_mass(d, highest_bit(left), momentum);
+      w.momentum[d] = momentum;
     }
     sync();
-    if (!SEVERAL_ROWS) return;
     SHARED_LOOP(i, Model::MASS_ENTRIES) {
-      const unsigned entry = Model::mass_entry(i), d = entry / 64;
-      set_mass(d, entry % 64, w.momentum[d]);
+      const unsigned entry = Model::mass_entry(i), d = entry / 64, ancestor = entry % 64;
+      w.mass[STRIDE * d + ancestor] = w.mass[STRIDE * ancestor + d] = w.axes[ancestor].dot(w.momentum[d]);
     }
     sync();
-  }
-
-  INLINE void set_mass(int d, int ancestor, Motion momentum) {
-    w.mass[STRIDE * d + ancestor] = w.mass[STRIDE * ancestor + d] = w.axes[ancestor].dot(momentum);
   }
 
   // ---- Contacts. Points are relative to the centre of mass of the first tree.
@@ -1078,6 +1117,7 @@ struct Step : Math {
     frictionless_quads = own_quads(w.contacts + Model::FRICTIONAL, frictionless);
     Motion axes[SLOTS];
     OWN_DOFS(slot, d) axes[slot] = w.axes[d < DOFS ? d : 0];
+    sync();  // rows are set up in their place
     const bool own = Model::VARIED && LANES > 1 && Model::FRICTIONAL <= LANES;
     float own_friction = 0.0f;  // of the lane's contact: in the loop, all would wait for one after the other
     if (own && lane < frictional) own_friction = Model::friction(w.contacts[lane].pair);
@@ -2034,7 +2074,7 @@ struct Step : Math {
       const Pose pose = pose_of(link);
       const Vec position = pose.position + pose.orientation * Model::body_position(b);
       const Mat orientation = Model::body_orientation(b);
-      const Motion velocity = sum_over(to_root(link), w.velocity);
+      const Motion velocity = link < 0 ? Motion{{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}} : w.velocity[link];
       xpos[3 * b] = position.x;
       xpos[3 * b + 1] = position.y;
       xpos[3 * b + 2] = position.z;
@@ -2067,7 +2107,7 @@ struct Step : Math {
         const int link = Model::part_link(i);
         const Pose pose = w.pose[link];
         const Vec offset = pose.position + pose.orientation * Model::part_center(i) - w.com[Model::tree(link)];
-        const Motion velocity = sum_over(to_root(link), w.velocity);
+        const Motion velocity = w.velocity[link];
         const Vec v = velocity.linear + velocity.angular.cross(offset);
         UNROLLED for (int k = 0; k < 3; ++k) total[k] += Model::part_share(i) * v.component(k);
       }
@@ -2087,7 +2127,7 @@ struct Step : Math {
         const int link = Model::momentum_link(i);
         const Pose pose = w.pose[link];
         const Vec offset = pose.position + pose.orientation * Model::momentum_center(i) - w.com[Model::tree(link)];
-        const Motion velocity = sum_over(to_root(link), w.velocity);
+        const Motion velocity = w.velocity[link];
         const float mass = Model::momentum_mass(i);
         const Vec push = (velocity.linear + velocity.angular.cross(offset)) * mass;
         const Symmetric inertia = Model::momentum_inertia(i).turned(pose.orientation);
@@ -2198,6 +2238,7 @@ if (live) {
 #undef ROLLED
 #undef UNROLLED
 #undef OWN_DOFS
+#undef OWN_LINKS
 #undef SHARED_LOOP
 #undef OWN_ROWS
 #undef LOCKSTEP

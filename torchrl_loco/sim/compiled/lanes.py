@@ -134,11 +134,12 @@ class Layout:
     def bytes(self) -> int:
         """Size of ``struct World``."""
         contacts = self.frictional + self.frictionless
-        vectors = pad(self.positions, 4) + 5 * self.stride + 8 * self.dofs + self.dofs * self.stride + 2 * self.rows
+        vectors = pad(self.positions, 4) + 4 * self.stride + self.dofs * self.stride
+        vectors += max(8 * self.dofs, self.stride + 2 * self.rows)
         before = 32 * contacts + 12 * (self.frictional + 1)
         quads = self.stride // 4
         solving = 4 * max(16 * (quads | 1) + 8 + 12 * quads, self.limb_numbers, self.rows)
-        kinematics = 32 * max(self.links, self.dofs) + 112 * self.links + 32 * (self.geoms + 1) + 2 * self.candidates
+        kinematics = 32 * self.dofs + 112 * self.links + 32 * (self.geoms + 1) + 2 * self.candidates
         total = 4 * vectors + pad(max(before, solving, 32 * self.links), 16)
         total = pad(total + 4 * self.jacobian_rows, 16)
         total += pad(max(kinematics, 4 * self.jacobian_rows * self.stride), 16)
@@ -391,7 +392,7 @@ class Description:
         self._add_links(tables)
         self._add_joints(tables)
         self._add_limbs(tables)
-        self._add_forces(tables, mask)
+        self._add_forces(tables)
         self._add_geoms(tables, mask)
         self._add_limits(tables)
         self._add_outputs(tables)
@@ -407,12 +408,13 @@ class Description:
         parents = [self.places[m.body_parentid[b]] for b in moving]
         attached = list(zip(parents, moving, strict=True))
         tables.integers("parent", [p.link for p in parents])
-        to_root: list[int] = []  # each link and its ancestors
-        for i, place in enumerate(parents):
-            to_root.append(1 << i | (to_root[place.link] if place.link >= 0 else 0))
-        links = "unsigned" if len(moving) <= 32 else "unsigned long long"
-        tables.lines.append(f"  typedef {links} Links;  // a bit for each link")
-        tables.integers("to_root", to_root, links)
+        above = [p.link for p in parents]  # in each round, the ancestor at twice the distance of the round before
+        rounds: list[int] = []
+        while max(above) >= 0:
+            rounds += above
+            above = [above[i] if i >= 0 else -1 for i in above]
+        tables.size(ROUNDS=len(rounds) // len(moving))
+        tables.integers("above", rounds)
         tables.structs("Vec", "link_position", [p.point(m.body_pos[b]) for p, b in attached])
         turns = [p.turn(m.body_quat[b]) for p, b in attached]
         tables.structs("Quat", "link_orientation", turns)
@@ -482,7 +484,7 @@ class Description:
         tables.integers("corner_column", [j for _, j in corner])
         tables.integers("crosses", [self.limbs.crosses(self._apart(pair)) for pair in self.pairs])
 
-    def _add_forces(self, tables: Tables, mask: str) -> None:
+    def _add_forces(self, tables: Tables) -> None:
         m = self.m
         stiffness, damping = m.jnt_stiffness[m.dof_jntid], m.dof_damping
         explicit = m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP) and not is_implicitfast(m)
@@ -494,7 +496,6 @@ class Description:
         tables.floats("armature", m.dof_armature)
         above = [list(self._dofs_to_root(parent)) for parent in m.dof_parentid]
         entries = [64 * d + j for d, ancestors in enumerate(above) for j in ancestors]
-        tables.integers("ancestors", [sum(1 << j for j in ancestors) for ancestors in above], mask)
         tables.size(MASS_ENTRIES=len(entries))
         tables.integers("mass_entry", entries, "unsigned")
         dofs = m.jnt_dofadr[m.actuator_trnid[:, 0]]
