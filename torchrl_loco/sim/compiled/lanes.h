@@ -1074,23 +1074,23 @@ struct Step : Math {
     if (Model::GEOMS > 0) place_geoms();
     const int count = Model::PAIRS > Model::SOLID_END ? near_pairs() : 0;
     int at = 0;  // in the list
-    collide_with_planes(0, Model::PLANE_FRICTIONAL_END, true);
+    // Those with friction, then those without, by one text.
+    ROLLED for (int kind = 0; kind < 2; ++kind) {
+      const bool friction = kind == 0;
+      if (!friction) limit_balls();
+      collide_with_planes(friction ? 0 : Model::SOLID_FRICTIONAL_END,
+                          friction ? Model::PLANE_FRICTIONAL_END : Model::PLANE_END, friction);
 //IF SOLIDS
-    collide_solids_with_planes(Model::PLANE_FRICTIONAL_END, Model::SOLID_FRICTIONAL_END, true);
+      collide_solids_with_planes(friction ? Model::PLANE_FRICTIONAL_END : Model::PLANE_END,
+                                 friction ? Model::SOLID_FRICTIONAL_END : Model::SOLID_END, friction);
 //END
-    collide_geoms(at, count, Model::SOLID_END, Model::GEOM_FRICTIONAL_END, true);
+      collide_geoms(at, count, friction ? Model::SOLID_END : Model::BOX_FRICTIONAL_END,
+                    friction ? Model::GEOM_FRICTIONAL_END : Model::GEOM_END, friction);
 //IF BOXES
-    collide_boxes(at, count, Model::GEOM_FRICTIONAL_END, Model::BOX_FRICTIONAL_END, true);
+      collide_boxes(at, count, friction ? Model::GEOM_FRICTIONAL_END : Model::GEOM_END,
+                    friction ? Model::BOX_FRICTIONAL_END : Model::BOX_END, friction);
 //END
-    limit_balls();
-    collide_with_planes(Model::SOLID_FRICTIONAL_END, Model::PLANE_END, false);
-//IF SOLIDS
-    collide_solids_with_planes(Model::PLANE_END, Model::SOLID_END, false);
-//END
-    collide_geoms(at, count, Model::BOX_FRICTIONAL_END, Model::GEOM_END, false);
-//IF BOXES
-    collide_boxes(at, count, Model::GEOM_END, Model::BOX_END, false);
-//END
+    }
     sync();
     if (Model::TOUCH) feel_contacts();
     sync();
@@ -1794,14 +1794,11 @@ struct Step : Math {
   // M and J times the search direction, a row a lane, and how the residuals change along it.
   INLINE void project() {
     sync();
-    const int together = SEVERAL_ROWS ? jacobian_rows() : 0;  // rows of J in the rounds of those of M
-    SHARED_LOOP(i, DOFS + together) {
+    SHARED_LOOP(i, DOFS + jacobian_rows()) {  // rows of J in the rounds of those of M
       const int r = i - DOFS;
-      const bool of_jacobian = SEVERAL_ROWS && r >= 0;
-      const float product = times(of_jacobian ? w.jacobian + STRIDE * r : w.mass + STRIDE * i, w.search);
-      *(of_jacobian ? w.projected + r : w.mass_search + i) = product;
+      const float product = times(r < 0 ? w.mass + STRIDE * i : w.jacobian + STRIDE * r, w.search);
+      *(r < 0 ? w.mass_search + i : w.projected + r) = product;
     }
-    if (!SEVERAL_ROWS) SHARED_LOOP(r, jacobian_rows()) w.projected[r] = times(w.jacobian + STRIDE * r, w.search);
     sync();
     SHARED_LOOP(r, rows()) w.change[r] = row_velocity(r, w.search);
     sync();
