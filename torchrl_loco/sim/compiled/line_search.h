@@ -39,7 +39,8 @@ if (BY_SLOPES) {  // Newton's method between two slopes of different sign: it is
     flat = found(last, left);
     ends = flat | stuck | (more == 1);
   }
-  result.alpha = flat | (last.slope < 0.0f) ? last.alpha : low;  // up to there the cost falls
+  const bool falls = flat | (last.slope < 0.0f);  // the cost does, up to the last step
+  result = {falls ? last.alpha : low, 0.0f, falls ? last.slope : start.slope};
   return result;
 }
 result.take(first, first.ends(start, accept, LS_NEAR));
