@@ -16,7 +16,7 @@
 
 float gradient_squared = 0.0f, decrement = 0.0f;
 const auto flat = [&](const float left) {  // with so much of both left
-  const float gradient_left = SCALE * SCALE * (gradient_squared * left);
+  const float gradient_left = SCALE * (SCALE * (gradient_squared * left));
   return (gradient_left < TOLERANCE * TOLERANCE) | (0.5f * SCALE * (decrement * left) < TOLERANCE);
 };
 bool found = false, done = !live;  // whether qacc is final; whether there is nothing left to do
