@@ -65,9 +65,10 @@ WORLD_BYTES = (
     BLOCK_BYTES // 2 - WARP_BYTES,
     BLOCK_BYTES - WARP_BYTES,
 )
-"""Shared memory that a world may fill: the first that leaves room for enough contacts. So 24, 20 and 16 worlds in blocks
-of 4, 12, 10 and 8 in blocks of 2, and 4 fit a multiprocessor of an H100 or H200. The first leaves a thread 80 registers,
-too few to eliminate limbs side by side."""
+"""Shared memory that a world may fill: the first that leaves room for enough contacts. So 24, 20 and 16 worlds in
+blocks of 4, 12, 10 and 8 in blocks of 2, and 4 fit a multiprocessor of an H100 or H200. The first leaves a thread 80
+registers, too few to eliminate limbs side by side.
+"""
 MULTIPROCESSOR_BYTES, SYSTEM_BYTES = 228 * 1024, 1024
 """Shared memory of a multiprocessor of an H100 or H200, and what the system takes of it for each block."""
 SCHEDULERS, REGISTERS = 4, 16 * 1024
