@@ -57,7 +57,6 @@ BLOCK_BYTES = 48 * 1024
 WARP_BYTES = 4 * LANES
 """What Warp takes of it for the threads of a world, 4 bytes each, whether a kernel has tiles or not."""
 WORLD_BYTES = (
-    9344,
     11136,
     BLOCK_BYTES // 4 - WARP_BYTES,
     18720,
@@ -65,10 +64,8 @@ WORLD_BYTES = (
     BLOCK_BYTES // 2 - WARP_BYTES,
     BLOCK_BYTES - WARP_BYTES,
 )
-"""Shared memory that a world may fill: the first that leaves room for enough contacts. So 24, 20 and 16 worlds in
-blocks of 4, 12, 10 and 8 in blocks of 2, and 4 fit a multiprocessor of an H100 or H200. The first leaves a thread 80
-registers, too few to eliminate limbs side by side.
-"""
+"""Shared memory that a world may fill: the first that leaves room for enough contacts. So 20 and 16 worlds in blocks of
+4, 12, 10 and 8 in blocks of 2, and 4 fit a multiprocessor of an H100 or H200."""
 MULTIPROCESSOR_BYTES, SYSTEM_BYTES = 228 * 1024, 1024
 """Shared memory of a multiprocessor of an H100 or H200, and what the system takes of it for each block."""
 SCHEDULERS, REGISTERS = 4, 16 * 1024
@@ -343,11 +340,10 @@ class Description:
             rows = max(directions * places + more_rows, frictionless, 1)
             return dataclasses.replace(empty, frictional=places, jacobian_rows=rows)
 
-        budgets = WORLD_BYTES[1:] if self.limbs else WORLD_BYTES
         least, wanted = (min(frictional, n) for n in (ENOUGH_FRICTIONAL, max(ENOUGH_FRICTIONAL, standing)))
         enough = max((n for n in range(least, wanted + 1) if sized(n).bytes <= WORLD_BYTES[-1]), default=least)
         most = min(frictional, max(MOST_FRICTIONAL, enough))
-        budget = next((b for b in budgets if sized(enough).bytes <= b), None)
+        budget = next((b for b in WORLD_BYTES if sized(enough).bytes <= b), None)
         if budget is None:
             raise ValueError(
                 f"a body so large: a world needs {sized(enough).bytes} bytes of shared memory, of {WORLD_BYTES[-1]}"
