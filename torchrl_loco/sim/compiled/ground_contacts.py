@@ -23,9 +23,9 @@ from torchrl_loco.sim.compiled.symbols import (
     Block,
     Scalar,
     cell,
-    cells_of,
     cross,
     dot,
+    leaves,
     literal,
     names,
     scalar,
@@ -74,7 +74,8 @@ class GroundContacts:
             self.pyramid = FULL
         read = [*self._velocity(self._stored_twist()), *(np.concatenate(self.directions) if with_frames else ())]
         titles = [f"{title}{i}" for title in ("lever", "normal", "tangent") for i in range(3)]
-        self._stored = [title for title in titles if f"contact[k].{title}" in cells_of(map(scalar, read))]
+        read_cells = {leaf.args[0] for leaf in leaves(map(scalar, read), "cell")}
+        self._stored = [title for title in titles if f"contact[k].{title}" in read_cells]
         self.fields = ["int body", *(f"float {title}" for title in self._stored)] if self.corners else []
         self.response = [f"float gradient[{len(self.live)}], stiffness[{len(self.live) * (len(self.live) + 1) // 2}]"]
         self.arrays = {"body_twist": len(self.bodies) * len(self.live)}

@@ -9,7 +9,7 @@ from typing import Any, TypeGuard
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled.symbols import Scalar, maximum
+from torchrl_loco.sim.compiled.symbols import Scalar, leaves, maximum
 from torchrl_loco.sim.varied import Varied, field, subtree_masses
 
 Number = float | Scalar
@@ -105,17 +105,7 @@ def is_of_model(x: Scalar) -> bool:
 
 def numbers_in(expressions: Iterable[Scalar]) -> list[Scalar]:
     """Returns the numbers of the model that expressions read, in the order of their places."""
-    found: dict[int, Scalar] = {}
-    stack, seen = list(expressions), set()
-    while stack:
-        x = stack.pop()
-        if x in seen:
-            continue
-        seen.add(x)
-        if x.op == "number":
-            found[x.args[1]] = x
-        stack += [arg for arg in x.args if isinstance(arg, Scalar)]
-    return [found[column] for column in sorted(found)]
+    return sorted(leaves(expressions, "number"), key=lambda x: x.args[1])
 
 
 def evaluate(x: Scalar, row: Sequence[float] | np.ndarray) -> float:

@@ -214,18 +214,15 @@ def sincos(x: Any) -> tuple[Scalar, Scalar]:
     return sine, Scalar("cos", sine)
 
 
-def cells_of(expressions: Iterable[Scalar]) -> set[str]:
-    """Returns the C++ of the variables and elements, assigned more than once, that some expressions read."""
-    found, seen, stack = set(), set(), list(expressions)
+def leaves(expressions: Iterable[Scalar], op: str) -> set[Scalar]:
+    """Returns the leaves of a kind, of :data:`LEAVES`, that some expressions read."""
+    seen, stack = set(), list(expressions)
     while stack:
         node = stack.pop()
-        if node in seen:
-            continue
-        seen.add(node)
-        if node.op == "cell":
-            found.add(node.args[0])
-        stack += [arg for arg in node.args if isinstance(arg, Scalar)]
-    return found
+        if node not in seen:
+            seen.add(node)
+            stack += [arg for arg in node.args if isinstance(arg, Scalar)]
+    return {node for node in seen if node.op == op}
 
 
 def select(left: Any, comparison: str, right: Any, if_true: Any, if_false: Any) -> Scalar:
