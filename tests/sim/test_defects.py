@@ -42,6 +42,20 @@ LIMBS = """
 """A sphere with a limb of two hinges over a floor."""
 
 
+KINKED = """
+<mujoco>
+  <option timestep="0.0005" iterations="1" ls_iterations="5" gravity="0 0 0"/>
+  <worldbody>
+    <geom type="plane" size="1 1 .1"/>
+    <body pos="0 0 .099"><joint name="s" type="slide" axis="0 0 1" range=".001 1" solreflimit=".0025 1" limited="true"/>
+      <geom size=".1" mass="1" condim="1" solimp=".98 .98 .1"/></body>
+  </worldbody>
+  <actuator><motor joint="s"/></actuator>
+</mujoco>
+"""
+"""A sphere that is pushed into the floor, and against a limit that begins to push back later."""
+
+
 def limbs(*replaced):
     """Returns the model with some of its text replaced."""
     xml = LIMBS
@@ -372,6 +386,7 @@ def test_a_small_gain_is_found_beside_a_large_cost(form):
     """Contacts 0.10 and 0.15 m deep cost 6e9 J, of which the last steps of the solver gain 8 to 70 J.
 
     In the other state a Newton step of single precision misses by 0.4 % and crosses no row: 28 of 2508 rad/s^2 are off.
+    In the last, the first step ends just where a limit begins that is 1e9 times as heavy as what ends it before.
     """
     for name, allowed in (("stalled", 0.02), ("skewed", 1.0))[: 1 if form == "traced" else 2]:
         model = mujoco.MjModel.from_xml_path(str(DATA / f"{name}.xml"))
@@ -379,3 +394,9 @@ def test_a_small_gain_is_found_beside_a_large_cost(form):
             rows = np.array([file[name] for name in file.files], dtype=np.float32)
         states = np.split(rows, np.cumsum([model.nq, model.nv, model.nv]), axis=1)
         assert (errors(model, states) / model.opt.timestep).max() < allowed, name
+    model, count = mujoco.MjModel.from_xml_string(KINKED), 64
+    model.dof_invweight0[:] *= 1e-9
+    speeds = np.linspace(0.9, 1.2, count)  # at which that limit pushes from 0.75 to 1 of the way on
+    states = [np.full((count, 1), x, dtype=np.float32) for x in (0, 0, 0, -1000)]
+    states[1][:, 0] = speeds
+    assert (errors(model, states) / model.opt.timestep).max() < 1.0

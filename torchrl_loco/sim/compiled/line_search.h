@@ -18,20 +18,25 @@ if (fabsf(start.slope) < noise) return result;
 
 const Point first = Point::at(1.0f, slope, curvature, whole + 1);
 if (BY_SLOPES) {  // Newton's method between two slopes of different sign: it is exact once it knows which rows are active
-  const auto step = [](const Point& p) { return -p.slope * Math::inverse(p.curvature); };
+  float low = 0.0f, high = Math::from_bits(0x7f800000u);
+  // Where the cost rises, a step leaves what is rounding of alpha: a heavy row may begin just before p.
+  const auto step = [&](const Point& p) {
+    const float left = -p.slope * Math::inverse(p.curvature);
+    return p.slope > 0.0f ? Math::smaller(left, -1e-6f * p.alpha) : Math::smaller(left, high - p.alpha);
+  };
   // Whether p is the minimum, or what is left to it is rounding of alpha.
   const auto found = [&](const Point& p, float left) {
-    return (fabsf(p.slope) < accept) | (fabsf(left) < 1e-6f * p.alpha);
+    return (fabsf(p.slope) < accept) | ((fabsf(left) < 1.5e-6f * p.alpha) & (p.slope < 0.1f * decrement));
   };
-  float low = 0.0f, high = Math::from_bits(0x7f800000u), left = step(first);
+  float left = step(first);
   Point last = first;
-  bool flat = found(first, left), ends = flat | (LS_ITERATIONS == 0);
+  bool flat = found(first, left), stuck = false, ends = flat | (LS_ITERATIONS == 0);
   ROLLED for (int more = 3 * LS_ITERATIONS; !ends; --more) {
     low = last.slope < 0.0f ? last.alpha : low;
     high = last.slope < 0.0f ? high : last.alpha;
     const float next = last.alpha + left;
     const float alphas[1] = {(next > low) & (next < high) ? next : 0.5f * (low + high)};
-    const bool stuck = (alphas[0] == low) | (alphas[0] == high);
+    stuck = (alphas[0] == low) | (alphas[0] == high);
     float sums[3] = {0.0f, 0.0f, 0.0f};
     add_rows(alphas, 1, sums);
     last = Point::at(alphas[0], slope, curvature, sums);
@@ -39,7 +44,7 @@ if (BY_SLOPES) {  // Newton's method between two slopes of different sign: it is
     flat = found(last, left);
     ends = flat | stuck | (more == 1);
   }
-  const bool falls = flat | (last.slope < 0.0f);  // the cost does, up to the last step
+  const bool falls = (flat | (last.slope < 0.0f)) & !stuck;  // the cost does, up to the last step
   result = {falls ? last.alpha : low, 0.0f, falls ? last.slope : start.slope};
   return result;
 }
