@@ -35,7 +35,7 @@ if (BY_SLOPES) {  // Newton's method between two slopes of different sign: it is
     low = last.slope < 0.0f ? last.alpha : low;
     high = last.slope < 0.0f ? high : last.alpha;
     const float next = last.alpha + left;
-    const float alphas[1] = {(next > low) & (next < high) ? next : 0.5f * (low + high)};
+    const float alphas[1] = {((next > low) & (next < high)) ? next : 0.5f * (low + high)};
     stuck = (alphas[0] == low) | (alphas[0] == high);
     float sums[3] = {0.0f, 0.0f, 0.0f};
     add_rows(alphas, 1, sums);
