@@ -12,6 +12,7 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 ``traced``           one thread a world: a control step from top to bottom
 ``symbols``          scalars whose arithmetic is traced, and blocks of C++
 ``dynamics``         poses, inertias, forces; M x and (M + K)^-1 x by sweeps over the tree
+``actuators``        force of an actuator
 ``constraints``      softness of constraints; rows of limits and dry friction
 ``pyramid``          rows of a contact
 ``ground_contacts``  contacts with planes of the world: a stiffness of a body each

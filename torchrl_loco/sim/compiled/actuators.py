@@ -4,11 +4,12 @@ import dataclasses
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from torchrl_loco.sim.compiled.symbols import Block, Scalar, maximum, minimum, name
 
-BIASES = NONE, AFFINE = (int(getattr(mujoco.mjtBias, f"mjBIAS_{kind}")) for kind in ("NONE", "AFFINE"))
+AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
+BIASES = int(mujoco.mjtBias.mjBIAS_NONE), AFFINE
+"""Kinds of bias that an actuator may have."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,11 +65,6 @@ def acting(m: mujoco.MjModel) -> list[int]:
         for i in range(m.nu)
         if not (0 <= m.actuator_group[i] < 31 and m.opt.disableactuator >> m.actuator_group[i] & 1)
     ]
-
-
-def affine_bias(m: mujoco.MjModel) -> np.ndarray:
-    """Returns the bias of each actuator, zero for motors, ``(nu, 3)``."""
-    return np.where((m.actuator_biastype == NONE)[:, None], 0, m.actuator_biasprm[:, :3])
 
 
 def _within(x: Scalar, limits: Any) -> Scalar:

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled import collision, shared, symbols
-from torchrl_loco.sim.compiled.actuators import Actuator, acting, affine_bias
+from torchrl_loco.sim.compiled.actuators import Actuator, acting
 from torchrl_loco.sim.compiled.collision import (
     BOX,
     CAPSULE,
@@ -254,7 +254,10 @@ class Description:
         self.subtrees = [s for s in sensors if s[0] == SUBTREE_VELOCITY]
         self.momenta = [s for s in sensors if s[0] == ANGULAR_MOMENTUM]
         self.touch = [s for s in sensors if s[0] == TOUCH]
-        self.implicit_actuators = is_implicitfast(m) and present(affine_bias(m)[acting(m), 2])
+        self.acting = acting(m)
+        self.actuators = [Actuator.of(m, a) for a in self.acting]
+        self.bias = np.reshape([[0.0] * 3 if a.bias is None else a.bias for a in self.actuators], (-1, 3))
+        self.implicit_actuators = is_implicitfast(m) and present(self.bias[:, 2])
         self.joint_force_limits = self.implicit_actuators or m.jnt_actfrclimited.any()
         self.limbs = Limbs.of(m.dof_parentid.tolist())
         self.layout = self._layout()
@@ -498,22 +501,21 @@ class Description:
         entries = [64 * d + j for d, ancestors in enumerate(above) for j in ancestors]
         tables.size(MASS_ENTRIES=len(entries))
         tables.integers("mass_entry", entries, "unsigned")
-        dofs = m.jnt_dofadr[m.actuator_trnid[:, 0]]
-        used = sorted(acting(m), key=lambda a: dofs[a])
-        bias = affine_bias(m)[used]
-        clamped = m.actuator_ctrllimited.astype(bool)
-        limited = m.actuator_forcelimited.astype(bool)
-        limits = np.where(clamped[:, None], m.actuator_ctrlrange, [-UNLIMITED, UNLIMITED])[used]
-        forces = np.where(limited[:, None], m.actuator_forcerange, [-UNLIMITED, UNLIMITED])[used]
-        tables.integers("first_actuator", [sum(d < k for d in dofs[used]) for k in range(m.nv + 1)])
-        tables.integers("control", used)
-        tables.floats("gear", m.actuator_gear[used, 0])
-        tables.floats("gain", m.actuator_gainprm[used, 0])
+        dofs = m.jnt_dofadr[m.actuator_trnid[self.acting, 0]]
+        order = np.argsort(dofs, kind="stable")
+        actuators = [self.actuators[i] for i in order]
+        tables.integers("first_actuator", [sum(dofs < k) for k in range(m.nv + 1)])
+        tables.integers("control", [self.acting[i] for i in order])
+        tables.floats("gear", [a.gear for a in actuators])
+        tables.floats("gain", [a.gain for a in actuators])
         for k, name in enumerate(("bias", "bias_position", "bias_velocity")):
-            tables.floats(name, bias[:, k])
+            tables.floats(name, self.bias[order, k])
+        free = (-UNLIMITED, UNLIMITED)
+        of_controls = [free if a.control_range is None else a.control_range for a in actuators]
+        of_forces = [free if a.force_range is None else a.force_range for a in actuators]
         for k, name in enumerate(("low", "high")):
-            tables.floats(f"control_{name}", limits[:, k])
-            tables.floats(f"force_{name}", forces[:, k])
+            tables.floats(f"control_{name}", [limits[k] for limits in of_controls])
+            tables.floats(f"force_{name}", [limits[k] for limits in of_forces])
         tables.size(IMPLICIT_ACTUATORS=self.implicit_actuators, JOINT_FORCE_LIMITS=self.joint_force_limits)
         limited = m.jnt_actfrclimited.astype(bool)
         forces = np.where(limited[:, None], m.jnt_actfrcrange, [-UNLIMITED, UNLIMITED])[m.dof_jntid]
@@ -522,7 +524,6 @@ class Description:
 
     def actuator(self) -> Actuator:
         """Returns an actuator that reads the tables."""
-        m, used = self.m, acting(self.m)
 
         def read(*titles: str) -> list[symbols.Scalar]:
             return [symbols.name(f"Model::{title}(a)") for title in titles]
@@ -531,9 +532,9 @@ class Description:
         return Actuator(
             gear,
             gain,
-            read("bias", "bias_position", "bias_velocity") if present(affine_bias(m)[used]) else None,
-            read("control_low", "control_high") if m.actuator_ctrllimited[used].any() else None,
-            read("force_low", "force_high") if m.actuator_forcelimited[used].any() else None,
+            read("bias", "bias_position", "bias_velocity") if present(self.bias) else None,
+            read("control_low", "control_high") if any(a.control_range is not None for a in self.actuators) else None,
+            read("force_low", "force_high") if any(a.force_range is not None for a in self.actuators) else None,
         )
 
     def _geom(self, g: int) -> tuple[int, np.ndarray, np.ndarray]:

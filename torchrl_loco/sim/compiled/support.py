@@ -3,6 +3,7 @@
 import mujoco
 
 from torchrl_loco.sim.compiled import lanes
+from torchrl_loco.sim.compiled.actuators import BIASES
 from torchrl_loco.sim.compiled.collision import BOX, PLANE, ROUND, SOLID, Pair, is_elliptic, pairs
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE
 from torchrl_loco.sim.compiled.parameters import VariedModel, nominal
@@ -115,8 +116,7 @@ def _actuators(m: mujoco.MjModel) -> list[str]:
             found.setdefault("a transmission other than a hinge or slide", []).append(name)
         if m.actuator_dyntype[i] != int(mujoco.mjtDyn.mjDYN_NONE):
             found.setdefault("activation dynamics", []).append(name)
-        biases = [int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)]
-        if m.actuator_gaintype[i] != int(mujoco.mjtGain.mjGAIN_FIXED) or m.actuator_biastype[i] not in biases:
+        if m.actuator_gaintype[i] != int(mujoco.mjtGain.mjGAIN_FIXED) or m.actuator_biastype[i] not in BIASES:
             found.setdefault("a gain that is not fixed or a bias that is not affine", []).append(name)
         if m.actuator_delay[i] or m.actuator_damping[i] or m.actuator_armature[i] or m.actuator_dampingpoly[i].any():
             found.setdefault("delay, damping or armature of an actuator", []).append(name)
