@@ -41,7 +41,7 @@ ROLLED for (int iteration = 0; any_of_block(!done); ++iteration) {
   same = !move(step);
   found = (step.improvement > 0.0f) & (step.improvement * SCALE < TOLERANCE);
   if (same && !found) {  // what is left of a Newton step; of a second one on the same parabola, rounding
-    // On a parabola the slope shrinks as the step grows to 1: what it differs by is the error of s, more of it across s.
+    // On a parabola the slope is (alpha - 1) decrement. A difference is an error of s along s; across, it may be tenfold.
     const float rest = 1.0f - step.alpha, error = 10.0f * (Math::divide(step.slope, decrement) + rest);
     found = repeated || flat(Math::larger(rest * rest, error * error));
   }
