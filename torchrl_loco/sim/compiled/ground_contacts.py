@@ -46,7 +46,7 @@ class GroundContacts:
     Attributes:
         directions: of contact ``k``: the normal, and the two tangents times friction, ``(3,)`` each.
         fields: what a contact stores besides its rows, in C++.
-        response: what a body adds up of its contacts, in C++.
+        link: what a body keeps for its contacts, its twist and what they add up, in C++.
     """
 
     def __init__(self, tree: Dynamics, found: list[Pair], touch: TouchSensors, *, with_frames: bool = False) -> None:
@@ -77,8 +77,8 @@ class GroundContacts:
         read_cells = {leaf.args[0] for leaf in leaves(map(scalar, read), "cell")}
         self._stored = [title for title in titles if f"contact[k].{title}" in read_cells]
         self.fields = ["int body", *(f"float {title}" for title in self._stored)] if self.corners else []
-        self.response = [f"float gradient[{len(self.live)}], stiffness[{len(self.live) * (len(self.live) + 1) // 2}]"]
-        self.arrays = {"body_twist": len(self.bodies) * len(self.live)}
+        n = len(self.live)
+        self.link = [f"float twist[{n}], gradient[{n}], stiffness[{n * (n + 1) // 2}]"]
 
     def body(self, corner: Corner) -> int:
         """Returns the body of a corner."""
@@ -126,7 +126,7 @@ class GroundContacts:
         """Returns the twist of the body of contact ``k``, ``(6,)``."""
         twist = zeros(6)
         for i, component in enumerate(self.live):
-            twist[component] = cell(f"body_twist[{len(self.live)} * contact[k].body + {i}]")
+            twist[component] = cell(f"link[contact[k].body][place].twist[{i}]")
         return twist
 
     def _velocity(self, twist: np.ndarray) -> list[Scalar]:
@@ -192,7 +192,7 @@ class GroundContacts:
         twists = self.tree.twists(velocity)
         for b, body in enumerate(self.bodies):
             for i, component in enumerate(self.live):
-                block.set(f"body_twist[{len(self.live) * b + i}]", twists[body][component])
+                block.set(f"link[{b}][place].twist[{i}]", twists[body][component])
 
     def _set(self, block: Block, field: str, residual: Scalar | float = 0.0) -> None:
         velocity = self._velocity(self._stored_twist())
@@ -220,7 +220,9 @@ class GroundContacts:
         if not self.count:
             return forces, stiffness
         packed = [(i, j) for i in range(len(live)) for j in range(i + 1)]
-        block("for (Response& each : response) each = {};")
+        with block.scope(f"for (int b = 0; b < {len(self.bodies)}; ++b)") as each:
+            for title in ("gradient", "stiffness"):
+                each(f"for (float& x : link[b][place].{title}) x = 0.0f;")
         with block.loop("k", "ground") as contact:
             x = [cell(f"contact[k].x{d}") for d in pyramid.directions]
             gradient, hessian = pyramid.response(cell("contact[k].D"), x)
@@ -229,7 +231,7 @@ class GroundContacts:
             ]
             force = total(gradient[d] * wrenches[d] for d in pyramid.directions)
             for i, component in enumerate(live):
-                contact.set(f"response[contact[k].body].gradient[{i}]", force[component], "+=")
+                contact.set(f"link[contact[k].body][place].gradient[{i}]", force[component], "+=")
             columns = [
                 total(
                     hessian[min(d, e), max(d, e)] * wrenches[e]
@@ -240,11 +242,11 @@ class GroundContacts:
             ]
             for at, (i, j) in enumerate(packed):
                 entry = total(wrenches[d][live[i]] * columns[d][live[j]] for d in pyramid.directions)
-                contact.set(f"response[contact[k].body].stiffness[{at}]", entry, "+=")
+                contact.set(f"link[contact[k].body][place].stiffness[{at}]", entry, "+=")
         for b, body in enumerate(self.bodies):
             for i, component in enumerate(live):
-                forces[body][component] = cell(f"response[{b}].gradient[{i}]")
+                forces[body][component] = cell(f"link[{b}][place].gradient[{i}]")
             for at, (i, j) in enumerate(packed):
-                entry = cell(f"response[{b}].stiffness[{at}]")
+                entry = cell(f"link[{b}][place].stiffness[{at}]")
                 stiffness[body][live[i], live[j]] = stiffness[body][live[j], live[i]] = entry
         return forces, stiffness

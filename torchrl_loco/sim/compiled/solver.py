@@ -47,7 +47,7 @@ class NewtonSolver:
         self.ground = GroundContacts(tree, found, self.touch, with_frames=bool(contact_geoms))
         self.dense = DenseContacts(tree, found, self.ground, self.touch, with_frames=bool(contact_geoms))
         self.arrays = dict.fromkeys(("qacc", "force", "search", "M_qacc", "M_search"), m.nv)
-        for rows in (self.limits, self.friction, self.ground, self.dense):
+        for rows in (self.limits, self.friction, self.dense):
             self.arrays.update(rows.arrays)
         self.by_slopes = near(m) == 0
         self.places = self.ground.count + self.dense.count
@@ -55,7 +55,7 @@ class NewtonSolver:
         rows_of_contact = [f"{field}{d}" for field in "xv" for d in range(directions)]
         self.structs = {
             "contact": (self.places, [f"float {', '.join([*rows_of_contact, 'D'])}", *self.ground.fields]),
-            "response": (len(self.ground.bodies), self.ground.response),
+            "link": (len(self.ground.bodies), self.ground.link),
         }
         self.arrays["touch"] = len(self.touch)
         if self.dense.count:

@@ -23,6 +23,10 @@ from torchrl_loco.sim.compiled.symbols import (
 INPUTS = {"qpos": "nq", "qvel": "nv", "qacc": "nv", "ctrl": "nu"}
 """What a world reads, and how many numbers of it. ``qacc`` starts as the warm start."""
 
+MOST_SHARED = 24 * 1024
+"""Bytes of shared memory of a warp up to which it holds links on a GPU: stores to local memory go on to the second
+cache, and links are what most of them were for."""
+
 
 def source(
     m: mujoco.MjModel,
@@ -64,7 +68,11 @@ def source(
                 world(f"float {title}[{count}];")
         for title, (count, fields) in solver.structs.items():
             if count:
-                world(f"struct alignas(16) {title.title()} {{ {'; '.join(fields)}; }} {title}[{count}];")
+                world(f"struct alignas(16) {title.title()} {{ {'; '.join(fields)}; }};")
+        if solver.places:
+            world(f"Contact contact[{solver.places}];")
+        if solver.ground.count:
+            _declare_links(world, len(solver.ground.bodies), len(solver.ground.live))
         if solver.places:
             for title in ("contact_corner", *(["contact_zones"] if solver.touch else [])):
                 world(f"int {title}[{solver.places}];")
@@ -81,6 +89,25 @@ def source(
         world("overflow_out.data[world] |= overflow;")
     _outputs(world, m, with_cvel, with_subtree_com)
     return shared.LAWS + world.text() + "\n"
+
+
+def _declare_links(world: Block, count: int, live: int) -> None:
+    """Declares ``link``, and the ``place`` of this thread in it. On a GPU a block is a warp.
+
+    Args:
+        world: where.
+        count: links.
+        live: components of their twists.
+    """
+    numbers = 2 * live + live * (live + 1) // 2
+    size = 16 * -(-numbers // 4)  # bytes of a link
+    local = f"Link link[{count}][1]; const int place = 0;"
+    if 32 * size * count <= MOST_SHARED:  # lanes of a warp are in different banks, whichever links they read
+        world("#ifdef __CUDA_ARCH__")
+        world(f"__shared__ Link link[{count}][32]; const int place = threadIdx.x % 32;")
+        world(f"#else\n{local}\n#endif")
+    else:
+        world(local)
 
 
 def _argument(title: str) -> str:
