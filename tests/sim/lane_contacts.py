@@ -15,7 +15,7 @@ DUMP = """
     for (int i = 0; i < found; ++i) {
       const Contact c = contact(i);
       const Vec point = c.point + w.com[0];
-      const float row[] = {(float)c.pair, c.distance, point.x, point.y, point.z, c.normal.x, c.normal.y, c.normal.z};
+      const float row[] = {(float)c.pair(), c.distance, point.x, point.y, point.z, c.normal.x, c.normal.y, c.normal.z};
       for (int k = 0; k < 8; ++k) contact_dump[8 * i + k] = row[k];
     }
     contact_dump[8 * found] = -1.0f;

@@ -67,8 +67,16 @@ def assert_agree(ours, theirs):
 def test_both_engines_agree(shared, states):
     task, state, action = states[0], states[1][::4], states[2][::4]
     for protocol in PROTOCOLS:
-        envs = (shared(task, len(state), protocol=protocol, engine=engine) for engine in ENGINES)
-        assert_agree(*(after(env, state, action) for env in envs))
+        envs = {engine: shared(task, len(state), protocol=protocol, engine=engine) for engine in ENGINES}
+        found = {engine: after(env, state, action) for engine, env in envs.items()}
+        if task == "walker_run" or protocol == "dm_control":
+            assert_agree(*found.values())
+            continue
+        # Four iterations rarely converge. By lanes, the first one guesses the active rows, and what is left is less.
+        many = {"iterations": 50, "ls_iterations": 50}
+        converged = after(shared(task, len(state), protocol=protocol, engine="compiled", **many), state, action)
+        error = {engine: np.abs(qpos - converged).mean() for engine, qpos in found.items()}
+        assert error["compiled"] < 0.5 * error["mujoco_warp"]
 
 
 def test_converged_steps_agree_with_c_mujoco(shared, states, monkeypatch):

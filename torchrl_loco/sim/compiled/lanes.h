@@ -73,6 +73,12 @@ enum {
   LINK_SLOTS = (Model::LINKS + LANES - 1) / LANES,
   SEVERAL_ROWS = SLOTS > 1,  // a lane has some: then what spares rounds pays for a longer text
   CONTACTS = Model::FRICTIONAL + Model::FRICTIONLESS,
+  // A lane looks after the contacts lane, lane + LANES, ... with friction, then after those without.
+  OWN_FRICTIONAL = (Model::FRICTIONAL + LANES - 1) / LANES,
+  GUESSES = Model::SUBSTEPS > 1,
+  CONTACT_SLOTS = OWN_FRICTIONAL + (Model::FRICTIONLESS + LANES - 1) / LANES,
+  POINT_BITS = 2,
+  SIDE_BITS = 10,  // of a contact: which edges of its pyramid are closed, the state of its cone, or whether it is closed
   // Columns are left out where a lane knows those of a contact of each kind; alone, it looks at each number itself.
   SKIPS_QUADS = SEVERAL_ROWS && LANES > 1 && Model::FRICTIONAL <= LANES && Model::FRICTIONLESS <= LANES,
   DIRECTIONS = Model::DIRECTIONS,  // in which a contact with friction acts, each with a row of the Jacobian
@@ -87,6 +93,11 @@ enum {
 };
 #define OWN_DOFS(slot, dof) UNROLLED for (int slot = 0, dof = lane; slot < SLOTS; ++slot, dof += LANES)
 #define OWN_LINKS(slot, link) UNROLLED for (int slot = 0, link = lane; slot < LINK_SLOTS; ++slot, link += LANES)
+#ifdef __CUDA_ARCH__
+#define OWN_PLACES(own, begin, end) UNROLLED for (int own = begin; own < (end); ++own)
+#else
+#define OWN_PLACES(own, begin, end) ROLLED for (int own = begin; own < (end); ++own)
+#endif
 #define SHARED_LOOP(i, count) ROLLED for (int i = lane; i < (count); i += LANES)
 
 struct alignas(16) Quad { float v[4]; };
@@ -101,7 +112,13 @@ struct LocalPose {
 struct alignas(16) Pose { Mat orientation; Vec position; };
 struct alignas(16) Body { Inertia inertia; Vec torque, force; };  // 16 floats
 struct alignas(16) Geom { Vec center, half_axis; float radius; };  // only a capsule has a half axis
-struct alignas(16) Contact { Vec point; float distance; Vec normal; int pair; };
+struct alignas(16) Contact {
+  Vec point;
+  float distance;
+  Vec normal;
+  int id;  // the pair, and in the lowest bits which of its contacts it is
+  INLINE int pair() const { return id >> POINT_BITS; }
+};
 
 struct alignas(16) World {
   float qpos[(Model::POSITIONS + 3) / 4 * 4];
@@ -175,14 +192,13 @@ struct Cone {
   }
   static INLINE State state(const float* x, float mu) { return state(x[0], length(x), mu); }
 
-  INLINE Cone(const float* x, float weight, float mu) {
+  INLINE Cone(const float* x, float weight, float mu, unsigned in) {
     const float n = x[0], t = length(x), inverse = t > 0.0f ? Math::inverse(t) : 0.0f, beside = n - mu * t;
-    const State in = state(n, t, mu);
     const bool slides = in == SLIDING;
     square = in == OPEN ? 0.0f : slides ? Math::divide(weight, 1.0f + mu * mu) : weight;
     mixed = slides ? -mu * square : 0.0f;
     along = slides ? mu * mu * square : square;
-    across = slides ? mixed * beside * inverse : square;
+    across = slides ? Math::larger(mixed * beside * inverse, 0.0f) : square;  // a guess may be beside
     gradient[0] = square * (slides ? beside : n);
     const float off = slides ? mixed * beside : square * t;
     UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
@@ -190,7 +206,6 @@ struct Cone {
       gradient[j] = off * way[j];
     }
   }
-  INLINE bool open() const { return square == 0.0f; }
   INLINE void times(const float* v, float* product) const {  // the Hessian
     float forward = 0.0f;
     UNROLLED for (int j = 1; j < DIRECTIONS; ++j) forward += way[j] * v[j];
@@ -260,10 +275,15 @@ struct Pyramid {
   float gradient[DIRECTIONS];
   float square[DIRECTIONS], mixed[DIRECTIONS];  // of the Hessian: of each direction, and of the normal with it
 
-  INLINE Pyramid(const float* x, float weight) {
+  static INLINE unsigned sides(const float* x) {  // the closed ones
+    unsigned found = 0;
+    UNROLLED for (int i = 0; i < CONTACT_ROWS; ++i) found |= (unsigned)(x[i] < 0.0f) << i;
+    return found;
+  }
+  INLINE Pyramid(const float* x, float weight, unsigned sides) {
     UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
       const float plus = x[2 * j - 2], minus = x[2 * j - 1];
-      const float d = OneSided::curvature(plus, weight), e = OneSided::curvature(minus, weight);
+      const float d = sides >> (2 * j - 2) & 1 ? weight : 0.0f, e = sides >> (2 * j - 1) & 1 ? weight : 0.0f;
       square[j] = d + e;
       mixed[j] = d - e;
       gradient[j] = d * plus - e * minus;
@@ -271,7 +291,6 @@ struct Pyramid {
       gradient[0] = (j == 1 ? d * plus : gradient[0] + d * plus) + e * minus;
     }
   }
-  INLINE bool open() const { return square[0] == 0.0f; }
   INLINE void times(const float* v, float* product) const {  // the Hessian
     product[0] = square[0] * v[0];
     UNROLLED for (int j = 1; j < DIRECTIONS; ++j) {
@@ -294,6 +313,10 @@ struct Step : Math {
   int frictional, frictionless;  // contacts
   int limits;                    // violated limits of hinges and slides
   int limit_row[Model::LIMIT_SIDES][SLOTS];  // the row of the limit of each own degree of freedom, or -1
+  // What is guessed: sides of own contacts, below their ids; and of own limits.
+  unsigned contact_guess[CONTACT_SLOTS];
+  unsigned char limit_guess[Model::LIMIT_SIDES][SLOTS];
+  int frictional_guesses, frictionless_guesses;
   // Of this lane's contacts, with friction and without, the quads of columns in which the Jacobian has numbers.
   unsigned frictional_quads, frictionless_quads;
 //IF LIMBS
@@ -308,7 +331,9 @@ struct Step : Math {
 //END
 
   INLINE Step(World& w, int lane, const float* ctrl, int* overflow, int world, const float* row)
-      : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world), varied{{row}} {}
+      : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world), varied{{row}} {
+    forget();
+  }
 
   // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for each direction
   // (all but the normal times a factor), and a constraint row for each edge of its pyramid, or each direction of its
@@ -330,6 +355,7 @@ struct Step : Math {
   INLINE bool any_of_block(bool x) const { return Model::LOCKSTEP && Model::SUBSTEPS ? __syncthreads_or(x) : x; }
   INLINE float read(float x, int from) const { return __shfl_sync(~0u, x, from); }
   INLINE int read(int x, int from) const { return __shfl_sync(~0u, x, from); }
+  INLINE unsigned read(unsigned x, int from) const { return __shfl_sync(~0u, x, from); }
   // The number of a lane, which the compiler knows to be the same in all, except before Ampere.
 #if __CUDA_ARCH__ >= 800
   INLINE unsigned agreed(unsigned x, int from) const { return __reduce_or_sync(~0u, lane == from ? x : 0u); }
@@ -376,6 +402,7 @@ struct Step : Math {
   INLINE bool any_of_block(bool x) const { return x; }
   INLINE float read(float x, int) const { return x; }
   INLINE int read(int x, int) const { return x; }
+  INLINE unsigned read(unsigned x, int) const { return x; }
   INLINE unsigned agreed(unsigned x, int) const { return x; }
   INLINE void sum(float*, const int) const {}
   INLINE void largest(float&, int&) const {}
@@ -670,10 +697,10 @@ struct Step : Math {
 
   // The deepest contacts stay: one that finds no place takes that of the shallowest. Returns the place of this lane's
   // contact, or none of them. Limits of ball joints, which have no depth, are not displaced.
-  INLINE int make_room(bool touches, Contact* stored, int place, int places, int pair, float depth) const {
+  INLINE int make_room(bool touches, Contact* stored, int place, int places, int id, float depth) const {
     if (touches && place < places) {
       stored[place].distance = depth;
-      stored[place].pair = pair;
+      stored[place].id = id;
     }
     sync();
     ROLLED for (unsigned late = ballot(touches && place >= places); late; late &= late - 1) {
@@ -682,7 +709,7 @@ struct Step : Math {
       float shallowest = -1e30f;
       int at = places;
       SHARED_LOOP(i, places) {
-        if (stored[i].distance <= shallowest || (Model::BALL_LIMITS && stored[i].pair >= Model::PAIRS)) continue;
+        if (stored[i].distance <= shallowest || (Model::BALL_LIMITS && stored[i].pair() >= Model::PAIRS)) continue;
         shallowest = stored[i].distance;
         at = i;
       }
@@ -691,7 +718,7 @@ struct Step : Math {
         if (lane == from) {
           place = at;
           stored[at].distance = depth;
-          stored[at].pair = pair;
+          stored[at].id = id;
         } else if (place == at) {
           place = places;
         }
@@ -703,8 +730,9 @@ struct Step : Math {
 
   // Stores a contact where `touches`. The first tangent follows the hint, unless that is nearly normal (or nothing);
   // then a coordinate axis. All lanes call this together, so that contacts lie in the order of the lanes.
-  INLINE void add_contact(bool touches, const bool friction, int pair, Vec point, float distance, Vec normal,
-                          Vec hint) {
+  INLINE void add_contact(bool touches, const bool friction, int pair, int number, Vec point, float distance,
+                          Vec normal, Vec hint) {
+    const int id = pair << POINT_BITS | number;
     const int left = Model::JACOBIAN_ROWS - DIRECTIONS * frictional;
     const int places = friction ? Model::FRICTIONAL : left < Model::FRICTIONLESS ? left : Model::FRICTIONLESS;
     int& count = friction ? frictional : frictionless;
@@ -714,11 +742,11 @@ struct Step : Math {
     if (count > places) {
       count = places;
       flag(NO_PLACE);
-      place = make_room(touches, w.contacts + (friction ? 0 : Model::FRICTIONAL), place, places, pair,
+      place = make_room(touches, w.contacts + (friction ? 0 : Model::FRICTIONAL), place, places, id,
                         distance - Model::margin(pair));
     }
     if (!touches || place >= places) return;
-    w.contacts[friction ? place : Model::FRICTIONAL + place] = {point, distance - Model::margin(pair), normal, pair};
+    w.contacts[friction ? place : Model::FRICTIONAL + place] = {point, distance - Model::margin(pair), normal, id};
     if (!friction) return;
     w.tangents[place] = Frame::tangent(normal, hint, Model::least_aligned());
   }
@@ -735,7 +763,7 @@ struct Step : Math {
       ROLLED for (int side = 0; side < 2; ++side) {
         const float sign = side ? -1.0f : 1.0f, distance = height + sign * rise;
         const bool exists = valid && (side == 0 || inverse_half > 0.0f);
-        add_contact(exists && distance < Model::margin(pair), friction, pair,
+        add_contact(exists && distance < Model::margin(pair), friction, pair, side,
                     geom.center + geom.half_axis * sign - normal * (geom.radius + 0.5f * distance), distance, normal,
                     geom.half_axis * inverse_half);
       }
@@ -834,7 +862,7 @@ struct Step : Math {
         const bool exists = point_below(g, k, n, point);
 //END
         const float distance = height + n.dot(point);
-        add_contact(near && exists && distance < Model::margin(pair), friction, pair,
+        add_contact(near && exists && distance < Model::margin(pair), friction, pair, k,
                     geom.center + axes * point - normal * (0.5f * distance), distance, normal, {0.0f, 0.0f, 0.0f});
       }
     }
@@ -891,7 +919,7 @@ struct Step : Math {
         float length;
         const Vec normal = Frame::normal(gap, length);
         const float distance = length - (a.radius + b.radius);
-        add_contact(own.valid && i < nearest.points && distance < Model::margin(pair), friction, pair,
+        add_contact(own.valid && i < nearest.points && distance < Model::margin(pair), friction, pair, i,
                     point + normal * (a.radius + 0.5f * distance), distance, normal, {0.0f, 0.0f, 0.0f});
       }
     }
@@ -1049,7 +1077,7 @@ struct Step : Math {
       const Ends ends = half.dot(half) > MINVAL ? capsule_and_box(center, half, size) : Ends{0.0f, 0.0f, 1};
       ROLLED for (int i = 0; i < 2; ++i) {
         const Depth depth = sphere_and_box(center + half * (i ? ends.second : ends.first), geom.radius, size);
-        add_contact(near && i < ends.points && depth.distance < Model::margin(pair), friction, pair,
+        add_contact(near && i < ends.points && depth.distance < Model::margin(pair), friction, pair, i,
                     origin + axes * depth.point, depth.distance, axes * depth.normal, {0.0f, 0.0f, 0.0f});
       }
     }
@@ -1064,7 +1092,7 @@ struct Step : Math {
       float angle;
       const Vec axis = qpos_quat(Model::ball_qpos(i)).axis(angle);
       const float distance = Model::ball_range(i) - angle;
-      add_contact(valid && distance < Model::margin(pair), false, pair, {0.0f, 0.0f, 0.0f}, distance, axis * -1.0f,
+      add_contact(valid && distance < Model::margin(pair), false, pair, 0, {0.0f, 0.0f, 0.0f}, distance, axis * -1.0f,
                   {0.0f, 0.0f, 0.0f});
     }
   }
@@ -1109,7 +1137,7 @@ struct Step : Math {
 
   // Those of the contact whose number is the lane's.
   INLINE unsigned own_quads(const Contact* contacts, const int count) const {
-    return SKIPS_QUADS && lane < count ? Model::quads(contacts[lane].pair) : ~0u;
+    return SKIPS_QUADS && lane < count ? Model::quads(contacts[lane].pair()) : ~0u;
   }
 
   INLINE void jacobians() {
@@ -1120,14 +1148,14 @@ struct Step : Math {
     sync();  // rows are set up in their place
     const bool own = Model::VARIED && LANES > 1 && Model::FRICTIONAL <= LANES;
     float own_friction = 0.0f;  // of the lane's contact: in the loop, all would wait for one after the other
-    if (own && lane < frictional) own_friction = Model::friction(w.contacts[lane].pair);
+    if (own && lane < frictional) own_friction = Model::friction(w.contacts[lane].pair());
 //IF LIMBS
     crossing = false;
 //END
     ROLLED for (int i = 0; i < frictional + frictionless; ++i) {
       const Contact c = contact(i);
-      const bool friction = i < frictional, ball = c.pair >= Model::PAIRS;
-      const int pair = ball ? 0 : c.pair;
+      const bool friction = i < frictional, ball = c.pair() >= Model::PAIRS;
+      const int pair = ball ? 0 : c.pair();
 //IF LIMBS
       crossing = crossing || (!ball && Model::crosses(pair));
 //END
@@ -1151,7 +1179,7 @@ struct Step : Math {
         const float sign = d < DOFS ? (float)((int)(with >> d & 1) - (int)(against >> d & 1)) : 0.0f;
         velocity = velocity * sign;
         if (Model::BALL_LIMITS && ball) {
-          const int k = d - Model::ball_dof(c.pair - Model::PAIRS);
+          const int k = d - Model::ball_dof(c.pair() - Model::PAIRS);
           row[d] = k >= 0 && k < 3 ? c.normal.component(k) : 0.0f;
           continue;
         }
@@ -1185,20 +1213,20 @@ struct Step : Math {
       const Contact& c = contact(contact_of_row(r));
 //IF ELLIPTIC
       if (r < first_frictionless() && r % CONTACT_ROWS > 0) {  // nothing is violated off the normal
-        w.weight[r] = Model::mu(c.pair);
+        w.weight[r] = Model::mu(c.pair());
         w.x[r] = 0.0f;
         continue;
       }
 //END
 //IF SOME_LACK_EDGES
-      if (r < first_frictionless() && r % CONTACT_ROWS >= Model::edges(c.pair)) {  // so far open that it stays so
+      if (r < first_frictionless() && r % CONTACT_ROWS >= Model::edges(c.pair())) {  // so far open that it stays so
         w.weight[r] = 0.0f;
         w.x[r] = 1e15f;
         continue;
       }
 //END
-      set_row(r, Model::contact_softness(c.pair), Model::inverse_inertia(c.pair), c.distance,
-              Model::least_regularisation(c.pair));
+      set_row(r, Model::contact_softness(c.pair()), Model::inverse_inertia(c.pair()), c.distance,
+              Model::least_regularisation(c.pair()));
     }
     limits = 0;
     OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
@@ -1244,17 +1272,108 @@ struct Step : Math {
     return vector[Model::friction_dof(Model::FRICTION_LOSSES ? r - first_friction() : 0)];
   }
 
-  // The law of a contact with friction at the residuals of now. The first of its rows has the weight of all; of a cone,
-  // the second has mu.
-  INLINE Law law(int contact) const {
+  // The sides on which a contact with friction is, and its law there, at the residuals of now. The first of its rows has the
+  // weight of all; of a cone, the second has mu.
+  INLINE unsigned sides_of(int contact) const {
+    const float* const x = w.x + CONTACT_ROWS * contact;
+//IF ELLIPTIC
+    return Cone::state(x, w.weight[CONTACT_ROWS * contact + 1]);
+//ELSE
+    return Pyramid::sides(x);
+//END
+  }
+  INLINE Law law(int contact, unsigned sides) const {
     const float *const x = w.x + CONTACT_ROWS * contact, *const weight = w.weight + CONTACT_ROWS * contact;
 //IF ELLIPTIC
-    return Law(x, weight[0], weight[1]);
+    return Law(x, weight[0], weight[1], sides);
 //ELSE
     float edges[CONTACT_ROWS];
     UNROLLED for (int i = 0; i < CONTACT_ROWS; ++i) edges[i] = CONTACT_ROWS == 4 ? read4(x).v[i & 3] : x[i];
-    return Law(edges, weight[0]);
+    return Law(edges, weight[0], sides);
 //END
+  }
+  INLINE Law law(int contact) const { return law(contact, sides_of(contact)); }
+
+  // ---- The guess: in the first iteration of a substep, contacts and limits are on the sides where they were at the end of
+  // the substep before, which is right more often than what the acceleration from there says.
+
+  INLINE bool has_friction(int own) const { return own < OWN_FRICTIONAL; }
+  INLINE int number(int own) const { return lane + LANES * (has_friction(own) ? own : own - OWN_FRICTIONAL); }
+  INLINE bool exists(int own) const { return number(own) < (has_friction(own) ? frictional : frictionless); }
+  // The sides of an own contact, 0 if it is open.
+  INLINE unsigned sides(int own, const bool guessed) const {
+    if (!exists(own)) return 0;
+    if (guessed) return contact_guess[own] & ((1u << SIDE_BITS) - 1);
+    return has_friction(own) ? sides_of(number(own)) : (unsigned)(w.x[first_frictionless() + number(own)] < 0.0f);
+  }
+  INLINE bool limit_closed(int side, int slot, const bool guessed) const {
+    return guessed ? limit_guess[side][slot] == CLOSED : w.x[limit_row[side][slot]] < 0.0f;
+  }
+  enum { NO_LIMIT, OPEN_LIMIT, CLOSED };  // of a guess
+
+  INLINE void forget() {
+    frictional_guesses = frictionless_guesses = 0;
+    OWN_PLACES(own, 0, CONTACT_SLOTS) contact_guess[own] = 0;
+    OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) limit_guess[side][slot] = NO_LIMIT;
+  }
+
+  // Guesses the sides of the contacts and limits that there are, and returns whether that is another guess than where they
+  // are now. What is new is guessed to be where it is.
+  INLINE bool guess() {
+    bool differs = false;
+    unsigned guesses[CONTACT_SLOTS];
+    OWN_PLACES(own, 0, CONTACT_SLOTS) {
+      const bool friction = has_friction(own);
+      const Contact* const contacts = w.contacts + (friction ? 0 : Model::FRICTIONAL);
+      const unsigned now = sides(own, false), id = exists(own) ? contacts[number(own)].id : 0;
+      unsigned found = id << SIDE_BITS | now;
+      const int first = friction ? 0 : OWN_FRICTIONAL, end = friction ? OWN_FRICTIONAL : CONTACT_SLOTS;
+      int left = friction ? frictional_guesses : frictionless_guesses;
+      OWN_PLACES(slot, first, end) {
+        const int some = left < LANES ? left : LANES;
+        ROLLED for (int from = 0; from < some; ++from) {
+          const unsigned before = read(contact_guess[slot], from);
+          if (before >> SIDE_BITS == id) found = before;
+        }
+        left -= some;
+      }
+      guesses[own] = found;
+      differs = differs || (exists(own) && (found ^ now) << (32 - SIDE_BITS));
+    }
+    OWN_PLACES(own, 0, CONTACT_SLOTS) contact_guess[own] = guesses[own];
+    OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
+      if (limit_row[side][slot] < 0) continue;
+      const bool now = limit_closed(side, slot, false);
+      unsigned char& before = limit_guess[side][slot];
+      if (before == NO_LIMIT) before = now ? CLOSED : OPEN_LIMIT;
+      differs = differs || now != (before == CLOSED);
+    }
+    return ballot(differs) != 0;
+  }
+
+  // Keeps for the next guess where contacts and limits are.
+  INLINE void keep_sides() {
+    OWN_PLACES(own, 0, CONTACT_SLOTS)
+      contact_guess[own] = contact_guess[own] >> SIDE_BITS << SIDE_BITS | sides(own, false);
+    OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side)
+      limit_guess[side][slot] = limit_row[side][slot] < 0 ? NO_LIMIT : limit_closed(side, slot, false) ? CLOSED : OPEN_LIMIT;
+    frictional_guesses = frictional;
+    frictionless_guesses = frictionless;
+  }
+
+  // Whether a contact or a limit is on another side than was guessed, or nowhere on a parabola.
+  INLINE bool misses() const {
+    bool some = false;
+    OWN_PLACES(own, 0, CONTACT_SLOTS) {
+      const unsigned now = sides(own, false);
+      some = some || now != sides(own, true);
+//IF ELLIPTIC
+      some = some || (has_friction(own) && now == Cone::SLIDING);
+//END
+    }
+    OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side)
+      some = some || (limit_row[side][slot] >= 0 && limit_closed(side, slot, false) != limit_closed(side, slot, true));
+    return some;
   }
 //IF ELLIPTIC
 
@@ -1282,7 +1401,7 @@ struct Step : Math {
 
   // What acts on a degree of freedom alone: its residual, limits and dry friction; and instead, in the end, what implicit
   // damping adds: (M + h D) a = M qacc, solved for the difference of a and qacc.
-  INLINE void own_terms(const bool damping_alone, float* diagonal, float* gradient) const {
+  INLINE void own_terms(const bool damping_alone, const bool guessed, float* diagonal, float* gradient) const {
     OWN_DOFS(slot, d) {
       diagonal[slot] = 0.0f;
       gradient[slot] = d < DOFS ? w.residual[d] : 0.0f;
@@ -1295,8 +1414,8 @@ struct Step : Math {
       UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
         const int r = limit_row[side][slot];
         if (r < 0) continue;
-        const float push = OneSided::gradient(w.x[r], w.weight[r]);
-        diagonal[slot] += OneSided::curvature(w.x[r], w.weight[r]);
+        const float weight = limit_closed(side, slot, guessed) ? w.weight[r] : 0.0f, push = weight * w.x[r];
+        diagonal[slot] += weight;
         gradient[slot] += w.limits[r - first_limit()] < 128 ? push : -push;
       }
       const int loss = Model::friction_row(d < DOFS ? d : 0);
@@ -1321,12 +1440,12 @@ struct Step : Math {
   }
 
   // J' D J over the active rows of contacts, and their gradient.
-  INLINE void add_contacts(Slots& h) const {
-    ROLLED for (int from = 0; from < frictional; from += LANES) {
-      const bool closed = from + lane < frictional && !law(from + lane).open();
-      ROLLED for (unsigned left = ballot(closed); left; left &= left - 1) {
-        const int k = from + lowest_bit(left);
-        const Law cost = law(k);
+  INLINE void add_contacts(Slots& h, const bool guessed) const {
+    OWN_PLACES(place, 0, OWN_FRICTIONAL) {
+      const unsigned own_sides = sides(place, guessed);
+      ROLLED for (unsigned left = ballot(own_sides); left; left &= left - 1) {
+        const int from = lowest_bit(left), k = LANES * place + from;
+        const Law cost = law(k, agreed(own_sides, from));
         const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
         const unsigned quads = SKIPS_QUADS ? agreed(frictional_quads, k) : ~0u;
         OWN_DOFS(slot, dof) {
@@ -1353,23 +1472,24 @@ struct Step : Math {
         }
       }
     }
-    ROLLED for (int k = 0; k < frictionless; ++k) {
-      const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
-      if (!(x < 0.0f)) continue;
-      const float* n = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
-      const unsigned quads = SKIPS_QUADS ? agreed(frictionless_quads, k) : ~0u;
-      OWN_DOFS(slot, dof) {
-        if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
-        const float n0 = n[dof < STRIDE ? dof : STRIDE - 1], c = weight * n0;
-        h.gradient[slot] += c * x;
-        if (LANES == 1 && c == 0.0f) continue;
-        UNROLLED for (int i = 0; i < QUADS; ++i) {
-          if (4 * i >= LANES * (slot + 1)) break;
-          if (SKIPS_QUADS && !(quads >> i & 1)) continue;
-          const Quad a = read4(n + 4 * i);
-          UNROLLED for (int j = 0; j < 4; ++j) h.row[slot][4 * i + j] += c * a.v[j];
+    OWN_PLACES(place, OWN_FRICTIONAL, CONTACT_SLOTS)
+      ROLLED for (unsigned left = ballot(sides(place, guessed)); left; left &= left - 1) {
+        const int k = LANES * (place - OWN_FRICTIONAL) + lowest_bit(left);
+        const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
+        const float* n = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
+        const unsigned quads = SKIPS_QUADS ? agreed(frictionless_quads, k) : ~0u;
+        OWN_DOFS(slot, dof) {
+          if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
+          const float n0 = n[dof < STRIDE ? dof : STRIDE - 1], c = weight * n0;
+          h.gradient[slot] += c * x;
+          if (LANES == 1 && c == 0.0f) continue;
+          UNROLLED for (int i = 0; i < QUADS; ++i) {
+            if (4 * i >= LANES * (slot + 1)) break;
+            if (SKIPS_QUADS && !(quads >> i & 1)) continue;
+            const Quad a = read4(n + 4 * i);
+            UNROLLED for (int j = 0; j < 4; ++j) h.row[slot][4 * i + j] += c * a.v[j];
+          }
         }
-      }
     }
   }
 
@@ -1589,7 +1709,8 @@ struct Step : Math {
     }
   }
 
-  INLINE void assemble(Branches& h, const bool with_contacts, const float* diagonal, const float* gradient) const {
+  INLINE void assemble(Branches& h, const bool with_contacts, const bool guessed, const float* diagonal,
+                       const float* gradient) const {
     OWN_ROWS(hold, row) {
       const int d = dof_of_row(row);
       const float* const mass = w.mass + STRIDE * d;
@@ -1600,33 +1721,37 @@ struct Step : Math {
     }
     if (!with_contacts) return;
     Factors factors[HOLDS];
-    ROLLED for (int k = 0; k < frictional; ++k) {
-      const Law cost = law(k);
-      if (cost.open()) continue;
-      const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
-      OWN_ROWS(hold, row) {
-        float own[DIRECTIONS];
-        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + dof_of_row(row)];
-        cost.times(own, factors[hold].of);
-        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
-          h.gradient[hold] = h.gradient[hold] + cost.gradient[i] * own[i];
-          h.diagonal[hold] = h.diagonal[hold] + factors[hold].of[i] * own[i];
+    OWN_PLACES(place, 0, OWN_FRICTIONAL) {
+      const unsigned own_sides = sides(place, guessed);
+      ROLLED for (unsigned left = ballot(own_sides); left; left &= left - 1) {
+        const int from = lowest_bit(left), k = LANES * place + from;
+        const Law cost = law(k, agreed(own_sides, from));
+        const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
+        OWN_ROWS(hold, row) {
+          float own[DIRECTIONS];
+          UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + dof_of_row(row)];
+          cost.times(own, factors[hold].of);
+          UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
+            h.gradient[hold] = h.gradient[hold] + cost.gradient[i] * own[i];
+            h.diagonal[hold] = h.diagonal[hold] + factors[hold].of[i] * own[i];
+          }
         }
+        add_products(h, rows, factors, DIRECTIONS);
       }
-      add_products(h, rows, factors, DIRECTIONS);
     }
-    ROLLED for (int k = 0; k < frictionless; ++k) {
-      const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
-      if (!(x < 0.0f)) continue;
-      const float* const row_of_contact = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
-      OWN_ROWS(hold, row) {
-        const float own = row_of_contact[dof_of_row(row)];
-        factors[hold].of[0] = weight * own;
-        h.gradient[hold] = h.gradient[hold] + factors[hold].of[0] * x;
-        h.diagonal[hold] = h.diagonal[hold] + factors[hold].of[0] * own;
+    OWN_PLACES(place, OWN_FRICTIONAL, CONTACT_SLOTS)
+      ROLLED for (unsigned left = ballot(sides(place, guessed)); left; left &= left - 1) {
+        const int k = LANES * (place - OWN_FRICTIONAL) + lowest_bit(left);
+        const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
+        const float* const row_of_contact = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
+        OWN_ROWS(hold, row) {
+          const float own = row_of_contact[dof_of_row(row)];
+          factors[hold].of[0] = weight * own;
+          h.gradient[hold] = h.gradient[hold] + factors[hold].of[0] * x;
+          h.diagonal[hold] = h.diagonal[hold] + factors[hold].of[0] * own;
+        }
+        add_products(h, row_of_contact, factors, 1);
       }
-      add_products(h, row_of_contact, factors, 1);
-    }
   }
 
   // Solves H x = gradient, sets the search direction to -x, and adds x times the gradient before.
@@ -1745,16 +1870,16 @@ struct Step : Math {
 //END
   // Sets the search direction, gradient' gradient and gradient' H^-1 gradient; or as the direction what implicit damping
   // adds to qacc.
-  INLINE void set_direction(const bool damping_alone, float& gradient_squared, float& decrement) {
+  INLINE void set_direction(const bool damping_alone, const bool guessed, float& gradient_squared, float& decrement) {
     float diagonal[SLOTS], gradient[SLOTS], sums[2] = {0.0f, 0.0f};
-    own_terms(damping_alone, diagonal, gradient);
+    own_terms(damping_alone, guessed, diagonal, gradient);
     bool by_limbs = false;
 //IF LIMBS
 #ifdef __CUDA_ARCH__
     by_limbs = damping_alone || !crossing;
     if (by_limbs) {
       Branches h;
-      assemble(h, !damping_alone, diagonal, gradient);
+      assemble(h, !damping_alone, guessed, diagonal, gradient);
       OWN_ROWS(hold, row) if (row < LIMB_ROWS + TRUNK) sums[0] += h.gradient[hold] * h.gradient[hold];
       factor_and_solve(h, sums[1]);
     }
@@ -1767,7 +1892,7 @@ struct Step : Math {
         h.gradient[slot] = gradient[slot];
       }
       start_from_mass(h);
-      if (!damping_alone) add_contacts(h);
+      if (!damping_alone) add_contacts(h, guessed);
       OWN_DOFS(slot, d) {
         gradient[slot] = d < DOFS ? h.gradient[slot] : 0.0f;
         sums[0] += gradient[slot] * gradient[slot];
@@ -1815,7 +1940,7 @@ struct Step : Math {
         continue;
       }
       const int c = r < DIRECTIONS * frictional ? r / DIRECTIONS : r - (DIRECTIONS - 1) * frictional;
-      const float damping = Model::contact_softness(contact(c).pair).damping;
+      const float damping = Model::contact_softness(contact(c).pair()).damping;
       w.projected[r] = product + damping * times(row, w.qvel);
     }
     sync();
@@ -1857,7 +1982,7 @@ struct Step : Math {
     sum(sums, 3 * n);
   }
 
-  INLINE Search line_search(const float decrement) {
+  INLINE Search line_search(const float decrement, const bool guessed) {
     float t[7] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
     OWN_DOFS(slot, d) {
       if (d >= DOFS) continue;
@@ -1888,8 +2013,8 @@ struct Step : Math {
 //LINE_SEARCH
   }
 
-  // Moves along the direction, and returns whether a row changed sides.
-  INLINE bool move(const Search& step) {
+  // Moves along the direction, and returns whether a row changed sides, or is not on those that were guessed.
+  INLINE bool move(const Search& step, const bool guessed) {
     const float alpha = step.alpha;
     OWN_DOFS(slot, d) {
       if (d >= DOFS) continue;
@@ -1904,18 +2029,24 @@ struct Step : Math {
       const int r = first_single() + i;
       const ConstraintRow row = single(r);
       const float next = row.after(alpha);
-      crossed |= row.crosses(next);
+      crossed |= row.crosses(next) && !(guessed && r < first_friction());
       w.x[r] = next;
     }
     sync();
+    if (guessed) crossed = misses() || (Model::FRICTION_LOSSES && crossed);
     return ballot(crossed) != 0;
   }
 
   // Leaves the acceleration in qacc; with implicit damping, search is what has to be added to it before integration.
   INLINE void solve(const bool live) {
-    if (live) complete_rows();
+    bool guesses = false;
+    if (live) {
+      complete_rows();
+      if (GUESSES) guesses = guess();
+    }
 //NEWTON
     sync();
+    if (live && GUESSES) keep_sides();
   }
 
   // ---- Integration: semi-implicit Euler
@@ -1949,9 +2080,9 @@ struct Step : Math {
     SHARED_LOOP(i, frictional + frictionless) {
       const Contact c = contact(i);
       unsigned felt = 0;
-      ROLLED for (int s = 0; s < Model::TOUCH && c.pair < Model::PAIRS; ++s) {
+      ROLLED for (int s = 0; s < Model::TOUCH && c.pair() < Model::PAIRS; ++s) {
         const int body = Model::site_body(s);
-        const bool first = body == Model::first_body(c.pair), second = body == Model::second_body(c.pair);
+        const bool first = body == Model::first_body(c.pair()), second = body == Model::second_body(c.pair());
         const Pose pose = pose_of(Model::site_link(s));
         const Mat site = Model::site_orientation(s);
         const Vec p = c.point + w.com[0] - pose.position;
@@ -1991,8 +2122,8 @@ struct Step : Math {
       const int i = lane + LANES * own;
       if (i >= frictional + frictionless) continue;
       const Contact c = contact(i);
-      own_contacts[own] = {c.normal, c.normal, c.pair};
-      if (i < frictional) own_contacts[own].tangent = w.tangents[i] * Model::friction(c.pair);
+      own_contacts[own] = {c.normal, c.normal, c.pair()};
+      if (i < frictional) own_contacts[own].tangent = w.tangents[i] * Model::friction(c.pair());
     }
     sync();
   }
@@ -2236,6 +2367,7 @@ if (live) {
 #undef UNROLLED
 #undef OWN_DOFS
 #undef OWN_LINKS
+#undef OWN_PLACES
 #undef SHARED_LOOP
 #undef OWN_ROWS
 #undef LOCKSTEP

@@ -44,7 +44,9 @@ from torchrl_loco.sim.models import NEVER, home_pose
 
 TEMPLATE = pathlib.Path(__file__).with_name("lanes.h")
 LINE_SEARCH = shared.line_search("Model::scale()", "Model::ls_tolerance()", "Model::ls_near()", "Model::LS_ITERATIONS")
-NEWTON = shared.newton("Model::scale()", "Model::tolerance()", "Model::ITERATIONS", "Model::IMPLICIT_DAMPING")
+NEWTON = shared.newton(
+    "Model::scale()", "Model::tolerance()", "Model::ITERATIONS", "Model::IMPLICIT_DAMPING", guesses="guesses"
+)
 TRANSLATION, ROTATION = 0, 1
 """Kinds of a degree of freedom in ``lanes.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
 UNLIMITED = 1e30

@@ -2,6 +2,7 @@
 // quadratic in pieces. The direction is a step of Newton's method, so its slope at alpha = 0 is minus the decrement, its
 // curvature there the decrement, and the first point that is tried is alpha = 1. It reads:
 //   decrement                   gradient' H^-1 gradient
+//   guessed                     whether these are of rows that were guessed to be active: then it is alpha = 1 or nothing
 //   quadratic[3]                slope and curvature of the quadratic form, and the squared length of the direction
 //   whole[4]                    of all rows the cost at alpha = 0, and at alpha = 1 what add_rows adds
 //   add_rows(alphas, n, sums)   adds three numbers for each of n steps, over all rows
@@ -14,9 +15,13 @@ const float tolerance = Math::larger(LS_TOLERANCE * Math::divide(Math::root(quad
 const float sizes = Math::root(2.0f * whole[0] * Math::larger(start.curvature - curvature, 0.0f)) + fabsf(slope);
 const float noise = 8.0f * 1.1920929e-7f * sizes, accept = Math::larger(tolerance, noise);
 Search result = {0.0f, 0.0f, 0.0f};
+const Point first = Point::at(1.0f, slope, curvature, whole + 1);
+if (guessed) {  // not the slope at alpha = 0, as other rows are active there
+  result.take(first, true);
+  return result;
+}
 if (fabsf(start.slope) < noise) return result;
 
-const Point first = Point::at(1.0f, slope, curvature, whole + 1);
 if (BY_SLOPES) {  // Newton's method between two slopes of different sign: it is exact once it knows which rows are active
   float low = 0.0f, high = Math::from_bits(0x7f800000u);
   // Where the cost rises, a step leaves what is rounding of alpha: a heavy row may begin just before p.

@@ -25,7 +25,7 @@ def line_search(scale: str, tolerance: str, near: str, iterations: str, by_slope
     return _filled(_LINE_SEARCH, SCALE=scale, **values)
 
 
-def newton(scale: str, tolerance: str, iterations: str, implicit_damping: str) -> str:
+def newton(scale: str, tolerance: str, iterations: str, implicit_damping: str, guesses: str) -> str:
     """Returns the body of the function of Newton's method.
 
     Args:
@@ -33,9 +33,10 @@ def newton(scale: str, tolerance: str, iterations: str, implicit_damping: str) -
         tolerance: of improvement and gradient, relative to it.
         iterations: at most.
         implicit_damping: whether it ends with what implicit damping adds.
+        guesses: whether it begins with a guess.
     """
-    values = {"SCALE": scale, "TOLERANCE": tolerance, "ITERATIONS": iterations, "IMPLICIT_DAMPING": implicit_damping}
-    return _filled(_NEWTON, **values)
+    values = {"SCALE": scale, "TOLERANCE": tolerance, "ITERATIONS": iterations}
+    return _filled(_NEWTON, **values, IMPLICIT_DAMPING=implicit_damping, GUESSES=guesses)
 
 
 def _filled(text: str, **values: str) -> str:
