@@ -491,7 +491,7 @@ class G1Velocity(Velocity):
     own_geoms = "(?!.*foot).*_collision"
     presets = {
         **Velocity.presets,
-        "ppo": {**Velocity.presets["ppo"], "total_frames": 300_000_000, "entropy_coeff": 0.005},
+        "ppo": {**Velocity.presets["ppo"], "total_frames": 340_000_000, "entropy_coeff": 0.005},
     }
     extremes = 0.1  # else it falls at times when both velocities and the yaw rate stay at an end
     stand = {".*": 0.05}
