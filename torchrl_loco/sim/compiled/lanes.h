@@ -75,7 +75,7 @@ enum {
   CONTACTS = Model::FRICTIONAL + Model::FRICTIONLESS,
   // A lane looks after the contacts lane, lane + LANES, ... with friction, then after those without.
   OWN_FRICTIONAL = (Model::FRICTIONAL + LANES - 1) / LANES,
-  GUESSES = Model::SUBSTEPS > 1,
+  GUESSES = Model::SUBSTEPS > 1 && !Model::ELLIPTIC,  // those of cones miss too often for what they cost
   CONTACT_SLOTS = OWN_FRICTIONAL + (Model::FRICTIONLESS + LANES - 1) / LANES,
   POINT_BITS = 2,
   SIDE_BITS = 10,  // of a contact: which edges of its pyramid are closed, the state of its cone, or whether it is closed
@@ -313,10 +313,10 @@ struct Step : Math {
   int frictional, frictionless;  // contacts
   int limits;                    // violated limits of hinges and slides
   int limit_row[Model::LIMIT_SIDES][SLOTS];  // the row of the limit of each own degree of freedom, or -1
-  // What is guessed: sides of own contacts, below their ids; and of own limits.
-  unsigned contact_guess[CONTACT_SLOTS];
-  unsigned char limit_guess[Model::LIMIT_SIDES][SLOTS];
-  int frictional_guesses, frictionless_guesses;
+  // On which sides the next direction takes own contacts to be, below their ids, and own limits.
+  unsigned contact_sides[CONTACT_SLOTS];
+  enum LimitSide : unsigned char { NO_LIMIT, OPEN, CLOSED } limit_sides[Model::LIMIT_SIDES][SLOTS];
+  int frictional_before, frictionless_before;  // contacts of the substep before
   // Of this lane's contacts, with friction and without, the quads of columns in which the Jacobian has numbers.
   unsigned frictional_quads, frictionless_quads;
 //IF LIMBS
@@ -332,7 +332,8 @@ struct Step : Math {
 
   INLINE Step(World& w, int lane, const float* ctrl, int* overflow, int world, const float* row)
       : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world), varied{{row}} {
-    forget();
+    frictional_before = frictionless_before = 0;
+    OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) limit_sides[side][slot] = NO_LIMIT;
   }
 
   // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for each direction
@@ -1294,100 +1295,67 @@ struct Step : Math {
   }
   INLINE Law law(int contact) const { return law(contact, sides_of(contact)); }
 
-  // ---- The guess: in the first iteration of a substep, contacts and limits are on the sides where they were at the end of
-  // the substep before, which is right more often than what the acceleration from there says.
-
   INLINE bool has_friction(int own) const { return own < OWN_FRICTIONAL; }
   INLINE int number(int own) const { return lane + LANES * (has_friction(own) ? own : own - OWN_FRICTIONAL); }
   INLINE bool exists(int own) const { return number(own) < (has_friction(own) ? frictional : frictionless); }
-  // The sides of an own contact, 0 if it is open.
-  INLINE unsigned sides(int own, const bool guessed) const {
+  // The sides of an own contact, 0 if it is open: as they are taken, and as they are.
+  INLINE unsigned sides(int own) const { return exists(own) ? contact_sides[own] & ((1u << SIDE_BITS) - 1) : 0; }
+  INLINE unsigned sides_now(int own) const {
     if (!exists(own)) return 0;
-    if (guessed) return contact_guess[own] & ((1u << SIDE_BITS) - 1);
     return has_friction(own) ? sides_of(number(own)) : (unsigned)(w.x[first_frictionless() + number(own)] < 0.0f);
   }
-  INLINE bool limit_closed(int side, int slot, const bool guessed) const {
-    return guessed ? limit_guess[side][slot] == CLOSED : w.x[limit_row[side][slot]] < 0.0f;
-  }
-  enum { NO_LIMIT, OPEN_LIMIT, CLOSED };  // of a guess
+  INLINE LimitSide limit_side_now(int row) const { return row < 0 ? NO_LIMIT : w.x[row] < 0.0f ? CLOSED : OPEN; }
 
-  INLINE void forget() {
-    frictional_guesses = frictionless_guesses = 0;
-    OWN_PLACES(own, 0, CONTACT_SLOTS) contact_guess[own] = 0;
-    OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) limit_guess[side][slot] = NO_LIMIT;
-  }
-
-  // Guesses the sides of the contacts and limits that there are, and returns whether that is another guess than where they
-  // are now. What is new is guessed to be where it is.
-  INLINE bool guess() {
+  // Takes contacts and limits to be where they were at the end of the substep before, which is right more often than what
+  // its acceleration says now; what is new, where it is. Returns whether some are elsewhere now.
+  INLINE bool guess_sides() {
     bool differs = false;
-    unsigned guesses[CONTACT_SLOTS];
+    unsigned found[CONTACT_SLOTS];
     OWN_PLACES(own, 0, CONTACT_SLOTS) {
       const bool friction = has_friction(own);
-      const Contact* const contacts = w.contacts + (friction ? 0 : Model::FRICTIONAL);
-      const unsigned now = sides(own, false), id = exists(own) ? contacts[number(own)].id : 0;
-      unsigned found = id << SIDE_BITS | now;
-      const int first = friction ? 0 : OWN_FRICTIONAL, end = friction ? OWN_FRICTIONAL : CONTACT_SLOTS;
-      int left = friction ? frictional_guesses : frictionless_guesses;
-      OWN_PLACES(slot, first, end) {
+      const unsigned now = sides_now(own);
+      const unsigned id = exists(own) ? w.contacts[number(own) + (friction ? 0 : Model::FRICTIONAL)].id : 0;
+      found[own] = id << SIDE_BITS | now;
+      int left = !GUESSES ? 0 : friction ? frictional_before : frictionless_before;
+      OWN_PLACES(slot, friction ? 0 : OWN_FRICTIONAL, friction ? OWN_FRICTIONAL : CONTACT_SLOTS) {
         const int some = left < LANES ? left : LANES;
         ROLLED for (int from = 0; from < some; ++from) {
-          const unsigned before = read(contact_guess[slot], from);
-          if (before >> SIDE_BITS == id) found = before;
+          const unsigned before = read(contact_sides[slot], from);
+          if (before >> SIDE_BITS == id) found[own] = before;
         }
         left -= some;
       }
-      guesses[own] = found;
-      differs = differs || (exists(own) && (found ^ now) << (32 - SIDE_BITS));
+      differs = differs || (exists(own) && (found[own] ^ now) << (32 - SIDE_BITS));
     }
-    OWN_PLACES(own, 0, CONTACT_SLOTS) contact_guess[own] = guesses[own];
+    OWN_PLACES(own, 0, CONTACT_SLOTS) contact_sides[own] = found[own];
     OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
-      if (limit_row[side][slot] < 0) continue;
-      const bool now = limit_closed(side, slot, false);
-      unsigned char& before = limit_guess[side][slot];
-      if (before == NO_LIMIT) before = now ? CLOSED : OPEN_LIMIT;
-      differs = differs || now != (before == CLOSED);
+      const LimitSide now = limit_side_now(limit_row[side][slot]), before = limit_sides[side][slot];
+      limit_sides[side][slot] = GUESSES && now != NO_LIMIT && before != NO_LIMIT ? before : now;
+      differs = differs || limit_sides[side][slot] != now;
     }
+    frictional_before = frictional;
+    frictionless_before = frictionless;
     return ballot(differs) != 0;
   }
 
-  // Keeps for the next guess where contacts and limits are.
-  INLINE void keep_sides() {
-    OWN_PLACES(own, 0, CONTACT_SLOTS)
-      contact_guess[own] = contact_guess[own] >> SIDE_BITS << SIDE_BITS | sides(own, false);
-    OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side)
-      limit_guess[side][slot] = limit_row[side][slot] < 0 ? NO_LIMIT : limit_closed(side, slot, false) ? CLOSED : OPEN_LIMIT;
-    frictional_guesses = frictional;
-    frictionless_guesses = frictionless;
-  }
-
-  // Whether a contact or a limit is on another side than was guessed, or nowhere on a parabola.
-  INLINE bool misses() const {
-    bool some = false;
+  // Takes contacts and limits to be where they are, and returns whether some were elsewhere, or nowhere on a parabola.
+  INLINE bool find_sides() {
+    bool differs = false;
     OWN_PLACES(own, 0, CONTACT_SLOTS) {
-      const unsigned now = sides(own, false);
-      some = some || now != sides(own, true);
+      const unsigned now = sides_now(own);
+      differs = differs || now != sides(own);
 //IF ELLIPTIC
-      some = some || (has_friction(own) && now == Cone::SLIDING);
+      differs = differs || (has_friction(own) && now == Cone::SLIDING);
 //END
+      contact_sides[own] = contact_sides[own] >> SIDE_BITS << SIDE_BITS | now;
     }
-    OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side)
-      some = some || (limit_row[side][slot] >= 0 && limit_closed(side, slot, false) != limit_closed(side, slot, true));
-    return some;
+    OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
+      const LimitSide now = limit_side_now(limit_row[side][slot]);
+      differs = differs || now != limit_sides[side][slot];
+      limit_sides[side][slot] = now;
+    }
+    return differs;
   }
-//IF ELLIPTIC
-
-  // Moves the residuals of a cone, and returns whether the Hessian of its cost changes.
-  INLINE bool move_cone(int contact, float alpha) {
-    const int first = CONTACT_ROWS * contact;
-    float* const x = w.x + first;
-    const float mu = w.weight[first + 1];
-    const Cone::State before = Cone::state(x, mu);
-    UNROLLED for (int j = 0; j < CONTACT_ROWS; ++j) x[j] += alpha * w.change[first + j];
-    const Cone::State after = Cone::state(x, mu);
-    return before != after || after == Cone::SLIDING;
-  }
-//END
 
   // ---- Newton's method
 
@@ -1401,7 +1369,7 @@ struct Step : Math {
 
   // What acts on a degree of freedom alone: its residual, limits and dry friction; and instead, in the end, what implicit
   // damping adds: (M + h D) a = M qacc, solved for the difference of a and qacc.
-  INLINE void own_terms(const bool damping_alone, const bool guessed, float* diagonal, float* gradient) const {
+  INLINE void own_terms(const bool damping_alone, float* diagonal, float* gradient) const {
     OWN_DOFS(slot, d) {
       diagonal[slot] = 0.0f;
       gradient[slot] = d < DOFS ? w.residual[d] : 0.0f;
@@ -1414,7 +1382,7 @@ struct Step : Math {
       UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
         const int r = limit_row[side][slot];
         if (r < 0) continue;
-        const float weight = limit_closed(side, slot, guessed) ? w.weight[r] : 0.0f, push = weight * w.x[r];
+        const float weight = limit_sides[side][slot] == CLOSED ? w.weight[r] : 0.0f, push = weight * w.x[r];
         diagonal[slot] += weight;
         gradient[slot] += w.limits[r - first_limit()] < 128 ? push : -push;
       }
@@ -1440,9 +1408,9 @@ struct Step : Math {
   }
 
   // J' D J over the active rows of contacts, and their gradient.
-  INLINE void add_contacts(Slots& h, const bool guessed) const {
+  INLINE void add_contacts(Slots& h) const {
     OWN_PLACES(place, 0, OWN_FRICTIONAL) {
-      const unsigned own_sides = sides(place, guessed);
+      const unsigned own_sides = sides(place);
       ROLLED for (unsigned left = ballot(own_sides); left; left &= left - 1) {
         const int from = lowest_bit(left), k = LANES * place + from;
         const Law cost = law(k, agreed(own_sides, from));
@@ -1473,7 +1441,7 @@ struct Step : Math {
       }
     }
     OWN_PLACES(place, OWN_FRICTIONAL, CONTACT_SLOTS)
-      ROLLED for (unsigned left = ballot(sides(place, guessed)); left; left &= left - 1) {
+      ROLLED for (unsigned left = ballot(sides(place)); left; left &= left - 1) {
         const int k = LANES * (place - OWN_FRICTIONAL) + lowest_bit(left);
         const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
         const float* n = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
@@ -1709,8 +1677,7 @@ struct Step : Math {
     }
   }
 
-  INLINE void assemble(Branches& h, const bool with_contacts, const bool guessed, const float* diagonal,
-                       const float* gradient) const {
+  INLINE void assemble(Branches& h, const bool with_contacts, const float* diagonal, const float* gradient) const {
     OWN_ROWS(hold, row) {
       const int d = dof_of_row(row);
       const float* const mass = w.mass + STRIDE * d;
@@ -1722,7 +1689,7 @@ struct Step : Math {
     if (!with_contacts) return;
     Factors factors[HOLDS];
     OWN_PLACES(place, 0, OWN_FRICTIONAL) {
-      const unsigned own_sides = sides(place, guessed);
+      const unsigned own_sides = sides(place);
       ROLLED for (unsigned left = ballot(own_sides); left; left &= left - 1) {
         const int from = lowest_bit(left), k = LANES * place + from;
         const Law cost = law(k, agreed(own_sides, from));
@@ -1740,7 +1707,7 @@ struct Step : Math {
       }
     }
     OWN_PLACES(place, OWN_FRICTIONAL, CONTACT_SLOTS)
-      ROLLED for (unsigned left = ballot(sides(place, guessed)); left; left &= left - 1) {
+      ROLLED for (unsigned left = ballot(sides(place)); left; left &= left - 1) {
         const int k = LANES * (place - OWN_FRICTIONAL) + lowest_bit(left);
         const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
         const float* const row_of_contact = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
@@ -1870,16 +1837,16 @@ struct Step : Math {
 //END
   // Sets the search direction, gradient' gradient and gradient' H^-1 gradient; or as the direction what implicit damping
   // adds to qacc.
-  INLINE void set_direction(const bool damping_alone, const bool guessed, float& gradient_squared, float& decrement) {
+  INLINE void set_direction(const bool damping_alone, float& gradient_squared, float& decrement) {
     float diagonal[SLOTS], gradient[SLOTS], sums[2] = {0.0f, 0.0f};
-    own_terms(damping_alone, guessed, diagonal, gradient);
+    own_terms(damping_alone, diagonal, gradient);
     bool by_limbs = false;
 //IF LIMBS
 #ifdef __CUDA_ARCH__
     by_limbs = damping_alone || !crossing;
     if (by_limbs) {
       Branches h;
-      assemble(h, !damping_alone, guessed, diagonal, gradient);
+      assemble(h, !damping_alone, diagonal, gradient);
       OWN_ROWS(hold, row) if (row < LIMB_ROWS + TRUNK) sums[0] += h.gradient[hold] * h.gradient[hold];
       factor_and_solve(h, sums[1]);
     }
@@ -1892,7 +1859,7 @@ struct Step : Math {
         h.gradient[slot] = gradient[slot];
       }
       start_from_mass(h);
-      if (!damping_alone) add_contacts(h, guessed);
+      if (!damping_alone) add_contacts(h);
       OWN_DOFS(slot, d) {
         gradient[slot] = d < DOFS ? h.gradient[slot] : 0.0f;
         sums[0] += gradient[slot] * gradient[slot];
@@ -2013,27 +1980,23 @@ struct Step : Math {
 //LINE_SEARCH
   }
 
-  // Moves along the direction, and returns whether a row changed sides, or is not on those that were guessed.
-  INLINE bool move(const Search& step, const bool guessed) {
+  // Moves along the direction, if at all, and returns whether a row is not where it was taken to be.
+  INLINE bool move(const Search& step) {
     const float alpha = step.alpha;
     OWN_DOFS(slot, d) {
-      if (d >= DOFS) continue;
+      if (d >= DOFS || alpha == 0.0f) continue;
       w.qacc[d] += alpha * w.search[d];
       w.residual[d] += alpha * w.mass_search[d];
     }
     bool crossed = false;
-//IF ELLIPTIC
-    SHARED_LOOP(k, frictional) crossed |= move_cone(k, alpha);
-//END
-    SHARED_LOOP(i, rows() - first_single()) {
-      const int r = first_single() + i;
-      const ConstraintRow row = single(r);
-      const float next = row.after(alpha);
-      crossed |= row.crosses(next) && !(guessed && r < first_friction());
+    SHARED_LOOP(r, alpha == 0.0f ? 0 : rows()) {
+      const float before = w.x[r], next = before + alpha * w.change[r];
+      if (Model::FRICTION_LOSSES && r >= first_friction())
+        crossed |= DryFriction::crosses(before, next, Model::friction_bound(r - first_friction()));
       w.x[r] = next;
     }
     sync();
-    if (guessed) crossed = misses() || (Model::FRICTION_LOSSES && crossed);
+    crossed |= find_sides();
     return ballot(crossed) != 0;
   }
 
@@ -2042,11 +2005,10 @@ struct Step : Math {
     bool guesses = false;
     if (live) {
       complete_rows();
-      if (GUESSES) guesses = guess();
+      guesses = guess_sides() && GUESSES;
     }
 //NEWTON
     sync();
-    if (live && GUESSES) keep_sides();
   }
 
   // ---- Integration: semi-implicit Euler

@@ -5,15 +5,15 @@
 // `repeated`. It reads:
 //   live                    whether there is a world
 //   any_of_block(x)         whether x holds here, or in a world that begins its iterations together with this one
-//   GUESSES                 whether the first iteration guesses which rows are active
-//   set_direction(found, guessed, gradient_squared, decrement)
+//   GUESSES                 whether the first direction takes other rows to be active than those that are
+//   set_direction(found, gradient_squared, decrement)
 //                           sets s and, at its start, gradient' gradient and gradient' H^-1 gradient; once qacc is
 //                           found, which is asked for if IMPLICIT_DAMPING, instead what that adds to qacc
 //   project()               sets how all changes along s
 //   line_search(decrement, guessed)
 //                           returns a step along s; of a guess, all of s or nothing
-//   move(step, guessed)     takes it, and returns whether a row changed sides, or is not where it was guessed; sets its
-//                           improvement if the search does not
+//   move(step)              takes it, and returns whether a row is on another side than the direction took it to be; sets
+//                           its improvement if the search does not
 //   flag(bit)               reports what was cut short
 // SCALE is one over the inertia of the model.
 
@@ -33,16 +33,16 @@ ROLLED for (int iteration = 0; any_of_block(!done); ++iteration) {
   done = found;
   if (done && !IMPLICIT_DAMPING) continue;
   const bool guessed = GUESSES && iteration == 0;
-  set_direction(found, guessed, gradient_squared, decrement);
+  set_direction(found, gradient_squared, decrement);
   if (done) continue;
   found = iteration > 0 && flat(1.0f);
   if (found) continue;
   project();
   Search step = line_search(decrement, guessed);
   found = (step.alpha == 0.0f) & !guessed;
-  if (step.alpha == 0.0f) continue;
+  if (found) continue;
   const bool repeated = same;
-  same = !move(step, guessed);
+  same = !move(step);
   found = (step.improvement > 0.0f) & (step.improvement * SCALE < TOLERANCE) & !guessed;
   if (same && !found) {  // what is left of a Newton step; of a second one on the same parabola, rounding
     // On a parabola the slope is (alpha - 1) decrement. A difference is an error of s along s; across, it may be tenfold.

@@ -77,14 +77,14 @@ class NewtonSolver:
         for i, product in enumerate(self.tree.mass_times(cells("qacc", m.nv))):
             block.set(f"M_qacc[{i}]", product)
         scale = 1 / (m.stat.meaninertia * max(m.nv, 1))
-        with block.function("set_direction", "bool, bool, float& gradient_squared, float& decrement") as direction:
+        with block.function("set_direction", "bool, float& gradient_squared, float& decrement") as direction:
             self._set_direction(direction)
         block("float quadratic[3], whole[4];")
         with block.function("project") as projection:
             self._project(projection)
         with block.function("line_search", "const float decrement, const bool guessed") as search:
             self._line_search(search, scale)
-        with block.function("move", "Search& step, bool") as step:
+        with block.function("move", "Search& step") as step:
             self._move(step)
         block("const auto any_of_block = [](bool x) { return x; };")
         limits = literal(scale), literal(tolerance(m)), str(option.iterations)
