@@ -277,7 +277,7 @@ def compare(xml, count=STATES, *, vary=False, implicitfast=False):
         else:  # a direction without much cost: as near to the minimum as float32 can tell from where the solver starts
             tried = (state[2], found_by_c, sim.qacc_warmstart[world].double().numpy(), *(qacc for _, qacc in nearby))
             start, least, reached, *others = (cost(model, data, qacc) for qacc in tried)
-            allowed = 1e-7 * max(start, least) + 10 * (max(others) - least)
+            allowed = 2 * np.finfo(np.float32).eps * max(start, least) + 10 * (max(others) - least)
             assert reached - least < allowed, f"world {world}: qvel differs by {error} of {change}"
         qpos = state[0].astype(np.float64)
         mujoco.mj_integratePos(model, qpos, sim.qvel[world].double().numpy(), model.opt.timestep)
