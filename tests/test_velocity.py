@@ -350,12 +350,6 @@ def test_commands_have_their_shares_and_ranges(many):
     assert memory["until_command"].min() >= 3.0
     assert memory["until_command"].max() == pytest.approx(8.0, abs=0.05)
 
-    extreme = type("Extreme", (velocity.H1Velocity,), {"extremes": 0.3})(2000, "cpu", 0, sim_dt=0.02)
-    command = extreme.reset()["observation"][:, -3:]
-    corners = command[(command.abs() == torch.tensor([1.0, 1.0, 0.5])).all(-1)]
-    assert len(corners) / 2000 == pytest.approx(0.3 * (2 / 3) ** 3, abs=0.02)
-    assert len(corners.unique(dim=0)) == 8
-
 
 def test_commands_are_drawn_anew_when_they_are_due(many):
     many.reset()
@@ -550,8 +544,6 @@ def test_a_table_makes_a_task_of_a_users_robot(caplog):
         type("Bare", (velocity.Velocity,), {"model": Table.model})(1, "cpu")
     with pytest.raises(ValueError, match="delay of Slow must be 0, 1 or 2 control steps, not 3"):
         type("Slow", (Table,), {"max_delay": 3})(1, "cpu")
-    with pytest.raises(ValueError, match="extremes"):
-        type("Wild", (Table,), {"extremes": 1.5})(1, "cpu")
 
 
 UNFIT = [

@@ -178,8 +178,6 @@ class Velocity(LocoEnv):
     """Weights of the reward's terms; that of ``angular_momentum`` needs a sensor ``subtreeangmom`` of this name."""
     curriculum: ClassVar[dict[int, commands.Ranges]] = CURRICULUM
     """Ranges of the commands by the control step of training from which they hold."""
-    extremes: ClassVar[float] = 0.0
-    """Share of the commands of which each component is at an end of its range, or zero."""
     step_height: ClassVar[float] = 0.1
     """Height of a foot in mid-swing (m)."""
     max_delay: ClassVar[int] = 2
@@ -193,16 +191,13 @@ class Velocity(LocoEnv):
 
         Raises:
             TypeError: an attribute is missing.
-            ValueError: the greatest delay is not 0, 1 or 2, or the share of extreme commands is none.
+            ValueError: the greatest delay is not 0, 1 or 2.
         """
         missing = [name for name in TABLE if not hasattr(cls, name)]
         if missing:
             raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.Velocity)")
         if cls.max_delay not in (0, 1, 2):
             raise ValueError(f"max_delay of {cls.__name__} must be 0, 1 or 2 control steps, not {cls.max_delay!r}")
-        if not 0 <= cls.extremes <= 1 - commands.STAND:
-            most = 1 - commands.STAND  # the others stand still
-            raise ValueError(f"extremes of {cls.__name__} must be a share from 0 to {most:g}, not {cls.extremes!r}")
         super().check_class()
 
     @classmethod
@@ -370,7 +365,7 @@ class Velocity(LocoEnv):
         goes_on["until_command"] = s.until_command - s.dt
         rows = {
             name: torch.where(due.view(-1, *[1] * (new.ndim - 1)), new, goes_on[name])
-            for name, new in commands.draw(s, self.curriculum, self.extremes).items()
+            for name, new in commands.draw(s, self.curriculum).items()
         }
         return {
             **self.commanded(s, rows, torch.atan2(forward[:, 1], forward[:, 0])),
@@ -415,7 +410,7 @@ class Velocity(LocoEnv):
         height = s.home[:, 2:3] + s.uniform(*START_HEIGHT, 1)
         turn = torch.stack([(0.5 * yaw).cos(), zero, zero, (0.5 * yaw).sin()], dim=-1)
         return {
-            **self.commanded(s, commands.draw(s, self.curriculum, self.extremes), yaw),
+            **self.commanded(s, commands.draw(s, self.curriculum), yaw),
             "qpos": torch.cat([place, height, turn, s.home[:, 7:]], dim=-1),
             "until_push": s.uniform(*PUSH_EVERY),
             "bias": s.uniform(-BIAS, BIAS, len(self.joints)),
@@ -491,9 +486,8 @@ class G1Velocity(Velocity):
     own_geoms = "(?!.*foot).*_collision"
     presets = {
         **Velocity.presets,
-        "ppo": {**Velocity.presets["ppo"], "total_frames": 340_000_000, "entropy_coeff": 0.005},
+        "ppo": {**Velocity.presets["ppo"], "total_frames": 300_000_000, "entropy_coeff": 0.005},
     }
-    extremes = 0.1  # else it falls at times when both velocities and the yaw rate stay at an end
     stand = {".*": 0.05}
     walk = {
         ".*hip_pitch.*": 0.3,

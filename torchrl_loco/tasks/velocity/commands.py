@@ -63,25 +63,14 @@ def first(curriculum: dict[int, Ranges]) -> dict[str, tuple[float, float]]:
     return dict(zip(NAMES, next(iter(curriculum.values())), strict=True))
 
 
-def draw(s: "View", curriculum: dict[int, Ranges], extremes: float = 0.0) -> dict[str, torch.Tensor]:
-    """Returns rows of a new command: of command, heading, whether it is held, and time until the next.
-
-    Args:
-        s: the worlds, whose memory has ``trained``.
-        curriculum: ranges by the control step of training from which they hold, in rising order.
-        extremes: share of the commands of which each component is at an end of its range, or zero.
-    """
+def draw(s: "View", curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
+    """Returns rows of a new command: of command, heading, whether it is held, and time until the next."""
     low, high = limits(s, curriculum)
-    share, kind = s.uniform(0.0, 1.0, 3), s.uniform(0.0, 1.0, 3)
-    command = low + (high - low) * share
-    stands, extreme = kind[:, 0] < STAND, (kind[:, 0] >= STAND) & (kind[:, 0] < STAND + extremes)
-    ahead, holds = (kind[:, 2] < AHEAD) & ~extreme, (kind[:, 1] < TURN) & ~extreme
+    command, kind = low + (high - low) * s.uniform(0.0, 1.0, 3), s.uniform(0.0, 1.0, 3)
+    stands, holds, ahead = kind[:, 0] < STAND, kind[:, 1] < TURN, kind[:, 2] < AHEAD
     forward = command[:, :1].abs().clamp(min=SLOWEST)
     straight = torch.cat([forward, torch.zeros_like(command[:, 1:])], dim=-1)
     command = torch.where(ahead.unsqueeze(-1), straight, command)
-    if extremes > 0:
-        ends = torch.where(share < 1 / 3, low, torch.where(share > 2 / 3, high, 0.0))
-        command = torch.where(extreme.unsqueeze(-1), ends, command)
     return {
         "command": torch.where(stands.unsqueeze(-1), 0.0, command),
         "heading": s.uniform(-math.pi, math.pi),
