@@ -75,7 +75,7 @@ enum {
   CONTACTS = Model::FRICTIONAL + Model::FRICTIONLESS,
   // A lane looks after the contacts lane, lane + LANES, ... with friction, then after those without.
   OWN_FRICTIONAL = (Model::FRICTIONAL + LANES - 1) / LANES,
-  GUESSES = Model::SUBSTEPS > 1 && !Model::ELLIPTIC,  // those of cones miss too often for what they cost
+  GUESSES = Model::SUBSTEPS > 1,
   CONTACT_SLOTS = OWN_FRICTIONAL + (Model::FRICTIONLESS + LANES - 1) / LANES,
   POINT_BITS = 2,
   SIDE_BITS = 10,  // of a contact: which edges of its pyramid are closed, the state of its cone, or whether it is closed
