@@ -155,6 +155,9 @@ def test_damaged_nan_dumps(tmp_path):
     with pytest.warns(torchrl_loco.NonFiniteWarning):
         env.close()
     assert_damage_is_noticed(path, lambda: nan_dump.load(path), "NaN dump")
+    path.write_bytes(path.read_bytes().replace(b'"env"', b'"fnv"'))
+    with pytest.raises(ValueError, match="settings lack env"):
+        nan_dump.load(path)
 
 
 def test_damaged_checkpoints(tmp_path):

@@ -70,6 +70,8 @@ def load(path: Path) -> NanDump:
         ValueError: it is no NaN dump, damaged, or of an environment that is not installed.
     """
     dump = NanDump(*storage.load(path, NAN_DUMP))
+    if missing := [name for name in ("env", "config", "seed", "protocol") if name not in dump.settings]:
+        raise ValueError(f"{path} cannot be read as a {NAN_DUMP}: its settings lack {', '.join(missing)}")
     try:
         _class_of(dump.settings)
     except (KeyError, OSError, ImportError, ValueError) as error:
