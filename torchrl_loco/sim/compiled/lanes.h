@@ -78,6 +78,7 @@ enum {
   GUESSES = Model::SUBSTEPS > 1,
   CONTACT_SLOTS = OWN_FRICTIONAL + (Model::FRICTIONLESS + LANES - 1) / LANES,
   POINT_BITS = 2,
+  NO_CONTACT = (1 << 22) - 1,  // an id
   SIDE_BITS = 10,  // of a contact: which edges of its pyramid are closed, the state of its cone, or whether it is closed
   // Columns are left out where a lane knows those of a contact of each kind; alone, it looks at each number itself.
   SKIPS_QUADS = SEVERAL_ROWS && LANES > 1 && Model::FRICTIONAL <= LANES && Model::FRICTIONLESS <= LANES,
@@ -1298,8 +1299,8 @@ struct Step : Math {
   INLINE bool has_friction(int own) const { return own < OWN_FRICTIONAL; }
   INLINE int number(int own) const { return lane + LANES * (has_friction(own) ? own : own - OWN_FRICTIONAL); }
   INLINE bool exists(int own) const { return number(own) < (has_friction(own) ? frictional : frictionless); }
-  // The sides of an own contact, 0 if it is open: as they are taken, and as they are.
-  INLINE unsigned sides(int own) const { return exists(own) ? contact_sides[own] & ((1u << SIDE_BITS) - 1) : 0; }
+  // The sides of an own contact, 0 if it is open, or none: as they are taken, and as they are.
+  INLINE unsigned sides(int own) const { return contact_sides[own] & ((1u << SIDE_BITS) - 1); }
   INLINE unsigned sides_now(int own) const {
     if (!exists(own)) return 0;
     return has_friction(own) ? sides_of(number(own)) : (unsigned)(w.x[first_frictionless() + number(own)] < 0.0f);
@@ -1314,7 +1315,7 @@ struct Step : Math {
     OWN_PLACES(own, 0, CONTACT_SLOTS) {
       const bool friction = has_friction(own);
       const unsigned now = sides_now(own);
-      const unsigned id = exists(own) ? w.contacts[number(own) + (friction ? 0 : Model::FRICTIONAL)].id : 0;
+      const unsigned id = exists(own) ? w.contacts[number(own) + (friction ? 0 : Model::FRICTIONAL)].id : NO_CONTACT;
       found[own] = id << SIDE_BITS | now;
       int left = !GUESSES ? 0 : friction ? frictional_before : frictionless_before;
       OWN_PLACES(slot, friction ? 0 : OWN_FRICTIONAL, friction ? OWN_FRICTIONAL : CONTACT_SLOTS) {
@@ -1325,7 +1326,7 @@ struct Step : Math {
         }
         left -= some;
       }
-      differs = differs || (exists(own) && (found[own] ^ now) << (32 - SIDE_BITS));
+      differs = differs || (found[own] ^ now) << (32 - SIDE_BITS);
     }
     OWN_PLACES(own, 0, CONTACT_SLOTS) contact_sides[own] = found[own];
     OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) {
