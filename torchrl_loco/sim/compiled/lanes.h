@@ -75,7 +75,7 @@ enum {
   CONTACTS = Model::FRICTIONAL + Model::FRICTIONLESS,
   // A lane looks after the contacts lane, lane + LANES, ... with friction, then after those without.
   OWN_FRICTIONAL = (Model::FRICTIONAL + LANES - 1) / LANES,
-  GUESSES = Model::SUBSTEPS > 1,
+  GUESSES = Model::SUBSTEPS > 1 && Model::ITERATIONS > 2,  // a guess that is refused has cost one of them
   CONTACT_SLOTS = OWN_FRICTIONAL + (Model::FRICTIONLESS + LANES - 1) / LANES,
   POINT_BITS = 2,
   NO_CONTACT = (1 << 22) - 1,  // an id

@@ -102,7 +102,7 @@ def _declare_links(world: Block, count: int, live: int) -> None:
     numbers = 2 * live + live * (live + 1) // 2
     size = 16 * -(-numbers // 4)  # bytes of a link
     local = f"Link link[{count}][1]; const int place = 0;"
-    if 32 * size * count <= MOST_SHARED:  # lanes of a warp are in different banks, whichever links they read
+    if 32 * size * count <= MOST_SHARED:  # an odd multiple of 16 bytes mostly: accesses of 16 bytes meet in no bank
         world("#ifdef __CUDA_ARCH__")
         world(f"__shared__ Link link[{count}][32]; const int place = threadIdx.x % 32;")
         world(f"#else\n{local}\n#endif")
