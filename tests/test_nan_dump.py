@@ -223,7 +223,7 @@ def test_files_that_are_no_nan_dump(file, tmp_path, capsys):
     with pytest.raises(SystemExit):
         cli.main(["inspect", str(file)])
     assert "its format is 'torchrl_loco policy 1'" in capsys.readouterr().err
-    storage.save(file, NAN_DUMP, {}, {"env": "Ant"})
+    storage.save(file, NAN_DUMP, {}, {"env": "Ant", "config": {}, "seed": 0, "protocol": "playground"})
     with pytest.raises(
         ValueError, match=r"is of 'Ant', which is not there; installed are torchrl_loco\.tasks\.cheetah\.CheetahRun"
     ):
