@@ -46,7 +46,7 @@ class GroundContacts:
     Attributes:
         directions: of contact ``k``: the normal, and the two tangents times friction, ``(3,)`` each.
         fields: what a contact stores besides its rows, in C++.
-        link: what a body keeps for its contacts, its twist and what they add up, in C++.
+        link: what a body keeps for its contacts, its twist and what they add up: arrays of floats, how many each has.
     """
 
     def __init__(self, tree: Dynamics, found: list[Pair], touch: TouchSensors, *, with_frames: bool = False) -> None:
@@ -78,7 +78,7 @@ class GroundContacts:
         self._stored = [title for title in titles if f"contact[k].{title}" in read_cells]
         self.fields = ["int body", *(f"float {title}" for title in self._stored)] if self.corners else []
         n = len(self.live)
-        self.link = [f"float twist[{n}], gradient[{n}], stiffness[{n * (n + 1) // 2}]"]
+        self.link = {"twist": n, "gradient": n, "stiffness": n * (n + 1) // 2}
 
     def body(self, corner: Corner) -> int:
         """Returns the body of a corner."""

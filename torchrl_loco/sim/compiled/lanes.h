@@ -78,8 +78,8 @@ enum {
   GUESSES = Model::SUBSTEPS > 1 && Model::ITERATIONS > 2,  // a guess that is refused has cost one of them
   CONTACT_SLOTS = OWN_FRICTIONAL + (Model::FRICTIONLESS + LANES - 1) / LANES,
   POINT_BITS = 2,
-  NO_CONTACT = (1 << 22) - 1,  // an id
   SIDE_BITS = 10,  // of a contact: which edges of its pyramid are closed, the state of its cone, or whether it is closed
+  NO_CONTACT = (1u << (32 - SIDE_BITS)) - 1,  // an id that none has
   // Columns are left out where a lane knows those of a contact of each kind; alone, it looks at each number itself.
   SKIPS_QUADS = SEVERAL_ROWS && LANES > 1 && Model::FRICTIONAL <= LANES && Model::FRICTIONLESS <= LANES,
   DIRECTIONS = Model::DIRECTIONS,  // in which a contact with friction acts, each with a row of the Jacobian
@@ -94,11 +94,15 @@ enum {
 };
 #define OWN_DOFS(slot, dof) UNROLLED for (int slot = 0, dof = lane; slot < SLOTS; ++slot, dof += LANES)
 #define OWN_LINKS(slot, link) UNROLLED for (int slot = 0, link = lane; slot < LINK_SLOTS; ++slot, link += LANES)
+// Own contacts; rolled on a CPU, where they are all of them.
 #ifdef __CUDA_ARCH__
 #define OWN_PLACES(own, begin, end) UNROLLED for (int own = begin; own < (end); ++own)
 #else
 #define OWN_PLACES(own, begin, end) ROLLED for (int own = begin; own < (end); ++own)
 #endif
+// Contacts that are taken to be closed: `left` has a bit for each of the lanes whose own ones have not been visited.
+#define CLOSED_CONTACTS(own, left, begin, end) \
+  OWN_PLACES(own, begin, end) ROLLED for (unsigned left = ballot(sides(own)); left; left &= left - 1)
 #define SHARED_LOOP(i, count) ROLLED for (int i = lane; i < (count); i += LANES)
 
 struct alignas(16) Quad { float v[4]; };
@@ -1297,7 +1301,8 @@ struct Step : Math {
   INLINE Law law(int contact) const { return law(contact, sides_of(contact)); }
 
   INLINE bool has_friction(int own) const { return own < OWN_FRICTIONAL; }
-  INLINE int number(int own) const { return lane + LANES * (has_friction(own) ? own : own - OWN_FRICTIONAL); }
+  INLINE int number(int own, int lane) const { return lane + LANES * (has_friction(own) ? own : own - OWN_FRICTIONAL); }
+  INLINE int number(int own) const { return number(own, lane); }
   INLINE bool exists(int own) const { return number(own) < (has_friction(own) ? frictional : frictionless); }
   // The sides of an own contact, 0 if it is open, or none: as they are taken, and as they are.
   INLINE unsigned sides(int own) const { return contact_sides[own] & ((1u << SIDE_BITS) - 1); }
@@ -1410,55 +1415,51 @@ struct Step : Math {
 
   // J' D J over the active rows of contacts, and their gradient.
   INLINE void add_contacts(Slots& h) const {
-    OWN_PLACES(place, 0, OWN_FRICTIONAL) {
-      const unsigned own_sides = sides(place);
-      ROLLED for (unsigned left = ballot(own_sides); left; left &= left - 1) {
-        const int from = lowest_bit(left), k = LANES * place + from;
-        const Law cost = law(k, agreed(own_sides, from));
-        const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
-        const unsigned quads = SKIPS_QUADS ? agreed(frictional_quads, k) : ~0u;
-        OWN_DOFS(slot, dof) {
-          if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
-          const int e = dof < STRIDE ? dof : STRIDE - 1;
-          float own[DIRECTIONS], c[DIRECTIONS];
-          UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + e];
-          cost.times(own, c);
-          bool some = false;
-          UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
-            h.gradient[slot] = h.gradient[slot] + cost.gradient[i] * own[i];
-            some = some || c[i] != 0.0f;
-          }
-          if (LANES == 1 && !some) continue;
-          UNROLLED for (int i = 0; i < QUADS; ++i) {
-            if (4 * i >= LANES * (slot + 1)) break;
-            if (SKIPS_QUADS && !(quads >> i & 1)) continue;
-            Quad columns[DIRECTIONS];
-            UNROLLED for (int l = 0; l < DIRECTIONS; ++l) columns[l] = read4(rows + STRIDE * l + 4 * i);
-            UNROLLED for (int j = 0; j < 4; ++j)
-              UNROLLED for (int l = 0; l < DIRECTIONS; ++l)
-                h.row[slot][4 * i + j] = h.row[slot][4 * i + j] + c[l] * columns[l].v[j];
-          }
+    CLOSED_CONTACTS(place, left, 0, OWN_FRICTIONAL) {
+      const int from = lowest_bit(left), k = number(place, from);
+      const Law cost = law(k, agreed(sides(place), from));
+      const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
+      const unsigned quads = SKIPS_QUADS ? agreed(frictional_quads, k) : ~0u;
+      OWN_DOFS(slot, dof) {
+        if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
+        const int e = dof < STRIDE ? dof : STRIDE - 1;
+        float own[DIRECTIONS], c[DIRECTIONS];
+        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + e];
+        cost.times(own, c);
+        bool some = false;
+        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
+          h.gradient[slot] = h.gradient[slot] + cost.gradient[i] * own[i];
+          some = some || c[i] != 0.0f;
+        }
+        if (LANES == 1 && !some) continue;
+        UNROLLED for (int i = 0; i < QUADS; ++i) {
+          if (4 * i >= LANES * (slot + 1)) break;
+          if (SKIPS_QUADS && !(quads >> i & 1)) continue;
+          Quad columns[DIRECTIONS];
+          UNROLLED for (int l = 0; l < DIRECTIONS; ++l) columns[l] = read4(rows + STRIDE * l + 4 * i);
+          UNROLLED for (int j = 0; j < 4; ++j)
+            UNROLLED for (int l = 0; l < DIRECTIONS; ++l)
+              h.row[slot][4 * i + j] = h.row[slot][4 * i + j] + c[l] * columns[l].v[j];
         }
       }
     }
-    OWN_PLACES(place, OWN_FRICTIONAL, CONTACT_SLOTS)
-      ROLLED for (unsigned left = ballot(sides(place)); left; left &= left - 1) {
-        const int k = LANES * (place - OWN_FRICTIONAL) + lowest_bit(left);
-        const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
-        const float* n = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
-        const unsigned quads = SKIPS_QUADS ? agreed(frictionless_quads, k) : ~0u;
-        OWN_DOFS(slot, dof) {
-          if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
-          const float n0 = n[dof < STRIDE ? dof : STRIDE - 1], c = weight * n0;
-          h.gradient[slot] += c * x;
-          if (LANES == 1 && c == 0.0f) continue;
-          UNROLLED for (int i = 0; i < QUADS; ++i) {
-            if (4 * i >= LANES * (slot + 1)) break;
-            if (SKIPS_QUADS && !(quads >> i & 1)) continue;
-            const Quad a = read4(n + 4 * i);
-            UNROLLED for (int j = 0; j < 4; ++j) h.row[slot][4 * i + j] += c * a.v[j];
-          }
+    CLOSED_CONTACTS(place, left, OWN_FRICTIONAL, CONTACT_SLOTS) {
+      const int k = number(place, lowest_bit(left));
+      const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
+      const float* n = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
+      const unsigned quads = SKIPS_QUADS ? agreed(frictionless_quads, k) : ~0u;
+      OWN_DOFS(slot, dof) {
+        if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
+        const float n0 = n[dof < STRIDE ? dof : STRIDE - 1], c = weight * n0;
+        h.gradient[slot] += c * x;
+        if (LANES == 1 && c == 0.0f) continue;
+        UNROLLED for (int i = 0; i < QUADS; ++i) {
+          if (4 * i >= LANES * (slot + 1)) break;
+          if (SKIPS_QUADS && !(quads >> i & 1)) continue;
+          const Quad a = read4(n + 4 * i);
+          UNROLLED for (int j = 0; j < 4; ++j) h.row[slot][4 * i + j] += c * a.v[j];
         }
+      }
     }
   }
 
@@ -1689,37 +1690,33 @@ struct Step : Math {
     }
     if (!with_contacts) return;
     Factors factors[HOLDS];
-    OWN_PLACES(place, 0, OWN_FRICTIONAL) {
-      const unsigned own_sides = sides(place);
-      ROLLED for (unsigned left = ballot(own_sides); left; left &= left - 1) {
-        const int from = lowest_bit(left), k = LANES * place + from;
-        const Law cost = law(k, agreed(own_sides, from));
-        const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
-        OWN_ROWS(hold, row) {
-          float own[DIRECTIONS];
-          UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + dof_of_row(row)];
-          cost.times(own, factors[hold].of);
-          UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
-            h.gradient[hold] = h.gradient[hold] + cost.gradient[i] * own[i];
-            h.diagonal[hold] = h.diagonal[hold] + factors[hold].of[i] * own[i];
-          }
+    CLOSED_CONTACTS(place, left, 0, OWN_FRICTIONAL) {
+      const int from = lowest_bit(left), k = number(place, from);
+      const Law cost = law(k, agreed(sides(place), from));
+      const float* const rows = w.jacobian + DIRECTIONS * STRIDE * k;
+      OWN_ROWS(hold, row) {
+        float own[DIRECTIONS];
+        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) own[i] = rows[STRIDE * i + dof_of_row(row)];
+        cost.times(own, factors[hold].of);
+        UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
+          h.gradient[hold] = h.gradient[hold] + cost.gradient[i] * own[i];
+          h.diagonal[hold] = h.diagonal[hold] + factors[hold].of[i] * own[i];
         }
-        add_products(h, rows, factors, DIRECTIONS);
       }
+      add_products(h, rows, factors, DIRECTIONS);
     }
-    OWN_PLACES(place, OWN_FRICTIONAL, CONTACT_SLOTS)
-      ROLLED for (unsigned left = ballot(sides(place)); left; left &= left - 1) {
-        const int k = LANES * (place - OWN_FRICTIONAL) + lowest_bit(left);
-        const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
-        const float* const row_of_contact = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
-        OWN_ROWS(hold, row) {
-          const float own = row_of_contact[dof_of_row(row)];
-          factors[hold].of[0] = weight * own;
-          h.gradient[hold] = h.gradient[hold] + factors[hold].of[0] * x;
-          h.diagonal[hold] = h.diagonal[hold] + factors[hold].of[0] * own;
-        }
-        add_products(h, row_of_contact, factors, 1);
+    CLOSED_CONTACTS(place, left, OWN_FRICTIONAL, CONTACT_SLOTS) {
+      const int k = number(place, lowest_bit(left));
+      const float x = w.x[first_frictionless() + k], weight = w.weight[first_frictionless() + k];
+      const float* const row_of_contact = w.jacobian + STRIDE * (DIRECTIONS * frictional + k);
+      OWN_ROWS(hold, row) {
+        const float own = row_of_contact[dof_of_row(row)];
+        factors[hold].of[0] = weight * own;
+        h.gradient[hold] = h.gradient[hold] + factors[hold].of[0] * x;
+        h.diagonal[hold] = h.diagonal[hold] + factors[hold].of[0] * own;
       }
+      add_products(h, row_of_contact, factors, 1);
+    }
   }
 
   // Solves H x = gradient, sets the search direction to -x, and adds x times the gradient before.
@@ -2331,6 +2328,7 @@ if (live) {
 #undef OWN_DOFS
 #undef OWN_LINKS
 #undef OWN_PLACES
+#undef CLOSED_CONTACTS
 #undef SHARED_LOOP
 #undef OWN_ROWS
 #undef LOCKSTEP

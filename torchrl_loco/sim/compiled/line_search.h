@@ -16,7 +16,7 @@ const float sizes = Math::root(2.0f * whole[0] * Math::larger(start.curvature - 
 const float noise = 8.0f * 1.1920929e-7f * sizes, accept = Math::larger(tolerance, noise);
 Search result = {0.0f, 0.0f, 0.0f};
 const Point first = Point::at(1.0f, slope, curvature, whole + 1);
-if (guessed) {  // not the slope at alpha = 0, as other rows are active there
+if (guessed) {  // the decrement is not the slope at alpha = 0, where other rows are active
   result.take(first, true);
   return result;
 }

@@ -55,7 +55,7 @@ class NewtonSolver:
         rows_of_contact = [f"{field}{d}" for field in "xv" for d in range(directions)]
         self.structs = {
             "contact": (self.places, [f"float {', '.join([*rows_of_contact, 'D'])}", *self.ground.fields]),
-            "link": (len(self.ground.bodies), self.ground.link),
+            "link": (len(self.ground.bodies), [f"float {title}[{size}]" for title, size in self.ground.link.items()]),
         }
         self.arrays["touch"] = len(self.touch)
         if self.dense.count:
@@ -87,8 +87,8 @@ class NewtonSolver:
         with block.function("move", "Search& step") as step:
             self._move(step)
         block("const auto any_of_block = [](bool x) { return x; };")
-        limits = literal(scale), literal(tolerance(m)), str(option.iterations)
-        block(shared.newton(*limits, implicit_damping="false", guesses="false"))
+        stopping = literal(scale), literal(tolerance(m)), str(option.iterations)
+        block(shared.newton(*stopping, implicit_damping="false", guesses="false"))
 
     def read_touch(self, block: Block) -> None:
         """Sets the touch sensors from the forces that were found."""

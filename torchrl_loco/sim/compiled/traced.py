@@ -72,7 +72,7 @@ def source(
         if solver.places:
             world(f"Contact contact[{solver.places}];")
         if solver.ground.count:
-            _declare_links(world, len(solver.ground.bodies), len(solver.ground.live))
+            _declare_links(world, len(solver.ground.bodies), sum(solver.ground.link.values()))
         if solver.places:
             for title in ("contact_corner", *(["contact_zones"] if solver.touch else [])):
                 world(f"int {title}[{solver.places}];")
@@ -91,15 +91,14 @@ def source(
     return shared.LAWS + world.text() + "\n"
 
 
-def _declare_links(world: Block, count: int, live: int) -> None:
+def _declare_links(world: Block, count: int, numbers: int) -> None:
     """Declares ``link``, and the ``place`` of this thread in it. On a GPU a block is a warp.
 
     Args:
         world: where.
         count: links.
-        live: components of their twists.
+        numbers: what a link keeps.
     """
-    numbers = 2 * live + live * (live + 1) // 2
     size = 16 * -(-numbers // 4)  # bytes of a link
     local = f"Link link[{count}][1]; const int place = 0;"
     if 32 * size * count <= MOST_SHARED:  # an odd multiple of 16 bytes mostly: accesses of 16 bytes meet in no bank
