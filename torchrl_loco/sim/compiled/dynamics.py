@@ -1,7 +1,6 @@
 """Rigid-body dynamics of a kinematic tree, traced for one model.
 
-Spatial vectors are (angular, linear), as in R. Featherstone, "Rigid Body Dynamics Algorithms" (2008), in world axes
-about the center of mass of their tree, as in MuJoCo. Bodies come in the order of the model: parents before children.
+Bodies come in the order of the model: parents before children.
 
 ==========================  ================================================================
 :func:`kinematics`          poses of bodies and joints
@@ -17,11 +16,11 @@ import numpy as np
 from torchrl_loco.sim.compiled.actuators import Actuator, acting
 from torchrl_loco.sim.compiled.links import matrix
 from torchrl_loco.sim.compiled.parameters import nominal, present, varies
+from torchrl_loco.sim.compiled.spatial import Inertia, cross_force, cross_motion, outer, turning
 from torchrl_loco.sim.compiled.symbols import (
     Block,
     Scalar,
     array,
-    cross,
     dot,
     identity,
     scalar,
@@ -75,47 +74,6 @@ def quaternion_matrix(q: list[Scalar]) -> np.ndarray:
 def constant_matrix(quaternion: np.ndarray) -> np.ndarray:
     """Returns the matrix of a constant quaternion (w, x, y, z), as scalars."""
     return array(matrix(quaternion))
-
-
-# Spatial algebra.
-
-
-@dataclasses.dataclass(frozen=True)
-class Inertia:
-    """Spatial inertia of a rigid body about the origin.
-
-    Attributes:
-        rotational: moments about the origin, ``(3, 3)`` (kg m^2).
-        first: mass times the offset of the center of mass, ``(3,)`` (kg m).
-        mass: mass (kg).
-    """
-
-    rotational: np.ndarray
-    first: np.ndarray
-    mass: Scalar
-
-    def __matmul__(self, motion: np.ndarray) -> np.ndarray:
-        """Returns the momentum, or force, of a motion."""
-        angular, linear = motion[:3], motion[3:]
-        return np.concatenate(
-            [self.rotational @ angular + cross(self.first, linear), self.mass * linear - cross(self.first, angular)]
-        )
-
-    def matrix(self) -> np.ndarray:
-        """Returns the same as a ``(6, 6)`` matrix."""
-        x, y, z = self.first
-        skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=object)
-        return np.block([[self.rotational, skew], [skew.T, identity(3) * self.mass]])
-
-
-def cross_motion(v: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """Returns the rate of change of a motion vector that moves with velocity ``v`` (Featherstone's crm)."""
-    return np.concatenate([cross(v[:3], motion[:3]), cross(v[:3], motion[3:]) + cross(v[3:], motion[:3])])
-
-
-def cross_force(v: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Returns the rate of change of a force vector that moves with velocity ``v`` (Featherstone's crf)."""
-    return np.concatenate([cross(v[:3], force[:3]) + cross(v[3:], force[3:]), cross(v[:3], force[3:])])
 
 
 # The tree.
@@ -235,8 +193,7 @@ class Dynamics:
         for i in range(3):
             if not same[i][k]:
                 rotational = rotational + (moments[i] - moments[k]) * outer(axes[:, i])
-        rotational = rotational + mass * (identity(3) * dot(d, d) - outer(d))
-        return Inertia(rotational, mass * d, scalar(mass))
+        return Inertia.moved(rotational, scalar(mass), d)
 
     def _motion_subspaces(self) -> list[np.ndarray]:
         """Returns the motion of the tree for a unit velocity of each degree of freedom (MuJoCo's ``cdof``)."""
@@ -247,11 +204,11 @@ class Dynamics:
             if m.jnt_type[j] == FREE:
                 cdof += [np.concatenate([zeros(3), unit]) for unit in identity(3)]
             if m.jnt_type[j] in (FREE, BALL):
-                cdof += [np.concatenate([axis, cross(axis, lever)]) for axis in self.poses.xmat[body].T]
+                cdof += [turning(axis, lever) for axis in self.poses.xmat[body].T]
             elif m.jnt_type[j] == SLIDE:
                 cdof.append(np.concatenate([zeros(3), self.poses.axis[j]]))
             elif m.jnt_type[j] == HINGE:
-                cdof.append(np.concatenate([self.poses.axis[j], cross(self.poses.axis[j], lever)]))
+                cdof.append(turning(self.poses.axis[j], lever))
         return cdof
 
     def _bias_force(self, qvel: list[Scalar]) -> list[Scalar]:
@@ -377,9 +334,3 @@ def _same_moments(moments: np.ndarray, at_nominal: np.ndarray) -> np.ndarray:
     same = np.array([np.isclose(at_nominal, moment, rtol=SAME, atol=0) for moment in at_nominal])
     varying = np.array([varies(moment) for moment in moments])
     return np.where(varying[:, None] | varying, np.eye(3, dtype=bool), same)
-
-
-def outer(a: np.ndarray, b: np.ndarray | None = None) -> np.ndarray:
-    """Returns a symmetric outer product, each entry computed once."""
-    b, n = a if b is None else b, len(a)
-    return np.array([[a[max(i, j)] * b[min(i, j)] for j in range(n)] for i in range(n)], dtype=object)

@@ -15,29 +15,21 @@ enum { LANES = 32 };
 enum { LANES = 1 };
 #endif
 
-// Spatial vectors (Featherstone, "Rigid Body Dynamics Algorithms", 2008), in world axes about the centre of mass of
-// their tree.
+// Spatial vectors, as in spatial.py.
 struct alignas(16) Motion {
   Vec angular, linear;
   INLINE Motion operator+(Motion b) const { return {angular + b.angular, linear + b.linear}; }
   INLINE Motion operator*(float k) const { return {angular * k, linear * k}; }
   INLINE float dot(Motion b) const { return angular.dot(b.angular) + linear.dot(b.linear); }
-  INLINE Motion cross_motion(Motion m) const {  // rate of change of a motion that moves with this velocity
-    return {angular.cross(m.angular), angular.cross(m.linear) + linear.cross(m.angular)};
-  }
-  INLINE Motion cross_force(Motion f) const {  // the same for a force
-    return {angular.cross(f.angular) + linear.cross(f.linear), angular.cross(f.linear)};
-  }
 };
 
 struct Inertia {
   Symmetric rotational;  // about the origin
   Vec first;             // mass times the offset of the centre of mass
   float mass;
-  INLINE Motion operator*(Motion m) const {
-    return {rotational * m.angular + first.cross(m.linear), m.linear * mass - first.cross(m.angular)};
-  }
 };
+
+//SPATIAL
 
 // Of a constraint: solref and solimp.
 //SOFTNESS
@@ -563,12 +555,12 @@ struct Step : Math {
         const Pose pose = w.pose[link];
         const Vec anchor = Model::HAS_BALL ? pose.position + pose.orientation * Model::dof_anchor(d) : pose.position;
         const Vec direction = pose.orientation.column(k);
-        axis = {direction, direction.cross(com - anchor)};
+        axis = Spatial::turning(direction, com - anchor);
       } else {
         const Pose parent = pose_of(Model::parent(link));
         const Vec direction = parent.orientation * axis.angular;
         const Vec anchor = parent.position + parent.orientation * axis.linear;
-        axis = {direction, direction.cross(com - anchor)};
+        axis = Spatial::turning(direction, com - anchor);
         if (Model::HAS_SLIDE && kind == SLIDE) axis = {{0.0f, 0.0f, 0.0f}, direction};
       }
       w.axes[d] = axis;
@@ -611,7 +603,7 @@ struct Step : Math {
         Motion relative = w.axes[d] * w.qvel[d];
         if (Model::QUATERNIONS > 0 && kind <= BALL)
           relative = relative + w.axes[d + 1] * w.qvel[d + 1] + w.axes[d + 2] * w.qvel[d + 2];
-        acceleration = acceleration + velocity.cross_motion(relative);
+        acceleration = acceleration + Spatial::cross_motion(velocity, relative);
         velocity = velocity + relative;
       }
       accelerations[slot] = acceleration;
@@ -624,13 +616,10 @@ struct Step : Math {
       acceleration.linear = acceleration.linear - Model::gravity();
       const Pose pose = w.pose[b];
       const float mass = Model::link_mass(b);
-      const Vec offset = center_of_mass(b, pose) - w.com[Model::tree(b)], first = offset * mass;
-      Symmetric s = Model::link_inertia(b).turned(pose.orientation);
-      s = {s.xx + first.y * offset.y + first.z * offset.z, s.xy - first.x * offset.y, s.xz - first.x * offset.z,
-           s.yy + first.x * offset.x + first.z * offset.z, s.yz - first.y * offset.z,
-           s.zz + first.x * offset.x + first.y * offset.y};
-      const Inertia inertia = {s, first, mass};
-      const Motion force = inertia * acceleration + velocity.cross_force(inertia * velocity);
+      const Vec offset = center_of_mass(b, pose) - w.com[Model::tree(b)];
+      const Inertia inertia = Spatial::moved(Model::link_inertia(b).turned(pose.orientation), mass, offset);
+      const Motion momentum = Spatial::product(inertia, velocity);
+      const Motion force = Spatial::product(inertia, acceleration) + Spatial::cross_force(velocity, momentum);
       w.bodies[b] = {inertia, force.angular, force.linear};
     }
     sync();
@@ -677,7 +666,7 @@ struct Step : Math {
     OWN_DOFS(slot, d) {
       if (d >= DOFS) continue;
       const Body body = w.bodies[Model::dof_link(d)];
-      const Motion axis = w.axes[d], momentum = body.inertia * axis, bias = {body.torque, body.force};
+      const Motion axis = w.axes[d], momentum = Spatial::product(body.inertia, axis), bias = {body.torque, body.force};
       w.residual[d] = axis.dot(bias) - joint_force(d, implicit_damping[slot]);
       w.mass[STRIDE * d + d] = axis.dot(momentum) + Model::armature(d);
       w.momentum[d] = momentum;

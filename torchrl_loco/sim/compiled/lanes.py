@@ -17,7 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled import collision, shared, symbols
+from torchrl_loco.sim.compiled import collision, shared, spatial, symbols
 from torchrl_loco.sim.compiled.actuators import Actuator, acting
 from torchrl_loco.sim.compiled.collision import (
     BOX,
@@ -828,6 +828,7 @@ def source(
     text = _parts(TEMPLATE.read_text(), asked).replace("//ACTUATOR", description.actuator().as_cpp())
     text = tables.use(text)
     text = text.replace("//SHARED", shared.LAWS).replace("//SOFTNESS", Softness.as_cpp())
+    text = text.replace("//SPATIAL", spatial.as_cpp())
     text = text.replace("//LINE_SEARCH", LINE_SEARCH).replace("//NEWTON", NEWTON)
     text = text.replace("//MODEL", tables.text()).replace("//ELIMINATE", description.elimination())
     return text.replace("//VARYING", tables.varied_text()).replace("//DERIVE", "" if substeps else tables.row.derive())
