@@ -486,7 +486,12 @@ class G1Velocity(Velocity):
     own_geoms = "(?!.*foot).*_collision"
     presets = {
         **Velocity.presets,
-        "ppo": {**Velocity.presets["ppo"], "total_frames": 300_000_000, "entropy_coeff": 0.005},
+        "ppo": {
+            **Velocity.presets["ppo"],
+            "total_frames": 420_000_000,
+            "minibatch_size": 32_768,
+            "entropy_coeff": 0.005,
+        },
     }
     stand = {".*": 0.05}
     walk = {
