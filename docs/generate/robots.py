@@ -23,7 +23,8 @@ BEFORE = ROOT / "benchmarks" / "results" / "2026-11-24-h100" / "mjlab.txt"
 CURVES = ROOT / "docs" / "_static" / "robots.png"
 MOVING = ROOT / "docs" / "_static" / "robots.webp"
 GPUS = {"H100": "#f5a623", "H200": "#c2571a"}
-"""The color of what was trained on each."""
+TRAINERS = {"REPPO": "#3b7dd8", "mjlab": "#9aa7ad"}
+"""Colors: by the GPU, but for these trainers."""
 NAMES = {"go1_velocity": "Go1", "g1_velocity": "G1", "go2_velocity": "Go2", "h1_velocity": "H1"}
 
 
@@ -156,7 +157,8 @@ def draw(picture: Path, folders: Sequence[Path] = RESULTS) -> None:
             for seed, row in enumerate(seeds if name == task else ()):
                 lines = [line for line in metrics_of(row["folder"] / row["run"])[1:] if line["episodes"] > 0]
                 points = [(line["seconds"], line["return"]) for line in lines]
-                color = "#9aa7ad" if "mjlab" in trainer else GPUS.get(gpu, "#f5a623")
+                own = (color for name, color in TRAINERS.items() if name in trainer)
+                color = next(own, GPUS.get(gpu, "#f5a623"))
                 label = None if seed else f"{trainer}, {gpu}"
                 axes.plot(*zip(*points, strict=True), color=color, linewidth=1, label=label)
         column, value = MJLAB.get(task, ("", 0.0))
