@@ -2,16 +2,30 @@
 
 import contextlib
 import gc
+import threading
 from collections.abc import Iterator
+
+_LOCK = threading.RLock()
+_blocks, _was_enabled = 0, False
+"""Blocks that threads are in, and whether garbage was collected before the first."""
 
 
 @contextlib.contextmanager
 def no_collection() -> Iterator[None]:
-    """Keeps garbage from being collected while the block lasts."""
-    was = gc.isenabled()
-    gc.disable()
+    """Keeps garbage from being collected, in all threads, while the block lasts.
+
+    A dropped environment in it would free its memory, which ends a recording on CUDA with an error.
+    """
+    global _blocks, _was_enabled
+    with _LOCK:
+        if _blocks == 0:
+            _was_enabled = gc.isenabled()
+            gc.disable()
+        _blocks += 1
     try:
         yield
     finally:
-        if was:
-            gc.enable()
+        with _LOCK:
+            _blocks -= 1
+            if _blocks == 0 and _was_enabled:
+                gc.enable()

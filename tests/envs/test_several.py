@@ -1,6 +1,8 @@
 """Several environments at once: side by side, in threads, in forked processes, on other streams and devices."""
 
+import contextlib
 import functools
+import gc
 import os
 import pickle
 import subprocess
@@ -15,6 +17,7 @@ from cases import COARSE
 from compare import assert_repeats, played
 
 import torchrl_loco
+from torchrl_loco.garbage import no_collection
 from torchrl_loco.sim import EXCLUSIVE
 
 WORLDS = 4
@@ -63,6 +66,14 @@ def test_threads_make_step_and_render_at_once(device, actions):
         for (result, lit), single in zip(pool.map(work, range(4)), expected, strict=True):
             assert_repeats(result, single)
             assert lit
+
+    first, second = contextlib.ExitStack(), contextlib.ExitStack()  # threads in which garbage must wait
+    for thread in (first, second):
+        thread.enter_context(no_collection())
+    first.close()
+    assert not gc.isenabled()
+    second.close()
+    assert gc.isenabled()
 
 
 def test_one_at_a_time_on_the_cpu(shared):

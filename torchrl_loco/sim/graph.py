@@ -21,16 +21,6 @@ two threads would share the scratch memory of tiles."""
 os.register_at_fork(before=EXCLUSIVE.acquire, after_in_parent=EXCLUSIVE.release, after_in_child=EXCLUSIVE.release)
 
 
-@contextlib.contextmanager
-def recording() -> Iterator[None]:
-    """Keeps what would spoil a recording away: other threads, and the collection of garbage.
-
-    A dropped environment would free its memory or its graphs of torch, which ends a recording with an error.
-    """
-    with EXCLUSIVE, no_collection():
-        yield
-
-
 def current_stream(device: wp.Device) -> wp.Stream | None:
     """Returns torch's current stream of a CUDA device as a Warp stream, and ``None`` for the CPU."""
     if not device.is_cuda:
@@ -78,9 +68,9 @@ class Graph:
         self._device = device
         self._scratch = scratch
         allocator = wp.ScopedAllocator(device, scratch) if device.is_cuda else contextlib.nullcontext()
-        with wp.ScopedDevice(device), allocator:
+        with EXCLUSIVE, wp.ScopedDevice(device), allocator:
             launch()
-            with recording(), wp.ScopedCapture(device=device) as capture:
+            with no_collection(), wp.ScopedCapture(device=device) as capture:
                 launch()
         self._graph = capture.graph
 
@@ -146,11 +136,11 @@ class TorchGraph:
             torch.cuda.synchronize(self._device)
             graph = torch.cuda.CUDAGraph()
             side = torch.cuda.Stream(self._device)  # else torch takes one of its current device
-            capture = torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local")
-            with recording(), torch.cuda.device(self._device):
+            recording = torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local")
+            with EXCLUSIVE, no_collection(), torch.cuda.device(self._device):
                 before = torch.cuda.current_stream()
                 try:
-                    with capture:
+                    with recording:
                         self._work()
                 except BaseException:
                     # A recording that cannot end leaves its stream current, and torch's random numbers waiting for its
