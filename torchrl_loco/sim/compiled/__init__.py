@@ -11,6 +11,7 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 ``collision``        which geoms may touch, and with which parameters
 ``traced``           one thread a world: a control step from top to bottom
 ``symbols``          scalars whose arithmetic is traced, and blocks of C++
+``spatial``          spatial algebra, of both schedules
 ``dynamics``         poses, inertias, forces; M x and (M + K)^-1 x by sweeps over the tree
 ``actuators``        force of an actuator
 ``constraints``      softness of constraints; rows of limits and dry friction

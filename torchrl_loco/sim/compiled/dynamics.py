@@ -1,6 +1,7 @@
 """Rigid-body dynamics of a kinematic tree, traced for one model.
 
-Bodies come in the order of the model: parents before children.
+Spatial vectors are those of ``spatial``, about the center of mass of their tree. Bodies come in the order of the model:
+parents before children.
 
 ==========================  ================================================================
 :func:`kinematics`          poses of bodies and joints
@@ -16,7 +17,7 @@ import numpy as np
 from torchrl_loco.sim.compiled.actuators import Actuator, acting
 from torchrl_loco.sim.compiled.links import matrix
 from torchrl_loco.sim.compiled.parameters import nominal, present, varies
-from torchrl_loco.sim.compiled.spatial import Inertia, cross_force, cross_motion, outer, turning
+from torchrl_loco.sim.compiled.spatial import Inertia, cross_force, cross_motion, turning
 from torchrl_loco.sim.compiled.symbols import (
     Block,
     Scalar,
@@ -223,9 +224,9 @@ class Dynamics:
                 if m.jnt_type[j] == FREE:  # translation, whose axes do not move
                     v = v + total(self.cdof[d] * qvel[d] for d in range(first, first + 3))
                     first += 3
-                turning = range(first, first + (3 if m.jnt_type[j] in (FREE, BALL) else 1))
-                a = a + total(cross_motion(v, self.cdof[d]) * qvel[d] for d in turning)
-                v = v + total(self.cdof[d] * qvel[d] for d in turning)
+                rotating = range(first, first + (3 if m.jnt_type[j] in (FREE, BALL) else 1))
+                a = a + total(cross_motion(v, self.cdof[d]) * qvel[d] for d in rotating)
+                v = v + total(self.cdof[d] * qvel[d] for d in rotating)
             velocity[body], acceleration[body] = v, a
             force[body] = self.inertia[body] @ a + cross_force(v, self.inertia[body] @ v)
         self.cvel = velocity
@@ -334,3 +335,9 @@ def _same_moments(moments: np.ndarray, at_nominal: np.ndarray) -> np.ndarray:
     same = np.array([np.isclose(at_nominal, moment, rtol=SAME, atol=0) for moment in at_nominal])
     varying = np.array([varies(moment) for moment in moments])
     return np.where(varying[:, None] | varying, np.eye(3, dtype=bool), same)
+
+
+def outer(a: np.ndarray, b: np.ndarray | None = None) -> np.ndarray:
+    """Returns a symmetric outer product, each entry computed once."""
+    b, n = a if b is None else b, len(a)
+    return np.array([[a[max(i, j)] * b[min(i, j)] for j in range(n)] for i in range(n)], dtype=object)

@@ -1,4 +1,4 @@
-"""Spatial algebra: traced as it stands here, and by lanes as functions of C++ that it writes of itself.
+"""Spatial algebra: traced as it stands here; what lanes need of it, it also writes as C++.
 
 Spatial vectors are (angular, linear), as in R. Featherstone, "Rigid Body Dynamics Algorithms" (2008), in world axes
 about the center of mass of their tree, as in MuJoCo.
@@ -28,7 +28,7 @@ class Inertia:
 
     @classmethod
     def moved(cls, rotational: np.ndarray, mass: Scalar, offset: np.ndarray) -> "Inertia":
-        """Returns that of a body with these moments about its center of mass, which is off the origin (Steiner)."""
+        """Returns that of a body whose center of mass, about which it has these moments, is at ``offset``."""
         first, moments = mass * offset, rotational.copy()
         for i in range(3):
             j, k = sorted({0, 1, 2} - {i})
@@ -51,7 +51,7 @@ class Inertia:
 
 
 def turning(axis: np.ndarray, lever: np.ndarray) -> np.ndarray:
-    """Returns the motion of a rotation about an axis, from which the origin is off by a lever."""
+    """Returns the motion of a rotation about an axis; the lever leads from a point of the axis to the origin."""
     return np.concatenate([axis, cross(axis, lever)])
 
 
@@ -65,14 +65,11 @@ def cross_force(v: np.ndarray, force: np.ndarray) -> np.ndarray:
     return np.concatenate([cross(v[:3], force[:3]) + cross(v[3:], force[3:]), cross(v[:3], force[3:])])
 
 
-def outer(a: np.ndarray, b: np.ndarray | None = None) -> np.ndarray:
-    """Returns a symmetric outer product, each entry computed once."""
-    b, n = a if b is None else b, len(a)
-    return np.array([[a[max(i, j)] * b[min(i, j)] for j in range(n)] for i in range(n)], dtype=object)
-
-
 def as_cpp() -> str:
-    """Returns a C++ struct of these functions, of a ``Vec``, a ``Symmetric``, a ``Motion`` and an ``Inertia``."""
+    """Returns a C++ struct of these functions, on structs of ``lanes.h`` and ``arithmetic.h``.
+
+    What they return lists members in the order of those structs.
+    """
     inertia = Inertia(_symmetric("i.rotational"), vec("i.first"), name("i.mass"))
     moved = Inertia.moved(_symmetric("s"), name("mass"), vec("offset"))
     six = [moved.rotational[i, j] for i in range(3) for j in range(i, 3)]
