@@ -23,8 +23,9 @@ BEFORE = ROOT / "benchmarks" / "results" / "2026-11-24-h100" / "mjlab.txt"
 CURVES = ROOT / "docs" / "_static" / "robots.png"
 MOVING = ROOT / "docs" / "_static" / "robots.webp"
 GPUS = {"H100": "#f5a623", "H200": "#c2571a"}
+"""The color of what was trained on each."""
 TRAINERS = {"REPPO": "#3b7dd8", "mjlab": "#9aa7ad"}
-"""Colors: by the GPU, but for these trainers."""
+"""Trainers with a color of their own."""
 NAMES = {"go1_velocity": "Go1", "g1_velocity": "G1", "go2_velocity": "Go2", "h1_velocity": "H1"}
 
 
@@ -113,7 +114,13 @@ def by_trainer(rows: Sequence[Row]) -> dict[Group, list[Row]]:
             trainer = "mjlab 1.6" if "mjlab" in row["algorithm"] else f"torchrl_loco, {row['algorithm'].upper()}"
             gpu = next((name for name in row["device"].split() if name in GPUS), row["device"])
             groups.setdefault((row["task"], trainer, gpu), []).append(row)
-    return {key: groups[key] for key in sorted(groups, key=lambda key: ([*NAMES].index(key[0]), "mjlab" in key[1]))}
+    others = [*TRAINERS]  # PPO first
+
+    def place(group: Group) -> tuple[int, int]:
+        task, trainer, _ = group
+        return [*NAMES].index(task), max((others.index(word) + 1 for word in others if word in trainer), default=0)
+
+    return {group: groups[group] for group in sorted(groups, key=place)}
 
 
 def before() -> dict[Group, list[Row]]:
@@ -157,7 +164,7 @@ def draw(picture: Path, folders: Sequence[Path] = RESULTS) -> None:
             for seed, row in enumerate(seeds if name == task else ()):
                 lines = [line for line in metrics_of(row["folder"] / row["run"])[1:] if line["episodes"] > 0]
                 points = [(line["seconds"], line["return"]) for line in lines]
-                own = (color for name, color in TRAINERS.items() if name in trainer)
+                own = (color for word, color in TRAINERS.items() if word in trainer)
                 color = next(own, GPUS.get(gpu, "#f5a623"))
                 label = None if seed else f"{trainer}, {gpu}"
                 axes.plot(*zip(*points, strict=True), color=color, linewidth=1, label=label)
