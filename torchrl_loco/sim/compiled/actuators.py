@@ -5,7 +5,7 @@ from typing import Any
 
 import mujoco
 
-from torchrl_loco.sim.compiled.symbols import Block, Scalar, maximum, minimum, name
+from torchrl_loco.sim.compiled.symbols import Scalar, cpp_function, maximum, minimum, name
 
 AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
 BIASES = int(mujoco.mjtBias.mjBIAS_NONE), AFFINE
@@ -52,10 +52,9 @@ class Actuator:
     def as_cpp(self) -> str:
         """Returns :meth:`force` as a member function of the actuator's number ``a``, which its numbers may read."""
         arguments = "control", "position", "velocity"
-        block = Block()
-        result = block.value(self.force(*map(name, arguments)))
         parameters = ", ".join(f"float {argument}" for argument in arguments)
-        return f"INLINE float actuator_force(int a, {parameters}) const {{\n{block.text()}\nreturn {result};\n}}"
+        head = f"INLINE float actuator_force(int a, {parameters}) const"
+        return cpp_function(head, self.force(*map(name, arguments)))
 
 
 def acting(m: mujoco.MjModel) -> list[int]:

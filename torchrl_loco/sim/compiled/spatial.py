@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from torchrl_loco.sim.compiled.symbols import Block, Scalar, cross, identity, name, vec
+from torchrl_loco.sim.compiled.symbols import Scalar, cpp_function, cross, identity, name, vec
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,24 +66,19 @@ def cross_force(v: np.ndarray, force: np.ndarray) -> np.ndarray:
 
 
 def as_cpp() -> str:
-    """Returns a C++ struct of these functions, on structs of ``lanes.h`` and ``arithmetic.h``.
-
-    What they return lists members in the order of those structs.
-    """
+    """Returns a C++ struct of these functions, on structs of ``lanes.h`` and ``arithmetic.h``."""
     inertia = Inertia(_symmetric("i.rotational"), vec("i.first"), name("i.mass"))
     moved = Inertia.moved(_symmetric("s"), name("mass"), vec("offset"))
     six = [moved.rotational[i, j] for i in range(3) for j in range(i, 3)]
-    return "\n".join(
-        [
-            "struct Spatial {",
-            _function("Motion turning(Vec axis, Vec lever)", turning(vec("axis"), vec("lever"))),
-            _function("Motion cross_motion(Motion v, Motion m)", cross_motion(_motion("v"), _motion("m"))),
-            _function("Motion cross_force(Motion v, Motion f)", cross_force(_motion("v"), _motion("f"))),
-            _function("Motion product(Inertia i, Motion m)", inertia @ _motion("m")),
-            _function("Inertia moved(Symmetric s, float mass, Vec offset)", [*six, *moved.first, moved.mass]),
-            "};",
-        ]
-    )
+    functions: dict[str, Iterable[Scalar]] = {
+        "Motion turning(Vec axis, Vec lever)": turning(vec("axis"), vec("lever")),
+        "Motion cross_motion(Motion v, Motion m)": cross_motion(_motion("v"), _motion("m")),
+        "Motion cross_force(Motion v, Motion f)": cross_force(_motion("v"), _motion("f")),
+        "Motion product(Inertia i, Motion m)": inertia @ _motion("m"),
+        "Inertia moved(Symmetric s, float mass, Vec offset)": [*six, *moved.first, moved.mass],
+    }
+    written = [cpp_function(f"static INLINE {head}", *results) for head, results in functions.items()]
+    return "\n".join(["struct Spatial {", *written, "};"])
 
 
 def _motion(text: str) -> np.ndarray:
@@ -92,9 +87,3 @@ def _motion(text: str) -> np.ndarray:
 
 def _symmetric(text: str) -> np.ndarray:
     return np.array([[name(f"{text}.{min(i, j)}{max(i, j)}") for j in "xyz"] for i in "xyz"], dtype=object)
-
-
-def _function(head: str, results: Iterable[Scalar]) -> str:
-    block = Block()
-    listed = ", ".join([block.value(x) for x in results])
-    return f"static INLINE {head} {{\n{block.text()}\nreturn {{{listed}}};\n}}"

@@ -395,6 +395,13 @@ class Block:
         return "\n".join(self.lines)
 
 
+def cpp_function(head: str, *results: Any) -> str:
+    """Returns a C++ function of names, which returns scalars: one, or the members of a struct in their order."""
+    block = Block()
+    listed = ", ".join([block.value(x) for x in results])
+    return f"{head} {{\n{block.text()}\nreturn {{{listed}}};\n}}"
+
+
 def literal(x: float) -> str:
     """Returns a float32 literal of C++."""
     number = np.float32(x)
