@@ -114,11 +114,10 @@ def by_trainer(rows: Sequence[Row]) -> dict[Group, list[Row]]:
             trainer = "mjlab 1.6" if "mjlab" in row["algorithm"] else f"torchrl_loco, {row['algorithm'].upper()}"
             gpu = next((name for name in row["device"].split() if name in GPUS), row["device"])
             groups.setdefault((row["task"], trainer, gpu), []).append(row)
-    others = [*TRAINERS]  # PPO first
 
-    def place(group: Group) -> tuple[int, int]:
+    def place(group: Group) -> tuple[int, bool, bool]:
         task, trainer, _ = group
-        return [*NAMES].index(task), max((others.index(word) + 1 for word in others if word in trainer), default=0)
+        return [*NAMES].index(task), "mjlab" in trainer, "REPPO" in trainer
 
     return {group: groups[group] for group in sorted(groups, key=place)}
 
@@ -161,11 +160,11 @@ def draw(picture: Path, folders: Sequence[Path] = RESULTS) -> None:
     panels = figure.subplots(-(-len(tasks) // 2), 2, squeeze=False).flat
     for task, axes in zip(tasks, panels, strict=False):
         for (name, trainer, gpu), seeds in groups.items():
+            own = (color for word, color in TRAINERS.items() if word in trainer)
+            color = next(own, GPUS.get(gpu, "#f5a623"))
             for seed, row in enumerate(seeds if name == task else ()):
                 lines = [line for line in metrics_of(row["folder"] / row["run"])[1:] if line["episodes"] > 0]
                 points = [(line["seconds"], line["return"]) for line in lines]
-                own = (color for word, color in TRAINERS.items() if word in trainer)
-                color = next(own, GPUS.get(gpu, "#f5a623"))
                 label = None if seed else f"{trainer}, {gpu}"
                 axes.plot(*zip(*points, strict=True), color=color, linewidth=1, label=label)
         column, value = MJLAB.get(task, ("", 0.0))
