@@ -399,7 +399,8 @@ def cpp_function(head: str, *results: Any) -> str:
     """Returns a C++ function of names, which returns scalars: one, or the members of a struct in their order."""
     block = Block()
     listed = ", ".join([block.value(x) for x in results])
-    return f"{head} {{\n{block.text()}\nreturn {{{listed}}};\n}}"
+    value = listed if len(results) == 1 else f"{{{listed}}}"  # Clang warns of a scalar in braces
+    return f"{head} {{\n{block.text()}\nreturn {value};\n}}"
 
 
 def literal(x: float) -> str:
