@@ -124,7 +124,7 @@ def robot():
 @pytest.fixture(scope="module")
 def many():
     """Many worlds of a robot, for what is counted: one physics step each time, as the physics does not matter."""
-    return velocity.H1Velocity(2000, "cpu", 0, sim_dt=0.02)
+    return type("Hard", (velocity.H1Velocity,), {"max_delay": 3, "push_scale": 1.5})(2000, "cpu", 0, sim_dt=0.02)
 
 
 @pytest.fixture(scope="module")
@@ -393,7 +393,7 @@ def test_pushes_change_the_velocity_of_the_base_alone(many):
     _, calm = stepped(many, with_memory(state, until_push=0.5), action)
     _, pushed = stepped(many, with_memory(state, until_push=0.0), action)
     change = pushed["qvel"] - calm["qvel"]
-    for column, most in enumerate((0.5, 0.5, 0.4, 0.52, 0.52, 0.78)):
+    for column, most in enumerate((0.75, 0.75, 0.6, 0.78, 0.78, 1.17)):
         assert change[:, column].abs().max().item() == pytest.approx(most, abs=0.01)
         assert change[:, column].std().item() == pytest.approx(most / math.sqrt(3), rel=0.06)
     assert (change[:, 6:] == 0).all()
@@ -407,12 +407,12 @@ def test_actions_are_late_by_the_delay_of_the_episode(many):
     td = many.reset()
     delay = many.get_state()["memory", "delay"]
     torch.testing.assert_close(td["privileged"][:, -1], delay)
-    for steps in range(3):
-        assert share(delay == steps) == pytest.approx(1 / 3, abs=0.03)
+    for steps in range(4):
+        assert share(delay == steps) == pytest.approx(1 / 4, abs=0.03)
     home = torch.tensor(many.mj_model.key("home").qpos[7:], dtype=torch.float32)
-    sent = torch.randn(4, *many.action_spec.shape)
-    sent[:2] = 0.0  # as before the first step
-    for step in range(2, 4):
+    sent = torch.randn(6, *many.action_spec.shape)
+    sent[:3] = 0.0  # as before the first step
+    for step in range(3, 6):
         td = many.step(td.set("action", sent[step]))["next"]
         arrived = sent[step - delay.long(), torch.arange(len(delay))]
         torch.testing.assert_close(many.sim.ctrl, home + 0.25 * arrived)
@@ -542,8 +542,9 @@ def test_a_table_makes_a_task_of_a_users_robot(caplog):
     assert "meshes without contacts are drawn and touch nothing: shell" in caplog.text
     with pytest.raises(TypeError, match="Bare must set base, trunk, feet, stand, walk, run"):
         type("Bare", (velocity.Velocity,), {"model": Table.model})(1, "cpu")
-    with pytest.raises(ValueError, match="delay of Slow must be 0, 1 or 2 control steps, not 3"):
-        type("Slow", (Table,), {"max_delay": 3})(1, "cpu")
+    for wrong in ({"max_delay": 4}, {"push_scale": -1.0}):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong))} of Slow must"):
+            type("Slow", (Table,), wrong)(1, "cpu")
 
 
 UNFIT = [

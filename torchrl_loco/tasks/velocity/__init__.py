@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import torch
 
+from torchrl_loco.checks import NOT_NEGATIVE, Interval, check_float, check_int
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.vary import Vary
@@ -39,9 +40,11 @@ NOISE = (0.5, 0.2, 0.05, 0.01, 1.5)
 BIAS = 0.015
 """Greatest error of a joint's encoder in an episode (rad)."""
 PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
-"""Greatest change of the base's velocity by a push (m/s, rad/s)."""
+"""Greatest change of the base's velocity by a push (m/s, rad/s), where :attr:`Velocity.push_scale` is 1."""
 PUSH_EVERY = (1.0, 3.0)
 """Least and greatest time between pushes (s)."""
+LATEST = 3
+"""Greatest delay of an action for which the actions before it are kept (control steps)."""
 START_HEIGHT = (0.01, 0.05)
 """Least and greatest height above the home pose at the start (m)."""
 STANDS, RUNS = 0.05, 1.5
@@ -71,7 +74,7 @@ def memory(joints: int, feet: int) -> dict[str, int | tuple[int, ...]]:
     return {
         **commands.ROWS,
         **{"until_push": (), "bias": joints, "delay": ()},  # time until it (s); rad; control steps
-        **{"last_action": joints, "earlier_action": joints},
+        **{"last_action": joints, "earlier_actions": (LATEST - 1, joints)},  # the newest first
         **{"air_time": feet, "peak": feet},  # s; m
     }
 
@@ -181,7 +184,9 @@ class Velocity(LocoEnv):
     step_height: ClassVar[float] = 0.1
     """Height of a foot in mid-swing (m)."""
     max_delay: ClassVar[int] = 2
-    """Greatest delay of an action in training (control steps), at most 2."""
+    """Greatest delay of an action in training (control steps), at most 3; ``verify`` delays by up to 2."""
+    push_scale: ClassVar[float] = 1.0
+    """Strength of the pushes in training, as a multiple of those of ``verify``."""
     own_geoms: ClassVar[str] = ""
     """Regular expression of the geoms of which ``self_collision`` counts the contacts."""
 
@@ -191,13 +196,13 @@ class Velocity(LocoEnv):
 
         Raises:
             TypeError: an attribute is missing.
-            ValueError: the greatest delay is not 0, 1 or 2.
+            ValueError: the greatest delay is not 0, 1, 2 or 3, or the strength of pushes is not positive or 0.
         """
         missing = [name for name in TABLE if not hasattr(cls, name)]
         if missing:
             raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.Velocity)")
-        if cls.max_delay not in (0, 1, 2):
-            raise ValueError(f"max_delay of {cls.__name__} must be 0, 1 or 2 control steps, not {cls.max_delay!r}")
+        check_int(f"max_delay of {cls.__name__}", cls.max_delay, Interval(0, LATEST + 1))
+        check_float(f"push_scale of {cls.__name__}", cls.push_scale, NOT_NEGATIVE)
         super().check_class()
 
     @classmethod
@@ -304,8 +309,9 @@ class Velocity(LocoEnv):
 
     def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
         """Returns the targets of the joints (rad): the home pose and a multiple of the action that arrives."""
-        late = s.delay.unsqueeze(-1)
-        arrived = torch.where(late < 1.0, action, torch.where(late < 2.0, s.last_action, s.earlier_action))
+        late, arrived = s.delay.unsqueeze(-1), action
+        for steps, earlier in enumerate([s.last_action, *s.earlier_actions.unbind(1)], start=1):
+            arrived = torch.where(late < steps, arrived, earlier)
         if self.action_scale is not None:
             return self.home(s) + self.action_scale * arrived
         greatest, stiffness = s.model("actuator_forcerange")[..., 1], s.model("actuator_gainprm")[..., 0]
@@ -372,7 +378,7 @@ class Velocity(LocoEnv):
             **({} if self.play else self.pushed(s)),
             "trained": s.trained + 1.0,
             "last_action": s.action,
-            "earlier_action": s.last_action,
+            "earlier_actions": torch.cat([s.last_action.unsqueeze(1), s.earlier_actions[:, :-1]], dim=1),
             "air_time": torch.where(touching, 0.0, s.air_time + s.dt),
             "peak": torch.where(touching, 0.0, s.peak),
         }
@@ -384,7 +390,7 @@ class Velocity(LocoEnv):
     def pushed(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns velocities, which a push changes every 1 to 3 s, and the time until the next."""
         push = s.until_push <= 0.0
-        change = s.uniform(-1.0, 1.0, 6) * torch.tensor(PUSH, device=s.device)
+        change = self.push_scale * s.uniform(-1.0, 1.0, 6) * torch.tensor(PUSH, device=s.device)
         base = s.qvel[:, :6] + torch.where(push.unsqueeze(-1), change, 0.0)
         until_push = torch.where(push, s.uniform(*PUSH_EVERY), s.until_push - s.dt)
         return {"qvel": torch.cat([base, s.qvel[:, 6:]], dim=-1), "until_push": until_push}
@@ -484,6 +490,7 @@ class G1Velocity(Velocity):
     base, trunk = "pelvis", "torso_link"
     feet = {side: rf"{side}\d_collision" for side in ("left_foot", "right_foot")}
     own_geoms = "(?!.*foot).*_collision"
+    max_delay, push_scale = 3, 1.3  # more than `verify` asks for: a third of the falls
     presets = {
         **Velocity.presets,
         "ppo": {
