@@ -22,7 +22,7 @@ class Conditions:
     noise: float = 1.0
     """Errors of the observation, as a share of those of the training."""
     pushes: float = 1.0
-    """Changes of the velocity by pushes, as a share of those of the training."""
+    """Changes of the velocity by pushes, as a share of those of the task; G1 trains under stronger ones."""
     max_falls: float = 0.01
     """Greatest share of episodes with a fall."""
     min_return: float = 0.9
