@@ -410,9 +410,9 @@ def test_actions_are_late_by_the_delay_of_the_episode(many):
     for steps in range(4):
         assert share(delay == steps) == pytest.approx(1 / 4, abs=0.03)
     home = torch.tensor(many.mj_model.key("home").qpos[7:], dtype=torch.float32)
-    sent = torch.randn(6, *many.action_spec.shape)
+    sent = torch.randn(8, *many.action_spec.shape)
     sent[:3] = 0.0  # as before the first step
-    for step in range(3, 6):
+    for step in range(3, 8):
         td = many.step(td.set("action", sent[step]))["next"]
         arrived = sent[step - delay.long(), torch.arange(len(delay))]
         torch.testing.assert_close(many.sim.ctrl, home + 0.25 * arrived)

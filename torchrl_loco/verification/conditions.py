@@ -20,9 +20,9 @@ class Conditions:
     friction: tuple[float, float] = (0.4, 1.2)
     """Least and greatest sliding friction, drawn for each episode."""
     noise: float = 1.0
-    """Errors of the observation, as a share of those of the training."""
+    """Errors of the observation, as a multiple of those of the training."""
     pushes: float = 1.0
-    """Changes of the velocity by pushes, as a share of those of the task; G1 trains under stronger ones."""
+    """Changes of the velocity by pushes, as a multiple of those of a training with ``push_scale`` 1."""
     max_falls: float = 0.01
     """Greatest share of episodes with a fall."""
     min_return: float = 0.9

@@ -150,7 +150,7 @@ def _describe(conditions: Conditions) -> str:
     delay = f"{first}" if first == last else f"{first} to {last}"
     return (
         f"actions {delay} control steps late, friction {low:g} to {high:g}, "
-        f"{conditions.noise:g} x the noise and {conditions.pushes:g} x the pushes of the training"
+        f"noise x {conditions.noise:g}, pushes x {conditions.pushes:g}"
     )
 
 
