@@ -132,7 +132,7 @@ def test_a_light_body_is_moved(form):
     np.testing.assert_allclose(compiled_step(model, states).qvel.numpy(), expected, rtol=1e-5)
 
 
-def test_joints_that_do_the_same_are_traced(form):
+def test_joints_that_do_the_same_are_traced():
     """The mass matrix is singular, which is C MuJoCo's to warn of; constants of it are not divided by zero."""
     joints = '<joint axis="0 0 1"/><joint axis="0 0 1"/>'
     model = mujoco.MjModel.from_xml_string(
@@ -380,6 +380,20 @@ def test_a_capsule_orients_the_frame_of_its_contact(form, monkeypatch):
     monkeypatch.setattr(collision, "UPRIGHT", 1e-6)  # C MuJoCo's rule
     for cases in (CASES[:4], CASES[4:]):
         assert errors(*leaning(cases)).max() < 2e-5, cases
+
+
+def test_links_that_cross_in_their_plane_are_pushed_out_of_it():
+    """The gap of their axes is what rounding leaves; the normal is across both."""
+    link = """<body pos="0 0 -.2"><joint axis="0 1 0" armature=".01"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02" mass=".2" condim="1"/>"""
+    rng = np.random.default_rng(0)
+    for links, bend in ((8, 2.0), (20, 1.5)):  # traced, and by lanes
+        model = mujoco.MjModel.from_xml_string(
+            f'<mujoco><option gravity="0 0 0"/><worldbody>{link * links}{"</body>" * links}</worldbody></mujoco>'
+        )
+        states = [rng.uniform(-bend, bend, (64, links)), rng.normal(size=(64, links)), np.zeros((64, links))]
+        found = errors(model, [x.astype(np.float32) for x in (*states, np.zeros((64, 0)))])
+        assert found.max() < 1e-3
 
 
 def test_a_small_gain_is_found_beside_a_large_cost(form):

@@ -30,7 +30,7 @@ MAX_DENSE = 12
 CONTACT = """
 const Vec from = first_segment.at(nearest.first[i]), gap = second_segment.at(nearest.second[i]) - from;
 float length;
-const Vec n = Frame::normal(gap, length);
+const Vec n = Frame::normal(gap, first_segment.along, second_segment.along, length);
 const float distance = length - (p_radius + q_radius), position = distance - margin;
 if (!(position < 0.0f)) continue;
 if (contacts >= MAX_CONTACTS) { flag(NO_PLACE); continue; }

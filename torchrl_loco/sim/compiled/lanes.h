@@ -912,7 +912,7 @@ struct Step : Math {
         const Vec point = first.at(i ? nearest.first[1] : nearest.first[0]);
         const Vec gap = second.at(i ? nearest.second[1] : nearest.second[0]) - point;
         float length;
-        const Vec normal = Frame::normal(gap, length);
+        const Vec normal = Frame::normal(gap, first.along, second.along, length);
         const float distance = length - (a.radius + b.radius);
         add_contact(own.valid && i < nearest.points && distance < Model::margin(pair), friction, pair, i,
                     point + normal * (a.radius + 0.5f * distance), distance, normal, {0.0f, 0.0f, 0.0f});

@@ -3,10 +3,14 @@
 // ---- Contacts
 
 struct Frame {  // of a contact
-  // The normal along the gap of two shapes.
-  static INLINE Vec normal(Vec gap, float& length) {
+  // The normal along the gap of two segments. Where they cross but for rounding, it is across both, as in C MuJoCo.
+  static INLINE Vec normal(Vec gap, Vec first, Vec second, float& length) {
+    const Vec across = first.cross(second);
+    const float width = across.norm(), aa = first.dot(first), bb = second.dot(second);
     length = gap.norm();
-    return length > 0.0f ? gap * Math::divide(1.0f, length) : Vec{1.0f, 0.0f, 0.0f};
+    const bool cross = length * length <= 1e-10f * (aa + bb) && width * width > 1e-8f * aa * bb;
+    const float size = cross ? width : length;
+    return size > 0.0f ? (cross ? across : gap) * Math::divide(1.0f, size) : Vec{1.0f, 0.0f, 0.0f};
   }
   // A tangent; the other one is normal x tangent.
   static INLINE Vec tangent(Vec normal) {
