@@ -543,7 +543,7 @@ def test_a_table_makes_a_task_of_a_users_robot(caplog):
     with pytest.raises(TypeError, match="Bare must set base, trunk, feet, stand, walk, run"):
         type("Bare", (velocity.Velocity,), {"model": Table.model})(1, "cpu")
     for wrong in ({"max_delay": 4}, {"push_scale": -1.0}):
-        with pytest.raises(ValueError, match=f"{next(iter(wrong))} of Slow must"):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong))} of Slow must lie in"):
             type("Slow", (Table,), wrong)(1, "cpu")
 
 

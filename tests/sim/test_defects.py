@@ -132,14 +132,16 @@ def test_a_light_body_is_moved(form):
     np.testing.assert_allclose(compiled_step(model, states).qvel.numpy(), expected, rtol=1e-5)
 
 
-def test_joints_that_do_the_same_are_traced():
+def test_joints_that_do_the_same_are_traced(monkeypatch):
     """The mass matrix is singular, which is C MuJoCo's to warn of; constants of it are not divided by zero."""
     joints = '<joint axis="0 0 1"/><joint axis="0 0 1"/>'
     model = mujoco.MjModel.from_xml_string(
         f'<mujoco><worldbody><body name="a">{joints}<geom type="sphere" size="0.1"/></body></worldbody></mujoco>'
     )
-    assert unsupported(model) == []
-    assert step.source(model, 1)
+    for traced_dofs in (31, 0):  # traced, and by lanes
+        monkeypatch.setattr(step, "TRACED_DOFS", traced_dofs)
+        assert unsupported(model) == []
+        assert step.source(model, 1)
 
 
 def test_a_site_feels_its_contact_and_none_beside_it(form):

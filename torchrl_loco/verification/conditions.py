@@ -22,7 +22,7 @@ class Conditions:
     noise: float = 1.0
     """Errors of the observation, as a multiple of those of the training."""
     pushes: float = 1.0
-    """Changes of the velocity by pushes, as a multiple of those of a training with ``push_scale`` 1."""
+    """Changes of the velocity by pushes, as a multiple of those of a training with push_scale 1."""
     max_falls: float = 0.01
     """Greatest share of episodes with a fall."""
     min_return: float = 0.9

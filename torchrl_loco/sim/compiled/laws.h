@@ -8,9 +8,9 @@ struct Frame {  // of a contact
     const Vec across = first.cross(second);
     const float width = across.norm(), aa = first.dot(first), bb = second.dot(second);
     length = gap.norm();
-    const bool cross = length * length <= 1e-10f * (aa + bb) && width * width > 1e-8f * aa * bb;
-    const float size = cross ? width : length;
-    return size > 0.0f ? (cross ? across : gap) * Math::divide(1.0f, size) : Vec{1.0f, 0.0f, 0.0f};
+    const bool crossing = length * length <= 1e-10f * (aa + bb) && width * width > 1e-8f * aa * bb;
+    const float size = crossing ? width : length;
+    return size > 0.0f ? (crossing ? across : gap) * Math::divide(1.0f, size) : Vec{1.0f, 0.0f, 0.0f};
   }
   // A tangent; the other one is normal x tangent.
   static INLINE Vec tangent(Vec normal) {

@@ -43,8 +43,8 @@ PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
 """Greatest change of the base's velocity by a push (m/s, rad/s), where :attr:`Velocity.push_scale` is 1."""
 PUSH_EVERY = (1.0, 3.0)
 """Least and greatest time between pushes (s)."""
-LATEST = 3
-"""Greatest delay of an action for which the actions before it are kept (control steps)."""
+MAX_DELAY = 3
+"""Greatest delay that a robot may set (control steps): memory has the actions up to it."""
 START_HEIGHT = (0.01, 0.05)
 """Least and greatest height above the home pose at the start (m)."""
 STANDS, RUNS = 0.05, 1.5
@@ -74,7 +74,7 @@ def memory(joints: int, feet: int) -> dict[str, int | tuple[int, ...]]:
     return {
         **commands.ROWS,
         **{"until_push": (), "bias": joints, "delay": ()},  # time until it (s); rad; control steps
-        **{"last_action": joints, "earlier_actions": (LATEST - 1, joints)},  # the newest first
+        **{"last_action": joints, "earlier_actions": (MAX_DELAY - 1, joints)},  # the newest first
         **{"air_time": feet, "peak": feet},  # s; m
     }
 
@@ -201,7 +201,7 @@ class Velocity(LocoEnv):
         missing = [name for name in TABLE if not hasattr(cls, name)]
         if missing:
             raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.Velocity)")
-        check_int(f"max_delay of {cls.__name__}", cls.max_delay, Interval(0, LATEST, with_high=True))
+        check_int(f"max_delay of {cls.__name__}", cls.max_delay, Interval(0, MAX_DELAY, with_high=True))
         check_float(f"push_scale of {cls.__name__}", cls.push_scale, NOT_NEGATIVE)
         super().check_class()
 
