@@ -16,6 +16,7 @@ from tensordict import TensorDict
 import torchrl_loco
 from torchrl_loco import PhysicsOverflowError, PhysicsOverflowWarning
 from torchrl_loco.envs import monitors
+from torchrl_loco.sim import Overflow
 
 WORLDS, INTERVAL = 2, 40
 
@@ -63,6 +64,7 @@ BITS = {
     OverflowType.CCD: "contact_overflow",
     OverflowType.ITERATIONS: "iteration_limit",
     OverflowType.LS_ITERATIONS: "line_search_limit",
+    Overflow.UNSOLVED: "solver_failure",
 }
 
 

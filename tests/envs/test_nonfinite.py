@@ -13,6 +13,7 @@ from torchrl_loco.envs.episode import FiniteCheck, Outputs, observer, zero_non_f
 from torchrl_loco.sim import WorldFunc, fill
 from torchrl_loco.sim.world_func import launch_together
 
+STATE = ("qpos", "qvel", "qacc_warmstart")
 BAD = [math.nan, math.inf, -math.inf]
 CASES = [
     *KINDS,
@@ -160,8 +161,8 @@ def observe_given(world: int, given: Given, observation: wp.array[float], terms:
 
 
 def test_everything_that_can_be_not_finite_is_looked_at():
-    for coalesced, spoilt in itertools.product([False, True], ["qpos", "qvel", "observation", "reward", None]):
-        given = {"qpos": (3, 3), "qvel": (3, 3), "observation": (3, 4), "reward": (3,)}
+    for coalesced, spoilt in itertools.product([False, True], [*STATE, "observation", "reward", None]):
+        given = {**dict.fromkeys(STATE, (3, 3)), "observation": (3, 4), "reward": (3,)}
         given = {name: torch.ones(shape) for name, shape in given.items()}
         if spoilt is not None:
             given[spoilt].view(3, -1)[1:, -1] = 2e10
@@ -170,7 +171,7 @@ def test_everything_that_can_be_not_finite_is_looked_at():
         written = {name: torch.full(shape, 7.0) for name, shape in written.items()}
         outputs = fill(Outputs, **{name: wp.from_torch(array) for name, array in written.items()})
         mask, bad = torch.tensor([True, True, False]), torch.zeros(3, dtype=torch.bool)
-        marked, state = wp.from_torch(bad), {name: given.pop(name) for name in ("qpos", "qvel")}
+        marked, state = wp.from_torch(bad), {name: given.pop(name) for name in STATE}
         observe = observer(observe_given, fill(Given, **given), outputs, marked, 4, coalesced=coalesced)
         check = WorldFunc(zero_non_finite, fill(FiniteCheck, **state, outputs=outputs, non_finite=marked))
         launch_together([observe, check], wp.from_torch(mask))

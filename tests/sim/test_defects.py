@@ -19,6 +19,7 @@ from torchrl_loco.sim.compiled.parameters import VariedModel
 from torchrl_loco.sim.compiled.symbols import array, names, scalar
 from torchrl_loco.sim.overflow import Overflow
 from torchrl_loco.sim.simulation import choose_engine
+from torchrl_loco.sim.varied import Varied
 
 DATA = Path(__file__).parents[1] / "data"
 LIMBS = """
@@ -56,6 +57,20 @@ KINKED = """
 """A sphere that is pushed into the floor, and against a limit that begins to push back later."""
 
 
+def chain(links, ratio, impedance):
+    """Returns a sphere with a chain of capsules, of which the last is ``ratio`` times as dense, and constraints."""
+    limb = ""
+    for k in reversed(range(links)):
+        axis, density = ("0 1 0", "0 0 1", "1 .3 0")[k % 3], 1e3 * ratio ** ((k + 1) / links)
+        limb = f"""<body pos="{0.2 if k else 0.1} 0 0"><joint axis="{axis}" range="-86 86" limited="true"/>
+          <geom type="capsule" fromto="0 0 0 .18 0 0" size=".03" density="{density}"/>{limb}</body>"""
+    solimp = f"{impedance} {impedance} .001"
+    return mujoco.MjModel.from_xml_string(f"""<mujoco><option iterations="100"/><default>
+      <geom solimp="{solimp}" solref=".004 1"/><joint solimplimit="{solimp}"/></default><worldbody>
+      <geom type="plane" size="5 5 .1"/><body pos="0 0 .2"><freejoint/><geom size=".1"/>{limb}</body>
+      </worldbody></mujoco>""")
+
+
 def limbs(*replaced):
     """Returns the model with some of its text replaced."""
     xml = LIMBS
@@ -86,6 +101,88 @@ def errors(model, states):
     reached = compiled_step(model, states).qvel.numpy()
     expected = [c_step(model, *state) for state in zip(*states, strict=True)]
     return np.abs(reached - np.array(expected)).max(axis=1)
+
+
+# What fails is seen.
+
+
+def unsolved(sim):
+    """Returns which worlds are flagged."""
+    return sim.overflow.numpy() & int(Overflow.UNSOLVED) != 0
+
+
+def test_what_is_no_number_ends_in_the_state(form):
+    """One of a world's own numbers, or a control; it does not become a limit, and no row of constraints hides it."""
+    limited = 'range="-1 1" limited="true" frictionloss=".1" axis="0 0.3 1"'
+    light = 'timestep="0.004" gravity="0 0 -.01"'  # so that it does not show that a contact is missing
+    replaced = (('axis="0 0.3 1"', limited), ("<motor", '<motor forcerange="-1 1"'), ('timestep="0.004"', light))
+    model = limbs(*replaced)
+    fields = ("body_mass", "dof_armature", "dof_damping", "gravity", "geom_friction", "actuator_gear")
+    varied = Varied(model, {**{name: [0] for name in fields}, "body_mass": [2], "dof_frictionloss": [7]})
+    data, count = mujoco.MjData(model), varied.count + 2
+    data.qpos[2] = 0.0995  # touches the floor
+    state = [np.repeat(x[None], count, axis=0) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)]
+    rows = np.repeat(varied.nominal()[None], count, axis=0)
+    np.fill_diagonal(rows, np.nan)
+    state[3][-2, 0] = np.nan
+    sim = compiled_step(model, state, varied, rows)
+    finite = np.array([sim.qvel.isfinite().all(1).tolist(), sim.qacc_warmstart.isfinite().all(1).tolist()])
+    assert finite[:, -1].all()
+    assert not finite[:, :-1].any(), [*varied.columns, "ctrl"]
+    assert unsolved(sim).tolist() == [True] * (count - 1) + [False]
+
+
+@pytest.mark.slow
+def test_a_step_is_right_or_flagged(form):
+    """Of stiff chains with heavy ends single precision keeps too few digits; ordinary ones are never flagged."""
+    for links, ratio, impedance in ((4, 100.0, 0.9999), (8, 10.0, 0.9999), (6, 0.1, 0.95)):
+        model = chain(links, ratio, impedance)
+        states = [x[:60] for x in slow_states(model)]
+        sim = compiled_step(model, states)
+        after = np.array([c_step(model, *state) for state in zip(*states, strict=True)])
+        change = np.maximum(np.abs(after - states[1]).max(axis=1), 0.05)
+        wrong = np.abs(sim.qvel.numpy() - after).max(axis=1) > 0.1 * change
+        assert not (wrong & ~unsolved(sim)).any()
+        assert unsolved(sim).any() == (impedance > 0.99)
+
+
+def slow_states(model, count=60):
+    """Returns states on trajectories of C MuJoCo, none of which is fast or deep in another."""
+    rng, data, rows = np.random.default_rng(0), mujoco.MjData(model), []
+    while len(rows) < count:
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_integratePos(model, data.qpos, 0.3 * rng.normal(size=model.nv), 1.0)
+        data.qvel[:] = rng.normal(size=model.nv)
+        mujoco.mj_step(model, data, int(rng.integers(20, 300)))
+        state = [x.astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)]
+        if data.ncon and data.contact.dist.min() > -0.02 and abs(data.qvel).max() < 30:
+            rows.append(state)
+    return [np.array(column) for column in zip(*rows, strict=True)]
+
+
+@pytest.mark.slow
+def test_a_world_that_blows_up_does_not_stand_still(form):
+    """Thrown at up to 300 or 3000 rad/s, as many worlds are lost as C MuJoCo warns of; none keeps its acceleration."""
+    model, count, steps = chain(3, 1.0, 0.9), 24, 200
+    start = mujoco.MjData(model).qpos
+    for speed in (300.0, 3000.0):
+        velocities = np.random.default_rng(0).uniform(-speed, speed, (count, model.nv))
+        states = [np.tile(start, (count, 1)), velocities, np.zeros_like(velocities), np.zeros((count, 0))]
+        sim = compiled_step(model, [x.astype(np.float32) for x in states])
+        lost, stands = np.zeros(count, bool), np.zeros(count, bool)
+        for _ in range(steps - 1):
+            before = sim.qacc_warmstart.clone()
+            sim.step()
+            bad = [~(x.abs() < 1e10).all(dim=1) for x in (sim.qpos, sim.qvel, sim.qacc_warmstart)]
+            lost |= (bad[0] | bad[1] | bad[2]).numpy()
+            stands = (sim.qacc_warmstart == before).all(dim=1).numpy()
+        warned = []
+        for state in zip(*states, strict=True):
+            data = c_data(model, *state)
+            mujoco.mj_step(model, data, steps)
+            warned.append(any(warning.number for warning in data.warning))
+        assert not (stands & ~lost).any()
+        assert (lost != warned).sum() <= 3
 
 
 # What is refused.

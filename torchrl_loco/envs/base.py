@@ -713,7 +713,9 @@ class LocoEnv(EnvBase):
           contacts share one pool: if some are dropped, that counts in every world.
         - ``iteration_limit``, ``line_search_limit``: the solver or its line search used up its iterations, as is usual
           under ``protocol="playground"``.
-        - ``non_finite``: the world became non-finite, and terminated.
+        - ``solver_failure``: the solver of ``compiled`` found no step, or lacked digits: accelerations may be wrong.
+        - ``non_finite``: the world became non-finite, and terminated: its positions, velocities, accelerations,
+          observation, reward or action were no numbers, or 1e10 and more, as C MuJoCo has it.
 
         ``"peak"`` holds the largest number of ``constraints`` in a world and of ``contacts`` in all worlds that a
         physics step needed; use it to choose ``njmax`` and ``naconmax``. Nothing waits for the device until you read a

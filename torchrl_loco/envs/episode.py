@@ -167,6 +167,7 @@ class FiniteCheck:
 
     qpos: wp.array2d[float]
     qvel: wp.array2d[float]
+    qacc_warmstart: wp.array2d[float]
     outputs: Outputs
     non_finite: wp.array[bool]
 
@@ -176,6 +177,7 @@ def zero_non_finite(world: int, args: FiniteCheck):
     """Marks a world whose state or reward is not finite; zeroes observation, reward and terms of one that is marked."""
     out = args.outputs
     found = count_non_finite(args.qpos[world]) + count_non_finite(args.qvel[world])
+    found += count_non_finite(args.qacc_warmstart[world])
     if args.non_finite[world] or found > 0 or not (wp.abs(out.reward[world]) < MAX_VALUE):
         args.non_finite[world] = True
         for i in range(out.observation.shape[1]):

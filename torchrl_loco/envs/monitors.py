@@ -122,6 +122,7 @@ COUNTERS = {
     "contact_overflow": Overflow.BROADPHASE | Overflow.NARROWPHASE | Overflow.CCD,
     "iteration_limit": Overflow.ITERATIONS,
     "line_search_limit": Overflow.LS_ITERATIONS,
+    "solver_failure": Overflow.UNSOLVED,
 }
 """Name of a counter and the bits of ``Data.overflow`` that it counts."""
 DROPPED = ("constraints", "contacts")

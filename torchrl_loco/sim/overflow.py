@@ -4,7 +4,7 @@ import enum
 
 
 class Overflow(enum.IntFlag):
-    """Bits of ``overflow``: those of :class:`mujoco_warp.OverflowType` that are counted."""
+    """Bits of ``overflow``: those of :class:`mujoco_warp.OverflowType` that are counted, and one of ``compiled``."""
 
     NEFC = 1
     """No room for a row of constraints."""
@@ -20,3 +20,5 @@ class Overflow(enum.IntFlag):
     """The solver used up its iterations."""
     LS_ITERATIONS = 1024
     """A line search used up its iterations."""
+    UNSOLVED = 1 << 16
+    """The solver failed, or had too few digits: accelerations may be wrong. MuJoCo-Warp never says so."""

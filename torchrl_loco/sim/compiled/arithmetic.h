@@ -11,10 +11,12 @@
 #endif
 
 static constexpr float MINVAL = 1e-15f;  // MuJoCo's mjMINVAL
+static constexpr unsigned INFINITE_BITS = 0x7f800000u, NAN_BITS = 0x7fc00000u;
 
 struct Math {
-  static INLINE float smaller(float a, float b) { return a < b ? a : b; }
-  static INLINE float larger(float a, float b) { return a > b ? a : b; }
+  // Of a number and a bound; what is no number stays none, and does not become the bound.
+  static INLINE float smaller(float a, float b) { return b < a ? b : a; }
+  static INLINE float larger(float a, float b) { return a < b ? b : a; }
   static INLINE float clamp(float x, float low, float high) { return smaller(larger(x, low), high); }
 #ifdef __CUDA_ARCH__
   // Approximate, and with denormals as zero: quicker, and near enough.

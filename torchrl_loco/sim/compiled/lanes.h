@@ -304,9 +304,8 @@ typedef Pyramid Law;
 struct Step : Math {
   World& w;
   const int lane;
-  const float* const ctrl;  // of all worlds
-  int* const overflow;      // of all worlds
-  const int world;
+  const float* const ctrl;  // of the world
+  int& overflow;            // of the world
   int frictional, frictionless;  // contacts
   int limits;                    // violated limits of hinges and slides
   int limit_row[Model::LIMIT_SIDES][SLOTS];  // the row of the limit of each own degree of freedom, or -1
@@ -327,8 +326,8 @@ struct Step : Math {
   struct OwnContact { Vec normal, tangent; int pair; } own_contacts[OWN_CONTACTS];
 //END
 
-  INLINE Step(World& w, int lane, const float* ctrl, int* overflow, int world, const float* row)
-      : w(w), lane(lane), ctrl(ctrl), overflow(overflow), world(world), varied{{row}} {
+  INLINE Step(World& w, int lane, const float* ctrl, int& overflow, const float* row)
+      : w(w), lane(lane), ctrl(ctrl), overflow(overflow), varied{{row}} {
     frictional_before = frictionless_before = 0;
     OWN_DOFS(slot, d) UNROLLED for (int side = 0; side < Model::LIMIT_SIDES; ++side) limit_sides[side][slot] = NO_LIMIT;
   }
@@ -407,7 +406,7 @@ struct Step : Math {
 #endif
   INLINE unsigned lanes_below() const { return (1u << lane) - 1; }
   INLINE void flag(int bit) const {
-    if (lane == 0 && Model::SUBSTEPS) overflow[world] |= bit;
+    if (lane == 0 && Model::SUBSTEPS) overflow |= bit;
   }
 
   // ---- Kinematics
@@ -648,7 +647,7 @@ struct Step : Math {
     const int end = Model::first_actuator(d + (Model::SUBSTEPS > 0));  // a step that is not taken has no actuation
     ROLLED for (int a = Model::first_actuator(d); a < end; ++a) {
       const float gear = Model::gear(a);
-      const float f = actuator_force(a, ctrl[world * Model::CONTROLS + Model::control(a)], w.qpos[q], w.qvel[d]);
+      const float f = actuator_force(a, ctrl[Model::control(a)], w.qpos[q], w.qvel[d]);
       if (Model::IMPLICIT_ACTUATORS && Model::force_low(a) < f && f < Model::force_high(a))
         damping = damping - gear * gear * Model::bias_velocity(a);
       if (Model::JOINT_FORCE_LIMITS) actuation = actuation + gear * f;
@@ -1357,6 +1356,7 @@ struct Step : Math {
   struct Slots {  // of the Hessian (or of M + h D): the rows that this lane owns
     float row[SLOTS][STRIDE];
     float diagonal[SLOTS], gradient[SLOTS];  // what has yet to be added to the diagonal; the right-hand side
+    float whole[SLOTS];                      // the diagonal, if DELICATE
   };
 
   static INLINE Quad read4(const float* p) { return *reinterpret_cast<const Quad*>(p); }
@@ -1364,9 +1364,9 @@ struct Step : Math {
 
   // What acts on a degree of freedom alone: its residual, limits and dry friction; and instead, in the end, what implicit
   // damping adds: (M + h D) a = M qacc, solved for the difference of a and qacc.
-  INLINE void own_terms(const bool damping_alone, float* diagonal, float* gradient) const {
+  INLINE void own_terms(const bool damping_alone, const float regularisation, float* diagonal, float* gradient) const {
     OWN_DOFS(slot, d) {
-      diagonal[slot] = 0.0f;
+      diagonal[slot] = Model::DELICATE && d < DOFS ? regularisation * w.mass[STRIDE * d + d] : 0.0f;
       gradient[slot] = d < DOFS ? w.residual[d] : 0.0f;
       if (damping_alone) {
         const float damping = Model::IMPLICIT_ACTUATORS ? implicit_damping[slot] : Model::damping(d < DOFS ? d : 0);
@@ -1394,6 +1394,7 @@ struct Step : Math {
   INLINE void start_from_mass(Slots& h) const {
     OWN_DOFS(slot, d) {
       const int e = d < DOFS ? d : DOFS - 1;
+      if (Model::DELICATE) h.whole[slot] = w.mass[STRIDE * e + e] + h.diagonal[slot];
       UNROLLED for (int i = 0; i < QUADS; ++i) {
         if (4 * i >= LANES * (slot + 1)) break;
         const Quad m = read4(w.mass + STRIDE * e + 4 * i);
@@ -1418,6 +1419,7 @@ struct Step : Math {
         bool some = false;
         UNROLLED for (int i = 0; i < DIRECTIONS; ++i) {
           h.gradient[slot] = h.gradient[slot] + cost.gradient[i] * own[i];
+          if (Model::DELICATE) h.whole[slot] = h.whole[slot] + c[i] * own[i];
           some = some || c[i] != 0.0f;
         }
         if (LANES == 1 && !some) continue;
@@ -1441,6 +1443,7 @@ struct Step : Math {
         if (SKIPS_QUADS && slot > 0 && !(quads >> LANES / 4 * slot)) break;
         const float n0 = n[dof < STRIDE ? dof : STRIDE - 1], c = weight * n0;
         h.gradient[slot] += c * x;
+        if (Model::DELICATE) h.whole[slot] += c * n0;
         if (LANES == 1 && c == 0.0f) continue;
         UNROLLED for (int i = 0; i < QUADS; ++i) {
           if (4 * i >= LANES * (slot + 1)) break;
@@ -1552,6 +1555,21 @@ struct Step : Math {
       if (block - 1 == last) break;
       hand_over(h, (4 * first - 1) / LANES, block - 1, first - 1);
     }
+  }
+
+  // Flags a world of whose entry of the diagonal elimination leaves little but rounding. Takes one over the pivot.
+  static INLINE bool is_lost(float whole, float inverse_pivot) {
+    return !((inverse_pivot > 0.0f) & (whole * inverse_pivot * Model::least_pivot() < 1.0f));
+  }
+  INLINE void look_at_pivots(const Slots& h) const {
+    const int places[4] = {0, 2, 3, 9};  // in what Block::write writes
+    bool lost = false;
+    OWN_DOFS(slot, d) {
+      if (d >= DOFS) continue;
+      const float inverse_pivot = LANES == 1 ? divide(1.0f, h.diagonal[slot]) : w.blocks[d / 4][places[d % 4]];
+      lost |= is_lost(h.whole[slot], inverse_pivot);
+    }
+    if (ballot(lost)) flag(UNSOLVED);
   }
 
   // Solves H x = -gradient for the search direction x.
@@ -1715,9 +1733,10 @@ struct Step : Math {
     const int above = limb ? end - 1 - dof_of_row(lane) : -1, place = LIMB - 1 - above;  // rows to eliminate before
     const int base = PIVOT * Model::limb_of_row(limb ? lane : 0);
     UNROLLED for (int j = 0; j < LIMB; ++j) if (j < skipped) h.limb[j] = 0.0f;
-    float before[HOLDS], left[ENTRIES];
+    float before[HOLDS], whole[HOLDS], left[ENTRIES];
     OWN_ROWS(hold, row) {
       before[hold] = h.gradient[hold];
+      whole[hold] = h.diagonal[hold];
       const int t = row - LIMB_ROWS;
       if (t < 0 || t >= TRUNK) continue;
       float* const corner = w.corner + LOWER + t * (t + 1) / 2;
@@ -1800,14 +1819,21 @@ struct Step : Math {
       x[k] = divide(x[k], row[k]);
     }
     float solution[HOLDS];
+    bool lost = false;
     OWN_ROWS(hold, row) {
       solution[hold] = 0.0f;
-      UNROLLED for (int t = 0; t < TRUNK; ++t) if (row == LIMB_ROWS + t) solution[hold] = x[t];
+      UNROLLED for (int t = 0; t < TRUNK; ++t) {
+        if (row != LIMB_ROWS + t) continue;
+        solution[hold] = x[t];
+        if (Model::DELICATE)
+          lost |= is_lost(whole[hold], t < KEPT ? inverse[t] : Math::inverse(w.corner[LOWER + t * (t + 3) / 2]));
+      }
     }
     // The limbs, outwards. All subtract; those who are done take no harm.
     float y = h.gradient[0];
     UNROLLED for (int t = 0; t < TRUNK; ++t) y = y - h.trunk[0][t] * x[t];
     const float own_inverse = Math::inverse(h.diagonal[0]);
+    if (Model::DELICATE && ballot(lost | (limb & is_lost(whole[0], own_inverse)))) flag(UNSOLVED);
     UNROLLED for (int j = 0; j < LIMB; ++j) {
       const float own = y * own_inverse, found = read(own, (lane - place + j) % LANES);
       if (limb && j == place) solution[0] = own;
@@ -1824,9 +1850,10 @@ struct Step : Math {
 //END
   // Sets the search direction, gradient' gradient and gradient' H^-1 gradient; or as the direction what implicit damping
   // adds to qacc.
-  INLINE void set_direction(const bool damping_alone, float& gradient_squared, float& decrement) {
+  INLINE void set_direction(const bool damping_alone, const float regularisation, float& gradient_squared,
+                            float& decrement) {
     float diagonal[SLOTS], gradient[SLOTS], sums[2] = {0.0f, 0.0f};
-    own_terms(damping_alone, diagonal, gradient);
+    own_terms(damping_alone, regularisation, diagonal, gradient);
     bool by_limbs = false;
 //IF LIMBS
 #ifdef __CUDA_ARCH__
@@ -1852,6 +1879,7 @@ struct Step : Math {
         sums[0] += gradient[slot] * gradient[slot];
       }
       factor_and_solve(h);
+      if (Model::DELICATE && !damping_alone) look_at_pivots(h);
       OWN_DOFS(slot, d) if (d < DOFS) sums[1] -= gradient[slot] * w.search[d];
     }
     if (damping_alone) return;
@@ -1883,8 +1911,10 @@ struct Step : Math {
     sync();
   }
 
-  // Brings velocity and acceleration into the rows, and the acceleration into the residual of M.
-  INLINE void complete_rows() {
+  // Brings velocity and acceleration into the rows, and the acceleration into the residual of M. Returns whether all rows
+  // are numbers: one that is none is on no side of its constraint.
+  INLINE bool complete_rows() {
+    bool numbers = true;
     SHARED_LOOP(i, DOFS + jacobian_rows()) {
       const int r = i - DOFS;
       const float* const row = r < 0 ? w.mass + STRIDE * i : w.jacobian + STRIDE * r;
@@ -1901,8 +1931,16 @@ struct Step : Math {
     SHARED_LOOP(r, rows()) {
       float v = row_velocity(r, w.qacc);
       if (r >= first_limit()) v += row_damping(r) * row_velocity(r, w.qvel);
-      w.x[r] += v;
+      const float x = w.x[r] += v;
+      numbers &= x == x;
     }
+    sync();
+    return ballot(!numbers) == 0;
+  }
+
+  // Makes the acceleration no number.
+  INLINE void lose() {
+    OWN_DOFS(slot, d) if (d < DOFS) w.qacc[d] = from_bits(NAN_BITS);
     sync();
   }
 
@@ -1991,7 +2029,10 @@ struct Step : Math {
   INLINE void solve(const bool live) {
     bool guesses = false;
     if (live) {
-      complete_rows();
+      if (!complete_rows()) {
+        flag(UNSOLVED);
+        lose();
+      }
       guesses = guess_sides() && GUESSES;
     }
 //NEWTON
@@ -2235,27 +2276,31 @@ World storage;
 World& w = storage;
 #define LOCKSTEP()
 #endif
-float* const sensors = sensordata_out.data + (live ? world : 0) * Model::SENSOR_VALUES;
-float* const row = numbers_out.data + static_cast<size_t>(live ? world : 0) * numbers_out.shape[1];
-Step step(w, lane, ctrl_in.data, overflow_out.data, world, row);
+const size_t this_world = live ? world : 0;
+const auto row_of = [=](auto* data, int size) { return data + this_world * size; };  // products of ints could wrap
+float* const sensors = row_of(sensordata_out.data, Model::SENSOR_VALUES);
+float* const row = row_of(numbers_out.data, numbers_out.shape[1]);
+float* const qpos = row_of(qpos_out.data, Model::POSITIONS);
+float *const qvel = row_of(qvel_out.data, DOFS), *const qacc = row_of(qacc_warmstart_out.data, DOFS);
+Step step(w, lane, row_of(ctrl_in.data, Model::CONTROLS), overflow_out.data[this_world], row);
 if (live && lane == 0) {  // in a step that is not taken, numbers may have changed
 //DERIVE
 }
 if (live) {
   step.sync();  // the first lane may have written the state
-  SHARED_LOOP(i, Model::POSITIONS) w.qpos[i] = qpos_out.data[world * Model::POSITIONS + i];
+  SHARED_LOOP(i, Model::POSITIONS) w.qpos[i] = qpos[i];
   SHARED_LOOP(i, STRIDE) {
-    w.qvel[i] = i < DOFS ? qvel_out.data[world * DOFS + i] : 0.0f;
-    w.qacc[i] = i < DOFS ? qacc_warmstart_out.data[world * DOFS + i] : 0.0f;
+    w.qvel[i] = i < DOFS ? qvel[i] : 0.0f;
+    w.qacc[i] = i < DOFS ? qacc[i] : 0.0f;
     w.search[i] = 0.0f;
   }
   SHARED_LOOP(i, DOFS * STRIDE) w.mass[i] = 0.0f;
   step.sync();
 }
 //IF CONTACT_GEOMS
-const int contact_row = world * Model::HISTORY * Model::CONTACT_GEOMS;
-float* const contact_forces = reinterpret_cast<float*>(contact_force_out.data + contact_row);
-bool* const in_contact = in_contact_out.data + contact_row;
+const int contacts = Model::HISTORY * Model::CONTACT_GEOMS;
+float* const contact_forces = reinterpret_cast<float*>(row_of(contact_force_out.data, contacts));
+bool* const in_contact = row_of(in_contact_out.data, contacts);
 //END
 if (live && Model::SUBSTEPS == 0 && Model::TOUCH + Model::CONTACT_GEOMS > 0) {  // a step that is not taken finds forces
   step.kinematics();
@@ -2291,23 +2336,23 @@ ROLLED for (int substep = 0;; ++substep) {
   }
 }
 if (live) {
-  const int first_body = world * Model::BODIES;
-  step.write_bodies(reinterpret_cast<float*>(xpos_out.data + first_body), reinterpret_cast<float*>(xmat_out.data + first_body),
-                    cvel_out.data ? reinterpret_cast<float*>(cvel_out.data + first_body) : nullptr);
+  step.write_bodies(reinterpret_cast<float*>(row_of(xpos_out.data, Model::BODIES)),
+                    reinterpret_cast<float*>(row_of(xmat_out.data, Model::BODIES)),
+                    cvel_out.data ? reinterpret_cast<float*>(row_of(cvel_out.data, Model::BODIES)) : nullptr);
 //IF SUBTREE_COM
-  step.write_centers(reinterpret_cast<float*>(subtree_com_out.data + first_body));
+  step.write_centers(reinterpret_cast<float*>(row_of(subtree_com_out.data, Model::BODIES)));
 //END
   step.write_subtree_velocities(sensors);
 //IF MOMENTA
   step.write_angular_momenta(sensors);
 //END
   if (Model::SUBSTEPS > 0) {
-    SHARED_LOOP(i, Model::POSITIONS) qpos_out.data[world * Model::POSITIONS + i] = w.qpos[i];
+    SHARED_LOOP(i, Model::POSITIONS) qpos[i] = w.qpos[i];
     SHARED_LOOP(i, DOFS) {
-      qvel_out.data[world * DOFS + i] = w.qvel[i];
-      qacc_warmstart_out.data[world * DOFS + i] = w.qacc[i];
+      qvel[i] = w.qvel[i];
+      qacc[i] = w.qacc[i];
     }
-    if (lane == 0) time_out.data[world] += Model::SUBSTEPS * Model::timestep();
+    if (lane == 0) time_out.data[this_world] += Model::SUBSTEPS * Model::timestep();
   }
   step.sync();  // the first lane may read it
 }

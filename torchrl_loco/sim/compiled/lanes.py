@@ -35,6 +35,7 @@ from torchrl_loco.sim.compiled.collision import (
     pairs,
 )
 from torchrl_loco.sim.compiled.constraints import Softness, both_sides, near, tolerance
+from torchrl_loco.sim.compiled.delicate import LEAST_PIVOT, is_delicate
 from torchrl_loco.sim.compiled.dynamics import BALL, FREE, HINGE, MINVAL, SLIDE
 from torchrl_loco.sim.compiled.links import Mass, matrix, moving_bodies, places
 from torchrl_loco.sim.compiled.parameters import Number, VariedModel, nominal, present, varies
@@ -45,7 +46,12 @@ from torchrl_loco.sim.models import NEVER, home_pose
 TEMPLATE = pathlib.Path(__file__).with_name("lanes.h")
 LINE_SEARCH = shared.line_search("Model::scale()", "Model::ls_tolerance()", "Model::ls_near()", "Model::LS_ITERATIONS")
 NEWTON = shared.newton(
-    "Model::scale()", "Model::tolerance()", "Model::ITERATIONS", "Model::IMPLICIT_DAMPING", guesses="guesses"
+    "Model::scale()",
+    "Model::tolerance()",
+    "Model::ITERATIONS",
+    "Model::IMPLICIT_DAMPING",
+    guesses="guesses",
+    delicate="Model::DELICATE",
 )
 TRANSLATION, ROTATION = 0, 1
 """Kinds of a degree of freedom in ``lanes.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
@@ -382,6 +388,7 @@ class Description:
             SENSOR_VALUES=m.nsensordata,
             LIMIT_SIDES=self.limit_sides,
             VARIED=isinstance(m, VariedModel),
+            DELICATE=is_delicate(nominal(m)),
             ROWS=layout.rows,
             **{name.upper(): size for name, size in dataclasses.asdict(layout).items()},
         )
@@ -392,6 +399,7 @@ class Description:
             ls_tolerance=tolerance(m) * m.opt.ls_tolerance,
             ls_near=near(m),
             least_aligned=collision.UPRIGHT,
+            least_pivot=LEAST_PIVOT,
         )
         tables.vector("gravity", m.opt.gravity)
         self._add_links(tables)

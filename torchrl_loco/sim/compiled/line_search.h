@@ -6,6 +6,7 @@
 //   quadratic[3]                slope and curvature of the quadratic form, and the squared length of the direction
 //   whole[4]                    of all rows the cost at alpha = 0, and at alpha = 1 what add_rows adds
 //   add_rows(alphas, n, sums)   adds three numbers for each of n steps, over all rows
+// A step of length 0 has the slope at alpha = 0 where no other is acceptable, and 0 where that slope is rounding.
 // With BY_SLOPES nothing adds the first of these three, the change of cost: what a step gains is for who takes it to say.
 
 const float slope = quadratic[0], curvature = quadratic[1];
@@ -21,9 +22,10 @@ if (guessed) {  // the decrement is not the slope at alpha = 0, where other rows
   return result;
 }
 if (fabsf(start.slope) < noise) return result;
+result.slope = start.slope;
 
 if (BY_SLOPES) {  // Newton's method between two slopes of different sign: it is exact once it knows which rows are active
-  float low = 0.0f, high = Math::from_bits(0x7f800000u);
+  float low = 0.0f, high = Math::from_bits(INFINITE_BITS);
   // Where the cost rises, a step leaves what is rounding of alpha: a heavy row may begin just before p.
   const auto step = [&](const Point& p) {
     const float left = -p.slope * Math::inverse(p.curvature);
@@ -92,7 +94,7 @@ ROLLED for (int i = 0; i < LS_ITERATIONS && !found; ++i) {
   const bool middle_ends = middle.ends(start, accept, LS_NEAR);
   found = low_ends | high_ends | middle_ends;
   if (found) {
-    result = {0.0f, 0.0f, 0.0f};
+    result = {0.0f, 0.0f, start.slope};
     result.take(next_low, low_ends);
     result.take(next_high, high_ends);
     result.take(middle, middle_ends);

@@ -6,24 +6,30 @@
 //   live                    whether there is a world
 //   any_of_block(x)         whether x holds here, or in a world that begins its iterations together with this one
 //   GUESSES                 whether the first direction takes other rows to be active than those that are
-//   set_direction(found, gradient_squared, decrement)
-//                           sets s and, at its start, gradient' gradient and gradient' H^-1 gradient; once qacc is
-//                           found, which is asked for if IMPLICIT_DAMPING, instead what that adds to qacc
+//   DELICATE                whether single precision may not be enough for H: then the diagonal of M helps where it is not
+//   set_direction(found, regularisation, gradient_squared, decrement)
+//                           sets s and, at its start, gradient' gradient and gradient' H^-1 gradient, with so much of the
+//                           diagonal of M added to H; once qacc is found, which is asked for if IMPLICIT_DAMPING, instead
+//                           what that adds to qacc
 //   project()               sets how all changes along s
 //   line_search(decrement, guessed)
 //                           returns a step along s; of a guess, all of s or nothing
 //   move(step)              takes it, and returns whether a row is on another side than the direction took it to be; sets
 //                           its improvement if the search does not
+//   lose()                  makes qacc no number, so that the state becomes none
 //   flag(bit)               reports what was cut short
 // SCALE is one over the inertia of the model.
+// A solve that fails is flagged. Where there are no numbers, or not a single step and much left to gain, the world is lost.
 
-float gradient_squared = 0.0f, decrement = 0.0f;
+float gradient_squared = 0.0f, decrement = 0.0f, regularisation = 0.0f, before = 0.0f;
 const auto flat = [&](const float left) {  // with so much of both left
   const float gradient_left = SCALE * (SCALE * (gradient_squared * left));
-  return (gradient_left < TOLERANCE * TOLERANCE) | (0.5f * SCALE * (decrement * left) < TOLERANCE);
+  const bool gained = (0.5f * SCALE * (decrement * left) < TOLERANCE) & (regularisation == 0.0f);
+  return (gradient_left < TOLERANCE * TOLERANCE) | gained;
 };
 bool found = false, done = !live;  // whether qacc is final; whether there is nothing left to do
 bool same = false;                 // whether the last step left all rows on their sides
+bool moved = false;                // whether qacc is no longer the start
 ROLLED for (int iteration = 0; any_of_block(!done); ++iteration) {
   if (done) continue;
   if (!found && iteration == ITERATIONS) {
@@ -33,20 +39,38 @@ ROLLED for (int iteration = 0; any_of_block(!done); ++iteration) {
   done = found;
   if (done && !IMPLICIT_DAMPING) continue;
   const bool guessed = GUESSES && iteration == 0;
-  set_direction(found, gradient_squared, decrement);
+  set_direction(found, regularisation, gradient_squared, decrement);
   if (done) continue;
+  const bool finite = gradient_squared + fabsf(decrement) < Math::from_bits(INFINITE_BITS);
+  if (!(finite & (0.5f * SCALE * decrement > -TOLERANCE))) {  // a pivot is no number, or not positive
+    flag(UNSOLVED);
+    if (DELICATE && finite) {
+      regularisation = 10.0f * regularisation + 1.0f;
+      continue;
+    }
+    if (!finite | !moved) lose();
+    found = true;
+    continue;
+  }
   found = iteration > 0 && flat(1.0f);
   if (found) continue;
   project();
   Search step = line_search(decrement, guessed);
-  found = (step.alpha == 0.0f) & !guessed;
-  if (found) continue;
+  if ((step.alpha == 0.0f) & !guessed) {
+    if (step.slope != 0.0f) flag(UNSOLVED);
+    if (!moved & (0.5f * SCALE * decrement > MUCH)) lose();
+    found = true;
+    continue;
+  }
+  moved |= step.alpha != 0.0f;
   const bool repeated = same;
   same = !move(step);
   found = (step.improvement > 0.0f) & (step.improvement * SCALE < TOLERANCE) & !guessed;
   if (same && !found) {  // what is left of a Newton step; of a second one on the same parabola, rounding
     // On a parabola the slope is (alpha - 1) decrement. A difference is an error of s along s; across, it may be tenfold.
     const float rest = 1.0f - step.alpha, error = 10.0f * (Math::divide(step.slope, decrement) + rest);
+    if (DELICATE && repeated && decrement > 1e-3f * before) flag(UNSOLVED);  // steps of Newton's method gain far more
     found = repeated || flat(Math::larger(rest * rest, error * error));
   }
+  before = decrement;
 }

@@ -5,7 +5,13 @@ import pathlib
 from torchrl_loco.sim.overflow import Overflow
 
 FOLDER = pathlib.Path(__file__).parent
-FLAGS = f"enum {{ NO_PLACE = {Overflow.NARROWPHASE:d}, LIMIT_REACHED = {Overflow.ITERATIONS:d} }};\n"  # of overflow
+FLAGS = (
+    f"enum {{ NO_PLACE = {Overflow.NARROWPHASE:d}, LIMIT_REACHED = {Overflow.ITERATIONS:d}, "
+    f"UNSOLVED = {Overflow.UNSOLVED:d} }};\n"
+)
+"""Bits of overflow."""
+MUCH = 1.0
+"""Mean square of the acceleration (rad^2/s^4, m^2/s^4) above which a solver that gains nothing has lost its world."""
 LAWS = "".join((FOLDER / f"{name}.h").read_text() + "\n" for name in ("arithmetic", "laws")) + FLAGS
 """Declarations, for the head of a function."""
 _LINE_SEARCH, _NEWTON = ((FOLDER / f"{name}.h").read_text() for name in ("line_search", "newton"))
@@ -25,7 +31,7 @@ def line_search(scale: str, tolerance: str, near: str, iterations: str, by_slope
     return _filled(_LINE_SEARCH, SCALE=scale, **values)
 
 
-def newton(scale: str, tolerance: str, iterations: str, implicit_damping: str, guesses: str) -> str:
+def newton(scale: str, tolerance: str, iterations: str, implicit_damping: str, guesses: str, delicate: str) -> str:
     """Returns the body of the function of Newton's method.
 
     Args:
@@ -34,9 +40,10 @@ def newton(scale: str, tolerance: str, iterations: str, implicit_damping: str, g
         iterations: at most.
         implicit_damping: whether it ends with what implicit damping adds.
         guesses: whether it begins with a guess.
+        delicate: whether single precision may not be enough (:func:`.delicate.is_delicate`).
     """
-    values = {"SCALE": scale, "TOLERANCE": tolerance, "ITERATIONS": iterations}
-    return _filled(_NEWTON, **values, IMPLICIT_DAMPING=implicit_damping, GUESSES=guesses)
+    values = {"SCALE": scale, "TOLERANCE": tolerance, "ITERATIONS": iterations, "MUCH": f"{MUCH}f"}
+    return _filled(_NEWTON, **values, IMPLICIT_DAMPING=implicit_damping, GUESSES=guesses, DELICATE=delicate)
 
 
 def _filled(text: str, **values: str) -> str:

@@ -5,14 +5,18 @@ The method is in ``newton.h`` and ``line_search.h``, and what rows cost in ``law
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from torchrl_loco.sim.compiled import shared
 from torchrl_loco.sim.compiled.collision import Pair
 from torchrl_loco.sim.compiled.constraints import DryFriction, JointLimits, Variables, near, tolerance
+from torchrl_loco.sim.compiled.delicate import LEAST_PIVOT, is_delicate
 from torchrl_loco.sim.compiled.dense_contacts import DenseContacts
-from torchrl_loco.sim.compiled.dynamics import Dynamics
+from torchrl_loco.sim.compiled.dynamics import ArticulatedFactor, Dynamics
 from torchrl_loco.sim.compiled.ground_contacts import GroundContacts
+from torchrl_loco.sim.compiled.parameters import nominal
 from torchrl_loco.sim.compiled.sensors import ContactForces, TouchSensors
-from torchrl_loco.sim.compiled.symbols import Block, cell, cells, dot, literal, total
+from torchrl_loco.sim.compiled.symbols import Block, Scalar, cell, cells, dot, literal, name, total
 
 WHOLE = "whole[0] += row.cost(); row.add(1.0f, whole + 1);"
 STEPS = "UNROLLED for (int s = 0; s < n; ++s) row.add(alphas[s], sums + 3 * s);"
@@ -50,6 +54,7 @@ class NewtonSolver:
         for rows in (self.limits, self.friction, self.dense):
             self.arrays.update(rows.arrays)
         self.by_slopes = near(m) == 0
+        self.delicate = is_delicate(nominal(m))
         self.places = self.ground.count + self.dense.count
         directions = max(len(rows.pyramid.directions) for rows in (self.ground, self.dense))
         rows_of_contact = [f"{field}{d}" for field in "xv" for d in range(directions)]
@@ -77,7 +82,9 @@ class NewtonSolver:
         for i, product in enumerate(self.tree.mass_times(cells("qacc", m.nv))):
             block.set(f"M_qacc[{i}]", product)
         scale = 1 / (m.stat.meaninertia * max(m.nv, 1))
-        with block.function("set_direction", "bool, float& gradient_squared, float& decrement") as direction:
+        with block.function(
+            "set_direction", "bool, float regularisation, float& gradient_squared, float& decrement"
+        ) as direction:
             self._set_direction(direction)
         block("float quadratic[3], whole[4];")
         with block.function("project") as projection:
@@ -87,8 +94,11 @@ class NewtonSolver:
         with block.function("move", "Search& step") as step:
             self._move(step)
         block("const auto any_of_block = [](bool x) { return x; };")
+        with block.function("lose", "") as loss:
+            loss(f"for (int i = 0; i < {m.nv}; ++i) qacc[i] = M_qacc[i] = Math::from_bits(NAN_BITS);")
         stopping = literal(scale), literal(tolerance(m)), str(option.iterations)
-        block(shared.newton(*stopping, implicit_damping="false", guesses="false"))
+        delicate = "true" if self.delicate else "false"
+        block(shared.newton(*stopping, implicit_damping="false", guesses="false", delicate=delicate))
 
     def read_touch(self, block: Block) -> None:
         """Sets the touch sensors from the forces that were found."""
@@ -117,7 +127,11 @@ class NewtonSolver:
         diagonal = [total([]) for _ in range(nv)]
         self.limits.add_to(gradient, diagonal)
         self.friction.add_to(gradient, diagonal)
+        if self.delicate:
+            diagonal = [x + name("regularisation") * float(m.dof_M0[i]) for i, x in enumerate(diagonal)]
         factor = tree.factor(stiffness, diagonal)
+        if self.delicate:
+            self._look_at_pivots(block, factor, stiffness, diagonal)
         if self.dense.count:
             for i in range(nv):
                 block.set(f"gradient[{i}]", gradient[i])
@@ -132,6 +146,15 @@ class NewtonSolver:
         block.set("decrement", dot(gradient, solution))
         for i, entry in enumerate([block.keep(entry) for entry in solution]):
             block.set(f"search[{i}]", -entry)
+
+    def _look_at_pivots(
+        self, block: Block, factor: ArticulatedFactor, stiffness: list[np.ndarray], diagonal: list[Scalar]
+    ) -> None:
+        """Flags a world of whose entry of the diagonal of H elimination leaves little but rounding."""
+        tree = self.tree
+        for whole, inverse in zip(tree.diagonal(stiffness, diagonal), factor.inverse, strict=True):
+            kept = block.value(whole * inverse * LEAST_PIVOT)
+            block(f"if (!(({block.value(inverse)} > 0.0f) & ({kept} < 1.0f))) flag(UNSOLVED);")
 
     def _project(self, block: Block) -> None:
         """Sets how residuals and M qacc change along the search direction, and what a line search asks of all rows."""
