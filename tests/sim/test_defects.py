@@ -185,6 +185,38 @@ def test_a_world_that_blows_up_does_not_stand_still(form):
         assert (lost != warned).sum() <= 3
 
 
+def test_limits_of_ball_joints_have_places_beside_any_number_of_contacts(form, monkeypatch):
+    """Twelve bars lie on the floor with 24 ends, more than lanes have places for, and six ball joints are beyond."""
+    limbs = ""
+    for k in range(6):
+        at = 0.12 * np.cos(np.pi * k / 3), 0.12 * np.sin(np.pi * k / 3)
+        bars = "".join(
+            f'<geom type="capsule" fromto="{x} -.02 {z} {x} .02 {z}" size=".03"/>'
+            for x, z in ((0.05, 0.05), (0.15, 0.07))
+        )
+        limbs += f"""<body pos="{at[0]} {at[1]} 0" euler="0 0 {60 * k}"><joint type="ball" range="0 8" limited="true"
+          armature=".01" damping=".1"/>{bars}</body>"""
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep=".004" iterations="100" ls_iterations="50">
+      <flag eulerdamp="disable"/></option><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .1"><freejoint/>
+      <geom size=".04" pos="0 0 .1"/>{limbs}</body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    for k in range(6):  # the bars level: 11.3 degrees, 3.3 beyond the limits
+        mujoco.mju_axisAngle2Quat(data.qpos[7 + 4 * k : 11 + 4 * k], np.array([0.0, 1.0, 0.0]), np.arctan(0.2))
+    mujoco.mj_kinematics(model, data)
+    capsules = model.geom_type == int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+    data.qpos[2] -= data.geom_xpos[capsules, 2].min() - 0.029  # 1 mm deep
+    state = [x[None].astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)]
+    mujoco.mj_step(model, data)
+    assert (data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)).sum() == 6
+    for standing, tolerance in ((lanes.STANDING, 1e-6), (0.0, 0.1)):  # with it, places for half of the contacts
+        monkeypatch.setattr(lanes, "STANDING", standing)
+        step.texts.clear()
+        sim = compiled_step(model, state)
+        dropped = bool(sim.overflow.item() & int(Overflow.NARROWPHASE))
+        assert dropped == (form == "lanes" and not standing)
+        np.testing.assert_allclose(sim.qvel.numpy()[0, 6:], data.qvel[6:], atol=tolerance)
+
+
 # What is refused.
 
 
@@ -474,9 +506,8 @@ def test_the_limit_of_iterations_is_flagged_where_it_is_reached(form):
     np.testing.assert_array_equal(flags, ~final)
 
 
-def test_a_capsule_orients_the_frame_of_its_contact(form, monkeypatch):
+def test_a_capsule_orients_the_frame_of_its_contact(form):
     """However steep it is, and however tilted the plane."""
-    monkeypatch.setattr(collision, "UPRIGHT", 1e-6)  # C MuJoCo's rule
     for cases in (CASES[:4], CASES[4:]):
         assert errors(*leaning(cases)).max() < 2e-5, cases
 

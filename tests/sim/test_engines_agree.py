@@ -9,8 +9,6 @@ from cases import COMPILED, ENGINES, MODELS, PROTOCOLS
 import torchrl_loco
 from torchrl_loco import State
 from torchrl_loco.sim import models
-from torchrl_loco.sim.compiled import collision
-from torchrl_loco.sim.compiled.step import texts
 from torchrl_loco.sim.simulation import set_options
 
 pytestmark = pytest.mark.slow
@@ -69,8 +67,13 @@ def test_both_engines_agree(shared, states):
     for protocol in PROTOCOLS:
         envs = {engine: shared(task, len(state), protocol=protocol, engine=engine) for engine in ENGINES}
         found = {engine: after(env, state, action) for engine, env in envs.items()}
-        if task == "walker_run" or protocol == "dm_control":
+        if task == "walker_run":
             assert_agree(*found.values())
+            continue
+        if protocol == "dm_control":  # but for frames of steep capsules, which MuJoCo-Warp does not align
+            error = np.abs(found["compiled"] - found["mujoco_warp"]).max(axis=1)
+            assert np.median(error) < 1e-6
+            assert np.quantile(error, 0.95) > 1e-5
             continue
         # Four iterations rarely converge. By lanes, the first one guesses the active rows, and what is left is less.
         many = {"iterations": 50, "ls_iterations": 50}
@@ -80,18 +83,9 @@ def test_both_engines_agree(shared, states):
         assert np.quantile(ours, 0.95) < 0.75 * np.quantile(theirs, 0.95)
 
 
-def test_converged_steps_agree_with_c_mujoco(shared, states, monkeypatch):
-    """With its rule for the contact frames of upright capsules, such as the humanoid's shins.
-
-    Under MuJoCo-Warp's own rule both engines differ from C MuJoCo alike.
-    """
+def test_converged_steps_agree_with_c_mujoco(shared, states):
     task, state, action = states
     env = shared(task, len(state), protocol="dm_control")
     expected, touching = of_c_mujoco(env, state, action)
     assert touching > 0.5
-    if task.startswith("humanoid"):
-        assert np.quantile(np.abs(after(env, state, action) - expected), 0.95) > 5e-6
-        monkeypatch.setattr(collision, "UPRIGHT", 1e-6)
-        texts.clear()
-        env = torchrl_loco.make(task, len(state), "cpu", protocol="dm_control")
     assert_agree(after(env, state, action), expected)

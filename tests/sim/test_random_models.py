@@ -15,7 +15,7 @@ from variation import draw_rows, some_varied
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import Simulation
-from torchrl_loco.sim.compiled import collision, step, unsupported
+from torchrl_loco.sim.compiled import step, unsupported
 
 STATES = 16
 FEW = 5
@@ -60,9 +60,7 @@ SETTINGS = {
 
 
 @pytest.fixture(autouse=True)
-def c_mujocos_frames(monkeypatch):
-    """Contact frames of upright capsules are as in C MuJoCo, not as in MuJoCo-Warp."""
-    monkeypatch.setattr(collision, "UPRIGHT", 1e-6)
+def quiet_c_mujoco():
     mujoco.set_mju_user_warning(lambda message: None)  # else it writes a log into the working directory
     yield
     mujoco.set_mju_user_warning(None)

@@ -27,12 +27,8 @@ MINMU = 1e-5
 """MuJoCo's mjMINMU."""
 SLIPPERY, LEAST = 0.03, 1e-4
 """Up to this friction the regularisation of a contact is no less than this share of the bodies' inverse inertia."""
-UPRIGHT = 0.5
-"""Sine of the angle to a plane's normal below which a capsule does not orient the frame of its contact.
-
-It is mujoco_warp's, so that both engines agree. C MuJoCo always takes the direction of the capsule: this is what makes
-the humanoid, whose shins stand upright, differ from C MuJoCo under both engines.
-"""
+LEAST_ALIGNED = 1e-6
+"""Sine of the angle to a plane's normal below which the direction of a capsule along the plane is rounding."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -228,7 +224,7 @@ def geom_pose(m: mujoco.MjModel, poses: Poses, geom: int) -> tuple[np.ndarray, n
 def frame(normal: np.ndarray, axis: np.ndarray | None) -> np.ndarray:
     """Returns the first tangent of a contact with a plane, ``(3,)``; the second is normal x first.
 
-    MuJoCo aligns the first with the axis of a capsule, unless that is nearly normal to the plane. Tangents that are
+    C MuJoCo aligns the first with the axis of a capsule, unless that is normal to the plane. Tangents that are
     exchanged or reversed give the same pyramid: where the axis of the capsule stays in one plane with the normal, one
     constant direction serves for all cases.
 
@@ -249,7 +245,7 @@ def frame(normal: np.ndarray, axis: np.ndarray | None) -> np.ndarray:
                 return array(direction)
     along = axis - normal * dot(normal, axis)
     length = sqrt(dot(along, along))
-    return np.array([select(length, "<", UPRIGHT, level[i], along[i] / length) for i in range(3)], dtype=object)
+    return np.array([select(length, "<", LEAST_ALIGNED, level[i], along[i] / length) for i in range(3)], dtype=object)
 
 
 # Meshes on planes.

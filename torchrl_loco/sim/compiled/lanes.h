@@ -690,7 +690,7 @@ struct Step : Math {
   }
 
   // The deepest contacts stay: one that finds no place takes that of the shallowest. Returns the place of this lane's
-  // contact, or none of them. Limits of ball joints, which have no depth, are not displaced.
+  // contact, or none of them. Limits of ball joints, which come first and always find a place, are not displaced.
   INLINE int make_room(bool touches, Contact* stored, int place, int places, int id, float depth) const {
     if (touches && place < places) {
       stored[place].distance = depth;

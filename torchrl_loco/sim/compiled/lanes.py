@@ -95,8 +95,8 @@ A body that touches the floor in more places when it stands should have, and has
 """
 MOST_ROUNDS = 4
 """Pairs of geoms whose bounding spheres a lane compares side by side, at most."""
-STANDING, FAR = 0.01, 1e3
-"""Height over its lowest point of what a body stands on, and a height that no pose exceeds (m)."""
+STANDING, FAR = 0.025, 1e3
+"""Height over its lowest point of what a body stands on or may at once, and a height that no pose exceeds (m)."""
 
 
 @dataclasses.dataclass
@@ -347,7 +347,9 @@ class Description:
             limb_numbers=self.limbs.numbers if self.limbs else 0,
         )
 
-        def sized(places: int, more_rows: int = 0) -> Layout:
+        balls = len(self.limited_balls)  # their rows are there however many contacts there are
+
+        def sized(places: int, more_rows: int = balls) -> Layout:
             rows = max(directions * places + more_rows, frictionless, 1)
             return dataclasses.replace(empty, frictional=places, jacobian_rows=rows)
 
@@ -360,7 +362,7 @@ class Description:
                 f"a body so large: a world needs {sized(enough).bytes} bytes of shared memory, of {WORLD_BYTES[-1]}"
             )
         count = max(n for n in range(enough, most + 1) if sized(n).bytes <= budget)
-        more = max(r for r in range(frictionless + 1) if sized(count, r).bytes <= budget)
+        more = max(r for r in range(balls, frictionless + 1) if sized(count, r).bytes <= budget)
         return sized(count, more)
 
     def tables(
@@ -398,7 +400,7 @@ class Description:
             tolerance=tolerance(m),
             ls_tolerance=tolerance(m) * m.opt.ls_tolerance,
             ls_near=near(m),
-            least_aligned=collision.UPRIGHT,
+            least_aligned=collision.LEAST_ALIGNED,
             least_pivot=LEAST_PIVOT,
         )
         tables.vector("gravity", m.opt.gravity)
