@@ -44,7 +44,7 @@ def measure(task: str, algorithm: str, device: str, settings: dict[str, Any]) ->
     with tempfile.TemporaryDirectory() as folder:
         env = Environments(config).training(Path(folder, "nan_dump"))
         learner = ALGORITHMS[algorithm](config, Spaces.of(env))
-        collector = RolloutCollector(env, learner.actor, frames_per_batch=config.batch_size)
+        collector = RolloutCollector(env, learner.actor, frames_per_batch=config.frames_per_batch)
 
         def iterate() -> None:
             learner.update(collector.rollout(), progress=0.0)
@@ -53,12 +53,12 @@ def measure(task: str, algorithm: str, device: str, settings: dict[str, Any]) ->
             iterate()
         iteration = seconds(iterate, ITERATIONS, learner.device)
         collecting = seconds(collector.rollout, ITERATIONS, learner.device)
-        frames = config.frames_per_batch * distributed.ranks()
+        frames = config.control_steps_per_batch * distributed.ranks()
         found = {
             "collection": frames / collecting,
             "training": frames / iteration,
             "iteration": 1e3 * iteration,
-            "gradient_steps": config.epochs * (config.batch_size // config.minibatch_size),
+            "gradient_steps": config.epochs * (config.frames_per_batch // config.minibatch_size),
             **exchange(learner),
         }
         learner.release()

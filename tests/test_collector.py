@@ -10,7 +10,15 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch._subclasses import FakeTensorMode
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, FiniteTensorDictCheck, InitTracker, RewardSum
+from torchrl.envs import (
+    CatFrames,
+    Compose,
+    FiniteTensorDictCheck,
+    InitTracker,
+    ObservationNorm,
+    RewardSum,
+    VecNormV2,
+)
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 import torchrl_loco
@@ -329,3 +337,47 @@ def test_a_closed_environment_begins_new_episodes():
     env.close()
     batch = collector.rollout()
     assert (batch["observation"][:, 0, 15:] == 0).all()  # at rest
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # for any batch
+def test_what_transforms_have_learned_goes_on(make):
+    """To the bit, from a state that is a copy: the collector that it was taken from does not change it."""
+
+    def collector(copy):
+        parts = CatFrames(2, dim=-1, in_keys=["observation"]), VecNormV2(["observation"], reduce_batch_dims=True)
+        env = torchrl_loco.TransformedEnv(make("walker_run", False, copy=copy), Compose(*parts))
+        return RolloutCollector(env, policy(env), frames_per_batch=12)
+
+    first, second = collector(0), collector(1)
+    for _ in range(3):
+        first.rollout()
+    state, expected = first.state_dict(), first.rollout()
+    for _ in range(2):
+        second.load_state_dict(state)
+        assert (second.rollout() == expected).all()
+
+
+def test_transforms_without_a_state_are_named(make, caplog):
+    env = torchrl_loco.TransformedEnv(make("walker_run", False), ObservationNorm(0.0, 1.0, in_keys=["observation"]))
+    collector = RolloutCollector(env, policy(env), frames_per_batch=12)
+    collector.rollout()
+    collector.load_state_dict({**collector.state_dict(), "transforms": {}})
+    assert caplog.messages == ["transforms that begin anew: ObservationNorm"]
+
+
+def test_its_state_goes_on_where_the_reward_has_other_terms():
+    def collector(*names):
+        reward = lambda self, s: {name: s.qpos[:, 0] * 0 + len(name) for name in names}  # noqa: E731
+        env = type("Task", (WalkerRun,), {"reward": reward})(2, "cpu", 0, reward_terms=True, **STAGGERED)
+        return RolloutCollector(env, policy(env), frames_per_batch=6)
+
+    first = collector("a", "bb")
+    first.rollout()
+    state, expected = first.state_dict(), first.rollout()["next", "observation"]
+    for names in (("bb", "a"), ("a", "bb", "ccc"), ("ccc",)):
+        other = collector(*names)
+        other.load_state_dict(state)
+        after = other.rollout()["next"]
+        assert torch.equal(after["observation"], expected)
+        found = {name: term.unique().item() for name, term in after["reward_terms"].items()}
+        assert found == {name: len(name) for name in names}

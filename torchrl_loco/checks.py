@@ -49,6 +49,8 @@ NOT_NEGATIVE = Interval(0, math.inf)
 FRACTION = Interval(0, 1, with_high=True)
 ANY = Interval(-math.inf, math.inf, with_low=False)
 """All finite numbers."""
+EXTENDED = Interval(-math.inf, math.inf, with_high=True)
+"""Those, and the two infinities."""
 
 
 def check_int(name: str, value: Any, interval: Interval = POSITIVE_INT) -> int:
@@ -84,6 +86,19 @@ def check_float(name: str, value: Any, interval: Interval = POSITIVE) -> float:
 def _check_interval(name: str, value: float, interval: Interval) -> None:
     if value not in interval:
         raise ValueError(f"{name} must lie in {interval}, got {value!r}")
+
+
+def check_pair(name: str, value: Any) -> tuple[float, float]:
+    """Returns two numbers, which may be infinite, of a tuple, a list, an array or a tensor.
+
+    Raises:
+        TypeError: it is something else.
+    """
+    entries = value.tolist() if hasattr(value, "tolist") else value
+    if not isinstance(entries, tuple | list) or len(entries) != 2:
+        raise TypeError(f"{name} must be two numbers, got {value!r}")
+    low, high = (check_float(f"each number of {name}", entry, EXTENDED) for entry in entries)
+    return low, high
 
 
 def check_bool(name: str, value: Any) -> bool:

@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_loco.checks import ANY, Interval, check_int
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.state import State
-from torchrl_loco.envs.transforms import PLAIN_TRANSFORMS
+from torchrl_loco.envs.transforms import PLAIN_TRANSFORMS, load_transforms, state_of_transforms
 from torchrl_loco.sim import TorchGraph
 
 
@@ -158,22 +158,32 @@ class RolloutCollector:
         logging.getLogger("torchrl_loco").warning("batches are collected step by step: %s", why)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the state of the worlds and the data that the next batch begins with."""
-        if self._carried is None:
-            return {}
-        return {"carried": self._carried.clone().to_dict(), "env": self._base.get_state().to_dict()}
+        """Returns a copy of the state of worlds and transforms, and of the data that the next batch begins with.
+
+        Of transforms it is what their ``state_dict`` holds, such as what ``VecNormV2`` has learned.
+        """
+        state: dict[str, Any] = {"transforms": state_of_transforms(self._env)}
+        if self._carried is not None:
+            state |= {"carried": self._carried.clone().to_dict(), "env": self._base.get_state().to_dict()}
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from a ``state`` that :meth:`state_dict` returned, in an environment of the same settings.
 
-        An empty one begins anew, with a reset of all worlds.
+        Without the entries of worlds they begin anew, with a reset of all; without that of transforms, those go on as
+        they are. If the environment returns other entries by now, such as other terms of the reward, it is those that
+        the next batch begins with.
         """
-        if not state:
-            self._carried = None
-            return
-        size, device = self._env.batch_size, self._env.device
-        self._env.reset(State(state["env"], batch_size=size, device=device), set_state=True)
-        self._carried = TensorDict(state["carried"], batch_size=size, device=device)
+        self._carried = None
+        if "carried" in state:
+            size, device = self._env.batch_size, self._env.device
+            begin = self._env.reset(State(state["env"], batch_size=size, device=device), set_state=True)
+            carried = TensorDict(state["carried"], batch_size=size, device=device)
+            remembered = set(getattr(self._policy, "in_keys", carried.keys())) - set(begin.keys())
+            kept = carried.select(*begin.keys(True, True), *remembered, strict=False)
+            self._carried = begin.update(kept)
+        if "transforms" in state:  # after the reset, from which some learn
+            load_transforms(self._env, state["transforms"])
 
     def shutdown(self) -> None:
         """Does nothing: TorchRL's ``Collector`` has this method."""

@@ -1,7 +1,10 @@
 """Tensors and settings in a file without code; files that are replaced whole, and that replace none."""
 
+import contextlib
 import itertools
 import json
+import os
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +30,37 @@ def save(path: Path, kind: str, tensors: dict[str, torch.Tensor], settings: dict
 
 
 def replace_file(path: Path, content: bytes | memoryview) -> None:
-    """Writes a file as a whole: if that fails or is interrupted, the file stays as it was.
+    """Writes a file as a whole, onto the disk: if that fails or is interrupted, the file stays as it was.
+
+    Of several processes that write the same file, the last one wins.
 
     Raises:
         OSError: it cannot be written, for example because the disk is full.
     """
-    part = Path(f"{path}.part")
+    part = path.with_name(f"{path.name}.{uuid.uuid4().hex}.part")
     try:
-        part.write_bytes(content)
+        with part.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())  # else a file system may rename before it writes
         part.replace(path)
+        _keep_name(path)
     except OSError as error:
-        part.unlink(missing_ok=True)
         kept = "; the previous file is kept" if path.exists() else ""
         raise OSError(error.errno or 0, f"{error.strerror or error}{kept}", str(path)) from error
+    finally:
+        with contextlib.suppress(OSError):  # after a rename there is none
+            part.unlink()
+
+
+def _keep_name(path: Path) -> None:
+    """Writes the folder of a file onto the disk, where the file system can."""
+    with contextlib.suppress(OSError):
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
 
 
 def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

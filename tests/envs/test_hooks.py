@@ -507,6 +507,7 @@ WRONG = [
     ({"begin": lambda self, s: {"qpos": s.home / 0}}, ValueError, "not finite"),
     ({"control": lambda self, s, action: action[:, :2]}, ValueError, r"shape \(4, 8\)"),
     ({"action_range": (0, 1)}, ValueError, r"must be \(-1, 1\) or"),
+    ({"action_range": 1}, TypeError, "must be two numbers"),
     ({"action_range": (-math.inf, math.inf)}, TypeError, "must define control"),
     ({"reward": lambda self, s: s.xpos("trunc")[:, 0]}, KeyError, "did you mean 'trunk'"),
     ({"reward": lambda self, s: s.qvel.add_(1.0)[:, 0]}, ValueError, r"reward writes to s\.qvel"),
@@ -592,11 +593,13 @@ def test_a_sensor_of_forces_is_asked_of_mujoco_warp():
 
 def test_bounds_of_actions():
     entries = {**BASE, "control": lambda self, s, action: s.home[:, 7:] + 0.5 * action}
-    free = type("Free", (LocoEnv,), {**entries, "action_range": (-math.inf, math.inf)})(2, "cpu", seed=0)
-    td = free.step(free.reset().set("action", torch.full((2, 8), 3.0)))
-    expected = torch.tensor(free.mj_model.key_qpos[0][7:]).float() + 1.5
-    torch.testing.assert_close(free.sim.ctrl, expected.expand(2, -1))
-    assert free.action_spec.contains(td["action"] * 1e6)
+    unbounded = torch.tensor([-math.inf, math.inf])
+    for action_range in (unbounded, unbounded.numpy(), unbounded.tolist(), (-math.inf, math.inf)):
+        free = type("Free", (LocoEnv,), {**entries, "action_range": action_range})(2, "cpu", seed=0)
+        td = free.step(free.reset().set("action", torch.full((2, 8), 3.0)))
+        expected = torch.tensor(free.mj_model.key_qpos[0][7:]).float() + 1.5
+        torch.testing.assert_close(free.sim.ctrl, expected.expand(2, -1))
+        assert free.action_spec.contains(td["action"] * 1e6)
     bound = type("Bound", (LocoEnv,), entries)(2, "cpu", seed=0)
     bound.step(bound.reset().set("action", torch.full((2, 8), 3.0)))
     torch.testing.assert_close(bound.sim.ctrl, (expected - 1.0).expand(2, -1))

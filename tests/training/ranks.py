@@ -8,14 +8,14 @@ import torch
 from small_runs import SMALL, made, small_walker
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
-from torchrl_loco.training import RunFolder, Trainer, distributed, preset
+from torchrl_loco.training import RunFolder, Trainer, distributed, preset, train
 from torchrl_loco.training.algorithm import Algorithm
 
 BATCH = SMALL["num_envs"] * SMALL["num_steps"] * SMALL["action_repeat"]
 """Frames in a batch of one rank."""
 
 
-def in_ranks(function, *args, count=2):
+def in_ranks(function, *args, count=2, connected=True):
     """Runs a function of this module in several ranks; returns what each has returned, in their order."""
     config = LaunchConfig(
         *(1, 1, count),
@@ -26,8 +26,13 @@ def in_ranks(function, *args, count=2):
         start_method="spawn" if torch.cuda.is_available() else "fork",  # a new interpreter takes seconds to import all
     )
     with distributed.handlers_restored():
-        results = elastic_launch(config, _connected)(function, *args)
+        results = elastic_launch(config, _connected if connected else _alone)(function, *args)
     return [results[rank] for rank in range(count)]
+
+
+def _alone(function, *args):
+    torch.set_num_threads(1)
+    return function(*args)
 
 
 def _connected(function, *args):
@@ -117,3 +122,9 @@ def of_ranks(out):
     with small_walker():
         runs = {algorithm: whole_and_resumed(out / algorithm, algorithm) for algorithm in ("ppo", "reppo")}
         return {"messages": messages(), "learnt": learnt(out), **runs}
+
+
+def resumed_by_train(path, frames):
+    """Resumes a run by ``train``, which connects the ranks itself; returns the frames of its last row."""
+    with small_walker():
+        return train("walker_stand", resume=path, total_frames=frames).read_metrics()["frames"][-1]

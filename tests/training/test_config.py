@@ -17,8 +17,10 @@ def test_a_preset_for_every_task():
         for algorithm in (None, "ppo", "reppo"):
             config = preset(task, "cpu", algorithm)
             assert (config.task, config.algorithm) == (task, algorithm or "ppo")
-            frames = config.num_envs * config.num_steps * config.action_repeat
-            assert config.total_frames >= config.frames_per_batch == frames
+            assert config.frames_per_batch == config.num_envs * config.num_steps
+            assert (
+                config.total_frames >= config.control_steps_per_batch == config.frames_per_batch * config.action_repeat
+            )
 
 
 def test_wrong_settings():

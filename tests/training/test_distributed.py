@@ -6,7 +6,7 @@ import signal
 import pytest
 import torch
 from compare import assert_same
-from ranks import BATCH, in_ranks, of_ranks
+from ranks import BATCH, in_ranks, of_ranks, resumed_by_train
 from small_runs import SMALL, made, small_walker
 
 import torchrl_loco
@@ -178,3 +178,11 @@ def test_wrong_numbers_of_gpus(tmp_path, monkeypatch, capsys):
         cli.main([*command, "--gpus=2"])
     assert "torchrun has started 4 processes: leave --gpus 2 out" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ranks_resume_by_train(ranks, tmp_path):
+    """Each calls it before they are connected."""
+    path, frames = shutil.copytree(ranks[0]["ppo"]["whole"], tmp_path / "run"), 6 * 2 * BATCH
+    assert in_ranks(resumed_by_train, path, frames, connected=False) == [frames, frames]
+    assert RunFolder(path).load_config().total_frames == frames
+    assert not (path / "lock").exists()

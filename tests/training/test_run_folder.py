@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import re
 import resource
@@ -9,6 +10,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -157,7 +159,55 @@ def test_a_disk_that_fills_up_while_training(tmp_path, capsys):
     assert problem.startswith("torchrl-loco: ")
     assert problem.endswith(f"the previous file is kept: '{run.path / 'checkpoint.pt'}'")
     assert way == f"to continue: torchrl-loco resume {run.path}"
-    assert not (run.path / "checkpoint.pt.part").exists()
+    assert list(run.path.glob("*.part")) == []
     assert_same(before, networks(run))
     Trainer(run, resume=True).train()
     assert run.is_finished
+
+
+def test_columns_stay_right_where_a_row_has_others(tmp_path):
+    """In another order, or more, or fewer of them, as where the terms of a reward change while a run is stopped."""
+    run = made(tmp_path)
+    for row in ({"frames": 128, "a": 1, "b": 2}, {"frames": 256, "b": 2, "a": 1}, {"frames": 384, "b": 2, "c": 3}):
+        run.append_metrics(row)
+    run.forget_after(384)
+    path = run.path / "metrics.csv"
+    assert path.read_text() == "frames,a,b,c\n128,1,2,\n256,1,2,\n384,,2,3\n"
+    metrics = run.read_metrics()
+    assert (metrics["frames"], metrics["b"], metrics["c"][2]) == ([128, 256, 384], [2, 2, 2], 3)
+    assert [math.isnan(value) for value in metrics["c"]] == [True, True, False]
+    path.write_text(path.read_text() + "1,2,3,4,5\n")
+    with pytest.raises(ValueError, match="a line of 5 columns, but its head names 4"):
+        run.read_metrics()
+
+
+def test_a_file_is_replaced_on_the_disk_or_not_at_all(tmp_path, monkeypatch):
+    path, calls, fsync, replace = tmp_path / "file", [], os.fsync, Path.replace
+    monkeypatch.setattr(os, "fsync", lambda descriptor: calls.append("fsync") or fsync(descriptor))
+    monkeypatch.setattr(Path, "replace", lambda *paths: calls.append("replace") or replace(*paths))
+    storage.replace_file(path, b"before")
+    assert calls == ["fsync", "replace", "fsync"]  # of the file, and of its folder
+    for error in (OSError(28, "no space left"), KeyboardInterrupt()):
+
+        def fail(*_, error=error):
+            raise error
+
+        monkeypatch.setattr(Path, "replace", fail)
+        with pytest.raises(type(error)):
+            storage.replace_file(path, b"after")
+        assert path.read_bytes() == b"before"
+        assert list(tmp_path.iterdir()) == [path]
+
+
+def test_of_two_who_write_a_file_the_last_wins(tmp_path, monkeypatch):
+    path, replace = tmp_path / "file", Path.replace
+
+    def meanwhile(part, target):
+        monkeypatch.setattr(Path, "replace", replace)
+        storage.replace_file(target, b"another's")
+        return replace(part, target)
+
+    monkeypatch.setattr(Path, "replace", meanwhile)
+    storage.replace_file(path, b"mine")
+    assert path.read_bytes() == b"mine"
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,19 +1,21 @@
 """``train``: what it takes, what it returns, and how what was handed in as an object is continued."""
 
 import re
+import shutil
 import sys
 
 import pytest
+import torch
 from compare import assert_same
 from hook_tasks import Unsteady
 from small_runs import SMALL, made, networks, trained
 from torch import nn
-from torchrl.envs import ObservationNorm, StepCounter
+from torchrl.envs import ObservationNorm, StepCounter, VecNormV2
 
 import torchrl_loco
 from torchrl_loco import cli, registry
 from torchrl_loco.policy import Policy
-from torchrl_loco.training import PPO, RunFolder, Trainer, evaluate_policy, preset, train
+from torchrl_loco.training import PPO, Given, RunFolder, Trainer, begin, evaluate_policy, preset, train
 from torchrl_loco.training.algorithm import Algorithm
 
 QUICK = {**SMALL, "logger": ("csv",)}
@@ -278,3 +280,48 @@ def test_a_task_with_memory_falls_and_what_the_critic_alone_reads(algorithm, tmp
     for name in ("return", "episode_length", "episodes", "reward/rate"):
         assert parts.read_metrics()[name] == metrics[name]
     assert_same(networks(parts), networks(whole))
+
+
+def test_a_refused_resume_changes_nothing(ppo_run, tmp_path):
+    """Neither a file nor the lock."""
+    run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
+    run.append_metrics({**{name: values[-1] for name, values in run.read_metrics().items()}, "frames": 384})
+    before = {file: file.read_bytes() for file in run.path.iterdir() if file.is_file()}
+    with pytest.raises(ValueError, match="must be more than the 256 frames"):
+        train("walker_stand", resume=run, total_frames=128)
+    with pytest.raises(ValueError, match="no device 'cuda:99' on this machine"):
+        train("walker_stand", resume=run, total_frames=512, device="cuda:99")
+    assert {file: file.read_bytes() for file in run.path.iterdir() if file.is_file()} == before
+
+
+def test_a_run_goes_on_on_another_device(ppo_run, tmp_path, caplog):
+    """Of CUDA as far as its files say: a generator's state has another size there, and Adam other flags."""
+    run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
+    checkpoint = run.load_checkpoint("cpu")
+    checkpoint["cuda_rng"] = checkpoint["algorithm"]["generator"] = torch.zeros(16, dtype=torch.uint8)
+    for optimizer in checkpoint["algorithm"]["optimizers"].values():
+        optimizer["param_groups"][0]["capturable"] = True
+    run.save_checkpoint(checkpoint)
+    run.store_config(run.load_config(device="cuda"))
+    assert cli.main(["resume", str(run.path), "--device=cpu", "--total_frames=384"]) == 0
+    assert "device: cuda so far, cpu from here on" in caplog.text
+    assert run.load_config().device == "cpu"
+    train("walker_stand", resume=run, device="cpu", total_frames=512)
+    assert run.read_metrics()["frames"] == [128, 256, 384, 512]
+    assert "cpu so far" not in caplog.text
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # for any batch
+def test_what_transforms_have_learned_is_in_the_checkpoint(tmp_path):
+    """A run that was stopped and goes on behind new ones equals one that was not."""
+
+    def env():
+        base = torchrl_loco.make("walker_stand", 4, "cpu", seed=7, episode_length=16)
+        return torchrl_loco.TransformedEnv(base, VecNormV2(["observation"], reduce_batch_dims=True))
+
+    settings = {**{name: value for name, value in QUICK.items() if name != "num_envs"}, "action_repeat": 1}
+    whole = train(env(), algorithm="ppo", out=tmp_path, **settings)
+    trainer = begin(whole.load_config(), Given(env=env()))
+    trainer.iterate()
+    trainer.save()
+    assert_same(networks(train(env(), resume=trainer.run)), networks(whole))

@@ -103,10 +103,8 @@ def test_resumed_while_trials_run(tmp_path):
     trainer.trials.end(trainer.frames, 500.0)
     trainer.iterate()
     trainer.save()
-    run.extend(20 * BATCH)
-    longer = Trainer(run, resume=True)
+    longer = Trainer(run, resume=True, total_frames=20 * BATCH)
     longer.iterate()
     assert longer.trials.is_over(longer.frames)
     assert longer.trials.progress(longer.frames) == 2 / 16
-    run.extend(5 * BATCH)
-    assert Trainer(run, resume=True).trials.progress(5 * BATCH) == 1.0
+    assert Trainer(run, resume=True, total_frames=5 * BATCH).trials.progress(5 * BATCH) == 1.0

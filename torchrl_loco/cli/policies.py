@@ -404,6 +404,7 @@ def verify(
         conditions: what the policy must hold in.
     """
     with user_errors(), tempfile.TemporaryDirectory() as folder:
+        from torchrl_loco import storage
         from torchrl_loco.verification.verify import verify
 
         conditions.check()
@@ -415,7 +416,7 @@ def verify(
         report = verify(path, conditions, device, alone=alone)
         print(*report.lines, sep="\n")
         if out is not None:
-            out.write_text(f"{json.dumps(report.figures, indent=2)}\n")
+            storage.replace_file(out, f"{json.dumps(report.figures, indent=2)}\n".encode())
             print(out)
     if not report.holds:
         raise SystemExit(1)

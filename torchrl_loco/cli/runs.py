@@ -50,7 +50,13 @@ def train(options: Any, args: list[str]) -> None:
         print(f"all seeds in one picture: torchrl-loco plot {' '.join(runs)}")
 
 
-def resume(run: tyro.conf.Positional[Path], /, gpus: int | None = None, total_frames: int | None = None) -> None:
+def resume(
+    run: tyro.conf.Positional[Path],
+    /,
+    gpus: int | None = None,
+    total_frames: int | None = None,
+    device: str | None = None,
+) -> None:
     """Continue a run that was stopped, from its last checkpoint, as if it had not been stopped.
 
     Args:
@@ -58,6 +64,7 @@ def resume(run: tyro.conf.Positional[Path], /, gpus: int | None = None, total_fr
         gpus: as in train: pass the same number to continue exactly.
         total_frames: train the run to another number of frames, also if it is complete. The learning rate follows the
             new number from here on. Trials keep the length with which they began.
+        device: train on another device from here on.
     """
     with user_errors():
         check_run(run)
@@ -65,19 +72,17 @@ def resume(run: tyro.conf.Positional[Path], /, gpus: int | None = None, total_fr
 
         folder = training.RunFolder(run)
         training.Given().check(folder)
-        device = folder.load_config().device
-        missing = missing_processes(gpus, device)
+        asked: dict[str, Any] = {"total_frames": total_frames, "device": device}
+        changes = {name: value for name, value in asked.items() if value is not None}
+        kind = folder.load_config(**changes).device
+        missing = missing_processes(gpus, kind)
     if missing:
-        more = [] if total_frames is None else [f"--total_frames={total_frames}"]
+        more = [f"--{name}={value}" for name, value in changes.items()]
         training.distributed.launch(missing, ["resume", str(run), f"--gpus={gpus}", *more])
     else:
-        with _joined(device):
+        with _joined(kind):
             with user_errors():
-                if total_frames is not None:
-                    if training.distributed.is_first():
-                        folder.extend(total_frames)
-                    training.distributed.wait_for_all()
-                trainer = training.Trainer(folder, resume=True)
+                trainer = training.Trainer(folder, resume=True, **changes)
             train_to_end(trainer)
 
 

@@ -31,6 +31,7 @@ from torchrl_loco.checks import (
     check_device,
     check_int,
     check_output_file,
+    check_pair,
 )
 from torchrl_loco.config import SimConfig, sim_config
 from torchrl_loco.envs.hooks import HOOKS, Hooks, check_commands, memory_shapes, own_hooks
@@ -121,7 +122,7 @@ class LocoEnv(EnvBase):
     """Numbers of the model that each world draws at its resets; see :class:`torchrl_loco.Vary`."""
     episode_length: ClassVar[int | None] = None
     """Control steps after which an episode is truncated; ``None`` takes that of :attr:`config`."""
-    action_range: ClassVar[tuple[float, float]] = BOUNDED
+    action_range: Sequence[float] = BOUNDED
     """(-1, 1), or (-inf, inf) for actions without bounds, which need an own :meth:`control`."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     """By algorithm, settings of training on CUDA that were tuned for this task."""
@@ -183,6 +184,7 @@ class LocoEnv(EnvBase):
         self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
         self.stagger, self.compile_hooks, self.play = stagger, compile_hooks, play
         self.randomize, self.variation = varys, variation
+        self.action_range = check_pair("action_range", self.action_range)  # a class may have a list or an array
         self.on_overflow, self.nan_dump = on_overflow, nan_dump
         self._action_shape = torch.Size([*self.batch_size, mj_model.nu])
         self._pid = os.getpid()
@@ -244,9 +246,10 @@ class LocoEnv(EnvBase):
                 raise TypeError(f"{name}.term_names must be a tuple of names, got {cls.term_names!r}")
         if cls.episode_length is not None:
             check_int(f"{name}.episode_length", cls.episode_length)
-        if tuple(cls.action_range) not in (BOUNDED, UNBOUNDED):
+        action_range = check_pair(f"{name}.action_range", cls.action_range)
+        if action_range not in (BOUNDED, UNBOUNDED):
             raise ValueError(f"{name}.action_range must be (-1, 1) or (-inf, inf), got {cls.action_range!r}")
-        if tuple(cls.action_range) == UNBOUNDED and "control" not in own:
+        if action_range == UNBOUNDED and "control" not in own:
             raise TypeError(f"{name} has actions without bounds, so it must define control(self, s, action)")
         check_commands(cls, memory_shapes(cls))
         check_randomize(f"{name}.randomize", cls.randomize)
@@ -456,7 +459,7 @@ class LocoEnv(EnvBase):
             observation["reward_terms"] = Composite(terms, shape=batch, device=device)
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.observation_spec = Composite(observation, shape=batch, device=device)
-        bounded, actions = tuple(self.action_range) == BOUNDED, (*batch, self.mj_model.nu)
+        bounded, actions = self.action_range == BOUNDED, (*batch, self.mj_model.nu)
         self.action_spec = Bounded(*BOUNDED, actions, **as_float) if bounded else Unbounded(actions, **as_float)
         # Those of the built-in tasks lie in [0, 1], but RewardSum would copy the bounds to the sum.
         self.reward_spec = Unbounded((*batch, 1), **as_float)

@@ -1,5 +1,8 @@
 """TransformedEnv, whose transforms need not wait for the device, and which transforms allow that."""
 
+import contextlib
+import logging
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -88,6 +91,52 @@ def resets_by_mask(transform: Transform) -> bool:
         if any(own) and kind not in PLAIN_TRANSFORMS and kind not in STATELESS_TRANSFORMS:
             return False
     return True
+
+
+def named_transforms(env: EnvBase) -> dict[str, Transform]:
+    """Returns the transforms of an environment by number and class, the innermost first, those of a Compose singly."""
+    found: list[Transform] = []
+    while isinstance(env, TorchRLTransformedEnv):
+        found[:0] = env.transform if isinstance(env.transform, Compose) else [env.transform]
+        env = env.base_env
+    return {f"{i} {type(transform).__name__}": transform for i, transform in enumerate(found)}
+
+
+def state_of_transforms(env: EnvBase) -> dict[str, Any]:
+    """Returns a copy of the ``state_dict`` of each transform that has one of tensors, numbers and text."""
+    states = {}
+    for name, transform in named_transforms(env).items():
+        with contextlib.suppress(TypeError):  # what else there is could not be read from a file without running code
+            states[name] = _copied(transform.state_dict())
+    return states
+
+
+def load_transforms(env: EnvBase, states: Mapping[str, Any]) -> None:
+    """Gives transforms the ``states`` that :func:`state_of_transforms` returned, and logs which there is none for."""
+    anew = []
+    for name, transform in named_transforms(env).items():
+        try:
+            if name in states or transform.state_dict():
+                transform.load_state_dict(_copied(states[name], env.device))
+        except (KeyError, RuntimeError):
+            anew.append(name.split()[1])
+    if anew:
+        logging.getLogger("torchrl_loco").warning("transforms that begin anew: %s", ", ".join(anew))
+
+
+def _copied(value: Any, device: torch.device | None = None) -> Any:
+    """Returns a copy of tensors, numbers and text in dictionaries.
+
+    Raises:
+        TypeError: something else is among them.
+    """
+    if isinstance(value, torch.Tensor):
+        return value.detach().to(device, copy=True)
+    if isinstance(value, Mapping):
+        return {key: _copied(entry, device) for key, entry in value.items()}
+    if isinstance(value, bool | int | float | str | None):
+        return value
+    raise TypeError(f"a state has a {type(value).__name__}")
 
 
 class TransformedEnv(TorchRLTransformedEnv):

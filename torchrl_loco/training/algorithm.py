@@ -201,12 +201,21 @@ class Algorithm(ABC):
             "generator": self.generator.get_state(),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from a ``state`` that :meth:`state_dict` returned."""
+    def load_state_dict(self, state: dict[str, Any], draws: bool = True) -> None:
+        """Continues from a ``state`` that :meth:`state_dict` returned.
+
+        Args:
+            state: the state.
+            draws: whether minibatches are drawn as they would have been: a generator is of one kind of device.
+        """
         self.networks.load_state_dict(state["networks"])
         for name, optimizer in self.optimizers.items():
+            own = [{kind: group[kind] for kind in ("capturable", "fused")} for group in optimizer.param_groups]
             optimizer.load_state_dict(state["optimizers"][name])
-        self.generator.set_state(state["generator"].cpu())
+            for group, of_device in zip(optimizer.param_groups, own, strict=True):
+                group.update(of_device)
+        if draws:
+            self.generator.set_state(state["generator"].cpu())
 
 
 class Acting(nn.Module):

@@ -53,7 +53,8 @@ Settings = dict[str, Any]
 class TrainingConfig:
     """Settings of any training run.
 
-    A frame is a control step of one world. A step of the policy is an action that is held for ``action_repeat`` frames.
+    A frame is a control step of one world. A step of the policy is an action that is held for ``action_repeat`` frames;
+    ``frames_per_batch`` alone counts those, as collectors do.
 
     Raises:
         TypeError: a field has the wrong type.
@@ -147,11 +148,11 @@ class TrainingConfig:
             raise ValueError("hidden must name the width of at least one layer")
         for width in self.hidden:
             check_int("each width of hidden", width)
-        if self.minibatch_size > self.batch_size:
+        if self.minibatch_size > self.frames_per_batch:
             raise ValueError(
                 f"minibatch_size ({self.minibatch_size}) must not exceed the batch of num_envs ({self.num_envs}) * "
-                f"num_steps ({self.num_steps}) = {self.batch_size}: pass minibatch_size={self.batch_size} or less, or "
-                f"num_steps={math.ceil(self.minibatch_size / self.num_envs)} or more"
+                f"num_steps ({self.num_steps}) = {self.frames_per_batch}: pass minibatch_size={self.frames_per_batch} "
+                f"or less, or num_steps={math.ceil(self.minibatch_size / self.num_envs)} or more"
             )
         if self.trials > 1 and self.trials * self.trial_fraction >= 1.0:
             raise ValueError(
@@ -159,10 +160,10 @@ class TrainingConfig:
                 f"are left for the best of them: pass trial_fraction={0.5 / self.trials:.2g}, for example"
             )
         part, frames = self.shortest_part
-        if frames < self.frames_per_batch:
+        if frames < self.control_steps_per_batch:
             raise ValueError(
                 f"{part} ({frames}) must be at least one batch of num_envs * num_steps * action_repeat "
-                f"({self.frames_per_batch}){', or trials must be 1' if self.trials > 1 else ''}"
+                f"({self.control_steps_per_batch}){', or trials must be 1' if self.trials > 1 else ''}"
             )
 
     @property
@@ -175,14 +176,14 @@ class TrainingConfig:
         return {"algorithm": self.algorithm, **dataclasses.asdict(self), "out": str(self.out)}
 
     @property
-    def batch_size(self) -> int:
-        """Steps in one batch, over all worlds."""
+    def frames_per_batch(self) -> int:
+        """Steps of the policy in one batch, over all worlds: what :class:`torchrl_loco.RolloutCollector` calls so."""
         return self.num_envs * self.num_steps
 
     @property
-    def frames_per_batch(self) -> int:
-        """Frames in one batch."""
-        return self.batch_size * self.action_repeat
+    def control_steps_per_batch(self) -> int:
+        """Control steps in one batch, over all worlds: what ``total_frames`` counts."""
+        return self.frames_per_batch * self.action_repeat
 
     @property
     def trial_frames(self) -> int:

@@ -1,12 +1,14 @@
 """Plots of learning curves."""
 
 import dataclasses
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from torchrl_loco import storage
 from torchrl_loco.checks import check_packages
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
@@ -79,7 +81,9 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     axes.title.set_fontsize("small")
     axes.grid(alpha=0.3)
     axes.legend(loc="best", fontsize="small")
-    figure.savefig(picture, dpi=150)
+    content = io.BytesIO()
+    figure.savefig(content, dpi=150, format=picture.suffix[1:] or "png")
+    storage.replace_file(picture, content.getvalue())
 
 
 def _is_whole(frames: Sequence[float], total: int) -> bool:

@@ -6,7 +6,7 @@ import dataclasses
 import io
 import json
 import pickle
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from torchrl_loco.policy import Policy
 from torchrl_loco.registry import resolve
 from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig, check_loggers, config_from_json
-from torchrl_loco.training.lock import lock
 
 CHECKPOINT_VERSION = 7
 
@@ -31,10 +30,25 @@ def _as_json(config: TrainingConfig) -> bytes:
     return f"{json.dumps(config.to_json(), indent=2)}\n".encode()
 
 
-def _whole_lines(path: Path) -> list[str]:
-    """Returns the lines of a CSV file, its head first, without those that a crash or a full disk has cut."""
-    *lines, _ = path.read_text().split("\n")
-    return [line for line in lines if line.count(",") == lines[0].count(",")]
+def _read_table(path: Path) -> tuple[list[str], list[list[str]]]:
+    """Returns the columns of a CSV file and its lines, without those that a crash or a full disk has cut.
+
+    Raises:
+        ValueError: a line has more columns than the head.
+    """
+    *whole, _ = path.read_text().split("\n") if path.exists() else [""]
+    columns, *lines = list(csv.reader(whole)) or [[]]
+    if longer := [line for line in lines if len(line) > len(columns)]:
+        raise ValueError(f"{path} has a line of {len(longer[0])} columns, but its head names {len(columns)}")
+    return columns, [line for line in lines if len(line) == len(columns)]
+
+
+def _write_table(path: Path, columns: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
+    """Writes a CSV file as a whole; columns that a line lacks at its end are empty in it."""
+    text = io.StringIO()
+    padded = [[*line, *[""] * (len(columns) - len(line))] for line in lines]
+    csv.writer(text, lineterminator="\n").writerows([columns, *padded])
+    storage.replace_file(path, text.getvalue().encode())
 
 
 class RunFolder:
@@ -85,11 +99,11 @@ class RunFolder:
             with contextlib.suppress(FileExistsError):
                 path.mkdir()
                 break
-        (path / "config.json").write_bytes(_as_json(config))
         if given:
-            (path / "given.json").write_text(f"{json.dumps(list(given))}\n")
+            storage.replace_file(path / "given.json", f"{json.dumps(list(given))}\n".encode())
+        storage.replace_file(path / "config.json", _as_json(config))  # from here on it is a run
         if launch := distributed.launch_id():
-            (path / "launch.txt").write_text(launch)
+            storage.replace_file(path / "launch.txt", launch.encode())
         return cls(path)
 
     @classmethod
@@ -112,18 +126,9 @@ class RunFolder:
             raise ValueError(f"{path} {why}: {error}") from error
         return dataclasses.replace(config, **overrides)
 
-    def extend(self, total_frames: int) -> None:
-        """Sets the number of frames to which the run is trained when it is resumed.
-
-        Raises:
-            ValueError: the run has as many frames already.
-            BlockingIOError: another process is training it.
-        """
-        lock(self.path)
-        done = max((row["frames"] for row in self._read("metrics.csv")), default=0)
-        if total_frames <= done:
-            raise ValueError(f"total_frames must be more than the {done:.0f} frames of {self.path}, got {total_frames}")
-        storage.replace_file(self.path / "config.json", _as_json(self.load_config(total_frames=total_frames)))
+    def store_config(self, config: TrainingConfig) -> None:
+        """Stores the settings that :meth:`load_config` returns from then on."""
+        storage.replace_file(self.path / "config.json", _as_json(config))
 
     @property
     def given(self) -> tuple[str, ...]:
@@ -177,7 +182,7 @@ class RunFolder:
         return self.policy.is_file() and "mean" in Policy.load(self.policy, "cpu").info
 
     def append_metrics(self, row: dict[str, Any]) -> None:
-        """Adds ``row`` to ``metrics.csv``."""
+        """Adds ``row`` to ``metrics.csv``; what it has more than the rows before becomes a column, empty in those."""
         self._append("metrics.csv", row)
 
     def append_evaluation(self, row: dict[str, Any]) -> None:
@@ -185,7 +190,7 @@ class RunFolder:
         self._append("evaluations.csv", row)
 
     def read_metrics(self) -> dict[str, list[float]]:
-        """Returns the columns of ``metrics.csv``.
+        """Returns the columns of ``metrics.csv``, with NaN where a row does not have them.
 
         Raises:
             ValueError: there is no line yet.
@@ -213,29 +218,29 @@ class RunFolder:
         """Removes the lines of metrics and evaluations after ``frames`` frames: a resumed run writes them again."""
         for name in ("metrics.csv", "evaluations.csv"):
             path = self.path / name
-            if not path.exists():
-                continue
-            if not (whole := _whole_lines(path)):
-                path.unlink()  # the disk was full when its first line was written
-                continue
-            head, *lines = whole
-            at = head.split(",").index("frames")
-            kept = [head, *(line for line in lines if float(line.split(",")[at]) <= frames)]
-            storage.replace_file(path, "".join(f"{line}\n" for line in kept).encode())
+            columns, lines = _read_table(path)
+            if columns:
+                at = columns.index("frames")
+                _write_table(path, columns, [line for line in lines if float(line[at]) <= frames])
+            else:
+                path.unlink(missing_ok=True)  # the disk was full when its first line was written
 
     def _append(self, name: str, row: dict[str, Any]) -> None:
         path = self.path / name
-        new = not path.exists()
+        with contextlib.ExitStack() as opened:
+            head = opened.enter_context(path.open(newline="")) if path.exists() else ()
+            columns = next(csv.reader(head), [])
+        if new := [key for key in row if key not in columns]:
+            columns, lines = _read_table(path)
+            columns = [*columns, *new]
+            _write_table(path, columns, lines)
         with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, row, lineterminator="\n")
-            if new:
-                writer.writeheader()
-            writer.writerow(row)
+            csv.DictWriter(file, columns, lineterminator="\n").writerow(row)
 
     def _read(self, name: str) -> list[dict[str, float]]:
         path = self.path / name
-        lines = _whole_lines(path) if path.exists() else []
-        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(lines)]
+        columns, lines = _read_table(path)
+        return [{key: float(value or "nan") for key, value in zip(columns, line, strict=True)} for line in lines]
 
     def save_checkpoint(self, entries: dict[str, Any]) -> None:
         """Writes ``entries`` as the checkpoint; a crash while writing leaves the previous one.

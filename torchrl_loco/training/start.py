@@ -46,9 +46,9 @@ def train(
         algorithm: ``"ppo"``, ``"reppo"`` or a subclass of :class:`torchrl_loco.training.algorithm.Algorithm`; ``None``
             takes that of ``config``, or the default of the device.
         out: the folder in which the run's own folder is made.
-        device: where to train; ``None`` takes CUDA if there is any.
-        resume: a run that was stopped, to continue from its checkpoint with the same task, network and algorithm; of
-            ``settings`` only ``total_frames`` can be another. The settings are the run's own.
+        device: where to train; ``None`` takes CUDA if there is any, or the device of the run that is resumed.
+        resume: a run that was stopped, to continue from its checkpoint with the same task, network and algorithm. The
+            settings are the run's own; only ``device`` and ``total_frames`` can be others.
         settings: fields of the settings, on top of ``config`` or of the preset.
 
     Returns:
@@ -75,9 +75,10 @@ def train(
         CONFIGS.setdefault(kind.algorithm, kind)  # by which the settings of the run are read again
     chosen = {name: value for name, value in (("out", out), ("device", device)) if value is not None}
     if resume is not None:
-        if config is not None or settings.keys() - {"total_frames"} or isinstance(algorithm, str) or chosen:
-            raise ValueError("a run that is resumed keeps its settings: pass no other than total_frames")
-        return _train(_resumed(resume, cls, settings), given)
+        changes = settings | chosen
+        if config is not None or changes.keys() - {"total_frames", "device"} or isinstance(algorithm, str):
+            raise ValueError("a run that is resumed keeps its settings: pass no other than total_frames and device")
+        return _train(_resumed(resume, cls), given, **changes)
     if given.env is not None:
         chosen |= _settings_of(given.env, {**settings, **chosen})
     config = _config(cls, config, algorithm, {**settings, **chosen})
@@ -119,7 +120,7 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
     return {**own, "seed": settings.get("seed", base.seed), "action_repeat": settings.get("action_repeat", 1)}
 
 
-def _resumed(resume: RunFolder | Path | str, task: Any, settings: dict[str, Any]) -> RunFolder:
+def _resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
     """Returns the run that is to be continued.
 
     Raises:
@@ -129,20 +130,18 @@ def _resumed(resume: RunFolder | Path | str, task: Any, settings: dict[str, Any]
     config = run.load_config()
     if task_name(task) != config.task:
         raise ValueError(f"{run.path} is a run of {config.task}, but task is {task_name(task)}")
-    if settings and distributed.is_first():
-        run.extend(settings["total_frames"])
     return run
 
 
-def _train(what: TrainingConfig | RunFolder, given: Given) -> RunFolder:
-    """Trains a new run, or goes on with one.
+def _train(what: TrainingConfig | RunFolder, given: Given, **changes: Any) -> RunFolder:
+    """Trains a new run, or goes on with one, some settings of which have changed.
 
     Returns:
         Its folder.
     """
-    config = what.load_config() if isinstance(what, RunFolder) else what
-    with distributed.joined(config.device):
-        trainer = Trainer(what, resume=True, given=given) if isinstance(what, RunFolder) else begin(what, given)
+    config = what.load_config(**changes) if isinstance(what, RunFolder) else what
+    with distributed.joined(config.device):  # before it, each rank would take itself for the first
+        trainer = Trainer(what, True, given, **changes) if isinstance(what, RunFolder) else begin(what, given)
         try:
             with saying_how_to_continue(trainer, given):
                 trainer.train()

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import logging
 import math
 import sys
 import time
@@ -48,32 +49,44 @@ class Trainer:
             that was not, bit for bit. With another number of ranks, parameters and counters continue, the worlds start
             anew, and what that changes is printed.
         given: what is handed in as objects.
+        total_frames: to how many frames a resumed run is trained; ``None`` leaves that as it was. As the device, it is
+            stored in the folder once nothing is left to be refused.
+        device: where a resumed run goes on; ``None`` keeps its device.
 
     Raises:
         FileNotFoundError: there is no checkpoint to resume from.
         ValueError: the checkpoint cannot be read; the run is complete, or too short for so many ranks; the run was
-            begun with other objects.
+            begun with other objects; ``total_frames`` is not more than it has.
         TypeError: the network has a part that a policy's file cannot hold.
         ImportError: the package of a logger is missing.
         BlockingIOError: another process is training the run.
     """
 
-    def __init__(self, run: RunFolder, resume: bool = False, given: Given | None = None) -> None:
+    def __init__(
+        self,
+        run: RunFolder,
+        resume: bool = False,
+        given: Given | None = None,
+        *,
+        total_frames: int | None = None,
+        device: str | None = None,
+    ) -> None:
         self.run = run
-        if distributed.is_first():
-            lock(run.path)
+        changes = {"total_frames": total_frames, "device": device}
+        taken = distributed.is_first() and lock(run.path)
         try:
-            self._make(given or Given(), resume)
+            self._make(given or Given(), resume, {name: new for name, new in changes.items() if new is not None})
         except BaseException:
-            unlock(run.path)
+            if taken:
+                unlock(run.path)
             raise
 
-    def _make(self, given: Given, resume: bool) -> None:
+    def _make(self, given: Given, resume: bool, changes: dict[str, Any]) -> None:
         run = self.run
         if resume:
             given.check(run)
-        config = run.load_config()
-        self.config = config = dataclasses.replace(config, device=distributed.own_device(config.device))
+        stored = run.load_config(**changes)
+        self.config = config = dataclasses.replace(stored, device=distributed.own_device(stored.device))
         check_device(config.device)
         check_loggers(config.logger)
         checkpoint = run.load_checkpoint(config.device) if resume else None
@@ -81,7 +94,7 @@ class Trainer:
         if checkpoint is None and frames < self.frames_per_iteration:
             raise ValueError(
                 f"{part} ({frames}) must be at least {self.frames_per_iteration}: one batch of "
-                f"{config.frames_per_batch} on each of {distributed.ranks()} ranks"
+                f"{config.control_steps_per_batch} on each of {distributed.ranks()} ranks"
             )
         torch.manual_seed(config.seed)
         first, rank = distributed.is_first(), distributed.rank()
@@ -99,7 +112,7 @@ class Trainer:
         self._terms = () if terms is None else tuple(terms.keys())
         self._source = source_of(config.task)
         self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
-        self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.batch_size)
+        self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
         self._non_finite, self._said = 0, set[str]()
         self._best = -math.inf  # the evaluation that selected the policy
@@ -107,9 +120,11 @@ class Trainer:
         if not first:  # the networks began alike, from here on each rank draws actions of its own
             torch.manual_seed(distributed.own_seed(config.seed))
         if checkpoint is not None:
-            self._load(checkpoint)
-        elif first:
-            run.forget_after(0)  # what a process wrote that torchrun has restarted before its first checkpoint
+            self._load(checkpoint, changes.get("total_frames", math.inf))
+        if first:  # nothing is refused any more
+            if changes:
+                run.store_config(stored)
+            run.forget_after(self.frames)  # of a process that was killed, or that torchrun has restarted
         distributed.copy_from_first(self.algorithm.networks.state_dict().values())
 
     def train(self) -> None:
@@ -200,7 +215,7 @@ class Trainer:
     @property
     def frames_per_iteration(self) -> int:
         """Frames between two updates, over all ranks."""
-        return self.config.frames_per_batch * distributed.ranks()
+        return self.config.control_steps_per_batch * distributed.ranks()
 
     @property
     def last_frame(self) -> int:
@@ -313,6 +328,7 @@ class Trainer:
                 "source": self._source,
                 "algorithm": self.algorithm.state_dict(),
                 "trials": self.trials.state_dict(),
+                "terms": list(self._terms),
             }
             self.run.save_checkpoint({**counters, **of, **ranks[0], "further_ranks": ranks[1:]})
         distributed.wait_for_all()
@@ -322,7 +338,7 @@ class Trainer:
         names = "algorithm", "task", "protocol", "num_envs", "hidden", "action_bound"
         return {name: getattr(self.config, name) for name in names if hasattr(self.config, name)}
 
-    def _load(self, checkpoint: dict[str, Any]) -> None:
+    def _load(self, checkpoint: dict[str, Any], total_frames: float) -> None:
         for name, value in self._identity().items():
             if checkpoint["settings"].get(name, value) != value:  # one of an earlier revision may lack a setting
                 raise ValueError(
@@ -330,33 +346,50 @@ class Trainer:
                     f"its config.json has {name}={value!r}"
                 )
         self.frames, self.iteration, self.seconds = (checkpoint[key] for key in ("frames", "iteration", "seconds"))
+        if total_frames < self.frames:
+            raise ValueError(
+                f"total_frames must be more than the {self.frames} frames of {self.run.path}, got {total_frames}"
+            )
         if self.frames >= self.last_frame and self.run.is_finished:
             raise ValueError(
                 f"{self.run.path} is complete: it has all of its {self.frames} frames. Pass --total_frames to train on"
             )
         if checkpoint.get("source", self._source) != self._source and distributed.is_first():
             print(f"{self.config.task} was edited since the checkpoint: the run goes on as it is now", file=sys.stderr)
+        terms = checkpoint.get("terms", self._terms)
+        if set(terms) != set(self._terms) and distributed.is_first():
+            names = [", ".join(each) or "none" for each in (terms, self._terms)]
+            logging.getLogger("torchrl_loco").warning("terms of the reward: %s so far, %s from here on", *names)
         rank = distributed.rank()
-        generator = self.algorithm.generator.get_state()
-        self.algorithm.load_state_dict(checkpoint["algorithm"])
+        before = 1 + len(checkpoint.get("further_ranks", ()))  # a checkpoint without is of one process
+        kind = "cpu" if checkpoint["cuda_rng"] is None else "cuda"
+        same_ranks, same_kind = before == distributed.ranks(), kind == self.algorithm.device.type
+        self.algorithm.load_state_dict(checkpoint["algorithm"], draws=same_ranks and same_kind)
         self.trials.load_state_dict(checkpoint["trials"])
         if distributed.is_first():
-            self.run.forget_after(self.frames)
-            means = [row["mean"] for row in self.run.read_evaluations()]
+            means = [row["mean"] for row in self.run.read_evaluations() if row["frames"] <= self.frames]
             if self.run.policy.is_file():  # maybe of an evaluation after the checkpoint, which is repeated inexactly
                 means.append(Policy.load(self.run.policy, "cpu").info.get("selected_by", -math.inf))
             self._best = max(means, default=-math.inf)
-        before = 1 + len(checkpoint.get("further_ranks", ()))  # a checkpoint without is of one process
-        if before != distributed.ranks():
-            self.episodes.load_state_dict(checkpoint["episodes"], running=False)
-            self.algorithm.generator.set_state(generator)
+        if not same_kind and distributed.is_first():
+            logging.getLogger("torchrl_loco").warning(
+                "device: %s so far, %s from here on; actions and minibatches are drawn anew, and rounded otherwise",
+                kind,
+                self.config.device,
+            )
+        if not same_ranks:
             self._say_what_changes(before)
+            self.episodes.load_state_dict(checkpoint["episodes"], running=False)
+            learnt = (checkpoint, *checkpoint.get("further_ranks", ()))[rank % before]
+            self.collector.load_state_dict({"transforms": learnt["collector"].get("transforms", {})})
             return
         own = checkpoint if rank == 0 else checkpoint["further_ranks"][rank - 1]
         self.collector.load_state_dict(own["collector"])
         self.episodes.load_state_dict(own["episodes"], running=True)
         torch.set_rng_state(own["rng"].cpu())
-        if own["cuda_rng"] is not None and self.algorithm.device.type == "cuda":
+        if not same_kind:
+            return
+        if own["cuda_rng"] is not None:
             torch.cuda.set_rng_state(own["cuda_rng"].cpu(), self.algorithm.device)
         if rank > 0:
             self.algorithm.generator.set_state(own["generator"].cpu())
@@ -375,8 +408,8 @@ class Trainer:
         if distributed.is_first():
             print(
                 f"ranks: {ranks_before} so far, {distributed.ranks()} from here on, each with {self.config.num_envs} "
-                f"worlds and minibatches of {self.config.minibatch_size}. All worlds start anew; networks, optimizers "
-                "and counters continue",
+                f"worlds and minibatches of {self.config.minibatch_size}. All worlds start anew; networks, optimizers, "
+                "transforms and counters continue",
                 file=sys.stderr,
             )
 
