@@ -16,10 +16,14 @@ class Client:
     """An open page, which counts as one once its camera is known."""
 
     def __init__(self, socket, server):
-        self._socket, self._server = socket, server
-        place = (1.0, 0.0, 0.0, 0.0), (3.0, 0.0, 1.0), 1.0, 0.1, 100.0, 480, 640, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+        self._socket = socket
+        self.look_from(3.0)
+        if server is not None:
+            self._until(server.get_clients)
+
+    def look_from(self, x):
+        place = (1.0, 0.0, 0.0, 0.0), (x, 0.0, 1.0), 1.0, 0.1, 100.0, 480, 640, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
         self._send(messages.ViewerCameraMessage(*place))
-        self._until(server.get_clients)
 
     def set(self, control, value):
         """Does what a person does to a control, and waits until the server knows."""
@@ -51,9 +55,11 @@ def _drain(socket):
 
 @contextlib.contextmanager
 def open_page(viewer):
-    url = viewer.url.replace("http", "ws")
-    with connect(url, subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as socket:
+    """Opens the page of a viewer, or of another process by its URL, as a browser does."""
+    url, server = (viewer, None) if isinstance(viewer, str) else (viewer.url, viewer.page.server)
+    version = f"viser-v{viser.__version__}"
+    with connect(url.replace("http", "ws"), origin=url, subprotocols=[version], max_size=None) as socket:
         reader = threading.Thread(target=_drain, args=(socket,))
         reader.start()
-        yield Client(socket, viewer.page.server)
+        yield Client(socket, server)
     reader.join()

@@ -2,7 +2,12 @@
 
 import io
 import shutil
+import subprocess
+import sys
 import time
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
@@ -15,8 +20,11 @@ pytest.importorskip("mjviser", reason="the extra viewer is not installed")
 
 from browser_client import open_page
 from generate.viewer import chrome
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from torchrl_loco.viewer.player import Player
+from torchrl_loco.viewer.settings import is_foreign
 from torchrl_loco.viewer.viewer import Viewer, cores
 
 
@@ -197,6 +205,93 @@ def test_no_tunnel_is_opened_and_other_machines_do_not_reach_it(viewer):
     with open_page(viewer) as page:
         page.ask_for_a_tunnel()
         assert viewer.page.server._share_tunnel is None
+
+
+@pytest.mark.parametrize(
+    ("host", "named", "origin", "foreign"),
+    [
+        ("127.0.0.1", "127.0.0.1:8080", None, False),
+        ("127.0.0.1", "127.0.0.1:8080", "http://127.0.0.1:8080", False),
+        ("127.0.0.1", "localhost:9000", "http://localhost:9000", False),  # through ssh
+        ("::1", "[::1]:8080", "http://[::1]:8080", False),
+        ("127.0.0.1", "127.0.0.1:8080", "https://evil.example", True),
+        ("127.0.0.1", "127.0.0.1:8080", "http://127.0.0.1:3000", True),
+        ("127.0.0.1", "127.0.0.1:8080", "null", True),
+        ("127.0.0.1", "evil.example:8080", "http://evil.example:8080", True),  # whose name leads here
+        ("127.0.0.1", None, None, True),
+        ("0.0.0.0", "lab.example:8080", "http://lab.example:8080", False),
+        ("0.0.0.0", "lab.example:8080", "http://evil.example:8080", True),
+    ],
+)
+def test_requests_of_other_sites_are_foreign(host, named, origin, foreign):
+    assert is_foreign(host, named, origin) == foreign
+
+
+def test_a_page_of_another_site_is_refused(viewer):
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(viewer.url.replace("http", "ws"), origin="https://evil.example")
+    with pytest.raises(HTTPError, match="403"):
+        urlopen(Request(viewer.url, headers={"Origin": "https://evil.example"}))
+    with urlopen(viewer.url) as page:
+        assert page.status == 200
+
+
+def test_hosts(led):
+    for host, start in {
+        "localhost": "http://127.0.0.1:",
+        "::1": "http://[::1]:",
+        "0.0.0.0": "http://127.0.0.1:",
+    }.items():
+        if host == "::1" and not Path("/proc/net/if_inet6").exists():
+            continue
+        with Viewer(led, still, host=host) as viewer, open_page(viewer):
+            assert viewer.url.startswith(start)
+    with pytest.raises(ValueError, match="does not appear to be an IPv4 or IPv6 address"):
+        Viewer(led, still, host="nowhere")
+    with pytest.raises(OSError, match="assign requested address"):
+        Viewer(led, still, host="192.0.2.1")
+
+
+def test_what_no_control_could_send_is_refused(viewer):
+    by_hand, lean, _ = viewer.page._sliders["command"]
+    with open_page(viewer) as page:
+        played(viewer, 2)
+        for control, value in (
+            *((lean, number) for number in (np.nan, np.inf, -9.0)),
+            *((viewer.page.choice, number) for number in (-1, 3)),
+            *((buttons, "Warp") for buttons in (viewer.page.clock, viewer.page.speed)),
+        ):
+            page.set(control, value)
+            played(viewer, 2)
+        page.look_from(np.nan)
+        for follow in (False, True):
+            page.set(viewer.page.follow, follow)
+            viewer.tick()
+    assert (by_hand.value, viewer.page.world, viewer.page.choice.value) == (False, 0, 0)
+    assert -1 <= lean.value <= 1
+    with pytest.raises(ValueError, match="finite"):
+        viewer.player.env.set_command([np.nan, 1.0])
+
+
+ENDS = """
+import sys, torchrl_loco
+env = torchrl_loco.make("walker_walk", 2, "cpu", 0)
+viewer = env.view(torchrl_loco.load_policy("walker_walk", "cpu"))
+print(viewer.url, flush=True)
+sys.stdin.readline()
+"""
+
+
+@pytest.mark.parametrize("wait", [0.2, *(pytest.param(0.2 + 0.0137 * i, marks=pytest.mark.ci) for i in range(1, 50))])
+def test_a_process_ends_quietly_while_a_page_is_open(wait):
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    with (
+        subprocess.Popen([sys.executable, "-c", ENDS], text=True, **pipes) as process,
+        open_page(process.stdout.readline().strip()),
+    ):
+        time.sleep(wait)
+        assert process.communicate("\n", timeout=60) == ("", "")
+    assert process.returncode == 0
 
 
 def test_in_a_notebook_it_plays_beside_the_cells(led):

@@ -1,5 +1,6 @@
 """Tasks in plain torch: what hooks see, what becomes of what they return, and what is said where they are wrong."""
 
+import contextlib
 import math
 
 import mujoco
@@ -12,6 +13,7 @@ from oracle import tolerance as numpy_tolerance
 
 from torchrl_loco import LocoEnv, SimConfig, State, Vary, WalkerWalk
 from torchrl_loco.envs.fusion import trace
+from torchrl_loco.envs.fusion.rules import RULES
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.view import View
@@ -409,6 +411,74 @@ def test_a_hook_that_leaves_torch_is_not_frozen(caplog):
         assert torch.equal(td["next", "observation"][:, -1], env.sim.qpos)
         assert f"{task.__name__}: reward, terminated: not compiled" in caplog.text
         assert f"{task.__name__}: observation: not compiled" in caplog.text
+
+
+def sine(self, s):
+    return torch.sin(s.qpos[:, 1])
+
+
+def fails(*args):
+    raise TypeError("unhashable type")
+
+
+@pytest.mark.parametrize(
+    ("rule", "why"),
+    [(RULES["cos"], "its kernel gives another reward than the hooks"), (fails, "the rule of aten.sin.default fails")],
+)
+def test_a_kernel_that_is_wrong_or_cannot_be_written_is_done_without(caplog, monkeypatch, rule, why):
+    monkeypatch.setitem(RULES, "sin", rule)
+    env = type("Sine", (WalkerWalk,), {"reward": sine})(2, "cpu", seed=0)
+    assert env.world._judge.kind == "plain torch"
+    assert caplog.text.count(f"Sine: reward: not compiled, runs as plain torch: {why}") == 1
+    assert torch.equal(env.rollout(2)["next", "reward"][:, -1, 0], torch.sin(env.sim.qpos[:, 1]))
+
+
+def test_hooks_that_refuse_all_other_numbers_are_not_compiled(caplog):
+    class Picky(WalkerWalk):
+        def reward(self, s):
+            if s.qpos.numpy().any():
+                raise ValueError("it moves")
+            return s.time
+
+    assert Picky(2, "cpu", seed=0).world._judge.kind == "plain torch"
+    assert "nothing can be compared: it moves" in caplog.text
+
+
+@pytest.mark.parametrize("kept", [{}, {"compile_hooks": False}])
+def test_an_attribute_that_is_fixed_says_so_when_it_is_set(kept):
+    class Faster(WalkerWalk):
+        target, notes = 1.0, None
+
+        def reward(self, s):
+            return self.scaled(s)
+
+        def scaled(self, s):
+            return s.qvel[:, 1] * self.target
+
+    for cls, fixed in ((Faster, not kept), (WalkerWalk, True)):  # a Warp function reads its target_speed
+        env, name = cls(2, "cpu", seed=0, **kept), "target" if cls is Faster else "target_speed"
+        assert type(env) is cls
+        env.notes = "nobody's concern"  # warnings are errors
+        with pytest.warns(UserWarning, match=f"{name} was read") if fixed else contextlib.nullcontext():
+            setattr(env, name, 2.0)
+        env.close()
+        setattr(env, name, 3.0)
+        reward = env.rollout(2)["next", "reward"][:, -1, 0]
+        if cls is Faster:
+            torch.testing.assert_close(reward, 3 * env.sim.qvel[:, 1])
+
+
+def test_a_table_may_have_as_many_rows_as_there_are_worlds():
+    class Nearest(WalkerWalk):
+        table = torch.linspace(-1, 1, 64)
+
+        def reward(self, s):
+            return (s.qpos[:, 1:2] - self.table).abs().amin(1) + self.table.sum()
+
+    env = Nearest(64, "cpu", seed=0)
+    assert env.world._judge.kind == "kernel"
+    reward = env.rollout(2)["next", "reward"][:, -1, 0]
+    torch.testing.assert_close(reward, (env.sim.qpos[:, 1:2] - env.table).abs().amin(1) + env.table.sum())
 
 
 def test_memory_can_be_an_index():

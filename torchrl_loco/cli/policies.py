@@ -27,7 +27,7 @@ from torchrl_loco.checks import (
 )
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.verification.conditions import DEFAULT, Conditions
-from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_viewer
+from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_host, check_viewer
 
 CONTAINERS = (".mp4", ".mkv", ".mov")
 """Suffixes of a video."""
@@ -181,7 +181,7 @@ class Browser:
     def check(self) -> None:
         """Checks all options before anything is printed or made."""
         check_viewer()
-        ipaddress.ip_address(self.host)
+        check_host(self.host)
         check_int("num_envs", self.num_envs, WORLDS)
         check_int("port", self.port, Interval(1, 2**16))
 
@@ -198,7 +198,7 @@ class Browser:
 
         with settings_for_small_networks():
             viewer = Viewer(env, policy, newer=newer, cpu_share=cpu_share, host=self.host, port=self.port)
-            if not ipaddress.ip_address(self.host).is_loopback:
+            if not ipaddress.ip_address(check_host(self.host)).is_loopback:
                 warning = f"warning: whoever reaches {self.host} can see and steer the worlds, without a password"
                 print(warning, file=sys.stderr)
             print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)

@@ -270,6 +270,15 @@ class LocoEnv(EnvBase):
             ValueError: it has not.
         """
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        fixed = getattr(self.__dict__.get("_world"), "fixed", ())
+        if name in fixed and name != "seed" and value is not getattr(self, name, None):  # set_seed() sets that
+            warn(
+                f"{type(self).__name__}.{name} was read when the environment was made, and changes nothing now: make "
+                "it a tensor that you change in place, or close() and reset() the environment"
+            )
+        super().__setattr__(name, value)
+
     def __repr__(self) -> str:
         num_envs = self.num_envs if self.batch_size else None
         device, protocol, seed = str(self.device), self.protocol, self.seed
@@ -343,6 +352,8 @@ class LocoEnv(EnvBase):
         rows = torch.zeros(row) if command is None else torch.as_tensor(command, dtype=torch.float32)
         if rows.shape not in (row, values.shape):
             raise ValueError(f"command must have shape {tuple(row)} or {tuple(values.shape)}, got {tuple(rows.shape)}")
+        if not rows.isfinite().all():
+            raise ValueError(f"command must have finite numbers, got {rows.tolist()}")
         values.copy_(rows)
         is_set.fill_(command is not None)
 

@@ -1,8 +1,9 @@
 """The hooks of a task: which are its own, what they return and ask for, and the parts of a control step they make."""
 
+import contextlib
 import math
 import weakref
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -111,6 +112,34 @@ def check_commands(cls: type["LocoEnv"], memory: Mapping[str, tuple[int, ...]]) 
                 raise ValueError(f"{title}: {name!r} must have a least and a greatest value, got {bounds}")
 
 
+def _noting(cls: Any) -> type:
+    """Returns a class that adds to ``_noted`` of an object the name of each attribute that is read."""
+
+    def __getattribute__(self: Any, name: str) -> Any:  # noqa: N807
+        object.__getattribute__(self, "_noted").add(name)
+        return cls.__getattribute__(self, name)
+
+    names = {"__getattribute__": __getattribute__, "__module__": cls.__module__, "__qualname__": cls.__qualname__}
+    return type(cls)(cls.__name__, (cls,), names)
+
+
+@contextlib.contextmanager
+def reads_of(env: Any) -> Iterator[set[str]]:
+    """Notes which attributes of an environment are read, by whom does not matter.
+
+    Yields:
+        Their names, in full at the end.
+    """
+    found, cls = set[str](), type(env)
+    env.__dict__["_noted"] = found
+    object.__setattr__(env, "__class__", _noting(cls))
+    try:
+        yield found
+    finally:
+        object.__setattr__(env, "__class__", cls)
+        del env.__dict__["_noted"]
+
+
 class Hooks:
     """The hooks of an environment's task that are plain torch.
 
@@ -127,6 +156,7 @@ class Hooks:
         groups: shape of a row of each tensor of the observation, by name; empty if a Warp function observes.
         term_names: names of the terms of the reward; ``None`` if a Warp function rewards.
         moves: whether ``events`` changes qpos or qvel.
+        read: by hook, the attributes of the environment that it reads.
         commands: in worlds to play with, the commands that can be set: their values, ``(num_envs, *row)``, and in which
             worlds they are, bool ``(num_envs,)``.
 
@@ -154,6 +184,7 @@ class Hooks:
         self.groups: dict[str, tuple[int, ...]] = {}
         self.term_names: tuple[str, ...] | None = None
         self.moves = False
+        self.read: dict[str, set[str]] = {}
         with torch.no_grad():
             self._probe(self._at_home())
         self.catalog.complete = True
@@ -165,7 +196,8 @@ class Hooks:
         if self.catalog.complete:
             return getattr(env, hook)(view, *args)
         before, own = {name: rows._version for name, rows in arrays.items()}, dict(vars(env))
-        returned = getattr(env, hook)(view, *args)
+        with reads_of(env) as self.read[hook]:
+            returned = getattr(env, hook)(view, *args)
         for name, version in before.items():
             if arrays[name]._version != version:
                 raise ValueError(f"{self._title}.{hook} writes to s.{name.removeprefix('memory.')}: work on a clone")

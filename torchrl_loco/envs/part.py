@@ -1,5 +1,6 @@
 """A part of the control step that hooks make: as one kernel, by torch.compile, or as plain torch."""
 
+import itertools
 import logging
 import traceback
 import warnings
@@ -10,13 +11,22 @@ import torch
 import warp as wp
 
 import torchrl_loco
-from torchrl_loco.envs.fusion import CannotFuse, fuse, trace
+from torchrl_loco.envs.fusion import fuse, trace
 from torchrl_loco.envs.hooks import Arrays
 from torchrl_loco.garbage import no_collection
 from torchrl_loco.sim import Recorded, Simulation
 
 COMPARED = 64
-"""Worlds in which a trace is compared with the hooks themselves."""
+"""Worlds in which a trace or a kernel is compared with the hooks themselves."""
+SPREADS = (0.02, 2.0)
+"""How far the numbers of a comparison are from those of worlds at rest: hooks may refuse wild ones, as an index."""
+TRACE = (
+    "its trace gives another {} for other numbers: a hook takes numbers out of torch (numpy, tolist), or changes "
+    "something of its own at each call"
+)
+KERNEL = "its kernel gives another {} than the hooks, which is an error of this package: please report it"
+COMPILED = "torch.compile gives another {} than the hooks"
+"""What is said where what stands for hooks differs from them."""
 
 
 class Part:
@@ -45,6 +55,7 @@ class Part:
         self._fixed = fixed
         self._work, self._arrays, self._title = work, arrays, title
         self._launch: Callable[[], None] | None = None
+        self._traced: torch.fx.GraphModule | None = None  # until its kernel is compared
         self._run: Callable[[], None] = lambda: work(arrays)
         self.kind = "plain torch"
 
@@ -68,51 +79,82 @@ class Part:
         on = torch.device(wp.device_to_torch(device))
         try:
             with no_collection():  # an environment that is dropped meanwhile computes, which would be traced too
-                traced = constants_on(on, trace(self._work, self._arrays))
-            self._check_on_other_numbers(traced)
+                self._traced = constants_on(on, trace(self._work, self._arrays))
         except Exception as error:  # whatever hooks and tracing raise
             self._stays_plain(error)
             return False
         try:
             with no_collection():
-                self._launch = fuse(traced, self._arrays, num_envs, device, self._fixed)
-            self.kind = "kernel"
-        except CannotFuse as error:
-            if device.is_cuda:
-                self._compile_by_torch(traced)
-            else:
-                self._stays_plain(error)
+                self._launch = fuse(self._traced, self._arrays, num_envs, device, self._fixed)
+        except Exception as error:  # CannotFuse, and what torch raises where it decomposes operators
+            self._do_without_kernel(device, error)
         return self._launch is not None
 
-    def _check_on_other_numbers(self, traced: torch.fx.GraphModule) -> None:
-        """Compares the trace with the hooks themselves, on numbers that they were not traced with.
+    def _do_without_kernel(self, device: wp.Device, error: Exception) -> None:
+        """Takes torch.compile on CUDA, unless hooks do something that no trace shows."""
+        self._launch, traced, self._traced = None, self._traced, None
+        assert traced is not None
+        try:
+            self._compare(lambda: traced(*self._arrays.values()), TRACE)
+        except ValueError as other:
+            self._stays_plain(other)
+            return
+        if device.is_cuda:
+            self._compile_by_torch(traced)
+        else:
+            self._stays_plain(error)
+
+    def _compare(self, run: Callable[[], None], what: str) -> None:
+        """Compares what stands for the hooks with the hooks themselves, on numbers that it was not made with.
+
+        Args:
+            run: changes the arrays as the hooks would.
+            what: is said of it where it differs, with the name of the array.
 
         Raises:
-            ValueError: they differ.
+            ValueError: they differ, or hooks take none of the numbers.
         """
-        generator = torch.Generator(self._arrays["qpos"].device).manual_seed(0)
-        for attempt in range(4):
-            flags = attempt % 2 == 1  # of worlds that are masked, or not finite
-            ours = {name: changed(rows, generator, flags) for name, rows in self._arrays.items()}
-            theirs = {name: rows.clone() for name, rows in ours.items()}
-            try:
-                self._work(ours)
-            except Exception:
-                continue
-            traced(*theirs.values())
-            self._compare(ours, theirs)
+        generator, compared = torch.Generator(self._arrays["qpos"].device).manual_seed(0), 0
+        kept = {name: rows.clone() for name, rows in self._arrays.items()}
+        refused: Exception | None = None
+        try:
+            for spread, flags in itertools.product(SPREADS, (False, True)):  # flags of worlds: masked, not finite
+                for name, rows in self._arrays.items():
+                    rows.copy_(changed(kept[name], generator, spread, flags))
+                # Only now, since some arrays are views of others.
+                ours = {name: rows.clone() for name, rows in self._arrays.items()}
+                try:
+                    self._work(ours)
+                except Exception as error:
+                    refused = error
+                    continue
+                run()
+                for name, rows in ours.items():
+                    one, other = (values[:COMPARED].double() for values in (rows, self._arrays[name]))
+                    if not torch.allclose(one, other, rtol=1e-4, atol=1e-4, equal_nan=True):
+                        raise ValueError(what.format(name))
+                compared += 1
+        finally:
+            for name, rows in self._arrays.items():
+                rows.copy_(kept[name])
+        if not compared:
+            raise ValueError(f"hooks refuse all other numbers, so nothing can be compared: {refused}") from refused
 
-    def _compare(self, ours: Arrays, theirs: Arrays) -> None:
-        for name, rows in ours.items():
-            one, other = (values[:COMPARED].double() for values in (rows, theirs[name]))
-            if not torch.allclose(one, other, rtol=1e-4, atol=1e-5, equal_nan=True):
-                raise ValueError(
-                    f"its trace gives another {name} for other numbers: a hook takes numbers out of torch (numpy, "
-                    "tolist), or changes something of its own at each call"
-                )
-
+    @torch.no_grad()
     def record(self, sim: Simulation) -> None:
-        """Records its launch."""
+        """Compares its kernel with the hooks, and records its launch; if they differ, there is no kernel."""
+
+        def run() -> None:  # on Warp's stream, the rest on torch's
+            wp.synchronize_device(sim.device)
+            self.launch()
+            wp.synchronize_device(sim.device)
+
+        try:
+            self._compare(run, KERNEL)
+        except ValueError as error:
+            self._do_without_kernel(sim.device, error)
+            return
+        self._traced, self.kind = None, "kernel"
         self._run = Recorded(self.launch, sim.capture(self.launch), sim.device)
 
     def _compile_by_torch(self, traced: torch.fx.GraphModule) -> None:
@@ -121,6 +163,7 @@ class Part:
                 warnings.simplefilter("ignore")  # those of torch's own code
                 compiled = torch.compile(traced, fullgraph=True, dynamic=False)
                 compiled(*self._arrays.values())
+            self._compare(lambda: compiled(*self._arrays.values()), COMPILED)
         except Exception as error:  # whatever the compiler raises
             self._stays_plain(error)
         else:
@@ -140,12 +183,14 @@ def _line_of_user(error: Exception) -> str:
     return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
 
-def changed(rows: torch.Tensor, generator: torch.Generator, flags: bool) -> torch.Tensor:
-    """Returns a copy of an array with other numbers of the same kind; booleans are all ``flags``."""
+def changed(rows: torch.Tensor, generator: torch.Generator, spread: float, flags: bool) -> torch.Tensor:
+    """Returns a copy of an array with other finite numbers of the same kind; booleans are all ``flags``."""
     if rows.dtype == torch.bool:
         return torch.full_like(rows, flags)
     noise = torch.rand(rows.shape, generator=generator, device=rows.device)
-    return rows.clone() + (4 * noise - 2 if rows.is_floating_point() else (10 * noise).to(rows.dtype))
+    if not rows.is_floating_point():
+        return rows + (10 * noise).to(rows.dtype)
+    return rows.nan_to_num(0.0, 0.0, 0.0) + spread * (2 * noise - 1)
 
 
 def constants_on(device: torch.device, traced: torch.fx.GraphModule) -> torch.fx.GraphModule:

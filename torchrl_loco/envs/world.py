@@ -30,7 +30,7 @@ from torchrl_loco.envs.episode import (
     poser,
     zero_non_finite,
 )
-from torchrl_loco.envs.hooks import PARTS, Hooks
+from torchrl_loco.envs.hooks import PARTS, Hooks, reads_of
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.variation import Variation
@@ -110,6 +110,7 @@ class World:
         truncated: whether the episode reached the time limit, ``(nworld,)``.
         seed: seed of all random streams, ``(1,)``.
         health: counts what went wrong in the physics.
+        fixed: attributes of the task that were read when this was made, and never again.
     """
 
     def __init__(self, task: Task, mj_model: mujoco.MjModel) -> None:
@@ -158,7 +159,8 @@ class World:
                 guard = NanGuard(task.nan_dump, self.sim, inputs, self.non_finite, self.seed, task.settings())
                 self._monitors.append(guard)
 
-            self._make_funcs(task)
+            with reads_of(task) as self.fixed:
+                self._make_funcs(task)
             self._make_parts(task)
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
             for rows in self.memory.values():
@@ -300,6 +302,7 @@ class World:
         arrays = {**streams, **self._arrays(task.hooks)} if task.hooks else {}
 
         parts: list[Part] = []
+        read: list[set[str]] = []  # by part, attributes of the task
 
         def part(name: str, needed: Collection[str] | None = None) -> Callable[[], None]:
             if hooks is None or not own & set(PARTS[name] if needed is None else needed):
@@ -307,11 +310,13 @@ class World:
             called = [hook for hook in PARTS[name] if hook in own] or [name]
             title = f"{self._title}: {', '.join(called)}"
             parts.append(Part(getattr(hooks, name), arrays, title, hooks.catalog.fixed()))
+            read.append(set().union(*(hooks.read.get(hook, ()) for hook in called)))
             return parts[-1]
 
         self._vary: Callable[[], None] = _nothing
         if variation is not None:
             parts.append(Part(variation.vary, streams, f"{self._title}: randomize", variation.fixed()))
+            read.append(set())
             self._vary = parts[-1]
 
         self._control, self._judge = part("control"), part("judge", own if hooks and hooks.commands else None)
@@ -327,6 +332,9 @@ class World:
         sim.compile(*launches, *([self._launch_move] if moves else []))
         for each in kernels:
             each.record(sim)
+        for each, names in zip(parts, read, strict=True):
+            if each.kind != "plain torch" or sim.device.is_cuda:  # where the step is recorded as a graph
+                self.fixed |= names
         self._physics, self._settle = self._record(self._launch_step), self._record(self._launch_reset)
         self._rest = self._record(self._launch_rest) if own or variation else _nothing
         self._conclude = self._record(self._launch_conclude) if own else _nothing

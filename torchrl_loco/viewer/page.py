@@ -1,17 +1,22 @@
 """The page of the viewer: scene, buttons, sliders and curves. What is clicked is passed on, not done here."""
 
 import contextlib
+import functools
+import http
 import io
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import torch
 import viser
+import websockets.asyncio.server
 from mjviser import ViserMujocoScene
 from viser import uplot
 
 from torchrl_loco.viewer.player import Player
+from torchrl_loco.viewer.settings import is_foreign
 
 SOLVER = {"iterations": 100, "ls_iterations": 50}
 """With which C MuJoCo finds the forces that arrows show: it converges, whatever the worlds' own settings are."""
@@ -23,6 +28,38 @@ COLORS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e3
 """Of the lines of a plot, again from the first after the last."""
 OVER_TIME = {"x": uplot.Scale(time=False, auto=True)}
 """A plot's axis of seconds, which are no dates."""
+
+
+_SERVING = threading.Lock()
+
+
+@contextlib.contextmanager
+def _for_own_page() -> Iterator[None]:
+    """Lets the server that viser starts meanwhile refuse requests of other sites' pages; viser has no setting for it.
+
+    Raises:
+        RuntimeError: viser has started none.
+    """
+    module: Any = websockets.asyncio.server
+    serve, served = module.serve, list[int]()
+
+    def serve_own(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            if is_foreign(host, request.headers.get("Host"), request.headers.get("Origin")):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "this page is for its own host only\n")
+            return process_request(connection, request)
+
+        served.append(port)
+        return serve(handler, host, port, process_request=process, **options)
+
+    with _SERVING:
+        module.serve = serve_own
+        try:
+            yield
+        finally:
+            module.serve = serve
+    if not served:
+        raise RuntimeError("this version of viser starts its server in another way: install viser 1.1")
 
 
 class _Server(viser.ViserServer):
@@ -58,7 +95,7 @@ class Page:
         self, player: Player, host: str, port: int, title: str, act: Callable[[Callable[[], None]], None]
     ) -> None:
         self._player, self._act, self.world = player, act, 0
-        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner
+        with contextlib.redirect_stdout(io.StringIO()), _for_own_page():  # without viser's banner
             self.server = _Server(host, port, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
@@ -97,7 +134,17 @@ class Page:
         self.server.initial_camera.position = tuple(distance * np.array(away))
         self.server.initial_camera.look_at = (0.0, 0.0, 0.0)  # the chosen world is kept there
 
-    # Controls.
+    # Controls. What a page sends is taken only if its controls could have sent it.
+
+    def on_click(self, buttons: Any, do: Callable[[str], None]) -> None:
+        """Has whoever steps the worlds call ``do`` with the name of the button that is clicked."""
+
+        def clicked(event: Any) -> None:
+            name = event.target.value
+            if name in event.target.options:
+                self._act(lambda: do(name))
+
+        buttons.on_click(clicked)
 
     def _make_choice(self) -> None:
         gui, n = self.server.gui, self._player.env.num_envs
@@ -113,14 +160,18 @@ class Page:
             self._move_cameras(self._followed)  # the scene goes back to its own coordinates
         if self.follow.value and not self.scene.camera_tracking_enabled:
             self._move_cameras(-self._followed)
-        self.world = int(self.choice.value)
+        if _in_range(self.choice):
+            self.world = int(self.choice.value)
+        else:
+            self.choice.value = self.world
         self.scene.camera_tracking_enabled = self.follow.value
         self.scene.show_only_selected = self.alone.value
         self.scene.show_contact_points = self.scene.show_contact_forces = self.forces.value
 
     def _move_cameras(self, by: np.ndarray) -> None:
         for client in self.server.get_clients().values():
-            client.camera.position = client.camera.position + by  # which takes what it looks at along
+            if np.isfinite([client.camera.position, client.camera.look_at]).all():
+                client.camera.position = client.camera.position + by  # which takes what it looks at along
 
     @property
     def _followed(self) -> np.ndarray:
@@ -139,19 +190,25 @@ class Page:
                 sliders.append(gui.add_slider(name, low, high, step, min(max(value, low), high)))
         self._sliders[entry] = [by_hand, *sliders]
 
+        numbers = [slider.value for slider in sliders]  # the last that were in range
+
         def set_command() -> None:
             env = self._player.env
-            numbers = torch.tensor([slider.value for slider in sliders]).reshape(env.world.memory[entry].shape[1:])
-            env.set_command(numbers if by_hand.value else None, entry)
+            row = torch.tensor(numbers).reshape(env.world.memory[entry].shape[1:])
+            env.set_command(row if by_hand.value else None, entry)
 
-        def moved(event: Any) -> None:
+        def moved(k: int, event: Any) -> None:
+            if not _in_range(event.target):
+                event.target.value = numbers[k]
+                return
+            numbers[k] = event.target.value
             if event.client is not None:  # by a person, not by show()
                 by_hand.value = True
                 self._act(set_command)
 
         by_hand.on_update(lambda event: self._act(set_command))
-        for slider in sliders:
-            slider.on_update(moved)
+        for k, slider in enumerate(sliders):
+            slider.on_update(functools.partial(moved, k))
 
     def _make_curves(self) -> None:
         gui, names = self.server.gui, self._player.term_names
@@ -195,6 +252,11 @@ class Page:
         """Shows a line of Markdown above the controls."""
         if self._status.content != text:
             self._status.content = text
+
+
+def _in_range(slider: Any) -> bool:
+    """Returns whether a slider is where a person can move it, and so not NaN."""
+    return slider.min <= slider.value <= slider.max
 
 
 def _plot(names: tuple[str, ...]) -> tuple[tuple[np.ndarray, ...], tuple[uplot.Series, ...]]:

@@ -1,5 +1,6 @@
 """Worlds and their page together: in real time, in a loop or beside a notebook."""
 
+import atexit
 import os
 import queue
 import threading
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_loco.checks import check_float, check_int
 from torchrl_loco.viewer.player import Player
-from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_viewer
+from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_host, check_viewer, url_of
 
 if TYPE_CHECKING:
     from torchrl_loco.envs.base import LocoEnv
@@ -39,12 +40,14 @@ class Viewer:
         action_repeat: control steps for which an action is held; ``None`` takes that of ``policy.info``, else 1.
         newer: called now and then, returns another policy to go on with, or ``None``.
         cpu_share: how much of the machine's CPU time this process may take; pictures come slower when it takes more.
-        host: address that the server listens on. There is no password: whoever reaches it can steer the worlds.
+        host: address that the server listens on, or ``localhost``. There is no password: whoever reaches it can steer
+            the worlds. Requests of other sites' pages are refused.
         port: its port; the next free one if it is taken.
 
     Raises:
         ImportError: the extra ``viewer`` is not installed.
-        ValueError: there are more than 64 worlds.
+        ValueError: there are more than 64 worlds, or ``host`` is no address.
+        OSError: ``host`` is none of this machine.
     """
 
     def __init__(
@@ -64,13 +67,13 @@ class Viewer:
         from torchrl_loco.viewer.page import Page
 
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._newer, self._host = newer, host
+        self._newer, self._host = newer, check_host(host)
         self._allowed = cpu_share * cores()
         self.player = Player(env, policy, action_repeat)
-        self.page = Page(self.player, host, port, type(env).__name__, self._requests.put)
+        self.page = Page(self.player, self._host, port, type(env).__name__, self._requests.put)
         clock = {"Play/Pause": self._pause, "Step": self._step_once, "Reset": self._reset}
-        self.page.clock.on_click(lambda event: self._requests.put(clock[event.target.value]))
-        self.page.speed.on_click(lambda event: self._requests.put(lambda: self._change_speed(event.target.value)))
+        self.page.on_click(self.page.clock, lambda name: clock[name]())
+        self.page.on_click(self.page.speed, self._change_speed)
         self.paused, self.speed = False, 1.0
         self._thread: threading.Thread | None = None
         self._ends = threading.Event()
@@ -83,7 +86,7 @@ class Viewer:
     @property
     def url(self) -> str:
         """Address of the page on this machine."""
-        return f"http://{LOOPBACK if self._host == '0.0.0.0' else self._host}:{self.page.port}"
+        return url_of(self._host, self.page.port)
 
     # Playing.
 
@@ -103,11 +106,13 @@ class Viewer:
         """
         self._thread = threading.Thread(target=self.run, name="torchrl-loco viewer", daemon=True)
         self._thread.start()
+        atexit.register(self.close)  # before the worlds are, which the thread would step on
         return self
 
     def close(self) -> None:
         """Ends :meth:`run` or what :meth:`start` began, and the page with it; the worlds stay."""
         self._ends.set()
+        atexit.unregister(self.close)
         if self._thread is None:
             self.page.server.stop()
         else:

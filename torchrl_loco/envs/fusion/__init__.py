@@ -14,6 +14,7 @@ What a world does depends on no other world: on neither their number nor their n
 """
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,7 +24,7 @@ from torch._decomp import decomposition_table
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from torchrl_loco.envs.fusion.nodes import CannotFuse as CannotFuse
-from torchrl_loco.envs.fusion.program import NoRule, Program
+from torchrl_loco.envs.fusion.program import LONG, NoRule, Program
 from torchrl_loco.envs.fusion.rules import RULES
 from torchrl_loco.envs.fusion.source import Source
 from torchrl_loco.envs.fusion.trace import trace as trace
@@ -36,6 +37,7 @@ def _written(
     num_envs: int,
     device: torch.device,
     fixed: Sequence[torch.Tensor],
+    long: float = LONG,
 ) -> tuple[Program, Source]:
     """Returns a graph as C++; operators without a rule are decomposed as torch does it for its compilers.
 
@@ -44,7 +46,7 @@ def _written(
     """
     missing, graph = dict[Any, Any](), traced
     while True:
-        program = Program(arrays, num_envs, device, RULES, fixed)
+        program = Program(arrays, num_envs, device, RULES, fixed, long)
         try:
             return program, program.run(graph.graph, functools.partial(getattr, graph))
         except NoRule as error:
@@ -90,7 +92,13 @@ def fuse(
         CannotFuse: the graph has an operator, type or shape that cannot be written as the code of one world.
     """
     with torch.no_grad():
-        program, source = _written(traced, arrays, num_envs, torch.device(wp.device_to_torch(device)), fixed)
+        given = traced, arrays, num_envs, torch.device(wp.device_to_torch(device)), fixed
+        try:
+            program, source = _written(*given)
+        except CannotFuse:  # a table may have as many rows as there are worlds
+            if num_envs not in (len(table) for table in traced.buffers() if table.ndim):
+                raise
+            program, source = _written(*given, long=math.inf)
     names = [f"p{index}" for index in source.used]
     struct = wp.struct(type("Pointers", (), {"__annotations__": dict.fromkeys(names, wp.uint64)}))
     tensors = [program.tensors[index] for index in source.used]

@@ -56,7 +56,8 @@ class Value:
         Raises:
             CannotFuse: one is that.
         """
-        found = [dim % max(self.array.ndim, 1) for dim in dims]
+        ndim = self.array.ndim
+        found = [dim % ndim for dim in dims] if ndim else []  # a number has none, though torch lets one name 0
         if self.world in found:
             raise CannotFuse("{op} goes across worlds")
         return found
@@ -86,6 +87,7 @@ class Program:
         device: where they live.
         rules: by operator's name without overload, a function of the program and the operator's arguments.
         fixed: tensors that never change, which can be indices.
+        long: rows of a user's tensor from which it is taken for one of the worlds, if there are as many worlds.
 
     Attributes:
         tensors: what it reads and writes.
@@ -98,7 +100,9 @@ class Program:
         device: torch.device,
         rules: dict[str, Callable[..., Any]],
         fixed: Iterable[torch.Tensor] = (),
+        long: float = LONG,
     ) -> None:
+        self._long = long
         self._fixed = {tensor.data_ptr() for tensor in fixed}
         self._arrays, self._n, self._device, self._rules = arrays, num_envs, device, rules
         self.tensors: list[torch.Tensor] = []
@@ -325,6 +329,8 @@ class Program:
                     raise
                 except CannotFuse as error:
                     raise CannotFuse(str(error).replace("{op}", _title(node.target))) from None
+                except Exception as error:  # operands that its rule did not foresee
+                    raise CannotFuse(f"the rule of {_title(node.target)} fails: {error}") from error
         return self._source()
 
     def _constant(self, node: torch.fx.Node, tensor: torch.Tensor) -> Any:
@@ -333,7 +339,7 @@ class Program:
             fresh or tensor.device != self._device
         ):  # torch.tensor(...) in a hook, or a copy that was made when it was traced
             return tensor.detach().cpu()
-        long = self._n >= LONG and tensor.ndim > 0 and tensor.shape[0] == self._n
+        long = self._n >= self._long and tensor.ndim > 0 and tensor.shape[0] == self._n
         return self.source(tensor, 0 if long else None)
 
     def _call(self, node: torch.fx.Node, found: dict[torch.fx.Node, Any]) -> Any:

@@ -195,7 +195,7 @@ def _permute(p: Program, x: Value, dims: Sequence[int]) -> Value:
 
 def _transpose(p: Program, x: Value, first: int = 0, second: int = 1) -> Value:
     dims = list(range(x.array.ndim))
-    if dims:
+    if len(dims) > 1:
         dims[first], dims[second] = dims[second], dims[first]
     return _permute(p, x, dims)
 
@@ -252,7 +252,7 @@ def _split(p: Program, x: Value, size: int | Sequence[int], dim: int = 0) -> lis
 
 
 def _flip(p: Program, x: Value, dims: Sequence[int]) -> Value:
-    return x.with_array(np.flip(x.array, tuple(x.rowwise(dims))).copy(), x.world)
+    return x.with_array(np.array(np.flip(x.array, tuple(x.rowwise(dims))), dtype=object), x.world)
 
 
 def _repeat(p: Program, x: Value, repeats: Sequence[int]) -> Value:
@@ -445,10 +445,11 @@ def _place(name: str, p: Program, x: Value, dim: int | None = None, keepdim: boo
 
 
 def _cumsum(p: Program, x: Value, dim: int, dtype: Any = None) -> Value:
-    (dim,), rows = x.rowwise([dim]), p.cast(x, p._meta.dtype).array.copy()
-    columns = np.moveaxis(rows, dim, 0)
-    for i in range(1, len(columns)):
-        columns[i] = p.each(ADD, p._meta.dtype, columns[i - 1], columns[i])
+    rows = p.cast(x, p._meta.dtype).array.copy()
+    for d in x.rowwise([dim]):
+        columns = np.moveaxis(rows, d, 0)
+        for i in range(1, len(columns)):
+            columns[i, ...] = p.each(ADD, p._meta.dtype, columns[i - 1], columns[i])  # else a number becomes an array
     return Value(rows, p._meta.dtype, x.world)
 
 
