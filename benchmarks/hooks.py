@@ -62,7 +62,7 @@ def bare(task: type[LocoEnv]) -> type[LocoEnv]:
 @torch.no_grad()
 def hooks(name: str, worlds: Sequence[int], device: torch.device) -> list[Row]:
     """Measures a task and its bare twin for each number of worlds; returns a row for each."""
-    task = registry.resolve(name)
+    task = registry.resolve(name, by_user=True)
     runs = [(cls, n) for n in worlds for cls in (bare(task), task)]
     return [
         {"task": cls.__name__, "worlds": n, **measure(cls, n, device)} for cls, n in until_interrupted(runs, "hooks")

@@ -5,9 +5,13 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import gc
+import tempfile
 
 import pytest
 from cases import ENGINES, KINDS
+
+STATE = tempfile.TemporaryDirectory()
+os.environ["XDG_STATE_HOME"] = STATE.name  # files that tests run are forgotten after them
 
 gc.disable()  # until all is imported: see pytest_collection_finish
 

@@ -191,7 +191,7 @@ def file(tmp_path, nothing_added, monkeypatch):
 
 def test_a_class_in_a_file(file, monkeypatch):
     """The file runs once, by whatever name; its neighbours can be imported."""
-    cls = registry.resolve(f"{file}:Slowly")
+    cls = registry.resolve(f"{file}:Slowly", by_user=True)
     assert cls.target_speed == 0.25
     assert issubclass(cls, torchrl_loco.WalkerWalk)
     monkeypatch.chdir(file.parent)
@@ -240,7 +240,7 @@ def test_a_class_in_a_script(file, capsys, monkeypatch):
     del sys.modules["neighbour"]  # as in another process
     names = json.loads(capsys.readouterr().out)
     assert names == [f"{script}:Own", f"{script.with_name('neighbour.py')}:Slowly"]
-    assert [registry.resolve(name).target_speed for name in names] == [0.25, 0.25]
+    assert [registry.resolve(name, by_user=True).target_speed for name in names] == [0.25, 0.25]
     assert [registry.task_name(name) for name in names] == names
 
 
@@ -262,14 +262,14 @@ def test_what_is_wrong_with_the_name_of_a_class(file):
         (3, TypeError, "3 is no subclass of torchrl_loco"),
     ]:
         with pytest.raises(kind, match=message):
-            registry.resolve(task)
+            registry.resolve(task, by_user=True)
         with pytest.raises(kind, match=message):
-            registry.task_name(task)
+            registry.task_name(task, by_user=True)
     for text, message in (("1 / 0", "ZeroDivisionError: division"), ("exit(3)", "SystemExit"), ("a =", "SyntaxError")):
         file.write_text(text)
         for _ in range(2):  # what has failed is tried again
             with pytest.raises(ImportError, match=f"broken.py cannot be loaded: {message}"):
-                registry.resolve(f"{file.rename(file.with_name('broken.py'))}:Slowly")
+                registry.resolve(f"{file.rename(file.with_name('broken.py'))}:Slowly", by_user=True)
             file.with_name("broken.py").rename(file)
 
 

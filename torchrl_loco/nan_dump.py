@@ -17,7 +17,8 @@ from torchrl_loco.envs import LocoEnv, State
 from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.monitors import NAN_DUMP
 from torchrl_loco.envs.vary import Vary
-from torchrl_loco.registry import env_class, list_envs, resolve
+from torchrl_loco.known_files import UnnamedFileError, place_of
+from torchrl_loco.registry import env_class, list_envs, resolve, task_name
 from torchrl_loco.sim.simulation import set_options
 
 RESETS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -62,18 +63,30 @@ class NanDump:
         return {name: self.tensors[name] for name in State.PHYSICS if name in self.tensors}
 
 
-def load(path: Path) -> NanDump:
+def load(path: Path, task: str | type[LocoEnv] | None = None) -> NanDump:
     """Returns a NaN dump, read without executing code.
+
+    Args:
+        path: the file.
+        task: the class of its environment, as :func:`torchrl_loco.make` takes it; ``None`` for what the file says.
 
     Raises:
         FileNotFoundError: there is no such file.
+        UnnamedFileError: its class is in a file that the user has not named.
         ValueError: it is no NaN dump, damaged, or of an environment that is not installed.
     """
     dump = NanDump(*storage.load(path, NAN_DUMP))
     if missing := [name for name in ("env", "config", "seed", "protocol") if name not in dump.settings]:
         raise ValueError(f"{path} cannot be read as a {NAN_DUMP}: its settings lack {', '.join(missing)}")
+    env, file = dump.settings["env"], dump.settings.get("file")
+    if task is not None:
+        dump.settings["task"] = task_name(task, by_user=True)
+    elif file and env not in _classes():
+        dump.settings["task"] = place_of(f"{file}:{env.rpartition('.')[2]}", Path(path).parent)
     try:
         _class_of(dump.settings)
+    except UnnamedFileError:
+        raise
     except (KeyError, OSError, ImportError, ValueError) as error:
         names = ", ".join(_classes())
         raise ValueError(f"{path} is of {dump.settings['env']!r}, which is not there; installed are {names}") from error
@@ -81,11 +94,8 @@ def load(path: Path) -> NanDump:
 
 
 def _class_of(settings: dict[str, Any]) -> type[LocoEnv]:
-    """Returns the class of a dump: one that is installed, or one of the file that it was in."""
-    classes = _classes()
-    if settings["env"] in classes or not settings.get("file"):
-        return classes[settings["env"]]
-    return resolve(f"{settings['file']}:{settings['env'].rpartition('.')[2]}")
+    """Returns the class of a dump: the one that was named, or one that is installed."""
+    return resolve(settings["task"]) if "task" in settings else _classes()[settings["env"]]
 
 
 def _classes() -> dict[str, type[LocoEnv]]:

@@ -6,6 +6,7 @@ import hashlib
 import importlib
 import importlib.util
 import re
+import shlex
 import sys
 import warnings
 from importlib import metadata
@@ -13,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from torchrl_loco import tasks
+from torchrl_loco import known_files, tasks
 from torchrl_loco.checks import check_choice, suggestion
 
 if TYPE_CHECKING:
@@ -181,30 +182,33 @@ def summary(id: str) -> str:
     return registered()[id].summary or _first_line(env_class(id))
 
 
-def resolve(task: "str | type[LocoEnv]") -> "type[LocoEnv]":
-    """Returns the class of a task.
+def resolve(task: "str | type[LocoEnv]", by_user: bool = False) -> "type[LocoEnv]":
+    """Returns the class of a task. Every name of a task becomes a class here.
 
     Args:
         task: an id or alias; a class; a class in a file, as ``"path/to/file.py:Class"``; or a class in a module that
             Python finds, as ``"module:Class"``. A file is run once. Modules beside it can be imported by it.
+        by_user: whether the user has named it, so that its file or module may run, and is known from then on. What
+            only a file names is run if it is known: see :mod:`torchrl_loco.known_files`.
 
     Raises:
         ValueError: there is no such id or class; the message names those that there are.
         TypeError: it is a class of something else.
         FileNotFoundError: there is no such file.
+        UnnamedFileError: the user has not named it; the message says how to.
         ImportError: the file or the module raises an error.
     """
     if not isinstance(task, str):
         return _check_environment(task)
-    if _is_place(task):
-        return _class_at(task)
+    if is_place(task):
+        return _class_at(task, by_user)
     try:
         return env_class(task)
     except ValueError as error:
         raise ValueError(f"{error}, or name a class of your own as path/to/file.py:Class") from None
 
 
-def task_name(task: "str | type[LocoEnv]") -> str:
+def task_name(task: "str | type[LocoEnv]", by_user: bool = False) -> str:
     """Returns the name by which :func:`resolve` finds a task, in another process too.
 
     It is the id, where every process knows it; else ``"/absolute/path/file.py:Class"`` if the class is in a script, in
@@ -214,6 +218,7 @@ def task_name(task: "str | type[LocoEnv]") -> str:
 
     Args:
         task: what :func:`resolve` takes.
+        by_user: as there.
 
     Raises:
         ValueError: as :func:`resolve`.
@@ -221,9 +226,9 @@ def task_name(task: "str | type[LocoEnv]") -> str:
         FileNotFoundError: as :func:`resolve`.
         ImportError: as :func:`resolve`.
     """
-    if isinstance(task, str) and not _is_place(task) and ALIASES.get(task, task) in installed():
+    if isinstance(task, str) and not is_place(task) and ALIASES.get(task, task) in installed():
         return canonical_id(task)
-    cls = resolve(task)
+    cls = resolve(task, by_user)
     for id, entry in installed().items():
         module, _, attribute = entry.target.partition(":")
         if _attribute(sys.modules.get(module), attribute) is cls:
@@ -246,15 +251,16 @@ _folders: set[Path] = set()
 """Folders of files that were named by their path: modules beside them are found in this process only."""
 
 
-def _is_place(task: str) -> bool:
+def is_place(task: str) -> bool:
     """Returns whether a task is named by where its class is."""
     return ":" in task or task.endswith(".py")
 
 
-def _class_at(place: str) -> "type[LocoEnv]":
+def _class_at(place: str, by_user: bool) -> "type[LocoEnv]":
     """Returns the class at ``"path/to/file.py:Class"`` or ``"module:Class"``.
 
     Raises:
+        UnnamedFileError: the user has not named it.
         ValueError: there is no such class.
         TypeError: it is a class of something else.
         OSError: there is no such file.
@@ -262,7 +268,9 @@ def _class_at(place: str) -> "type[LocoEnv]":
     """
     source, _, name = place.rpartition(":") if ":" in place else (place, "", "")
     try:
-        module = _module_of_file(Path(source)) if source.endswith(".py") else _module(source)
+        module = _loaded(source) or _run(source, name, by_user)
+        if by_user and (file := _file(module)) is not None and module.__name__.partition(".")[0] != "torchrl_loco":
+            known_files.remember(file)
         if (cls := _attribute(module, name)) is None:
             raise ValueError(_no_class(module, source, name))
     except (ValueError, OSError, ImportError):
@@ -302,20 +310,60 @@ def _module(name: str) -> ModuleType:
         raise ImportError(f"the module {name!r} cannot be loaded: {type(error).__name__}: {error}{hint}") from error
 
 
-def _module_of_file(path: Path) -> ModuleType:
-    """Returns a file as a module, which is run unless it already was, as a script or under its own name too.
+def _loaded(source: str) -> ModuleType | None:
+    """Returns a file or a module that this process has run already, as a script or under its own name too."""
+    if not source.endswith(".py"):
+        return sys.modules.get(source)
+    path = Path(source).expanduser().resolve()
+    modules = (sys.modules.get(name) for name in (*MAIN, path.stem, _name_of(path)))
+    return next((module for module in modules if _file(module) == path), None)
+
+
+def _run(source: str, name: str, by_user: bool) -> ModuleType:
+    """Returns a file or a module, which is run, if the user has named it, now or before.
 
     Raises:
         FileNotFoundError: there is no such file.
+        UnnamedFileError: the user has not named it.
         ImportError: it raises an error.
     """
-    path = path.expanduser().resolve()
+    path = Path(source).expanduser().resolve() if source.endswith(".py") else None
+    if path is not None and not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}: where its class is now is told by --task FILE.py:CLASS")
+    if not by_user:
+        file = path or _file_of(source)
+        if file is None or not known_files.is_known(file):
+            place = f"{path or source}:{name}"
+            raise known_files.UnnamedFileError(
+                f"{file or source} was not run: only a file names it, and you have not run it here. If you trust what "
+                f"is in it, name it yourself, once: add --task {shlex.quote(place)} to the command, or call "
+                f"torchrl_loco.registry.resolve({place!r}, by_user=True)"
+            )
+    return _module(source) if path is None else _module_of_file(path)
+
+
+def _file_of(module: str) -> Path | None:
+    """Returns the file of a module. Neither it nor a package around it is imported, as ``importlib.util`` would."""
+    places, origin = None, None
+    for i in range(module.count(".") + 1):
+        name = ".".join(module.split(".")[: i + 1])
+        specs = (finder.find_spec(name, places) for finder in sys.meta_path)
+        spec = next((spec for spec in specs if spec is not None), None)
+        if spec is None or (i > 0 and places is None):
+            return None
+        places, origin = spec.submodule_search_locations, spec.origin if spec.has_location else None
+    return Path(origin).resolve() if origin else None
+
+
+def _module_of_file(path: Path) -> ModuleType:
+    """Returns a file as a module, which is run.
+
+    Raises:
+        ImportError: it raises an error.
+    """
     name = _name_of(path)
-    for loaded in (*MAIN, path.stem, name):
-        if _file(sys.modules.get(loaded)) == path:
-            return sys.modules[loaded]
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}")
+    if known_files.is_kept(path):
+        sys.dont_write_bytecode = True  # only sources are compared with those that are known
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))
         _folders.add(path.parent)
@@ -365,7 +413,8 @@ def make(task: "str | type[LocoEnv]", *args: Any, **kwargs: Any) -> "LocoEnv":
 
     Args:
         task: one of :func:`torchrl_loco.list_envs`, or its alias ``mjx/<id>-v0``; or a class, or where one is, as
-            ``"path/to/file.py:Class"``.
+            ``"path/to/file.py:Class"``: that file is run. For a name that you read from a file, pass the class that
+            :func:`torchrl_loco.registry.resolve` returns.
         args: positional arguments of :class:`torchrl_loco.LocoEnv`: ``num_envs``, ``device``, ``seed``, ``protocol``.
         kwargs: keyword arguments of :class:`torchrl_loco.LocoEnv`, fields of :class:`torchrl_loco.SimConfig` among
             them, such as ``episode_length=500``.
@@ -388,7 +437,7 @@ def make(task: "str | type[LocoEnv]", *args: Any, **kwargs: Any) -> "LocoEnv":
     for name, instead in TAKEN_BY_TORCHRL.items():
         if kwargs.get(name):
             raise ValueError(f"{name} is no argument: {instead}")
-    env = resolve(task)(*args, **kwargs)
+    env = resolve(task, by_user=True)(*args, **kwargs)
     if env.engine == "compiled" and (ignored := [name for name in ("njmax", "naconmax") if name in kwargs]):
         why = "the compiled step has no such limits, engine='mujoco_warp' has"
         warnings.warn(f"{' and '.join(ignored)} have no effect: {why}", stacklevel=2)

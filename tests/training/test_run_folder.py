@@ -17,8 +17,10 @@ import torch
 from compare import assert_same
 from small_runs import made, networks
 
-from torchrl_loco import cli, storage
-from torchrl_loco.training import RunFolder, Trainer
+from torchrl_loco import cli, registry, storage
+from torchrl_loco.envs.base import folder_of
+from torchrl_loco.sim import models
+from torchrl_loco.training import RunFolder, Trainer, preset
 
 
 def test_unused_path(tmp_path):
@@ -211,3 +213,43 @@ def test_of_two_who_write_a_file_the_last_wins(tmp_path, monkeypatch):
     storage.replace_file(path, b"mine")
     assert path.read_bytes() == b"mine"
     assert list(tmp_path.iterdir()) == [path]
+
+
+TASK = """
+import own_numbers, torchrl_loco
+
+class Own(torchrl_loco.LocoEnv):
+    model = "robot/own.xml"
+    config = torchrl_loco.SimConfig(ctrl_dt=own_numbers.DT, sim_dt=0.005)
+"""
+MODEL = """
+<mujoco><compiler meshdir="meshes"/><include file="scene.xml"/><include file="assets.xml"/>
+<worldbody><body><freejoint/><geom type="mesh" mesh="box"/></body></worldbody></mujoco>
+"""
+
+
+def test_the_source_of_a_task_is_kept(tmp_path, monkeypatch):
+    """With what is beside it: modules, model and meshes. It is what is run where the file is gone."""
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    project = tmp_path / "project"
+    (project / "robot" / "meshes").mkdir(parents=True)
+    files = {
+        "own_task.py": TASK,
+        "own_numbers.py": "DT = 0.02",
+        "robot/own.xml": MODEL,
+        "robot/assets.xml": '<mujoco><asset><mesh name="box" file="box.obj"/></asset></mujoco>',
+        "robot/meshes/box.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n",
+    }
+    for name, text in {**files, "unrelated.py": "", "robot/unrelated.xml": ""}.items():
+        (project / name).write_text(text)
+    run = RunFolder.create(preset(f"{project / 'own_task.py'}:Own", "cpu", out=tmp_path))
+    kept = run.path / "source"
+    assert {str(path.relative_to(kept)) for path in kept.rglob("*") if path.is_file()} == set(files)
+    project.rename(tmp_path / "moved")
+    for name in [name for name in sys.modules if name.startswith(("own_task_", "own_numbers"))]:
+        monkeypatch.delitem(sys.modules, name)
+    cls = registry.resolve(run.task)
+    assert run.task == f"{kept / 'own_task.py'}:Own"
+    assert models.load(cls.model, folder_of(cls)).nmesh == 1
+    assert RunFolder(run.path, "walker_walk").task == "walker_walk"

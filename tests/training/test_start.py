@@ -1,5 +1,6 @@
 """``train``: what it takes, what it returns, and how what was handed in as an object is continued."""
 
+import json
 import re
 import shutil
 import sys
@@ -223,15 +224,98 @@ def test_a_class_in_a_file(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(["eval", "tasks/shaky.py:StandShaky"])
     assert "name one of yours with --policy" in capsys.readouterr().err
-    file.rename(tmp_path / "moved.py")
-    monkeypatch.setattr(registry, "_named", {})  # as in another process
-    for name in [name for name in sys.modules if name.startswith("shaky")]:
-        monkeypatch.delitem(sys.modules, name)
-    for command in (["eval", str(path), "--device=cpu"], ["resume", str(path), "--total_frames=768"]):
+    moved = file.rename(tmp_path / "moved.py")
+    assert (path / "source" / "shaky.py").read_text() == moved.read_text()
+    forget(monkeypatch)
+    for command in (
+        ["eval", str(path), "--episodes=2", "--device=cpu"],
+        ["eval", str(run.policy), "--episodes=2", "--device=cpu"],
+        ["record", str(path), "--seconds=0.05", "--device=cpu"],
+        ["resume", str(path), "--total_frames=768"],
+    ):
+        assert cli.main(command) == 0
+    assert run.load_config().task == Policy.load(run.policy, "cpu").info["task"] == f"{file}:StandShaky"
+    assert "was edited" not in capsys.readouterr().err
+    shutil.rmtree(path / "source")
+    forget(monkeypatch)
+    commands = (["eval", str(path), "--episodes=2", "--device=cpu"], ["resume", str(path), "--total_frames=896"])
+    for command in commands:
         with pytest.raises(SystemExit, match="2"):
             cli.main(command)
         assert f"there is no file {file}" in capsys.readouterr().err
+    for command in commands:
+        assert cli.main([*command, f"--task={moved}:StandShaky"]) == 0
     assert cli.main(["plot", str(path), "--out=curve.png"]) == 0
+
+
+def forget(monkeypatch):
+    """Continues as another process would."""
+    monkeypatch.setattr(registry, "_named", {})
+    for name in [name for name in sys.modules if name.startswith(("shaky", "moved", "evil", "gone"))]:
+        monkeypatch.delitem(sys.modules, name)
+
+
+@pytest.mark.slow
+def test_a_run_of_a_stranger_runs_nothing(ppo_run, tmp_path, monkeypatch, capsys):
+    """Its file is asked for, in its place and as a copy; the line that the message gives is what lets it run."""
+    run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
+    mark, evil = tmp_path / "mark", tmp_path / "evil.py"
+    text = f"import torchrl_loco\nopen({str(mark)!r}, 'w').close()\nclass X(torchrl_loco.WalkerStand): pass\n"
+    evil.write_text(text)
+    (run.path / "source").mkdir()
+    (run.path / "source" / "gone.py").write_text(f"{text}\n")  # another one: what is known is known by its hash
+    monkeypatch.chdir(tmp_path)
+    for named, asked in (("evil.py:X", evil), (f"{tmp_path}/gone.py:X", run.path / "source" / "gone.py")):
+        config = json.loads((run.path / "config.json").read_text())
+        (run.path / "config.json").write_text(json.dumps({**config, "task": named}))
+        policy = Policy.load(run.policy, "cpu")
+        policy.info["task"] = run.load_config().task
+        policy.save(run.policy)
+        checkpoint = torch.load(run.checkpoint, weights_only=True)
+        checkpoint["settings"]["task"] = run.load_config().task
+        torch.save(checkpoint, run.checkpoint)
+        commands = (
+            f"eval {run.path} --episodes=1 --device=cpu",
+            f"eval {run.policy} --episodes=1 --device=cpu",
+            f"play {run.path} --seconds=.1 --device=cpu --out=x.mp4",
+            f"record {run.path} --seconds=.1 --device=cpu --out=x.mp4",
+            f"verify {run.path} --episodes=1 --seconds=.1 --device=cpu",
+            f"resume {run.path} --total_frames=384",
+            f"watch {run.path}",
+        )
+        for command in commands:
+            with pytest.raises(SystemExit, match="2"):
+                cli.main(command.split())
+            said = capsys.readouterr().err
+            assert f"{asked} was not run" in said, command
+            assert f"--task {asked}:X" in said
+        assert cli.main(["plot", str(run.path)]) == 0
+        assert cli.main(["export", str(run.path), "--format=torch"]) == 0
+        assert f"the network alone: its task is not at hand: {asked} was not run" in capsys.readouterr().out
+        assert not mark.exists()
+        assert cli.main(["eval", str(run.path), "--episodes=1", "--device=cpu", f"--task={asked}:X"]) == 0
+        mark.unlink()
+        forget(monkeypatch)
+        assert cli.main(["eval", str(run.path), "--episodes=1", "--device=cpu"]) == 0
+        mark.unlink()
+
+
+@pytest.mark.slow
+def test_a_run_that_was_stopped_is_played_from_its_checkpoint(tmp_path, capsys):
+    trainer = Trainer(made(tmp_path))
+    for _ in range(2):
+        trainer.iterate()
+    trainer.save()
+    run = str(trainer.run.path)
+    for command in (["eval", run, "--episodes=2", "--device=cpu"], ["export", run, "--format=torch"]):
+        assert cli.main(command) == 0
+        said = capsys.readouterr()
+        assert "no policy was evaluated yet, this is that of the last checkpoint, after 256 frames" in said.err
+    assert cli.main(["eval", "walker_run", "--policy", run, "--episodes=2", "--device=cpu"]) == 0
+    assert cli.main(["export", "walker_run", "--policy", run, "--format=torch", f"--out={tmp_path / 'x.pt2'}"]) == 0
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["eval", "walker_run", "--policy", run, "--task=walker_run"])
+    assert "walker_run names the task already: leave --task out" in capsys.readouterr().err
 
 
 HOOKS = {

@@ -6,7 +6,7 @@ import tyro
 
 from torchrl_loco.checks import check_device
 from torchrl_loco.cli.errors import user_errors
-from torchrl_loco.cli.options import summaries
+from torchrl_loco.cli.options import OtherTask, summaries
 
 
 def list_tasks() -> None:
@@ -49,16 +49,17 @@ def diagnose(
     print("verdict: everything works")
 
 
-def inspect(file: tyro.conf.Positional[Path], /, device: str | None = None) -> None:
+def inspect(file: tyro.conf.Positional[Path], /, task: OtherTask = None, device: str | None = None) -> None:
     """Inspect a NaN dump: step its world again, substep by substep, in Warp and in C MuJoCo.
 
     Args:
         file: the file that make(..., nan_dump=FILE) or a training run wrote.
+        task: the task that it is of.
         device: where Warp computes; default: CUDA if there is any.
     """
     with user_errors():
         from torchrl_loco import nan_dump
 
         check_device(device)  # before the first line is printed
-        for line in nan_dump.describe(nan_dump.load(file), device):
+        for line in nan_dump.describe(nan_dump.load(file, task), device):
             print(line)

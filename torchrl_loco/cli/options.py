@@ -67,7 +67,7 @@ def task_options(args: list[str]) -> Any:
     device, algorithm = (_take(flag, args) for flag in ("--device", "--algorithm"))
     if len(args) > 1 and not args[1].startswith("-"):
         with user_errors():
-            task = task_name(args[1])
+            task = task_name(args[1], by_user=True)
             config = _options(preset(task, device, algorithm))
             _check_names(args[2:], config)
             note = tuning_note(config)
@@ -84,6 +84,14 @@ def task_options(args: list[str]) -> Any:
     return tyro.extras.subcommand_type_from_defaults(configs, about, prefix_names=False)
 
 
+OtherTask = Annotated[
+    str | None,
+    tyro.conf.arg(
+        name="task",
+        metavar="TASK",
+        help="the task, instead of what the run or the file says: an id, or FILE.py:CLASS, which is run.",
+    ),
+]
 GPUS = Annotated[
     int | None,
     tyro.conf.arg(

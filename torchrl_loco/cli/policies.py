@@ -26,6 +26,8 @@ from torchrl_loco.checks import (
     is_run,
 )
 from torchrl_loco.cli.errors import user_errors
+from torchrl_loco.cli.options import OtherTask
+from torchrl_loco.known_files import place_of
 from torchrl_loco.verification.conditions import DEFAULT, Conditions
 from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_host, check_viewer
 
@@ -50,32 +52,50 @@ Protocol = Annotated[
 
 
 def _policy(
-    run_or_task: str, protocol: str, device: str | None, other: Path | None = None
+    run_or_task: str, protocol: str, device: str | None, other: Path | None = None, task: str | None = None
 ) -> tuple["torchrl_loco.Policy", Path]:
     """Returns a policy, and the path from which the default names of its video and of its export derive.
 
-    Its task is the one that is named, if ``other`` says where the policy is.
+    Its task is the one that is named: ``task``, or ``run_or_task`` if ``other`` says where the policy is.
     """
+    if task is not None and (other is not None or not Path(run_or_task).exists()):
+        raise ValueError(f"{run_or_task} names the task already: leave --task out")
     if other is not None:
-        policy, _ = _policy_at(other, device)
-        policy.info["task"] = _task(run_or_task)
+        policy, _ = _policy_at(other, device, _task(run_or_task))
         return policy, Path(_label(policy))
     if Path(run_or_task).exists():
-        return _policy_at(Path(run_or_task), device)
+        return _policy_at(Path(run_or_task), device, None if task is None else _task(task))
     task = _task(run_or_task)
     if ":" in task:
         raise ValueError(f"the package has no policy for {task}: name one of yours with --policy, or its run folder")
     return torchrl_loco.load_policy(task, device, protocol), Path(task)
 
 
-def _policy_at(source: Path, device: str | None) -> tuple["torchrl_loco.Policy", Path]:
-    """Returns the policy of a run folder or a file, and the path of its file."""
+def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["torchrl_loco.Policy", Path]:
+    """Returns the policy of a run folder or a file, and the path of its file.
+
+    Of a run that was stopped before a policy was evaluated, it is that of the last checkpoint.
+
+    Args:
+        source: the run folder, or the file.
+        device: where the policy computes.
+        task: the name of its task, as the user says; ``None`` for what the file says.
+    """
     if not source.is_dir():
-        return torchrl_loco.Policy.load(source, device), source
+        policy = torchrl_loco.Policy.load(source, device)
+        policy.info["task"] = task or place_of(policy.info["task"], source.parent)
+        return policy, source
     from torchrl_loco import training
 
-    run = training.RunFolder(source)
-    return run.load_policy(device), run.policy
+    run = training.RunFolder(source, task)
+    if run.policy.is_file() or run.given or not run.has_checkpoint:
+        return run.load_policy(device), run.policy
+    from torchrl_loco.training.watching import last_policy
+
+    policy = last_policy(run, device)
+    after = f"after {policy.info['frames']:,} frames"
+    print(f"{run.path}: no policy was evaluated yet, this is that of the last checkpoint, {after}", file=sys.stderr)
+    return policy, run.policy
 
 
 def _task(name: str) -> str:
@@ -83,7 +103,7 @@ def _task(name: str) -> str:
     from torchrl_loco.registry import task_name
 
     try:
-        return task_name(name)
+        return task_name(name, by_user=True)
     except ValueError as error:
         raise ValueError(f"there is no run folder or policy file {name!r}, and {error}") from None
 
@@ -100,6 +120,7 @@ def evaluate(
     seed: int | None = None,
     protocol: Protocol = "playground",
     policy: OtherPolicy = None,
+    task: OtherTask = None,
     device: str | None = None,
 ) -> None:
     """Evaluate a trained policy over full episodes, without exploration.
@@ -110,10 +131,11 @@ def evaluate(
         seed: seed of the episodes; default: those of that evaluation.
         protocol: which policy of the package.
         policy: a policy that may be of another task.
+        task: the task of the run or the file.
         device: where to play them; default: CUDA if there is any.
     """
     with user_errors():
-        played, _ = _policy(run_or_task, protocol, device, policy)
+        played, _ = _policy(run_or_task, protocol, device, policy, task)
         from torchrl_loco import training
 
         summary = training.evaluate_policy(played, episodes, seed)
@@ -213,6 +235,7 @@ def record(
     /,
     protocol: Protocol = "playground",
     policy: OtherPolicy = None,
+    task: OtherTask = None,
     video: VideoOptions = Video(),
 ) -> None:
     """Record a video of a trained policy.
@@ -221,12 +244,13 @@ def record(
         run_or_task: what to record.
         protocol: which policy of the package.
         policy: a policy that may be of another task.
+        task: the task of the run or the file.
         video: which part of an episode is shown, and how.
     """
     with user_errors():
         video.check()
         video.check_encoder()
-        played, beside = _policy(run_or_task, protocol, video.device, policy)
+        played, beside = _policy(run_or_task, protocol, video.device, policy, task)
         video.make(played, _video_file(played, beside))
 
 
@@ -239,6 +263,7 @@ def play(
     ] = "auto",
     protocol: Protocol = "playground",
     policy: OtherPolicy = None,
+    task: OtherTask = None,
     browser: BrowserOptions = Browser(),
     video: VideoOptions = Video(),
 ) -> None:
@@ -249,6 +274,7 @@ def play(
         viewer: where it is shown.
         protocol: which policy of the package.
         policy: a policy that may be of another task.
+        task: the task of the run or the file.
         browser: how many worlds the browser shows, and at which address.
         video: which part of an episode is shown, and how; --out always records a video.
     """
@@ -260,7 +286,7 @@ def play(
             browser.check()
         if viewer == "video":
             video.check_encoder()
-        played, beside = _policy(run_or_task, protocol, video.device, policy)
+        played, beside = _policy(run_or_task, protocol, video.device, policy, task)
         from torchrl_loco import training
         from torchrl_loco.training.environments import make_for
 
@@ -300,6 +326,7 @@ def watch(
     device: str = "cpu",
     seed: int = 0,
     cpu_share: float = 0.02,
+    task: OtherTask = None,
     browser: BrowserOptions = Browser(),
 ) -> None:
     """Show a running training in the browser: its newest policy, swapped in as it appears.
@@ -311,6 +338,7 @@ def watch(
         device: where the worlds that are shown compute; on CUDA they would share the GPU with the training.
         seed: seed of the worlds.
         cpu_share: how much of the machine's CPU time it may take; pictures come slower where that is little.
+        task: where its task is now.
         browser: how many worlds are shown, and at which address.
     """
     with user_errors():
@@ -323,7 +351,8 @@ def watch(
         from torchrl_loco import training
         from torchrl_loco.training.watching import Watched
 
-        watched = Watched(training.RunFolder(run), browser.num_envs, device, seed)
+        folder = training.RunFolder(run, None if task is None else _task(task))
+        watched = Watched(folder, browser.num_envs, device, seed)
         browser.show(watched.env, watched.newer(), watched.newer, cpu_share)
 
 
@@ -345,6 +374,8 @@ def export(
     format: Literal["onnx", "torch"] = "onnx",
     out: Path | None = None,
     protocol: Protocol = "playground",
+    policy: OtherPolicy = None,
+    task: OtherTask = None,
 ) -> None:
     """Write a policy as a file for programs without this package, and compare it with the policy.
 
@@ -353,9 +384,11 @@ def export(
         format: onnx, or torch for a program of torch.export (.pt2).
         out: the file, a new one; default: a new file beside the policy, or TASK.onnx for a policy of the package.
         protocol: which policy of the package.
+        policy: a policy that may be of another task.
+        task: the task of the run or the file.
     """
     with user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
-        policy, beside = _policy(run_or_task, protocol, "cpu")
+        written, beside = _policy(run_or_task, protocol, "cpu", policy, task)
         from torchrl_loco import storage
         from torchrl_loco.deployment import why_not
         from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy
@@ -364,8 +397,8 @@ def export(
         if out is not None:
             check_output_file("out", out, (suffix,))
         out = storage.unused_path(beside.with_suffix(suffix)) if out is None else out
-        error = export_policy(policy, out)
-    if reason := why_not(policy):
+        error = export_policy(written, out)
+    if reason := why_not(written):
         print(f"the file holds the network alone: {reason}")
     print(f"largest difference from the policy, on random observations: {error:.1e} (at most {TOLERANCE:.0e})")
     print(out)
@@ -385,6 +418,8 @@ def verify(
     ],
     /,
     protocol: Protocol = "playground",
+    policy: OtherPolicy = None,
+    task: OtherTask = None,
     device: str | None = None,
     alone: bool = False,
     out: Path | None = None,
@@ -398,37 +433,43 @@ def verify(
     Args:
         run_task_or_file: what to verify.
         protocol: which policy of the package.
+        policy: a policy that may be of another task, exported or not.
+        task: the task of the run or the file.
         device: where the simulator of the training computes; default: CUDA if there is any.
         alone: whether to play a robot in C MuJoCo alone, which is quicker on a CPU.
         out: figures as JSON, a new file; default: a new verify.json in the run folder, none elsewhere.
         conditions: what the policy must hold in.
     """
     with user_errors(), tempfile.TemporaryDirectory() as folder:
-        from torchrl_loco import storage
         from torchrl_loco.verification.verify import verify
 
         conditions.check()
         out = None if out is None else check_output_file("out", out, (".json",))
-        path = Path(run_task_or_file)
-        if path.suffix != ".onnx":
-            path, in_run = _exported_for(run_task_or_file, protocol, Path(folder))
-            out = in_run if out is None else out
-        report = verify(path, conditions, device, alone=alone)
+        path = Path(run_task_or_file) if policy is None else policy
+        if path.suffix == ".onnx":
+            named = task if policy is None else run_task_or_file
+            named = None if named is None else _task(named)
+        else:
+            path, in_run = _exported_for(run_task_or_file, protocol, policy, task, Path(folder))
+            out, named = in_run if out is None else out, None
+        report = verify(path, conditions, device, alone=alone, task=named)
         print(*report.lines, sep="\n")
         if out is not None:
-            storage.replace_file(out, f"{json.dumps(report.figures, indent=2)}\n".encode())
+            out.write_text(f"{json.dumps(report.figures, indent=2)}\n")
             print(out)
     if not report.holds:
         raise SystemExit(1)
 
 
-def _exported_for(run_or_task: str, protocol: str, folder: Path) -> tuple[Path, Path | None]:
+def _exported_for(
+    run_or_task: str, protocol: str, other: Path | None, task: str | None, folder: Path
+) -> tuple[Path, Path | None]:
     """Exports a policy into a folder. Returns the file, and where figures belong in its run folder, if it has one."""
     from torchrl_loco import storage
     from torchrl_loco.deployment import why_not
     from torchrl_loco.export import export_policy
 
-    policy, beside = _policy(run_or_task, protocol, "cpu")
+    policy, beside = _policy(run_or_task, protocol, "cpu", other, task)
     if reason := why_not(policy):
         raise ValueError(f"{run_or_task} cannot be verified: {reason}")
     path = folder / "policy.onnx"

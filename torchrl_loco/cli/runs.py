@@ -11,7 +11,7 @@ import tyro
 
 from torchrl_loco.checks import SEED, check_int, check_run
 from torchrl_loco.cli.errors import user_errors
-from torchrl_loco.cli.options import settings
+from torchrl_loco.cli.options import OtherTask, settings
 from torchrl_loco.garbage import no_collection
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ def resume(
     gpus: int | None = None,
     total_frames: int | None = None,
     device: str | None = None,
+    task: OtherTask = None,
 ) -> None:
     """Continue a run that was stopped, from its last checkpoint, as if it had not been stopped.
 
@@ -65,12 +66,14 @@ def resume(
         total_frames: train the run to another number of frames, also if it is complete. The learning rate follows the
             new number from here on. Trials keep the length with which they began.
         device: train on another device from here on.
+        task: where its task is now.
     """
     with user_errors():
         check_run(run)
         from torchrl_loco import training
+        from torchrl_loco.registry import resolve, task_name
 
-        folder = training.RunFolder(run)
+        folder = training.RunFolder(run, None if task is None else task_name(task, by_user=True))
         training.Given().check(folder)
         asked: dict[str, Any] = {"total_frames": total_frames, "device": device}
         changes = {name: value for name, value in asked.items() if value is not None}
@@ -78,10 +81,12 @@ def resume(
         missing = missing_processes(gpus, kind)
     if missing:
         more = [f"--{name}={value}" for name, value in changes.items()]
+        more += [] if task is None else [f"--task={task}"]
         training.distributed.launch(missing, ["resume", str(run), f"--gpus={gpus}", *more])
     else:
         with _joined(kind):
             with user_errors():
+                resolve(folder.task)  # before settings are written
                 trainer = training.Trainer(folder, resume=True, **changes)
             train_to_end(trainer)
 

@@ -14,7 +14,7 @@ import torch
 import warp as wp
 from tensordict import TensorDict
 
-from torchrl_loco import storage
+from torchrl_loco import known_files, storage
 from torchrl_loco.envs.state import State
 from torchrl_loco.sim import Buffer, Overflow, Simulation, WorldFunc, fill
 
@@ -346,6 +346,8 @@ class NanGuard(Monitor):
         else:
             try:
                 storage.save(self._path, NAN_DUMP, kept, settings)
+                if (file := self._settings["file"]) and not self._settings["env"].startswith("torchrl_loco."):
+                    known_files.remember(Path(file).resolve())
             except BaseException:
                 self._path.unlink()  # an empty file would keep a later one from being written
                 raise

@@ -1,13 +1,18 @@
 """Models from MJCF files, and what a model must keep to."""
 
+import contextlib
 from collections.abc import Collection
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
 SCENE = Path(__file__).with_name("scene.xml")
 """What every model can include by its name, from any folder: light, materials, the look of the floor."""
+
+FOLDERS = ("assetdir", "meshdir", "texturedir")
+"""Attributes of MJCF's compiler that name folders of files."""
 
 NEVER = -1e10
 """Margin (m) of an explicit pair of geoms that does not touch: nothing is so deep."""
@@ -73,16 +78,52 @@ def specification(source: Path | str | mujoco.MjSpec, folder: Path | None = None
         return source.copy()
     if isinstance(source, str) and source.lstrip().startswith("<"):
         return mujoco.MjSpec.from_string(source, {SCENE.name: SCENE.read_bytes()})
-    tried = [Path(source) if folder is None else folder / source, Path(source)]
-    path = next((path for path in tried if path.is_file()), None)
-    if path is None:
-        where = " and ".join(dict.fromkeys(str(path.absolute()) for path in tried))
-        raise FileNotFoundError(f"there is no model {str(source)!r}: looked for {where}")
+    path = _path(source, folder)
     own = path.with_name(SCENE.name).exists()
     try:
         return mujoco.MjSpec.from_file(str(path), {} if own else {SCENE.name: SCENE.read_bytes()})
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _path(source: Path | str, folder: Path | None) -> Path:
+    """Returns the path of an MJCF file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
+    tried = [Path(source) if folder is None else folder / source, Path(source)]
+    path = next((path for path in tried if path.is_file()), None)
+    if path is None:
+        where = " and ".join(dict.fromkeys(str(path.absolute()) for path in tried))
+        raise FileNotFoundError(f"there is no model {str(source)!r}: looked for {where}")
+    return path
+
+
+def files(source: Path | str | mujoco.MjSpec, folder: Path | None = None) -> list[Path]:
+    """Returns the files of a model, what it includes and its meshes among them; none for MJCF text and specs.
+
+    Args:
+        source: as :func:`load` takes it.
+        folder: as there.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
+    if isinstance(source, mujoco.MjSpec) or (isinstance(source, str) and source.lstrip().startswith("<")):
+        return []
+    path = _path(source, folder).resolve()
+    found, places, names = [path], [path.parent], list[str]()
+    for file in found:  # which grows by what is included
+        with contextlib.suppress(ElementTree.ParseError):
+            for node in ElementTree.parse(file).iter():
+                places += [path.parent / node.attrib[name] for name in FOLDERS if name in node.attrib]
+                of = [value for name, value in node.items() if name.startswith("file")]
+                names += of
+                included = [(path.parent / name).resolve() for name in of if node.tag == "include"]
+                found += [each for each in included if each.is_file() and each not in found]
+    others = [file for name in names for place in places if (file := (place / name).resolve()).is_file()]
+    return list(dict.fromkeys([*found, *others]))
 
 
 def has_home(mj_model: mujoco.MjModel) -> bool:

@@ -20,7 +20,7 @@ from torchrl_loco.checks import (
     check_packages,
 )
 from torchrl_loco.config import PROTOCOLS
-from torchrl_loco.registry import task_name
+from torchrl_loco.registry import is_place, task_name
 
 LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow"]
 INTERVALS = {
@@ -322,14 +322,19 @@ class REPPOConfig(TrainingConfig):
 
 
 def _stored_name(task: Any) -> str:
-    """Returns the name of a task; one that says already where its class is stays as it is.
+    """Returns the name of a task; of one that says where its class is, with the whole path of its file.
 
-    The class is looked up where it is needed: without it, the curve of a run can still be plotted.
+    The class is looked up where it is needed: settings come from files too, whose curve is plotted without it.
+
+    Raises:
+        ValueError: there is no such id, or no class is named.
     """
-    source, _, name = task.rpartition(":") if isinstance(task, str) else ("", "", "")
-    if name and source and (not source.endswith(".py") or Path(source).is_absolute()):
-        return task
-    return task_name(task)
+    if not (isinstance(task, str) and is_place(task)):
+        return task_name(task)
+    source, _, name = task.rpartition(":")
+    if not (source and name):
+        raise ValueError(f"{task!r} names no class: write path/to/file.py:Class")
+    return f"{Path(source).expanduser().resolve()}:{name}" if source.endswith(".py") else task
 
 
 def check_loggers(names: Collection[str]) -> None:

@@ -61,7 +61,7 @@ class Environments:
         config, env, runner = self._config, self._given, is_runner(self._config.task)
         if env is None:
             env = make(
-                config.task,
+                resolve(config.task),
                 config.num_envs,
                 config.device,
                 config.seed,
@@ -88,7 +88,7 @@ class Environments:
         worlds = base.num_envs if base is not None and self.transforms else episodes
         if worlds not in self._evaluating:
             if base is None:
-                own = make(config.task, worlds, config.device, seed, config.protocol, world_offset=0)
+                own = make(resolve(config.task), worlds, config.device, seed, config.protocol, world_offset=0)
             else:
                 settings = {**dataclasses.asdict(base.config), "randomize": base.randomize}
                 del settings["naconmax"]  # which is for the number of its worlds
@@ -159,11 +159,11 @@ def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: 
     Raises:
         ValueError: it was trained behind transforms.
         OSError: the file of its task is missing.
-        ImportError: the file or module of its task is broken.
+        ImportError: the file or module of its task is broken, or not known.
     """
     refuse_transforms(policy)
     info = policy.info
-    return make(info["task"], num_envs, device, seed, info["protocol"], world_offset=0, **settings)
+    return make(resolve(info["task"]), num_envs, device, seed, info["protocol"], world_offset=0, **settings)
 
 
 def refuse_transforms(policy: Policy) -> None:

@@ -40,7 +40,7 @@ def preset(
         ValueError: there is no such device, algorithm or setting, or one is out of range; the message names what is
             valid. It may be one in the ``presets`` of the class.
     """
-    task, device = task_name(task), check_device(device)
+    task, device = task_name(task, by_user=True), check_device(device)
     on_cuda = device.type == "cuda"
     own: Mapping[str, Mapping[str, Any]] = {}
     if on_cuda or task not in tasks.found():  # importing one of ours takes seconds

@@ -13,10 +13,12 @@ from typing import Any
 
 import torch
 
-from torchrl_loco import storage
+from torchrl_loco import known_files, storage
 from torchrl_loco.checks import check_device, check_run
+from torchrl_loco.envs.base import folder_of
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import resolve
+from torchrl_loco.sim import models
 from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig, check_loggers, config_from_json
 
@@ -58,17 +60,20 @@ class RunFolder:
     ``learning_curve.png``, ``video.mp4``, what its loggers write (``tensorboard/``, ``wandb/``, ``mlflow.db``),
     ``verify.json`` if the policy was verified, and ``nan_dump.safetensors`` if a world became non-finite.
     ``launch.txt`` names the launch by torchrun that began it, ``given.json`` what was handed to
-    :func:`torchrl_loco.training.train` as an object.
+    :func:`torchrl_loco.training.train` as an object. ``source/`` has a copy of the file of the task, if it is in one,
+    of the modules beside it that it imports, and of its model, if that is below the same folder: they are what is run
+    where that file is gone.
 
     Args:
         path: an existing run folder.
+        task: where the class of its task is now, as the user says; ``None`` for what the folder says.
 
     Raises:
         FileNotFoundError: ``path`` is no folder with a ``config.json``.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = check_run(path)
+    def __init__(self, path: Path, task: str | None = None) -> None:
+        self.path, self._named = check_run(path), task
 
     @classmethod
     def create(cls, config: TrainingConfig, given: Collection[str] = ()) -> "RunFolder":
@@ -104,7 +109,9 @@ class RunFolder:
         storage.replace_file(path / "config.json", _as_json(config))  # from here on it is a run
         if launch := distributed.launch_id():
             storage.replace_file(path / "launch.txt", launch.encode())
-        return cls(path)
+        run = cls(path)
+        run.keep_source()
+        return run
 
     @classmethod
     def of_launch(cls, config: TrainingConfig) -> "RunFolder | None":
@@ -125,6 +132,24 @@ class RunFolder:
             why = "is damaged, from another release, or of a task that is not installed"
             raise ValueError(f"{path} {why}: {error}") from error
         return dataclasses.replace(config, **overrides)
+
+    @property
+    def task(self) -> str:
+        """Where the class of its task is: as the user or its settings say, or in ``source/`` if that file is gone."""
+        return self._named or known_files.place_of(self.load_config().task, self.path)
+
+    def keep_source(self) -> None:
+        """Copies the file of its task, and what belongs to it, into ``source/``, and remembers it as the user's."""
+        path = Path(self.task.rpartition(":")[0])
+        if path.suffix != ".py" or not path.is_file() or known_files.is_kept(path):
+            return
+        known_files.remember(path)
+        cls, package = resolve(self.task), Path(known_files.__file__).parent
+        for file in [*known_files.with_imports(path), *models.files(cls.model, folder_of(cls))]:
+            if file.is_relative_to(path.parent) and not file.is_relative_to(package):
+                copy = self.path / known_files.KEPT / file.relative_to(path.parent)
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                storage.replace_file(copy, file.read_bytes())
 
     def store_config(self, config: TrainingConfig) -> None:
         """Stores the settings that :meth:`load_config` returns from then on."""
@@ -159,6 +184,7 @@ class RunFolder:
         policy, task = Policy.load(self.policy, device), self.load_config().task
         if policy.info["task"] != task:
             raise ValueError(f"{self.policy} is a policy for {policy.info['task']}, but the run is of {task}")
+        policy.info["task"] = self.task
         return policy
 
     @property

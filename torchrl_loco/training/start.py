@@ -11,7 +11,7 @@ from typing import Any
 from torchrl.envs import EnvBase
 
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.registry import task_name
+from torchrl_loco.registry import is_place, task_name
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
@@ -98,8 +98,8 @@ def _config(
         return preset(task, settings.pop("device", None), name, **settings)
     if name is not None and name != config.algorithm:
         raise ValueError(f"config is of {config.algorithm}, but algorithm is {name}: pass one of them")
-    if task_name(task) != config.task:
-        raise ValueError(f"config is for {config.task}, but task is {task_name(task)}")
+    if (named := task_name(task, by_user=True)) != config.task:
+        raise ValueError(f"config is for {config.task}, but task is {named}")
     for setting in settings:
         check_setting("setting", setting, type(config))
     return dataclasses.replace(config, **settings)
@@ -127,10 +127,11 @@ def _resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
         ValueError: it is of another task.
     """
     run = resume if isinstance(resume, RunFolder) else RunFolder(Path(resume))
-    config = run.load_config()
-    if task_name(task) != config.task:
-        raise ValueError(f"{run.path} is a run of {config.task}, but task is {task_name(task)}")
-    return run
+    named, of = task_name(task, by_user=True), run.load_config().task
+    moved = is_place(named) and is_place(of) and named.rpartition(":")[2] == of.rpartition(":")[2]
+    if named != of and not moved:
+        raise ValueError(f"{run.path} is a run of {of}, but task is {named}")
+    return RunFolder(run.path, named)
 
 
 def _train(what: TrainingConfig | RunFolder, given: Given, **changes: Any) -> RunFolder:

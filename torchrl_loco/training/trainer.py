@@ -98,7 +98,7 @@ class Trainer:
             )
         torch.manual_seed(config.seed)
         first, rank = distributed.is_first(), distributed.rank()
-        self.environments = Environments(config, given.env)
+        self.environments = Environments(dataclasses.replace(config, task=run.task), given.env)
         dump = run.nan_dump if first else run.nan_dump.with_stem(f"nan_dump_rank{rank}")
         self.env = self.environments.training(dump)
         make_algorithm = given.algorithm or ALGORITHMS[config.algorithm]
@@ -110,7 +110,7 @@ class Trainer:
         self._training_length = self._base.config.episode_length
         terms = self.env.observation_spec.get("reward_terms", None)
         self._terms = () if terms is None else tuple(terms.keys())
-        self._source = source_of(config.task)
+        self._source = source_of(run.task)
         self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
@@ -124,6 +124,8 @@ class Trainer:
         if first:  # nothing is refused any more
             if changes:
                 run.store_config(stored)
+            if resume:
+                run.keep_source()
             run.forget_after(self.frames)  # of a process that was killed, or that torchrun has restarted
         distributed.copy_from_first(self.algorithm.networks.state_dict().values())
 
@@ -326,6 +328,7 @@ class Trainer:
             of = {
                 "settings": self._identity(),
                 "source": self._source,
+                "spaces": dataclasses.asdict(self.algorithm.spaces),
                 "algorithm": self.algorithm.state_dict(),
                 "trials": self.trials.state_dict(),
                 "terms": list(self._terms),
@@ -355,7 +358,7 @@ class Trainer:
                 f"{self.run.path} is complete: it has all of its {self.frames} frames. Pass --total_frames to train on"
             )
         if checkpoint.get("source", self._source) != self._source and distributed.is_first():
-            print(f"{self.config.task} was edited since the checkpoint: the run goes on as it is now", file=sys.stderr)
+            print(f"{self.run.task} was edited since the checkpoint: the run goes on as it is now", file=sys.stderr)
         terms = checkpoint.get("terms", self._terms)
         if set(terms) != set(self._terms) and distributed.is_first():
             names = [", ".join(each) or "none" for each in (terms, self._terms)]

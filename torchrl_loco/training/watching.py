@@ -1,7 +1,8 @@
 """A run that may still be training, seen from another process: its files are read, and nothing else."""
 
+from torchrl_loco.checks import check_device
 from torchrl_loco.policy import Policy
-from torchrl_loco.registry import make
+from torchrl_loco.registry import make, resolve
 from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.environments import refuse_transforms
 from torchrl_loco.training.run_folder import RunFolder
@@ -29,7 +30,7 @@ class Watched:
         self._run, self._config = run, run.load_config(device=device)
         config = self._config
         settings = {"world_offset": 0, "reward_terms": True, "play": True}
-        self.env = make(config.task, num_envs, device, seed, config.protocol, **settings)
+        self.env = make(resolve(run.task), num_envs, device, seed, config.protocol, **settings)
         self._files = [run.policy] if run.given else [run.policy, run.checkpoint]
         self._seen = 0
 
@@ -48,7 +49,24 @@ class Watched:
             policy = self._run.load_policy(self._config.device)
             refuse_transforms(policy)
             return policy
-        checkpoint = self._run.load_checkpoint(self._config.device)
-        algorithm = ALGORITHMS[self._config.algorithm](self._config, Spaces.of(self.env))
-        algorithm.networks.load_state_dict(checkpoint["algorithm"]["networks"])
-        return deterministic_policy(algorithm.actor, self._config, {"frames": checkpoint["frames"]})
+        return last_policy(self._run, self._config.device)
+
+
+def last_policy(run: RunFolder, device: str | None = None) -> Policy:
+    """Returns the policy of a run's checkpoint, which no evaluation has chosen.
+
+    Args:
+        run: a run with a checkpoint, which was begun without objects of one's own.
+        device: where it computes; ``None`` takes CUDA if there is any.
+
+    Raises:
+        ValueError: the checkpoint cannot be read.
+    """
+    device = str(check_device(device))
+    config, checkpoint = run.load_config(device=device, task=run.task), run.load_checkpoint(device)
+    stored = checkpoint.get("spaces")  # checkpoints of earlier revisions have none
+    spaces = Spaces.of(make(resolve(run.task), 1, device)) if stored is None else Spaces(**stored)
+    algorithm = ALGORITHMS[config.algorithm](config, spaces)
+    algorithm.networks.load_state_dict(checkpoint["algorithm"]["networks"])
+    counters = {name: checkpoint[name] for name in ("frames", "seconds")}
+    return deterministic_policy(algorithm.actor, config, counters)

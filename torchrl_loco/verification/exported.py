@@ -21,6 +21,7 @@ class Exported:
 
     Args:
         path: the file.
+        task: the name of its task, as the user says; ``None`` for what the file says.
 
     Attributes:
         facts: what the file says, by name: see :mod:`torchrl_loco.deployment`.
@@ -34,7 +35,7 @@ class Exported:
             is not at hand.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, task: str | None = None) -> None:
         import onnxruntime
 
         if not Path(path).is_file():
@@ -48,6 +49,8 @@ class Exported:
             self.facts[name] = word
             with contextlib.suppress(json.JSONDecodeError):  # words are not quoted
                 self.facts[name] = json.loads(word)
+        if task is not None:
+            self.facts["task"] = task
         if "observation" not in self.facts:
             raise ValueError(
                 f"{path} does not say what the policy observes: export it again with its task at hand, which needs a "

@@ -29,7 +29,14 @@ class Report:
     figures: dict[str, Any]
 
 
-def verify(path: Path, conditions: Conditions = DEFAULT, device: str | None = None, *, alone: bool = False) -> Report:
+def verify(
+    path: Path,
+    conditions: Conditions = DEFAULT,
+    device: str | None = None,
+    *,
+    alone: bool = False,
+    task: str | None = None,
+) -> Report:
     """Plays an exported policy in C MuJoCo, beside the simulator in which it was trained.
 
     Robots that follow a velocity command meet fixed and drawn commands, late actions, errors of the observation,
@@ -41,6 +48,7 @@ def verify(path: Path, conditions: Conditions = DEFAULT, device: str | None = No
         conditions: what it must hold in.
         device: where the simulator of the training computes; ``None`` takes CUDA if there is any.
         alone: whether to play a robot in C MuJoCo alone, which is quicker on a CPU.
+        task: the name of its task, as the user says; ``None`` for what the file says.
 
     Returns:
         What was found. Without the task of a robot at hand, it is of C MuJoCo alone, and says so.
@@ -54,7 +62,7 @@ def verify(path: Path, conditions: Conditions = DEFAULT, device: str | None = No
     check_packages("verifying", ("onnxruntime",), "onnx")
     conditions.check()
     check_bool("alone", alone)
-    exported = Exported(path)
+    exported = Exported(path, task)
     if "velocity" in exported.facts:
         return _velocity(exported, conditions, device, alone)
     if alone:

@@ -405,8 +405,8 @@ struct Step : Math {
   INLINE void largest(float&, int&) const {}
 #endif
   INLINE unsigned lanes_below() const { return (1u << lane) - 1; }
-  INLINE void flag(int bit) const {
-    if (lane == 0 && Model::SUBSTEPS) overflow |= bit;
+  INLINE void flag(int bits) const {
+    if (lane == 0 && Model::SUBSTEPS) overflow |= bits;
   }
 
   // ---- Kinematics
@@ -1911,10 +1911,9 @@ struct Step : Math {
     sync();
   }
 
-  // Brings velocity and acceleration into the rows, and the acceleration into the residual of M. Returns whether all rows
-  // are numbers: one that is none is on no side of its constraint.
-  INLINE bool complete_rows() {
-    bool numbers = true;
+  // Brings velocity and acceleration into the rows, and the acceleration into the residual of M. A row that is no number,
+  // which would be on no side of its constraint, makes that residual none.
+  INLINE void complete_rows() {
     SHARED_LOOP(i, DOFS + jacobian_rows()) {
       const int r = i - DOFS;
       const float* const row = r < 0 ? w.mass + STRIDE * i : w.jacobian + STRIDE * r;
@@ -1932,17 +1931,12 @@ struct Step : Math {
       float v = row_velocity(r, w.qacc);
       if (r >= first_limit()) v += row_damping(r) * row_velocity(r, w.qvel);
       const float x = w.x[r] += v;
-      numbers &= x == x;
+      if (!(x == x)) w.residual[0] = x;
     }
     sync();
-    return ballot(!numbers) == 0;
   }
 
-  // Makes the acceleration no number.
-  INLINE void lose() {
-    OWN_DOFS(slot, d) if (d < DOFS) w.qacc[d] = from_bits(NAN_BITS);
-    sync();
-  }
+  INLINE void lose() { w.qacc[0] = from_bits(NAN_BITS); }
 
   // ---- Line search
 
@@ -2029,10 +2023,7 @@ struct Step : Math {
   INLINE void solve(const bool live) {
     bool guesses = false;
     if (live) {
-      if (!complete_rows()) {
-        flag(UNSOLVED);
-        lose();
-      }
+      complete_rows();
       guesses = guess_sides() && GUESSES;
     }
 //NEWTON
@@ -2276,22 +2267,22 @@ World storage;
 World& w = storage;
 #define LOCKSTEP()
 #endif
-const size_t this_world = live ? world : 0;
-const auto row_of = [=](auto* data, int size) { return data + this_world * size; };  // products of ints could wrap
+const unsigned this_world = live ? world : 0;
+const auto row_of = [=](auto* data, unsigned size) {  // products of 32 bits could wrap
+  return data + static_cast<size_t>(this_world) * size;
+};
 float* const sensors = row_of(sensordata_out.data, Model::SENSOR_VALUES);
 float* const row = row_of(numbers_out.data, numbers_out.shape[1]);
-float* const qpos = row_of(qpos_out.data, Model::POSITIONS);
-float *const qvel = row_of(qvel_out.data, DOFS), *const qacc = row_of(qacc_warmstart_out.data, DOFS);
 Step step(w, lane, row_of(ctrl_in.data, Model::CONTROLS), overflow_out.data[this_world], row);
 if (live && lane == 0) {  // in a step that is not taken, numbers may have changed
 //DERIVE
 }
 if (live) {
   step.sync();  // the first lane may have written the state
-  SHARED_LOOP(i, Model::POSITIONS) w.qpos[i] = qpos[i];
+  SHARED_LOOP(i, Model::POSITIONS) w.qpos[i] = row_of(qpos_out.data, Model::POSITIONS)[i];
   SHARED_LOOP(i, STRIDE) {
-    w.qvel[i] = i < DOFS ? qvel[i] : 0.0f;
-    w.qacc[i] = i < DOFS ? qacc[i] : 0.0f;
+    w.qvel[i] = i < DOFS ? row_of(qvel_out.data, DOFS)[i] : 0.0f;
+    w.qacc[i] = i < DOFS ? row_of(qacc_warmstart_out.data, DOFS)[i] : 0.0f;
     w.search[i] = 0.0f;
   }
   SHARED_LOOP(i, DOFS * STRIDE) w.mass[i] = 0.0f;
@@ -2347,10 +2338,10 @@ if (live) {
   step.write_angular_momenta(sensors);
 //END
   if (Model::SUBSTEPS > 0) {
-    SHARED_LOOP(i, Model::POSITIONS) qpos[i] = w.qpos[i];
+    SHARED_LOOP(i, Model::POSITIONS) row_of(qpos_out.data, Model::POSITIONS)[i] = w.qpos[i];
     SHARED_LOOP(i, DOFS) {
-      qvel[i] = w.qvel[i];
-      qacc[i] = w.qacc[i];
+      row_of(qvel_out.data, DOFS)[i] = w.qvel[i];
+      row_of(qacc_warmstart_out.data, DOFS)[i] = w.qacc[i];
     }
     if (lane == 0) time_out.data[this_world] += Model::SUBSTEPS * Model::timestep();
   }

@@ -16,10 +16,10 @@
 //                           returns a step along s; of a guess, all of s or nothing
 //   move(step)              takes it, and returns whether a row is on another side than the direction took it to be; sets
 //                           its improvement if the search does not
-//   lose()                  makes qacc no number, so that the state becomes none
-//   flag(bit)               reports what was cut short
+//   lose()                  makes the first of qacc no number, and with it the state
+//   flag(bits)              reports what was cut short
 // SCALE is one over the inertia of the model.
-// A solve that fails is flagged. Where there are no numbers, or not a single step and much left to gain, the world is lost.
+// A solve that fails is flagged. Where there are no numbers, or no step though much is left to gain, the world is lost.
 
 float gradient_squared = 0.0f, decrement = 0.0f, regularisation = 0.0f, before = 0.0f;
 const auto flat = [&](const float left) {  // with so much of both left
@@ -29,26 +29,26 @@ const auto flat = [&](const float left) {  // with so much of both left
 };
 bool found = false, done = !live;  // whether qacc is final; whether there is nothing left to do
 bool same = false;                 // whether the last step left all rows on their sides
-bool moved = false;                // whether qacc is no longer the start
+int failures = 0;  // bits to flag
 ROLLED for (int iteration = 0; any_of_block(!done); ++iteration) {
   if (done) continue;
   if (!found && iteration == ITERATIONS) {
     found = true;
-    flag(LIMIT_REACHED);
+    failures |= LIMIT_REACHED;
   }
   done = found;
   if (done && !IMPLICIT_DAMPING) continue;
   const bool guessed = GUESSES && iteration == 0;
   set_direction(found, regularisation, gradient_squared, decrement);
   if (done) continue;
-  const bool finite = gradient_squared + fabsf(decrement) < Math::from_bits(INFINITE_BITS);
-  if (!(finite & (0.5f * SCALE * decrement > -TOLERANCE))) {  // a pivot is no number, or not positive
-    flag(UNSOLVED);
-    if (DELICATE && finite) {
+  const float gain = 0.5f * SCALE * decrement;
+  if (!(gain > -TOLERANCE)) {  // a pivot is no number, or not positive
+    failures |= UNSOLVED;
+    if (DELICATE && decrement < 0.0f && regularisation < 1e6f) {
       regularisation = 10.0f * regularisation + 1.0f;
       continue;
     }
-    if (!finite | !moved) lose();
+    if (!(gain > -MUCH)) lose();
     found = true;
     continue;
   }
@@ -57,20 +57,20 @@ ROLLED for (int iteration = 0; any_of_block(!done); ++iteration) {
   project();
   Search step = line_search(decrement, guessed);
   if ((step.alpha == 0.0f) & !guessed) {
-    if (step.slope != 0.0f) flag(UNSOLVED);
-    if (!moved & (0.5f * SCALE * decrement > MUCH)) lose();
+    if (gain > MUCH) lose();
+    if ((step.slope != 0.0f) | (gain > MUCH)) failures |= UNSOLVED;
     found = true;
     continue;
   }
-  moved |= step.alpha != 0.0f;
   const bool repeated = same;
   same = !move(step);
   found = (step.improvement > 0.0f) & (step.improvement * SCALE < TOLERANCE) & !guessed;
   if (same && !found) {  // what is left of a Newton step; of a second one on the same parabola, rounding
     // On a parabola the slope is (alpha - 1) decrement. A difference is an error of s along s; across, it may be tenfold.
     const float rest = 1.0f - step.alpha, error = 10.0f * (Math::divide(step.slope, decrement) + rest);
-    if (DELICATE && repeated && decrement > 1e-3f * before) flag(UNSOLVED);  // steps of Newton's method gain far more
+    if (DELICATE && repeated && decrement > 1e-3f * before) failures |= UNSOLVED;  // steps of Newton's method gain far more
     found = repeated || flat(Math::larger(rest * rest, error * error));
   }
   before = decrement;
 }
+if (failures) flag(failures);

@@ -95,7 +95,7 @@ class NewtonSolver:
             self._move(step)
         block("const auto any_of_block = [](bool x) { return x; };")
         with block.function("lose", "") as loss:
-            loss(f"for (int i = 0; i < {m.nv}; ++i) qacc[i] = M_qacc[i] = Math::from_bits(NAN_BITS);")
+            loss("qacc[0] = M_qacc[0] = Math::from_bits(NAN_BITS);")
         stopping = literal(scale), literal(tolerance(m)), str(option.iterations)
         delicate = "true" if self.delicate else "false"
         block(shared.newton(*stopping, implicit_damping="false", guesses="false", delicate=delicate))

@@ -58,7 +58,7 @@ def source(
         world(f"float {title}[{max(count, 1)}];")
         world(f"for (int i = 0; i < {count}; ++i) {title}[i] = wp::index({argument}, world, i);")
     world("int overflow = 0;")
-    world("const auto flag = [&](int bit) { overflow |= bit; };")
+    world("const auto flag = [&](int bits) { overflow |= bits; };")
     if substeps or TOUCH in m.sensor_type or contact_geoms:
         if not substeps:
             world("// Touch is a force: a step that is not taken finds it, without actuation.")
