@@ -369,7 +369,7 @@ def test_broken_plug_ins_are_named_and_harm_no_other(tmp_path, discover, capsys,
         "broken_loco:Missing": "cannot be loaded: AttributeError: .*Missing",
         "broken_loco:number": "5 is no subclass of torchrl_loco.LocoEnv",
         "failing_loco:Env": "cannot be loaded: ZeroDivisionError: division by zero",
-        "broken_loco:Ant": "Ant must set model, config",
+        "broken_loco:Ant": "Ant must set model",
         "broken_loco:Empty": r"Empty.observation_size must lie in \[1, 2\*\*31\)",
     }
     distribution(

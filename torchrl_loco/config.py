@@ -45,7 +45,8 @@ class SimConfig:
             H200; ``mujoco_warp`` is MuJoCo-Warp; ``auto`` takes ``compiled`` if it supports the model,
             else ``mujoco_warp``.
         integrator: how velocities and positions advance: ``euler`` (semi-implicit), ``implicitfast``, or ``rk4``
-            (under ``mujoco_warp`` only). It replaces the one that the model names, and a line of the log says so.
+            (under ``mujoco_warp`` only). It replaces the one that the model names, as ``sim_dt``, iterations and
+            ``euler_damping`` do: a line of the log and ``repr(env)`` say so, and :meth:`of` keeps those of the model.
         contacts: what bodies touch: ``all`` that the model says, or the ``ground``, that is, what is fixed to the
             world and not each other. Under both engines, and in :attr:`torchrl_loco.LocoEnv.mj_model`.
 
@@ -77,10 +78,44 @@ class SimConfig:
             raise ValueError(f"deterministic=True needs integrator='euler', got {self.integrator!r}")
         check_multiple("ctrl_dt", self.ctrl_dt, "sim_dt", self.sim_dt)
 
+    @classmethod
+    def of(cls, model: Any, ctrl_dt: float | None = None, **others: Any) -> "SimConfig":
+        """Returns settings that keep the options of a model: time step, integrator, iterations, damping.
+
+        Args:
+            model: a ``mujoco.MjModel`` or ``MjSpec``, MJCF text, or the path of a file.
+            ctrl_dt: time between two actions (s); ``None`` is the multiple of the time step that is nearest to 0.02 s.
+            others: further fields.
+
+        Raises:
+            ValueError: the model's integrator is none of those of :attr:`integrator`.
+        """
+        import mujoco
+
+        if not isinstance(model, mujoco.MjModel | mujoco.MjSpec):
+            is_text = isinstance(model, str) and model.lstrip().startswith("<")
+            model = mujoco.MjSpec.from_string(model) if is_text else mujoco.MjSpec.from_file(str(model))
+        fields = options_of(model.opt if isinstance(model, mujoco.MjModel) else model.option)
+        steps = max(1, round(0.02 / fields["sim_dt"]))
+        return cls(**{"ctrl_dt": steps * fields["sim_dt"] if ctrl_dt is None else ctrl_dt, **fields, **others})
+
     @property
     def substeps(self) -> int:
         """Physics steps in one control step."""
         return round(self.ctrl_dt / self.sim_dt)
+
+
+def options_of(option: Any) -> dict[str, Any]:
+    """Returns MuJoCo's options that :class:`SimConfig` replaces, by its fields."""
+    import mujoco
+
+    return {
+        "sim_dt": float(option.timestep),
+        "iterations": int(option.iterations),
+        "ls_iterations": int(option.ls_iterations),
+        "euler_damping": not option.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP),
+        "integrator": mujoco.mjtIntegrator(option.integrator).name.removeprefix("mjINT_").lower(),
+    }
 
 
 CONVERGED: dict[str, Any] = {"iterations": 100, "ls_iterations": 50, "euler_damping": True}

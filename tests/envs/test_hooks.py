@@ -558,7 +558,7 @@ BASE = {"model": DOG, "config": CONFIG, "reward": lambda self, s: s.time, "obser
 
 WRONG = [
     ({"reward": None}, TypeError, "must define reward"),
-    ({"config": None}, TypeError, "must set config"),
+    ({"config": 1}, TypeError, "config must be a torchrl_loco.SimConfig"),
     ({"model": "nowhere.xml"}, FileNotFoundError, "no model 'nowhere.xml'"),
     ({"reward": lambda self, s: s.qpos}, ValueError, r"must return shape \(4,\)"),
     ({"reward": lambda self, s: {"a": s.time, "b": 0.0}}, TypeError, r"reward\['b'\] must return a tensor"),
@@ -686,3 +686,37 @@ def test_the_model_as_text_path_and_spec(tmp_path, monkeypatch):
     assert spec.sensor("unread") is not None  # it stays as it was
     assert envs[0].sim.mj_model.nsensor == 0
     assert envs[0].mj_model.nsensor == 11
+
+
+DAMPED = """<mujoco><option timestep="0.004" iterations="7" integrator="implicitfast"/><worldbody>
+  <body name="a"><joint name="hinge" axis="0 1 0" damping="3"/><geom size=".1" pos="0 0 -.2"/></body></worldbody>
+  <actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+def test_options_of_a_model_that_config_replaces_are_said(caplog):
+    """And kept by a task without a config, or with one of the model."""
+    entries = {"model": DAMPED, "reward": lambda self, s: s.qpos[:, 0], "observation": lambda self, s: s.qpos}
+    own = {"config": SimConfig(ctrl_dt=0.02, sim_dt=0.005)}
+    env = type("Replacing", (LocoEnv,), {**entries, **own})(1, "cpu", 0)
+    said = "sim_dt 0.004 -> 0.005, iterations 7 -> 100, euler_damping True -> False"
+    assert any(f"Replacing: config replaces options of the model: {said};" in message for message in caplog.messages)
+    assert "'integrator': 'implicitfast -> euler'" in repr(env)
+    caplog.clear()
+    of_model = SimConfig.of(DAMPED, ctrl_dt=0.008, episode_length=20)
+    assert (of_model.ctrl_dt, of_model.episode_length, of_model.substeps) == (0.008, 20, 2)
+    for config in ({}, {"config": of_model}):
+        env = type("Keeping", (LocoEnv,), {**entries, **config})(1, "cpu", 0)
+        opt = env.mj_model.opt
+        kept = opt.timestep, opt.iterations, opt.integrator, opt.disableflags
+        assert kept == (0.004, 7, mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 0)
+        assert "replaced" not in repr(env) + caplog.text
+    assert type(env).config.ctrl_dt == 0.008
+    assert SimConfig.of(env.mj_model).ctrl_dt == 0.02  # the nearest to 0.02 s
+
+
+def test_a_body_without_a_floor_or_actuators_is_told_of(caplog):
+    floating = '<mujoco><worldbody><body name="a"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+    entries = {"model": floating, "reward": lambda self, s: s.time, "observation": lambda self, s: s.qpos}
+    type("Floating", (LocoEnv,), entries)(1, "cpu", 0)
+    assert "bodies fall for ever" in caplog.text
+    assert "no actuators" in caplog.text

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import difflib
 import inspect
+import logging
 import math
 import multiprocessing
 import os
@@ -11,7 +12,7 @@ import secrets
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import mujoco
 import numpy as np
@@ -33,7 +34,7 @@ from torchrl_loco.checks import (
     check_output_file,
     check_pair,
 )
-from torchrl_loco.config import SimConfig, sim_config
+from torchrl_loco.config import SimConfig, options_of, sim_config
 from torchrl_loco.envs.hooks import HOOKS, Hooks, check_commands, memory_shapes, own_hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.state import State, without_state, write_state
@@ -50,6 +51,13 @@ if TYPE_CHECKING:
 
 BOUNDED, UNBOUNDED = (-1.0, 1.0), (-math.inf, math.inf)
 """What ``action_range`` can be."""
+
+
+class _OfModel:
+    """Settings of a class that has none of its own: the options of its model."""
+
+    def __get__(self, env: "LocoEnv | None", cls: "type[LocoEnv]") -> SimConfig:
+        return SimConfig.of(models.load(cls.model, folder_of(cls)))
 
 
 class LocoEnv(EnvBase):
@@ -109,8 +117,9 @@ class LocoEnv(EnvBase):
 
     model: ClassVar[Path | str | mujoco.MjSpec]
     """Path of an MJCF file (relative to the file of the class), MJCF text, or a ``mujoco.MjSpec``."""
-    config: SimConfig
-    """Settings of the simulation under ``playground``. An instance's has all that was overridden."""
+    config: SimConfig = cast("SimConfig", _OfModel())
+    """Settings of the simulation under ``playground``; without any, the options of the model
+    (:meth:`torchrl_loco.SimConfig.of`). An instance's has all that was overridden."""
     memory: ClassVar[Mapping[str, int | tuple[int, ...]]] = {}
     """What a world remembers, as names and shapes of its rows, such as ``{"command": 3, "air_time": 4}``.
     ``s.command`` reads it; :meth:`update`, :meth:`events` and :meth:`begin` return new rows. The state holds it."""
@@ -182,6 +191,8 @@ class LocoEnv(EnvBase):
         self.num_envs, self.world_offset = worlds, world_offset
         self.seed = secrets.randbits(32) if seed is None else seed
         self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
+        self._replaced = self._replaced_options()
+        _say_what_is_missing(mj_model)
         self.stagger, self.compile_hooks, self.play = stagger, compile_hooks, play
         self.randomize, self.variation = varys, variation
         self.action_range = check_pair("action_range", self.action_range)  # a class may have a list or an array
@@ -228,9 +239,8 @@ class LocoEnv(EnvBase):
         """
         name, own = cls.__name__, own_hooks(cls)
         _warn_of_misspelt_names(cls)
-        missing = [attribute for attribute in ("model", "config") if not hasattr(cls, attribute)]
-        if missing:
-            raise TypeError(f"{name} must set {', '.join(missing)}: see help(torchrl_loco.LocoEnv)")
+        if not hasattr(cls, "model"):
+            raise TypeError(f"{name} must set model: see help(torchrl_loco.LocoEnv)")
         if not isinstance(cls.config, SimConfig):
             raise TypeError(f"{name}.config must be a torchrl_loco.SimConfig, got {cls.config!r}")
         if not isinstance(cls.model, str | Path | mujoco.MjSpec):
@@ -285,7 +295,33 @@ class LocoEnv(EnvBase):
         engine = self.engine if self.engine == "compiled" else f"{self.engine} ({self.engine_reason})"
         randomize = f", randomize={list(self.randomize)}" if self.randomize else ""
         contacts = "" if self.config.contacts == "all" else f", contacts={self.config.contacts!r}"
-        return f"{type(self).__name__}({num_envs=}, {device=}, {seed=}, {protocol=}, {engine=}{contacts}{randomize})"
+        replaced = f", replaced={self._replaced}" if self._replaced else ""
+        settings = f"{num_envs=}, {device=}, {seed=}, {protocol=}, {engine=}{contacts}{replaced}{randomize}"
+        return f"{type(self).__name__}({settings})"
+
+    def _replaced_options(self) -> dict[str, str]:
+        """Returns which options of the model ``config`` replaces, and logs them, unless both are this package's.
+
+        Of defaults, which an MJCF may not have named, it is the damping alone, where there is any.
+        """
+        owners = [next(each for each in type(self).__mro__ if name in vars(each)) for name in ("model", "config")]
+        if all(owner.__module__.startswith("torchrl_loco.tasks") for owner in owners):
+            return {}
+        of_model, default = options_of(self.mj_model.opt), options_of(mujoco.MjSpec().option)
+        default["euler_damping"] = False if self.mj_model.dof_damping.any() else of_model["euler_damping"]
+        replaced = {
+            name: f"{value} -> {new}"
+            for name, value in of_model.items()
+            if (new := getattr(self.config, name)) != value and value != default[name]
+        }
+        if said := {name: text for name, text in replaced.items() if name != "integrator"}:  # of which Simulation tells
+            listed = ", ".join(f"{name} {text}" for name, text in said.items())
+            logging.getLogger("torchrl_loco").warning(
+                "%s: config replaces options of the model: %s; SimConfig.of(model) keeps them",
+                type(self).__name__,
+                listed,
+            )
+        return replaced
 
     # The hooks of a task, in plain torch, in the order in which they are called.
 
@@ -868,6 +904,18 @@ def _warn_if_worlds_repeat() -> None:
 def rows_of(mask: torch.Tensor, entry: torch.Tensor) -> torch.Tensor:
     """Returns a mask of worlds, ``(*batch, 1)``, in a shape that broadcasts with an entry, ``(*batch, ...)``."""
     return mask.view(*mask.shape[:-1], *[1] * (entry.ndim - mask.ndim + 1))
+
+
+def _say_what_is_missing(m: mujoco.MjModel) -> None:
+    """Says in the log if a body that floats has nothing to stand on, or nothing moves it."""
+    say = logging.getLogger("torchrl_loco").warning
+    touching = (m.geom_contype | m.geom_conaffinity) != 0
+    fixed = m.body_weldid[m.geom_bodyid] == 0
+    floats = (m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).any()
+    if floats and m.opt.gravity.any() and not (touching & fixed).any() and m.npair == 0:
+        say("nothing that is fixed to the world touches anything: bodies fall for ever. Add a plane")
+    if m.nu == 0:
+        say("the model has no actuators: actions change nothing")
 
 
 def folder_of(cls: type) -> Path | None:

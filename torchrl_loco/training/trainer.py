@@ -115,6 +115,8 @@ class Trainer:
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
         self._non_finite, self._said = 0, set[str]()
+        self._alike: float | None = None  # the reward of the last batch, if there was only one
+        self._ends_at_once = False
         self._best = -math.inf  # the evaluation that selected the policy
         self._evaluator: Evaluator | None = None
         if not first:  # the networks began alike, from here on each rank draws actions of its own
@@ -200,6 +202,12 @@ class Trainer:
         ended = f"{self._non_finite} episodes have ended because a state, an observation or a reward was not finite"
         notes = {
             "non_finite": ended if self._non_finite else "",
+            "alike": f"the reward was {self._alike:g} in every step of every world: look at reward(self, s)"
+            if self._alike is not None
+            else "",
+            "ends_at_once": "every episode ended at its first step: look at terminated(self, s) and begin(self, s)"
+            if self._ends_at_once
+            else "",
             "algorithm": self.algorithm.note({key: [row[key]] for key in row}),
         }
         for kind, note in notes.items():
@@ -226,19 +234,31 @@ class Trainer:
         return self.frames + batches * self.frames_per_iteration
 
     def iterate(self) -> dict[str, float]:
-        """Returns the metrics of collecting a batch and updating on it; reads from the device once."""
+        """Returns the metrics of collecting a batch and updating on it; reads from the device once.
+
+        Raises:
+            ValueError: no step of it was finite.
+        """
         config, algorithm, start = self.config, self.algorithm, time.perf_counter()
         batch = self.collector.rollout()
         after = batch["next"]
         reward = after["reward"].mean() / config.action_repeat
         flags = (after[name].squeeze(-1) for name in ("done", "terminated"))
         ended = self.episodes.add(after["reward"].squeeze(-1), *flags)
+        spread, ends = after["reward"].max() - after["reward"].min(), after["done"].float().mean()
         terms = [after["reward_terms", name].mean() / config.action_repeat for name in self._terms]
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
         non_finite = self._base.health()["total", "non_finite"]
-        numbers = torch.cat([torch.stack([non_finite, reward, *terms]), ended, metrics])
-        non_finite, mean_reward, *means = distributed.mean_of_ranks(numbers).tolist()
-        self._non_finite = round(non_finite * distributed.ranks())
+        numbers = torch.cat([torch.stack([non_finite, spread, ends, reward, *terms]), ended, metrics])
+        non_finite, spread, ends, mean_reward, *means = distributed.mean_of_ranks(numbers).tolist()
+        before, self._non_finite = self._non_finite, round(non_finite * distributed.ranks())
+        if self._non_finite - before >= config.frames_per_batch * distributed.ranks():
+            raise ValueError(
+                f"there is nothing to learn from: in all steps of a batch of {self.run.path} a state, an observation or "
+                "a reward was not finite. torchrl-loco inspect shows the first, which its nan_dump.safetensors holds"
+            )
+        self._alike = mean_reward if spread == 0.0 else None
+        self._ends_at_once = ends == 1.0
         of_terms = [means.pop(0) for _ in self._terms]
         self.episodes.take(*(means.pop(0) * distributed.ranks() for _ in ended))
         self.frames += self.frames_per_iteration
