@@ -10,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 from cases import MODELS
 from generate import address
@@ -133,3 +134,12 @@ def test_citation_agrees_with_the_package():
     assert citation["type"] == "software"
     assert citation.get("repository-code", "") == address.ADDRESS
     assert all(citation[key] for key in ("message", "title", "authors"))
+
+
+@pytest.mark.ci
+def test_extras_combine():
+    """All of them at once, and so any two, as pip resolves them; torch is that of here."""
+    extras = ",".join(PROJECT["optional-dependencies"])
+    torch_here = f"torch=={torch.__version__.partition('+')[0]}"
+    command = sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--quiet"
+    run(*command, torch_here, f"{ROOT}[{extras}]", cwd=ROOT)

@@ -16,6 +16,7 @@ from variation import draw_rows, some_varied
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import Simulation
 from torchrl_loco.sim.compiled import step, unsupported
+from torchrl_loco.sim.overflow import Overflow
 
 STATES = 16
 FEW = 5
@@ -260,8 +261,8 @@ def compare(xml, count=STATES, *, vary=False, implicitfast=False):
     nominal = model
     for world, (row, *state) in enumerate(zip(rows, *starts, strict=True)):
         model = nominal if varied is None else varied.edited(row)
-        if sim.overflow[world]:
-            found["overflow"] += 1
+        if flags := int(sim.overflow[world]):
+            found["unsolved" if flags == Overflow.UNSOLVED else "overflow"] += 1
             continue
         data = c_data(model, *state)
         mujoco.mj_forward(model, data)
@@ -318,6 +319,7 @@ def test_a_step_agrees_with_c_mujoco(traced_dofs, count, monkeypatch):
     assert total["states"] > 4 * count
     assert total["close"] > 0.95 * total["states"]
     assert total["overflow"] < 0.01 * total["states"]
+    assert total["unsolved"] < 0.02 * total["states"]  # of models for which single precision may not be enough
     if count == 200:
         assert min(total[kind] for kind in (KINDS if traced_dofs else KINDS_OF_LANES)) > 50, total
 
@@ -339,6 +341,7 @@ def test_a_step_with_numbers_of_each_world_agrees_with_c_mujoco(traced_dofs, mon
     assert total["states"] > 4 * count
     assert total["close"] > 0.95 * total["states"]
     assert total["overflow"] < 0.01 * total["states"]
+    assert total["unsolved"] < 0.02 * total["states"]  # of models for which single precision may not be enough
 
 
 @pytest.mark.slow

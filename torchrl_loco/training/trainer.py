@@ -252,10 +252,10 @@ class Trainer:
         numbers = torch.cat([torch.stack([non_finite, spread, ends, reward, *terms]), ended, metrics])
         non_finite, spread, ends, mean_reward, *means = distributed.mean_of_ranks(numbers).tolist()
         before, self._non_finite = self._non_finite, round(non_finite * distributed.ranks())
-        if self._non_finite - before >= config.frames_per_batch * distributed.ranks():
+        if ends == 1.0 and self._non_finite - before >= config.frames_per_batch * distributed.ranks():
             raise ValueError(
-                f"there is nothing to learn from: in all steps of a batch of {self.run.path} a state, an observation or "
-                "a reward was not finite. torchrl-loco inspect shows the first, which its nan_dump.safetensors holds"
+                f"there is nothing to learn from: in all steps of a batch of {self.run.path} a state, observation or "
+                "reward was not finite. torchrl-loco inspect shows the first, which its nan_dump.safetensors holds"
             )
         self._alike = mean_reward if spread == 0.0 else None
         self._ends_at_once = ends == 1.0
