@@ -49,6 +49,8 @@ args = parser.parse_args()
 session = onnxruntime.InferenceSession(args.file)
 words, text = session.get_modelmeta().custom_metadata_map, ("task", "protocol", "torchrl_loco", "mjcf")
 facts = {name: word if name in text else json.loads(word) for name, word in words.items()}
+if "velocity" not in facts:
+    parser.error(f"{args.file} holds no policy that follows a velocity command, such as one of go1_velocity")
 offset, scale = np.array(facts["action_offset"]), np.array(facts["action_scale"])
 low, high = (facts["velocity"][f"command_{end}"] for end in ("low", "high"))
 if (np.array(args.command) < low).any() or (np.array(args.command) > high).any():

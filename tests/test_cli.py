@@ -121,3 +121,10 @@ def test_options_of_a_video_are_checked_first(capsys, tmp_path, monkeypatch):
             assert said.out == ""
             assert message in said.err
     assert [path.name for path in tmp_path.iterdir()] == ["taken.mp4"]
+
+
+def test_a_window_needs_a_display(monkeypatch, capsys):
+    monkeypatch.setattr("torchrl_loco.training.has_display", lambda: False)
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["play", "walker_walk", "--viewer=window"])
+    assert "no display for a window: pass --viewer browser" in capsys.readouterr().err

@@ -18,7 +18,7 @@ from tqdm.auto import trange
 import torchrl_loco
 from torchrl_loco.checks import check_choice, why_no_cuda
 from torchrl_loco.envs import State
-from torchrl_loco.registry import env_class, list_envs, make
+from torchrl_loco.registry import env_class, is_place, list_envs, make, task_name
 from torchrl_loco.sim.mujoco_warp import with_margin
 from torchrl_loco.sim.simulation import free_memory
 from torchrl_loco.sim.warp_init import init_warp
@@ -44,7 +44,7 @@ def diagnose(body: str = "walker") -> Iterator[Finding]:
     double precision, from the same state.
 
     Args:
-        body: the body, or a task; ``"all"`` takes every body, those of plug-ins too.
+        body: the body, or a task, which may be ``file.py:Class``; ``"all"`` takes every body, those of plug-ins too.
 
     Yields:
         What was found, line by line.
@@ -62,7 +62,9 @@ def diagnose(body: str = "walker") -> Iterator[Finding]:
     if body in tasks:
         tasks = {body: tasks[body]}
     elif body != "all":
-        tasks = {body: check_choice("body or task", body, list_envs(), also=[*tasks, "all"])}
+        if not is_place(body):
+            check_choice("body or task", body, list_envs(), also=[*tasks, "all"])
+        tasks = {body: task_name(body, by_user=True)}
     yield Finding("python", f"{platform.python_version()} on {platform.platform()}")
     yield Finding("torchrl-loco", torchrl_loco.__version__)
     for name in PACKAGES:

@@ -720,3 +720,8 @@ def test_a_body_without_a_floor_or_actuators_is_told_of(caplog):
     type("Floating", (LocoEnv,), entries)(1, "cpu", 0)
     assert "bodies fall for ever" in caplog.text
     assert "no actuators" in caplog.text
+
+
+def test_torchs_own_random_numbers_are_told_of(caplog):
+    type("Drawn", (WalkerWalk,), {"reward": lambda self, s: torch.rand(s.time.shape)})(2, "cpu", 0)
+    assert "draws by torch.rand instead of s.uniform" in caplog.text

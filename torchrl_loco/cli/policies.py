@@ -284,6 +284,11 @@ def play(
             viewer = "video"
         if viewer == "browser":
             browser.check()
+        if viewer == "window":
+            from torchrl_loco.training import has_display
+
+            if not has_display():
+                raise ValueError("there is no display for a window: pass --viewer browser or --viewer video")
         if viewer == "video":
             video.check_encoder()
         played, beside = _policy(run_or_task, protocol, video.device, policy, task)

@@ -22,7 +22,7 @@ SPREADS = (0.02, 2.0)
 """How far the numbers of a comparison are from those of worlds at rest: hooks may refuse wild ones, as an index."""
 TRACE = (
     "its trace gives another {} for other numbers: a hook takes numbers out of torch (numpy, tolist), or changes "
-    "something of its own at each call"
+    "something of its own at each call, or draws by torch.rand instead of s.uniform and s.normal"
 )
 KERNEL = "its kernel gives another {} than the hooks, which is an error of this package: please report it"
 COMPILED = "torch.compile gives another {} than the hooks"
