@@ -46,7 +46,7 @@ def _run(args: list[str]) -> None:
         options_type = task_options(args) if args[:1] == ["train"] else None
 
     def train(options: Annotated[options_type, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]
-        """Train a policy, with evaluation, learning curve and video. All settings: train TASK or FILE.py:CLASS --help."""
+        """Train a policy, with evaluation, curve and video. All settings: train TASK, or FILE.py:CLASS, --help."""
         runs.train(options, complete)
 
     commands: dict[str, Callable[..., None]] = {
