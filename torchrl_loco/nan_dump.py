@@ -43,7 +43,8 @@ class NanDump:
 
     def make_env(self, device: torch.device | str | None = None, **config: Any) -> LocoEnv:
         """Returns an environment of one world with the settings of the dump, and ``config`` on top."""
-        env, settings = _class_of(self.settings), {**self.settings["config"], **config}
+        of_file = dataclasses.asdict(SimConfig(**self.settings["config"]))  # nothing else, such as a file to write
+        env, settings = _class_of(self.settings), {**of_file, **config}
         arguments = (1, device, self.settings["seed"], self.settings["protocol"])
         varys = [Vary(**vary) for vary in self.settings.get("randomize", [])]
         return env(*arguments, world_offset=0, on_overflow="ignore", randomize=varys, **settings)
