@@ -17,7 +17,7 @@ from generate import address
 
 import torchrl_loco
 from hatch_build import absolute, urls
-from torchrl_loco.sim import models
+from torchrl_loco.config import SCENE
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -68,7 +68,7 @@ def test_wheel_holds_the_package_and_nothing_else(built):
         entry_points = wheel.read(f"{info}/entry_points.txt").decode()
     inside = {name for name in names if not name.startswith(info)}
     assert inside == files_below(ROOT / "torchrl_loco")
-    assert {path.relative_to(ROOT).as_posix() for path in [*MODELS.values(), models.SCENE]} < inside
+    assert {path.relative_to(ROOT).as_posix() for path in [*MODELS.values(), SCENE]} < inside
     assert {f"torchrl_loco/policies/playground/walker_{goal}.safetensors" for goal in ("stand", "walk", "run")} < inside
     assert "torchrl_loco/py.typed" in inside
     assert {f"{info}/licenses/LICENSE", f"{info}/licenses/NOTICE"} < names

@@ -3,9 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any
 
 from torchrl_loco.checks import check_choice, check_fields, check_multiple
+
+SCENE = Path(__file__).parent / "sim" / "scene.xml"
+"""What every model can include by its name, from any folder: light, materials, the look of the floor."""
 
 PROTOCOLS = ("playground", "dm_control")
 
@@ -46,7 +50,8 @@ class SimConfig:
             else ``mujoco_warp``.
         integrator: how velocities and positions advance: ``euler`` (semi-implicit), ``implicitfast``, or ``rk4``
             (under ``mujoco_warp`` only). It replaces the one that the model names, as ``sim_dt``, iterations and
-            ``euler_damping`` do: a line of the log and ``repr(env)`` say so, and :meth:`of` keeps those of the model.
+            ``euler_damping`` do. For tasks of yours a line of the log and ``repr(env)`` say so, where the model names
+            another than MuJoCo's default; :meth:`of` keeps those of the model.
         contacts: what bodies touch: ``all`` that the model says, or the ``ground``, that is, what is fixed to the
             world and not each other. Under both engines, and in :attr:`torchrl_loco.LocoEnv.mj_model`.
 
@@ -83,7 +88,8 @@ class SimConfig:
         """Returns settings that keep the options of a model: time step, integrator, iterations, damping.
 
         Args:
-            model: a ``mujoco.MjModel`` or ``MjSpec``, MJCF text, or the path of a file.
+            model: a ``mujoco.MjModel`` or ``MjSpec``, MJCF text, or the path of a file from the working directory; a
+                task without a config finds its model beside its own file.
             ctrl_dt: time between two actions (s); ``None`` is the multiple of the time step that is nearest to 0.02 s.
             others: further fields.
 
@@ -93,8 +99,7 @@ class SimConfig:
         import mujoco
 
         if not isinstance(model, mujoco.MjModel | mujoco.MjSpec):
-            is_text = isinstance(model, str) and model.lstrip().startswith("<")
-            model = mujoco.MjSpec.from_string(model) if is_text else mujoco.MjSpec.from_file(str(model))
+            model = read_mjcf(model)
         fields = options_of(model.opt if isinstance(model, mujoco.MjModel) else model.option)
         steps = max(1, round(0.02 / fields["sim_dt"]))
         return cls(**{"ctrl_dt": steps * fields["sim_dt"] if ctrl_dt is None else ctrl_dt, **fields, **others})
@@ -103,6 +108,16 @@ class SimConfig:
     def substeps(self) -> int:
         """Physics steps in one control step."""
         return round(self.ctrl_dt / self.sim_dt)
+
+
+def read_mjcf(source: Path | str) -> Any:
+    """Returns MJCF, a text or a file, as a ``mujoco.MjSpec``; an included ``scene.xml`` is ours if none lies there."""
+    import mujoco
+
+    scene = {SCENE.name: SCENE.read_bytes()}
+    if isinstance(source, str) and source.lstrip().startswith("<"):
+        return mujoco.MjSpec.from_string(source, scene)
+    return mujoco.MjSpec.from_file(str(source), {} if Path(source).with_name(SCENE.name).exists() else scene)
 
 
 def options_of(option: Any) -> dict[str, Any]:

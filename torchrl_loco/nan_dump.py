@@ -82,7 +82,7 @@ def load(path: Path, task: str | type[LocoEnv] | None = None) -> NanDump:
     env, file = dump.settings["env"], dump.settings.get("file")
     if task is not None:
         dump.settings["task"] = task_name(task, by_user=True)
-    elif file and env not in _classes():
+    elif file and env not in _classes() and not env.startswith("torchrl_loco."):
         dump.settings["task"] = place_of(f"{file}:{env.rpartition('.')[2]}", Path(path).parent)
     try:
         _class_of(dump.settings)

@@ -712,6 +712,8 @@ def test_options_of_a_model_that_config_replaces_are_said(caplog):
         assert "replaced" not in repr(env) + caplog.text
     assert type(env).config.ctrl_dt == 0.008
     assert SimConfig.of(env.mj_model).ctrl_dt == 0.02  # the nearest to 0.02 s
+    including = DAMPED.replace("<worldbody>", '<include file="scene.xml"/><worldbody>', 1)
+    assert SimConfig.of(including).iterations == 7
 
 
 def test_a_body_without_a_floor_or_actuators_is_told_of(caplog):

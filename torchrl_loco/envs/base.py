@@ -317,7 +317,7 @@ class LocoEnv(EnvBase):
         if said := {name: text for name, text in replaced.items() if name != "integrator"}:  # of which Simulation tells
             listed = ", ".join(f"{name} {text}" for name, text in said.items())
             logging.getLogger("torchrl_loco").warning(
-                "%s: config replaces options of the model: %s; SimConfig.of(model) keeps them",
+                "%s: config replaces options of the model: %s; without config, or by SimConfig.of(model), they stay",
                 type(self).__name__,
                 listed,
             )

@@ -346,11 +346,11 @@ class NanGuard(Monitor):
         else:
             try:
                 storage.save(self._path, NAN_DUMP, kept, settings)
-                if (file := self._settings["file"]) and not self._settings["env"].startswith("torchrl_loco."):
-                    known_files.remember(Path(file).resolve())
             except BaseException:
                 self._path.unlink()  # an empty file would keep a later one from being written
                 raise
             where = f"its state and action before that step are in {self._path}: see torchrl-loco inspect"
+            if (file := self._settings["file"]) and not self._settings["env"].startswith("torchrl_loco."):
+                known_files.remember(Path(file).resolve())
         step = counters["elapsed_steps"] + 1
         warn(f"world {world} became non-finite in step {step} of its episode; {where}", NonFiniteWarning)

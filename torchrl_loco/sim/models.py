@@ -8,8 +8,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-SCENE = Path(__file__).with_name("scene.xml")
-"""What every model can include by its name, from any folder: light, materials, the look of the floor."""
+from torchrl_loco.config import read_mjcf
 
 FOLDERS = ("assetdir", "meshdir", "texturedir")
 """Attributes of MJCF's compiler that name folders of files."""
@@ -77,11 +76,10 @@ def specification(source: Path | str | mujoco.MjSpec, folder: Path | None = None
     if isinstance(source, mujoco.MjSpec):
         return source.copy()
     if isinstance(source, str) and source.lstrip().startswith("<"):
-        return mujoco.MjSpec.from_string(source, {SCENE.name: SCENE.read_bytes()})
+        return read_mjcf(source)
     path = _path(source, folder)
-    own = path.with_name(SCENE.name).exists()
     try:
-        return mujoco.MjSpec.from_file(str(path), {} if own else {SCENE.name: SCENE.read_bytes()})
+        return read_mjcf(path)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 

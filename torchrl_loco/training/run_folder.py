@@ -141,7 +141,7 @@ class RunFolder:
     def keep_source(self) -> None:
         """Copies the file of its task, and what belongs to it, into ``source/``, and remembers it as the user's."""
         path = Path(self.task.rpartition(":")[0])
-        if path.suffix != ".py" or not path.is_file() or known_files.is_kept(path):
+        if path.suffix != ".py" or not path.is_file() or path.is_relative_to(self.path.resolve() / known_files.KEPT):
             return
         known_files.remember(path)
         cls, package = resolve(self.task), Path(known_files.__file__).parent

@@ -1727,7 +1727,7 @@ struct Step : Math {
   }
 
   // Solves H x = gradient, sets the search direction to -x, and adds x times the gradient before.
-  INLINE void factor_and_solve(Branches& h, float& decrement) const {
+  INLINE void factor_and_solve(Branches& h, const bool damping_alone, float& decrement) const {
     const bool limb = lane < LIMB_ROWS;
     const int end = Model::limb_row_end(limb ? lane : 0), skipped = LIMB - Model::limb_length(Model::limb_of_row(limb ? lane : 0));
     const int above = limb ? end - 1 - dof_of_row(lane) : -1, place = LIMB - 1 - above;  // rows to eliminate before
@@ -1833,7 +1833,7 @@ struct Step : Math {
     float y = h.gradient[0];
     UNROLLED for (int t = 0; t < TRUNK; ++t) y = y - h.trunk[0][t] * x[t];
     const float own_inverse = Math::inverse(h.diagonal[0]);
-    if (Model::DELICATE && ballot(lost | (limb & is_lost(whole[0], own_inverse)))) flag(UNSOLVED);
+    if (Model::DELICATE && !damping_alone && ballot(lost | (limb & is_lost(whole[0], own_inverse)))) flag(UNSOLVED);
     UNROLLED for (int j = 0; j < LIMB; ++j) {
       const float own = y * own_inverse, found = read(own, (lane - place + j) % LANES);
       if (limb && j == place) solution[0] = own;
@@ -1862,7 +1862,7 @@ struct Step : Math {
       Branches h;
       assemble(h, !damping_alone, diagonal, gradient);
       OWN_ROWS(hold, row) if (row < LIMB_ROWS + TRUNK) sums[0] += h.gradient[hold] * h.gradient[hold];
-      factor_and_solve(h, sums[1]);
+      factor_and_solve(h, damping_alone, sums[1]);
     }
 #endif
 //END

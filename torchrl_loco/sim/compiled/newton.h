@@ -69,7 +69,7 @@ ROLLED for (int iteration = 0; any_of_block(!done); ++iteration) {
     // On a parabola the slope is (alpha - 1) decrement. A difference is an error of s along s; across, it may be tenfold.
     const float rest = 1.0f - step.alpha, error = 10.0f * (Math::divide(step.slope, decrement) + rest);
     if (DELICATE && repeated && decrement > 1e-3f * before) failures |= UNSOLVED;  // steps of Newton's method gain far more
-    found = repeated || flat(Math::larger(rest * rest, error * error));
+    found = repeated || flat(Math::larger(error * error, rest * rest));
   }
   before = decrement;
 }
