@@ -1,5 +1,6 @@
 """Pixels against where the bodies are, and rendering changes nothing but pixels."""
 
+import mujoco
 import pytest
 import quickly
 import torch
@@ -43,6 +44,21 @@ def test_every_camera_sees_its_world_and_changes_nothing(shared, task, device):
     for camera, (pixels, kept) in pictures.items():
         assert not torch.equal(env.render(camera, 48, 36), kept)
         assert torch.equal(pixels, kept)  # a later picture does not overwrite an earlier one
+
+
+@pytest.mark.parametrize("task", BODIES)
+def test_the_floor_reaches_the_horizon_wherever_a_body_goes(shared, task):
+    env = shared(task, 2)
+    m = env.mj_model
+    free = m.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
+    along = 0 if free else int(m.joint("rootx").qposadr[0])
+    qpos = torch.tensor(m.qpos0, dtype=torch.float32).repeat(2, 1)
+    qpos[1, along] -= 60.0  # behind the end of the floors' size
+    env.reset(State({"qpos": qpos, "qvel": torch.zeros(2, m.nv)}, batch_size=[2]), set_state=True)
+    start, far = env.render("side", 48, 36)
+    lowest = far[-6:].float()
+    assert (lowest[..., 2] - lowest[..., 0]).max() < 60  # the sky is bluer than that
+    assert (start[-6:].float() - lowest).abs().mean() < 30
 
 
 def test_pixels_follow_the_state(shared):

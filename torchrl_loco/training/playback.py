@@ -8,6 +8,7 @@ import warnings
 from pathlib import Path
 
 from torchrl_loco.envs import LocoEnv
+from torchrl_loco.rendering import to_the_horizon
 from torchrl_loco.storage import replace_file
 from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.evaluation import PolicyFunc, play
@@ -63,8 +64,9 @@ def view(policy: PolicyFunc, env: LocoEnv, action_repeat: int = 1) -> None:
     """
     import mujoco.viewer  # needs a display
 
-    data = mujoco.MjData(env.mj_model)
-    with mujoco.viewer.launch_passive(env.mj_model, data) as window:
+    model = to_the_horizon(env.mj_model)
+    data = mujoco.MjData(model)
+    with mujoco.viewer.launch_passive(model, data) as window:
         with window.lock():  # a free camera would lose a body that runs
             window.cam.type, window.cam.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, 1
         while window.is_running():
@@ -72,7 +74,7 @@ def view(policy: PolicyFunc, env: LocoEnv, action_repeat: int = 1) -> None:
             for _ in play(policy, env, action_repeat, env.config.episode_length, "episode"):
                 data.qpos[:] = env.sim.qpos[0].cpu()
                 for update in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):  # all that is seen
-                    update(env.mj_model, data)
+                    update(model, data)
                 window.sync()
                 due += env.config.ctrl_dt
                 time.sleep(max(0.0, due - time.perf_counter()))
