@@ -5,6 +5,7 @@ import functools
 import hashlib
 import importlib
 import importlib.util
+import multiprocessing
 import re
 import shlex
 import sys
@@ -371,12 +372,43 @@ def _module_of_file(path: Path) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    _reading.append(path)
     try:
         spec.loader.exec_module(module)
+    except _ReadEnough:
+        pass
     except (Exception, SystemExit) as error:  # a file may raise anything
         del sys.modules[name]
         raise ImportError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from error
+    finally:
+        _reading.remove(path)
     return module
+
+
+class _ReadEnough(BaseException):
+    """A script was read up to where it trains."""
+
+
+_reading: list[Path] = []
+"""Files that run now because a class in them was named."""
+
+
+def check_is_run() -> None:
+    """Ends the reading of a script that trains outside of ``if __name__ == "__main__"``: it does not train twice.
+
+    Where its class was named, the reading ends here, and what is defined above is found.
+
+    Raises:
+        RuntimeError: a process that the script has started reads it.
+        _ReadEnough: this process does, for a class.
+    """
+    if _reading:
+        raise _ReadEnough
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise RuntimeError(
+            "a process that this script has started reads the script, and would train again: put what it does, beside "
+            'defining classes, under if __name__ == "__main__":'
+        )
 
 
 def _name_of(path: Path) -> str:

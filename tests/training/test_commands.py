@@ -96,7 +96,7 @@ def test_a_finished_run_is_trained_on(ppo_run, tmp_path, capsys):
     assert run.is_finished
     with pytest.raises(SystemExit, match="2"):
         cli.main(["resume", str(run.path), "--total_frames", "384"])
-    assert "must be more than the 512 frames" in capsys.readouterr().err
+    assert "must be at least the 512 frames" in capsys.readouterr().err
     assert run.load_config().total_frames == 512
 
 

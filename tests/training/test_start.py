@@ -1,6 +1,7 @@
 """``train``: what it takes, what it returns, and how what was handed in as an object is continued."""
 
 import json
+import multiprocessing
 import re
 import shutil
 import sys
@@ -245,6 +246,10 @@ def test_a_class_in_a_file(tmp_path, monkeypatch, capsys):
         assert f"there is no file {file}" in capsys.readouterr().err
     for command in commands:
         assert cli.main([*command, f"--task={moved}:StandShaky"]) == 0
+    assert [copy.read_text() for copy in (path / "source").iterdir()] == [moved.read_text()]
+    moved.unlink()
+    forget(monkeypatch)
+    assert cli.main(commands[0]) == 0
     assert cli.main(["plot", str(path), "--out=curve.png"]) == 0
 
 
@@ -371,7 +376,7 @@ def test_a_refused_resume_changes_nothing(ppo_run, tmp_path):
     run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
     run.append_metrics({**{name: values[-1] for name, values in run.read_metrics().items()}, "frames": 384})
     before = {file: file.read_bytes() for file in run.path.iterdir() if file.is_file()}
-    with pytest.raises(ValueError, match="must be more than the 256 frames"):
+    with pytest.raises(ValueError, match="must be at least the 256 frames"):
         train("walker_stand", resume=run, total_frames=128)
     with pytest.raises(ValueError, match="no device 'cuda:99' on this machine"):
         train("walker_stand", resume=run, total_frames=512, device="cuda:99")
@@ -430,3 +435,23 @@ def test_what_cannot_teach_anything_is_said(tmp_path, capsys):
         train(tasks[name], algorithm="ppo", device="cpu", out=tmp_path, **{**SMALL, "action_repeat": 1})
         said = capsys.readouterr()
         assert (said.out + said.err).count(note) == 1
+
+
+def test_a_script_that_is_read_for_its_class_does_not_train_again(tmp_path, monkeypatch):
+    script = tmp_path / "trains.py"
+    script.write_text(
+        "import torchrl_loco\n"
+        "from torchrl_loco.training import train\n"
+        "class Slowly(torchrl_loco.WalkerWalk):\n"
+        "    target_speed = 0.25\n"
+        f"train(Slowly, out={str(tmp_path / 'runs')!r})\n"
+        "raise AssertionError\n"
+    )
+    assert registry.resolve(f"{script}:Slowly", by_user=True).target_speed == 0.25
+    assert not (tmp_path / "runs").exists()
+    monkeypatch.setattr(
+        multiprocessing.current_process(), "_inheriting", True, raising=False
+    )  # a child reads its script
+    with pytest.raises(RuntimeError, match="would train again: put what it does"):
+        train("walker_walk", out=tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()

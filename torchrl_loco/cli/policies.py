@@ -457,6 +457,7 @@ def verify(
         else:
             path, in_run = _exported_for(run_task_or_file, protocol, policy, task, Path(folder))
             out, named = in_run if out is None else out, None
+        print(f"verifying: {conditions.episodes} episodes, which take minutes on a CPU", file=sys.stderr, flush=True)
         report = verify(path, conditions, device, alone=alone, task=named)
         print(*report.lines, sep="\n")
         if out is not None:

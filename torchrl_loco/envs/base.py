@@ -308,11 +308,12 @@ class LocoEnv(EnvBase):
         if all(owner.__module__.startswith("torchrl_loco.tasks") for owner in owners):
             return {}
         of_model, default = options_of(self.mj_model.opt), options_of(mujoco.MjSpec().option)
-        default["euler_damping"] = False if self.mj_model.dof_damping.any() else of_model["euler_damping"]
+        if self.config.integrator != "euler" or not self.mj_model.dof_damping.any():
+            del of_model["euler_damping"]
         replaced = {
             name: f"{value} -> {new}"
             for name, value in of_model.items()
-            if (new := getattr(self.config, name)) != value and value != default[name]
+            if (new := getattr(self.config, name)) != value and (value != default[name] or name == "euler_damping")
         }
         if said := {name: text for name, text in replaced.items() if name != "integrator"}:  # of which Simulation tells
             listed = ", ".join(f"{name} {text}" for name, text in said.items())

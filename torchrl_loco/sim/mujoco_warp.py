@@ -122,6 +122,13 @@ def with_margin(needed: int) -> int:
     return math.ceil(needed * MARGIN)
 
 
+def _instead(m: mujoco.MjModel) -> str:
+    """Returns what to write in an MJCF for what MuJoCo-Warp does not have."""
+    if m.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
+        return ' Write <option solver="Newton"/>, or leave solver out'
+    return ""
+
+
 class MujocoWarpEngine:
     """Steps all worlds with MuJoCo-Warp.
 
@@ -160,7 +167,10 @@ class MujocoWarpEngine:
         self._num_envs, self._device = num_envs, device
         self._substeps = config.substeps
         with wp.ScopedDevice(device):
-            self.model = mjw.put_model(mj_model)
+            try:
+                self.model = mjw.put_model(mj_model)
+            except NotImplementedError as error:
+                raise ValueError(f"MuJoCo-Warp cannot step this model: {error}{_instead(mj_model)}") from error
             self.data = mjw.make_data(
                 with_every_row(mj_model, varied), nworld=num_envs, naconmax=config.naconmax, njmax=config.njmax
             )

@@ -144,12 +144,18 @@ class RunFolder:
         if path.suffix != ".py" or not path.is_file() or path.is_relative_to(self.path.resolve() / known_files.KEPT):
             return
         known_files.remember(path)
-        cls, package = resolve(self.task), Path(known_files.__file__).parent
+        cls, package, folder = resolve(self.task), Path(known_files.__file__).parent, self.path / known_files.KEPT
+        copies = {}
         for file in [*known_files.with_imports(path), *models.files(cls.model, folder_of(cls))]:
             if file.is_relative_to(path.parent) and not file.is_relative_to(package):
-                copy = self.path / known_files.KEPT / file.relative_to(path.parent)
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                storage.replace_file(copy, file.read_bytes())
+                copies[folder / file.relative_to(path.parent)] = file
+        if copies.pop(folder / path.name, None):
+            copies[folder / Path(self.load_config().task.rpartition(":")[0]).name] = path  # by which the run finds it
+        for copy, file in copies.items():
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            storage.replace_file(copy, file.read_bytes())
+        for gone in set(folder.rglob("*.py")) - copies.keys():
+            gone.unlink()
 
     def store_config(self, config: TrainingConfig) -> None:
         """Stores the settings that :meth:`load_config` returns from then on."""
@@ -277,6 +283,12 @@ class RunFolder:
         buffer = io.BytesIO()  # torch's own writer does not say what went wrong
         torch.save({"version": CHECKPOINT_VERSION, **entries}, buffer)
         storage.replace_file(self.checkpoint, buffer.getbuffer())
+
+    def remove_parts(self) -> None:
+        """Removes what a process that was killed had written of a checkpoint or a policy; the lock must be taken."""
+        for whole in (self.checkpoint, self.policy):
+            for part in self.path.glob(f"{whole.name}.*.part"):
+                part.unlink()
 
     def load_checkpoint(self, device: torch.device | str) -> dict[str, Any]:
         """Reads the checkpoint without executing code.

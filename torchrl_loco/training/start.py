@@ -11,7 +11,7 @@ from typing import Any
 from torchrl.envs import EnvBase
 
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.registry import is_place, task_name
+from torchrl_loco.registry import check_is_run, is_place, task_name
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
@@ -58,12 +58,14 @@ def train(
     Raises:
         ValueError: an argument is out of range or does not fit; the message names what is valid.
         TypeError: an argument has the wrong type, or the network has a layer that a policy's file cannot hold.
+        RuntimeError: a script without ``if __name__ == "__main__"`` is read by a process that it has started.
         KeyboardInterrupt: Ctrl-C, after a checkpoint; the call that continues is printed.
 
     Example:
         >>> run = training.train("walker_walk", total_frames=4_000_000)  # doctest: +SKIP
         >>> policy = run.load_policy()  # doctest: +SKIP
     """
+    check_is_run()
     given = Given(
         env=task if isinstance(task, EnvBase) else None,
         network=network,

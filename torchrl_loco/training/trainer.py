@@ -74,6 +74,8 @@ class Trainer:
         self.run = run
         changes = {"total_frames": total_frames, "device": device}
         taken = distributed.is_first() and lock(run.path)
+        if taken:
+            run.remove_parts()
         try:
             self._make(given or Given(), resume, {name: new for name, new in changes.items() if new is not None})
         except BaseException:
@@ -319,6 +321,8 @@ class Trainer:
     def _finish(self) -> None:
         """Evaluates the best policy in episodes that did not select it, plots the learning curve, records a video."""
         config = self.config
+        recording = ", and its video is recorded" if config.video_seconds > 0 else ""
+        print(f"all frames are done: the best policy plays {config.eval_episodes} new episodes{recording}", flush=True)
         policy = Policy.load(self.run.policy, config.device)
         summary = self._summary(policy, final=True)
         plot_runs([self.run], self.run.path / "learning_curve.png")
@@ -371,7 +375,7 @@ class Trainer:
         self.frames, self.iteration, self.seconds = (checkpoint[key] for key in ("frames", "iteration", "seconds"))
         if total_frames < self.frames:
             raise ValueError(
-                f"total_frames must be more than the {self.frames} frames of {self.run.path}, got {total_frames}"
+                f"total_frames must be at least the {self.frames} frames of {self.run.path}, got {total_frames}"
             )
         if self.frames >= self.last_frame and self.run.is_finished:
             raise ValueError(
@@ -387,7 +391,8 @@ class Trainer:
         before = 1 + len(checkpoint.get("further_ranks", ()))  # a checkpoint without is of one process
         kind = "cpu" if checkpoint["cuda_rng"] is None else "cuda"
         same_ranks, same_kind = before == distributed.ranks(), kind == self.algorithm.device.type
-        self.algorithm.load_state_dict(checkpoint["algorithm"], draws=same_ranks and same_kind)
+        same = {} if same_ranks and same_kind else {"draws": False}  # which a user's algorithm may not take
+        self.algorithm.load_state_dict(checkpoint["algorithm"], **same)
         self.trials.load_state_dict(checkpoint["trials"])
         if distributed.is_first():
             means = [row["mean"] for row in self.run.read_evaluations() if row["frames"] <= self.frames]

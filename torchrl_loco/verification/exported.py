@@ -33,6 +33,7 @@ class Exported:
         FileNotFoundError: there is no such file.
         ValueError: it is no exported policy, or does not say what the policy observes; or it has no model, and its task
             is not at hand.
+        UnnamedFileError: its task is in a file that the user has not named.
     """
 
     def __init__(self, path: Path, task: str | None = None) -> None:
