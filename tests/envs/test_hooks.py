@@ -704,7 +704,7 @@ def test_options_of_a_model_that_config_replaces_are_said(caplog):
     explicit = DAMPED.replace("/><worldbody>", '><flag eulerdamp="disable"/></option><worldbody>', 1)
     config = SimConfig(ctrl_dt=0.02, sim_dt=0.004, euler_damping=True)
     env = type("Damping", (LocoEnv,), {**entries, "model": explicit, "config": config})(1, "cpu", 0)
-    assert "euler_damping False -> True" in repr(env)
+    assert "'euler_damping': 'False -> True'" in repr(env)
     caplog.clear()
     of_model = SimConfig.of(DAMPED, ctrl_dt=0.008, episode_length=20)
     assert (of_model.ctrl_dt, of_model.episode_length, of_model.substeps) == (0.008, 20, 2)
