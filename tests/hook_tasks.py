@@ -170,3 +170,13 @@ registry.register("dog_follow", FollowVelocity)
 registry.register("walker_backwards", WalkBackwards)
 registry.register("walker_blindly", WalkBlindly)
 registry.register("walker_unsteady", Unsteady)
+
+
+class Still:
+    """A policy that does nothing."""
+
+    def __init__(self, env):
+        self.env = env
+
+    def __call__(self, td):
+        return td.set("action", self.env.action_spec.zero())

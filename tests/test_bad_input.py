@@ -27,6 +27,8 @@ BAD = {
     "randomize": (3, TypeError),
     "compile_hooks": (1, TypeError),
     "play": ("yes", TypeError),
+    "metrics": (1, TypeError),
+    "observation_terms": ("all", TypeError),
     "on_overflow": ("shout", ValueError),
     "nan_dump": ("no/such/folder/file", ValueError),
     "ctrl_dt": (0.003, ValueError),

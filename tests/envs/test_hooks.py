@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cases import COARSE
-from hook_tasks import DOG, WalkBackwards, WalkBlindly
+from hook_tasks import DOG, Still, WalkBackwards, WalkBlindly
 from oracle import tolerance as numpy_tolerance
 
 from torchrl_loco import LocoEnv, SimConfig, State, Vary, WalkerWalk
@@ -95,16 +95,6 @@ def everything(request):
         env.mj_model.opt.disableflags = flags
         every.append(data)
     return env, td, every
-
-
-class Still:
-    """A policy that does nothing."""
-
-    def __init__(self, env):
-        self.env = env
-
-    def __call__(self, td):
-        return td.set("action", self.env.action_spec.zero())
 
 
 def by_world(td, name, every, expected, atol=2e-5):
@@ -585,7 +575,7 @@ WRONG = [
     ({"reward": lambda self, s: {}}, ValueError, "tensors by name"),
     ({"observation": lambda self, s: {"memory": s.qpos}}, ValueError, "'memory' is no name"),
     ({"memory": {"a": 4}, "begin": lambda self, s: {"a": s.time}}, ValueError, r"a of shape \(4, 4\)"),
-    ({"reward": lambda self, s: s.comand}, AttributeError, "the memory has no entries"),
+    ({"reward": lambda self, s: s.comand}, AttributeError, "memory, shared and constants have no entries"),
     ({"reward": lambda self, s: s.model("geom_fiction")}, AttributeError, "no array 'geom_fiction'"),
     ({"reward": lambda self, s: s.joint_qpos(".*")[:, 0]}, ValueError, "name a free or ball joint alone"),
     ({"reward": lambda self, s: s.sensor("unread")[:, 0], "engine": "compiled"}, ValueError, "'unread'"),

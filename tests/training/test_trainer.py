@@ -10,14 +10,14 @@ import imageio.v3 as imageio
 import pytest
 import torch
 from compare import assert_same
-from small_runs import SMALL, WALKER, made, networks, trained
+from small_runs import EPISODE, SMALL, WALKER, made, networks, small_walker, trained
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torchrl_loco
 from torchrl_loco import NonFiniteWarning, cli, nan_dump
 from torchrl_loco.policy import Policy
 from torchrl_loco.tasks.walker import Walker
-from torchrl_loco.training import RunFolder, Trainer, evaluate_run, preset, trainer
+from torchrl_loco.training import RunFolder, Trainer, evaluate_run, preset, train, trainer
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.evaluation import Evaluator
 from torchrl_loco.training.interrupts import interruptible
@@ -332,3 +332,41 @@ def test_a_run_on_cuda(algorithm, compiled, tmp_path):
     assert all(value.isfinite().all() for value in after.values())
     assert any((value != before[name]).any() for name, value in after.items() if "weight" in name)
     assert evaluate_run(run, device="cpu")["mean"] > 0
+
+
+class Levels(Walker):
+    """A level of each world rises with its episodes; what all have done is shared, and both are logged."""
+
+    target_speed = 0.0
+    memory = {"level": ()}
+    shared = {"steps": ()}
+
+    def metrics(self, s):
+        return {"level": s.level, "steps": s.steps.expand(s.num_envs)}
+
+    def adapt(self, s):
+        return {"steps": s.steps + 1.0}
+
+    def observation(self, s):
+        return {"observation": {"walker": super().observation(s), "level": s.level}}
+
+    def begin(self, s):
+        return {**super().begin(s), "level": s.level + 1.0}
+
+
+def test_metrics_are_logged_and_a_curriculum_is_judged_where_it_is(tmp_path):
+    with small_walker():
+        run = train(Levels, out=tmp_path, device="cpu", eval_interval=128, logger=("csv",), **SMALL)
+        rows, evaluations, policy = run.read_metrics(), run.read_evaluations(), run.load_policy("cpu")
+        steps = 2 * 8 * SMALL["action_repeat"]
+        assert rows["metric/steps"] == [17.0, 49.0]  # in the last of the four frames of each action
+        assert rows["metric/level"][0] < rows["metric/level"][1]
+        reached = policy.info["stage"]["memory"]["level"]
+        assert len(reached) == SMALL["num_envs"]
+        assert policy.info["stage"]["shared"]["steps"] in (steps / 2, steps)
+        # Each episode begins with a reset, which raises the level of a world of the training that it goes on from.
+        least = [evaluation["metric/level"] for evaluation in evaluations]
+        assert 2.0 <= least[0] <= least[1]
+        assert evaluations[1]["metric/steps"] == pytest.approx(steps + (EPISODE - 1) / 2)
+        longer = train(Levels, resume=run, total_frames=512)
+        assert longer.read_metrics()["metric/steps"][2] == 81.0

@@ -35,7 +35,7 @@ from torchrl_loco.checks import (
     check_pair,
 )
 from torchrl_loco.config import SimConfig, options_of, sim_config
-from torchrl_loco.envs.hooks import HOOKS, Hooks, check_commands, memory_shapes, own_hooks
+from torchrl_loco.envs.hooks import HOOKS, Hooks, check_commands, declared, own_hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.state import State, without_state, write_state
 from torchrl_loco.envs.variation import Variation, constant_of
@@ -51,6 +51,14 @@ if TYPE_CHECKING:
 
 BOUNDED, UNBOUNDED = (-1.0, 1.0), (-math.inf, math.inf)
 """What ``action_range`` can be."""
+
+
+STAGE_WORLDS = 64
+"""Of how many worlds a stage keeps the memory, at most."""
+
+
+NESTED = ("reward_terms", "metrics", "observation_terms")
+"""Entries of a step that are TensorDicts."""
 
 
 class _OfModel:
@@ -82,6 +90,9 @@ class LocoEnv(EnvBase):
             step different worlds pass different offsets: worker k of n worlds each passes ``k * n``. ``None`` means 0.
         reward_terms: whether to return each term of the reward, if it has any, under
             ``("next", "reward_terms", name)``.
+        observation_terms: whether to return each term of the observation, if it has names, also apart, under
+            ``("observation_terms", group, name)``; of a history it is the newest.
+        metrics: whether to call :meth:`metrics`, and return each number under ``("next", "metrics", name)``.
         stagger: whether a full ``reset()`` starts each world at a random point of its time limit, so that the worlds
             are not truncated together.
         on_overflow: what to do when the physics dropped contacts or constraints for want of room: ``"warn"``,
@@ -120,9 +131,25 @@ class LocoEnv(EnvBase):
     config: SimConfig = cast("SimConfig", _OfModel())
     """Settings of the simulation under ``playground``; without any, the options of the model
     (:meth:`torchrl_loco.SimConfig.of`). An instance's has all that was overridden."""
-    memory: ClassVar[Mapping[str, int | tuple[int, ...]]] = {}
-    """What a world remembers, as names and shapes of its rows, such as ``{"command": 3, "air_time": 4}``.
+    memory: ClassVar[Mapping[str, Any]] = {}
+    """What a world remembers, by name: the shape of a row, its dtype, or both, such as
+    ``{"command": 3, "frame": torch.int32, "bins": ((4,), torch.int32)}``; floats of float32, int32, int64 or bool.
     ``s.command`` reads it; :meth:`update`, :meth:`events` and :meth:`begin` return new rows. The state holds it."""
+    shared: ClassVar[Mapping[str, Any]] = {}
+    """What all worlds have in common, by name, as for :attr:`memory`: it begins as zeros, ``s.name`` reads it,
+    :meth:`adapt` returns new values after each step. The state holds it. A world of such a task depends on its
+    neighbours; in training on several GPUs each rank has its own."""
+    constants: ClassVar[Any] = {}
+    """Tables that never change, tensors or arrays by name, or a method that returns them once: ``s.name`` reads them
+    on the device. ``s.table[s.frame]`` looks up a row in each world; where an index is out of range it gives NaN, which
+    :meth:`health` counts as ``index_error``."""
+    noise: ClassVar[Mapping[str, Any]] = {}
+    """By term of the observation, the most that is added to its numbers or taken away, drawn uniformly at each step; or
+    that and the name of an entry of :attr:`memory` that is added too, an offset, such as ``{"gravity": 0.05,
+    "joint_positions": (0.01, "bias")}``. The policy's groups have it, ``privileged`` has not; nor has it in play."""
+    history: ClassVar[Mapping[str, int]] = {}
+    """By group of the observation, how many of the last ones it has, with noise, the newest last; at a reset all are
+    the first. The state holds them."""
     command_ranges: ClassVar[Mapping[str, Mapping[str, tuple[float, float]]]] = {}
     """Entries of :attr:`memory` that are commands: by entry, the name of each of its numbers, with its unit, and the
     least and greatest value, such as ``{"command": {"forward (m/s)": (-1.0, 2.0)}}``. With ``play=True`` they can be
@@ -154,6 +181,8 @@ class LocoEnv(EnvBase):
         *,
         world_offset: int | None = None,
         reward_terms: bool = False,
+        observation_terms: bool = False,
+        metrics: bool = False,
         stagger: bool = False,
         on_overflow: str = "warn",
         nan_dump: Path | str | None = None,
@@ -177,6 +206,7 @@ class LocoEnv(EnvBase):
         elif seed is not None:
             _warn_if_worlds_repeat()
         reward_terms, stagger = check_bool("reward_terms", reward_terms), check_bool("stagger", stagger)
+        with_metrics, apart = check_bool("metrics", metrics), check_bool("observation_terms", observation_terms)
         compile_hooks, play = check_bool("compile_hooks", compile_hooks), check_bool("play", play)
         check_choice("on_overflow", on_overflow, ON_OVERFLOW)
         nan_dump = None if nan_dump is None else check_output_file("nan_dump", nan_dump)
@@ -193,6 +223,7 @@ class LocoEnv(EnvBase):
         self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
         self._replaced = self._replaced_options()
         _say_what_is_missing(mj_model)
+        self.with_metrics = with_metrics
         self.stagger, self.compile_hooks, self.play = stagger, compile_hooks, play
         self.randomize, self.variation = varys, variation
         self.action_range = check_pair("action_range", self.action_range)  # a class may have a list or an array
@@ -202,7 +233,9 @@ class LocoEnv(EnvBase):
         self._world: World | None = None
         self._episodes: torch.Tensor | None = None  # of a closed environment
         self.hooks = (
-            Hooks(self, mj_model) if own_hooks(type(self)) or self.memory or models.has_home(mj_model) else None
+            Hooks(self, mj_model)
+            if own_hooks(type(self)) or self.memory or self.shared or models.has_home(mj_model)
+            else None
         )
         own = self.hooks.own if self.hooks else frozenset()
         self.groups = dict(self.hooks.groups) if self.hooks else {}
@@ -210,6 +243,9 @@ class LocoEnv(EnvBase):
             self.groups["observation"] = (self.observation_size,)
         if self.hooks and self.hooks.term_names is not None:
             self.term_names = self.hooks.term_names
+        self.metric_names = self.hooks.metric_names if self.hooks else ()
+        self.observation_layout = dict(self.hooks.terms) if self.hooks else {}
+        self._apart = {group: sizes for group, sizes in self.observation_layout.items() if sizes and apart}
         if "observation" in self.groups:
             self.observation_size = math.prod(self.groups["observation"])
         self.reward_terms = reward_terms and len(self.term_names) > 0
@@ -220,7 +256,8 @@ class LocoEnv(EnvBase):
     def _without_unread_sensors(self, own: frozenset[str]) -> mujoco.MjModel:
         """Returns the model that is stepped: without sensors that no hook asks an engine for, if hooks do all."""
         model, stepped = self.mj_model, self.mj_model
-        if self.hooks and model.nsensor and {"reward", "observation"} <= own:
+        by_warp = self.hooks and "warp" in self.hooks.catalog.arrays
+        if self.hooks and model.nsensor and {"reward", "observation"} <= own and not by_warp:
             kept = sorted(self.hooks.catalog.sensors)
             stepped = models.load(self.model, folder_of(type(self)), kept)
             sizes = [int(size) for size in model.sensor_dim[kept]]
@@ -261,7 +298,7 @@ class LocoEnv(EnvBase):
             raise ValueError(f"{name}.action_range must be (-1, 1) or (-inf, inf), got {cls.action_range!r}")
         if action_range == UNBOUNDED and "control" not in own:
             raise TypeError(f"{name} has actions without bounds, so it must define control(self, s, action)")
-        check_commands(cls, memory_shapes(cls))
+        check_commands(cls, declared(cls)[0])
         check_randomize(f"{name}.randomize", cls.randomize)
         # Of the package's own functions only LocoEnv's reads the table.
         if cls.pose_func is not LocoEnv.pose_func and cls.pose_func.__module__.startswith("torchrl_loco."):
@@ -333,35 +370,60 @@ class LocoEnv(EnvBase):
             s: the worlds before the physics.
             action: ``(num_envs, nu)``, clipped to :attr:`action_range`, zero in worlds where one is not finite.
         """
-        raise NotImplementedError
+        low, high = s.model("actuator_ctrlrange").unbind(-1)
+        return 0.5 * (low + high) + 0.5 * (high - low) * action
 
     def update(self, s: "View") -> Mapping[str, torch.Tensor]:
         """Returns new rows of :attr:`memory` by name, after the physics: what the reward must know of the past."""
-        raise NotImplementedError
+        return {}
 
     def reward(self, s: "View") -> torch.Tensor | Mapping[str, torch.Tensor]:
-        """Returns the reward ``(num_envs,)``, or its terms by name, which are summed."""
-        raise NotImplementedError
+        """Returns the reward ``(num_envs,)``, or its terms by name, which are summed.
+
+        By default it is that of the class's Warp function, if it has one: what ``super().reward(s)`` returns.
+        """
+        return s._by_warp("reward")
 
     def terminated(self, s: "View") -> torch.Tensor:
         """Returns whether the episode ends, bool ``(num_envs,)``; by default never."""
-        raise NotImplementedError
+        return torch.zeros(s.num_envs, dtype=torch.bool, device=s.device)
+
+    def metrics(self, s: "View") -> Mapping[str, torch.Tensor]:
+        """Returns numbers of each world for the log alone, by name, each ``(num_envs,)``, such as an error in m.
+
+        It is called where they are read: in training, and with ``metrics=True``.
+        """
+        return {}
 
     def events(self, s: "View") -> Mapping[str, torch.Tensor]:
         """Returns rows for what comes next, by name: of :attr:`memory` (a new command, the last action), qpos, qvel."""
-        raise NotImplementedError
+        return {}
 
-    def observation(self, s: "View") -> torch.Tensor | Mapping[str, torch.Tensor]:
-        """Returns the observation ``(num_envs, n)``, or several by name: ``privileged`` is the critic's."""
-        raise NotImplementedError
+    def adapt(self, s: "View") -> Mapping[str, torch.Tensor]:
+        """Returns new values of :attr:`shared` by name, after the events; it alone may sum over worlds.
+
+        ``s.terminated`` tells whose episode has ended. Sums of floats have a fixed order, so that runs repeat.
+        """
+        return {}
+
+    def observation(self, s: "View") -> torch.Tensor | Mapping[str, torch.Tensor | Mapping[str, torch.Tensor]]:
+        """Returns the observation ``(num_envs, n)``, or several by name: ``privileged`` is the critic's.
+
+        Each may be terms by name, ``(num_envs, ...)``, which are joined in their order:
+        ``{"observation": {"gravity": ..., "joint_positions": ...}, "privileged": {...}}``. :attr:`noise` and
+        :attr:`history` go by these names.
+
+        By default it is that of the class's Warp function, if it has one: what ``super().observation(s)`` returns.
+        """
+        return s._by_warp("observation")
 
     def begin(self, s: "View") -> Mapping[str, torch.Tensor]:
         """Returns rows that begin an episode, by name: qpos, qvel, and of :attr:`memory`.
 
         What is not returned begins as zero, ``qpos`` as ``s.home``. The worlds are at rest; ``s`` shows the memory that
-        the last episode left.
+        the last episode left. By default a Warp function or table of the class begins it, if it has one.
         """
-        return {}
+        return s._begun_by_warp()
 
     # Looking at a policy.
 
@@ -505,6 +567,19 @@ class LocoEnv(EnvBase):
         if self.reward_terms:
             terms = {name: Unbounded((*batch, 1), **as_float) for name in self.term_names}
             observation["reward_terms"] = Composite(terms, shape=batch, device=device)
+        if self.metric_names:
+            metrics = {name: Unbounded((*batch, 1), **as_float) for name in self.metric_names}
+            observation["metrics"] = Composite(metrics, shape=batch, device=device)
+        if self._apart:
+            apart = {
+                group: Composite(
+                    {name: Unbounded((*batch, size), **as_float) for name, size in sizes.items()},
+                    shape=batch,
+                    device=device,
+                )
+                for group, sizes in self._apart.items()
+            }
+            observation["observation_terms"] = Composite(apart, shape=batch, device=device)
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.observation_spec = Composite(observation, shape=batch, device=device)
         bounded, actions = self.action_range == BOUNDED, (*batch, self.mj_model.nu)
@@ -561,20 +636,18 @@ class LocoEnv(EnvBase):
             self._set_state(tensordict, mask)
         else:
             self.world.reset(mask, stagger=self.stagger and mask is None)
-        result = self._outputs()
-        if self.reward_terms:
-            result.get("reward_terms").zero_()  # nothing was rewarded yet
-        return result
+        everywhere = torch.ones((*self.batch_size, 1), dtype=torch.bool, device=self.device)
+        return self._outputs(unrewarded=everywhere)
 
     def _outputs(self, *, with_reward: bool = False, unrewarded: torch.Tensor | None = None) -> TensorDict:
         """Returns a copy of what the kernels wrote: the buffers themselves change at the next step.
 
         Args:
             with_reward: whether the reward is in it.
-            unrewarded: worlds ``(*batch, 1)`` whose terms of the reward are zero.
+            unrewarded: worlds ``(*batch, 1)`` whose terms of the reward, and metrics, are zero.
         """
         outputs, batch = self.world.outputs, self.batch_size
-        *groups, reward, terms, flags = outputs.parts(outputs.memory.clone())
+        *groups, reward, terms, metrics, flags = outputs.parts(outputs.memory.clone())
         done, terminated, truncated = flags.view(3, *batch, 1).unbind()
         entries = {"done": done, "terminated": terminated, "truncated": truncated}
         for (name, shape), group in zip(self.groups.items(), groups, strict=True):
@@ -582,12 +655,22 @@ class LocoEnv(EnvBase):
         if with_reward:
             entries["reward"] = reward.view(*batch, 1)
         result = TensorDict._new_unsafe(entries, batch_size=batch, device=self.device)  # they need no checks
-        if self.reward_terms:
-            terms = terms.view(*batch, len(self.term_names))
-            if unrewarded is not None:
-                terms.masked_fill_(unrewarded, 0.0)
-            columns = terms.unsqueeze(-1).unbind(-2)
-            result["reward_terms"] = dict(zip(self.term_names, columns, strict=True))
+        for key, names, numbers in (
+            ("reward_terms", self.term_names if self.reward_terms else (), terms),
+            ("metrics", self.metric_names, metrics),
+        ):
+            if names:
+                numbers = numbers.view(*batch, len(names))
+                if unrewarded is not None:
+                    numbers.masked_fill_(unrewarded, 0.0)
+                result[key] = dict(zip(names, numbers.unsqueeze(-1).unbind(-2), strict=True))
+        if self._apart:
+            result["observation_terms"] = {
+                group: dict(
+                    zip(sizes, result[group][..., -sum(sizes.values()) :].split([*sizes.values()], -1), strict=True)
+                )
+                for group, sizes in self._apart.items()
+            }
         return result
 
     def _batched(self, rows: torch.Tensor) -> torch.Tensor:
@@ -628,7 +711,7 @@ class LocoEnv(EnvBase):
             and tensordict.device == self.device
             and not self.run_type_checks
             and self._post_step_mdp_hooks is None
-            and all(isinstance(value, torch.Tensor) or key == "reward_terms" for key, value in tensordict.items())
+            and all(isinstance(value, torch.Tensor) or key in NESTED for key, value in tensordict.items())
             and "_step" not in tensordict
         )
 
@@ -765,6 +848,7 @@ class LocoEnv(EnvBase):
         - ``iteration_limit``, ``line_search_limit``: the solver or its line search used up its iterations, as is usual
           under ``protocol="playground"``.
         - ``solver_failure``: the solver of ``compiled`` found no step, or lacked digits: accelerations may be wrong.
+        - ``index_error``: a hook indexed one of its ``constants`` or ``shared`` out of range, which gave NaN.
         - ``non_finite``: the world became non-finite, and terminated: its positions, velocities, accelerations,
           observation, reward or action were no numbers, or 1e10 and more, as C MuJoCo has it.
 
@@ -809,6 +893,41 @@ class LocoEnv(EnvBase):
         return self.variation.varied.edited(self.sim.numbers[world].cpu().numpy())
 
     # State.
+
+    def get_stage(self) -> dict[str, Any]:
+        """Returns how far a curriculum has come, as JSON can hold it: what episodes go on from.
+
+        That is :attr:`shared`, and of :attr:`memory` the entries that :meth:`begin` makes from their former values, as
+        a level, in at most 64 worlds, evenly spread. Training keeps it with checkpoint and policy.
+        """
+        if self.hooks is None or not (self.world.shared or self.hooks.carried):
+            return {}
+        rows = torch.linspace(0, self.num_envs - 1, min(self.num_envs, STAGE_WORLDS)).round().long()
+        memory = {name: self.world.memory[name].cpu()[rows].tolist() for name in self.hooks.carried}
+        return {"shared": {name: values.tolist() for name, values in self.world.shared.items()}, "memory": memory}
+
+    def set_stage(self, stage: Mapping[str, Any]) -> None:
+        """Lets the next episodes begin where a curriculum has come to.
+
+        Args:
+            stage: what :meth:`get_stage` returned, of any number of worlds, or parts of it, such as
+                ``{"memory": {"level": [3.0]}}``: rows are dealt to the worlds in turn.
+
+        Raises:
+            ValueError: the task has no such entry, or it has another shape.
+        """
+        known = {"shared": self.world.shared, "memory": self.world.memory}
+        for group, entries in stage.items():
+            of_task = known[check_choice("stage", group, known)]
+            for name, values in entries.items():
+                target = of_task[check_choice(f"{group} of the stage", name, of_task)]
+                new = torch.as_tensor(values, device=self.device).to(target.dtype)
+                if group == "memory" and len(new):
+                    new = new[torch.arange(self.num_envs, device=self.device) % len(new)]
+                if new.shape != target.shape:
+                    shape = tuple(target.shape[group == "memory" :])
+                    raise ValueError(f"{group} {name!r} of a stage must have rows of shape {shape}")
+                target.copy_(new)
 
     def get_state(self) -> State:
         """Returns a copy of the state of all worlds, for ``env.reset(state, set_state=True)``."""

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import torch
 
-from torchrl_loco.checks import suggestion
+from torchrl_loco.checks import Interval, check_choice, check_float, check_int, suggestion
 from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.state import State
+from torchrl_loco.envs.tables import Entry, constants, entries
 from torchrl_loco.envs.view import CONTACT_HISTORY, Catalog, View, usable
 from torchrl_loco.sim import models
+from torchrl_loco.sim.overflow import Overflow
 
 if TYPE_CHECKING:
     from torchrl_loco.envs.base import LocoEnv
@@ -21,14 +23,16 @@ if TYPE_CHECKING:
 Arrays = Mapping[str, torch.Tensor]
 """The arrays of all worlds by name: physics, ``memory.<name>``, ``out.<group>``, counters and flags."""
 
-HOOKS = ("control", "update", "reward", "terminated", "events", "observation", "begin")
+HOOKS = ("control", "update", "reward", "terminated", "metrics", "events", "adapt", "observation", "begin")
 
 PARTS = {
     "control": ("control",),
-    "judge": ("update", "reward", "terminated", "events"),
+    "judge": ("update", "reward", "terminated", "metrics", "events"),
+    "adapt": ("adapt",),
     "observe": ("observation",),
     "begin": ("begin",),
     "observe_begun": ("observation",),
+    "observe_restored": ("observation",),
 }
 """The hooks that each part of a step or reset calls, in their order."""
 
@@ -58,41 +62,34 @@ def _draws_states(cls: type["LocoEnv"]) -> bool:
     """Returns whether a class has a hook, a Warp function or a table that begins its episodes."""
     from torchrl_loco.envs.base import LocoEnv
 
-    return any(getattr(cls, name) is not getattr(LocoEnv, name) for name in ("begin", *FUSED["begin"]))
+    return cls.begin is not LocoEnv.begin or draws_by_warp(cls)
 
 
-def memory_shapes(cls: type) -> dict[str, tuple[int, ...]]:
-    """Returns the shapes of a row of each entry of the memory of a class.
+def draws_by_warp(cls: type["LocoEnv"]) -> bool:
+    """Returns whether a class has a Warp function or a table that begins its episodes."""
+    from torchrl_loco.envs.base import LocoEnv
+
+    return any(getattr(cls, name) is not getattr(LocoEnv, name) for name in FUSED["begin"])
+
+
+def declared(cls: type["LocoEnv"]) -> tuple[dict[str, Entry], dict[str, Entry]]:
+    """Returns the entries of ``memory`` and of ``shared`` that a class declares.
 
     Raises:
-        TypeError: ``memory`` is no table of names and shapes.
+        TypeError: one is no table of names and shapes.
         ValueError: a name is taken, or a size is less than 1.
     """
-    memory: Any = getattr(cls, "memory", {})
-    if not isinstance(memory, Mapping):
-        raise TypeError(f"{cls.__name__}.memory must be a dict of names and shapes, such as {{'command': 3}}")
     taken = {name for name in vars(View) if not name.startswith("_")}
-    shapes = {}
-    for name, shape in memory.items():
-        if not isinstance(name, str) or not name.isidentifier() or name.startswith("_"):
-            raise ValueError(f"{cls.__name__}.memory: {name!r} is no name of an attribute")
-        if name in taken:
-            raise ValueError(f"{cls.__name__}.memory: {name!r} is taken, since s.{name} is something else: rename it")
-        sizes = (shape,) if isinstance(shape, int) else shape
-        if not isinstance(sizes, tuple | list) or not all(isinstance(n, int) for n in sizes):
-            raise TypeError(f"{cls.__name__}.memory[{name!r}] must be a size or a tuple of sizes, got {shape!r}")
-        if any(n < 1 for n in sizes):
-            raise ValueError(f"{cls.__name__}.memory[{name!r}] must have sizes of 1 or more, got {shape!r}")
-        shapes[name] = tuple(sizes)
-    return shapes
+    memory = entries(cls, "memory", taken)
+    return memory, entries(cls, "shared", {*taken, *memory})
 
 
-def check_commands(cls: type["LocoEnv"], memory: Mapping[str, tuple[int, ...]]) -> None:
+def check_commands(cls: type["LocoEnv"], memory: Mapping[str, Entry]) -> None:
     """Checks the commands that a class declares.
 
     Args:
         cls: the class.
-        memory: shapes of a row of each entry of its memory.
+        memory: the entries of its memory.
 
     Raises:
         ValueError: there is no such entry, it has another number of numbers, or a range is empty.
@@ -104,7 +101,8 @@ def check_commands(cls: type["LocoEnv"], memory: Mapping[str, tuple[int, ...]]) 
     for entry, ranges in entries.items():
         if entry not in memory:
             raise ValueError(f"{title}: {entry!r} is no entry of memory, which has {', '.join(memory) or 'none'}")
-        if len(memory[entry]) > 1 or len(ranges) != math.prod(memory[entry]):
+        shape, dtype = memory[entry]
+        if len(shape) > 1 or len(ranges) != math.prod(shape) or dtype != torch.float32:
             raise ValueError(f"{title}: {entry!r} must be a row of {len(ranges)} numbers, as many as there are ranges")
         for name, bounds in ranges.items():
             low, high = bounds
@@ -154,8 +152,12 @@ class Hooks:
         own: names of the hooks.
         catalog: the model's names, and what the hooks ask for.
         groups: shape of a row of each tensor of the observation, by name; empty if a Warp function observes.
+        terms: by group, the sizes of its terms by name, in their order; empty for one that has no names.
+        history: how many of the last observations a group has, by name, where it is more than one.
         term_names: names of the terms of the reward; ``None`` if a Warp function rewards.
+        metric_names: names of the metrics.
         moves: whether ``events`` changes qpos or qvel.
+        carried: names of the entries of memory that begin an episode from what the last one left of them: a level.
         read: by hook, the attributes of the environment that it reads.
         commands: in worlds to play with, the commands that can be set: their values, ``(num_envs, *row)``, and in which
             worlds they are, bool ``(num_envs,)``.
@@ -167,40 +169,62 @@ class Hooks:
 
     @torch.inference_mode(False)  # writes of hooks are noticed by versions of tensors
     def __init__(self, env: "LocoEnv", mj_model: mujoco.MjModel) -> None:
+        from torchrl_loco.envs.base import LocoEnv
+
         self._env = weakref.ref(env)
         self._title = type(env).__name__
         self.own = own_hooks(type(env))
         if models.has_home(mj_model) and not _draws_states(type(env)):
             self.own |= {"begin"}
         bounded = env.action_range != (-float("inf"), float("inf"))
-        self._substeps, shapes = env.config.substeps, memory_shapes(type(env))
-        settings = env.num_envs, env.device, shapes, env.config.ctrl_dt
+        self._substeps, (memory, shared) = env.config.substeps, declared(type(env))
+        settings = env.num_envs, env.device, memory, shared, env.config.ctrl_dt
         self.catalog = Catalog(mj_model, *settings, bounded=bounded, variation=env.variation)
+        if type(env).observation_func is not LocoEnv.observation_func:
+            self.catalog.warp_outputs = type(env).observation_size
+        self.catalog.draws_states = draws_by_warp(type(env))
+        own_tables = env.constants() if callable(env.constants) else env.constants
+        taken = {*(name for name in vars(View) if not name.startswith("_")), *memory, *shared}
+        self.catalog.constants = constants(self._title, own_tables, taken, env.device)
+        if not env.with_metrics:
+            self.own -= {"metrics"}
         kept: dict[str, Any] = {"device": env.device}
         self.commands = {
-            entry: (torch.zeros(env.num_envs, *shapes[entry], **kept), torch.zeros(env.num_envs, **kept) > 0)
+            entry: (torch.zeros(env.num_envs, *memory[entry].shape, **kept), torch.zeros(env.num_envs, **kept) > 0)
             for entry in (type(env).command_ranges if env.play else ())
         }
         self.groups: dict[str, tuple[int, ...]] = {}
+        self.terms: dict[str, dict[str, int]] = {}
+        self.history: dict[str, int] = {}
+        self._noise: dict[tuple[str, str], tuple[float, str | None]] = {}
         self.term_names: tuple[str, ...] | None = None
+        self.metric_names: tuple[str, ...] = ()
         self.moves = False
+        self.carried: tuple[str, ...] = ()
+        self._pose = {"qpos": Entry((mj_model.nq,), torch.float32), "qvel": Entry((mj_model.nv,), torch.float32)}
         self.read: dict[str, set[str]] = {}
         with torch.no_grad():
             self._probe(self._at_home())
         self.catalog.complete = True
 
-    def _call(self, hook: str, arrays: Arrays, *, steps: int = 0, args: tuple[Any, ...] = ()) -> Any:
+    def _call(
+        self, hook: str, arrays: Arrays, *, steps: int = 0, args: tuple[Any, ...] = (), view: View | None = None
+    ) -> Any:
         env = self._env()
         assert env is not None
-        view = View(self.catalog, arrays, hook, steps)
+        view = View(self.catalog, arrays, hook, steps) if view is None else view
         if self.catalog.complete:
-            return getattr(env, hook)(view, *args)
-        before, own = {name: rows._version for name, rows in arrays.items()}, dict(vars(env))
+            returned = getattr(env, hook)(view, *args)
+            if view.lost:
+                self._count_lost(arrays, view.lost, masked=hook in ("begin", "observation") and steps == 0)
+            return returned
+        shown = {**arrays, **self.catalog.constants}
+        before, own = {name: rows._version for name, rows in shown.items()}, dict(vars(env))
         with reads_of(env) as self.read[hook]:
             returned = getattr(env, hook)(view, *args)
         for name, version in before.items():
-            if arrays[name]._version != version:
-                raise ValueError(f"{self._title}.{hook} writes to s.{name.removeprefix('memory.')}: work on a clone")
+            if shown[name]._version != version:
+                raise ValueError(f"{self._title}.{hook} writes to s.{name.rpartition('.')[2]}: work on a clone")
         for name, value in vars(env).items():
             if own.get(name, own) is not value:
                 raise ValueError(
@@ -208,6 +232,14 @@ class Hooks:
                     "from update() or events()"
                 )
         return returned
+
+    def _count_lost(self, a: Arrays, lost: Mapping[bool, torch.Tensor], *, masked: bool) -> None:
+        """Flags worlds in which an index of a table was out of range; ``masked``, those of the mask alone."""
+        bits = a["overflow"]
+        for gave_nan, worlds in lost.items():
+            flag = Overflow.INDEX if gave_nan else Overflow.INDEX | Overflow.INDEX_OF_INTEGERS
+            bits = torch.where(worlds, bits | int(flag), bits)
+        a["overflow"].copy_(torch.where(a["mask"], bits, a["overflow"]) if masked else bits)
 
     # Calling the hooks once.
 
@@ -223,19 +255,39 @@ class Hooks:
         rows |= {"contact_force": [[0.0] * 3], "in_contact": [0.0], "action": [0.0] * m.nu}
         rows |= {name: [rows[name.removesuffix("_history")]] * self._substeps for name in CONTACT_HISTORY}
         rows |= {"numbers": catalog.variation.varied.nominal()} if catalog.variation else {}
-        rows |= {f"memory.{name}": torch.zeros(shape) for name, shape in catalog.memory.items()}
+        if catalog.warp_outputs is not None:
+            rows |= {"warp.observation": [0.0] * catalog.warp_outputs, "warp.reward": 0.0}
         arrays = {name: torch.as_tensor(row, dtype=torch.float32).to(device) for name, row in rows.items()}
         arrays = {name: row.repeat(n, *[1] * row.ndim) for name, row in arrays.items()}
-        zeros = torch.zeros(n, dtype=torch.long, device=device)
-        return {**arrays, "seed": zeros[:1], "world": zeros, "episode": zeros, "elapsed_steps": zeros}
+        kept: dict[str, Any] = {"device": device}
+        arrays |= {
+            f"memory.{name}": torch.zeros(n, *shape, dtype=kind, **kept)
+            for name, (shape, kind) in catalog.memory.items()
+        }
+        arrays |= {
+            f"shared.{name}": torch.zeros(shape, dtype=kind, **kept) for name, (shape, kind) in catalog.shared.items()
+        }
+        zeros = torch.zeros(n, dtype=torch.long, **kept)
+        arrays |= {
+            "seed": zeros[:1],
+            "world": torch.arange(n, **kept),
+            "ended": torch.zeros(n, dtype=torch.bool, **kept),
+        }
+        return {**arrays, "episode": zeros, "elapsed_steps": zeros}
 
     def _probe(self, arrays: dict[str, torch.Tensor]) -> None:
         m, n = self.catalog.mj_model, self.catalog.num_envs
         if "control" in self.own:
             controls = self._call("control", arrays, args=(arrays["action"],))
             self._check("control", controls, (n, m.nu))
-        rows = self._rows("update", arrays, self.catalog.memory) if "update" in self.own else {}
-        arrays |= {f"memory.{name}": row.float() for name, row in rows.items()}
+        memory, pose = self.catalog.memory, self._pose
+
+        def remember(rows: Mapping[str, torch.Tensor]) -> None:
+            arrays.update(
+                {f"memory.{name}": row.to(memory[name].dtype) for name, row in rows.items() if name in memory}
+            )
+
+        remember(self._rows("update", arrays, memory) if "update" in self.own else {})
         if "reward" in self.own:
             terms = self._call("reward", arrays, steps=1)
             if isinstance(terms, Mapping) and not (terms and all(isinstance(name, str) for name in terms)):
@@ -248,26 +300,75 @@ class Hooks:
             self._check("terminated", ended, (n,))
             if ended.dtype != torch.bool:
                 raise TypeError(f"{self._title}.terminated must return a bool tensor, got {ended.dtype}")
-        state = {"qpos": (m.nq,), "qvel": (m.nv,)}
+        if "metrics" in self.own:
+            numbers = self._metrics(arrays)
+            for name, number in numbers.items():
+                self._check("metrics", number, (n,), name)
+            self.metric_names = tuple(numbers)
         if "events" in self.own:
-            rows = self._rows("events", arrays, {**self.catalog.memory, **state})
-            self.moves = bool(state.keys() & rows.keys())
-            arrays |= {f"memory.{name}": row.float() for name, row in rows.items() if name in self.catalog.memory}
+            rows = self._rows("events", arrays, {**memory, **pose})
+            self.moves = bool(pose.keys() & rows.keys())
+            remember(rows)
+        if "adapt" in self.own:
+            self._adapted(arrays)
         if "begin" in self.own:
-            rows = self._rows("begin", arrays, {**self.catalog.memory, **state})
+            rows = self._rows("begin", arrays, {**memory, **pose})
             for name, row in rows.items():
                 if not row.isfinite().all():
                     raise ValueError(f"{self._title}.begin returns {name} with numbers that are not finite")
+            self.carried = tuple(name for name in rows if name in memory and self._is_carried(name, arrays, rows[name]))
         if "observation" in self.own:
             groups = self._groups(arrays)
-            for name, values in groups.items():
-                self._check("observation", values, (n, *values.shape[1:]), name)
-                if not values.is_floating_point():
-                    raise TypeError(f"{self._title}.observation{_of(name)} must be of floats, got {values.dtype}")
             self.groups = {name: tuple(values.shape[1:]) for name, values in groups.items()}
+        self._declare_noise_and_history()
+
+    def _declare_noise_and_history(self) -> None:
+        """Takes ``noise`` and ``history`` of the class.
+
+        Raises:
+            ValueError: one names no term or group, or is out of range.
+        """
+        env = self._env()
+        assert env is not None
+        seen = {name: sizes or {name: 0} for name, sizes in self.terms.items() if name != CRITIC}
+        known = list(dict.fromkeys(term for sizes in seen.values() for term in sizes))
+        for term, value in env.noise.items():
+            what = check_choice(f"{self._title}.noise", term, known)
+            most, entry = value if isinstance(value, tuple) else (value, None)
+            check_float(f"{self._title}.noise[{term!r}]", most, Interval(0.0, MAX_VALUE))
+            if entry is not None:
+                check_choice(f"{self._title}.noise[{term!r}]", entry, list(self.catalog.memory))
+            if not env.play:
+                self._noise |= {(group, what): (float(most), entry) for group, sizes in seen.items() if what in sizes}
+        for group, count in env.history.items():
+            check_choice(f"{self._title}.history", group, list(self.groups))
+            if len(self.groups[group]) != 1:
+                raise ValueError(f"{self._title}.history[{group!r}] must be of rows, not of shape {self.groups[group]}")
+            if check_int(f"{self._title}.history[{group!r}]", count) > 1:
+                (size,) = self.groups[group]
+                if (name := HISTORY.format(group)) in self.catalog.memory:
+                    raise ValueError(f"{self._title}.memory: {name!r} is taken by history: rename it")
+                self.catalog.memory[name] = Entry((count, size), torch.float32)
+                self.history[group], self.groups[group] = count, (count * size,)
+
+    def _is_carried(self, name: str, arrays: Arrays, row: torch.Tensor) -> bool:
+        """Returns whether ``begin`` makes something else of an entry of memory where it held something else."""
+        key = f"memory.{name}"
+        other = ~arrays[key] if arrays[key].dtype == torch.bool else arrays[key] + 1
+        try:
+            again = self._call("begin", {**arrays, key: other})[name]
+        except Exception:  # it refuses that number, so it reads it
+            return True
+        return not torch.equal(again.expand_as(row), row)
 
     def _groups(self, arrays: Arrays, steps: int = 0) -> dict[str, torch.Tensor]:
-        groups = self._call("observation", arrays, steps=steps)
+        """Returns the present observation by group, its terms joined in their order, with noise.
+
+        Raises:
+            ValueError: a group has a name that it cannot have.
+        """
+        view = View(self.catalog, arrays, "observation", steps)
+        groups = self._call("observation", arrays, steps=steps, view=view)
         if not isinstance(groups, Mapping):
             groups = {"observation": groups}
         wrong = [name for name in groups if not isinstance(name, str) or name in NO_GROUPS or "." in name]
@@ -276,33 +377,78 @@ class Hooks:
                 f"{self._title}.observation must return a tensor or tensors by name, such as 'observation' and "
                 f"'privileged'{f'; {wrong[0]!r} is no name that they can have' if wrong else ''}"
             )
-        return dict(groups)
+        return {name: self._joined(view, name, values) for name, values in groups.items()}
+
+    def _joined(self, view: View, group: str, values: Any) -> torch.Tensor:
+        """Returns a group of the observation: the tensor that a hook returned, or its terms in their order."""
+        terms = values if isinstance(values, Mapping) else {group: values}
+        if not self.catalog.complete:
+            for term, rows in terms.items():
+                self._check_term(group, term, rows)
+            named = isinstance(values, Mapping)
+            self.terms[group] = {term: rows[0].numel() for term, rows in terms.items()} if named else {}
+        found = []
+        for term, rows in terms.items():
+            if (noise := self._noise.get((group, term))) is not None:
+                most, entry = noise
+                drawn = view.uniform(-most, most, *rows.shape[1:])
+                rows = rows + (drawn if entry is None else drawn + getattr(view, entry))
+            found.append(rows)
+        if not isinstance(values, Mapping):
+            return found[0]
+        return torch.cat([rows.unsqueeze(-1) if rows.ndim == 1 else rows.flatten(1) for rows in found], dim=-1)
+
+    def _check_term(self, group: str, term: Any, rows: Any) -> None:
+        if not isinstance(term, str):
+            raise ValueError(f"{self._title}.observation{_of(group)} must have terms by name, got {term!r}")
+        name = f"{group}.{term}" if term != group else group
+        shape = (self.catalog.num_envs, *(rows.shape[1:] if isinstance(rows, torch.Tensor) else ()))
+        self._check("observation", rows, shape, name)
+        if not rows.is_floating_point():
+            raise TypeError(f"{self._title}.observation{_of(name)} must be of floats, got {rows.dtype}")
+
+    def _metrics(self, arrays: Arrays) -> dict[str, torch.Tensor]:
+        values = self._call("metrics", arrays, steps=1)
+        if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
+            raise TypeError(f"{self._title}.metrics must return numbers of each world by name, got {_kind(values)}")
+        return dict(values)
+
+    def _adapted(self, arrays: Arrays) -> dict[str, torch.Tensor]:
+        """Returns new values of what worlds share, by name; sums over worlds have a fixed order."""
+        before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+        torch.use_deterministic_algorithms(True)
+        try:
+            return self._rows("adapt", arrays, self.catalog.shared, by_world=False)
+        finally:
+            torch.use_deterministic_algorithms(before[0], warn_only=before[1])
 
     def _rows(
-        self, hook: str, arrays: Arrays, known: Mapping[str, tuple[int, ...]], steps: int = 1
+        self, hook: str, arrays: Arrays, known: Mapping[str, Entry], *, by_world: bool = True
     ) -> dict[str, torch.Tensor]:
         """Returns the new rows that a hook returns, by name, each of full shape.
 
         Raises:
-            TypeError: it returns no rows by name.
+            TypeError: it returns no rows by name, or one of another type.
             ValueError: a name is unknown, or a row has the wrong shape.
         """
-        rows = self._call(hook, arrays, steps=0 if hook == "begin" else steps)
+        rows = self._call(hook, arrays, steps=0 if hook == "begin" else 1)
         if rows is None:
             return {}
         if not isinstance(rows, Mapping):
             raise TypeError(f"{self._title}.{hook} must return new rows by name, got {_kind(rows)}")
-        n = self.catalog.num_envs
+        first, kind = ([self.catalog.num_envs], "memory") if by_world else ([], "shared")
         for name, row in rows.items():
             if name not in known:
                 raise ValueError(
                     f"{self._title}.{hook} returns {name!r}{suggestion(str(name), list(known))}: choose of "
-                    f"{', '.join(known) or 'the names of memory, which has no entries'}"
+                    f"{', '.join(known) or f'the names of {kind}, which has no entries'}"
                 )
-            shape = (n, *known[name])
+            shape = (*first, *known[name].shape)
             if not isinstance(row, torch.Tensor) or not _broadcasts(row.shape, shape):
                 raise ValueError(f"{self._title}.{hook} must return {name} of shape {shape}, got {_kind(row)}")
-        return {name: row.expand(n, *known[name]) for name, row in rows.items()}
+            if not torch.can_cast(row.dtype, known[name].dtype):
+                raise TypeError(f"{self._title}.{hook} must return {name} of {known[name].dtype}, got {row.dtype}")
+        return {name: row.expand((*first, *known[name].shape)) for name, row in rows.items()}
 
     def _check(self, hook: str, values: Any, shape: tuple[int, ...], name: str = "") -> None:
         if not isinstance(values, torch.Tensor):
@@ -336,34 +482,46 @@ class Hooks:
             a["reward"].copy_(terms)
         if "terminated" in self.own:
             a["ended"].copy_(self._call("terminated", a, steps=1))
+        if "metrics" in self.own:
+            a["metrics"].copy_(torch.stack([value.float() for value in self._metrics(a).values()], dim=-1))
         if "events" in self.own:
-            m = self.catalog.mj_model
-            rows = self._rows("events", a, {**self.catalog.memory, "qpos": (m.nq,), "qvel": (m.nv,)})
+            rows = self._rows("events", a, {**self.catalog.memory, **self._pose})
             changed = [(rows[name] != a[name]).any(-1) for name in ("qpos", "qvel") if name in rows]
             if changed:
                 a["moved"].copy_(torch.stack(changed).any(0))
             self._remember(a, rows)
         self._remember(a, self._commanded(a))
 
+    def adapt(self, a: Arrays) -> None:
+        """After the events: writes what worlds share."""
+        new = {name: value.clone() for name, value in self._adapted(a).items()}  # one may be another's old one
+        for name, value in new.items():
+            a[f"shared.{name}"].copy_(value)
+
     def observe(self, a: Arrays) -> None:
         """At the end of a step: writes the observation, and marks and zeroes worlds that are not finite."""
         groups = self._groups(a, steps=1) if "observation" in self.own else {}
         for name, values in groups.items():
+            if name in self.history:
+                past = a[f"memory.{HISTORY.format(name)}"]
+                values = torch.cat([past[:, 1:], values.unsqueeze(1)], dim=1)
+                past.copy_(values)
+                values = values.flatten(1)
             a[f"out.{name}"].copy_(values)
         outputs = [a[name] for name in a if name.startswith("out.")]
-        memory = [a[f"memory.{name}"] for name in self.catalog.memory]
-        wrong = a["non_finite"] | _beyond(a["reward"], a["qpos"], a["qvel"], *memory, *outputs)
+        memory = [a[f"memory.{name}"] for name, (_, kind) in self.catalog.memory.items() if kind.is_floating_point]
+        wrong = a["non_finite"] | _beyond(a["reward"], a["qpos"], a["qvel"], *memory, *outputs) | self._lost(a)
         a["non_finite"].copy_(wrong)
-        for values in (*outputs, a["reward"], a["terms"]):
+        for values in (*outputs, a["reward"], a["terms"], *([a["metrics"]] if self.metric_names else [])):
             values.masked_fill_(_by_world(wrong, values), 0.0)
 
     def begin(self, a: Arrays) -> None:
         """At a reset, in the masked worlds, which are at rest: writes pose and memory."""
-        m, memory = self.catalog.mj_model, self.catalog.memory
+        memory = self.catalog.memory
         rows: dict[str, torch.Tensor] = {}
         if "begin" in self.own:
             home = {"qpos": self.catalog.home.expand_as(a["qpos"])}
-            rows = {**home, **self._rows("begin", a, {**memory, "qpos": (m.nq,), "qvel": (m.nv,)})}
+            rows = {**home, **self._rows("begin", a, {**memory, **self._pose})}
         zeros = {name: torch.zeros_like(a[f"memory.{name}"]) for name in memory if name not in rows}
         self._remember(a, {**zeros, **rows}, a["mask"])
         self._remember(a, self._commanded(a), a["mask"])
@@ -376,13 +534,37 @@ class Hooks:
         }
 
     def observe_begun(self, a: Arrays) -> None:
-        """After a reset, or after a state was written: writes the observation of the masked worlds."""
+        """After a reset: writes the observation of the masked worlds, which is all of their history."""
         groups = self._groups(a)
-        wrong = _beyond(a["qpos"], a["qvel"], *groups.values())
+        for name, count in self.history.items():
+            past = a[f"memory.{HISTORY.format(name)}"]
+            values = groups[name].unsqueeze(1).expand(-1, count, -1)
+            past.copy_(torch.where(_by_world(a["mask"], past), values, past))
+            groups[name] = values.flatten(1)
+        self._show_begun(a, groups)
+
+    def observe_restored(self, a: Arrays) -> None:
+        """After a state was written: writes the observation of the masked worlds, with the state's history, if any."""
+        groups = self._groups(a)
+        for name, count in self.history.items():
+            past = a[f"memory.{HISTORY.format(name)}"]
+            has_past = past.isfinite().flatten(1).all(-1)
+            values = torch.where(_by_world(has_past, past), past, groups[name].unsqueeze(1).expand(-1, count, -1))
+            past.copy_(torch.where(_by_world(a["mask"], past), values, past))
+            groups[name] = values.flatten(1)
+        self._show_begun(a, groups)
+
+    def _show_begun(self, a: Arrays, groups: Mapping[str, torch.Tensor]) -> None:
+        wrong = _beyond(a["qpos"], a["qvel"], *groups.values()) | self._lost(a)
         a["non_finite"].copy_(torch.where(a["mask"], a["non_finite"] | wrong, a["non_finite"]))
         for name, values in groups.items():
             target, values = a[f"out.{name}"], values.masked_fill(_by_world(wrong, values), 0.0)
             target.copy_(torch.where(_by_world(a["mask"], target), values, target))
+
+    def _lost(self, a: Arrays) -> Any:
+        """Returns in which worlds an index out of range gave what looks like a number."""
+        has_tables = self.catalog.constants or self.catalog.shared
+        return (a["overflow"] & int(Overflow.INDEX_OF_INTEGERS)) != 0 if has_tables else False
 
     def _remember(self, a: Arrays, rows: Mapping[str, torch.Tensor], mask: torch.Tensor | None = None) -> None:
         new = {}  # all of them before the first is written: a row may be a view of another entry
@@ -396,8 +578,24 @@ class Hooks:
             (a[f"memory.{name}"] if name in self.catalog.memory else a[name]).copy_(row)
 
 
+CRITIC = "privileged"
+"""Group of the observation that the critic alone sees: it has no noise."""
+HISTORY = "{}_history"
+"""Name of the entry of memory that keeps the last observations of a group."""
 NO_GROUPS = (
-    *("reward", "done", "terminated", "truncated", "action", "next", "reward_terms", "_reset", "_step"),
+    *(
+        "reward",
+        "done",
+        "terminated",
+        "truncated",
+        "action",
+        "next",
+        "reward_terms",
+        "metrics",
+        "observation_terms",
+        "_reset",
+        "_step",
+    ),
     *State.KEYS,
 )
 """Names that a tensor of the observation cannot have: those of a step's other entries, and of a state."""

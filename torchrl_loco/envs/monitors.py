@@ -123,6 +123,7 @@ COUNTERS = {
     "iteration_limit": Overflow.ITERATIONS,
     "line_search_limit": Overflow.LS_ITERATIONS,
     "solver_failure": Overflow.UNSOLVED,
+    "index_error": Overflow.INDEX,
 }
 """Name of a counter and the bits of ``Data.overflow`` that it counts."""
 DROPPED = ("constraints", "contacts")

@@ -130,7 +130,7 @@ class Part:
                     continue
                 run()
                 for name, rows in ours.items():
-                    one, other = (values[:COMPARED].double() for values in (rows, self._arrays[name]))
+                    one, other = (torch.atleast_1d(values)[:COMPARED].double() for values in (rows, self._arrays[name]))
                     if not torch.allclose(one, other, rtol=1e-4, atol=1e-4, equal_nan=True):
                         raise ValueError(what.format(name))
                 compared += 1

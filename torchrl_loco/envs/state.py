@@ -20,6 +20,7 @@ class State(TensorDict):
     ``qacc_warmstart``  ``(N, nv)``  initial guess of the constraint solver
     ``act``             ``(N, na)``  activations of the actuators, if the model has any
     ``memory``          nested       entries of the task's memory by name, if it has any
+    ``shared``          nested       what worlds share, by name, the same in each row, if the task has any
     ``model``           nested       by field, ``(N, numbers that vary)``, if ``randomize`` names any
     ``elapsed_steps``   ``(N,)``     control steps since the world's reset
     ``episode``         ``(N,)``     episodes begun: index of the next random stream
@@ -34,7 +35,7 @@ class State(TensorDict):
     """
 
     PHYSICS = ("qpos", "qvel", "qacc_warmstart", "act")
-    KEYS = (*PHYSICS, "memory", "model", "elapsed_steps", "episode")
+    KEYS = (*PHYSICS, "memory", "shared", "model", "elapsed_steps", "episode")
 
     def branch(self, world: int, num_envs: int | None = None) -> "State":
         """Returns a state in which every world is a copy of one, to try different futures from the same moment.
@@ -85,7 +86,9 @@ def without_state(tensordict: TensorDictBase | None, device: torch.device | None
 def write_state(
     state: TensorDictBase | None, targets: Mapping[str | tuple[str, str], torch.Tensor], mask: torch.Tensor
 ) -> None:
-    """Writes a state into the worlds of a mask. Missing entries become zero, but episode and model stay as they are.
+    """Writes a state into the worlds of a mask. Missing entries become zero, but episode, model and shared stay.
+
+    What worlds share is written where all of them are.
 
     Args:
         state: the state; a plain TensorDict with the same keys works too.
@@ -96,7 +99,7 @@ def write_state(
         ValueError: qpos or qvel is missing, a shape is wrong, or a value is not finite. Then nothing is written.
     """
     given: dict[Any, Any] = {key: None if state is None else state.get(key, None) for key in targets}
-    for group, owner in (("memory", "the task"), ("model", "randomize")):
+    for group, owner in (("memory", "the task"), ("shared", "the task"), ("model", "randomize")):
         entries = None if state is None else state.get(group, None)
         known = [key[1] for key in targets if key[0] == group]
         for name in [] if entries is None else entries.keys():
@@ -111,14 +114,26 @@ def write_state(
     for key, value in new.items():
         if value.shape != targets[key].shape:
             raise ValueError(f"{key} must have shape {tuple(targets[key].shape)}, got {tuple(value.shape)}")
+        if value.dtype != (dtype := targets[key].dtype) and not torch.can_cast(value.dtype, dtype):
+            raise ValueError(f"{key} must be of {dtype}, got {value.dtype}: it is of an earlier version of the task")
+        if key[0] == "shared" and not (value == value[:1]).all():
+            raise ValueError(f"{key} must be the same in all worlds, which share it")
         if targets[key].dtype.is_floating_point:
             if not value[mask].to(targets[key].dtype).isfinite().all():
                 raise ValueError(f"{key} must be finite")
-        elif not ((value[mask].long() >= 0) & (value[mask].long() < 2**31 - 1)).all():  # it will be counted up
+        elif (
+            key in ("elapsed_steps", "episode")
+            and not ((value[mask].long() >= 0) & (value[mask].long() < 2**31 - 1)).all()
+        ):  # it will be counted up
             raise ValueError(f"{key} must lie in [0, 2**31 - 1)")
     for key, target in targets.items():
-        if (key == "episode" or key[0] == "model") and key not in new:
+        if (key == "episode" or key[0] in ("model", "shared")) and key not in new:
             continue  # the world's random stream goes on, and its numbers stay
-        value = new.get(key, torch.zeros_like(target))
+        if key[0] == "shared":
+            if mask.all():
+                target[0].copy_(new[key][0])
+            continue
+        none = float("nan") if key[0] == "memory" and key[1].endswith("_history") else 0
+        value = new.get(key, torch.full_like(target, none))
         rows = mask.view(-1, *[1] * (target.ndim - 1))
         target.copy_(torch.where(rows, value.to(target.dtype), target))

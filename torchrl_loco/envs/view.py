@@ -11,6 +11,7 @@ import torch
 
 from torchrl_loco.envs import draws, sensors
 from torchrl_loco.envs.names import Elements, Names
+from torchrl_loco.envs.tables import Entry, Table
 from torchrl_loco.envs.variation import Variation, constant_of
 from torchrl_loco.sim import models
 
@@ -27,7 +28,8 @@ class Catalog(Elements):
         mj_model: the model.
         num_envs: number of worlds.
         device: where the tensors live.
-        memory: shape of a row of each entry of the memory, by name.
+        memory: each entry of the memory, by name.
+        shared: each entry of what worlds share, by name.
         ctrl_dt: time of a control step (s).
         bounded: whether actions are clipped to [-1, 1].
         variation: which numbers of the model differ from world to world, if any do.
@@ -37,6 +39,9 @@ class Catalog(Elements):
         sensors: ids of the sensors that only an engine can evaluate.
         contact_geoms: ids of the geoms whose contacts were asked for, in the order of the engine's columns.
         sensor_address: where a sensor's numbers begin in ``sensordata``, by its id.
+        constants: the task's tables by name.
+        warp_outputs: size of the observation of the class's Warp function; ``None`` if it has none.
+        draws_states: whether a Warp function or a table of the class begins its episodes.
         complete: whether all that hooks ask for is known: what else they ask for later is refused.
         home: home pose, ``(nq,)``: the keyframe ``home`` if there is one, else ``qpos0``.
     """
@@ -46,7 +51,8 @@ class Catalog(Elements):
         mj_model: mujoco.MjModel,
         num_envs: int,
         device: torch.device,
-        memory: Mapping[str, tuple[int, ...]],
+        memory: Mapping[str, Entry],
+        shared: Mapping[str, Entry],
         ctrl_dt: float,
         *,
         bounded: bool,
@@ -54,7 +60,10 @@ class Catalog(Elements):
     ) -> None:
         super().__init__(mj_model)
         self.num_envs, self.device = num_envs, device
-        self.memory, self.ctrl_dt, self.bounded, self.variation = dict(memory), ctrl_dt, bounded, variation
+        self.memory, self.shared, self.constants = dict(memory), dict(shared), dict[str, torch.Tensor]()
+        self.ctrl_dt, self.bounded, self.variation = ctrl_dt, bounded, variation
+        self.warp_outputs: int | None = None
+        self.draws_states = False
         self.arrays: set[str] = set()
         self.sensors: set[int] = set()
         self.contact_geoms: list[int] = []
@@ -83,8 +92,9 @@ class Catalog(Elements):
         return self._constants[key]
 
     def fixed(self) -> list[torch.Tensor]:
-        """Returns the tensors of indices, which never change."""
-        return [*self._index.values(), *(self.variation.fixed() if self.variation else [])]
+        """Returns tensors that never change: of indices, and the task's tables."""
+        variation = self.variation.fixed() if self.variation else []
+        return [*self._index.values(), *self.constants.values(), *variation]
 
     def places(self, first: int, count: int) -> torch.Tensor:
         """Returns places of random streams, which torch.compile would compute wrongly: they wrap around 64 bits."""
@@ -112,12 +122,16 @@ class View:
         arrays: the arrays of all worlds, by name.
         hook: name of the hook that sees it, from which its random numbers depend.
         steps: control steps that the worlds have taken beyond those that are counted.
+
+    Attributes:
+        lost: in which worlds an index of a table was out of range, by whether that gave NaN.
     """
 
     def __init__(self, catalog: Catalog, arrays: Mapping[str, torch.Tensor], hook: str, steps: int = 0) -> None:
         self._catalog, self._arrays, self._hook, self._steps = catalog, arrays, hook, steps
         self._stream: torch.Tensor | None = None
         self._drawn = 0
+        self.lost: dict[bool, torch.Tensor] = {}
 
     # The state.
 
@@ -194,21 +208,67 @@ class View:
         numbers = self._catalog.constant(field)
         return numbers.expand(self._catalog.num_envs, *numbers.shape)
 
+    @property
+    def env_index(self) -> torch.Tensor:
+        """Number of each env, int64 ``(num_envs,)``: from ``world_offset`` on, else from 0."""
+        return self._arrays["world"]
+
+    @property
+    def terminated(self) -> torch.Tensor:
+        """Whether ``terminated()`` ends the episode in this step, bool ``(num_envs,)``.
+
+        Raises:
+            ValueError: the hook comes before it.
+        """
+        if self._hook not in ("events", "adapt", "metrics"):
+            raise ValueError(f"s.terminated is not known in {self._hook}(): read it in events, adapt or metrics")
+        return self._arrays["ended"]
+
     def __getattr__(self, name: str) -> torch.Tensor:
-        """Returns an entry of the memory, ``(num_envs, *row)``.
+        """Returns an entry of the memory, ``(num_envs, *row)``, one of ``shared``, or a table of ``constants``.
 
         Raises:
             AttributeError: there is no such entry.
         """
         if name.startswith("_"):
             raise AttributeError(name)
-        memory = self._catalog.memory
-        if name in memory:
+        catalog = self._catalog
+        if name in catalog.memory:
             return self._arrays[f"memory.{name}"]
+        if name in catalog.shared:
+            return Table.of(self._arrays[f"shared.{name}"], self._note)
+        if name in catalog.constants:
+            return Table.of(catalog.constants[name], self._note)
         public = [key for key in vars(View) if not key.startswith("_")]
-        near = difflib.get_close_matches(name, [*public, *memory], n=1)
+        entries = [*catalog.memory, *catalog.shared, *catalog.constants]
+        near = difflib.get_close_matches(name, [*public, *entries], n=1)
         hint = f", did you mean s.{near[0]}?" if near else ""
-        raise AttributeError(f"s has no {name!r}{hint}: the memory has {', '.join(memory) or 'no entries'}")
+        raise AttributeError(
+            f"s has no {name!r}{hint}: memory, shared and constants have {', '.join(entries) or 'no entries'}"
+        )
+
+    def _note(self, lost: torch.Tensor, gave_nan: bool) -> None:
+        if lost.shape[0] not in (1, self.num_envs):  # of an index that is the same in all worlds
+            lost = lost.any().reshape(1)
+        self.lost[gave_nan] = self.lost[gave_nan] | lost if gave_nan in self.lost else lost
+
+    def _by_warp(self, name: str) -> torch.Tensor:
+        """Returns what the Warp function of the class has made in this step, its ``observation`` or ``reward``.
+
+        Raises:
+            NotImplementedError: the class has none.
+        """
+        if self._catalog.warp_outputs is None:
+            raise NotImplementedError(f"no class above this one has {name}(self, s)")
+        self._catalog.arrays.add("warp")
+        return self._arrays[f"warp.{name}"]
+
+    def _begun_by_warp(self) -> dict[str, torch.Tensor]:
+        """Returns the pose and velocities that the class's Warp function or table has drawn, if it has any."""
+        if not self._catalog.draws_states:
+            return {}
+        self._catalog.arrays.add("warp.begin")
+        return {"qpos": self.qpos, "qvel": self.qvel}
 
     # Poses and velocities.
 

@@ -98,7 +98,9 @@ class World:
         groups: the groups of the observation by name, tensors ``(nworld, *row)``.
         reward: rewards, ``(nworld,)``.
         terms: terms of the rewards, ``(nworld, len(term_names))``.
+        metrics: numbers for the log, ``(nworld, count)``.
         memory: entries of the task's memory by name, tensors ``(nworld, *row)``.
+        shared: what worlds share, by name.
         mask: worlds to reset, ``(nworld,)``.
         stream: start of the random stream of the current episode, ``(nworld,)`` uint32.
         episode: episodes drawn so far, ``(nworld,)``.
@@ -132,15 +134,21 @@ class World:
             device = self.sim.device
             self.action = Buffer((n, nu), float, device)
             shapes = task.groups
-            sizes = [*(torch.Size(shape).numel() for shape in shapes.values()), 1, len(task.term_names)]
+            sizes = [torch.Size(shape).numel() for shape in shapes.values()]
+            sizes += [1, len(task.term_names), len(hooks.metric_names) if hooks else 0]
             self.outputs = PackedBuffers([n * size for size in sizes], 3 * n, task.device)
-            *groups, reward, terms, flags = self.outputs.parts(self.outputs.memory)
+            *groups, reward, terms, metrics, flags = self.outputs.parts(self.outputs.memory)
             self.groups = {name: part.view(n, *shapes[name]) for name, part in zip(shapes, groups, strict=True)}
             self.reward, self.terms = Buffer.around(reward), Buffer.around(terms.view(n, -1))
+            self.metrics = metrics.view(n, -1)
             self.done, self.terminated, self.truncated = map(Buffer.around, flags.view(3, n))
             self.memory = {
-                name: torch.zeros(n, *shape, dtype=torch.float32, device=task.device)
-                for name, shape in (hooks.catalog.memory if hooks else {}).items()
+                name: torch.zeros(n, *shape, dtype=dtype, device=task.device)
+                for name, (shape, dtype) in (hooks.catalog.memory if hooks else {}).items()
+            }
+            self.shared = {
+                name: torch.zeros(shape, dtype=dtype, device=task.device)
+                for name, (shape, dtype) in (hooks.catalog.shared if hooks else {}).items()
             }
             self.mask = Buffer(n, bool, device)
             self.stream = Buffer(n, wp.uint32, device)
@@ -163,7 +171,7 @@ class World:
                 self._make_funcs(task)
             self._make_parts(task)
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
-            for rows in self.memory.values():
+            for rows in (*self.memory.values(), *self.shared.values()):
                 rows.zero_()  # recording wrote into it
             self.sim.numbers.copy_(nominal)
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
@@ -179,7 +187,8 @@ class World:
         """The control step: under the actions in the buffer, unless torch records it with others."""
         self._control()  # own control(): actions to controls
         self._physics(*action)  # default control; the substeps; fused reward and observation
-        self._judge()  # update(), reward(), terminated(), events()
+        self._judge()  # update(), reward(), terminated(), metrics(), events()
+        self._adapt()  # adapt(): what worlds share
         self._move()  # poses and velocities again, if events() changed the state
         self._observe()  # observation(); worlds that are not finite
         self._conclude()  # time limit, flags, counters
@@ -205,7 +214,8 @@ class World:
         )
         self._fused: list[WorldFunc] = []
         self._check_finite: list[WorldFunc] = []
-        if not {"reward", "observation"} <= self._own:
+        asked = task.hooks.catalog.arrays if task.hooks else set()
+        if not {"reward", "observation"} <= self._own or "warp" in asked:
             outputs, size, terms = self._fused_outputs(task)
             func, inputs = check_pair("observation_func", task.observation_func(self))
             if not _of_package(type(task)):  # the tests check those of the package
@@ -239,7 +249,7 @@ class World:
         )
         self._start = [WorldFunc(begin_episode, start)]
         self._starts_at_rest = True
-        pose = task.pose_func(self) if "begin" not in self._own else None
+        pose = task.pose_func(self) if "begin" not in self._own or "warp.begin" in asked else None
         if pose is not None:
             func, inputs = check_pair("pose_func", pose)
             self._start.append(poser(func, inputs, self.stream.warp))
@@ -320,10 +330,14 @@ class World:
             self._vary = parts[-1]
 
         self._control, self._judge = part("control"), part("judge", own if hooks and hooks.commands else None)
+        self._adapt = part("adapt")
         self._observe = part("observe", own)  # it looks for what is not finite, too
         self._begin = part("begin", own if self.memory else None)  # it zeroes memory, too
-        self._observe_begun = part("observe_begun")
-        kernels = [each for each in parts if task.compile_hooks and each.compile(task.num_envs, sim.device)]
+        self._observe_begun = self._observe_restored = part("observe_begun")
+        if hooks is not None and hooks.history:
+            self._observe_restored = part("observe_restored")
+        alone = [each for each in parts if each is not self._adapt]  # which sums over worlds
+        kernels = [each for each in alone if task.compile_hooks and each.compile(task.num_envs, sim.device)]
 
         moves = hooks is not None and hooks.moves
         launches = [self._launch_step, self._launch_reset, *(each.launch for each in kernels)]
@@ -361,6 +375,9 @@ class World:
         sim, catalog = self.sim, hooks.catalog
         arrays = {name: getattr(sim, name) for name in ("qvel", "ctrl", "xpos", "xmat")}
         arrays |= {name: getattr(sim, name) for name in ("cvel", "subtree_com") if name in catalog.arrays}
+        if "warp" in catalog.arrays:
+            observation, reward, _ = self._kept_alive
+            arrays |= {"warp.observation": observation.torch, "warp.reward": reward.torch}
         if "sensordata" in catalog.arrays:
             arrays["sensordata"] = wp.to_torch(sim.data.sensordata)
         if catalog.contact_geoms:
@@ -374,7 +391,10 @@ class World:
             "ended": self.ended.torch,
             "reward": self.reward.torch,
             "terms": self.terms.torch,
+            "metrics": self.metrics,
+            "overflow": sim.overflow,
         }
+        arrays |= {f"shared.{name}": values for name, values in self.shared.items()}
         arrays |= {f"out.{name}": group for name, group in self.groups.items()}
         return arrays | {f"memory.{name}": rows for name, rows in self.memory.items()}
 
@@ -474,6 +494,8 @@ class World:
         if sim.mj_model.na:
             physics["act"] = sim.act
         physics |= {("memory", name): rows for name, rows in self.memory.items()}
+        n = sim.num_envs
+        physics |= {("shared", name): values.expand(n, *values.shape) for name, values in self.shared.items()}
         if self._variation is not None:
             columns = self._variation.varied.columns
             physics |= {("model", name): sim.numbers[:, which] for name, which in columns.items()}
@@ -493,7 +515,7 @@ class World:
             if self._refresh_graph is None:
                 self._refresh_graph = self._record_refresh()
             self._refresh_graph.replay()
-        self._observe_begun()
+        self._observe_restored()
 
     def judge(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns reward and end of the state that :meth:`refresh` was called for, each ``(nworld,)``.

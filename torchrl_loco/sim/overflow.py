@@ -4,7 +4,7 @@ import enum
 
 
 class Overflow(enum.IntFlag):
-    """Bits of ``overflow``: those of :class:`mujoco_warp.OverflowType` that are counted, and one of ``compiled``."""
+    """Bits of ``overflow``: those of :class:`mujoco_warp.OverflowType` that are counted, and our own at the end."""
 
     NEFC = 1
     """No room for a row of constraints."""
@@ -22,3 +22,7 @@ class Overflow(enum.IntFlag):
     """A line search used up its iterations."""
     UNSOLVED = 1 << 16
     """The solver failed, or had too few digits: accelerations may be wrong. MuJoCo-Warp never says so."""
+    INDEX = 1 << 17
+    """A hook has indexed a table beyond its end."""
+    INDEX_OF_INTEGERS = 1 << 18
+    """The same, of a table whose numbers have no NaN."""

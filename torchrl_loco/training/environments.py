@@ -4,7 +4,10 @@ import copy
 import dataclasses
 import hashlib
 import inspect
+import logging
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
@@ -17,6 +20,8 @@ from torchrl_loco.registry import make, resolve
 from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.presets import is_runner
+
+NO_STAGE: Mapping[str, Any] = MappingProxyType({})
 
 
 class Environments:
@@ -69,6 +74,7 @@ class Environments:
                 world_offset=distributed.rank() * config.num_envs,
                 stagger=True,
                 reward_terms=not runner,
+                metrics=True,
                 nan_dump=None if nan_dump.exists() else nan_dump,
                 episode_length=config.episode_length or self.full_length,
             )
@@ -77,25 +83,29 @@ class Environments:
         # The runners' tasks end at the time limit alone, and TorchRL's transform has less to do.
         return TransformedEnv(env, (FrameSkipTransform if runner else ActionRepeat)(config.action_repeat))
 
-    def evaluation(self, episodes: int, seed: int) -> EnvBase:
+    def evaluation(self, episodes: int, seed: int, stage: Mapping[str, Any] = NO_STAGE) -> EnvBase:
         """Returns worlds in which a policy of the run can be played, each for an episode of the task's own length.
 
         They are made once for a number of episodes; then their random streams begin anew. They have the settings and
         the transforms of the environment that was handed in. With transforms there are as many worlds as there,
-        whatever ``episodes`` is: some transforms keep a row for each.
+        whatever ``episodes`` is: some transforms keep a row for each. Episodes begin at a stage of the curriculum.
         """
         config, base = self._config, self._base
         worlds = base.num_envs if base is not None and self.transforms else episodes
         if worlds not in self._evaluating:
             if base is None:
-                own = make(resolve(config.task), worlds, config.device, seed, config.protocol, world_offset=0)
+                place = resolve(config.task), worlds, config.device, seed, config.protocol
+                own = make(*place, world_offset=0, metrics=True)
             else:
                 settings = {**dataclasses.asdict(base.config), "randomize": base.randomize}
                 del settings["naconmax"]  # which is for the number of its worlds
-                own = type(base)(worlds, base.device, seed, base.protocol, world_offset=0, play=base.play, **settings)
+                settings |= {"world_offset": 0, "play": base.play, "metrics": True}
+                own = type(base)(worlds, base.device, seed, base.protocol, **settings)
             self._evaluating[worlds] = own
-        env: EnvBase = self._evaluating[worlds]
-        env.set_seed(seed)
+        own = self._evaluating[worlds]
+        own.set_seed(seed)
+        own.set_stage(stage)
+        env: EnvBase = own
         for transform in self.transforms:
             env = TransformedEnv(env, copy.deepcopy(transform.clone()))  # that it learns in evaluations stays apart
         return env
@@ -147,7 +157,7 @@ def unwrapped(env: EnvBase) -> tuple[LocoEnv, tuple[Transform, ...]]:
 
 
 def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: Any) -> LocoEnv:
-    """Returns new worlds of the task of a policy, under the protocol that it was trained under.
+    """Returns new worlds of the task of a policy, under the protocol that it was trained under, and at its stage.
 
     Args:
         policy: the policy.
@@ -163,7 +173,12 @@ def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: 
     """
     refuse_transforms(policy)
     info = policy.info
-    return make(resolve(info["task"]), num_envs, device, seed, info["protocol"], world_offset=0, **settings)
+    env = make(resolve(info["task"]), num_envs, device, seed, info["protocol"], world_offset=0, **settings)
+    try:
+        env.set_stage(info.get("stage", {}))
+    except ValueError as error:  # of another task, or of this one as it was
+        logging.getLogger("torchrl_loco").warning("episodes begin at the first stage of the curriculum: %s", error)
+    return env
 
 
 def refuse_transforms(policy: Policy) -> None:

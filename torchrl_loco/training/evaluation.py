@@ -36,11 +36,15 @@ class Evaluator:
         policy: what is evaluated; for another one of its kind, load its weights into this one.
         env: the worlds, one for each episode.
         action_repeat: frames for which an action is held.
+
+    Attributes:
+        metrics: of the last evaluation, the task's metrics by name: means over an episode's steps, and over episodes.
     """
 
     def __init__(self, policy: PolicyFunc, env: Any, action_repeat: int = 1) -> None:
         self.policy: Any = policy
         self.env = env
+        self.metrics: dict[str, float] = {}
         self._frames = action_repeat * max(1, PIECE // action_repeat)
         self._held = _Held(policy, action_repeat)
         # A function is not watched for other weights, so it must not be recorded as if it were a module.
@@ -59,13 +63,19 @@ class Evaluator:
         self._collector.load_state_dict({})
         returns = torch.zeros(env.num_envs, 1, device=env.device)
         alive = torch.ones_like(returns, dtype=torch.bool)
+        sums, steps = dict[str, torch.Tensor](), torch.zeros_like(returns)
         pieces = math.ceil(env.config.episode_length / self._frames)
         for _ in trange(pieces, desc="evaluation", leave=False, disable=None):  # no bar in logs
             self._held.begin()
             after = self._collector.rollout()["next"]
-            for reward, done in zip(after["reward"].unbind(1), after["done"].unbind(1), strict=True):
+            metrics = after.get("metrics", {})
+            for t, (reward, done) in enumerate(zip(after["reward"].unbind(1), after["done"].unbind(1), strict=True)):
                 returns += reward * alive
+                steps += alive
+                for name, values in metrics.items():
+                    sums[name] = sums.get(name, 0.0) + values[:, t] * alive
                 alive &= ~done
+        self.metrics = {f"metric/{name}": (total / steps).mean().item() for name, total in sums.items()}
         return returns.squeeze(-1)
 
 

@@ -112,6 +112,7 @@ class Trainer:
         self._training_length = self._base.config.episode_length
         terms = self.env.observation_spec.get("reward_terms", None)
         self._terms = () if terms is None else tuple(terms.keys())
+        self._metrics = self._base.metric_names
         self._source = source_of(run.task)
         self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
@@ -251,6 +252,7 @@ class Trainer:
         terms = [after["reward_terms", name].mean() / config.action_repeat for name in self._terms]
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
         non_finite = self._base.health()["total", "non_finite"]
+        terms += [after["metrics", name].mean() for name in self._metrics]
         numbers = torch.cat([torch.stack([non_finite, spread, ends, reward, *terms]), ended, metrics])
         non_finite, spread, ends, mean_reward, *means = distributed.mean_of_ranks(numbers).tolist()
         before, self._non_finite = self._non_finite, round(non_finite * distributed.ranks())
@@ -262,6 +264,7 @@ class Trainer:
         self._alike = mean_reward if spread == 0.0 else None
         self._ends_at_once = ends == 1.0
         of_terms = [means.pop(0) for _ in self._terms]
+        of_metrics = [means.pop(0) for _ in self._metrics]
         self.episodes.take(*(means.pop(0) * distributed.ranks() for _ in ended))
         self.frames += self.frames_per_iteration
         self.iteration += 1
@@ -275,6 +278,7 @@ class Trainer:
             "frames_per_second": round(self.frames_per_iteration / seconds, 1),
             **self._of_episodes(mean_reward),
             **{f"reward/{name}": round(mean, 6) for name, mean in zip(self._terms, of_terms, strict=True)},
+            **{f"metric/{name}": round(mean, 6) for name, mean in zip(self._metrics, of_metrics, strict=True)},
             **{name: round(value, 6) for name, value in zip(names, means, strict=True)},
         }
 
@@ -299,11 +303,14 @@ class Trainer:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""
         when = {"frames": self.frames, "seconds": round(self.seconds, 3)}
         of_env: dict[str, Any] = {"trained_on": self.device_name, "control_timestep": self._base.config.ctrl_dt}
+        if stage := self._base.get_stage():
+            of_env["stage"] = stage
         if self.environments.transforms:
             of_env["transforms"] = self.environments.names_of_transforms
         policy = deterministic_policy(self.algorithm.actor, self.config, {**when, **of_env})
         summary = self._summary(policy, final=False)
-        self.run.append_evaluation({**when, **summary})
+        assert self._evaluator is not None
+        self.run.append_evaluation({**when, **summary, **self._evaluator.metrics})
         if summary["mean"] >= self._best:
             self._best = policy.info["selected_by"] = summary["mean"]
             policy.save(self.run.policy)
@@ -312,7 +319,7 @@ class Trainer:
     def _summary(self, policy: Policy, final: bool) -> dict[str, float]:
         """Returns what a policy earns in the episodes that select the best policy, or in those at the end."""
         config, seed = self.config, evaluation_seed(self.config.seed, final)
-        env = self.environments.evaluation(config.eval_episodes, seed)
+        env = self.environments.evaluation(config.eval_episodes, seed, policy.info.get("stage", {}))
         if self._evaluator is None or self._evaluator.env is not env:  # with transforms it is a new one
             self._evaluator = Evaluator(policy, env, config.action_repeat)
         self._evaluator.policy.load_state_dict(policy.state_dict())
@@ -327,7 +334,8 @@ class Trainer:
         summary = self._summary(policy, final=True)
         plot_runs([self.run], self.run.path / "learning_curve.png")
         if config.video_seconds > 0:
-            env = self.environments.evaluation(config.eval_episodes, evaluation_seed(config.seed, final=True))
+            seed, stage = evaluation_seed(config.seed, final=True), policy.info.get("stage", {})
+            env = self.environments.evaluation(config.eval_episodes, seed, stage)
             record(policy, env, self.run.video, config.video_seconds, config.action_repeat)
         policy.info |= summary
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
@@ -355,6 +363,7 @@ class Trainer:
                 "spaces": dataclasses.asdict(self.algorithm.spaces),
                 "algorithm": self.algorithm.state_dict(),
                 "trials": self.trials.state_dict(),
+                "stage": self._base.get_stage(),
                 "terms": list(self._terms),
             }
             self.run.save_checkpoint({**counters, **of, **ranks[0], "further_ranks": ranks[1:]})

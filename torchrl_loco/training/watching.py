@@ -1,5 +1,7 @@
 """A run that may still be training, seen from another process: its files are read, and nothing else."""
 
+from typing import Any
+
 from torchrl_loco.checks import check_device
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
@@ -68,5 +70,5 @@ def last_policy(run: RunFolder, device: str | None = None) -> Policy:
     spaces = Spaces.of(make(resolve(run.task), 1, device)) if stored is None else Spaces(**stored)
     algorithm = ALGORITHMS[config.algorithm](config, spaces)
     algorithm.networks.load_state_dict(checkpoint["algorithm"]["networks"])
-    counters = {name: checkpoint[name] for name in ("frames", "seconds")}
+    counters: dict[str, Any] = {name: checkpoint[name] for name in ("frames", "seconds", "stage") if name in checkpoint}
     return deterministic_policy(algorithm.actor, config, counters)

@@ -13,6 +13,7 @@ WRAPPING = (ADD, SUB, MUL, NEG, SHL)
 """Operators that wrap around for integers: C++ defines that for unsigned ones only."""
 WHERE, AND, OR, EQUAL = "{0} ? {1} : {2}", "{0} & {1}", "{0} | {1}", "{0} == {1}"
 LEAST, MOST = "{0} < {1} || {0} != {0} ? {0} : {1}", "{0} > {1} || {0} != {0} ? {0} : {1}"  # NaN wins, as in torch
+OF_INTEGERS = {LEAST: "{0} < {1} ? {0} : {1}", MOST: "{0} > {1} ? {0} : {1}"}
 
 
 class CannotFuse(Exception):  # noqa: N818
@@ -29,7 +30,8 @@ class Node:
         varies: whether it may differ from world to world.
         number: value of a constant.
         place: of what is read from memory, the index of the tensor, and how many elements the world's begins later
-            than that of the first, and how many each world's later than that of the last.
+            than that of the first (``None`` where the world looks it up), and how many each world's later than that of
+            the last.
     """
 
     __slots__ = ("args", "dtype", "number", "place", "text", "varies")

@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchrl_loco.envs.fusion.nodes import MOST_NUMBERS, TYPES, WHERE, WRAPPING, CannotFuse, Node
-from torchrl_loco.envs.fusion.source import Source, span
+from torchrl_loco.envs.fusion.nodes import MOST_NUMBERS, OF_INTEGERS, TYPES, WHERE, WRAPPING, CannotFuse, Node
+from torchrl_loco.envs.fusion.source import Source
 from torchrl_loco.sim.compiled.symbols import literal
 
 LONG = 64
 """Rows of a user's tensor that are taken for those of the worlds, if there are as many worlds; fewer may be chance."""
 
+GLOBAL = ("seed", "shared.")
+"""How the names of arrays begin that are the same in all worlds."""
 VIEWS = ("view", "reshape", "_unsafe_view", "flatten", "unflatten")
 INFINITE = "(1e30f * 1e30f)"
 FORMS = ("{}", "{}_like", "new_{}")
@@ -86,7 +88,7 @@ class Program:
         num_envs: number of worlds.
         device: where they live.
         rules: by operator's name without overload, a function of the program and the operator's arguments.
-        fixed: tensors that never change, which can be indices.
+        fixed: tensors that never change: they are constants, and can be indices and tables.
         long: rows of a user's tensor from which it is taken for one of the worlds, if there are as many worlds.
 
     Attributes:
@@ -104,6 +106,9 @@ class Program:
     ) -> None:
         self._long = long
         self._fixed = {tensor.data_ptr() for tensor in fixed}
+        self._copied: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}  # constants by the storage of their copies
+        self._tables: dict[Any, int] = {}
+        self._kept: list[torch.Tensor] = []  # no other constant gets its address meanwhile
         self._arrays, self._n, self._device, self._rules = arrays, num_envs, device, rules
         self.tensors: list[torch.Tensor] = []
         self._nodes: dict[Any, Node] = {}
@@ -120,6 +125,8 @@ class Program:
         """
         if text == WHERE and args[1] is args[2]:
             return args[1]
+        if text in OF_INTEGERS and dtype != torch.float32:
+            text = OF_INTEGERS[text]
         if text in WRAPPING and dtype in (torch.int32, torch.int64):
             text = text.replace("{", f"(unsigned {TYPES[dtype]}){{")
         key = text, dtype, place, *map(id, args)
@@ -280,7 +287,7 @@ class Program:
         return Value(self.each(WHERE, dtype, *arrays), dtype, world)
 
     def numbers(self, x: Any) -> np.ndarray:
-        """Returns constants, or what is in memory now, as numbers: for indices.
+        """Returns constants as numbers: for indices.
 
         Raises:
             CannotFuse: they are known only when the kernel runs.
@@ -288,18 +295,54 @@ class Program:
         if isinstance(x, torch.Tensor):
             return x.numpy()
         values = np.empty(x.array.shape, dtype=bool if x.dtype == torch.bool else int)
-        memory: dict[int, torch.Tensor] = {}
         for at in np.ndindex(*values.shape):
-            node = x.array[at]
-            if node.number is None and (node.place is None or node.varies):
-                raise CannotFuse("{op} has indices that depend on the state")
-            if node.number is None and node.place[0] not in memory:
-                tensor = self.tensors[node.place[0]]
-                if tensor.data_ptr() not in self._fixed:
-                    raise CannotFuse("{op} has indices in a tensor that may change: index with numbers, or by names")
-                memory[node.place[0]] = torch.as_strided(tensor, (span(tensor),), (1,)).cpu()
-            values[at] = node.number if node.number is not None else memory[node.place[0]][node.place[1]]
+            if (number := x.array[at].number) is None:
+                why = "depend on the state" if x.array[at].varies else "in a tensor that may change"
+                raise CannotFuse(f"{{op}} has indices that {why}: index with numbers, by names, or with constants")
+            values[at] = number
         return values
+
+    def table(self, x: Any) -> tuple[int, int, list[int], torch.dtype]:
+        """Returns where a tensor without worlds is in memory: its index, first element and steps, and its type.
+
+        Raises:
+            CannotFuse: it is computed when the kernel runs.
+        """
+        if isinstance(x, torch.Tensor):
+            return self._index_of(x), 0, list(x.stride()), x.dtype
+        first = x.array.flat[0].place if x.array.size else None
+        places = [node.place for node in x.array.flat]
+        if x.world is not None or first is None or any(p is None or p[0] != first[0] or p[2] for p in places):
+            raise CannotFuse("{op} looks up what is computed")
+        offsets = np.array([place[1] for place in places]).reshape(x.array.shape)
+        steps = [
+            int(np.take(offsets, 1, d).flat[0]) - first[1] if size > 1 else 0 for d, size in enumerate(offsets.shape)
+        ]
+        affine = sum(i * step for i, step in zip(np.indices(offsets.shape), steps, strict=True))
+        if not np.array_equal(offsets, first[1] + affine):
+            raise CannotFuse("{op} looks up parts of several tables")
+        return first[0], first[1], steps, x.dtype
+
+    def _index_of(self, x: torch.Tensor) -> int:
+        """Returns the index of a constant among the tensors: of what is on the device already, or of a copy there.
+
+        Raises:
+            CannotFuse: its numbers are of another type than those of kernels.
+        """
+        key = x.data_ptr(), tuple(x.shape), x.stride(), x.dtype
+        if key not in self._tables:
+            if x.dtype not in TYPES:
+                raise CannotFuse(f"{{op}} looks up a table of {x.dtype}")
+            copy, original = self._copied.get(x.untyped_storage().data_ptr(), (None, None))
+            if copy is None or original is None or x.dtype != original.dtype:
+                original = x.to(self._device)
+            else:
+                offset = original.storage_offset() + x.storage_offset() - copy.storage_offset()
+                original = original.as_strided(x.shape, x.stride(), offset)
+            self._tables[key] = len(self.tensors)
+            self.tensors.append(original)
+            self._kept.append(x)
+        return self._tables[key]
 
     # The graph.
 
@@ -318,7 +361,7 @@ class Program:
         for node in graph.nodes:
             if node.op == "placeholder":
                 name, tensor = next(inputs)
-                by_world = tensor.ndim > 0 and tensor.shape[0] == self._n and name != "seed"
+                by_world = tensor.ndim > 0 and tensor.shape[0] == self._n and not name.startswith(GLOBAL)
                 found[node] = self.source(tensor, 0 if by_world else None)
             elif node.op == "get_attr":
                 found[node] = self._constant(node, constants(node.target))
@@ -339,6 +382,10 @@ class Program:
             fresh or tensor.device != self._device
         ):  # torch.tensor(...) in a hook, or a copy that was made when it was traced
             return tensor.detach().cpu()
+        if tensor.data_ptr() in self._fixed and tensor.numel():
+            copy = tensor.detach().cpu()
+            self._copied[copy.untyped_storage().data_ptr()] = copy, tensor.detach()
+            return copy
         long = self._n >= self._long and tensor.ndim > 0 and tensor.shape[0] == self._n
         return self.source(tensor, 0 if long else None)
 

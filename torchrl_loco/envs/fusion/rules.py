@@ -24,7 +24,17 @@ from torchrl_loco.envs.fusion.nodes import (
     WHERE,
     CannotFuse,
 )
-from torchrl_loco.envs.fusion.program import FILLERS, LONG, VIEWS, Program, Value, Worldwise, _shifted, _varies
+from torchrl_loco.envs.fusion.program import (
+    FILLERS,
+    INFINITE,
+    LONG,
+    VIEWS,
+    Program,
+    Value,
+    Worldwise,
+    _shifted,
+    _varies,
+)
 
 BEATS = {"max": "{0} > {1} || ({0} != {0} && {1} == {1})", "min": "{0} < {1} || ({0} != {0} && {1} == {1})"}
 REMAINDER = "{0} != 0 && ({0} < 0) != ({1} < 0) ? {0} + {1} : {0}"
@@ -289,6 +299,9 @@ def _stack(p: Program, tensors: Sequence[Any], dim: int = 0) -> Any:
 
 
 def _index_select(p: Program, x: Any, dim: int, index: Any) -> Value:
+    if isinstance(index, Value) and not (isinstance(x, Value) and x.world is not None):
+        ndim = x.array.ndim if isinstance(x, Value) else x.ndim
+        return _looked_up(p, x, [*[None] * (dim % ndim), index])
     x = p.value(x)
     (dim,) = x.rowwise([dim])
     return x.with_array(np.take(x.array, p.numbers(index), axis=dim), x.world)
@@ -302,8 +315,9 @@ def _pick(p: Program, columns: Sequence[Any], index: Value) -> Value:
     """
     if len(columns) > LONG:
         raise CannotFuse(f"{{op}} chooses among {len(columns)} numbers")
-    index, found = p.cast(index, torch.int64), p.value(columns[0])
-    for i, column in enumerate(columns[1:], 1):
+    index, first = p.cast(index, torch.int64), p.value(columns[0])
+    found = p.value(math.nan) if first.dtype == torch.float32 else first  # out of range
+    for i, column in enumerate(columns):
         chosen = p.apply(f"{{0}} == {i} || {{0}} == {i - len(columns)}", torch.bool, index, of=torch.int64)
         found = p.where(chosen, column, found)
     return found
@@ -317,13 +331,66 @@ def _gather(p: Program, x: Any, dim: int, index: Any, sparse_grad: bool = False)
     return _pick(p, columns, index)
 
 
+def _looked_up(p: Program, x: Any, indices: Sequence[Any]) -> Value:
+    """Returns what each world looks up in a table: NaN (of integers 0) where an index is beyond its end."""
+    dims = [dim for dim, index in enumerate(indices) if index is not None]
+    shape = tuple(x.array.shape if isinstance(x, Value) else x.shape)
+    values, world = p.aligned(*(p.cast(indices[dim], torch.int64) for dim in dims))
+    table, first, steps, dtype = p.table(x)
+    address, inside = p.value(0), p.value(True)
+    for dim, index in zip(dims, values, strict=True):
+        index = p.apply(f"{{0}} < 0 ? {{0}} + {shape[dim]} : {{0}}", torch.int64, index)
+        inside = p.apply(f"{{0}} && {{1}} >= 0 && {{1}} < {shape[dim]}", torch.bool, inside, index, of=torch.int64)
+        address = p.apply(ADD, torch.int64, address, p.apply(MUL, torch.int64, index, steps[dim]))
+    rest = [dim for dim in range(len(shape)) if dim not in dims]
+    offsets = np.zeros([shape[dim] for dim in rest], dtype=int)
+    for axis, dim in enumerate(rest):
+        offsets += steps[dim] * np.arange(shape[dim]).reshape(-1, *[1] * (len(rest) - axis - 1))
+    nothing = "0" if dtype != torch.float32 else f"{INFINITE} - {INFINITE}"
+    made = np.empty((*address.array.shape, *offsets.shape), dtype=object)
+    for at in np.ndindex(*address.array.shape):
+        for of in np.ndindex(*offsets.shape):
+            text = f"{{0}} ? p{table}_0[{first + int(offsets[of])} + {{1}}] : {nothing}"
+            made[(*at, *of)] = p.node(text, dtype, inside.array[at], address.array[at], place=(table, None, 0))
+    start, count = dims[0] if dims == list(range(dims[0], dims[-1] + 1)) else 0, address.array.ndim
+    return Value(np.moveaxis(made, range(count), range(start, start + count)), dtype, _shifted(world, start))
+
+
+def _search(p: Program, table: Any, x: Any, *, out_int32: bool = False, right: bool = False, **others: Any) -> Value:
+    """Returns how many numbers of a sorted row are less than (``right``: at most) each number.
+
+    Raises:
+        CannotFuse: it has other options, or the row is no row.
+    """
+    if any(value not in (None, "left") for name, value in others.items() if name != "side"):
+        raise CannotFuse("{op} has a sorter")
+    right = right or others.get("side") == "right"
+    shape = table.array.shape if isinstance(table, Value) else table.shape
+    if len(shape) != 1:
+        raise CannotFuse("{op} searches in more than one row")
+    at, first, (step,), dtype = p.table(table)
+    x, found = p.cast(x, dtype), p.value(0)
+    compare = "<=" if right else "<"
+    for by in reversed([1 << bit for bit in range(int(shape[0]).bit_length())]):
+        last = f"p{at}_0[{first} + ({{0}} + {by - 1}) * {step}]"
+        text = f"{{0}} + {by} <= {shape[0]} && {last} {compare} {{1}} ? {{0}} + {by} : {{0}}"
+        (found, x), world = p.aligned(found, x)
+        nodes = np.frompyfunc(lambda a, b, text=text: p.node(text, torch.int64, a, b, place=(at, None, 0)), 2, 1)
+        found = Value(np.asarray(nodes(found.array, x.array), dtype=object), torch.int64, world)
+    return p.cast(found, p._meta.dtype)
+
+
+def _bucketize(p: Program, x: Any, boundaries: Any, **options: Any) -> Value:
+    return _search(p, boundaries, x, **options)
+
+
 def _index(p: Program, x: Any, indices: Sequence[Any]) -> Value:
-    x, some = p.value(x), [index for index in indices if index is not None]
-    if len(some) == 1 and isinstance(some[0], Value) and _varies(some[0]) and x.world is None and indices[0] is some[0]:
-        shape = (1,) * some[0].array.ndim  # of a table, the row that each world asks for
-        rows = [row.reshape(shape + row.shape) for row in map(np.asarray, x.array)]
-        index = some[0].array.reshape(some[0].array.shape + (1,) * (x.array.ndim - 1))
-        return _pick(p, [x.with_array(row, None) for row in rows], some[0].with_array(index, some[0].world))
+    some = [index for index in indices if index is not None]
+    has_worlds = isinstance(x, Value) and x.world is not None
+    if not has_worlds and all(not isinstance(index, Value) or index.dtype != torch.bool for index in some):
+        if any(isinstance(index, Value) and any(node.number is None for node in index.array.flat) for index in some):
+            return _looked_up(p, x, indices)
+    x = p.value(x)
     if x.world == 0 and indices[0] is not None and len(some) == len(indices) == 2:  # x[arange(n), i]
         if np.array_equal(p.numbers(indices[0]), np.arange(p._n)):
             index = p.value(indices[1])
@@ -526,5 +593,6 @@ RULES: dict[str, _Rule] = {
         "constant_pad_nd": _pad,
     },
     **{"index_select": _index_select, "index": _index, "index_put": _index_put, "gather": _gather},
+    **{"searchsorted": _search, "bucketize": _bucketize},
 }
 """Operators by name, without overload."""

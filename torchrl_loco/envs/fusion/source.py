@@ -85,7 +85,7 @@ class Source:
             self._lines.append(f"if (!{self._names[mask]}) return;")
             for target, node in stores:
                 self._store(target, node)
-        self.text = "\n".join([ROWS, *_pointers(tensors, places), *self._lines])
+        self.text = "\n".join([ROWS, *_pointers(tensors, places), *self._lines, ""])
 
     def _store_together(self, stores: list[Store]) -> None:
         value = dict(stores)

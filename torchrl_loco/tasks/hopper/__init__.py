@@ -79,6 +79,7 @@ class Hopper(LocoEnv):
     model = Path(__file__).with_name("hopper.xml")
     config = SimConfig(ctrl_dt=0.02, sim_dt=0.005, naconmax=50_000, njmax=50, iterations=4, ls_iterations=10)
     observation_size = 15
+    term_names: tuple[str, ...] = ("standing", "small_control")
     target_speed = 0.0
 
     @classmethod
@@ -143,7 +144,6 @@ class HopperStand(Hopper):
         dm_control ``suite/hopper.py``.
     """
 
-    term_names = ("standing", "small_control")
     presets = {
         "reppo": {
             "total_frames": 60_000_000,

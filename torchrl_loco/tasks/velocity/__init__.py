@@ -34,9 +34,6 @@ CURRICULUM: dict[int, commands.Ranges] = {
     240_000: ((-2.0, 3.0), (-1.0, 1.0), (-0.7, 0.7)),
 }
 """Ranges of the commands by the control step of training from which they hold."""
-NOISE = (0.5, 0.2, 0.05, 0.01, 1.5)
-"""Uniform noise, either way, of the policy's observation: velocity (m/s), rotation (rad/s), gravity, joint positions
-(rad) and joint velocities (rad/s)."""
 BIAS = 0.015
 """Greatest error of a joint's encoder in an episode (rad)."""
 PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
@@ -163,6 +160,14 @@ class Velocity(LocoEnv):
         },
     }
 
+    noise: ClassVar[Mapping[str, Any]] = {
+        "linear_velocity": 0.5,  # m/s
+        "angular_velocity": 0.2,  # rad/s
+        "gravity": 0.05,
+        "joint_positions": (0.01, "bias"),  # rad
+        "joint_velocities": 1.5,  # rad/s
+    }
+
     base: ClassVar[str]
     """Body that floats."""
     trunk: ClassVar[str]
@@ -265,15 +270,20 @@ class Velocity(LocoEnv):
         """Returns the heights of the feet (m), ``(num_envs, feet)``."""
         return s.site_xpos(list(self.feet))[..., 2]
 
-    def seen(self, s: "View") -> list[torch.Tensor]:
-        """Returns what a policy sees, without noise, each part ``(num_envs, n)``.
+    def seen(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns what a policy sees, without noise, by name, each ``(num_envs, n)``.
 
-        Velocity and rotation of the base and gravity in the base's frame, joint positions relative to home, joint
-        velocities, last action, command.
+        Velocities and gravity are in the frame of the base (m/s, rad/s), joint positions relative to home (rad).
         """
-        moves = [s.to_body(self.base, s.linvel(self.base)), s.to_body(self.base, s.angvel(self.base))]
-        joints = [s.joint_qpos(self.joints) - self.home(s), s.joint_qvel(self.joints)]
-        return [*moves, s.projected_gravity(self.base), *joints, s.last_action, s.command]
+        return {
+            "linear_velocity": s.to_body(self.base, s.linvel(self.base)),
+            "angular_velocity": s.to_body(self.base, s.angvel(self.base)),
+            "gravity": s.projected_gravity(self.base),
+            "joint_positions": s.joint_qpos(self.joints) - self.home(s),
+            "joint_velocities": s.joint_qvel(self.joints),
+            "last_action": s.last_action,
+            "command": s.command,
+        }
 
     @classmethod
     def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
@@ -281,18 +291,19 @@ class Velocity(LocoEnv):
         joints = actuated(m)
         home = models.home_pose(m)[[int(m.joint(name).qposadr[0]) for name in joints]].tolist()
         size = {"size": len(joints), "joints": joints}
-        linear, angular, gravity, position, velocity = NOISE
+        noise = {name: most[0] if isinstance(most, tuple) else most for name, most in cls.noise.items()}
         scale = np.full(m.nu, cls.action_scale or 0.0)
         if cls.action_scale is None:
             scale = 0.25 * m.actuator_forcerange[:, 1] / m.actuator_gainprm[:, 0]
         low, high = commands.reached(cls.curriculum, info.get("frames", 0) // info.get("num_envs", 1))
         return {
             "observation": [
-                {"term": "linear_velocity", "size": 3, "body": cls.base, "noise": linear},
-                {"term": "angular_velocity", "size": 3, "body": cls.base, "noise": angular},
-                {"term": "gravity", "size": 3, "body": cls.base, "noise": gravity},
-                {"term": "joint_positions", **size, "home": home, "noise": position, "bias": BIAS},
-                {"term": "joint_velocities", **size, "noise": velocity},
+                *(
+                    {"term": term, "size": 3, "body": cls.base, "noise": noise[term]}
+                    for term in ("linear_velocity", "angular_velocity", "gravity")
+                ),
+                {"term": "joint_positions", **size, "home": home, "noise": noise["joint_positions"], "bias": BIAS},
+                {"term": "joint_velocities", **size, "noise": noise["joint_velocities"]},
                 {"term": "last_action", "size": m.nu},
                 {"term": "command", "size": 3},
             ],
@@ -328,7 +339,10 @@ class Velocity(LocoEnv):
 
     def terms(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the terms of the reward by name, each ``(num_envs,)``, before they are weighted."""
-        linear, angular, _, stray, _, _, command = self.seen(s)
+        seen = self.seen(s)
+        linear, angular, stray, command = (
+            seen[name] for name in ("linear_velocity", "angular_velocity", "joint_positions", "command")
+        )
         speed = command[:, :2].norm(dim=-1) + command[:, 2].abs()
         moves, stands, runs = speed > STANDS, (speed < STANDS).unsqueeze(-1), (speed >= RUNS).unsqueeze(-1)
         walking = torch.where(runs, self.stray(s, self.run), self.stray(s, self.walk))
@@ -395,19 +409,17 @@ class Velocity(LocoEnv):
         until_push = torch.where(push, s.uniform(*PUSH_EVERY), s.until_push - s.dt)
         return {"qvel": torch.cat([base, s.qvel[:, 6:]], dim=-1), "until_push": until_push}
 
-    def observation(self, s: "View") -> dict[str, torch.Tensor]:
+    def observation(self, s: "View") -> dict[str, dict[str, torch.Tensor]]:
         """Returns what the policy sees, and for the critic the same without noise and the feet."""
-        parts = self.seen(s)
-        clean = noisy = torch.cat(parts, dim=-1)
-        if not self.play:
-            sizes = [part.shape[-1] for part in parts[: len(NOISE)]]
-            noise = [s.uniform(-most, most, size) for most, size in zip(NOISE, sizes, strict=True)]
-            noise[3] = noise[3] + s.bias
-            noisy = torch.cat([clean[:, : sum(sizes)] + torch.cat(noise, dim=-1), clean[:, sum(sizes) :]], dim=-1)
-        forces = self.forces(s).flatten(1)
-        forces = forces.sign() * torch.log1p(forces.abs())
-        hidden = [self.heights(s), s.air_time, self.touching(s).float(), forces, s.delay.unsqueeze(-1)]
-        return {"observation": noisy, "privileged": torch.cat([clean, *hidden], dim=-1)}
+        seen, forces = self.seen(s), self.forces(s).flatten(1)
+        hidden = {
+            "foot_heights": self.heights(s),
+            "air_time": s.air_time,
+            "foot_contacts": self.touching(s).float(),
+            "foot_forces": forces.sign() * torch.log1p(forces.abs()),
+            "delay": s.delay,
+        }
+        return {"observation": seen, "privileged": {**seen, **hidden}}
 
     def begin(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the home pose, somewhere within half a meter and just above the ground, and a command."""

@@ -85,6 +85,7 @@ class Walker(LocoEnv):
     model = Path(__file__).with_name("walker.xml")
     config = SimConfig(ctrl_dt=0.025, sim_dt=0.0025, naconmax=50_000, njmax=100, iterations=2, ls_iterations=5)
     observation_size = 24
+    term_names: tuple[str, ...] = ("stand",)
     target_speed = 0.0
 
     @classmethod
@@ -146,7 +147,6 @@ class WalkerStand(Walker):
         dm_control ``suite/walker.py``.
     """
 
-    term_names = ("stand",)
     presets = {
         "reppo": {
             "total_frames": 34_000_000,

@@ -1,0 +1,223 @@
+"""Tables that worlds look up, what they share, numbers for the log, and hooks on top of Warp functions."""
+
+import pytest
+import torch
+from hook_tasks import Still
+from tensordict import TensorDict
+
+import torchrl_loco
+from torchrl_loco import HopperHop, LocoEnv, WalkerWalk
+
+FRAMES = torch.arange(90_000.0).view(30_000, 3)
+
+
+class Looks(WalkerWalk):
+    """Looks up numbers of a long table, of a short one through another, and through what is shared."""
+
+    constants = {"frames": FRAMES, "ids": [3, 5], "order": torch.arange(29_999, -1, -1), "small": [1.0, 2.0, 3.0]}
+    memory = {"frame": torch.int32, "pair": ((2,), torch.int64), "fell": torch.bool}
+    shared = {"rate": (4,), "falls": torch.int64, "upto": 4}
+
+    def reward(self, s):
+        return super().reward(s) + s.small[s.frame % 3]
+
+    def terminated(self, s):
+        return s.qpos[:, 0] < -0.3
+
+    def metrics(self, s):
+        return {"height": s.qpos[:, 0], "fell": s.terminated.float()}
+
+    def events(self, s):
+        return {"frame": s.frame + 1, "fell": s.terminated, "pair": torch.stack([s.frame.long(), s.env_index], dim=-1)}
+
+    def adapt(self, s):
+        rate = 0.9 * s.rate + torch.zeros_like(s.rate).index_add(0, s.frame % 4, s.qvel[:, 0].abs() + 0.1)
+        return {"rate": rate, "falls": s.falls + s.terminated.sum(), "upto": rate.cumsum(0) / rate.sum()}
+
+    def observation(self, s):
+        place = torch.searchsorted(s.upto, s.uniform(0.0, 0.9)).clamp(max=3)
+        looked_up = [
+            s.frames[s.frame, 1:],
+            s.frames[s.order[s.frame]][:, :1],
+            s.frames[s.falls, :1].expand(s.num_envs, 1),
+        ]
+        return torch.cat([super().observation(s), *looked_up, s.rate[place, None], s.qpos[:, s.ids]], dim=-1)
+
+    def begin(self, s):
+        return {**super().begin(s), "frame": (s.env_index * 7) % 100}
+
+
+def played(env, actions, td=None):
+    """Returns what worlds return under actions, in a stack along the time."""
+    td, found = env.reset() if td is None else td, []
+    for action in actions.unbind(0):
+        after = env.step(td.set("action", action))["next"]
+        found.append(after.clone())
+        td = env.maybe_reset(after.exclude("reward"))
+    return torch.stack(found, 1)
+
+
+ACTIONS = 2 * torch.rand(80, 5, 6, generator=torch.Generator().manual_seed(0)) - 1
+
+
+def test_hooks_with_tables_are_kernels_and_equal_plain_torch():
+    env, plain = (Looks(5, "cpu", 0, metrics=True, compile_hooks=kernels) for kernels in (True, False))
+    assert {part.kind for part in (env.world._judge, env.world._observe, env.world._begin)} == {"kernel"}
+    ours, theirs = played(env, ACTIONS), played(plain, ACTIONS)
+    for key in ("observation", "reward", ("metrics", "height"), "done"):
+        assert torch.equal(ours[key], theirs[key])
+    assert ours["terminated"].any()
+    assert torch.equal(ours["metrics", "fell"], ours["terminated"].float())
+    for name, values in env.world.shared.items():
+        assert torch.equal(values, plain.world.shared[name])
+    assert env.world.shared["falls"] == ours["terminated"].sum()
+    assert env.health()["total", "index_error"] == 0
+    walker = WalkerWalk(5, "cpu", 0)
+    alike = played(walker, ACTIONS[:5])  # until the first of ours ends
+    assert not ours["done"][:, :5].any()
+    assert torch.equal(ours["observation"][:, :5, :24], alike["observation"])
+    small = torch.tensor([1.0, 2.0, 3.0])[(torch.arange(5)[:, None] * 7 + torch.arange(5)) % 3]
+    assert torch.equal(ours["reward"][:, :5, 0], alike["reward"][..., 0] + small)
+
+
+@pytest.mark.parametrize("kernels", [True, False])
+def test_an_index_out_of_range_gives_nan_and_is_counted(kernels):
+    env = Looks(5, "cpu", 0, compile_hooks=kernels)
+    env.reset()
+    state = env.get_state()
+    state["memory", "frame"] = torch.tensor([5, 29_999, 40_000, -30_001, -3], dtype=torch.int32)
+    after = played(env, ACTIONS[:1], env.reset(state, set_state=True))[:, 0]
+    assert env.health()["worlds", "index_error"].tolist() == [0, 1, 1, 1, 0]
+    assert env.health()["worlds", "non_finite"].tolist() == [0, 1, 1, 1, 0]
+    assert after["terminated"].flatten().tolist() == [False, True, True, True, False]
+    assert not (after["observation"] * after["terminated"]).any()
+    assert after["observation"][4, 24:26].tolist() == [3 * 29_998 + 1, 3 * 29_998 + 2]
+
+
+def test_what_worlds_share_is_part_of_the_state():
+    env = Looks(5, "cpu", 0)
+    played(env, ACTIONS[:20])
+    state = env.get_state()
+    assert state["shared", "rate"].shape == (5, 4)
+    assert state["memory", "frame"].dtype == torch.int32
+    first = played(env, ACTIONS[20:], env.reset(state.clone(), set_state=True))
+    assert torch.equal(first["observation"], played(env, ACTIONS[20:], env.reset(state, set_state=True))["observation"])
+    env.load_state_dict(saved := env.state_dict())
+    assert torch.equal(env.get_state()["shared", "rate"], saved["_extra_state"]["worlds"]["shared"]["rate"])
+    state["shared", "falls"] = torch.arange(5)
+    with pytest.raises(ValueError, match="must be the same in all worlds"):
+        env.reset(state, set_state=True)
+    state["shared", "falls"].zero_()
+    state["memory", "frame"] = torch.zeros(5)
+    with pytest.raises(ValueError, match=r"must be of torch.int32, got torch.float32: it is of an earlier version"):
+        env.reset(state, set_state=True)
+
+
+class Levels(HopperHop):
+    """Starts where the level of the last episode was left, and counts all steps."""
+
+    memory = {"level": ()}
+    shared = {"steps": ()}
+
+    def events(self, s):
+        return {"level": s.level + 1.0}
+
+    def adapt(self, s):
+        return {"steps": s.steps + 1.0}
+
+    def begin(self, s):
+        return {**super().begin(s), "level": s.level}
+
+    def reward(self, s):
+        return {"hop": super().reward(s), "level": s.level, "steps": s.steps.expand(s.num_envs)}
+
+
+def test_a_stage_is_where_episodes_go_on():
+    env = Levels(3, "cpu", 0)
+    assert env.hooks.carried == ("level",)
+    env.rollout(4, Still(env))
+    assert env.get_stage() == {"shared": {"steps": 4.0}, "memory": {"level": [4.0, 4.0, 4.0]}}
+    other = Levels(5, "cpu", 1, reward_terms=True)
+    other.set_stage({**env.get_stage(), "memory": {"level": [10.0, 20.0]}})
+    after = other.rollout(1, Still(other))["next", "reward_terms"]
+    assert after["level"].flatten().tolist() == [10.0, 20.0, 10.0, 20.0, 10.0]
+    assert after["steps"].unique().tolist() == [4.0]
+    with pytest.raises(ValueError, match="choose one of level"):
+        other.set_stage({"memory": {"levels": [1.0]}})
+    with pytest.raises(ValueError, match=r"'level' of a stage must have rows of shape \(\)"):
+        other.set_stage({"memory": {"level": [[1.0]]}})
+    assert torchrl_loco.make("hopper_hop", 1, "cpu").get_stage() == {}
+
+
+def test_built_in_starts_and_controls_can_be_built_on():
+    class Shifted(WalkerWalk):
+        def begin(self, s):
+            rows = super().begin(s)
+            return {**rows, "qvel": rows["qvel"] + 1.0}
+
+        def control(self, s, action):
+            return super().control(s, action)
+
+    own, built_in = (cls(4, "cpu", 3) for cls in (Shifted, WalkerWalk))
+    for env in (own, built_in):
+        env.reset()
+    states = [env.get_state() for env in (own, built_in)]
+    assert torch.equal(states[0]["qpos"], states[1]["qpos"])
+    assert torch.equal(states[0]["qvel"], states[1]["qvel"] + 1.0)
+    action = TensorDict({"action": ACTIONS[0, :4]}, batch_size=[4])
+    for env in (own, built_in):
+        env.step(action.clone())
+    torch.testing.assert_close(own.sim.ctrl, built_in.sim.ctrl)
+
+    class Alone(LocoEnv):
+        model = WalkerWalk.model
+
+        def reward(self, s):
+            return super().reward(s)
+
+        def observation(self, s):
+            return s.qpos
+
+    with pytest.raises(NotImplementedError, match=r"no class above this one has reward\(self, s\)"):
+        Alone(1, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("entries", "error", "message"),
+    [
+        (
+            {"memory": {"frame": torch.float64}},
+            ValueError,
+            r"must be of torch.float32, torch.int32.* got torch.float64",
+        ),
+        ({"shared": {"rate": (0,)}}, ValueError, r"shared\['rate'\] must have sizes of 1 or more"),
+        ({"shared": {"qpos": 3}}, ValueError, "'qpos' is taken"),
+        ({"memory": {"rate": ()}, "shared": {"rate": ()}}, ValueError, "'rate' is taken"),
+        ({"memory": {"a": ()}, "constants": {"a": [1.0]}}, ValueError, "'a' is taken"),
+        (
+            {"memory": {"i": ()}, "constants": {"text": "abc"}},
+            TypeError,
+            r"constants\['text'\] must be an array of numbers",
+        ),
+        (
+            {"memory": {"i": torch.int64}, "update": lambda self, s: {"i": s.time}},
+            TypeError,
+            "must return i of torch.int64",
+        ),
+        (
+            {"shared": {"r": 2}, "adapt": lambda self, s: {"r": s.time}},
+            ValueError,
+            r"adapt must return r of shape \(2,\)",
+        ),
+        ({"update": lambda self, s: {"i": s.terminated}}, ValueError, r"s.terminated is not known in update\(\)"),
+        ({"metrics": lambda self, s: {"m": s.qpos}}, ValueError, r"metrics\['m'\] must return shape \(3,\)"),
+        (
+            {"constants": {"a": [1.0]}, "update": lambda self, s: s.a.add_(1.0) and {}},
+            ValueError,
+            "update writes to s.a",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said(entries, error, message):
+    with pytest.raises(error, match=message):
+        type("Wrong", (WalkerWalk,), entries)(3, "cpu", 0, metrics=True)
