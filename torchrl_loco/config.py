@@ -13,7 +13,7 @@ SCENE = Path(__file__).parent / "sim" / "scene.xml"
 
 PROTOCOLS = ("playground", "dm_control")
 
-ENGINES = ("auto", "compiled", "mujoco_warp")
+ENGINES = ("auto", "compiled", "mujoco_warp", "mujoco")
 
 INTEGRATORS = ("euler", "implicitfast", "rk4")
 
@@ -47,7 +47,8 @@ class SimConfig:
             :meth:`torchrl_loco.LocoEnv.health`.
         engine: what steps the physics. ``compiled`` is one kernel made for the model, 6 to 50 times as fast on an
             H200; ``mujoco_warp`` is MuJoCo-Warp; ``auto`` takes ``compiled`` if it supports the model,
-            else ``mujoco_warp``.
+            else ``mujoco_warp``. ``mujoco`` is C MuJoCo in float64 on the CPU, a thread for each core, with the options
+            of the model but for time step and integrator: what the others are compared with.
         integrator: how velocities and positions advance: ``euler`` (semi-implicit), ``implicitfast``, or ``rk4``
             (under ``mujoco_warp`` only). It replaces the one that the model names, as ``sim_dt``, iterations and
             ``euler_damping`` do. For tasks of yours a line of the log and ``repr(env)`` say so, where the model names

@@ -113,7 +113,7 @@ class LocoEnv(EnvBase):
         seed: the seed, also one that was drawn.
         protocol: the protocol.
         config: all settings, a :class:`torchrl_loco.SimConfig`.
-        engine: what steps the worlds, ``"compiled"`` or ``"mujoco_warp"``.
+        engine: what steps the worlds, ``"compiled"``, ``"mujoco_warp"`` or ``"mujoco"``.
         engine_reason: why.
         mj_model: the model, a ``mujoco.MjModel``.
         groups: shape of a row of each tensor of the observation, by name.
@@ -347,6 +347,8 @@ class LocoEnv(EnvBase):
         of_model, default = options_of(self.mj_model.opt), options_of(mujoco.MjSpec().option)
         if self.config.integrator != "euler" or not self.mj_model.dof_damping.any():
             del of_model["euler_damping"]
+        if self.config.engine == "mujoco":  # which has all other options from the model
+            of_model = {name: of_model[name] for name in ("sim_dt", "integrator")}
         replaced = {
             name: f"{value} -> {new}"
             for name, value in of_model.items()

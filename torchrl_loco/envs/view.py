@@ -346,7 +346,7 @@ class View:
         """Returns a sensor of the model, ``(num_envs, size)``, in MuJoCo's units.
 
         Those of poses and velocities (gyro, velocimeter, frame*, joint*) are computed here; touch, and velocity and
-        angular momentum of a subtree, by either engine; any other by ``engine="mujoco_warp"``.
+        angular momentum of a subtree, by every engine; any other by ``mujoco_warp`` and ``mujoco``.
         """
         (sensor,), _ = self._catalog.ids("sensor", _one("sensor", name))
         derived = sensors.evaluate(self, sensor)

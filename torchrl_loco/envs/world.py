@@ -39,6 +39,7 @@ from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import (
     EXCLUSIVE,
     Buffer,
+    Direct,
     Graph,
     PackedBuffers,
     Recorded,
@@ -353,7 +354,7 @@ class World:
         self._rest = self._record(self._launch_rest) if own or variation else _nothing
         self._conclude = self._record(self._launch_conclude) if own else _nothing
         self._move = self._keeping_what_was(self._record(self._launch_move)) if moves else _nothing
-        self._refresh_graph: Graph | None = None  # most environments never need it
+        self._refresh_graph: Graph | Direct | None = None  # most environments never need it
         self._run_step = self._as_graph("_take_step", several=bool(own))
         self._run_reset = self._as_graph("_begin_masked", several=bool(own) or variation is not None)
 
@@ -528,7 +529,7 @@ class World:
         self._judge()
         return self.reward.torch, self.ended.torch
 
-    def _record_refresh(self) -> Graph:
+    def _record_refresh(self) -> Graph | Direct:
         device = self.sim.device
         with torch.inference_mode(False), EXCLUSIVE, self.sim.qpos.device:
             wp.synchronize_device(device)  # the state was written on torch's stream; Warp's reads it while recording

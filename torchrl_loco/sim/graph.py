@@ -80,6 +80,24 @@ class Graph:
             wp.capture_launch(self._graph, stream=current_stream(self._device))
 
 
+class Direct:
+    """A launch that is made anew at each replay: C MuJoCo's steps are none that Warp could record.
+
+    Args:
+        launch: a method that makes it. Its object is not kept alive.
+    """
+
+    def __init__(self, launch: Callable[[], None]) -> None:
+        self._launch = weakref.WeakMethod(launch)
+
+    def replay(self) -> None:
+        """Makes the launch."""
+        launch = self._launch()
+        assert launch is not None
+        with EXCLUSIVE, wp.ScopedDevice("cpu"):
+            launch()
+
+
 class Recorded:
     """Warp launches as a call: a recording of them is replayed, or they join the CUDA graph that torch records.
 
@@ -89,7 +107,7 @@ class Recorded:
         device: the Warp device.
     """
 
-    def __init__(self, launch: Callable[..., None], graph: Graph, device: wp.Device) -> None:
+    def __init__(self, launch: Callable[..., None], graph: Graph | Direct, device: wp.Device) -> None:
         self._launch, self._graph, self._device = weakref.WeakMethod(launch), graph, device
 
     def __call__(self, *args: Any) -> None:

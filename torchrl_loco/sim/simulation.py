@@ -13,9 +13,10 @@ import warp as wp
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import compiled, mjw, models, mujoco_warp
+from torchrl_loco.sim import mujoco as c_mujoco
 from torchrl_loco.sim.batched_model import BatchedModel, with_every_row
 from torchrl_loco.sim.compilation import compile_kernels
-from torchrl_loco.sim.graph import Graph, ScratchPool
+from torchrl_loco.sim.graph import Direct, Graph, ScratchPool
 from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.warp_init import init_warp
 from torchrl_loco.sim.world_func import WorldFunc, WorldKernel, copy_row, fill, zero_row
@@ -110,7 +111,7 @@ class Simulation:
         MemoryError: the device has no room for so many worlds.
     """
 
-    engine: compiled.CompiledEngine | mujoco_warp.MujocoWarpEngine
+    engine: compiled.CompiledEngine | mujoco_warp.MujocoWarpEngine | c_mujoco.MujocoEngine
 
     def __init__(
         self,
@@ -128,6 +129,8 @@ class Simulation:
         say_what_is_only_seen(mj_model)
         geoms = check_geoms(mj_model, contact_geoms)
         differing = varied if varied is not None and varied.count else None
+        if config.engine == "mujoco" and device.type != "cpu":
+            raise ValueError(f"engine='mujoco' is C MuJoCo, which computes on the CPU: pass device='cpu', got {device}")
         self.engine_choice = name, _ = choose_engine(mj_model, config, differing)
         rows = config.substeps if contact_history else 1
         needed = memory(name, mj_model, config, num_envs, device, len(geoms), differing, rows)
@@ -136,7 +139,11 @@ class Simulation:
         self.num_envs = num_envs
         init_warp()
         self.device = wp.get_device(str(device))
-        engines: dict[str, type] = {"compiled": compiled.CompiledEngine, "mujoco_warp": mujoco_warp.MujocoWarpEngine}
+        engines: dict[str, type] = {
+            "compiled": compiled.CompiledEngine,
+            "mujoco_warp": mujoco_warp.MujocoWarpEngine,
+            "mujoco": c_mujoco.MujocoEngine,
+        }
         self.engine = engines[name](mj_model, config, num_envs, self.device, geoms, differing, rows)
         self.model, self.data = self.engine.model, self.engine.data
         self._mujoco_data: dict[int, mjw.Data] = {}
@@ -291,18 +298,25 @@ class Simulation:
         """Compiles the kernels that ``launches`` would launch, in parallel and with a progress bar."""
         compile_kernels(launches, self.device)
 
-    def capture(self, launch: Callable[[], None]) -> Graph:
+    def capture(self, launch: Callable[[], None]) -> Graph | Direct:
         """Returns a recording of the launches that ``launch`` makes. It also runs them: reset before use."""
+        if isinstance(self.engine, c_mujoco.MujocoEngine):
+            return Direct(launch)
         return Graph(launch, self.device, self._scratch)
 
 
 def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
-    """Sets the options of a model from ``config``, and takes contacts out of it that ``config`` does not want."""
+    """Sets the options of a model from ``config``, and takes contacts out of it that ``config`` does not want.
+
+    Under C MuJoCo these are the time step and the integrator.
+    """
     if config.contacts == "ground":
         models.touch_ground_only(mj_model)
     option = mj_model.opt
     option.integrator = integrator(config)
     option.timestep = config.sim_dt
+    if config.engine == "mujoco":
+        return  # all else is the model's own
     option.iterations = config.iterations
     option.ls_iterations = config.ls_iterations
     euler_damping = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
@@ -368,7 +382,7 @@ def choose_engine(mj_model: mujoco.MjModel, config: SimConfig, varied: Varied | 
     Raises:
         ValueError: ``config.engine`` is "compiled", and the model needs something that it does not have.
     """
-    if config.engine == "mujoco_warp":
+    if config.engine in ("mujoco_warp", "mujoco"):
         return config.engine, "as asked"
     missing = compiled.unsupported(mj_model, varied)
     if not missing:
@@ -395,6 +409,8 @@ def memory(
     """Returns the memory that a simulation takes (bytes)."""
     if engine == "compiled":
         return compiled.data_bytes(mj_model, num_envs, contact_geoms * contact_rows, varied)
+    if engine == "mujoco":
+        return c_mujoco.data_bytes(mj_model, num_envs)
     scratch = DETERMINISTIC_SCRATCH if config.deterministic and device.type == "cuda" else SCRATCH
     return int(scratch * mujoco_warp.data_bytes(mj_model, config, num_envs, contact_geoms, varied, contact_rows))
 

@@ -1,0 +1,357 @@
+"""C MuJoCo in float64 as an engine: the oracle. A thread for each core steps worlds one by one."""
+
+import concurrent.futures
+import copy
+import os
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from torchrl_loco.config import SimConfig
+from torchrl_loco.sim import mjw
+from torchrl_loco.sim.batched_model import nominal_numbers
+from torchrl_loco.sim.buffer import Buffer
+from torchrl_loco.sim.compiled.engine import Model
+from torchrl_loco.sim.overflow import Overflow
+from torchrl_loco.sim.varied import Varied
+from torchrl_loco.sim.world_func import WorldFunc, WorldKernel
+
+STATE = ("qpos", "qvel", "act", "qacc_warmstart", "time", "mocap_pos", "mocap_quat")
+"""What hooks, states and resets may change between two steps; all else follows from it."""
+
+LOST = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")]
+"""MuJoCo's warnings after which a world is not finite: MuJoCo has reset it, or left out what it was told."""
+
+FULL = {
+    int(mujoco.mjtWarning.mjWARN_CONTACTFULL): Overflow.NARROWPHASE,
+    int(mujoco.mjtWarning.mjWARN_CNSTRFULL): Overflow.NEFC,
+}
+"""MuJoCo's warnings that something was dropped, and how that is flagged."""
+
+
+class Data:
+    """The state of all worlds in float32, as the other engines have it, and what follows from it.
+
+    Arrays are those of MuJoCo-Warp's ``mjData``. Those that were read as attributes once are kept up to date.
+
+    Args:
+        m: the model.
+        num_envs: number of worlds.
+    """
+
+    def __init__(self, m: mujoco.MjModel, num_envs: int) -> None:
+        with wp.ScopedDevice("cpu"):
+            arrays = mjw.make_data(m, nworld=num_envs, naconmax=1, njmax=1)
+        self._arrays: dict[str, wp.array] = {}
+        self._all = arrays
+
+    def __getattr__(self, name: str) -> wp.array:
+        """Returns an array, which follows from then on.
+
+        Raises:
+            AttributeError: neither MuJoCo-Warp nor C MuJoCo has it.
+        """
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name not in self._arrays:
+            array = getattr(self._all, name)
+            if not isinstance(array, wp.array) or (
+                name not in ("overflow", "ctrl") and not hasattr(mujoco.MjData, name)
+            ):
+                raise AttributeError(f"the engine 'mujoco' has no data.{name}")
+            self._arrays[name] = array
+        return self._arrays[name]
+
+    def shown(self) -> dict[str, np.ndarray]:
+        """Returns what was asked for of what follows from a step, by name: views ``(num_envs, ...)``."""
+        kept = (*STATE, "overflow", "ctrl")
+        return {name: array.numpy() for name, array in self._arrays.items() if name not in kept}
+
+
+class World:
+    """A world of C MuJoCo: its ``mjData``, and NumPy's views of what is copied to and from it at every step.
+
+    Args:
+        m: the model.
+        state: names of what makes up its state.
+    """
+
+    def __init__(self, m: mujoco.MjModel, state: Collection[str]) -> None:
+        self.model, self.data = m, mujoco.MjData(m)
+        self._views: dict[str, np.ndarray] = {}
+        self.state = {name: self.view(name) for name in state if name != "time"}
+        self.ctrl, self.warned, self.iterations = self.data.ctrl, self.data.warning.number, self.data.solver_niter
+
+    def view(self, name: str) -> np.ndarray:
+        """Returns an array of the ``mjData``, which shows its present numbers."""
+        if name not in self._views:
+            self._views[name] = getattr(self.data, name)
+        return self._views[name]
+
+
+class MujocoEngine:
+    """Steps all worlds with C MuJoCo, each in an ``mjData`` of its own.
+
+    Time step, integrator and contacts are those of ``config``, all else the options of the model.
+
+    Args:
+        mj_model: the compiled model.
+        config: settings of the simulation.
+        num_envs: number of worlds.
+        device: the CPU.
+        contact_geoms: geoms whose contact forces are computed.
+        varied: which numbers of the model differ from world to world.
+        contact_rows: of how many substeps contact forces are kept: of the last, or of all.
+
+    Attributes:
+        model: the model on the device, to be read only.
+        data: the state of all worlds.
+        worlds: the ``mjData`` of each world, in float64.
+        numbers: the numbers that differ, ``(nworld, varied.count)``; none without ``varied``.
+        peak_constraints: most constraint rows that a substep needed since the last reset, by world, ``(nworld,)``.
+        peak_contacts: most contacts that a substep of one world needed, times the worlds, ``(1,)``.
+        coalesced: false: the numbers of a world are contiguous.
+    """
+
+    coalesced = False
+
+    def __init__(
+        self,
+        mj_model: mujoco.MjModel,
+        config: SimConfig,
+        num_envs: int,
+        device: wp.Device,
+        contact_geoms: Sequence[int] = (),
+        varied: Varied | None = None,
+        contact_rows: int = 1,
+    ) -> None:
+        m = mj_model
+        self._varied, self._substeps, self._rows = varied, config.substeps, contact_rows
+        self.model, self.data = Model(m, device), Data(m, num_envs)
+        self._kernels: dict[tuple[wp.Function, ...], WorldKernel] = {}
+        self._passive = _without_actuation(m)
+        home: Any = mujoco.MjData(m)
+        names = [name for name in STATE if np.size(getattr(home, name))]
+        self._worlds = [World(m, names) for _ in range(num_envs)]
+        count = 0 if varied is None else varied.count
+        numbers = np.zeros((num_envs, 0)) if varied is None else nominal_numbers(varied, num_envs)
+        self.numbers = wp.array(numbers, shape=(num_envs, count), dtype=float, device=device)
+        self._state = {name: getattr(self.data, name).numpy() for name in names}
+        for name, rows in self._state.items():
+            rows[:] = np.reshape(getattr(home, name), rows.shape[1:])
+        self._written = {name: rows.copy() for name, rows in self._state.items()}
+        self._ctrl, self._overflow = self.data.ctrl.numpy(), self.data.overflow.numpy()
+        self._geoms, self._column = len(contact_geoms), np.full(m.ngeom + 1, -1)  # a part of a flex is geom -1
+        self._column[list(contact_geoms)] = np.arange(self._geoms)
+        shape = num_envs, contact_rows * len(contact_geoms)
+        self._force = wp.zeros(shape, dtype=wp.vec3, device=device)
+        self._in_contact = wp.zeros(shape, dtype=bool, device=device)
+        self._all = wp.ones(num_envs, dtype=bool, device=device)
+        self.peak_constraints, self.peak_contacts = Buffer(num_envs, int, device), Buffer(1, int, device)
+        self._forces, self._touches = self._force.numpy(), self._in_contact.numpy()
+        self._most = self.peak_constraints.torch.numpy(), self.peak_contacts.torch.numpy()
+        self._threads = concurrent.futures.ThreadPoolExecutor(os.cpu_count(), "mujoco")
+
+    @property
+    def worlds(self) -> list[mujoco.MjData]:
+        """The ``mjData`` of each world."""
+        return [world.data for world in self._worlds]
+
+    def remedy(self, dropped: str, most: int) -> str:
+        """Returns advice for the warning about dropped constraints or contacts, of which a substep needed ``most``."""
+        return f'C MuJoCo had no memory for more {dropped} than {most}: raise <size memory="..."/> in the model'
+
+    def contact_arrays(self) -> tuple[wp.array, wp.array]:
+        """Returns net contact forces vec3 and whether there is a contact, ``(nworld, contact_rows * geoms)`` each."""
+        return self._force, self._in_contact
+
+    def subtree_com(self) -> wp.array:
+        """Returns ``data.subtree_com``."""
+        return self.data.subtree_com
+
+    def step(
+        self,
+        before: Sequence[WorldFunc] = (),
+        after: Sequence[WorldFunc] = (),
+        first: Sequence[WorldFunc] = (),
+        last: Sequence[WorldFunc] = (),
+    ) -> None:
+        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state.
+
+        Forces, contacts and the sensors of forces are those of the last substep.
+
+        Args:
+            before: what each world does first.
+            after: what it does at the end.
+            first: what it does before that.
+            last: what it does after that.
+        """
+        self._launch([*first, *before], self._all)
+        shown, substeps, rows = self.data.shown(), self._substeps, self._rows
+        changed = {name: _differ(rows, self._written[name]) for name, rows in self._state.items()}
+        anything = np.any(list(changed.values()), axis=0)
+
+        def advance(i: int) -> None:
+            world = self._worlds[i]
+            d, m, iterations, most = world.data, world.model, world.iterations, world.model.opt.iterations
+            if anything[i]:
+                self._load(i, [name for name, worlds in changed.items() if worlds[i]])
+            world.warned[:] = 0
+            world.ctrl[:] = self._ctrl[i]
+            limited = False
+            for k in range(substeps):
+                mujoco.mj_step(m, d)
+                limited |= iterations[0] >= most or (d.nisland > 1 and iterations[: d.nisland].max() >= most)
+                if self._geoms and k >= substeps - rows:
+                    self._add_up_forces(i, k - substeps + rows)
+            lost = self._flag(i, limited=limited)
+            mujoco.mj_step1(m, d)
+            self._write(i, shown, lost=lost or bool(world.warned[LOST].any()))
+
+        self._each(np.arange(len(self._worlds)), advance)
+        self._keep_written()
+        self._launch([*after, *last], self._all)
+
+    def forward(
+        self,
+        mask: wp.array,
+        before: Sequence[WorldFunc] = (),
+        after: Sequence[WorldFunc] = (),
+        *,
+        at_rest: bool = False,
+        contacts: bool = True,
+    ) -> None:
+        """Updates poses and sensors where ``mask`` ``(nworld,)`` is set, those of forces without control.
+
+        Numbers of the model that were changed there count from now on.
+
+        Args:
+            mask: the worlds.
+            before: what each of them does first.
+            after: what it does at the end.
+            at_rest: whether they are at rest, which makes no difference here.
+            contacts: whether contact forces are found.
+        """
+        self._launch(before, mask)
+        shown = self.data.shown()
+
+        def update(i: int) -> None:
+            world = self._worlds[i]
+            if self._varied is not None:
+                world.model = self._varied.edited(self.numbers.numpy()[i])
+            d, m = world.data, world.model
+            mujoco.mj_resetData(m, d)
+            self._load(i, self._state)
+            mujoco.mj_forward(self._passive if self._varied is None else _without_actuation(m), d)
+            d.qacc_warmstart[:] = self._state["qacc_warmstart"][i]
+            if contacts and self._geoms:
+                for row in range(self._rows):
+                    self._add_up_forces(i, row)
+            self._write(i, shown, lost=bool(world.warned[LOST].any()))
+
+        self._each(np.flatnonzero(mask.numpy()), update)
+        self._keep_written()
+        self._launch(after, mask)
+
+    def _launch(self, funcs: Sequence[WorldFunc], mask: wp.array) -> None:
+        """Launches functions of worlds in a kernel of their own, which is kept: nothing records it."""
+        key = tuple(func for func, _ in funcs)
+        if key not in self._kernels:
+            self._kernels[key] = WorldKernel(funcs)
+        self._kernels[key].launch(funcs, mask)
+
+    def _each(self, worlds: np.ndarray, work: Callable[[int], None]) -> None:
+        """Does something in worlds, a share of them in each thread; MuJoCo computes without Python's lock."""
+
+        def some(share: np.ndarray) -> None:
+            for world in share.tolist():
+                work(world)
+
+        threads = min(len(worlds), os.cpu_count() or 1)
+        if threads < 2:
+            some(worlds)
+            return
+        for done in [self._threads.submit(some, share) for share in np.array_split(worlds, threads)]:
+            done.result()
+
+    def _load(self, i: int, names: Collection[str]) -> None:
+        """Writes parts of a world's state into its ``mjData``."""
+        world = self._worlds[i]
+        for name in names:
+            if name == "time":
+                world.data.time = float(self._state[name][i])
+            else:
+                view = world.state[name]
+                view[:] = self._state[name][i].reshape(view.shape)
+
+    def _write(self, i: int, shown: Mapping[str, np.ndarray], *, lost: bool) -> None:
+        """Writes a world into the arrays; one that MuJoCo has lost has no numbers."""
+        world = self._worlds[i]
+        for name, view in world.state.items():
+            rows = self._state[name]
+            rows[i] = view.reshape(rows.shape[1:])
+        self._state["time"][i] = world.data.time
+        if lost:
+            self._state["qpos"][i] = np.nan
+        for name, rows in shown.items():
+            rows[i] = world.view(name).reshape(rows.shape[1:])
+
+    def _keep_written(self) -> None:
+        """Notes the state that was written, to see later what was changed."""
+        for name, rows in self._state.items():
+            np.copyto(self._written[name], rows)
+
+    def _flag(self, i: int, *, limited: bool) -> bool:
+        """Flags what the substeps of a world have dropped or not finished.
+
+        Returns:
+            Whether MuJoCo has lost it.
+        """
+        world = self._worlds[i]
+        d, bits = world.data, int(Overflow.ITERATIONS) if limited else 0
+        if world.warned.any():
+            bits |= sum(int(flag) for kind, flag in FULL.items() if world.warned[kind])
+        if bits:
+            self._overflow[i] |= bits
+        if (rows := d.maxuse_efc) > self._most[0][i]:
+            self._most[0][i] = rows
+        if (contacts := d.maxuse_con) > self._most[1][0]:
+            self._most[1][0] = contacts
+        return bool(world.warned[LOST].any())
+
+    def _add_up_forces(self, i: int, row: int) -> None:
+        """Adds up the forces of a world's contacts on each geom that was asked for, in the world's frame (N)."""
+        d, m, count = self._worlds[i].data, self._worlds[i].model, self._geoms
+        columns = slice(row * count, (row + 1) * count)
+        forces, touches = np.zeros((count, 3)), np.zeros(count, dtype=bool)
+        found, contacts = np.zeros(6), d.contact
+        pairs, frames = self._column[contacts.geom], contacts.frame
+        for k in np.flatnonzero((contacts.efc_address >= 0) & (pairs >= 0).any(-1)).tolist():
+            mujoco.mj_contactForce(m, d, k, found)
+            force = found[:3] @ frames[k].reshape(3, 3)
+            for column, sign in zip(pairs[k].tolist(), (-1.0, 1.0), strict=True):
+                if column >= 0:
+                    forces[column] += sign * force
+                    touches[column] = True
+        self._forces[i, columns] = forces
+        self._touches[i, columns] = touches
+
+
+def _without_actuation(m: mujoco.MjModel) -> mujoco.MjModel:
+    passive = copy.copy(m)
+    passive.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    return passive
+
+
+def _differ(rows: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Returns in which worlds numbers differ from those of before, ``(nworld,)``."""
+    return (rows != before).reshape(len(rows), -1).any(1)
+
+
+def data_bytes(m: mujoco.MjModel, num_envs: int) -> int:
+    """Returns about how much memory so many worlds take (bytes): an ``mjData`` uses a small part of its arena."""
+    data: Any = mujoco.MjData(m)
+    return num_envs * (2 * int(data.nbuffer) + 65_536)
