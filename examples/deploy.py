@@ -23,17 +23,18 @@ class Robot:
         self.data.qpos[:] = facts["home"]
         mujoco.mj_forward(self.model, self.data)
 
-    def read(self, term, last_action, command):
-        d, kind = self.data, term["term"]
-        if kind in ("linear_velocity", "angular_velocity", "gravity"):
-            rotation = d.body(term["body"]).xmat.reshape(3, 3)  # from the base's frame to the world's
-            vectors = {"linear_velocity": rotation.T @ d.qvel[:3], "angular_velocity": d.qvel[3:6]}
-            return vectors.get(kind, -rotation[2])
-        if kind == "joint_positions":
-            return np.concatenate([d.joint(name).qpos for name in term["joints"]]) - term["home"]
-        if kind == "joint_velocities":
-            return np.concatenate([d.joint(name).qvel for name in term["joints"]])
-        return {"last_action": last_action, "command": command}[kind]
+    def read(self, last_action, command):
+        d, joints = self.data, [self.data.joint(name) for name in self.facts["joints"]]
+        rotation = d.body(self.facts["velocity"]["base"]).xmat.reshape(3, 3)  # from the base's frame to the world's
+        return {
+            "linear_velocity": rotation.T @ d.qvel[:3],
+            "angular_velocity": d.qvel[3:6],
+            "gravity": -rotation[2],
+            "joint_positions": np.concatenate([joint.qpos for joint in joints]) - self.facts["action_offset"],
+            "joint_velocities": np.concatenate([joint.qvel for joint in joints]),
+            "last_action": last_action,
+            "command": command,
+        }
 
     def send(self, targets):
         self.data.ctrl[:] = targets
@@ -58,7 +59,8 @@ if (np.array(args.command) < low).any() or (np.array(args.command) > high).any()
 robot, action = Robot(facts), np.zeros(len(scale))
 for step in range(round(args.seconds / facts["control_timestep"])):
     if step % facts["action_repeat"] == 0:
-        observation = np.concatenate([robot.read(term, action, args.command) for term in facts["observation"]])
+        seen = robot.read(action, args.command)
+        observation = np.concatenate([seen[term["term"]] for term in facts["observation"]])
         action = session.run(["action"], {"observation": observation[None].astype(np.float32)})[0][0]
     robot.send(offset + scale * action)
 print("base at", *robot.data.qpos[:3].round(2), "m; targets (rad):")

@@ -29,6 +29,7 @@ BAD = {
     "play": ("yes", TypeError),
     "metrics": (1, TypeError),
     "observation_terms": ("all", TypeError),
+    "noise_scale": (-1.0, ValueError),
     "on_overflow": ("shout", ValueError),
     "nan_dump": ("no/such/folder/file", ValueError),
     "ctrl_dt": (0.003, ValueError),

@@ -24,7 +24,6 @@ from torchrl_loco.policy import ObservationNorm, Policy
 from torchrl_loco.registry import env_class
 from torchrl_loco.tasks.velocity import actuated
 from torchrl_loco.training.reppo import REPPO
-from torchrl_loco.verification.layout import Layout, State
 
 RESULTS = Path(__file__).parents[1] / "benchmarks/results/2026-11-21-h200"
 
@@ -243,7 +242,7 @@ def test_a_policy_of_mjlab_moves_the_same_joints_to_the_same_targets(tmp_path):
     norm = {"obs_normalizer._mean": mean[None], "obs_normalizer._std": std[None], "std_epsilon": 0.01}
     np.savez(tmp_path / "go1.npz", facts=json.dumps(facts), **layers, **norm)
     policy = mjlab_policy.convert(tmp_path / "go1.npz")
-    own = env_class("go1_velocity").layout(m, policy.info)
+    own = mjlab_policy.of_ours(m, env_class("go1_velocity"), policy.info)
 
     d.qpos[:], d.qvel[:] = rng.normal(size=m.nq), rng.normal(size=m.nv)
     d.qpos[3:7] /= np.linalg.norm(d.qpos[3:7])
@@ -259,10 +258,15 @@ def test_a_policy_of_mjlab_moves_the_same_joints_to_the_same_targets(tmp_path):
         hidden = np.where(hidden > 0, hidden, np.expm1(hidden))
     expected = dict(zip(theirs, home[order] + scale * (weights[-1] @ hidden + biases[-1]), strict=True))
 
-    state = State.zeros(m, 1)
-    state.write(0, d)
-    observation = Layout(own["observation"], m)(state, last[None], command[None])
-    action = policy.module(torch.tensor(observation, dtype=torch.float32)).numpy()[0]
+    env = env_class("go1_velocity")(1, "cpu", 0, engine="mujoco", play=True)
+    env.reset()
+    state = env.get_state()
+    for entries, name, row in (
+        *((state, "qpos", d.qpos), (state, "qvel", d.qvel)),
+        *((state["memory"], "last_action", last), (state["memory"], "command", command)),
+    ):
+        entries[name] = torch.tensor(row, dtype=torch.float32)[None]
+    action = policy.module(env.reset(state, set_state=True)["observation"]).numpy()[0]
     ours = np.array(own["action_offset"]) + own["action_scale"] * action
     assert np.allclose(ours, [expected[name] for name in joints], atol=1e-4)
     np.savez(tmp_path / "go1.npz", facts=json.dumps(facts | {"base": "pelvis"}), **layers, **norm)

@@ -41,7 +41,7 @@ def read_program(path):
 
 
 OF_ROBOT = {
-    *("observation", "action_offset", "actuators", "joints", "stiffness", "damping", "force_limit"),
+    *("observation", "history", "action_offset", "actuators", "joints", "stiffness", "damping", "force_limit"),
     *("home", "physics_timestep", "mjcf"),
 }
 
@@ -65,7 +65,7 @@ def test_exported_policies_do_the_same(name, read, tmp_path):
         assert expected.std() > 1e-2
         np.testing.assert_allclose(play(seen), expected.detach().numpy(), rtol=0, atol=TOLERANCE)
     assert facts.pop("info") == INFO
-    assert facts.pop("action_scale") == [1.0] * 6  # what else is told of the robot, test_verification.py plays
+    assert facts.pop("action_scale") == [1.0] * 6  # what else is told of the robot, test_verify.py plays
     assert {name: facts[name] for name in facts if name not in OF_ROBOT} == {
         **{"task": "walker_stand", "protocol": "dm_control", "torchrl_loco": torchrl_loco.__version__},
         **{"observation_size": 24, "action_size": 6, "action_low": -1.0, "action_high": 1.0},

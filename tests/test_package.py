@@ -11,14 +11,14 @@ import torchrl_loco
 
 ROOT = Path(torchrl_loco.__file__).parent
 LAYERS = [  # a module imports from its own layer or from those before it
-    {"checks", "config", "garbage", "known_files", "rewards", "storage"},
+    {"checks", "conditions", "config", "garbage", "known_files", "rewards", "storage"},
     {"sim"},
     {"rendering"},
     {"envs", "viewer"},
     {"tasks"},
     {"registry", "collector"},
     {"policy", "nan_dump", "doctor", "wrappers"},
-    {"export", "deployment", "verification"},
+    {"export", "deployment", "verify"},
     {"training"},
     {"cli", "__main__"},
 ]
@@ -73,7 +73,7 @@ from torchrl_loco import *
 import quickly
 env = make("walker_walk", 1, "cpu")
 assert RolloutCollector and training.PPOConfig("walker_walk")
-assert torchrl_loco.wrappers.GymnasiumVectorEnv
+assert torchrl_loco.wrappers.LIBRARIES
 assert env.rollout(2, load_policy("walker_walk", "cpu")).shape == (1, 2)
 assert "mujoco_warp" not in sys.modules
 assert env.sim.model.opt.timestep.numpy() == env.config.sim_dt and "mujoco_warp" in sys.modules

@@ -3,6 +3,7 @@
 import copy
 import functools
 import sys
+import warnings
 
 import imageio.v3 as imageio
 import numpy as np
@@ -75,27 +76,29 @@ def stable_baselines3():
 
 
 CLASSES = {
-    "gymnasium": wrappers.GymnasiumVectorEnv,
-    "rsl_rl": wrappers.RslRlVecEnv,
-    "stable_baselines3": wrappers.StableBaselines3VecEnv,
+    "gymnasium": "GymnasiumVectorEnv",
+    "rsl_rl": "RslRlVecEnv",
+    "stable_baselines3": "StableBaselines3VecEnv",
 }
 
 # All of them.
 
 
 def test_a_missing_library_is_named(monkeypatch):
-    for library, cls in CLASSES.items():
+    for library, name in CLASSES.items():
         monkeypatch.setitem(sys.modules, library, None)  # as if it were not installed
-        needs = rf"{cls.__name__} needs {library}: pip install 'torchrl-loco\[wrappers\]'"
+        needs = rf"{name} needs {library}: pip install 'torchrl-loco\[wrappers\]'"
         with pytest.raises(ImportError, match=needs):
-            cls("walker_stand", 2, device="cpu")
+            getattr(wrappers, name)
+    with pytest.raises(AttributeError, match="has no GymEnv: it has GymnasiumEnv, GymnasiumVectorEnv"):
+        wrappers.GymEnv  # noqa: B018
 
 
 @pytest.mark.ci
 @pytest.mark.parametrize("library", CLASSES)
 def test_what_is_wrapped(library):
     pytest.importorskip(library)
-    cls = CLASSES[library]
+    cls = getattr(wrappers, CLASSES[library])
     assert cls("walker_stand", **settings).num_envs == 1
     for env in (cls("walker_stand", 2, **settings), cls(torchrl_loco.WalkerStand, 2, **settings)):
         assert type(env.env) is torchrl_loco.WalkerStand
@@ -119,6 +122,42 @@ def test_what_is_wrapped(library):
 
 
 # Gymnasium.
+
+
+@pytest.mark.ci
+def test_classes_are_those_of_their_libraries(gymnasium):
+    assert issubclass(wrappers.GymnasiumVectorEnv, gymnasium.vector.VectorEnv)
+    assert issubclass(wrappers.GymnasiumEnv, gymnasium.Env)
+
+
+@pytest.mark.ci
+def test_one_world_of_gymnasium(gymnasium, actions):
+    """As Gymnasium's own checker and wrappers take it; ``make_vec`` and ``gymnasium.wrappers`` see an ordinary env."""
+    from gymnasium.utils.env_checker import check_env
+
+    options = {"device": "cpu", "episode_length": LENGTH, "reward_terms": True, "render_mode": "rgb_array"}
+    env = wrappers.GymnasiumEnv("walker_stand", width=32, height=24, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # observations have no bounds
+        check_env(env, skip_render_check=True)
+    twin = torchrl_loco.make("walker_stand", 1, "cpu", 7, episode_length=LENGTH)
+    drawn, td = actions(twin, 2 * LENGTH), twin.reset()
+    seen, _ = env.reset(seed=7)
+    for t, action in enumerate(drawn):
+        np.testing.assert_array_equal(seen, td["observation"][0].numpy())
+        step, td = twin.step_and_maybe_reset(td.set("action", action))
+        seen, reward, terminated, truncated, infos = env.step(action[0].numpy())
+        assert (reward, terminated) == (float(step["next", "reward"]), False)
+        assert infos["reward_terms"]["stand"] > 0.0
+        assert truncated == ((t + 1) % LENGTH == 0)
+        if truncated:
+            np.testing.assert_array_equal(seen, step["next", "observation"][0].numpy())
+            with pytest.raises(gymnasium.error.ResetNeeded, match="after an episode has ended"):
+                env.step(action[0].numpy())
+            seen, _ = env.reset()
+    assert env.render().shape == (24, 32, 3)
+    with pytest.raises(ValueError, match="has 4 worlds: take GymnasiumVectorEnv"):
+        wrappers.GymnasiumEnv(make())
 
 
 @pytest.mark.ci

@@ -10,22 +10,15 @@ from torchrl_loco.registry import resolve
 if TYPE_CHECKING:
     from torchrl_loco.policy import Policy
 
-HOOKS = ("observation", "observation_func", "control", "layout")
-"""What a layout describes, and the layout: of the most derived definition of them it must be a part."""
-
 
 def why_not(policy: "Policy") -> str:
     """Returns why the file of a policy cannot tell how to play it, an empty string if it can."""
-    task = policy.info["task"]
     if names := policy.info.get("transforms"):
         return f"the policy was trained behind {', '.join(names)}"
     try:
-        cls = resolve(task)
+        resolve(policy.info["task"])
     except (ValueError, OSError, ImportError) as error:
         return f"its task is not at hand: {error}"
-    below = next(base for base in cls.__mro__ if vars(base).keys() & set(HOOKS))
-    if "layout" not in vars(below) or below.__module__ == "torchrl_loco.envs.base":
-        return f"{cls.__name__} has no layout() of its own observation and control: see help(torchrl_loco.LocoEnv)"
     return ""
 
 
@@ -33,28 +26,33 @@ def of_robot(policy: "Policy") -> dict[str, Any]:
     """Returns what the file of a policy tells of its task and robot; nothing where :func:`why_not` says why.
 
     Returns:
-        The facts by name. ``observation``, terms as in :mod:`torchrl_loco.verification.layout`; ``action_offset`` and
-        ``action_scale`` ``(nu,)``, by which the controls are ``offset + scale * action``; ``actuators``, their names;
-        ``joints``, those of the joints that they move, empty for a tendon; ``stiffness``, ``damping`` and
-        ``force_limit`` of position actuators, 0 and ``None`` for others; ``home``, the home pose ``(nq,)``;
-        ``physics_timestep`` of the training (s); ``mjcf``, the model as text, with six digits, unless it needs further
-        files; and whatever else the task's layout holds, such as ``velocity``.
+        The facts by name. ``observation``, names and sizes of its terms in their order, none where they have no names;
+        ``history``, how many of the last ones are joined, the newest last; ``action_offset`` and ``action_scale``
+        ``(nu,)``, by which the controls are ``offset + scale * action``, unless the task has another way;
+        ``actuators``, their names; ``joints``, those of the joints that they move, empty for a tendon; ``stiffness``,
+        ``damping`` and ``force_limit`` of position actuators, 0 and ``None`` for others; ``home``, the home pose
+        ``(nq,)``; ``physics_timestep`` of the training (s); ``mjcf``, the model as text, with six digits, unless it
+        needs further files; and whatever else :meth:`torchrl_loco.LocoEnv.facts` holds, such as ``velocity``.
     """
     if why_not(policy):
         return {}
+    from torchrl_loco.envs.hooks import own_hooks
     from torchrl_loco.sim import models
 
     cls, spec = resolve(policy.info["task"]), specification(policy.info["task"])
     m = spec.compile()
     low, high = m.actuator_ctrlrange.T
+    env = cls(1, "cpu", 0, policy.info["protocol"], engine="mujoco", compile_hooks=False)  # its hooks tell the terms
+    scaled = {"action_offset": (0.5 * (low + high)).tolist(), "action_scale": (0.5 * (high - low)).tolist()}
     return {
-        "action_offset": (0.5 * (low + high)).tolist(),
-        "action_scale": (0.5 * (high - low)).tolist(),
+        "observation": [{"term": name, "size": size} for name, size in env.observation_layout["observation"].items()],
+        "history": cls.history.get("observation", 1),
+        **({} if "control" in own_hooks(cls) else scaled),
         **_actuators(m),
         "home": models.home_pose(m).tolist(),
         "physics_timestep": cls.config.sim_dt,
         **_text(spec),
-        **cls.layout(m, policy.info),
+        **cls.facts(m, policy.info),
     }
 
 

@@ -22,6 +22,7 @@ from benchmarks.robots import KEPT, write_metrics
 from torchrl_loco.policy import ObservationNorm, Policy
 from torchrl_loco.registry import env_class
 from torchrl_loco.sim import models
+from torchrl_loco.tasks.velocity import actuated
 
 TERMS = {
     "base_lin_vel": "linear_velocity",
@@ -58,7 +59,7 @@ def convert(path: Path) -> Policy:
         **{"frames": facts["frames"], "num_envs": facts["worlds"], "seconds": round(facts["seconds"], 3)},
         "eval_episodes": 128,
     }
-    own = cls.layout(models.load(cls.model), info)
+    own = of_ours(models.load(cls.model), cls, info)
     weights = [file[name].astype(float) for name in sorted(file, key=_layer) if name.endswith(".weight")]
     biases = [file[name].astype(float) for name in sorted(file, key=_layer) if name.endswith(".bias")]
     matrix, shift = observation(facts, own)
@@ -78,6 +79,14 @@ def convert(path: Path) -> Policy:
     return Policy(nn.Sequential(*layers[:-1]).requires_grad_(False), info)
 
 
+def of_ours(m: mujoco.MjModel, cls: Any, info: dict[str, Any]) -> dict[str, Any]:
+    """Returns what our task observes, ``sizes`` of its terms by name, and controls: ``joints``, offsets and scales."""
+    joints = actuated(m)
+    sizes = {"linear_velocity": 3, "angular_velocity": 3, "gravity": 3, "joint_positions": len(joints)}
+    sizes |= {"joint_velocities": len(joints), "last_action": len(joints), "command": 3}
+    return {"sizes": sizes, "joints": joints, **cls.facts(m, info)}
+
+
 def _layer(name: str) -> tuple[bool, int]:
     """Returns where an array stands among those of the network: ``mlp.4.weight`` is the third layer's."""
     first, _, rest = name.partition(".")
@@ -89,16 +98,16 @@ def observation(facts: dict[str, Any], own: dict[str, Any]) -> Affine:
 
     Args:
         facts: those of mjlab's file.
-        own: our layout.
+        own: :func:`of_ours`.
 
     Raises:
         ValueError: a term is unknown, or of another size.
         KeyError: a joint is not ours.
     """
     starts, first = {}, 0
-    for term in own["observation"]:
-        starts[term["term"]], first = first, first + term["size"]
-    (joints,) = (term["joints"] for term in own["observation"] if term["term"] == "joint_positions")
+    for term, size in own["sizes"].items():
+        starts[term], first = first, first + size
+    joints = own["joints"]
     matrix, shift, row = np.zeros((sum(facts["sizes"]), first)), np.zeros(sum(facts["sizes"])), 0
     turned = np.empty(9)
     mujoco.mju_quat2Mat(turned, np.array(facts["imu_quaternion"]))
@@ -131,7 +140,7 @@ def observation(facts: dict[str, Any], own: dict[str, Any]) -> Affine:
 
 def action(facts: dict[str, Any], own: dict[str, Any]) -> Affine:
     """Returns how our action follows from mjlab's, so that the targets of the joints are the same."""
-    (joints,) = (term["joints"] for term in own["observation"] if term["term"] == "joint_positions")
+    joints = own["joints"]
     order = _order(joints, facts["actions"])
     scale, offset = np.array(own["action_scale"]), np.array(own["action_offset"])
     matrix = np.zeros((len(joints), len(order)))

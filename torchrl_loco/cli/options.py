@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 from collections.abc import Callable
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
 import tyro
 
@@ -25,6 +25,17 @@ def _integers_and_optionals(info: tyro.constructors.PrimitiveTypeInfo) -> Any:
     named = [kind for kind in kinds if kind is not NoneType]
     if named != [int] and (len(named) != 1 or len(kinds) == 1):
         return None
+    if get_origin(named[0]) is tuple:
+        return _pair(get_args(named[0])[0])
+    if named == [bool]:
+        return tyro.constructors.PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="{True,False}",
+            instance_from_str=lambda words: {"true": True, "false": False}[words[0].lower()],
+            is_instance=lambda value: isinstance(value, tuple(kinds)),
+            str_from_instance=lambda value: [str(value)],
+            choices=("True", "False"),
+        )
     parse: Callable[[str], Any] = _integer if named == [int] else named[0]
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
@@ -32,6 +43,18 @@ def _integers_and_optionals(info: tyro.constructors.PrimitiveTypeInfo) -> Any:
         instance_from_str=lambda words: parse(words[0]),
         is_instance=lambda value: isinstance(value, tuple(kinds)),
         str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _pair(kind: type) -> tyro.constructors.PrimitiveConstructorSpec:
+    """Parses two numbers."""
+    parse: Callable[[str], Any] = _integer if kind is int else kind
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=2,
+        metavar=f"{kind.__name__.upper()} {kind.__name__.upper()}",
+        instance_from_str=lambda words: tuple(map(parse, words)),
+        is_instance=lambda value: value is None or isinstance(value, tuple),
+        str_from_instance=lambda value: ["None"] if value is None else [str(each) for each in value],
     )
 
 
@@ -118,13 +141,16 @@ def _check_names(args: list[str], config: Any) -> None:
     Raises:
         ValueError: there is no such setting; the message names the nearest or all, or the algorithm that has it.
     """
-    from torchrl_loco.training.config import CONFIGS
+    from torchrl_loco.training.config import CONFIGS, Sim
 
     settings_of = {algorithm: {field.name for field in dataclasses.fields(kind)} for algorithm, kind in CONFIGS.items()}
     mine = {field.name for field in dataclasses.fields(config)} - {"task"}
     for arg in args:
         name = arg.partition("=")[0].removeprefix("--").replace("-", "_")
         if not arg.startswith("--") or name.removeprefix("no_") in mine or name in ("", "help"):
+            continue
+        if name.startswith("sim."):
+            check_choice("field of --sim", name.removeprefix("sim."), [field.name for field in dataclasses.fields(Sim)])
             continue
         for algorithm, names in settings_of.items():
             if name in names - settings_of[config.algorithm]:

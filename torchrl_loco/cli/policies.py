@@ -27,8 +27,8 @@ from torchrl_loco.checks import (
 )
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.options import OtherTask
+from torchrl_loco.conditions import DEFAULT, Conditions
 from torchrl_loco.known_files import place_of
-from torchrl_loco.verification.conditions import DEFAULT, Conditions
 from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_host, check_viewer
 
 CONTAINERS = (".mp4", ".mkv", ".mov")
@@ -74,13 +74,19 @@ def _policy(
 def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["torchrl_loco.Policy", Path]:
     """Returns the policy of a run folder or a file, and the path of its file.
 
-    Of a run that was stopped before a policy was evaluated, it is that of the last checkpoint.
+    Of a run that was stopped before a policy was evaluated, it is that of the last checkpoint; a checkpoint can be
+    named, too.
 
     Args:
         source: the run folder, or the file.
         device: where the policy computes.
         task: the name of its task, as the user says; ``None`` for what the file says.
     """
+    if source.suffix == ".pt" and is_run(source.parent):
+        from torchrl_loco import training
+        from torchrl_loco.training.watching import last_policy
+
+        return last_policy(training.RunFolder(source.parent, task), device, source), source
     if not source.is_dir():
         policy = torchrl_loco.Policy.load(source, device)
         policy.info["task"] = task or place_of(policy.info["task"], source.parent)
@@ -430,10 +436,10 @@ def verify(
     out: Path | None = None,
     conditions: ConditionOptions = DEFAULT,
 ) -> None:
-    """Play a policy, as exported, in C MuJoCo on the robot's model at full accuracy; status 1 if it does not hold.
+    """Play a policy, as exported, in its task in C MuJoCo, by the model's own options; status 1 if it does not hold.
 
-    Robots with a velocity command: falls and tracking errors, under late actions, noise, friction and pushes, beside
-    the same episodes in the simulator of the training. Other tasks: the return, beside that there.
+    Falls, return, terms of the reward and metrics, beside those of the same episodes in the simulator of the training.
+    The task says what it asks for, and under which late actions, friction, noise and pushes; options change it.
 
     Args:
         run_task_or_file: what to verify.
@@ -441,12 +447,12 @@ def verify(
         policy: a policy that may be of another task, exported or not.
         task: the task of the run or the file.
         device: where the simulator of the training computes; default: CUDA if there is any.
-        alone: whether to play a robot in C MuJoCo alone, which is quicker on a CPU.
+        alone: whether to play it in C MuJoCo alone, which is quicker on a CPU.
         out: figures as JSON, a new file; default: a new verify.json in the run folder, none elsewhere.
         conditions: what the policy must hold in.
     """
     with user_errors(), tempfile.TemporaryDirectory() as folder:
-        from torchrl_loco.verification.verify import verify
+        from torchrl_loco import verify as verification
 
         conditions.check()
         out = None if out is None else check_output_file("out", out, (".json",))
@@ -458,7 +464,7 @@ def verify(
             path, in_run = _exported_for(run_task_or_file, protocol, policy, task, Path(folder))
             out, named = in_run if out is None else out, None
         print(f"verifying: {conditions.episodes} episodes, which take minutes on a CPU", file=sys.stderr, flush=True)
-        report = verify(path, conditions, device, alone=alone, task=named)
+        report = verification.verify(path, conditions, device, alone=alone, task=named)
         print(*report.lines, sep="\n")
         if out is not None:
             out.write_text(f"{json.dumps(report.figures, indent=2)}\n")

@@ -25,11 +25,13 @@ from torchrl.envs import EnvBase
 from torchrl_loco.checks import (
     ANY,
     COUNT,
+    NOT_NEGATIVE,
     SEED,
     Interval,
     check_bool,
     check_choice,
     check_device,
+    check_float,
     check_int,
     check_output_file,
     check_pair,
@@ -92,6 +94,7 @@ class LocoEnv(EnvBase):
             ``("next", "reward_terms", name)``.
         observation_terms: whether to return each term of the observation, if it has names, also apart, under
             ``("observation_terms", group, name)``; of a history it is the newest.
+        noise_scale: what :attr:`noise` is multiplied by; ``None`` is 1, and 0 with ``play=True``.
         metrics: whether to call :meth:`metrics`, and return each number under ``("next", "metrics", name)``.
         stagger: whether a full ``reset()`` starts each world at a random point of its time limit, so that the worlds
             are not truncated together.
@@ -150,6 +153,13 @@ class LocoEnv(EnvBase):
     history: ClassVar[Mapping[str, int]] = {}
     """By group of the observation, how many of the last ones it has, with noise, the newest last; at a reset all are
     the first. The state holds them."""
+    observation_names: ClassVar[Mapping[str, int]] = {}
+    """Names and sizes of the terms of a Warp function's observation, in their order."""
+    holds: ClassVar[Mapping[str, Any]] = {}
+    """What ``torchrl-loco verify`` asks for: ``falls``, the greatest share of episodes that terminate; ``return``, the
+    least return; without either ``kept``, the least share of the return in the training, 0.9. And in which conditions:
+    ``delay`` (least and greatest, control steps), ``friction`` (least and greatest), ``pushes`` (a multiple of
+    mjlab's), such as ``{"falls": 0.01, "delay": (0, 2), "pushes": 1.0}``."""
     command_ranges: ClassVar[Mapping[str, Mapping[str, tuple[float, float]]]] = {}
     """Entries of :attr:`memory` that are commands: by entry, the name of each of its numbers, with its unit, and the
     least and greatest value, such as ``{"command": {"forward (m/s)": (-1.0, 2.0)}}``. With ``play=True`` they can be
@@ -182,6 +192,7 @@ class LocoEnv(EnvBase):
         world_offset: int | None = None,
         reward_terms: bool = False,
         observation_terms: bool = False,
+        noise_scale: float | None = None,
         metrics: bool = False,
         stagger: bool = False,
         on_overflow: str = "warn",
@@ -208,6 +219,7 @@ class LocoEnv(EnvBase):
         reward_terms, stagger = check_bool("reward_terms", reward_terms), check_bool("stagger", stagger)
         with_metrics, apart = check_bool("metrics", metrics), check_bool("observation_terms", observation_terms)
         compile_hooks, play = check_bool("compile_hooks", compile_hooks), check_bool("play", play)
+        noise_scale = float(not play) if noise_scale is None else check_float("noise_scale", noise_scale, NOT_NEGATIVE)
         check_choice("on_overflow", on_overflow, ON_OVERFLOW)
         nan_dump = None if nan_dump is None else check_output_file("nan_dump", nan_dump)
         if randomize is None:
@@ -223,7 +235,7 @@ class LocoEnv(EnvBase):
         self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
         self._replaced = self._replaced_options()
         _say_what_is_missing(mj_model)
-        self.with_metrics = with_metrics
+        self.with_metrics, self.noise_scale = with_metrics, noise_scale
         self.stagger, self.compile_hooks, self.play = stagger, compile_hooks, play
         self.randomize, self.variation = varys, variation
         self.action_range = check_pair("action_range", self.action_range)  # a class may have a list or an array
@@ -245,6 +257,8 @@ class LocoEnv(EnvBase):
             self.term_names = self.hooks.term_names
         self.metric_names = self.hooks.metric_names if self.hooks else ()
         self.observation_layout = dict(self.hooks.terms) if self.hooks else {}
+        if "observation" not in own:
+            self.observation_layout["observation"] = dict(self.observation_names)
         self._apart = {group: sizes for group, sizes in self.observation_layout.items() if sizes and apart}
         if "observation" in self.groups:
             self.observation_size = math.prod(self.groups["observation"])
@@ -393,6 +407,8 @@ class LocoEnv(EnvBase):
     def metrics(self, s: "View") -> Mapping[str, torch.Tensor]:
         """Returns numbers of each world for the log alone, by name, each ``(num_envs,)``, such as an error in m.
 
+        Those that are NaN do not count.
+
         It is called where they are read: in training, and with ``metrics=True``.
         """
         return {}
@@ -479,24 +495,37 @@ class LocoEnv(EnvBase):
 
         return Viewer(self, policy, action_repeat, **server).start()
 
-    # What a policy's file tells of the task.
+    # What verify plays, and what a policy's file tells of the task.
 
     @classmethod
-    def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns what programs without this package must know of the task to play a policy; by default nothing.
+    def stage_of(cls, info: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Returns the stage of the curriculum that a policy has reached, as :meth:`set_stage` takes it.
 
-        ``export`` writes it into ONNX files, and ``torchrl-loco verify`` reads it there. It counts if no class below
-        the one that defines it changes what is observed or controlled.
+        Args:
+            info: the policy's information; training writes ``stage`` into it.
+        """
+        return info.get("stage", {})
+
+    @classmethod
+    def fixed_commands(cls, info: Mapping[str, Any]) -> Mapping[str, Sequence[Sequence[float]]]:
+        """Returns by entry of :attr:`command_ranges` the commands that half of ``verify``'s episodes have throughout.
+
+        Args:
+            info: the policy's information: ``frames``, ``num_envs`` of its training.
+        """
+        return {}
+
+    @classmethod
+    def facts(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns what programs without this package must know to play a policy, beside :mod:`torchrl_loco.deployment`.
 
         Args:
             m: the model.
             info: the policy's information: protocol, settings of its training.
 
         Returns:
-            ``observation``, a list of terms as in :mod:`torchrl_loco.verification.layout`, in their order;
             ``action_offset`` and ``action_scale``, each ``(nu,)``, if actions become controls in another way than
-            scaled to each ``ctrlrange``; for robots that follow a velocity command ``velocity``, as in
-            :mod:`torchrl_loco.verification.velocity`.
+            scaled to each ``ctrlrange``; whatever else JSON can hold.
         """
         return {}
 

@@ -196,6 +196,7 @@ class Hooks:
         self.groups: dict[str, tuple[int, ...]] = {}
         self.terms: dict[str, dict[str, int]] = {}
         self.history: dict[str, int] = {}
+        self._noise_scale = env.noise_scale
         self._noise: dict[tuple[str, str], tuple[float, str | None]] = {}
         self.term_names: tuple[str, ...] | None = None
         self.metric_names: tuple[str, ...] = ()
@@ -338,8 +339,12 @@ class Hooks:
             check_float(f"{self._title}.noise[{term!r}]", most, Interval(0.0, MAX_VALUE))
             if entry is not None:
                 check_choice(f"{self._title}.noise[{term!r}]", entry, list(self.catalog.memory))
-            if not env.play:
-                self._noise |= {(group, what): (float(most), entry) for group, sizes in seen.items() if what in sizes}
+            if env.noise_scale:
+                self._noise |= {
+                    (group, what): (env.noise_scale * float(most), entry)
+                    for group, sizes in seen.items()
+                    if what in sizes
+                }
         for group, count in env.history.items():
             check_choice(f"{self._title}.history", group, list(self.groups))
             if len(self.groups[group]) != 1:
@@ -392,7 +397,10 @@ class Hooks:
             if (noise := self._noise.get((group, term))) is not None:
                 most, entry = noise
                 drawn = view.uniform(-most, most, *rows.shape[1:])
-                rows = rows + (drawn if entry is None else drawn + getattr(view, entry))
+                if entry is not None:
+                    offset = getattr(view, entry)
+                    drawn = drawn + (offset if self._noise_scale == 1.0 else self._noise_scale * offset)
+                rows = rows + drawn
             found.append(rows)
         if not isinstance(values, Mapping):
             return found[0]

@@ -518,17 +518,6 @@ class World:
             self._refresh_graph.replay()
         self._observe_restored()
 
-    def judge(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns reward and end of the state that :meth:`refresh` was called for, each ``(nworld,)``.
-
-        Args:
-            action: the actions of the step that led to it in another simulator, ``(nworld, nu)``; ``sim.ctrl`` held
-                its controls when the state was written.
-        """
-        self.action.torch.copy_(action)
-        self._judge()
-        return self.reward.torch, self.ended.torch
-
     def _record_refresh(self) -> Graph | Direct:
         device = self.sim.device
         with torch.inference_mode(False), EXCLUSIVE, self.sim.qpos.device:

@@ -125,7 +125,9 @@ def deterministic_policy(actor: ProbabilisticActor, config: TrainingConfig, info
         last = _first_half(last)
     squashed = _squashed(actor[-1].distribution_kwargs.get("bound"), last)
     settings = {
-        name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "device", "logger")
+        name: value
+        for name, value in dataclasses.asdict(config).items()
+        if name not in ("out", "device", "logger", "init")
     }
     policy = Policy(nn.Sequential(*layers, last, *squashed), {"algorithm": config.algorithm, **settings, **info})
     _check_that_they_agree(policy, actor)

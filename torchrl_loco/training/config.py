@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
@@ -19,7 +19,7 @@ from torchrl_loco.checks import (
     check_int,
     check_packages,
 )
-from torchrl_loco.config import PROTOCOLS
+from torchrl_loco.config import PROTOCOLS, SimConfig
 from torchrl_loco.registry import is_place, task_name
 
 LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow"]
@@ -47,6 +47,17 @@ INTERVALS = {
 
 Settings = dict[str, Any]
 """Fields of a config, by name."""
+
+_OPTIONAL: Any = [(field.name, field.type | None, None) for field in dataclasses.fields(SimConfig)]  # type: ignore[operator]
+Sim: Any = dataclasses.make_dataclass(
+    "Sim",
+    [field for field in _OPTIONAL if field[0] != "episode_length"],
+    namespace={
+        "__doc__": "Fields of :class:`torchrl_loco.SimConfig` that a run replaces; ``None`` is as the task says."
+    },
+    frozen=True,
+)
+AS_THE_TASK = Sim()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,6 +88,13 @@ class TrainingConfig:
     """Decides every random draw of the run."""
     out: Path = Path("runs")
     """Folder in which the run's own folder is made."""
+
+    init: str = ""
+    """A policy file or a run folder whose weights the networks begin with; without one they are drawn."""
+    sim: Sim = AS_THE_TASK
+    """Settings of the simulation that replace those of the task, such as ``{"iterations": 20}``."""
+    randomize: bool = True
+    """Whether numbers of the model vary as the task says."""
 
     num_envs: int = 64
     """Worlds stepped together."""
@@ -127,6 +145,8 @@ class TrainingConfig:
     """Length of the video of the trained policy (s); 0 makes none."""
     checkpoint_seconds: float = 60.0
     """Time between two checkpoints (s)."""
+    keep: int = 1
+    """Checkpoints that stay: the last one, and beside it, under the number of its frames, those before it."""
     logger: tuple[LoggerName, ...] = ("tensorboard",)
     """Where metrics go besides the run's CSV files, which are always written; csv adds nothing to them."""
 
@@ -141,6 +161,8 @@ class TrainingConfig:
         object.__setattr__(self, "device", str(self.device))
         object.__setattr__(self, "out", Path(self.out))
         object.__setattr__(self, "hidden", tuple(self.hidden))
+        object.__setattr__(self, "sim", _checked_sim(self.sim))
+        object.__setattr__(self, "init", str(Path(self.init).expanduser().resolve()) if self.init else "")
         # Whether the machine has the device is checked when the run starts.
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
             raise ValueError(f"no device {self.device!r}: choose one of cpu, cuda, cuda:0, ...")
@@ -174,6 +196,12 @@ class TrainingConfig:
     def to_json(self) -> dict[str, Any]:
         """Returns the settings as values that JSON can hold, from which ``config_from_json`` makes them again."""
         return {"algorithm": self.algorithm, **dataclasses.asdict(self), "out": str(self.out)}
+
+    @property
+    def of_env(self) -> dict[str, Any]:
+        """Arguments of the environments of the run, beside task, worlds, device, seed and protocol."""
+        sim = {name: value for name, value in dataclasses.asdict(self.sim).items() if value is not None}
+        return sim if self.randomize else {**sim, "randomize": ()}
 
     @property
     def frames_per_batch(self) -> int:
@@ -319,6 +347,21 @@ class REPPOConfig(TrainingConfig):
                 raise ValueError(f"init_{name} ({first}) must not be below min_{name} ({least})")
         if self.min_value >= self.max_value:
             raise ValueError(f"min_value ({self.min_value:g}) must be below max_value ({self.max_value:g})")
+
+
+def _checked_sim(sim: Any) -> Any:
+    """Returns fields of the simulation's settings, of a dict too.
+
+    Raises:
+        ValueError: there is no such field.
+        TypeError: they are no dict.
+    """
+    if isinstance(sim, Sim):
+        return sim
+    if not isinstance(sim, Mapping):
+        raise TypeError(f"sim must be a dict of fields of torchrl_loco.SimConfig, got {sim!r}")
+    names = [field.name for field in dataclasses.fields(Sim)]
+    return Sim(**{check_choice("field of sim", name, names): value for name, value in sim.items()})
 
 
 def _stored_name(task: Any) -> str:

@@ -77,6 +77,7 @@ class Environments:
                 metrics=True,
                 nan_dump=None if nan_dump.exists() else nan_dump,
                 episode_length=config.episode_length or self.full_length,
+                **config.of_env,
             )
         if config.action_repeat == 1:
             return env
@@ -95,11 +96,12 @@ class Environments:
         if worlds not in self._evaluating:
             if base is None:
                 place = resolve(config.task), worlds, config.device, seed, config.protocol
-                own = make(*place, world_offset=0, metrics=True)
+                terms = not is_runner(config.task)
+                own = make(*place, world_offset=0, metrics=True, reward_terms=terms, **config.of_env)
             else:
                 settings = {**dataclasses.asdict(base.config), "randomize": base.randomize}
                 del settings["naconmax"]  # which is for the number of its worlds
-                settings |= {"world_offset": 0, "play": base.play, "metrics": True}
+                settings |= {"world_offset": 0, "play": base.play, "metrics": True, "reward_terms": base.reward_terms}
                 own = type(base)(worlds, base.device, seed, base.protocol, **settings)
             self._evaluating[worlds] = own
         own = self._evaluating[worlds]
@@ -173,7 +175,9 @@ def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: 
     """
     refuse_transforms(policy)
     info = policy.info
-    env = make(resolve(info["task"]), num_envs, device, seed, info["protocol"], world_offset=0, **settings)
+    sim = {name: value for name, value in info.get("sim", {}).items() if value is not None}
+    place = resolve(info["task"]), num_envs, device, seed, info["protocol"]
+    env = make(*place, **{**sim, "world_offset": 0, **settings})
     try:
         env.set_stage(info.get("stage", {}))
     except ValueError as error:  # of another task, or of this one as it was

@@ -38,7 +38,8 @@ class Evaluator:
         action_repeat: frames for which an action is held.
 
     Attributes:
-        metrics: of the last evaluation, the task's metrics by name: means over an episode's steps, and over episodes.
+        metrics: of the last evaluation, by name, the terms of the reward, summed over an episode, and the task's
+            metrics, means over its steps; all are means over episodes.
     """
 
     def __init__(self, policy: PolicyFunc, env: Any, action_repeat: int = 1) -> None:
@@ -63,19 +64,23 @@ class Evaluator:
         self._collector.load_state_dict({})
         returns = torch.zeros(env.num_envs, 1, device=env.device)
         alive = torch.ones_like(returns, dtype=torch.bool)
-        sums, steps = dict[str, torch.Tensor](), torch.zeros_like(returns)
+        sums, counts, earned = dict[str, torch.Tensor](), dict[str, torch.Tensor](), dict[str, torch.Tensor]()
         pieces = math.ceil(env.config.episode_length / self._frames)
         for _ in trange(pieces, desc="evaluation", leave=False, disable=None):  # no bar in logs
             self._held.begin()
             after = self._collector.rollout()["next"]
-            metrics = after.get("metrics", {})
+            metrics, terms = after.get("metrics", {}), after.get("reward_terms", {})
             for t, (reward, done) in enumerate(zip(after["reward"].unbind(1), after["done"].unbind(1), strict=True)):
                 returns += reward * alive
-                steps += alive
                 for name, values in metrics.items():
-                    sums[name] = sums.get(name, 0.0) + values[:, t] * alive
+                    counted = alive & ~values[:, t].isnan()
+                    sums[name] = sums.get(name, 0.0) + torch.where(counted, values[:, t], 0.0)
+                    counts[name] = counts.get(name, 0.0) + counted
+                for name, values in terms.items():
+                    earned[name] = earned.get(name, 0.0) + values[:, t] * alive
                 alive &= ~done
-        self.metrics = {f"metric/{name}": (total / steps).mean().item() for name, total in sums.items()}
+        self.metrics = {f"reward/{name}": total.mean().item() for name, total in earned.items()}
+        self.metrics |= {f"metric/{name}": (total / counts[name]).nanmean().item() for name, total in sums.items()}
         return returns.squeeze(-1)
 
 

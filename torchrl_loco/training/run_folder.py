@@ -274,8 +274,12 @@ class RunFolder:
         columns, lines = _read_table(path)
         return [{key: float(value or "nan") for key, value in zip(columns, line, strict=True)} for line in lines]
 
-    def save_checkpoint(self, entries: dict[str, Any]) -> None:
+    def save_checkpoint(self, entries: dict[str, Any], keep: int = 1) -> None:
         """Writes ``entries`` as the checkpoint; a crash while writing leaves the previous one.
+
+        Args:
+            entries: tensors and numbers; ``frames`` is how far it is.
+            keep: how many checkpoints stay: with more than one, each also lies in ``checkpoint-<frames>.pt``.
 
         Raises:
             OSError: it cannot be written, for example because the disk is full.
@@ -283,6 +287,11 @@ class RunFolder:
         buffer = io.BytesIO()  # torch's own writer does not say what went wrong
         torch.save({"version": CHECKPOINT_VERSION, **entries}, buffer)
         storage.replace_file(self.checkpoint, buffer.getbuffer())
+        if keep > 1:
+            storage.replace_file(self.path / f"checkpoint-{entries['frames']}.pt", buffer.getbuffer())
+            kept = sorted(self.path.glob("checkpoint-*.pt"), key=lambda path: int(path.stem.rpartition("-")[2]))
+            for old in kept[:-keep]:
+                old.unlink()
 
     def remove_parts(self) -> None:
         """Removes what a process that was killed had written of a checkpoint or a policy; the lock must be taken."""
@@ -290,8 +299,12 @@ class RunFolder:
             for part in self.path.glob(f"{whole.name}.*.part"):
                 part.unlink()
 
-    def load_checkpoint(self, device: torch.device | str) -> dict[str, Any]:
+    def load_checkpoint(self, device: torch.device | str, path: Path | None = None) -> dict[str, Any]:
         """Reads the checkpoint without executing code.
+
+        Args:
+            device: where its tensors are put.
+            path: another of its checkpoints; ``None`` is the last one.
 
         Returns:
             Its entries, with tensors on ``device``.
@@ -300,9 +313,9 @@ class RunFolder:
             FileNotFoundError: the run has none yet.
             ValueError: it is damaged, or of another version.
         """
-        path = self.checkpoint
-        if not self.has_checkpoint:
-            raise FileNotFoundError(f"{self.path} has no checkpoint.pt: start a new run")
+        path = self.checkpoint if path is None else path
+        if not path.is_file():
+            raise FileNotFoundError(f"{self.path} has no {path.name}: start a new run")
         try:
             entries = torch.load(path, map_location=device, weights_only=True)
             version = entries["version"]

@@ -6,6 +6,7 @@ import logging
 import math
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -32,6 +33,7 @@ from torchrl_loco.training.reppo import REPPO
 from torchrl_loco.training.run_folder import RunFolder
 from torchrl_loco.training.spaces import Spaces
 from torchrl_loco.training.trials import Trials
+from torchrl_loco.training.warm_start import begin_from
 
 ALGORITHMS: dict[str, type[Algorithm]] = {cls.config_type.algorithm: cls for cls in (PPO, REPPO)}
 
@@ -124,6 +126,8 @@ class Trainer:
         self._evaluator: Evaluator | None = None
         if not first:  # the networks began alike, from here on each rank draws actions of its own
             torch.manual_seed(distributed.own_seed(config.seed))
+        if checkpoint is None and config.init:
+            begin_from(self.algorithm, Path(config.init), config.device)
         if checkpoint is not None:
             self._load(checkpoint, changes.get("total_frames", math.inf))
         if first:  # nothing is refused any more
@@ -252,7 +256,7 @@ class Trainer:
         terms = [after["reward_terms", name].mean() / config.action_repeat for name in self._terms]
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
         non_finite = self._base.health()["total", "non_finite"]
-        terms += [after["metrics", name].mean() for name in self._metrics]
+        terms += [after["metrics", name].nanmean() for name in self._metrics]
         numbers = torch.cat([torch.stack([non_finite, spread, ends, reward, *terms]), ended, metrics])
         non_finite, spread, ends, mean_reward, *means = distributed.mean_of_ranks(numbers).tolist()
         before, self._non_finite = self._non_finite, round(non_finite * distributed.ranks())
@@ -366,7 +370,7 @@ class Trainer:
                 "stage": self._base.get_stage(),
                 "terms": list(self._terms),
             }
-            self.run.save_checkpoint({**counters, **of, **ranks[0], "further_ranks": ranks[1:]})
+            self.run.save_checkpoint({**counters, **of, **ranks[0], "further_ranks": ranks[1:]}, self.config.keep)
         distributed.wait_for_all()
 
     def _identity(self) -> dict[str, Any]:

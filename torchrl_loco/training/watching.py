@@ -1,5 +1,6 @@
 """A run that may still be training, seen from another process: its files are read, and nothing else."""
 
+from pathlib import Path
 from typing import Any
 
 from torchrl_loco.checks import check_device
@@ -54,18 +55,19 @@ class Watched:
         return last_policy(self._run, self._config.device)
 
 
-def last_policy(run: RunFolder, device: str | None = None) -> Policy:
+def last_policy(run: RunFolder, device: str | None = None, path: Path | None = None) -> Policy:
     """Returns the policy of a run's checkpoint, which no evaluation has chosen.
 
     Args:
         run: a run with a checkpoint, which was begun without objects of one's own.
         device: where it computes; ``None`` takes CUDA if there is any.
+        path: another of its checkpoints; ``None`` is the last one.
 
     Raises:
         ValueError: the checkpoint cannot be read.
     """
     device = str(check_device(device))
-    config, checkpoint = run.load_config(device=device, task=run.task), run.load_checkpoint(device)
+    config, checkpoint = run.load_config(device=device, task=run.task), run.load_checkpoint(device, path)
     stored = checkpoint.get("spaces")  # checkpoints of earlier revisions have none
     spaces = Spaces.of(make(resolve(run.task), 1, device)) if stored is None else Spaces(**stored)
     algorithm = ALGORITHMS[config.algorithm](config, spaces)

@@ -1,7 +1,6 @@
 """Cheetah: a planar body on a back and a front leg that learns to run."""
 
 import hashlib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -81,15 +80,10 @@ class CheetahRun(LocoEnv):
     model = Path(__file__).with_name("cheetah.xml")
     config = SimConfig(ctrl_dt=0.01, sim_dt=0.01, naconmax=100_000, njmax=100, iterations=4, ls_iterations=8)
     observation_size = 17
+    observation_names = {"positions": 8, "velocities": 9}
     term_names = ("move",)
     presets = {"reppo": {"total_frames": 30_000_000, "lr": 1e-3, "minibatch_size": 4096, "min_temperature": 1e-9}}
     target_speed = RUN_SPEED
-
-    @classmethod
-    def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the terms of the observation, as :meth:`torchrl_loco.LocoEnv.layout` wants them."""
-        qpos = {"term": "qpos", "size": m.nq - 1, "first": 1}
-        return {"observation": [qpos, {"term": "qvel", "size": m.nv, "first": 0}]}
 
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""

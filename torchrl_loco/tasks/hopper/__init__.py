@@ -1,10 +1,8 @@
 """Hopper: a planar body on one leg that learns to stand and to hop."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import warp as wp
 
 from torchrl_loco.config import SimConfig
@@ -79,19 +77,9 @@ class Hopper(LocoEnv):
     model = Path(__file__).with_name("hopper.xml")
     config = SimConfig(ctrl_dt=0.02, sim_dt=0.005, naconmax=50_000, njmax=50, iterations=4, ls_iterations=10)
     observation_size = 15
+    observation_names = {"positions": 6, "velocities": 7, "touch": 2}
     term_names: tuple[str, ...] = ("standing", "small_control")
     target_speed = 0.0
-
-    @classmethod
-    def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the terms of the observation, as :meth:`torchrl_loco.LocoEnv.layout` wants them."""
-        return {
-            "observation": [
-                {"term": "qpos", "size": m.nq - 1, "first": 1},
-                {"term": "qvel", "size": m.nv, "first": 0},
-                {"term": "sensors", "size": 2, "names": ["touch_toe", "touch_heel"], "function": "log1p"},
-            ]
-        }
 
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""

@@ -1,10 +1,8 @@
 """Humanoid: 21 hinges on a free root, learning to stand, walk and run."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import warp as wp
 
 from torchrl_loco.config import SimConfig
@@ -104,22 +102,16 @@ class Humanoid(LocoEnv):
     model = Path(__file__).with_name("humanoid.xml")
     config = SimConfig(ctrl_dt=0.025, sim_dt=0.005, naconmax=200_000, njmax=250, iterations=4, ls_iterations=8)
     observation_size = 67
+    observation_names = {
+        "joint_angles": 21,
+        "head_height": 1,
+        "extremities": 12,
+        "torso_vertical": 3,
+        "com_velocity": 3,
+        "velocities": 27,
+    }
     term_names = ("standing", "upright", "small_control", "move")
     target_speed = 0.0
-
-    @classmethod
-    def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the terms of the observation, as :meth:`torchrl_loco.LocoEnv.layout` wants them."""
-        return {
-            "observation": [
-                {"term": "qpos", "size": m.nq - 7, "first": 7},
-                {"term": "height", "size": 1, "body": "head"},
-                {"term": "positions", "size": 12, "bodies": list(EXTREMITIES), "frame": "torso"},
-                {"term": "axes", "size": 3, "bodies": ["torso"], "entries": [6, 7, 8]},
-                {"term": "sensors", "size": 3, "names": ["torso_velocity"]},
-                {"term": "qvel", "size": m.nv, "first": 0},
-            ]
-        }
 
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""

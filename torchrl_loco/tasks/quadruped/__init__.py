@@ -1,10 +1,8 @@
 """Quadruped: four legs on a free torso, learning to walk and run."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import warp as wp
 
 from torchrl_loco.config import SimConfig
@@ -104,25 +102,17 @@ class Quadruped(LocoEnv):
         euler_damping=True,  # its hinges are damped so strongly that without it a control step errs by 0.01 rad
     )
     observation_size = 78
+    observation_names = {
+        "joint_angles": 16,
+        "joint_velocities": 16,
+        "activations": 12,
+        "torso_velocity": 3,
+        "upright": 1,
+        "imu": 6,
+        "foot_forces": 24,
+    }
     term_names = ("upright", "move")
     target_speed = WALK_SPEED
-
-    @classmethod
-    def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the terms of the observation, as :meth:`torchrl_loco.LocoEnv.layout` wants them."""
-        sensors = [m.sensor(i).name for i in range(m.nsensor)]
-        forces = [name for name in sensors if name.startswith(("force", "torque"))]
-        return {
-            "observation": [
-                {"term": "qpos", "size": m.nq - 7, "first": 7},
-                {"term": "qvel", "size": m.nv - 6, "first": 6},
-                {"term": "activations", "size": m.na},
-                {"term": "sensors", "size": 3, "names": ["velocimeter"]},
-                {"term": "axes", "size": 1, "bodies": ["torso"], "entries": [8]},
-                {"term": "sensors", "size": 6, "names": ["imu_accel", "imu_gyro"]},
-                {"term": "sensors", "size": 24, "names": forces, "function": "arcsinh"},
-            ]
-        }
 
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -34,6 +34,8 @@ CURRICULUM: dict[int, commands.Ranges] = {
     240_000: ((-2.0, 3.0), (-1.0, 1.0), (-0.7, 0.7)),
 }
 """Ranges of the commands by the control step of training from which they hold."""
+SETTLING = 1.5
+"""Time after a new command for which its errors do not count (s)."""
 BIAS = 0.015
 """Greatest error of a joint's encoder in an episode (rad)."""
 PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
@@ -160,6 +162,7 @@ class Velocity(LocoEnv):
         },
     }
 
+    holds: ClassVar[Mapping[str, Any]] = {"falls": 0.01, "delay": (0, 2), "friction": (0.4, 1.2), "pushes": 1.0}
     noise: ClassVar[Mapping[str, Any]] = {
         "linear_velocity": 0.5,  # m/s
         "angular_velocity": 0.2,  # rad/s
@@ -286,35 +289,30 @@ class Velocity(LocoEnv):
         }
 
     @classmethod
-    def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns what :meth:`observation`, :meth:`control` and the episodes are, as in numbers of a file."""
-        joints = actuated(m)
-        home = models.home_pose(m)[[int(m.joint(name).qposadr[0]) for name in joints]].tolist()
-        size = {"size": len(joints), "joints": joints}
-        noise = {name: most[0] if isinstance(most, tuple) else most for name, most in cls.noise.items()}
+    def facts(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns how actions become targets of the joints, and what commands the policy follows."""
+        home = models.home_pose(m)[[int(m.joint(name).qposadr[0]) for name in actuated(m)]].tolist()
         scale = np.full(m.nu, cls.action_scale or 0.0)
         if cls.action_scale is None:
             scale = 0.25 * m.actuator_forcerange[:, 1] / m.actuator_gainprm[:, 0]
-        low, high = commands.reached(cls.curriculum, info.get("frames", 0) // info.get("num_envs", 1))
+        low, high = commands.reached(cls.curriculum, steps_of_training(info))
         return {
-            "observation": [
-                *(
-                    {"term": term, "size": 3, "body": cls.base, "noise": noise[term]}
-                    for term in ("linear_velocity", "angular_velocity", "gravity")
-                ),
-                {"term": "joint_positions", **size, "home": home, "noise": noise["joint_positions"], "bias": BIAS},
-                {"term": "joint_velocities", **size, "noise": noise["joint_velocities"]},
-                {"term": "last_action", "size": m.nu},
-                {"term": "command", "size": 3},
-            ],
             "action_offset": home,
             "action_scale": scale.tolist(),
-            "velocity": {
-                **{"base": cls.base, "trunk": cls.trunk, "fallen": UPSIDE},
-                **{"command_low": low, "command_high": high, "command_every": commands.EVERY, "still": commands.STAND},
-                **{"push": PUSH, "push_every": PUSH_EVERY, "start_height": START_HEIGHT},
-            },
+            "velocity": {"base": cls.base, "trunk": cls.trunk, "command_low": low, "command_high": high},
         }
+
+    @classmethod
+    def stage_of(cls, info: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Returns the stage of the curriculum; files of earlier revisions tell it by the frames of their training."""
+        return info.get("stage") or {"memory": {"trained": [float(steps_of_training(info))]}}
+
+    @classmethod
+    def fixed_commands(cls, info: Mapping[str, Any]) -> Mapping[str, Sequence[Sequence[float]]]:
+        """Returns standing, each limit of the commands alone, and both limits of all together."""
+        low, high = commands.reached(cls.curriculum, steps_of_training(info))
+        alone = [[limit[k] if j == k else 0.0 for j in range(3)] for k in range(3) for limit in (high, low)]
+        return {"command": [[0.0, 0.0, 0.0], *alone, high, low]}
 
     # The hooks, in the order in which they are called.
 
@@ -378,11 +376,19 @@ class Velocity(LocoEnv):
         """Returns whether the trunk is tilted by more than 70 degrees."""
         return s.projected_gravity(self.trunk)[:, 2] > -UPSIDE
 
+    def metrics(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns the errors of horizontal velocity (m/s) and yaw rate (rad/s), once a command has settled."""
+        seen, settled = self.seen(s), s.command_age >= SETTLING
+        linear = (s.command - seen["linear_velocity"])[:, :2].norm(dim=-1)
+        angular = (s.command - seen["angular_velocity"])[:, 2].abs()
+        errors = {"linear_error": linear, "angular_error": angular}
+        return {name: torch.where(settled, error, math.nan) for name, error in errors.items()}
+
     def events(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the command that holds next, the last action, how long feet are in the air, and pushes."""
         due, forward, touching = s.until_command <= 0.0, s.xmat(self.base)[:, :2, 0], self.touching(s)
         goes_on = {name: getattr(s, name) for name in ("command", "heading", "holds_heading")}
-        goes_on["until_command"] = s.until_command - s.dt
+        goes_on |= {"until_command": s.until_command - s.dt, "command_age": s.command_age + s.dt}
         rows = {
             name: torch.where(due.view(-1, *[1] * (new.ndim - 1)), new, goes_on[name])
             for name, new in commands.draw(s, self.curriculum).items()
@@ -435,6 +441,11 @@ class Velocity(LocoEnv):
             "delay": torch.zeros_like(yaw) if self.play else s.uniform(0.0, self.max_delay + 1.0).floor(),
             "trained": s.trained,  # it counts on over all episodes
         }
+
+
+def steps_of_training(info: Mapping[str, Any]) -> int:
+    """Returns after how many control steps of each world a policy was saved."""
+    return int(info.get("frames", 0)) // int(info.get("num_envs", 1))
 
 
 def actuated(m: mujoco.MjModel) -> list[str]:

@@ -28,10 +28,11 @@ ROWS: dict[str, int | tuple[int, ...]] = {
     "heading": (),
     "holds_heading": (),
     "until_command": (),
+    "command_age": (),
     "trained": (),
 }
-"""Rows of memory: the command; the heading (rad) and whether it is held; time until the next (s); control steps of
-training, over all episodes of the world."""
+"""Rows of memory: the command; the heading (rad) and whether it is held; time until the next (s); time since it was
+drawn (s); control steps of training, over all episodes of the world."""
 
 
 def limits(s: "View", curriculum: dict[int, Ranges]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -64,7 +65,7 @@ def first(curriculum: dict[int, Ranges]) -> dict[str, tuple[float, float]]:
 
 
 def draw(s: "View", curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
-    """Returns rows of a new command: of command, heading, whether it is held, and time until the next."""
+    """Returns rows of a new command: of command, heading, whether it is held, time until the next, and its age."""
     low, high = limits(s, curriculum)
     command, kind = low + (high - low) * s.uniform(0.0, 1.0, 3), s.uniform(0.0, 1.0, 3)
     stands, holds, ahead = kind[:, 0] < STAND, kind[:, 1] < TURN, kind[:, 2] < AHEAD
@@ -76,6 +77,7 @@ def draw(s: "View", curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
         "heading": s.uniform(-math.pi, math.pi),
         "holds_heading": (holds & ~stands & ~ahead).float(),
         "until_command": s.uniform(*EVERY),
+        "command_age": torch.zeros_like(s.command_age),
     }
 
 

@@ -1,10 +1,8 @@
 """Walker: a planar body that learns to stand, walk and run."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import warp as wp
 
 from torchrl_loco.config import SimConfig
@@ -85,20 +83,9 @@ class Walker(LocoEnv):
     model = Path(__file__).with_name("walker.xml")
     config = SimConfig(ctrl_dt=0.025, sim_dt=0.0025, naconmax=50_000, njmax=100, iterations=2, ls_iterations=5)
     observation_size = 24
+    observation_names = {"orientations": 14, "height": 1, "velocities": 9}
     term_names: tuple[str, ...] = ("stand",)
     target_speed = 0.0
-
-    @classmethod
-    def layout(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the terms of the observation, as :meth:`torchrl_loco.LocoEnv.layout` wants them."""
-        height = (
-            {"term": "height", "size": 1, "body": "torso"}
-            if info["protocol"] == "dm_control"
-            else {"term": "axes", "size": 1, "bodies": ["torso"], "entries": [8]}
-        )
-        bodies = [m.body(1 + i).name for i in range(7)]
-        axes = {"term": "axes", "size": 14, "bodies": bodies, "entries": [0, 2]}
-        return {"observation": [axes, height, {"term": "qvel", "size": m.nv, "first": 0}]}
 
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""

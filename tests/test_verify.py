@@ -1,0 +1,214 @@
+"""Exported policies in C MuJoCo: they are played in their own task, and what does not hold is told."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import torchrl_loco
+from torchrl_loco import WalkerWalk, cli
+from torchrl_loco.conditions import Conditions
+from torchrl_loco.export import export_policy
+from torchrl_loco.policy import ObservationNorm, Policy
+from torchrl_loco.verify import Exported, play, verify
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxscript")
+
+BLOCK = """
+import runpy, sys
+class Blocked:
+    names = ["torch", "warp", "torchrl_loco"]
+    def find_spec(self, name, *others):
+        if name in self.names:
+            raise ImportError(f"{name} is blocked")
+sys.meta_path.insert(0, Blocked())
+runpy.run_path(sys.argv.pop(1), run_name="__main__")
+"""
+EXAMPLE = Path(__file__).parents[1] / "examples" / "deploy.py"
+
+
+def constant(task, size, actions, value=0.0, **info):
+    """Returns a policy whose action is always the same."""
+    network = nn.Sequential(ObservationNorm(size), nn.Linear(size, actions))
+    nn.init.zeros_(network[1].weight)
+    nn.init.constant_(network[1].bias, value)
+    about = {"task": task, "protocol": "playground", "action_repeat": 1, "control_timestep": 0.02}
+    return Policy(network, {**about, **info})
+
+
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory):
+    """An H1 that stands until it is pushed over."""
+    path = tmp_path_factory.mktemp("h1") / "h1.onnx"
+    export_policy(constant("h1_velocity", 69, 19), path)
+    return path
+
+
+def command(capsys, *arguments):
+    """Returns the status of the command and what it prints."""
+    try:
+        status = cli.main(["verify", *map(str, arguments)])
+    except SystemExit as ended:
+        status = ended.code
+    return status, capsys.readouterr()
+
+
+def test_a_file_is_deployed_without_this_package(standing):
+    done = subprocess.run(
+        [sys.executable, "-c", BLOCK, EXAMPLE, standing, "--seconds", "1"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    base, targets = done.stdout.splitlines()
+    assert 0.9 < float(base.split()[4]) < 1.0
+    assert targets.startswith("left_hip_yaw 0.00, left_hip_roll 0.00, left_hip_pitch -0.27, left_knee 0.80, ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pushes", [0, 6])
+def test_robots_do_the_same_in_both_engines(standing, capsys, tmp_path, pushes):
+    out = tmp_path / "out.json"
+    options = ("--episodes", 8, "--seconds", 3, "--pushes", pushes, "--device", "cpu", "--out", out)
+    status, said = command(capsys, standing, *options)
+    figures = json.loads(out.read_text())
+    there, here = (figures["outcomes"][name]["all"] for name in ("C MuJoCo", "training simulator"))
+    assert (there["falls"] > 0) == (pushes > 0)
+    assert there["falls"] == here["falls"]
+    assert (status, figures["holds"]) == ((1, False) if pushes else (0, True))
+    assert ("DOES NOT HOLD: falls in" in said.out) == (pushes > 0)
+    for figure in ("return", "linear_error", "angular_error", "upright"):
+        assert there[figure] == pytest.approx(here[figure], rel=0.2 if pushes else 0.02)
+    assert figures["outcomes"]["C MuJoCo"].keys() == {
+        *("all", "fixed commands", "drawn commands", "delay 0", "delay 1", "delay 2"),
+    }
+
+
+@pytest.mark.slow
+def test_a_runner_earns_the_same_in_c_mujoco(capsys, tmp_path):
+    """From the same starts, under the model's own solver; what is asked for decides on the status."""
+    policy = torchrl_loco.load_policy("walker_walk", "cpu", "dm_control")
+    policy.save(tmp_path / "policy.safetensors")
+    (tmp_path / "config.json").write_text("{}")  # as in a run folder
+    options = ("--episodes", 4, "--seconds", 5, "--device", "cpu")
+    status, said = command(capsys, tmp_path / "policy.safetensors", *options)
+    assert status == 0, said.err
+    outcomes = json.loads((tmp_path / "verify.json").read_text())["outcomes"]
+    here, there = (outcomes[name]["all"]["return"] for name in ("training simulator", "C MuJoCo"))
+    assert 150 < here < 200
+    assert there == pytest.approx(here, rel=0.01)
+    status, said = command(capsys, tmp_path / "policy.safetensors", *options, "--seconds", 1, "--min_return", 1.1)
+    assert (status, "DOES NOT HOLD: return" in said.out) == (1, True)
+    _, said = command(capsys, "humanoid_walk", "--episodes", 4, "--seconds", 0.5, "--device", "cpu")
+    assert "1 episode, since all begin alike, of 0.5 s" in said.out
+
+
+class Late(WalkerWalk):
+    """Measures the action that arrives, and observes with noise and memory; a policy must earn 30 of 40."""
+
+    memory = {"steps": ()}
+    noise = {"steps": 0.25}
+    holds = {"return": 30.0, "falls": 0.5}
+    episode_length = 40
+
+    def reward(self, s):
+        return {"arrived": s.action[:, 0]}
+
+    def terminated(self, s):
+        return (s.env_index == 0) & (s.steps >= 9)
+
+    def metrics(self, s):
+        return {"late": torch.where(s.steps < 4, s.action[:, 0] == 0.0, torch.nan)}
+
+    def events(self, s):
+        return {"steps": s.steps + 1}
+
+    def observation(self, s):
+        return {"observation": {"steps": s.steps}}
+
+
+def exported(path, **info):
+    """Returns the file of a policy for :class:`Late`."""
+    export_policy(constant(torchrl_loco.registry.task_name(Late), 1, 6, 1.0, **info), path)
+    return path
+
+
+def test_a_task_of_a_users_own_is_verified_by_its_own_hooks(tmp_path):
+    """Actions arrive late, terms and metrics are means over the steps that count, and a fall ends an episode."""
+    path = exported(tmp_path / "late.onnx")
+    report = verify(path, Conditions(episodes=6, delay=(0, 2)), "cpu")
+    for engine in ("C MuJoCo", "training simulator"):
+        table = report.figures["outcomes"][engine]
+        assert (table["all"]["falls"], table["all"]["episodes"]) == (1, 6)
+        assert table["all"]["mean_steps"] == pytest.approx((10 + 5 * 40) / 6)
+        for delay in range(3):
+            assert table[f"delay {delay}"]["late"] == pytest.approx(delay / 4)
+    assert report.holds
+    assert "holds: falls in 16.7% of the episodes, 50.0% are allowed; return" in report.lines[-1]
+    report = verify(path, Conditions(episodes=6, delay=(15, 15)), "cpu", alone=True)
+    assert not report.holds
+    assert "DOES NOT HOLD: return 20.8, at least 30.0 is asked for" in report.lines[-1]
+    assert list(report.figures["outcomes"]) == ["C MuJoCo"]
+
+
+def test_noise_is_the_tasks_own(tmp_path):
+    played = []
+    policy = Exported(exported(tmp_path / "late.onnx"))
+    policy.act = lambda seen: played.append(seen.clone()) or torch.zeros(len(seen), 6)
+    for scale in (0.0, 2.0):
+        env = Late(4, "cpu", 0, play=True, noise_scale=scale, metrics=True)
+        play(policy, env, Conditions(noise=scale).of(Late.holds), "test")
+    clean, noisy = (torch.cat(played[i : i + 40], dim=1) for i in (0, 40))
+    assert torch.equal(clean, torch.arange(40.0).expand(4, 40))
+    assert 0.4 < (noisy - clean).abs().max() <= 0.5
+
+
+def test_robots_are_pushed_alike_in_both_engines(standing):
+    """A push is added to the velocity of the base after a step; nothing else is."""
+    policy, changes = Exported(standing), []
+    policy.act = lambda seen: torch.zeros(len(seen), 19)
+    conditions = Conditions(episodes=3, seconds=1.5, pushes=1.0, delay=(0, 0), noise=0.0).of(
+        torchrl_loco.H1Velocity.holds
+    )
+    for engine in ("mujoco", "auto"):
+        env = torchrl_loco.make("h1_velocity", 3, "cpu", 0, engine=engine, play=True, metrics=True)
+        velocities = []
+        step = env.world.step
+        env.world.step = lambda action, env=env, step=step, kept=velocities: (
+            kept.append(env.sim.qvel.clone()),
+            step(action),
+        )
+        play(policy, env, conditions, "test")
+        found = torch.stack(velocities)
+        jumps = (found[1:, :, :2] - found[:-1, :, :2]).abs().amax(-1)
+        changes.append(jumps > 0.1)
+        np.testing.assert_allclose(found[60].numpy()[:, :6], found[60].numpy()[:, :6])
+    assert 0 < changes[0].sum() < 10
+    assert torch.equal(changes[0], changes[1])
+
+
+def test_what_cannot_be_verified(standing, tmp_path, capsys):
+    path = tmp_path / "runner.onnx"
+    export_policy(constant("walker_walk", 24, 6), path)
+    other = tmp_path / "other.onnx"
+    export_policy(constant("walker_walk", 23, 6), other)
+    nameless = tmp_path / "nameless.onnx"
+    model = onnx.load(path)
+    del model.metadata_props[:]
+    onnx.save(model, nameless)
+    cases = {
+        (path, "--alone"): "held to its return in the training simulator",
+        (path, "--pushes", "1"): "pushes need a body that floats",
+        (path, "--delay", "2", "1"): "delay: the least, 2, must not be greater than the greatest, 1",
+        (other,): "the policy has 23 numbers of the observation, walker_walk has 24",
+        (nameless,): "does not say its task",
+        (tmp_path / "none.onnx",): "there is no file",
+    }
+    for arguments, message in cases.items():
+        status, said = command(capsys, *arguments, "--episodes", 2, "--device", "cpu")
+        assert status == 2
+        assert message in " ".join(said.err.split())

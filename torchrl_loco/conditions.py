@@ -1,0 +1,65 @@
+"""What a policy must hold in, as ``torchrl-loco verify`` plays it."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from torchrl_loco.checks import COUNT, FRACTION, NOT_NEGATIVE, SEED, check_float, check_int
+
+
+@dataclasses.dataclass(frozen=True)
+class Conditions:
+    """What a policy must hold in. What is ``None`` is as the task says (:attr:`torchrl_loco.LocoEnv.holds`)."""
+
+    episodes: int = 256
+    """Number of episodes."""
+    seconds: float | None = None
+    """Length of an episode (s), at most that of the task."""
+    seed: int = 0
+    """Seed of the episodes."""
+    delay: tuple[int, int] | None = None
+    """Least and greatest delay of an action (control steps); each has as many episodes."""
+    friction: tuple[float, float] | None = None
+    """Least and greatest sliding friction, drawn for each episode."""
+    noise: float = 1.0
+    """What the task's noise of the observation is multiplied by."""
+    pushes: float | None = None
+    """Changes of a floating base's velocity by pushes, as a multiple of mjlab's."""
+    max_falls: float | None = None
+    """Greatest share of episodes that terminate."""
+    min_return: float | None = None
+    """Least return, as a share of that in the training simulator."""
+
+    def check(self) -> None:
+        """Checks all values.
+
+        Raises:
+            ValueError: one is out of range.
+            TypeError: one has the wrong type.
+        """
+        check_int("episodes", self.episodes)
+        check_int("seed", self.seed, SEED)
+        if self.seconds is not None:
+            check_float("seconds", self.seconds)
+        for name, check, interval in (("delay", check_int, COUNT), ("friction", check_float, NOT_NEGATIVE)):
+            if (values := getattr(self, name)) is not None:
+                least, most = (check(name, value, interval) for value in values)
+                if least > most:
+                    raise ValueError(f"{name}: the least, {least}, must not be greater than the greatest, {most}")
+        for name in ("noise", "pushes", "min_return"):
+            if getattr(self, name) is not None:
+                check_float(name, getattr(self, name), NOT_NEGATIVE)
+        if self.max_falls is not None:
+            check_float("max_falls", self.max_falls, FRACTION)
+
+    def of(self, holds: Mapping[str, Any]) -> "Conditions":
+        """Returns the conditions of a task: what is ``None`` here is as its ``holds`` says, else without."""
+        none = {"delay": (0, 0), "pushes": 0.0}
+        asked = {**none, **{name: value for name, value in holds.items() if name in vars(self)}}
+        return dataclasses.replace(
+            self, **{name: value for name, value in asked.items() if getattr(self, name) is None}
+        )
+
+
+DEFAULT = Conditions()
+"""What each task asks for."""

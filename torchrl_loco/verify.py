@@ -1,0 +1,398 @@
+"""From an exported policy to a report: whether it holds in C MuJoCo, beside the engine in which it was trained.
+
+Both are the policy's own task, with ``engine="mujoco"`` and as it was trained: the same hooks, episodes and draws.
+"""
+
+import contextlib
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.checks import check_bool, check_packages
+from torchrl_loco.conditions import DEFAULT, Conditions
+
+if TYPE_CHECKING:
+    import torch
+
+    from torchrl_loco.envs import LocoEnv
+
+PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
+"""Greatest change of a floating base's velocity by a push (m/s, rad/s), as mjlab 1.6 has it."""
+PUSH_EVERY = (1.0, 3.0)
+"""Least and greatest time between two pushes (s)."""
+
+ENGINES = ("C MuJoCo", "training simulator")
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What was found.
+
+    Attributes:
+        holds: whether the policy holds.
+        lines: it, to be printed.
+        figures: it, as JSON can hold it.
+    """
+
+    holds: bool
+    lines: list[str]
+    figures: dict[str, Any]
+
+
+class Exported:
+    """A policy in an ONNX file that :func:`torchrl_loco.export_policy` wrote.
+
+    Args:
+        path: the file.
+        task: the name of its task, as the user says; ``None`` for what the file says.
+
+    Attributes:
+        facts: what the file says, by name: see :mod:`torchrl_loco.deployment`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no exported policy.
+    """
+
+    def __init__(self, path: Path, task: str | None = None) -> None:
+        import onnxruntime
+
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"there is no file {path}")
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's have no base of their own
+            raise ValueError(f"{path} cannot be read as an ONNX file: {error}") from error
+        self.facts: dict[str, Any] = {}
+        for name, word in self._session.get_modelmeta().custom_metadata_map.items():
+            self.facts[name] = word
+            with contextlib.suppress(json.JSONDecodeError):  # words are not quoted
+                self.facts[name] = json.loads(word)
+        if "task" not in self.facts:
+            raise ValueError(f"{path} does not say its task: it must be a file that torchrl-loco export wrote")
+        if task is not None:
+            self.facts["task"] = task
+
+    def act(self, observation: "torch.Tensor") -> "torch.Tensor":
+        """Returns the actions ``(n, nu)`` for observations ``(n, size)``, on their device."""
+        import torch
+
+        (action,) = self._session.run(["action"], {"observation": observation.cpu().numpy()})
+        return torch.from_numpy(action).to(observation.device)
+
+
+def verify(
+    path: Path,
+    conditions: Conditions = DEFAULT,
+    device: str | None = None,
+    *,
+    alone: bool = False,
+    task: str | None = None,
+) -> Report:
+    """Plays an exported policy in C MuJoCo, beside the engine in which it was trained.
+
+    Both play the same episodes of its task: the same starts, commands, late actions, noise, friction and pushes, where
+    the task's own hooks reward, end and measure.
+
+    Args:
+        path: an ONNX file that :func:`torchrl_loco.export_policy` wrote.
+        conditions: what it must hold in.
+        device: where the engine of the training computes; ``None`` takes CUDA if there is any.
+        alone: whether to play it in C MuJoCo alone, which is quicker on a CPU.
+        task: the name of its task, as the user says; ``None`` for what the file says.
+
+    Returns:
+        What was found.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it does not fit its task, or the task cannot have these conditions.
+        ImportError: onnxruntime is missing, or the task is.
+    """
+    check_packages("verifying", ("onnxruntime",), "onnx")
+    conditions.check()
+    check_bool("alone", alone)
+    from torchrl_loco.registry import resolve
+
+    exported = Exported(path, task)
+    cls = resolve(exported.facts["task"])
+    conditions = conditions.of(cls.holds)
+    if alone and conditions.min_return is None and not {"falls", "return"} & cls.holds.keys():
+        raise ValueError(f"{cls.__name__} is held to its return in the training simulator: it cannot be played alone")
+    outcomes, env = dict[str, Outcome](), None
+    for name in ENGINES[:1] if alone else ENGINES:
+        env = _worlds(cls, exported, conditions, name, device)
+        if env.num_envs > 1 and name == ENGINES[0] and _begins_alike(env, conditions):
+            conditions = dataclasses.replace(conditions, episodes=1)
+            env = _worlds(cls, exported, conditions, name, device)
+        outcomes[name] = play(exported, env, conditions, name)
+    assert env is not None
+    return _report(exported, cls, conditions, outcomes, outcomes[ENGINES[0]].steps_of_episode * env.config.ctrl_dt)
+
+
+def _worlds(cls: Any, exported: Exported, conditions: Conditions, engine: str, device: str | None) -> "LocoEnv":
+    """Returns worlds of a policy's task, a world for each episode.
+
+    Raises:
+        ValueError: the policy does not fit the task.
+    """
+    from torchrl_loco.envs.vary import Vary
+
+    facts, options = exported.facts, dict[str, Any]()
+    if conditions.friction is not None:
+        options["randomize"] = [Vary("geom_friction", *conditions.friction, how="set", once=True)]
+    if engine == ENGINES[0]:
+        device, options["engine"] = "cpu", "mujoco"
+    env = cls(
+        *(conditions.episodes, device, conditions.seed, facts["protocol"]),
+        **{"world_offset": 0, "play": True, "noise_scale": conditions.noise, "metrics": True, "reward_terms": True},
+        **options,
+    )
+    for name, size, own in (
+        ("observation", facts["observation_size"], env.observation_spec["observation"].shape[-1]),
+        ("action", facts["action_size"], env.mj_model.nu),
+    ):
+        if size != own:
+            raise ValueError(f"the policy has {size} numbers of the {name}, {facts['task']} has {own}")
+    env.set_stage(cls.stage_of(facts.get("info", {})))
+    return env
+
+
+def _begins_alike(env: "LocoEnv", conditions: Conditions) -> bool:
+    """Returns whether all episodes are the same one."""
+    env.reset()
+    same = all(bool((view == view[:1]).all()) for view in (env.sim.qpos, env.sim.qvel))
+    least, most = conditions.delay or (0, 0)
+    varied = conditions.friction is not None or conditions.pushes or least != most
+    draws = env.hooks is not None and (env.hooks.own or env.memory)
+    return same and not varied and not draws
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How a policy did, by episode.
+
+    Attributes:
+        fell: whether it terminated, ``(n,)``.
+        steps: control steps until then or to the end, ``(n,)``.
+        returns: what it earned, ``(n,)``.
+        sums: by term of the reward and by metric, what it summed up to, and over how many control steps, ``(n,)`` each.
+        delay: control steps by which actions were late, ``(n,)``.
+        is_fixed: whether it had one command throughout, ``(n,)``.
+        steps_of_episode: control steps of a whole one.
+        metrics: names of the metrics.
+    """
+
+    fell: np.ndarray
+    steps: np.ndarray
+    returns: np.ndarray
+    sums: dict[str, tuple[np.ndarray, np.ndarray]]
+    delay: np.ndarray
+    is_fixed: np.ndarray
+    steps_of_episode: int
+    metrics: tuple[str, ...]
+
+    def rows(self) -> dict[str, np.ndarray]:
+        """Returns by name the episodes of each kind, as masks ``(n,)``."""
+        rows = {"all": np.ones(len(self.fell), dtype=bool)}
+        if self.is_fixed.any():
+            rows |= {"fixed commands": self.is_fixed, "drawn commands": ~self.is_fixed}
+        if len(delays := np.unique(self.delay)) > 1:
+            rows |= {f"delay {delay}": self.delay == delay for delay in delays}
+        return rows
+
+    def of(self, episodes: np.ndarray) -> dict[str, Any]:
+        """Returns falls, mean length (control steps), mean return, and means of terms and metrics over control steps.
+
+        A mean is ``None`` if no control step of these episodes counts.
+        """
+        means = {}
+        for name, (total, counted) in self.sums.items():
+            count = float(counted[episodes].sum())
+            means[name] = float(total[episodes].sum()) / count if count else None
+        return {
+            "episodes": int(episodes.sum()),
+            "falls": int(self.fell[episodes].sum()),
+            "mean_steps": float(self.steps[episodes].mean()),
+            "return": float(self.returns[episodes].mean()),
+            **means,
+        }
+
+
+def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str) -> Outcome:
+    """Plays the policy in worlds of its task, a world for each episode.
+
+    Args:
+        exported: the policy.
+        env: the worlds.
+        conditions: what they are played in.
+        label: of the progress bar.
+
+    Returns:
+        How it did.
+
+    Raises:
+        ValueError: nothing floats that could be pushed.
+    """
+    import torch
+    from tqdm.auto import trange
+
+    n, steps, dt = env.num_envs, env.config.episode_length, env.config.ctrl_dt
+    if conditions.seconds is not None:
+        steps = min(steps, max(round(conditions.seconds / dt), 1))
+    generator, hold = np.random.default_rng(conditions.seed), int(exported.facts["action_repeat"])
+    assert conditions.delay is not None
+    least, most = conditions.delay
+    delay = generator.permutation(least + np.arange(n) % (most - least + 1))
+    pushes = _pushes(env, generator, steps, float(conditions.pushes or 0.0))
+    is_fixed = _fix_commands(env, exported.facts.get("info", {}))
+    env.set_seed(conditions.seed)  # from the first episode on, in both engines
+    td = env.reset()
+    own_delay = env.memory.get("delay") == ()  # the task's own hooks hold its actions back
+    if own_delay:
+        env.world.memory["delay"].copy_(torch.from_numpy(delay))
+    behind = torch.from_numpy(np.zeros(n, dtype=int) if own_delay else delay).to(env.device)
+    late = torch.zeros(most + 1, n, env.mj_model.nu, device=env.device)
+    alive = torch.ones(n, dtype=torch.bool, device=env.device)
+    counts = {name: torch.zeros(n, device=env.device, dtype=torch.float64) for name in ("return", "steps", "fell")}
+    sums: dict[str, list[torch.Tensor]] = {}
+    for t in trange(steps, desc=label, leave=False, disable=None):  # no bar in logs
+        if t % hold == 0:
+            action = exported.act(td["observation"])
+        late = torch.cat([action.unsqueeze(0), late[:-1]])
+        after = env.step(td.set("action", late.gather(0, behind.view(1, n, 1).expand(1, n, late.shape[2]))[0]))["next"]
+        counts["return"] += after["reward"].squeeze(-1) * alive
+        counts["steps"] += alive
+        for group in ("reward_terms", "metrics"):
+            for name, values in after.get(group, {}).items():
+                value = values.squeeze(-1).double()
+                counted = alive & value.isfinite()
+                total = sums.setdefault(name, [torch.zeros_like(value), torch.zeros_like(value)])
+                total[0] += torch.where(counted, value, 0.0)
+                total[1] += counted
+        ended = after["terminated"].squeeze(-1)
+        counts["fell"] += ended & alive
+        alive &= ~after["done"].squeeze(-1)
+        td = after.exclude("reward")
+        if not alive.any():
+            break
+        if t in pushes:
+            env.sim.qvel[:, :6] += torch.from_numpy(pushes[t]).float().to(env.device)  # poses stay
+    kept = {name: values.cpu().numpy() for name, values in counts.items()}
+    return Outcome(
+        fell=kept["fell"] > 0,
+        steps=kept["steps"],
+        returns=kept["return"],
+        sums={name: (total[0].cpu().numpy(), total[1].cpu().numpy()) for name, total in sums.items()},
+        delay=delay,
+        is_fixed=is_fixed,
+        steps_of_episode=steps,
+        metrics=env.metric_names,
+    )
+
+
+def _pushes(env: "LocoEnv", generator: np.random.Generator, steps: int, scale: float) -> dict[int, np.ndarray]:
+    """Returns changes of the bases' velocities ``(n, 6)`` (m/s, rad/s), by the control step after which they come.
+
+    Raises:
+        ValueError: nothing floats that could be pushed.
+    """
+    if not scale:
+        return {}
+    if env.mj_model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        raise ValueError("pushes need a body that floats, whose free joint is the model's first")
+    found = dict[int, np.ndarray]()
+    for i in range(env.num_envs):
+        t = round(generator.uniform(*PUSH_EVERY) / env.config.ctrl_dt)
+        while t < steps:
+            found.setdefault(t, np.zeros((env.num_envs, 6)))[i] = scale * generator.uniform(-1.0, 1.0, 6) * PUSH
+            t += max(round(generator.uniform(*PUSH_EVERY) / env.config.ctrl_dt), 1)
+    return found
+
+
+def _fix_commands(env: "LocoEnv", info: dict[str, Any]) -> np.ndarray:
+    """Lets the first half of the worlds have one command throughout, if the task says which.
+
+    Returns:
+        In which worlds, ``(n,)``.
+    """
+    import torch
+
+    n, fixed = env.num_envs, type(env).fixed_commands(info)
+    is_fixed = np.arange(n) < (n // 2 if fixed else 0)
+    for entry, rows in fixed.items():
+        assert env.hooks is not None
+        values, is_set = env.hooks.commands[entry]
+        table = torch.tensor(rows, dtype=torch.float32, device=env.device)
+        values.copy_(table[torch.arange(n, device=env.device) % len(table)])
+        is_set.copy_(torch.from_numpy(is_fixed))
+    return is_fixed
+
+
+def _report(
+    exported: Exported, cls: Any, conditions: Conditions, outcomes: dict[str, Outcome], seconds: float
+) -> Report:
+    """Returns whether a policy holds, and the figures by engine and kind of episodes."""
+    table = {
+        engine: {name: played.of(rows) for name, rows in played.rows().items()} for engine, played in outcomes.items()
+    }
+    there, here = (table.get(name, {}).get("all") for name in ENGINES)
+    assert there is not None
+    bounds = []
+    max_falls = cls.holds.get("falls") if conditions.max_falls is None else conditions.max_falls
+    if max_falls is not None:
+        share = there["falls"] / there["episodes"]
+        words = f"falls in {share:.1%} of the episodes, {max_falls:.1%} are allowed"
+        bounds.append((share <= max_falls, words))
+    if (least := cls.holds.get("return")) is not None:
+        bounds.append((there["return"] >= least, f"return {there['return']:.1f}, at least {least:.1f} is asked for"))
+    kept = conditions.min_return
+    if kept is None and not bounds:
+        kept = cls.holds.get("kept", 0.9)
+    if kept is not None and here is not None:
+        trained = here["return"]
+        if conditions == dataclasses.replace(
+            Conditions().of(cls.holds), episodes=conditions.episodes, seed=conditions.seed
+        ):
+            trained = max(trained, exported.facts.get("info", {}).get("mean", trained))  # when its training ended
+        least = trained - (1.0 - kept) * abs(trained)
+        bounds.append((there["return"] >= least, f"return {there['return']:.1f}, at least {least:.1f} is asked for"))
+    holds = all(met for met, _ in bounds)
+    words = "; ".join(text for met, text in bounds if met == holds)
+    task, n = exported.facts["task"], there["episodes"]
+    episodes = "1 episode, since all begin alike," if n == 1 < DEFAULT.episodes else f"{n} episodes"
+    lines = [f"{task} in C MuJoCo {mujoco.__version__}, {episodes} of {seconds:g} s, {_describe(conditions)}"]
+    lines += [*_lines(table, outcomes[ENGINES[0]].metrics), f"{'holds' if holds else 'DOES NOT HOLD'}: {words}"]
+    about = {"task": task, "protocol": exported.facts["protocol"], "mujoco": mujoco.__version__}
+    figures = {"holds": holds, **about, "conditions": dataclasses.asdict(conditions), "outcomes": table}
+    return Report(holds, lines, figures)
+
+
+def _describe(conditions: Conditions) -> str:
+    assert conditions.delay is not None
+    first, last = conditions.delay
+    delay = f"{first}" if first == last else f"{first} to {last}"
+    friction = "" if conditions.friction is None else "friction {:g} to {:g}, ".format(*conditions.friction)
+    scales = f"noise x {conditions.noise:g}, pushes x {conditions.pushes:g}"
+    return f"actions {delay} control steps late, {friction}{scales}"
+
+
+def _lines(table: dict[str, dict[str, dict[str, Any]]], metrics: tuple[str, ...]) -> list[str]:
+    """Returns the figures, a line for each and a column for each engine: of a kind of episodes, falls and metrics."""
+    lines = [f"{'':<34}{''.join(f'{engine:>22}' for engine in table)}"]
+    few = ["falls", *(metrics or ["return"])]
+    for kind, row in table[ENGINES[0]].items():
+        for name in few if kind != "all" else [name for name in row if name != "episodes"]:
+            values = [figures[kind][name] for figures in table.values()]
+            words = [f"{value} of {row['episodes']}" if name == "falls" else _rounded(value) for value in values]
+            title = name if kind == "all" else f"{kind}, {name}"
+            lines.append(f"{title:<34}{''.join(f'{word:>22}' for word in words)}")
+    return lines
+
+
+def _rounded(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}" if abs(value) >= 100 else f"{value:.3g}"

@@ -1,0 +1,95 @@
+"""What all wrappers share: the environment that is wrapped, its spaces, its steps."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Composite
+from torchrl.envs import EnvBase
+from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
+
+from torchrl_loco.checks import check_choice
+from torchrl_loco.envs import LocoEnv
+from torchrl_loco.registry import make
+
+RENDER_MODES = ("rgb_array",)
+
+
+def made(env: str | type[LocoEnv] | EnvBase, num_envs: int | None, settings: dict[str, Any]) -> EnvBase:
+    """Returns the environment that is to be wrapped.
+
+    Raises:
+        TypeError: it is no environment of this package, or is made already and has settings.
+        ValueError: it has no batch of worlds.
+    """
+    if not isinstance(env, EnvBase):
+        return make(env, 1 if num_envs is None else num_envs, **settings)
+    if not isinstance(base_of(env), LocoEnv):
+        raise TypeError(f"env must be an id, a class or an environment of torchrl_loco, got {type(env).__name__}")
+    if num_envs is not None or settings:
+        names = [*(["num_envs"] if num_envs is not None else []), *settings]
+        raise TypeError(f"{', '.join(names)}: the environment is made already, pass this where it is made")
+    if not env.batch_size:
+        raise ValueError("the environment has no batch of worlds: make it with num_envs=1")
+    return env
+
+
+def base_of(env: EnvBase) -> Any:
+    """Returns the environment under the transforms."""
+    while isinstance(env, TorchRLTransformedEnv):
+        env = env.base_env
+    return env
+
+
+def step_worlds(env: EnvBase, td: TensorDictBase, actions: Any) -> tuple[TensorDictBase, TensorDictBase]:
+    """Steps all worlds, and resets those that are done.
+
+    Returns:
+        The results of the step, and what the next one begins with, batch ``(num_envs,)`` each.
+    """
+    actions = torch.as_tensor(actions, device=env.device, dtype=env.action_spec.dtype)
+    step, begin = env.step_and_maybe_reset(td.set("action", actions))
+    return step["next"], begin
+
+
+def groups_of(env: EnvBase) -> list[str]:
+    """Returns the groups of observations; what is nested is none of them: the terms of the reward."""
+    return [key for key, spec in env.observation_spec.items() if not isinstance(spec, Composite)]
+
+
+def observations(td: TensorDictBase, groups: list[str]) -> Any:
+    """Returns the tensor of the policy, or a dictionary where there are further groups."""
+    return td["observation"] if groups == ["observation"] else {key: td[key] for key in groups}
+
+
+def to_numpy(data: Any) -> Any:
+    """Returns a tensor, or those of a dictionary, as arrays on the host."""
+    return {key: x.numpy(force=True) for key, x in data.items()} if isinstance(data, dict) else data.numpy(force=True)
+
+
+def rows_as_objects(data: Any, mask: np.ndarray) -> np.ndarray:
+    """Returns an array of objects, ``(num_envs,)``: the rows of the mask, each an observation; ``None`` elsewhere."""
+    rows = np.full(len(mask), None, dtype=object)
+    for i in mask.nonzero()[0]:
+        rows[i] = {key: x[i] for key, x in data.items()} if isinstance(data, dict) else data[i]
+    return rows
+
+
+def check_render_mode(mode: str | None) -> str | None:
+    """Returns a render mode, which may be ``None``.
+
+    Raises:
+        ValueError: there is no such mode.
+    """
+    return None if mode is None else check_choice("render_mode", mode, RENDER_MODES)
+
+
+def render_metadata(env: EnvBase) -> dict[str, Any]:
+    """Returns what Gymnasium's metadata say of pictures."""
+    return {"render_modes": list(RENDER_MODES), "render_fps": round(1 / base_of(env).config.ctrl_dt)}
+
+
+def pictures(env: EnvBase, picture: tuple[str, int, int]) -> np.ndarray:
+    """Returns the current picture of each world, uint8 ``(num_envs, height, width, 3)``."""
+    return base_of(env).render(*picture).numpy(force=True)

@@ -1,0 +1,251 @@
+"""Environments as Gymnasium's: many worlds as a vector environment, or one."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import Env
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+from torchrl_loco.checks import check_choice
+from torchrl_loco.envs import LocoEnv
+from torchrl_loco.wrappers.common import (
+    check_render_mode,
+    groups_of,
+    made,
+    observations,
+    pictures,
+    render_metadata,
+    rows_as_objects,
+    step_worlds,
+    to_numpy,
+)
+from torchrl_loco.wrappers.spaces import box, observation_space
+
+ARRAYS = ("numpy", "torch")
+
+
+class GymnasiumEnv(Env):
+    """One world as Gymnasium's ``Env``, in NumPy arrays; ``reset()`` begins its next episode.
+
+    For many worlds :class:`GymnasiumVectorEnv` is far quicker.
+
+    Args:
+        env: an id, a class, or an environment of one world that is made already.
+        render_mode: ``"rgb_array"`` if ``render()`` is to return pixels, else ``None``.
+        camera: name of the camera.
+        width: pixels in a row.
+        height: rows.
+        settings: arguments of :func:`torchrl_loco.make`, for an id or a class.
+
+    Attributes:
+        env: the environment.
+        metadata: ``render_modes`` and ``render_fps``, the control steps in a second.
+
+    Raises:
+        ValueError: an argument is out of range or unknown, or the environment has several worlds.
+        TypeError: ``env`` is no environment of this package, or has settings though it is made already.
+    """
+
+    def __init__(
+        self,
+        env: str | type[LocoEnv] | EnvBase,
+        *,
+        render_mode: str | None = None,
+        camera: str = "side",
+        width: int = 320,
+        height: int = 240,
+        **settings: Any,
+    ) -> None:
+        self.render_mode = check_render_mode(render_mode)
+        self._picture = (camera, width, height)
+        self.env = made(env, None, settings)
+        if self.env.batch_size[0] != 1:
+            raise ValueError(f"the environment has {self.env.batch_size[0]} worlds: take GymnasiumVectorEnv")
+        self.metadata = render_metadata(self.env)
+        self.observation_space, self.action_space = observation_space(self.env), box(self.env.action_spec)
+        self._groups = groups_of(self.env)
+        self._td: TensorDictBase | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begins a new episode.
+
+        Args:
+            seed: decides all later draws too; ``None`` goes on with the random stream.
+            options: ignored.
+
+        Returns:
+            The observation, and an empty dictionary.
+        """
+        super().reset(seed=seed)
+        if seed is not None:
+            self.env.set_seed(seed)
+        self._td = self.env.reset()
+        return self._observation(self._td), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Steps the world.
+
+        Args:
+            action: array or tensor.
+
+        Returns:
+            Observation, reward, whether the episode terminated or was truncated, and the infos: with
+            ``reward_terms=True``, ``reward_terms`` by name.
+
+        Raises:
+            gymnasium.error.ResetNeeded: ``reset()`` was never called, or the episode is over.
+        """
+        if self._td is None:
+            raise ResetNeeded("reset() must be called before step(), and after an episode has ended")
+        action = torch.as_tensor(action, device=self.env.device, dtype=self.env.action_spec.dtype)
+        after = self.env.step(self._td.set("action", action.unsqueeze(0)))["next"]
+        terminated, truncated = bool(after["terminated"]), bool(after["truncated"])
+        self._td = None if terminated or truncated else after.exclude("reward")
+        infos = {}
+        if "reward_terms" in after:
+            infos["reward_terms"] = {name: float(term) for name, term in after["reward_terms"].items()}
+        return self._observation(after), float(after["reward"]), terminated, truncated, infos
+
+    def _observation(self, td: TensorDictBase) -> Any:
+        seen = to_numpy(observations(td, self._groups))
+        return {name: rows[0] for name, rows in seen.items()} if isinstance(seen, dict) else seen[0]
+
+    def render(self) -> Any:
+        """Returns the current picture, uint8 ``(height, width, 3)``, or ``None`` without a render mode."""
+        return None if self.render_mode is None else pictures(self.env, self._picture)[0]
+
+    def close(self) -> None:
+        """Frees the memory of the world."""
+        self.env.close()
+
+
+class GymnasiumVectorEnv(VectorEnv):
+    """An environment as Gymnasium's ``VectorEnv``, with its autoreset mode ``SAME_STEP``.
+
+    Spaces, observations and actions are those of the task. A task with ``observation`` alone has a ``Box``; one with
+    further groups, such as ``privileged``, has a ``Dict`` of them. Actions without bounds have infinite ones.
+
+    In the infos ``_final_obs`` marks the worlds that are done, and ``final_obs`` has the true last observation of each:
+
+    - with ``arrays="numpy"`` as Gymnasium's own vector environments: in steps in which a world is done, an array of
+      objects with an observation for each world that is done and ``None`` for the others;
+    - with ``arrays="torch"`` in every step, in the form of an observation, batch ``(num_envs,)``, because only the
+      device knows which worlds are done. In the other worlds it equals the observation.
+
+    With ``reward_terms=True``, ``info["reward_terms"]`` has the terms of the step by name, each ``(num_envs,)``.
+
+    Args:
+        env: an id, a class, or an environment that is made already, with TorchRL's transforms or without.
+        num_envs: number of worlds of an id or a class; ``None`` means 1.
+        arrays: what is returned: ``"numpy"`` arrays on the host, which Gymnasium's wrappers expect, or ``"torch"``
+            tensors on the device, for which nothing waits. Actions may be either.
+        render_mode: ``"rgb_array"`` if ``render()`` is to return pixels, else ``None``.
+        camera: name of the camera.
+        width: pixels in a row.
+        height: rows.
+        settings: arguments of :func:`torchrl_loco.make`, for an id or a class.
+
+    Attributes:
+        env: the environment.
+        num_envs: number of worlds.
+        metadata: ``autoreset_mode``, ``render_modes`` and ``render_fps``, the control steps in a second.
+
+    Raises:
+        ValueError: an argument is out of range or unknown, or the environment has no batch of worlds.
+        TypeError: ``env`` is no environment of this package, or has settings though it is made already.
+    """
+
+    def __init__(
+        self,
+        env: str | type[LocoEnv] | EnvBase,
+        num_envs: int | None = None,
+        *,
+        arrays: str = "numpy",
+        render_mode: str | None = None,
+        camera: str = "side",
+        width: int = 320,
+        height: int = 240,
+        **settings: Any,
+    ) -> None:
+        self._torch = check_choice("arrays", arrays, ARRAYS) == "torch"
+        self.render_mode = check_render_mode(render_mode)
+        self._picture = (camera, width, height)
+        self.env = made(env, num_envs, settings)
+        self.num_envs = self.env.batch_size[0]
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, **render_metadata(self.env)}
+        self.single_observation_space = observation_space(self.env)
+        self.single_action_space = box(self.env.action_spec)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._groups = groups_of(self.env)
+        self._td: TensorDictBase | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begins new episodes.
+
+        Args:
+            seed: decides all later draws too; ``None`` goes on with the random streams.
+            options: ``{"reset_mask": mask}``, bool ``(num_envs,)``, resets the worlds of the mask alone.
+
+        Returns:
+            The observations of all worlds, and an empty dictionary.
+        """
+        super().reset(seed=seed)
+        if seed is not None:
+            self.env.set_seed(seed)
+        mask = None if options is None else options.get("reset_mask")
+        if mask is None or self._td is None:
+            self._td = self.env.reset()
+        else:
+            rows = torch.as_tensor(mask, device=self.env.device).unsqueeze(-1)
+            self._td = self.env.reset(self._td.copy().set("_reset", rows))
+        return self._convert(observations(self._td, self._groups)), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Steps all worlds and resets those that are done.
+
+        Args:
+            actions: array or tensor, ``(num_envs, ...)``.
+
+        Returns:
+            The observations after the resets; rewards, terminations and truncations of the step, ``(num_envs,)`` each;
+            and the infos.
+
+        Raises:
+            gymnasium.error.ResetNeeded: ``reset()`` was never called.
+        """
+        if self._td is None:
+            raise ResetNeeded("reset() must be called before step()")
+        after, self._td = step_worlds(self.env, self._td, actions)
+        rewards, terminations, truncations, done = (
+            self._convert(after[key].squeeze(-1)) for key in ("reward", "terminated", "truncated", "done")
+        )
+        infos = {}
+        if self._torch or done.any():
+            last = self._convert(observations(after, self._groups))
+            infos = {"final_obs": last if self._torch else rows_as_objects(last, done), "_final_obs": done}
+        if "reward_terms" in after:
+            infos["reward_terms"] = {k: self._convert(x.squeeze(-1)) for k, x in after["reward_terms"].items()}
+        return self._convert(observations(self._td, self._groups)), rewards, terminations, truncations, infos
+
+    def _convert(self, data: Any) -> Any:
+        return data if self._torch else to_numpy(data)
+
+    def render(self) -> tuple[np.ndarray, ...]:
+        """Returns the current picture of each world, uint8 ``(height, width, 3)``; worlds that were done are new.
+
+        Raises:
+            ValueError: the environment was made without ``render_mode="rgb_array"``.
+        """
+        if self.render_mode is None:
+            raise ValueError('nothing can be rendered: make the environment with render_mode="rgb_array"')
+        return tuple(pictures(self.env, self._picture))
+
+    def close_extras(self, **_: Any) -> None:
+        """Frees the memory of the worlds."""
+        self.env.close()

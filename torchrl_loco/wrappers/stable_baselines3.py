@@ -1,0 +1,134 @@
+"""Environments as Stable-Baselines3's."""
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+from torchrl.envs import EnvBase
+
+from torchrl_loco.envs import LocoEnv
+from torchrl_loco.wrappers.common import (
+    check_render_mode,
+    groups_of,
+    made,
+    observations,
+    pictures,
+    render_metadata,
+    rows_as_objects,
+    step_worlds,
+    to_numpy,
+)
+from torchrl_loco.wrappers.spaces import box, observation_space
+
+
+class StableBaselines3VecEnv(VecEnv):
+    """An environment as Stable-Baselines3's ``VecEnv``: all data is copied to the host, as NumPy arrays.
+
+    A task with ``observation`` alone has a ``Box``; one with further groups, such as ``privileged``, has a ``Dict`` of
+    them, for ``MultiInputPolicy``. Stable-Baselines3 refuses actions without bounds.
+
+    The infos of a world that is done have ``terminal_observation``, the true last one, and ``TimeLimit.truncated``,
+    whether it was truncated and not terminated.
+
+    Args:
+        env: an id, a class, or an environment that is made already, with TorchRL's transforms or without.
+        num_envs: number of worlds of an id or a class; ``None`` means 1.
+        render_mode: ``"rgb_array"`` if ``render()`` is to return pixels, else ``None``.
+        camera: name of the camera.
+        width: pixels in a row.
+        height: rows.
+        settings: arguments of :func:`torchrl_loco.make`, for an id or a class.
+
+    Attributes:
+        env: the environment.
+        num_envs: number of worlds.
+        metadata: ``render_modes`` and ``render_fps``, the control steps in a second.
+
+    Raises:
+        ValueError: an argument is out of range or unknown, or the environment has no batch of worlds.
+        TypeError: ``env`` is no environment of this package, or has settings though it is made already.
+    """
+
+    _seeds: list[int | None]
+
+    def __init__(
+        self,
+        env: str | type[LocoEnv] | EnvBase,
+        num_envs: int | None = None,
+        *,
+        render_mode: str | None = None,
+        camera: str = "side",
+        width: int = 320,
+        height: int = 240,
+        **settings: Any,
+    ) -> None:
+        self.render_mode = check_render_mode(render_mode)
+        self._picture = (camera, width, height)
+        self.env = made(env, num_envs, settings)
+        self.num_envs = self.env.batch_size[0]
+        super().__init__(self.num_envs, observation_space(self.env), box(self.env.action_spec))
+        self.metadata = render_metadata(self.env)
+        self._groups = groups_of(self.env)
+
+    def reset(self) -> Any:
+        """Returns the first observations of all worlds, under the seed that ``seed()`` was given before, if any."""
+        if self._seeds[0] is not None:
+            self.env.set_seed(self._seeds[0])
+        self._seeds = [None] * self.num_envs
+        self._td = self.env.reset()
+        return to_numpy(observations(self._td, self._groups))
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Takes the actions, ``(num_envs, ...)``; ``step_wait`` steps."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Steps all worlds and resets those that are done.
+
+        Returns:
+            The observations after the resets; rewards and dones of the step, ``(num_envs,)`` each; and the infos of
+            each world.
+        """
+        after, self._td = step_worlds(self.env, self._td, self._actions)
+        rewards, dones, terminated = (to_numpy(after[key].squeeze(-1)) for key in ("reward", "done", "terminated"))
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if dones.any():
+            last = rows_as_objects(to_numpy(observations(after, self._groups)), dones)
+            for world in dones.nonzero()[0]:
+                infos[world] = {"terminal_observation": last[world], "TimeLimit.truncated": not terminated[world]}
+        return to_numpy(observations(self._td, self._groups)), rewards, dones, infos
+
+    def get_images(self) -> list[np.ndarray]:
+        """Returns the current picture of each world, uint8 ``(height, width, 3)``, which ``render()`` joins."""
+        return list(pictures(self.env, self._picture))
+
+    def close(self) -> None:
+        """Frees the memory of the worlds."""
+        self.env.close()
+
+    # The worlds are rows of tensors, no objects: an attribute belongs to all of them.
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Returns the attribute once for each world of ``indices``."""
+        worlds = range(self.num_envs) if indices is None else [indices] if isinstance(indices, int) else indices
+        return [getattr(self, attr_name) for _ in worlds]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refuses.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(f"{attr_name!r} cannot be set in single worlds, which are no objects: set it in .env")
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Refuses.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(f"{method_name}() cannot be called in single worlds, which are no objects: use .env")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """Returns False for each world of ``indices``."""
+        return [False for _ in self.get_attr("num_envs", indices)]
