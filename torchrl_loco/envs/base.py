@@ -347,7 +347,11 @@ class LocoEnv(EnvBase):
         randomize = f", randomize={list(self.randomize)}" if self.randomize else ""
         contacts = "" if self.config.contacts == "all" else f", contacts={self.config.contacts!r}"
         replaced = f", replaced={self._replaced}" if self._replaced else ""
-        settings = f"{num_envs=}, {device=}, {seed=}, {protocol=}, {engine=}{contacts}{replaced}{randomize}"
+        kinds = dict[str, list[str]]()
+        for hook, kind in (self._world.kinds if self._world else {}).items():
+            kinds.setdefault(kind, []).append(hook)
+        hooks = "".join(f", {kind}: {' '.join(of_kind)}" for kind, of_kind in kinds.items())
+        settings = f"{num_envs=}, {device=}, {seed=}, {protocol=}, {engine=}{contacts}{replaced}{randomize}{hooks}"
         return f"{type(self).__name__}({settings})"
 
     def _replaced_options(self) -> dict[str, str]:

@@ -113,6 +113,7 @@ class World:
         truncated: whether the episode reached the time limit, ``(nworld,)``.
         seed: seed of all random streams, ``(1,)``.
         health: counts what went wrong in the physics.
+        kinds: by hook of the task in torch, how it runs: see :attr:`torchrl_loco.envs.part.Part.kind`.
         fixed: attributes of the task that were read when this was made, and never again.
     """
 
@@ -314,6 +315,7 @@ class World:
 
         parts: list[Part] = []
         read: list[set[str]] = []  # by part, attributes of the task
+        of_hook: dict[str, Part] = {}
 
         def part(name: str, needed: Collection[str] | None = None) -> Callable[[], None]:
             if hooks is None or not own & set(PARTS[name] if needed is None else needed):
@@ -322,6 +324,7 @@ class World:
             title = f"{self._title}: {', '.join(called)}"
             parts.append(Part(getattr(hooks, name), arrays, title, hooks.catalog.fixed()))
             read.append(set().union(*(hooks.read.get(hook, ()) for hook in called)))
+            of_hook.update({hook: parts[-1] for hook in called if hook in own and hook not in of_hook})
             return parts[-1]
 
         self._vary: Callable[[], None] = _nothing
@@ -347,6 +350,7 @@ class World:
         sim.compile(*launches, *([self._launch_move] if moves else []))
         for each in kernels:
             each.record(sim)
+        self.kinds = {hook: part.kind for hook, part in of_hook.items()}
         for each, names in zip(parts, read, strict=True):
             if each.kind != "plain torch" or sim.device.is_cuda:  # where the step is recorded as a graph
                 self.fixed |= names

@@ -369,14 +369,18 @@ def _search(p: Program, table: Any, x: Any, *, out_int32: bool = False, right: b
     if len(shape) != 1:
         raise CannotFuse("{op} searches in more than one row")
     at, first, (step,), dtype = p.table(table)
-    x, found = p.cast(x, dtype), p.value(0)
-    compare = "<=" if right else "<"
-    for by in reversed([1 << bit for bit in range(int(shape[0]).bit_length())]):
-        last = f"p{at}_0[{first} + ({{0}} + {by - 1}) * {step}]"
-        text = f"{{0}} + {by} <= {shape[0]} && {last} {compare} {{1}} ? {{0}} + {by} : {{0}}"
-        (found, x), world = p.aligned(found, x)
-        nodes = np.frompyfunc(lambda a, b, text=text: p.node(text, torch.int64, a, b, place=(at, None, 0)), 2, 1)
-        found = Value(np.asarray(nodes(found.array, x.array), dtype=object), torch.int64, world)
+    x, start, end = p.cast(x, dtype), p.value(0), p.value(int(shape[0]))
+    for _ in range(int(shape[0]).bit_length()):  # as torch halves it, so that rows that are not sorted give the same
+        (start, end, x), world = p.aligned(start, end, x)
+        middle = f"p{at}_0[{first} + ({{0}} + {{1}}) / 2 * {step}]"
+        text = f"{{0}} < {{1}} && !({middle} {'>' if right else '>='} {{2}})"
+        nodes = np.frompyfunc(lambda *args, text=text: p.node(text, torch.bool, *args, place=(at, None, 0)), 3, 1)
+        less = Value(np.asarray(nodes(start.array, end.array, x.array), dtype=object), torch.bool, world)
+        half = p.apply("({0} + {1}) / 2", torch.int64, start, end)
+        more, kept = p.apply("{0} + 1", torch.int64, half), p.apply("{0} < {1}", torch.bool, start, end, of=torch.int64)
+        end = p.where(less, end, p.where(kept, half, end, torch.int64), torch.int64)
+        start = p.where(less, more, start, torch.int64)
+    found = start
     return p.cast(found, p._meta.dtype)
 
 
