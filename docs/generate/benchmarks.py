@@ -119,7 +119,7 @@ def tables() -> dict[str, str]:
 
 def of_tasks() -> dict[str, str]:
     """Returns what the pages of tasks and bodies take from the package; not of plug-ins that happen to be installed."""
-    made = {"velocity-weights": tasks.velocity_weights()}
+    made = {"velocity-weights": tasks.velocity_weights(), "velocity-observation": tasks.velocity_observation()}
     for name in tasks.RUNNERS:
         label = name.replace("_", "-")
         made[f"{label}-properties"] = tasks.properties(name, training(name))

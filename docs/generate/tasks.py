@@ -162,6 +162,35 @@ def joined(pieces: list[torch.Tensor], dim: int, gap: int) -> torch.Tensor:
     return torch.cat(all_pieces, dim=dim).round().to(torch.uint8)
 
 
+MEANINGS = {
+    "linear_velocity": "velocity of the base in its frame (m/s)",
+    "angular_velocity": "angular velocity of the base in its frame (rad/s)",
+    "gravity": "direction of gravity in the base's frame",
+    "joint_positions": "relative to the home pose (rad), in the order of the actuators",
+    "joint_velocities": "rad/s",
+    "last_action": "the last action that was sent",
+    "command": "velocity forward, to the left (m/s), yaw rate (rad/s)",
+    "foot_heights": "m",
+    "air_time": "of each foot (s)",
+    "foot_contacts": "whether each touches something, 0 or 1",
+    "foot_forces": "`sign(f) log(1 + abs(f))` of the components of each contact force (N)",
+    "delay": "of actions (control steps)",
+}
+"""What the terms of a robot's observation are."""
+
+
+def velocity_observation() -> str:
+    """Returns the terms of a robot's observation: sizes of a quadruped and of a humanoid, noise, and who sees them."""
+    envs = [torchrl_loco.make(name, 1, "cpu", 0, engine="mujoco") for name in ("go1_velocity", "g1_velocity")]
+    seen, rows = envs[0].observation_layout["observation"], []
+    for name in envs[0].observation_layout["privileged"]:
+        sizes = [env.observation_layout["privileged"][name] for env in envs]
+        noise = envs[0].noise.get(name, 0.0)
+        most = f"{noise[0]:g}, and `{noise[1]}`" if isinstance(noise, tuple) else f"{noise:g}" if noise else ""
+        rows.append((f"`{name}`", MEANINGS[name], *sizes, most, "" if name in seen else "critic"))
+    return table(("term", "", "Go1", "G1", "noise, either way", "seen by"), rows)
+
+
 def velocity_weights() -> str:
     """Returns the table of the weights of the reward of those that follow a velocity, a column a robot."""
     followers = {name: env_class(name).weights for name in OURS if not is_runner(name)}

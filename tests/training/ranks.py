@@ -8,6 +8,7 @@ import torch
 from small_runs import SMALL, made, small_walker
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
+from torchrl_loco.tasks.walker import Walker
 from torchrl_loco.training import RunFolder, Trainer, distributed, preset, train
 from torchrl_loco.training.algorithm import Algorithm
 
@@ -61,6 +62,25 @@ def messages():
         "from_first": distributed.from_first(f"of {rank}"),
         "gathered": [state["rank"] for state in distributed.gathered({"rank": rank})],
     }
+
+
+class Counts(Walker):
+    """Counts control steps of all worlds, over the ranks and of this one."""
+
+    shared = {"all_steps": torch.int64, "own_steps": torch.int64}
+    summed_over_ranks = ("all_steps",)
+
+    def adapt(self, s):
+        return {name: getattr(s, name) + s.num_envs for name in ("all_steps", "own_steps")}
+
+
+def counted(out):
+    """Returns what worlds share after two batches, by name."""
+    path = RunFolder.create(preset(Counts, "cpu", out=out, **SMALL)).path if distributed.is_first() else None
+    trainer = Trainer(RunFolder(distributed.from_first(path)))
+    for _ in range(2):
+        trainer.iterate()
+    return {name: int(values) for name, values in trainer._base.world.shared.items()}
 
 
 def whole_and_resumed(out, algorithm):
@@ -121,7 +141,7 @@ def of_ranks(out):
     """Returns all of the above."""
     with small_walker():
         runs = {algorithm: whole_and_resumed(out / algorithm, algorithm) for algorithm in ("ppo", "reppo")}
-        return {"messages": messages(), "learnt": learnt(out), **runs}
+        return {"messages": messages(), "learnt": learnt(out), "counted": counted(out / "counts"), **runs}
 
 
 def resumed_by_train(path, frames):

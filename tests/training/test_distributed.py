@@ -116,6 +116,11 @@ def test_messages(ranks):
     assert (first["gathered"], second["gathered"]) == ([0, 1], [])
 
 
+def test_what_worlds_share_is_added_up_where_the_task_says_so(ranks):
+    steps = 2 * BATCH // SMALL["num_envs"] * SMALL["num_envs"]
+    assert [of["counted"] for of in ranks] == [{"all_steps": 2 * steps, "own_steps": steps}] * 2
+
+
 def test_the_launcher_leaves_no_handlers_behind(ranks):
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 

@@ -141,7 +141,10 @@ class LocoEnv(EnvBase):
     shared: ClassVar[Mapping[str, Any]] = {}
     """What all worlds have in common, by name, as for :attr:`memory`: it begins as zeros, ``s.name`` reads it,
     :meth:`adapt` returns new values after each step. The state holds it. A world of such a task depends on its
-    neighbours; in training on several GPUs each rank has its own."""
+    neighbours; in training on several GPUs each rank has its own, but for those in :attr:`summed_over_ranks`."""
+    summed_over_ranks: ClassVar[Sequence[str]] = ()
+    """Names of entries of :attr:`shared`, such as counts, whose changes are added up over the ranks of a training,
+    after each batch."""
     constants: ClassVar[Any] = {}
     """Tables that never change, tensors or arrays by name, or a method that returns them once: ``s.name`` reads them
     on the device. ``s.table[s.frame]`` looks up a row in each world; where an index is out of range it gives NaN, which
@@ -312,7 +315,10 @@ class LocoEnv(EnvBase):
             raise ValueError(f"{name}.action_range must be (-1, 1) or (-inf, inf), got {cls.action_range!r}")
         if action_range == UNBOUNDED and "control" not in own:
             raise TypeError(f"{name} has actions without bounds, so it must define control(self, s, action)")
-        check_commands(cls, declared(cls)[0])
+        memory, shared = declared(cls)
+        check_commands(cls, memory)
+        for entry in cls.summed_over_ranks:
+            check_choice(f"{name}.summed_over_ranks", entry, shared)
         check_randomize(f"{name}.randomize", cls.randomize)
         # Of the package's own functions only LocoEnv's reads the table.
         if cls.pose_func is not LocoEnv.pose_func and cls.pose_func.__module__.startswith("torchrl_loco."):

@@ -235,6 +235,20 @@ def mean_of_ranks(values: torch.Tensor) -> torch.Tensor:
     return values / ranks()
 
 
+def add_changes(values: torch.Tensor, before: torch.Tensor) -> None:
+    """Writes into ``values``, of any shape and type, what they were before plus the changes of all ranks.
+
+    Args:
+        values: those of this rank.
+        before: what they were on all ranks; it becomes the same.
+    """
+    if ranks() > 1:
+        change = (values - before).double()
+        _sum(change)
+        values.copy_(before + change.to(values.dtype))
+    before.copy_(values)
+
+
 def extremes_of_ranks(least: torch.Tensor, largest: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns the least and the largest number of all ranks from those of each, which are scalars."""
     if ranks() == 1:

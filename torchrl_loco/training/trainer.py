@@ -137,6 +137,8 @@ class Trainer:
                 run.keep_source()
             run.forget_after(self.frames)  # of a process that was killed, or that torchrun has restarted
         distributed.copy_from_first(self.algorithm.networks.state_dict().values())
+        shared = self._base.world.shared
+        self._summed = {name: shared[name].clone() for name in type(self._base).summed_over_ranks}
 
     def train(self) -> None:
         """Trains to the last frame, then evaluates the best policy, plots the learning curve and records a video.
@@ -248,6 +250,8 @@ class Trainer:
         """
         config, algorithm, start = self.config, self.algorithm, time.perf_counter()
         batch = self.collector.rollout()
+        for name, kept in self._summed.items():
+            distributed.add_changes(self._base.world.shared[name], kept)
         after = batch["next"]
         reward = after["reward"].mean() / config.action_repeat
         flags = (after[name].squeeze(-1) for name in ("done", "terminated"))
