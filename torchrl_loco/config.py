@@ -48,7 +48,7 @@ class SimConfig:
         engine: what steps the physics. ``compiled`` is one kernel made for the model, 6 to 50 times as fast on an
             H200; ``mujoco_warp`` is MuJoCo-Warp; ``auto`` takes ``compiled`` if it supports the model,
             else ``mujoco_warp``. ``mujoco`` is C MuJoCo in float64 on the CPU, a thread for each core, with the options
-            of the model but for time step and integrator: what the others are compared with.
+            of the model but for time step and integrator, and a solver that converges: it judges the others.
         integrator: how velocities and positions advance: ``euler`` (semi-implicit), ``implicitfast``, or ``rk4``
             (under ``mujoco_warp`` only). It replaces the one that the model names, as ``sim_dt``, iterations and
             ``euler_damping`` do. For tasks of yours a line of the log and ``repr(env)`` say so, where the model names

@@ -95,7 +95,8 @@ class World:
 class MujocoEngine:
     """Steps all worlds with C MuJoCo, each in an ``mjData`` of its own.
 
-    Time step, integrator and contacts are those of ``config``, all else the options of the model.
+    Time step, integrator and contacts are those of ``config``, all else the options of the model; the solver has at
+    least MuJoCo's default limits, which many models lower for speed.
 
     Args:
         mj_model: the compiled model.

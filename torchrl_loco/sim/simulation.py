@@ -11,7 +11,7 @@ import mujoco
 import torch
 import warp as wp
 
-from torchrl_loco.config import SimConfig
+from torchrl_loco.config import CONVERGED, SimConfig
 from torchrl_loco.sim import compiled, mjw, models, mujoco_warp
 from torchrl_loco.sim import mujoco as c_mujoco
 from torchrl_loco.sim.batched_model import BatchedModel, with_every_row
@@ -23,6 +23,9 @@ from torchrl_loco.sim.world_func import WorldFunc, WorldKernel, copy_row, fill, 
 
 SCRATCH = 1.4
 """Memory of a simulation as a multiple of its ``mjData``; the rest is scratch memory (measured: 1.3 to 1.4)."""
+
+TOLERANCE = 1e-8
+"""MuJoCo's default tolerance of the solver."""
 
 DETERMINISTIC_SCRATCH = 11.0
 """The same with ``deterministic=True`` on CUDA (measured: 6 to 8 times the memory of a world)."""
@@ -308,15 +311,18 @@ class Simulation:
 def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
     """Sets the options of a model from ``config``, and takes contacts out of it that ``config`` does not want.
 
-    Under C MuJoCo these are the time step and the integrator.
+    Under C MuJoCo these are the time step and the integrator; its solver has MuJoCo's default limits at least.
     """
     if config.contacts == "ground":
         models.touch_ground_only(mj_model)
     option = mj_model.opt
     option.integrator = integrator(config)
     option.timestep = config.sim_dt
-    if config.engine == "mujoco":
-        return  # all else is the model's own
+    if config.engine == "mujoco":  # all else is the model's own, but the solver converges
+        option.iterations = max(option.iterations, CONVERGED["iterations"])
+        option.ls_iterations = max(option.ls_iterations, CONVERGED["ls_iterations"])
+        option.tolerance = min(option.tolerance, TOLERANCE)
+        return
     option.iterations = config.iterations
     option.ls_iterations = config.ls_iterations
     euler_damping = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
