@@ -10,6 +10,7 @@ from torchrl.envs import check_env_specs
 
 import torchrl_loco
 from torchrl_loco import LocoEnv, SimConfig, State, Vary, WalkerWalk
+from torchrl_loco.sim.mujoco import _contact_forces
 
 TASKS = ("walker_walk", "cheetah_run", "hopper_hop", "humanoid_run", "quadruped_walk", "g1_velocity")
 
@@ -58,6 +59,27 @@ def test_what_follows_from_a_step_is_that_of_the_compiled_engine():
     torch.testing.assert_close(force, other_force, rtol=0.05, atol=0.5)
     for key, most in (("privileged", 0.02), ("reward", 1e-3)):
         torch.testing.assert_close(ours[key], theirs[key], rtol=most, atol=most)
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_contact_forces_are_mujocos_own(cone):
+    """Of contacts of one, three, four and six numbers."""
+    balls = "".join(
+        f'<body pos="{i} 0 .09"><freejoint/><geom name="b{i}" size=".1" condim="{dim}" friction=".7 .02 .01"/></body>'
+        for i, dim in enumerate((1, 3, 4, 6))
+    )
+    m = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option cone="{cone}" gravity="2 1 -9"/><worldbody><geom name="floor" type="plane" size="9 9 1" '
+        f'condim="1"/>{balls}<body pos="0 .19 .09"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+    )
+    d = mujoco.MjData(m)
+    d.qvel[:] = np.random.default_rng(0).normal(size=m.nv)
+    mujoco.mj_step(m, d, 3)
+    found, wrench = _contact_forces(m, d, np.arange(d.ncon)), np.zeros(6)
+    assert sorted(set(d.contact.dim.tolist())) == [1, 3, 4, 6]
+    for i in range(d.ncon):
+        mujoco.mj_contactForce(m, d, i, wrench)
+        np.testing.assert_allclose(found[i], wrench[:3] @ d.contact[i].frame.reshape(3, 3), atol=1e-9)
 
 
 class Varied(WalkerWalk):
