@@ -7,6 +7,7 @@ from tensordict import TensorDict
 
 import torchrl_loco
 from torchrl_loco import HopperHop, LocoEnv, WalkerWalk
+from torchrl_loco.envs.fixed_order import running_sum
 
 FRAMES = torch.arange(90_000.0).view(30_000, 3)
 
@@ -111,6 +112,25 @@ def test_what_worlds_share_is_part_of_the_state():
     state["memory", "frame"] = torch.zeros(5)
     with pytest.raises(ValueError, match=r"must be of torch.int32, got torch.float32: it is of an earlier version"):
         env.reset(state, set_state=True)
+
+
+@pytest.mark.parametrize("shape", [(1,), (2,), (37,), (3, 64), (5, 1)])
+def test_running_sums_of_a_fixed_order(shape):
+    """Which stand for ``cumsum`` on CUDA, where its order varies, within ``adapt``."""
+    values = torch.rand(shape, dtype=torch.float64)
+    for dim in range(len(shape)):
+        torch.testing.assert_close(running_sum(values, dim), values.cumsum(dim))
+
+
+@pytest.mark.gpu
+def test_what_worlds_share_repeats_on_cuda():
+    runs = []
+    for _ in range(2):
+        env = Looks(4096, "cuda", 0)
+        played(env, 2 * torch.rand(20, 4096, 6, generator=torch.Generator().manual_seed(0)).cuda() - 1)
+        runs.append({name: values.clone() for name, values in env.world.shared.items()})
+    assert all(torch.equal(values, runs[1][name]) for name, values in runs[0].items())
+    assert runs[0]["upto"][-1] == pytest.approx(1.0)
 
 
 class Levels(HopperHop):

@@ -11,6 +11,7 @@ import torch
 
 from torchrl_loco.checks import Interval, check_choice, check_float, check_int, suggestion
 from torchrl_loco.envs.episode import MAX_VALUE
+from torchrl_loco.envs.fixed_order import fixed_order
 from torchrl_loco.envs.state import State
 from torchrl_loco.envs.tables import Entry, constants, entries
 from torchrl_loco.envs.view import CONTACT_HISTORY, Catalog, View, usable
@@ -423,12 +424,8 @@ class Hooks:
 
     def _adapted(self, arrays: Arrays) -> dict[str, torch.Tensor]:
         """Returns new values of what worlds share, by name; sums over worlds have a fixed order."""
-        before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
-        torch.use_deterministic_algorithms(True)
-        try:
+        with fixed_order():
             return self._rows("adapt", arrays, self.catalog.shared, by_world=False)
-        finally:
-            torch.use_deterministic_algorithms(before[0], warn_only=before[1])
 
     def _rows(
         self, hook: str, arrays: Arrays, known: Mapping[str, Entry], *, by_world: bool = True

@@ -51,8 +51,10 @@ class Watched:
         if newest == self._run.policy:
             policy = self._run.load_policy(self._config.device)
             refuse_transforms(policy)
-            return policy
-        return last_policy(self._run, self._config.device)
+        else:
+            policy = last_policy(self._run, self._config.device)
+        self.env.set_stage(policy.info.get("stage", {}))
+        return policy
 
 
 def last_policy(run: RunFolder, device: str | None = None, path: Path | None = None) -> Policy:
