@@ -155,6 +155,34 @@ def test_a_task_of_a_users_own_is_verified_by_its_own_hooks(tmp_path):
     assert list(report.figures["outcomes"]) == ["C MuJoCo"]
 
 
+class Levels(Late):
+    """Begins an episode one level above the last, and earns the level."""
+
+    memory = {"steps": (), "level": ()}
+    holds = {"return": 0.0}
+
+    def reward(self, s):
+        return s.level + 0.0 * s.action[:, 0]
+
+    def terminated(self, s):
+        return s.steps < 0
+
+    def begin(self, s):
+        return {"level": s.level + 1.0}
+
+
+def test_both_engines_begin_at_the_stage_of_the_policy_and_have_its_simulation(tmp_path):
+    path, about = (
+        tmp_path / "levels.onnx",
+        {"stage": {"memory": {"level": [7.0]}}, "sim": {"ctrl_dt": 0.05, "sim_dt": None}},
+    )
+    export_policy(constant(torchrl_loco.registry.task_name(Levels), 1, 6, **about), path)
+    report = verify(path, Conditions(episodes=3), "cpu")
+    for table in report.figures["outcomes"].values():
+        assert table["all"]["return"] == 40 * 8.0
+    assert "3 episodes of 2 s" in report.lines[0]
+
+
 def test_noise_is_the_tasks_own(tmp_path):
     played = []
     policy = Exported(exported(tmp_path / "late.onnx"))

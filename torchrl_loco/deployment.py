@@ -42,7 +42,10 @@ def of_robot(policy: "Policy") -> dict[str, Any]:
     cls, spec = resolve(policy.info["task"]), specification(policy.info["task"])
     m = spec.compile()
     low, high = m.actuator_ctrlrange.T
-    env = cls(1, "cpu", 0, policy.info["protocol"], engine="mujoco", compile_hooks=False)  # its hooks tell the terms
+    sim = {name: value for name, value in policy.info.get("sim", {}).items() if value is not None}
+    env = cls(
+        1, "cpu", 0, policy.info["protocol"], **{**sim, "engine": "mujoco"}, compile_hooks=False
+    )  # tells the terms
     scaled = {"action_offset": (0.5 * (low + high)).tolist(), "action_scale": (0.5 * (high - low)).tolist()}
     return {
         "observation": [{"term": name, "size": size} for name, size in env.observation_layout["observation"].items()],
@@ -50,7 +53,7 @@ def of_robot(policy: "Policy") -> dict[str, Any]:
         **({} if "control" in own_hooks(cls) else scaled),
         **_actuators(m),
         "home": models.home_pose(m).tolist(),
-        "physics_timestep": cls.config.sim_dt,
+        "physics_timestep": env.config.sim_dt,
         **_text(spec),
         **cls.facts(m, policy.info),
     }

@@ -142,7 +142,8 @@ def _worlds(cls: Any, exported: Exported, conditions: Conditions, engine: str, d
     """
     from torchrl_loco.envs.vary import Vary
 
-    facts, options = exported.facts, dict[str, Any]()
+    facts = exported.facts
+    options = {name: value for name, value in facts.get("info", {}).get("sim", {}).items() if value is not None}
     if conditions.friction is not None:
         options["randomize"] = [Vary("geom_friction", *conditions.friction, how="set", once=True)]
     if engine == ENGINES[0]:
@@ -158,7 +159,6 @@ def _worlds(cls: Any, exported: Exported, conditions: Conditions, engine: str, d
     ):
         if size != own:
             raise ValueError(f"the policy has {size} numbers of the {name}, {facts['task']} has {own}")
-    env.set_stage(cls.stage_of(facts.get("info", {})))
     return env
 
 
@@ -241,6 +241,8 @@ def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str)
     import torch
     from tqdm.auto import trange
 
+    from torchrl_loco.envs.base import set_stage
+
     n, steps, dt = env.num_envs, env.config.episode_length, env.config.ctrl_dt
     if conditions.seconds is not None:
         steps = min(steps, max(round(conditions.seconds / dt), 1))
@@ -251,8 +253,11 @@ def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str)
     pushes = _pushes(env, generator, steps, float(conditions.pushes or 0.0))
     is_fixed = _fix_commands(env, exported.facts.get("info", {}))
     env.set_seed(conditions.seed)  # from the first episode on, in both engines
+    set_stage(env, exported.facts.get("info", {}))
     td = env.reset()
-    own_delay = env.memory.get("delay") == ()  # the task's own hooks hold its actions back
+    own_delay = (
+        "delay" in env.world.memory and env.world.memory["delay"].ndim == 1
+    )  # the task's own hooks hold its actions back
     if own_delay:
         env.world.memory["delay"].copy_(torch.from_numpy(delay))
     behind = torch.from_numpy(np.zeros(n, dtype=int) if own_delay else delay).to(env.device)

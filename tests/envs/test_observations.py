@@ -106,7 +106,11 @@ def test_robots_name_what_they_see():
         ({"noise": {"pose": -0.1}}, ValueError, r"noise\['pose'\] must lie in \[0"),
         ({"history": {"observations": 3}}, ValueError, "unknown Wrong.history 'observations'"),
         ({"history": {"observation": 0}}, ValueError, r"history\['observation'\] must lie in \[1"),
-        ({"memory": {"offset": 2, "observation_history": 3}}, ValueError, "'observation_history' is taken by history"),
+        (
+            {"memory": {"offset": ()}, "begin": lambda self, s: {}},
+            ValueError,
+            r"noise\['pose'\]: 'offset' must have the term's shape \(2,\), not \(\)",
+        ),
         (
             {"observation": lambda self, s: {"observation": {"pose": s.qpos > 0}}},
             TypeError,

@@ -6,7 +6,7 @@ from hook_tasks import Still
 from tensordict import TensorDict
 
 import torchrl_loco
-from torchrl_loco import HopperHop, LocoEnv, WalkerWalk
+from torchrl_loco import HopperHop, LocoEnv, State, WalkerWalk
 from torchrl_loco.envs.fixed_order import running_sum
 
 FRAMES = torch.arange(90_000.0).view(30_000, 3)
@@ -150,6 +150,74 @@ class Levels(HopperHop):
 
     def reward(self, s):
         return {"hop": super().reward(s), "level": s.level, "steps": s.steps.expand(s.num_envs)}
+
+
+class Plateau(Levels):
+    """Its level is clamped, so that a small one does not show at the start."""
+
+    def begin(self, s):
+        return {"level": (s.level + 0.0).clamp(2.0, 50.0)}
+
+
+def test_a_level_that_is_clamped_is_carried_on_too():
+    assert Plateau(1, "cpu", 0).hooks.carried == ("level",)
+
+
+def test_a_closed_environment_goes_on_at_its_stage():
+    env = Levels(2, "cpu", 0)
+    env.rollout(4, Still(env))
+    env.close()
+    env.reset()
+    assert env.get_stage() == {"shared": {"steps": 4.0}, "memory": {"level": [4.0, 4.0]}}
+
+
+def test_entries_may_be_called_histories():
+    class Own(WalkerWalk):
+        memory = {"pose_history": (2, 1), "count_history": torch.int64}
+
+        def observation(self, s):
+            return torch.cat([s.qpos, s.pose_history.flatten(1)], dim=-1)
+
+    env = Own(2, "cpu", 0)
+    env.reset()
+    state = env.get_state()
+    assert env.reset(state.clone(), set_state=True)["observation"].isfinite().all()
+    by_hand = State({"qpos": state["qpos"], "qvel": state["qvel"]}, batch_size=[2])
+    assert torch.equal(env.reset(by_hand, set_state=True)["observation"][:, -2:], torch.zeros(2, 2))
+
+
+class Long(WalkerWalk):
+    """Shares more numbers than are written out one by one, and looks rows and columns up."""
+
+    constants = {"grid": torch.arange(24.0).view(2, 3, 4)}
+    shared = {"big": 150_000}
+    memory = {"i": torch.int64}
+
+    def reward(self, s):
+        return super().reward(s) + s.big[s.i * 10_000]
+
+    def events(self, s):
+        return {"i": (s.i + 1) % 2}
+
+    def adapt(self, s):
+        return {"big": s.big + 1.0}
+
+    def observation(self, s):
+        return torch.cat([s.grid[s.i, :, [3] * s.num_envs], s.qpos], dim=-1)
+
+
+def test_what_is_shared_may_be_long_and_lists_are_indices():
+    env = Long(3, "cpu", 0, reward_terms=True)
+    assert env.world.kinds["reward"] == "kernel"
+    td = env.rollout(3, Still(env), break_when_any_done=False)
+    assert torch.equal(td["observation"][0, :, :3], Long.constants["grid"][[0, 1, 0], :, [3, 3, 3]])
+    with pytest.raises(IndexError, match="takes numbers and slices, no masks"):
+        type("Masked", (Long,), {"observation": lambda self, s: s.grid[s.i, s.qpos[:, 0] > 0]})(3, "cpu", 0)
+
+
+def test_noise_of_a_warp_functions_observation_is_refused():
+    with pytest.raises(ValueError, match="has noise or history, but a Warp function observes"):
+        type("Noisy", (WalkerWalk,), {"history": {"observation": 2}})(1, "cpu", 0)
 
 
 def test_a_stage_is_where_episodes_go_on():

@@ -120,6 +120,43 @@ def test_each_world_has_its_own_model_and_state():
     assert env.reset()["observation"].isfinite().all()
 
 
+SENSING = """<mujoco><worldbody><body name="b" pos="0 0 1"><joint name="hinge" axis="0 1 0"/>
+  <geom size=".1" pos=".1 0 0"/></body></worldbody><actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator><sensor>
+  <framepos name="unread" objtype="body" objname="b"/><subtreelinvel name="read" body="b"/></sensor></mujoco>"""
+
+
+def test_varied_worlds_have_the_sensors_that_are_stepped():
+    """Others are left out of the physics, also of the models of single worlds."""
+
+    class Senses(LocoEnv):
+        model = SENSING
+        randomize = (Vary("body_mass", 0.5, 2.0),)
+
+        def reward(self, s):
+            return s.time
+
+        def observation(self, s):
+            return s.sensor("read")
+
+    env = Senses(3, "cpu", 0, engine="mujoco")
+    seen = env.rollout(5, break_when_any_done=False)["next", "observation"][:, -1]
+    for world, d in zip(env.sim.engine._worlds, env.sim.engine.worlds, strict=True):
+        assert world.model.nsensordata == len(d.sensordata) == 3
+        mujoco.mj_subtreeVel(world.model, d)
+    expected = np.array([d.subtree_linvel[1] for d in env.sim.engine.worlds])
+    np.testing.assert_allclose(seen.numpy(), expected, atol=1e-5)
+
+
+def test_what_is_written_between_steps_counts_beside_resets_of_others():
+    env = torchrl_loco.make("walker_walk", 3, "cpu", 0, engine="mujoco")
+    td = env.reset()
+    env.sim.qvel[2] = 0.5
+    td = env.reset(td.set("_reset", torch.tensor([True, False, False]).unsqueeze(-1)))
+    env.step(td.set("action", torch.zeros(3, 6)))
+    assert env.sim.engine.worlds[2].qvel[1] == pytest.approx(0.5, abs=0.2)
+    assert abs(env.sim.engine.worlds[1].qvel[1]) < 0.2
+
+
 def test_what_goes_wrong_is_counted():
     env = torchrl_loco.make("walker_walk", 4, "cpu", 0, engine="mujoco")
     env.reset()

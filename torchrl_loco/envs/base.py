@@ -247,6 +247,7 @@ class LocoEnv(EnvBase):
         self._pid = os.getpid()
         self._world: World | None = None
         self._episodes: torch.Tensor | None = None  # of a closed environment
+        self._stage: Mapping[str, Any] = {}
         self.hooks = (
             Hooks(self, mj_model)
             if own_hooks(type(self)) or self.memory or self.shared or models.has_home(mj_model)
@@ -262,6 +263,11 @@ class LocoEnv(EnvBase):
         self.observation_layout = dict(self.hooks.terms) if self.hooks else {}
         if "observation" not in own:
             self.observation_layout["observation"] = dict(self.observation_names)
+            if self.noise or self.history:
+                raise ValueError(
+                    f"{type(self).__name__} has noise or history, but a Warp function observes: "
+                    'def observation(self, s): return {"observation": {"all": super().observation(s)}}'
+                )
         self._apart = {group: sizes for group, sizes in self.observation_layout.items() if sizes and apart}
         if "observation" in self.groups:
             self.observation_size = math.prod(self.groups["observation"])
@@ -805,6 +811,7 @@ class LocoEnv(EnvBase):
         self.engine, self.engine_reason = self._world.sim.engine_choice
         if self._episodes is not None:
             self._world.episode.torch.copy_(self._episodes)
+            self.set_stage(self._stage)
         self.is_closed = False
 
     @property
@@ -835,9 +842,10 @@ class LocoEnv(EnvBase):
             raise_if_closed: ignored; part of TorchRL's signature.
         """
         super().close(raise_if_closed=False)
+        stage = self.get_stage() if self._world is not None else {}
         world, self._world = self._world, None
         if world is not None:
-            self._episodes = world.episode.torch.cpu()
+            self._episodes, self._stage = world.episode.torch.cpu(), stage
             world.close()
 
     def _refuse_after_fork(self) -> None:
@@ -1060,6 +1068,19 @@ def _warn_if_worlds_repeat() -> None:
             "same seed step identical worlds: give worker k of n worlds each its own function, with world_offset=k*n "
             "(ParallelEnv and collectors take a list of functions)"
         )
+
+
+def set_stage(env: LocoEnv, info: Mapping[str, Any]) -> None:
+    """Lets episodes begin at the stage that a policy has reached, unless it is of another task, which a log line says.
+
+    Args:
+        env: the worlds.
+        info: the policy's information.
+    """
+    try:
+        env.set_stage(env.stage_of(info))
+    except ValueError as error:
+        logging.getLogger("torchrl_loco").warning("episodes begin at the first stage of the curriculum: %s", error)
 
 
 def rows_of(mask: torch.Tensor, entry: torch.Tensor) -> torch.Tensor:

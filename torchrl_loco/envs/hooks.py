@@ -197,6 +197,7 @@ class Hooks:
         self.groups: dict[str, tuple[int, ...]] = {}
         self.terms: dict[str, dict[str, int]] = {}
         self.history: dict[str, int] = {}
+        self._shapes: dict[tuple[str, str], tuple[int, ...]] = {}
         self._noise_scale = env.noise_scale
         self._noise: dict[tuple[str, str], tuple[float, str | None]] = {}
         self.term_names: tuple[str, ...] | None = None
@@ -340,6 +341,11 @@ class Hooks:
             check_float(f"{self._title}.noise[{term!r}]", most, Interval(0.0, MAX_VALUE))
             if entry is not None:
                 check_choice(f"{self._title}.noise[{term!r}]", entry, list(self.catalog.memory))
+                has = self.catalog.memory[entry].shape
+                if wrong := [shape for group in seen if (shape := self._shapes.get((group, term), has)) != has]:
+                    raise ValueError(
+                        f"{self._title}.noise[{term!r}]: {entry!r} must have the term's shape {wrong[0]}, not {has}"
+                    )
             if env.noise_scale:
                 self._noise |= {
                     (group, what): (env.noise_scale * float(most), entry)
@@ -352,20 +358,24 @@ class Hooks:
                 raise ValueError(f"{self._title}.history[{group!r}] must be of rows, not of shape {self.groups[group]}")
             if check_int(f"{self._title}.history[{group!r}]", count) > 1:
                 (size,) = self.groups[group]
-                if (name := HISTORY.format(group)) in self.catalog.memory:
-                    raise ValueError(f"{self._title}.memory: {name!r} is taken by history: rename it")
-                self.catalog.memory[name] = Entry((count, size), torch.float32)
+                self.catalog.memory[HISTORY.format(group)] = Entry((count, size), torch.float32)
                 self.history[group], self.groups[group] = count, (count * size,)
 
     def _is_carried(self, name: str, arrays: Arrays, row: torch.Tensor) -> bool:
         """Returns whether ``begin`` makes something else of an entry of memory where it held something else."""
         key = f"memory.{name}"
-        other = ~arrays[key] if arrays[key].dtype == torch.bool else arrays[key] + 1
-        try:
-            again = self._call("begin", {**arrays, key: other})[name]
-        except Exception:  # it refuses that number, so it reads it
-            return True
-        return not torch.equal(again.expand_as(row), row)
+        held = arrays[key]
+        others = (
+            [~held] if held.dtype == torch.bool else [held + by for by in (1, 3, 10, 100, -1)]
+        )  # some may be clamped
+        for other in others:
+            try:
+                again = self._call("begin", {**arrays, key: other})[name]
+            except Exception:  # it refuses that number, so it reads it
+                return True
+            if not torch.equal(again.expand_as(row).nan_to_num(), row.nan_to_num()):
+                return True
+        return False
 
     def _groups(self, arrays: Arrays, steps: int = 0) -> dict[str, torch.Tensor]:
         """Returns the present observation by group, its terms joined in their order, with noise.
@@ -391,6 +401,7 @@ class Hooks:
         if not self.catalog.complete:
             for term, rows in terms.items():
                 self._check_term(group, term, rows)
+                self._shapes[group, term] = tuple(rows.shape[1:])
             named = isinstance(values, Mapping)
             self.terms[group] = {term: rows[0].numel() for term, rows in terms.items()} if named else {}
         found = []
@@ -585,7 +596,7 @@ class Hooks:
 
 CRITIC = "privileged"
 """Group of the observation that the critic alone sees: it has no noise."""
-HISTORY = "{}_history"
+HISTORY = "{}.history"
 """Name of the entry of memory that keeps the last observations of a group."""
 NO_GROUPS = (
     *(

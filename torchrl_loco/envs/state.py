@@ -133,7 +133,7 @@ def write_state(
             if mask.all():
                 target[0].copy_(new[key][0])
             continue
-        none = float("nan") if key[0] == "memory" and key[1].endswith("_history") else 0
-        value = new.get(key, torch.full_like(target, none))
+        of_history = key[0] == "memory" and key[1].endswith(".history")  # NaN where a state has none
+        value = new[key] if key in new else torch.full_like(target, float("nan") if of_history else 0)
         rows = mask.view(-1, *[1] * (target.ndim - 1))
         target.copy_(torch.where(rows, value.to(target.dtype), target))

@@ -158,10 +158,16 @@ def lookup(table: torch.Tensor, index: Any, note: Note) -> torch.Tensor:
 
     Returns:
         What torch returns, NaN (or of integers the first) where an index is out of range.
+
+    Raises:
+        IndexError: a mask is beside an index.
     """
     parts = list(index) if isinstance(index, tuple) else [index]
     if not any(map(_is_index, parts)):
         return table[index]
+    parts = [torch.tensor(part, device=table.device) if isinstance(part, list) else part for part in parts]
+    if any(isinstance(part, torch.Tensor) and part.dtype == torch.bool for part in parts):
+        raise IndexError("beside an index of worlds, a table takes numbers and slices, no masks")
     consumed = sum(part is not None and part is not Ellipsis for part in parts)
     rest = [slice(None)] * (table.ndim - consumed)
     parts = [each for part in parts for each in (rest if part is Ellipsis else [part])]

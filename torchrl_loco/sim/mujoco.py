@@ -133,6 +133,7 @@ class MujocoEngine:
         self._varied, self._substeps, self._rows = varied, config.substeps, contact_rows
         self.model, self.data = Model(m, device), Data(m, num_envs)
         self._kernels: dict[tuple[wp.Function, ...], WorldKernel] = {}
+        self._nominal = m
         self._passive = _without_actuation(m)
         home: Any = mujoco.MjData(m)
         names = [name for name in STATE if np.size(getattr(home, name))]
@@ -213,7 +214,7 @@ class MujocoEngine:
             self._write(i, shown, lost=lost or bool(world.warned[LOST].any()))
 
         self._each(np.arange(len(self._worlds)), advance)
-        self._keep_written()
+        self._keep_written(np.arange(len(self._worlds)))
         self._launch([*after, *last], self._all)
 
     def forward(
@@ -242,7 +243,7 @@ class MujocoEngine:
         def update(i: int) -> None:
             world = self._worlds[i]
             if self._varied is not None:
-                world.model = self._varied.edited(self.numbers.numpy()[i])
+                world.model = self._varied.edited(self.numbers.numpy()[i], self._nominal)
             d, m = world.data, world.model
             mujoco.mj_resetData(m, d)
             self._load(i, self._state)
@@ -253,8 +254,9 @@ class MujocoEngine:
                     self._add_up_forces(i, row)
             self._write(i, shown, lost=bool(world.warned[LOST].any()))
 
-        self._each(np.flatnonzero(mask.numpy()), update)
-        self._keep_written()
+        worlds = np.flatnonzero(mask.numpy())
+        self._each(worlds, update)
+        self._keep_written(worlds)
         self._launch(after, mask)
 
     def _launch(self, funcs: Sequence[WorldFunc], mask: wp.array) -> None:
@@ -300,10 +302,10 @@ class MujocoEngine:
         for name, rows in shown.items():
             rows[i] = world.view(name).reshape(rows.shape[1:])
 
-    def _keep_written(self) -> None:
-        """Notes the state that was written, to see later what was changed."""
+    def _keep_written(self, worlds: np.ndarray) -> None:
+        """Notes the state of worlds that was written, to see later what was changed."""
         for name, rows in self._state.items():
-            np.copyto(self._written[name], rows)
+            self._written[name][worlds] = rows[worlds]
 
     def _flag(self, i: int, *, limited: bool) -> bool:
         """Flags what the substeps of a world have dropped or not finished.

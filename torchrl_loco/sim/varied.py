@@ -63,13 +63,13 @@ class Varied:
             values[self.places[name]] = row[self.columns[name]]
         return values.reshape(nominal.shape)
 
-    def edited(self, row: ArrayLike) -> mujoco.MjModel:
-        """Returns a copy of the model with the numbers of a world's row, for C MuJoCo.
+    def edited(self, row: ArrayLike, model: mujoco.MjModel | None = None) -> mujoco.MjModel:
+        """Returns a copy of the model, or of another that differs in its sensors, with the numbers of a world's row.
 
         ``body_subtreemass`` follows the masses. ``body_invweight0``, ``dof_invweight0`` and ``stat.meaninertia`` stay
         nominal, as they do in both engines.
         """
-        m, numbers = copy.copy(self._mj_model), np.asarray(row, dtype=float)
+        m, numbers = copy.copy(self._mj_model if model is None else model), np.asarray(row, dtype=float)
         for name in self.places:
             field(m, name)[...] = self.full(name, numbers)
         if "body_ipos" in self.places:

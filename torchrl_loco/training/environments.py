@@ -4,7 +4,6 @@ import copy
 import dataclasses
 import hashlib
 import inspect
-import logging
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -14,6 +13,7 @@ from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
 from torchrl_loco.envs import LocoEnv
+from torchrl_loco.envs.base import set_stage
 from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
@@ -178,10 +178,7 @@ def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: 
     sim = {name: value for name, value in info.get("sim", {}).items() if value is not None}
     place = resolve(info["task"]), num_envs, device, seed, info["protocol"]
     env = make(*place, **{**sim, "world_offset": 0, **settings})
-    try:
-        env.set_stage(info.get("stage", {}))
-    except ValueError as error:  # of another task, or of this one as it was
-        logging.getLogger("torchrl_loco").warning("episodes begin at the first stage of the curriculum: %s", error)
+    set_stage(env, info)
     return env
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_loco.checks import check_device
+from torchrl_loco.envs.base import set_stage
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
 from torchrl_loco.training.actor import deterministic_policy
@@ -53,7 +54,7 @@ class Watched:
             refuse_transforms(policy)
         else:
             policy = last_policy(self._run, self._config.device)
-        self.env.set_stage(policy.info.get("stage", {}))
+        set_stage(self.env, policy.info)
         return policy
 
 

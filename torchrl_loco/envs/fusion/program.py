@@ -80,6 +80,23 @@ class Worldwise:
     parts: list[Value]
 
 
+@dataclass
+class Huge:
+    """A tensor without worlds that is too long to be written number by number."""
+
+    tensor: torch.Tensor
+
+    @property
+    def shape(self) -> torch.Size:
+        """Its shape."""
+        return self.tensor.shape
+
+    @property
+    def ndim(self) -> int:
+        """How many dimensions it has."""
+        return self.tensor.ndim
+
+
 class Program:
     """A traced graph as C++.
 
@@ -308,8 +325,9 @@ class Program:
         Raises:
             CannotFuse: it is computed when the kernel runs.
         """
-        if isinstance(x, torch.Tensor):
-            return self._index_of(x), 0, list(x.stride()), x.dtype
+        if isinstance(x, torch.Tensor | Huge):
+            tensor = x.tensor if isinstance(x, Huge) else x
+            return self._index_of(tensor), 0, list(tensor.stride()), tensor.dtype
         first = x.array.flat[0].place if x.array.size else None
         places = [node.place for node in x.array.flat]
         if x.world is not None or first is None or any(p is None or p[0] != first[0] or p[2] for p in places):
@@ -362,7 +380,8 @@ class Program:
             if node.op == "placeholder":
                 name, tensor = next(inputs)
                 by_world = tensor.ndim > 0 and tensor.shape[0] == self._n and not name.startswith(GLOBAL)
-                found[node] = self.source(tensor, 0 if by_world else None)
+                huge = not by_world and tensor.numel() > MOST_NUMBERS  # can be looked up alone
+                found[node] = Huge(tensor) if huge else self.source(tensor, 0 if by_world else None)
             elif node.op == "get_attr":
                 found[node] = self._constant(node, constants(node.target))
             elif node.op == "call_function":
@@ -402,7 +421,7 @@ class Program:
         leaves = torch.utils._pytree.tree_leaves((args, kwargs))
         if name not in VIEWS and any(isinstance(leaf, Worldwise) for leaf in leaves):
             raise CannotFuse("{op} mixes worlds")
-        if not any(isinstance(leaf, Value | Worldwise) for leaf in leaves) and name not in FILLERS:
+        if not any(isinstance(leaf, Value | Worldwise | Huge) for leaf in leaves) and name not in FILLERS:
             # torch computes constants
             kwargs = {**kwargs, "device": "cpu"} if "device" in kwargs else kwargs
             return target(*args, **kwargs)
