@@ -215,6 +215,64 @@ def test_what_is_shared_may_be_long_and_lists_are_indices():
         type("Masked", (Long,), {"observation": lambda self, s: s.grid[s.i, s.qpos[:, 0] > 0]})(3, "cpu", 0)
 
 
+class Forms(WalkerWalk):
+    """Looks numbers up in every form that torch has for it."""
+
+    constants = {
+        "t1": torch.arange(7.0) ** 2,
+        "t2": torch.linspace(0.0, 1.0, 350).view(70, 5),
+        "t3": torch.arange(72.0).sin().view(4, 6, 3),
+        "ints": torch.arange(70) * 7 % 6,
+        "flags": torch.arange(9) % 3 > 0,
+    }
+    shared = {"u": (6,), "v": ((5, 3), torch.float32), "w": torch.int64}
+    memory = {"i": torch.int64, "j": torch.int32, "k": ((2,), torch.int64)}
+
+    def events(self, s):
+        k = torch.stack([s.i.abs() % 4, (2 * s.j.long()) % 6], dim=-1)
+        return {"i": (3 * s.i + 1) % 7 - 3, "j": (s.j + 1) % 5, "k": k}
+
+    def adapt(self, s):
+        return {"u": s.u + torch.arange(6.0) + 0.1, "v": s.v + torch.arange(15.0).view(5, 3), "w": s.w + 1}
+
+    def observation(self, s):
+        found = {
+            "row": s.t2[s.i],
+            "number": s.t2[s.i, 2],
+            "part": s.t2[s.i, 1:4],
+            "two": s.t2[s.i, s.j],
+            "plane": s.t3[s.i % 4, s.j],
+            "apart": s.t3[s.i % 4, :, s.j % 3],
+            "last": s.t3[..., s.j % 3].movedim(-1, 0),
+            "column": s.t2[:, 0][s.i],
+            "later": s.t2[5:][s.j],
+            "turned": s.t2.T[s.j],
+            "several": s.t3[1][s.k],
+            "pairs": s.t3[s.k[:, 0], s.k[:, 1]],
+            "through": s.t2[s.ints[s.i.abs()]],
+            "flag": s.flags[s.j].float(),
+            "shared": s.v[s.j, s.i % 3],
+            "all": s.u[s.w % 6].expand(s.num_envs),
+            "more": s.t2[s.i, None],
+            "computed": (2.0 * s.t2)[s.j] * s.t1[:5],
+            "sums": s.t1.cumsum(0)[s.j],
+            "selected": s.t3.index_select(0, s.j % 4),
+            "left": torch.searchsorted(s.u, s.qpos[:, 0].contiguous()).float(),
+            "right": torch.searchsorted(s.t1, 10.0 * s.qpos[:, :3].abs(), right=True).float(),
+            "bins": torch.bucketize(s.qvel[:, :2].contiguous(), s.t1).float(),
+        }
+        return {"observation": found}
+
+
+@pytest.mark.parametrize("num_envs", [4, 70])
+def test_every_form_of_a_lookup_is_a_kernel(num_envs):
+    env, plain = (Forms(num_envs, "cpu", 0, compile_hooks=kernels) for kernels in (True, False))
+    assert env.world.kinds["observation"] == "kernel"
+    actions = 2 * torch.rand(12, num_envs, 6, generator=torch.Generator().manual_seed(0)) - 1
+    assert torch.equal(played(env, actions)["observation"], played(plain, actions)["observation"])
+    assert env.health()["total", "index_error"] == 0
+
+
 def test_noise_of_a_warp_functions_observation_is_refused():
     with pytest.raises(ValueError, match="has noise or history, but a Warp function observes"):
         type("Noisy", (WalkerWalk,), {"history": {"observation": 2}})(1, "cpu", 0)

@@ -120,7 +120,8 @@ class Part:
         try:
             for spread, flags in itertools.product(SPREADS, (False, True)):  # flags of worlds: masked, not finite
                 for name, rows in self._arrays.items():
-                    rows.copy_(changed(kept[name], generator, spread, flags))
+                    most = 2 if name.startswith(("memory.", "shared.")) else 10  # which may be an index
+                    rows.copy_(changed(kept[name], generator, spread, flags, most))
                 # Only now, since some arrays are views of others.
                 ours = {name: rows.clone() for name, rows in self._arrays.items()}
                 try:
@@ -183,13 +184,16 @@ def _line_of_user(error: Exception) -> str:
     return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
 
-def changed(rows: torch.Tensor, generator: torch.Generator, spread: float, flags: bool) -> torch.Tensor:
-    """Returns a copy of an array with other finite numbers of the same kind; booleans are all ``flags``."""
+def changed(rows: torch.Tensor, generator: torch.Generator, spread: float, flags: bool, most: int = 10) -> torch.Tensor:
+    """Returns a copy of an array with other finite numbers of the same kind; booleans are all ``flags``.
+
+    Integers grow by less than ``most``.
+    """
     if rows.dtype == torch.bool:
         return torch.full_like(rows, flags)
     noise = torch.rand(rows.shape, generator=generator, device=rows.device)
     if not rows.is_floating_point():
-        return rows + (10 * noise).to(rows.dtype)
+        return rows + (most * noise).to(rows.dtype)
     return rows.nan_to_num(0.0, 0.0, 0.0) + spread * (2 * noise - 1)
 
 

@@ -107,7 +107,7 @@ class Table(torch.Tensor):
     So it is everywhere, while torch would raise an error on the CPU and break the device on CUDA. Of integers, which
     have no NaN, it gives the first, and the world ends as one that is not finite.
 
-    What is computed from a table is a plain tensor; its parts, such as ``s.table[:, 3]``, are tables.
+    Its parts, and what is computed from tables alone, such as ``s.table[:, 3]`` or ``s.weights.cumsum(0)``, are tables.
     """
 
     _plain: torch.Tensor
@@ -123,29 +123,24 @@ class Table(torch.Tensor):
     @classmethod
     def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Returns what torch does, but of :func:`lookup` where worlds look something up."""
-        tables = [leaf for leaf in torch.utils._pytree.tree_leaves((args, kwargs)) if isinstance(leaf, Table)]
+        leaves = [leaf for leaf in torch.utils._pytree.tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+        tables = [leaf for leaf in leaves if isinstance(leaf, Table)]
         of_table = bool(args) and isinstance(args[0], Table)
         args, kwargs = torch.utils._pytree.tree_map_only(Table, lambda table: table._plain, (args, kwargs or {}))
-        first = tables[0]
+        first, alone = tables[0], len(tables) == len(leaves)
         if of_table and func is torch.Tensor.__getitem__:
             result = lookup(args[0], args[1], first._note)
         elif of_table and func in (torch.index_select, torch.Tensor.index_select) and len(args) == 3:
             result = lookup(args[0], (*[slice(None)] * (args[1] % args[0].ndim), args[2]), first._note)
         else:
             result = func(*args, **kwargs)
-        return torch.utils._pytree.tree_map_only(torch.Tensor, lambda each: _part_of(first, each), result)
+        if not alone:
+            return result
+        return torch.utils._pytree.tree_map_only(torch.Tensor, lambda each: Table.of(each, first._note), result)
 
 
 Note = Callable[[torch.Tensor, bool], None]
 """Takes in which worlds, ``(num_envs,)`` or all ``(1,)``, an index was out of range, and whether it gave NaN."""
-
-
-def _part_of(table: Table, result: torch.Tensor) -> torch.Tensor:
-    """Returns a result as a table if it shows a part of one."""
-    same = not isinstance(result, Table) and result.untyped_storage().data_ptr() == (
-        table._plain.untyped_storage().data_ptr()
-    )
-    return Table.of(result, table._note) if same else result
 
 
 def lookup(table: torch.Tensor, index: Any, note: Note) -> torch.Tensor:

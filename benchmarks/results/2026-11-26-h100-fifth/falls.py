@@ -17,7 +17,13 @@ from torchrl_loco.envs.vary import Vary
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import resolve
 from torchrl_loco.tasks.velocity import commands
-from torchrl_loco.verification.velocity import fixed_commands
+
+
+def fixed_commands(low, high):
+    """Returns standing, each limit of a component alone, and both limits of all together."""
+    alone = [np.eye(3)[k] * bound[k] for k in range(3) for bound in (high, low)]
+    return [np.zeros(3), *alone, high, low]
+
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
