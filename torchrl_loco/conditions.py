@@ -43,6 +43,8 @@ class Conditions:
             check_float("seconds", self.seconds)
         for name, check, interval in (("delay", check_int, COUNT), ("friction", check_float, NOT_NEGATIVE)):
             if (values := getattr(self, name)) is not None:
+                if not isinstance(values, tuple | list) or len(values) != 2:
+                    raise TypeError(f"{name} must be two numbers, the least and the greatest, got {values!r}")
                 least, most = (check(name, value, interval) for value in values)
                 if least > most:
                     raise ValueError(f"{name}: the least, {least}, must not be greater than the greatest, {most}")

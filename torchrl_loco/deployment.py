@@ -46,9 +46,11 @@ def of_robot(policy: "Policy") -> dict[str, Any]:
     env = cls(
         1, "cpu", 0, policy.info["protocol"], **{**sim, "engine": "mujoco"}, compile_hooks=False
     )  # tells the terms
+    terms = env.observation_layout["observation"]
+    env.close()
     scaled = {"action_offset": (0.5 * (low + high)).tolist(), "action_scale": (0.5 * (high - low)).tolist()}
     return {
-        "observation": [{"term": name, "size": size} for name, size in env.observation_layout["observation"].items()],
+        "observation": [{"term": name, "size": size} for name, size in terms.items()],
         "history": cls.history.get("observation", 1),
         **({} if "control" in own_hooks(cls) else scaled),
         **_actuators(m),

@@ -171,6 +171,16 @@ def test_a_closed_environment_goes_on_at_its_stage():
     assert env.get_stage() == {"shared": {"steps": 4.0}, "memory": {"level": [4.0, 4.0]}}
 
 
+def test_what_is_shared_may_begin_with_numbers():
+    class Begun(Levels):
+        shared = {"steps": torch.tensor(5.0)}
+
+    env = Begun(2, "cpu", 0, reward_terms=True)
+    terms = env.rollout(2, Still(env))["next", "reward_terms", "steps"]
+    assert terms[0].flatten().tolist() == [5.0, 6.0]
+    assert Begun.shared["steps"] == 5.0
+
+
 def test_entries_may_be_called_histories():
     class Own(WalkerWalk):
         memory = {"pose_history": (2, 1), "count_history": torch.int64}
@@ -338,6 +348,16 @@ def test_built_in_starts_and_controls_can_be_built_on():
         ),
         ({"shared": {"rate": (0,)}}, ValueError, r"shared\['rate'\] must have sizes of 1 or more"),
         ({"shared": {"qpos": 3}}, ValueError, "'qpos' is taken"),
+        ({"memory": {"a": torch.zeros(3)}}, TypeError, r"memory\['a'\] must be a shape or a dtype, not an array"),
+        ({"holds": {"fals": 0.5}}, ValueError, "unknown Wrong.holds 'fals', did you mean 'falls'"),
+        ({"holds": {"delay": 2}}, TypeError, "delay must be two numbers, the least and the greatest, got 2"),
+        ({"noise": 0.1}, TypeError, "Wrong.noise must be a dict by name, got 0.1"),
+        ({"summed_over_ranks": "falls"}, TypeError, "must be a tuple of names, got 'falls'"),
+        (
+            {"memory": {"i": ()}, "update": lambda self, s: setattr(s, "i", s.time)},
+            AttributeError,
+            "s.i cannot be set: return {'i': ...} from update",
+        ),
         ({"memory": {"rate": ()}, "shared": {"rate": ()}}, ValueError, "'rate' is taken"),
         ({"memory": {"a": ()}, "constants": {"a": [1.0]}}, ValueError, "'a' is taken"),
         (

@@ -36,6 +36,7 @@ from torchrl_loco.checks import (
     check_output_file,
     check_pair,
 )
+from torchrl_loco.conditions import Conditions
 from torchrl_loco.config import SimConfig, options_of, sim_config
 from torchrl_loco.envs.hooks import HOOKS, Hooks, check_commands, declared, own_hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
@@ -61,6 +62,10 @@ STAGE_WORLDS = 64
 
 NESTED = ("reward_terms", "metrics", "observation_terms")
 """Entries of a step that are TensorDicts."""
+
+
+HOLDS = ("falls", "return", "kept", "delay", "friction", "pushes")
+"""What a task can ask for: see :attr:`LocoEnv.holds`."""
 
 
 class _OfModel:
@@ -139,9 +144,10 @@ class LocoEnv(EnvBase):
     ``{"command": 3, "frame": torch.int32, "bins": ((4,), torch.int32)}``; floats of float32, int32, int64 or bool.
     ``s.command`` reads it; :meth:`update`, :meth:`events` and :meth:`begin` return new rows. The state holds it."""
     shared: ClassVar[Mapping[str, Any]] = {}
-    """What all worlds have in common, by name, as for :attr:`memory`: it begins as zeros, ``s.name`` reads it,
-    :meth:`adapt` returns new values after each step. The state holds it. A world of such a task depends on its
-    neighbours; in training on several GPUs each rank has its own, but for those in :attr:`summed_over_ranks`."""
+    """What all worlds have in common, by name, as for :attr:`memory`, or a tensor that it begins with, else with zeros.
+    ``s.name`` reads it, :meth:`adapt` returns new values after each step. The state holds it. A world of such a task
+    depends on its neighbours; in training on several GPUs each rank has its own, but for those in
+    :attr:`summed_over_ranks`."""
     summed_over_ranks: ClassVar[Sequence[str]] = ()
     """Names of entries of :attr:`shared`, such as counts, whose changes are added up over the ranks of a training,
     after each batch."""
@@ -323,6 +329,14 @@ class LocoEnv(EnvBase):
             raise TypeError(f"{name} has actions without bounds, so it must define control(self, s, action)")
         memory, shared = declared(cls)
         check_commands(cls, memory)
+        for attribute in ("noise", "history", "holds"):
+            if not isinstance(getattr(cls, attribute), Mapping):
+                raise TypeError(f"{name}.{attribute} must be a dict by name, got {getattr(cls, attribute)!r}")
+        if isinstance(cls.summed_over_ranks, str):
+            raise TypeError(f"{name}.summed_over_ranks must be a tuple of names, got {cls.summed_over_ranks!r}")
+        for what in cls.holds:
+            check_choice(f"{name}.holds", what, HOLDS)
+        Conditions().of(cls.holds).check()
         for entry in cls.summed_over_ranks:
             check_choice(f"{name}.summed_over_ranks", entry, shared)
         check_randomize(f"{name}.randomize", cls.randomize)

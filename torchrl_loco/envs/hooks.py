@@ -184,6 +184,8 @@ class Hooks:
         if type(env).observation_func is not LocoEnv.observation_func:
             self.catalog.warp_outputs = type(env).observation_size
         self.catalog.draws_states = draws_by_warp(type(env))
+        starts = {name: value for name, value in type(env).shared.items() if isinstance(value, torch.Tensor)}
+        self.catalog.starts = {name: value.detach().to(env.device) for name, value in starts.items()}
         own_tables = env.constants() if callable(env.constants) else env.constants
         taken = {*(name for name in vars(View) if not name.startswith("_")), *memory, *shared}
         self.catalog.constants = constants(self._title, own_tables, taken, env.device)
@@ -270,6 +272,7 @@ class Hooks:
         arrays |= {
             f"shared.{name}": torch.zeros(shape, dtype=kind, **kept) for name, (shape, kind) in catalog.shared.items()
         }
+        arrays |= {f"shared.{name}": start.clone() for name, start in catalog.starts.items()}
         zeros = torch.zeros(n, dtype=torch.long, **kept)
         arrays |= {
             "seed": zeros[:1],

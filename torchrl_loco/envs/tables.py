@@ -42,10 +42,14 @@ def entries(cls: type, attribute: str, taken: Collection[str]) -> dict[str, Entr
     for name, value in declared.items():
         _check_name(title, name, taken)
         shape, dtype = value, torch.float32
-        if isinstance(value, torch.dtype):
+        if attribute == "shared" and isinstance(value, torch.Tensor):
+            shape, dtype = tuple(value.shape), value.dtype
+        elif isinstance(value, torch.dtype):
             shape, dtype = (), value
         elif isinstance(value, tuple) and len(value) == 2 and isinstance(value[1], torch.dtype):
             shape, dtype = value
+        if isinstance(value, torch.Tensor | np.ndarray) and not isinstance(shape, tuple):
+            raise TypeError(f"{title}[{name!r}] must be a shape or a dtype, not an array: see constants")
         sizes = (shape,) if isinstance(shape, int) else shape
         if not isinstance(sizes, tuple | list) or not all(isinstance(n, int) for n in sizes):
             raise TypeError(

@@ -40,6 +40,7 @@ class Catalog(Elements):
         contact_geoms: ids of the geoms whose contacts were asked for, in the order of the engine's columns.
         sensor_address: where a sensor's numbers begin in ``sensordata``, by its id.
         constants: the task's tables by name.
+        starts: what entries of ``shared`` begin with, by name, where it is not zero.
         warp_outputs: size of the observation of the class's Warp function; ``None`` if it has none.
         draws_states: whether a Warp function or a table of the class begins its episodes.
         complete: whether all that hooks ask for is known: what else they ask for later is refused.
@@ -62,6 +63,7 @@ class Catalog(Elements):
         self.num_envs, self.device = num_envs, device
         self.memory, self.shared, self.constants = dict(memory), dict(shared), dict[str, torch.Tensor]()
         self.ctrl_dt, self.bounded, self.variation = ctrl_dt, bounded, variation
+        self.starts: dict[str, torch.Tensor] = {}
         self.warp_outputs: int | None = None
         self.draws_states = False
         self.arrays: set[str] = set()
@@ -132,6 +134,18 @@ class View:
         self._stream: torch.Tensor | None = None
         self._drawn = 0
         self.lost: dict[bool, torch.Tensor] = {}
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuses to set what a hook sees.
+
+        Raises:
+            AttributeError: always, but for the view's own.
+        """
+        if not name.startswith("_") and name != "lost":
+            raise AttributeError(
+                f"s.{name} cannot be set: return {{{name!r}: ...}} from update, events, adapt or begin"
+            )
+        super().__setattr__(name, value)
 
     # The state.
 

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import mujoco
 import torch
+import torch._subclasses.schema_check_mode  # noqa: F401, which closing needs: an import while garbage is collected may fail
 import warp as wp
 
 from torchrl_loco.config import SimConfig
@@ -175,6 +176,8 @@ class World:
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
             for rows in (*self.memory.values(), *self.shared.values()):
                 rows.zero_()  # recording wrote into it
+            for name, start in (hooks.catalog.starts if hooks else {}).items():
+                self.shared[name].copy_(start)
             self.sim.numbers.copy_(nominal)
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
             for monitor in self._monitors:

@@ -209,6 +209,12 @@ class Trainer:
     def _say_once(self, row: dict[str, float]) -> None:
         """Prints what a user should know after a batch with these metrics, each thing once in a run."""
         ended = f"{self._non_finite} episodes have ended because a state, an observation or a reward was not finite"
+        if (
+            self._non_finite
+            and "non_finite" not in self._said
+            and (lost := self._base.health()["total", "index_error"])
+        ):
+            ended += f"; {int(lost)} steps indexed constants or shared beyond their end"
         notes = {
             "non_finite": ended if self._non_finite else "",
             "alike": f"the reward was {self._alike:g} in every step of every world: look at reward(self, s)"
