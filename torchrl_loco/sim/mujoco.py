@@ -113,7 +113,7 @@ class MujocoEngine:
         worlds: the ``mjData`` of each world, in float64.
         numbers: the numbers that differ, ``(nworld, varied.count)``; none without ``varied``.
         peak_constraints: most constraint rows that a substep needed since the last reset, by world, ``(nworld,)``.
-        peak_contacts: most contacts that a substep of one world needed, times the worlds, ``(1,)``.
+        peak_contacts: most contacts that a substep of any one world needed, ``(1,)``.
         coalesced: false: the numbers of a world are contiguous.
     """
 
@@ -209,9 +209,9 @@ class MujocoEngine:
                 limited |= iterations[0] >= most or (d.nisland > 1 and iterations[: d.nisland].max() >= most)
                 if self._geoms and k >= substeps - rows:
                     self._add_up_forces(i, k - substeps + rows)
-            lost = self._flag(i, limited=limited)
+            self._flag(i, limited=limited)
             mujoco.mj_step1(m, d)
-            self._write(i, shown, lost=lost or bool(world.warned[LOST].any()))
+            self._write(i, shown)
 
         self._each(np.arange(len(self._worlds)), advance)
         self._keep_written(np.arange(len(self._worlds)))
@@ -252,7 +252,7 @@ class MujocoEngine:
             if contacts and self._geoms:
                 for row in range(self._rows):
                     self._add_up_forces(i, row)
-            self._write(i, shown, lost=bool(world.warned[LOST].any()))
+            self._write(i, shown)
 
         worlds = np.flatnonzero(mask.numpy())
         self._each(worlds, update)
@@ -290,14 +290,14 @@ class MujocoEngine:
                 view = world.state[name]
                 view[:] = self._state[name][i].reshape(view.shape)
 
-    def _write(self, i: int, shown: Mapping[str, np.ndarray], *, lost: bool) -> None:
+    def _write(self, i: int, shown: Mapping[str, np.ndarray]) -> None:
         """Writes a world into the arrays; one that MuJoCo has lost has no numbers."""
         world = self._worlds[i]
         for name, view in world.state.items():
             rows = self._state[name]
             rows[i] = view.reshape(rows.shape[1:])
         self._state["time"][i] = world.data.time
-        if lost:
+        if world.warned[LOST].any():
             self._state["qpos"][i] = np.nan
         for name, rows in shown.items():
             rows[i] = world.view(name).reshape(rows.shape[1:])
@@ -307,12 +307,8 @@ class MujocoEngine:
         for name, rows in self._state.items():
             self._written[name][worlds] = rows[worlds]
 
-    def _flag(self, i: int, *, limited: bool) -> bool:
-        """Flags what the substeps of a world have dropped or not finished.
-
-        Returns:
-            Whether MuJoCo has lost it.
-        """
+    def _flag(self, i: int, *, limited: bool) -> None:
+        """Flags what the substeps of a world have dropped or not finished."""
         world = self._worlds[i]
         d, bits = world.data, int(Overflow.ITERATIONS) if limited else 0
         if world.warned.any():
@@ -323,7 +319,6 @@ class MujocoEngine:
             self._most[0][i] = rows
         if (contacts := d.maxuse_con) > self._most[1][0]:
             self._most[1][0] = contacts
-        return bool(world.warned[LOST].any())
 
     def _add_up_forces(self, i: int, row: int) -> None:
         """Adds up the forces of a world's contacts on each geom that was asked for, in the world's frame (N)."""
