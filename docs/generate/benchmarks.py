@@ -23,16 +23,16 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
 PICTURES = ROOT / "docs" / "_static"
 
-LOOP, DAY = "2026-11-22-h200-loop", "2026-11-23-h200"
+LOOP, DAY = "2026-11-22/h200-loop", "2026-11-23/h200"
 ENGINES = (f"{LOOP}/engines.json", f"{LOOP}/engines-others.json")
 COLLECTED = (f"{DAY}/throughput.json", f"{DAY}/throughput-many.json", f"{LOOP}/throughput-apart.json")
 PEERS = (f"{LOOP}/peers.json",)
-SUITE = "2026-11-24-cpu/suite.json"
-VARIATION = "2026-11-25-h100-third/variation.json"
-TO_950 = "2026-11-23-h200-presets/time-to-return.csv"
-BRAX_TO_950 = "2026-11-21-h200/training/time-to-return.json"
-ROBOTS = f"{robots.RESULTS[-1].name}/results.json"
-MJLAB = f"{robots.BEFORE.parent.name}/{robots.BEFORE.name}"
+SUITE = "2026-11-24/cpu/suite.json"
+VARIATION = "2026-11-25/h100-third/variation.json"
+TO_950 = "2026-11-23/h200-presets/time-to-return.csv"
+BRAX_TO_950 = "2026-11-21/h200/training/time-to-return.json"
+ROBOTS = f"{robots.RESULTS[-1].relative_to(RESULTS)}/results.json"
+MJLAB = str(robots.BEFORE.relative_to(RESULTS))
 
 
 class Measured(NamedTuple):
@@ -72,9 +72,9 @@ class Runs(NamedTuple):
     alone: tuple[str, str, str, str | None] | None = None
 
 
-SEEDS = ("2026-11-23-h200-presets/campaign", "2026-11-23-h200-seeds/campaign")
-FIRST, ALONE, LAST = f"{DAY}/campaign", "2026-11-23-h200-alone/campaign", "2026-11-24-h200-alone/campaign"
-RUNNERS, RUN = "2026-11-22-h200-runners/campaign", "2026-11-24-h100/walker-run"
+SEEDS = ("2026-11-23/h200-presets/campaign", "2026-11-23/h200-seeds/campaign")
+FIRST, ALONE, LAST = f"{DAY}/campaign", "2026-11-23/h200-alone/campaign", "2026-11-24/h200-alone/campaign"
+RUNNERS, RUN = "2026-11-22/h200-runners/campaign", "2026-11-24/h100/walker-run"
 RUNS = {
     ("walker_stand", "playground"): Runs(SEEDS, (ALONE, "walker_stand", "playground", None)),
     ("walker_walk", "playground"): Runs(SEEDS, (SEEDS[1], "walker_walk", "playground", "4")),
@@ -213,7 +213,7 @@ def speed() -> str:
     for body in BODIES[:2]:
         step = (_found(line, body=body, worlds=8192) for line in (ours, loop))
         rows.append((f"control step of 8192 {body}s (ms, H200)", *step, "", _found(playground, body=body, worlds=8192)))
-    folder, file = TO_950.split("/")
+    folder, file = TO_950.rsplit("/", 1)
     run = [row for row in read(RESULTS / folder, file) if row["task"] == "walker_walk"]
     brax = [row for row in _json(BRAX_TO_950) if row["trainer"] != "ours"]
     seconds = [

@@ -16,9 +16,10 @@ from torchrl_loco.policy import shipped_policies
 
 Row = dict[str, Any]
 ROOT = Path(__file__).parents[2]
-RESULTS = (ROOT / "benchmarks" / "results" / "2026-11-26-h100-robots",)
+ALL = ROOT / "benchmarks" / "results"
+RESULTS = (ALL / "2026-11-26" / "h100-robots",)
 """Trained by today's presets, and mjlab's policies."""
-BEFORE = ROOT / "benchmarks" / "results" / "2026-11-24-h100" / "mjlab.txt"
+BEFORE = ALL / "2026-11-24" / "h100" / "mjlab.txt"
 """mjlab's own training, where the folder has none."""
 CURVES = ROOT / "docs" / "_static" / "robots.png"
 MOVING = ROOT / "docs" / "_static" / "robots.webp"
@@ -65,13 +66,10 @@ def tables(folders: Sequence[Path] = RESULTS) -> dict[str, str]:
         return {**of_page, "robots-training": none, "robots-curves": "", "robots-verified": none}
     ours = by_trainer(found)
     episodes = " or ".join(sorted({f"{row['episodes']}" for row in found if "episodes" in row}))
-    used = dict.fromkeys(row["folder"].name for row in found)
-    links = " and ".join(f"[{name}/results.json](../benchmarks/results/{name}/results.json)" for name in used)
+    links = " and ".join(dict.fromkeys(_link(row["folder"] / "results.json") for row in found))
     robots = {task for task, trainer, _ in ours if "mjlab" in trainer}
     earlier = {key: rows for key, rows in before().items() if key[0] not in robots}
-    source = (
-        f", mjlab's from [{BEFORE.parent.name}/{BEFORE.name}](../benchmarks/results/{BEFORE.parent.name}/{BEFORE.name})"
-    )
+    source = f", mjlab's from {_link(BEFORE)}"
     return {
         **of_page,
         "robots-training": _table({**ours, **earlier}, TRAINING) + f"\nFrom {links}{source if earlier else ''}.\n",
@@ -79,6 +77,11 @@ def tables(folders: Sequence[Path] = RESULTS) -> dict[str, str]:
         "robots-verified": _table(ours, VERIFIED)
         + f"\nFalls are episodes, of {episodes} of each policy; a third of them are on time. From {links}.\n",
     }
+
+
+def _link(file: Path) -> str:
+    name = file.relative_to(ALL) if file.is_relative_to(ALL) else file.name
+    return f"[{name}](../benchmarks/results/{name})"
 
 
 def rows_of(folders: Sequence[Path] = RESULTS) -> list[Row]:
