@@ -7,6 +7,7 @@ ARGS ?=
 PYTEST_ARGS ?= --numprocesses auto --dist loadfile
 PICTURES ?=
 NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
+CPP := $(wildcard torchrl_loco/sim/compiled/*/*.h torchrl_loco/sim/compiled/*/*/*.h)
 PYTEST := $(BIN)/python -m pytest $(PYTEST_ARGS)
 
 .PHONY: help train test test-fast test-all tests tests-ci lint format docs runners viewer tables notebooks report dist clean
@@ -35,11 +36,13 @@ tests-ci: $(VENV)/installed-ci
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run --Werror $(CPP)
 	$(BIN)/mypy
 
 format: $(VENV)/installed  ## format the code and apply safe fixes
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+	$(BIN)/clang-format -i $(CPP)
 
 dist: $(VENV)/installed  ## wheel and sdist, checked and tried out, into dist/
 	rm -rf dist

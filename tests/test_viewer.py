@@ -1,6 +1,7 @@
 """The viewer: what it steps, shows and lets a person do, over the page's own connection; and in a real browser."""
 
 import io
+import os
 import shutil
 import subprocess
 import sys
@@ -285,8 +286,9 @@ sys.stdin.readline()
 @pytest.mark.parametrize("wait", [0.2, *(pytest.param(0.2 + 0.0137 * i, marks=pytest.mark.ci) for i in range(1, 50))])
 def test_a_process_ends_quietly_while_a_page_is_open(wait):
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    quiet = {**os.environ, "TQDM_DISABLE": "1"}  # its kernels may have to be compiled first
     with (
-        subprocess.Popen([sys.executable, "-c", ENDS], text=True, **pipes) as process,
+        subprocess.Popen([sys.executable, "-c", ENDS], text=True, env=quiet, **pipes) as process,
         open_page(process.stdout.readline().strip()),
     ):
         time.sleep(wait)

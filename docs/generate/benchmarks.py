@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.published import PUBLISHED, read
 from benchmarks.variation import plot_variation
-from generate import address, bodies, fields, rewards, robots, tasks
+from generate import address, bodies, fields, rewards, robots, shapes, tasks
 from generate.markdown import table
 
 Row = dict[str, Any]
@@ -110,6 +110,7 @@ def tables() -> dict[str, str]:
         "speed-sources": sources([(TO_950, BRAX_TO_950, ROBOTS, MJLAB)]),
         "variation": variation(),
         "fields": fields.fields(),
+        "pairs": shapes.pairs(),
         **robots.tables(),
         **of_tasks(),
         "badges": address.badges(),
@@ -323,7 +324,13 @@ PAGES = (
     ROOT / "notebooks" / "README.md",
     *(
         ROOT / "docs" / name
-        for name in ("benchmarks.md", "robots.md", "api/model-numbers.md", "guides/your-own-task.md")
+        for name in (
+            "benchmarks.md",
+            "compiled-step.md",
+            "robots.md",
+            "api/model-numbers.md",
+            "guides/your-own-task.md",
+        )
     ),
     *sorted((ROOT / "docs" / "tasks").glob("*.md")),
 )

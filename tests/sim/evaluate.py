@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_loco.sim.compiled.symbols import Scalar, scalar
+from torchrl_loco.sim.compiled.ir.symbols import Scalar, scalar
 
 FUNCTIONS: dict[str, Callable[..., float]] = {
     "Math::root": np.sqrt,

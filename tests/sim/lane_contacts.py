@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from torchrl_loco.sim.compiled import lanes
 from torchrl_loco.sim.compiled.engine import Chain, Data, _kernel
+from torchrl_loco.sim.compiled.schedules import lanes
 from torchrl_loco.sim.compiled.step import launch_size
 
 FIELDS = 8

@@ -44,7 +44,7 @@ LAWS = {
 }
 """Choices for the friction of contacts. A step that is traced has the first alone."""
 SOLIDS = {
-    "box": {"contype": 6, "conaffinity": 0},
+    "box": {"contype": 14, "conaffinity": 8},
     "cylinder": {"contype": 2, "conaffinity": 0},
     "ellipsoid": {"contype": 2, "conaffinity": 0},
     "mesh": {"contype": 2, "conaffinity": 0, "mesh": "wedge"},

@@ -10,7 +10,9 @@ from lane_contacts import find_contacts
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import Simulation
-from torchrl_loco.sim.compiled import collision, lanes, unsupported
+from torchrl_loco.sim.compiled import unsupported
+from torchrl_loco.sim.compiled.collision import kinds
+from torchrl_loco.sim.compiled.schedules.lanes import description
 from torchrl_loco.sim.simulation import set_options
 
 STATES = 400
@@ -103,13 +105,13 @@ def assert_same(m, states, may_differ=lambda data, geoms: False):
 def is_upright(data, geoms):
     """Whether a cylinder or mesh is aligned with a plane: rounding chooses the lowest of its points in C MuJoCo."""
     plane, solid = (data.geom_xmat[g].reshape(3, 3) for g in geoms)
-    kinds = collision.CYLINDER, collision.MESH
-    return data.model.geom_type[geoms[1]] in kinds and np.abs(plane[:, 2] @ solid).max() > 1 - 1e-9
+    edged = kinds.CYLINDER, kinds.MESH
+    return data.model.geom_type[geoms[1]] in edged and np.abs(plane[:, 2] @ solid).max() > 1 - 1e-9
 
 
 def test_solids_touch_planes(monkeypatch):
     for name in ("ENOUGH_FRICTIONAL", "MOST_FRICTIONAL"):
-        monkeypatch.setattr(lanes, name, 64)  # so that all have a place
+        monkeypatch.setattr(description, name, 64)  # so that all have a place
     m = model(FLOORS, *(BODY.format(name=name, shape=shape) for name, (shape, _) in SOLIDS.items()))
     rng, states = np.random.default_rng(0), np.zeros((STATES, m.nq))
     for body in range(len(SOLIDS)):
@@ -146,6 +148,29 @@ def test_spheres_and_capsules_touch_boxes():
         counts
     )
     assert all(counts[(name, "box"), 2] > 100 for name in ("short", "long")), counts
+
+
+def test_boxes_touch_boxes(monkeypatch):
+    """Flat, on edges and at corners, deep and within the margin; a third of them without rounding."""
+    for name in ("ENOUGH_FRICTIONAL", "MOST_FRICTIONAL"):
+        monkeypatch.setattr(description, name, 40)
+    fixed = '<geom name="step" type="box" size=".1 .07 .04" margin=".01" euler="0 0 30"/>'
+    sizes = {"cube": ".08 .08 .05", "plank": ".2 .03 .01", "bar": ".02 .02 .15"}
+    bodies = [
+        f'<body><freejoint/><geom name="{name}" type="box" size="{size}" contype="0"/></body>'
+        for name, size in sizes.items()
+    ]
+    m, rng = model(fixed, *bodies), np.random.default_rng(0)
+    states = np.zeros((3 * STATES, m.nq))
+    for body in range(len(sizes)):
+        states[:, 7 * body : 7 * body + 3] = rng.uniform((-0.15, -0.15, -0.1), (0.15, 0.15, 0.1), (len(states), 3))
+        states[:, 7 * body + 3 : 7 * body + 7] = rng.normal(size=(len(states), 4))
+        quarters = rng.integers(0, 4, STATES) * np.pi / 4 + np.pi / 12  # from the turn of the step
+        turns = np.where(rng.random(STATES) < 0.5, quarters, rng.uniform(0, np.pi, STATES))
+        states[:STATES, 7 * body + 3 : 7 * body + 7] = [[np.cos(a), 0, 0, np.sin(a)] for a in turns]
+    counts = assert_same(m, states.astype(np.float32))
+    assert sum(counts.values()) > 1000
+    assert {number for _, number in counts} >= set(range(1, 9)), counts
 
 
 MASKED = """
@@ -191,7 +216,7 @@ def test_bodies_touch_the_ground_only():
 def test_the_deepest_contacts_stay(monkeypatch):
     """With and without friction. Limits of ball joints, which are among the latter, stay whatever they are."""
     for name in ("ENOUGH_FRICTIONAL", "MOST_FRICTIONAL", "MOST_FRICTIONLESS"):
-        monkeypatch.setattr(lanes, name, 3)
+        monkeypatch.setattr(description, name, 3)
     balls = [
         f'<geom size=".05" pos="{0.1 * i} {0.1 * condim} {0.02 * i}" condim="{condim}" margin="{0.001 * i}"/>'
         for condim in (1, 3)
@@ -223,4 +248,4 @@ def test_the_deepest_contacts_stay(monkeypatch):
 def test_there_are_places_for_what_a_body_stands_on():
     feet = "".join(f'<geom type="box" size=".1 .03 .02" pos="0 {0.1 * i} {0.001 * i}"/>' for i in range(7))
     m = model(FLOORS, f'<body pos="0 0 1"><freejoint/>{feet}<geom type="box" size=".1 .1 .1" pos="0 0 .2"/></body>')
-    assert lanes.Description(m).layout.frictional >= 28
+    assert description.Description(m).layout.frictional >= 28

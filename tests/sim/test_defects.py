@@ -12,11 +12,14 @@ from test_random_models import c_data, c_step, compiled_step
 from variation import all_varied
 
 from torchrl_loco.config import SimConfig
-from torchrl_loco.sim.compiled import collision, lanes, step, unsupported
-from torchrl_loco.sim.compiled.constraints import MANY_ITERATIONS, Softness
+from torchrl_loco.sim.compiled import step, unsupported
+from torchrl_loco.sim.compiled.collision import planes
 from torchrl_loco.sim.compiled.engine import Chain, _kernel
-from torchrl_loco.sim.compiled.parameters import VariedModel
-from torchrl_loco.sim.compiled.symbols import array, names, scalar
+from torchrl_loco.sim.compiled.ir.parameters import VariedModel
+from torchrl_loco.sim.compiled.ir.symbols import array, names, scalar
+from torchrl_loco.sim.compiled.physics.constraints import MANY_ITERATIONS, Softness
+from torchrl_loco.sim.compiled.schedules import lanes
+from torchrl_loco.sim.compiled.schedules.lanes import description
 from torchrl_loco.sim.overflow import Overflow
 from torchrl_loco.sim.simulation import choose_engine
 from torchrl_loco.sim.varied import Varied
@@ -208,8 +211,8 @@ def test_limits_of_ball_joints_have_places_beside_any_number_of_contacts(form, m
     state = [x[None].astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)]
     mujoco.mj_step(model, data)
     assert (data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)).sum() == 6
-    for standing, tolerance in ((lanes.STANDING, 1e-6), (0.0, 0.1)):  # with it, places for half of the contacts
-        monkeypatch.setattr(lanes, "STANDING", standing)
+    for standing, tolerance in ((description.STANDING, 1e-6), (0.0, 0.1)):  # with it, places for half of the contacts
+        monkeypatch.setattr(description, "STANDING", standing)
         step.texts.clear()
         sim = compiled_step(model, state)
         dropped = bool(sim.overflow.item() & int(Overflow.NARROWPHASE))
@@ -377,7 +380,7 @@ def test_tangents_are_normal_to_a_tilted_plane():
         normal = np.array(normal) / np.linalg.norm(normal)
         axis = normal + 1e-8 * np.array([1.0, -2.0, 3.0])
         tangent = evaluate(
-            collision.frame(array(normal), np.array(names("axis", 3), dtype=object)),
+            planes.frame(array(normal), np.array(names("axis", 3), dtype=object)),
             {f"axis[{i}]": axis[i] for i in range(3)},
         )
         assert normal @ tangent == pytest.approx(0, abs=1e-12)
@@ -431,10 +434,9 @@ def test_worlds_and_what_warp_adds_fit_a_block():
 def wide(model):
     """Returns the C++ in which the state of a world is declared, and its size checked."""
     text = lanes.source(model, 1)
-    head, check = text.split("// ---- One substep")[0], 'static_assert(sizeof(World) == Model::WORLD_BYTES, "size");'
-    return (
-        f"{{\n{head}\n{check}\n}}\n#undef INLINE\n#undef ROLLED\n#undef UNROLLED\n#undef OWN_DOFS\n#undef SHARED_LOOP\n"
-    )
+    head, check = text.split("// ---- Friction")[0], 'static_assert(sizeof(World) == Model::WORLD_BYTES, "size");'
+    macros = ("INLINE", "ROLLED_FOR", "UNROLLED_FOR", "OWN_DOFS", "SHARED_LOOP")
+    return "\n".join(["{", head, check, "}", *(f"#undef {macro}" for macro in macros), ""])
 
 
 @pytest.mark.parametrize("form", [0], indirect=True, ids=["lanes"])

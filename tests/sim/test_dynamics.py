@@ -10,8 +10,8 @@ from random_models import models
 
 import torchrl_loco.sim.models
 from torchrl_loco.sim.compiled import unsupported
-from torchrl_loco.sim.compiled.dynamics import Dynamics
-from torchrl_loco.sim.compiled.symbols import names
+from torchrl_loco.sim.compiled.ir.symbols import names
+from torchrl_loco.sim.compiled.physics.dynamics import Dynamics
 
 SETTINGS = {"deadline": None, "derandomize": True, "database": None, "phases": [hypothesis.Phase.generate]}
 EXACT = {"rtol": 1e-9, "atol": 1e-9}

@@ -24,6 +24,8 @@ PTX = {
     r'asm\("div\..*': "x = a / b;",
     r'asm\("rcp\..*': "x = 1.0f / a;",
     r'asm\("rsqrt\..*': "y = 1.0f / sqrtf(larger(x, 1e-30f));",
+    r'asm\("min\..*': "x = b < a ? b : a;",
+    r'asm\("max\..*': "x = a < b ? b : a;",
 }
 
 STIFF_LINK = """<body pos="{x} 0 {z}"><joint axis="0 1 0"/>

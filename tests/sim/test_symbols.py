@@ -12,8 +12,7 @@ from evaluate import evaluate
 from hypothesis import strategies as st
 
 from torchrl_loco.sim import models
-from torchrl_loco.sim.compiled.dynamics import Dynamics
-from torchrl_loco.sim.compiled.symbols import (
+from torchrl_loco.sim.compiled.ir.symbols import (
     Block,
     Scalar,
     absolute,
@@ -30,6 +29,7 @@ from torchrl_loco.sim.compiled.symbols import (
     sincos,
     sqrt,
 )
+from torchrl_loco.sim.compiled.physics.dynamics import Dynamics
 
 SYMBOLS = ("a", "b", "c")
 NUMBERS = st.sampled_from([-2.0, -1.0, 0.0, 0.5, 1.0, 3.0])

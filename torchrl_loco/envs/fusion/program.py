@@ -12,7 +12,7 @@ import torch
 
 from torchrl_loco.envs.fusion.nodes import MOST_NUMBERS, OF_INTEGERS, TYPES, WHERE, WRAPPING, CannotFuse, Node
 from torchrl_loco.envs.fusion.source import Source
-from torchrl_loco.sim.compiled.symbols import literal
+from torchrl_loco.sim.compiled.ir.symbols import literal
 
 LONG = 64
 """Rows of a user's tensor that are taken for those of the worlds, if there are as many worlds; fewer may be chance."""

@@ -8,24 +8,18 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 ``engine``           all worlds at once
 ``step``             the choice of a schedule, and the size of a launch
 ``support``          which models are supported
-``collision``        which geoms may touch, and with which parameters
-``traced``           one thread a world: a control step from top to bottom
-``symbols``          scalars whose arithmetic is traced, and blocks of C++
-``spatial``          spatial algebra, of both schedules
-``dynamics``         poses, inertias, forces; M x and (M + K)^-1 x by sweeps over the tree
-``actuators``        force of an actuator
-``constraints``      softness of constraints; rows of limits and dry friction
-``pyramid``          rows of a contact
-``ground_contacts``  contacts with planes of the world: a stiffness of a body each
-``dense_contacts``   all other contacts, and limits of ball joints
-``solver``           what Newton's loop, ``newton.h``, calls in traced code
-``sensors``          velocities and momenta of subtrees, touch, and contact forces of geoms
-``lanes``            a group of lanes a world: what ``lanes.h`` has to know about a model
-``shared``           the C++ of both: arithmetic, laws, Newton's loop, line search
-``links``            bodies that are welded together
-``parameters``       numbers of the model that differ from world to world
-``tables``           constants and tables as C++
 ``read_only``        the model that environments see
+``ir``               ``symbols``: scalars whose arithmetic is traced, and blocks of C++;
+                     ``parameters``: numbers of the model that differ from world to world;
+                     ``tables``: constants and tables as C++
+``physics``          ``spatial``, ``links``, ``dynamics``, ``actuators``, ``constraints``,
+                     ``pyramid``, ``sensors``, ``delicate``; ``arithmetic.h``, ``laws.h``
+``collision``        ``kinds``: how the shapes of two geoms touch; ``pairs``: which geoms may,
+                     and with which parameters; ``planes``, ``meshes``
+``schedules``        ``traced``, with ``solver``, ``ground_contacts``, ``dense_contacts``: one
+                     thread a world, a control step from top to bottom;
+                     ``lanes``: a group of lanes a world, by its headers;
+                     ``newton.h``, ``line_search.h``, ``shared``: what both run
 ===================  =====================================================================
 """
 

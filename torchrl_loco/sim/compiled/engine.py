@@ -12,7 +12,7 @@ import warp as wp
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.buffer import Buffer
-from torchrl_loco.sim.compiled.parameters import VariedModel
+from torchrl_loco.sim.compiled.ir.parameters import VariedModel
 from torchrl_loco.sim.compiled.read_only import ReadOnly, read_only
 from torchrl_loco.sim.compiled.step import (
     WARP,

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from torchrl_loco.sim.compiled import lanes, traced
-from torchrl_loco.sim.compiled.collision import needs_lanes
-from torchrl_loco.sim.compiled.parameters import VariedModel, nominal
+from torchrl_loco.sim.compiled.collision.pairs import needs_lanes
+from torchrl_loco.sim.compiled.ir.parameters import VariedModel, nominal
+from torchrl_loco.sim.compiled.schedules import lanes, traced
 
 TRACED_DOFS = 16
 """Most degrees of freedom of a body that is traced. A thread holds its state; for the humanoid that would be 12 KiB and

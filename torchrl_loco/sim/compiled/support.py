@@ -2,12 +2,13 @@
 
 import mujoco
 
-from torchrl_loco.sim.compiled import lanes
-from torchrl_loco.sim.compiled.actuators import BIASES
-from torchrl_loco.sim.compiled.collision import BOX, PLANE, ROUND, SOLID, Pair, is_elliptic, pairs
-from torchrl_loco.sim.compiled.dynamics import BALL, FREE
-from torchrl_loco.sim.compiled.parameters import VariedModel, nominal
-from torchrl_loco.sim.compiled.sensors import ANGULAR_MOMENTUM, SUBTREE_VELOCITY, TOUCH
+from torchrl_loco.sim.compiled.collision.kinds import PLANE, described, title
+from torchrl_loco.sim.compiled.collision.pairs import Pair, is_elliptic, kind, pairs
+from torchrl_loco.sim.compiled.ir.parameters import VariedModel, nominal
+from torchrl_loco.sim.compiled.physics.actuators import BIASES
+from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE
+from torchrl_loco.sim.compiled.physics.sensors import ANGULAR_MOMENTUM, SUBTREE_VELOCITY, TOUCH
+from torchrl_loco.sim.compiled.schedules import lanes
 from torchrl_loco.sim.compiled.step import is_traced
 from torchrl_loco.sim.varied import Varied
 
@@ -137,24 +138,19 @@ def _contacts(m: mujoco.MjModel) -> list[str]:
     for pair in pairs(m):
         if not _collides(m, pair):
             moving = moving or m.body_weldid[m.geom_bodyid[list(pair.geoms)]].all()
-            names = [mujoco.mjtGeom(int(m.geom_type[geom])).name.removeprefix("mjGEOM_").lower() for geom in pair.geoms]
-            kinds.add(" and ".join(names))
+            kinds.add(" and ".join(title(m.geom_type[geom]) for geom in pair.geoms))
     if kinds:
         choice = "; contacts='ground' leaves out those of moving bodies with each other" if moving else ""
-        found.append(
-            f"contacts of {', '.join(sorted(kinds))}: only spheres and capsules with each other and with boxes, and "
-            f"with planes of the world all of these, cylinders, ellipsoids and meshes{choice}"
-        )
+        found.append(f"contacts of {', '.join(sorted(kinds))}: compiled are {described()}{choice}")
     if is_elliptic(m) and m.pair_solreffriction.any():  # pyramids do without
         found.append("solreffriction of an explicit pair with an elliptic cone")
     return found
 
 
 def _collides(m: mujoco.MjModel, pair: Pair) -> bool:
-    first, second = (m.geom_type[geom] for geom in pair.geoms)
-    if first == PLANE:
-        return second in ROUND + SOLID and bool(m.body_weldid[m.geom_bodyid[pair.geoms[0]]] == 0)
-    return first in ROUND and second in (*ROUND, BOX)
+    first = pair.geoms[0]
+    of_world = m.geom_type[first] != PLANE or m.body_weldid[m.geom_bodyid[first]] == 0
+    return bool(kind(m, pair).points and of_world)
 
 
 def _sensors(m: mujoco.MjModel) -> list[str]:

@@ -1,0 +1,13 @@
+"""Which shapes touch which in the compiled step, from its table of pairs."""
+
+from generate.markdown import table
+from torchrl_loco.sim.compiled.collision.kinds import KINDS, title
+
+
+def pairs() -> str:
+    """Returns a row for each pair of shapes: its contacts, and the schedules that have it."""
+    rows = [
+        [title(first), title(second), str(kind.points), "both" if kind.traced else "lanes"]
+        for (first, second), kind in KINDS.items()
+    ]
+    return table(["first", "second", "contacts at most", "schedule"], rows)

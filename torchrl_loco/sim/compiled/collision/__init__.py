@@ -1,0 +1,1 @@
+"""Which geoms may touch, with which parameters, and how the shapes of a pair do."""

@@ -1,0 +1,71 @@
+"""The shapes of geoms, and how two of them touch: each pair is an entry of :data:`KINDS` and a function of lanes."""
+
+import dataclasses
+
+import mujoco
+
+PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
+    for kind in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
+)
+SHAPES = (SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)
+"""In the order of ``enum Shape`` in ``laws.h``."""
+SOLID = (ELLIPSOID, CYLINDER, BOX, MESH)
+"""Shapes that are no segment with a radius."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """How two shapes touch.
+
+    Attributes:
+        points: contacts that a pair of geoms can have.
+        function: the function of lanes that finds them, ``collide_...`` in ``schedules/lanes``.
+        traced: whether the schedule of one thread a world has it too.
+    """
+
+    points: int
+    function: str
+    traced: bool = False
+
+
+KINDS = {
+    (PLANE, SPHERE): Kind(1, "round_on_plane", traced=True),
+    (PLANE, CAPSULE): Kind(2, "round_on_plane", traced=True),
+    (PLANE, ELLIPSOID): Kind(1, "solid_on_plane"),
+    (PLANE, CYLINDER): Kind(4, "solid_on_plane"),
+    (PLANE, BOX): Kind(4, "solid_on_plane"),
+    (PLANE, MESH): Kind(4, "solid_on_plane"),
+    (SPHERE, SPHERE): Kind(1, "round_and_round", traced=True),
+    (SPHERE, CAPSULE): Kind(1, "round_and_round", traced=True),
+    (CAPSULE, CAPSULE): Kind(2, "round_and_round", traced=True),
+    (SPHERE, BOX): Kind(1, "round_and_box"),
+    (CAPSULE, BOX): Kind(2, "round_and_box"),
+    (BOX, BOX): Kind(8, "box_and_box"),
+}
+"""What is compiled, by the two shapes, the one of the smaller number first. A plane belongs to the world."""
+
+NOT_COMPILED = Kind(0, "")
+
+FUNCTIONS = tuple(dict.fromkeys(kind.function for kind in KINDS.values()))
+"""The functions of lanes, in the order in which they look at their pairs."""
+
+PLANE_FUNCTIONS = {kind.function for (first, _), kind in KINDS.items() if first == PLANE}
+"""Those of contacts with planes of the world. The others look at pairs whose bounding spheres are near."""
+
+POINT_BITS = max(kind.points - 1 for kind in KINDS.values()).bit_length()
+"""Bits of the number of a contact within its pair."""
+
+
+def title(shape: int) -> str:
+    """Returns the name of a shape, in lower case."""
+    return mujoco.mjtGeom(shape).name.removeprefix("mjGEOM_").lower()
+
+
+def described() -> str:
+    """Returns which shapes touch which, in words."""
+    with_: dict[int, list[str]] = {}
+    for first, second in KINDS:
+        with_.setdefault(first, []).append(title(second))
+    titles = {shape: "plane of the world" if shape == PLANE else title(shape) for shape in with_}
+    return "; ".join(f"{titles[shape]} with {', '.join(others)}" for shape, others in with_.items())

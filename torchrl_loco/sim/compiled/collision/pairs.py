@@ -1,0 +1,181 @@
+"""Which geoms may touch, and with which parameters.
+
+What MuJoCo decides per contact (which pairs may touch, mixing of parameters) is decided here per pair of geoms, once.
+Source: MuJoCo's documentation, chapter Computation ("Collision detection").
+"""
+
+import dataclasses
+
+import mujoco
+
+from torchrl_loco.sim.compiled.collision.kinds import KINDS, NOT_COMPILED, Kind
+from torchrl_loco.sim.compiled.ir.parameters import Number, largest, varies
+from torchrl_loco.sim.compiled.ir.symbols import Scalar, select
+from torchrl_loco.sim.compiled.physics.dynamics import MINVAL
+from torchrl_loco.sim.models import NEVER
+
+MINMU = 1e-5
+"""MuJoCo's mjMINMU."""
+SLIPPERY, LEAST = 0.03, 1e-4
+"""Up to this friction the regularisation of a contact is no less than this share of the bodies' inverse inertia."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """Two geoms that may touch, and the parameters of their contacts.
+
+    Attributes:
+        geoms: their ids, the simpler shape first; the normal points from the first to the second.
+        condim: 1 (no friction), 3 (sliding), 4 (torsional friction too) or 6 (rolling friction too).
+        friction: sliding friction coefficient, along the first tangent of the contact, 0 without friction.
+        friction_ratio: that along the second tangent over the first; 1 unless an explicit pair says otherwise.
+        torsional: torsional friction coefficient (m), 0 without.
+        rolling: rolling friction coefficient (m), about the first tangent, 0 without.
+        rolling_ratio: that about the second tangent over the first; 1 unless an explicit pair says otherwise.
+        margin: distance below which a contact is active (m).
+        solref: reference parameters of the constraint, ``(2,)``.
+        solimp: impedance parameters, ``(5,)``.
+        weight: approximate inverse inertia of the two bodies (1/kg).
+    """
+
+    geoms: tuple[int, int]
+    condim: int
+    friction: Number
+    torsional: Number
+    rolling: Number
+    margin: float
+    solref: tuple[float, ...]
+    solimp: tuple[float, ...]
+    weight: Number
+    friction_ratio: Number = 1.0
+    rolling_ratio: Number = 1.0
+
+
+def pairs(m: mujoco.MjModel) -> list[Pair]:
+    """Returns all pairs of geoms that may touch: explicit ones, then those of MuJoCo's filters.
+
+    The filters are by type, body, parent and exclusion; explicit pairs pass them, but for geoms that cannot move
+    relative to each other.
+    """
+    weld = m.body_weldid[m.geom_bodyid]
+    parent_weld = m.body_weldid[m.body_parentid[weld]]
+    filter_parent = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
+    excluded = set(m.exclude_signature.tolist())
+    explicit = [tuple(sorted((int(m.pair_geom1[i]), int(m.pair_geom2[i])))) for i in range(m.npair)]
+    found = [
+        _explicit_pair(m, i) for i, (a, b) in enumerate(explicit) if weld[a] != weld[b] and m.pair_margin[i] > NEVER
+    ]
+    for a in range(m.ngeom):
+        for b in range(a + 1, m.ngeom):
+            if (a, b) in explicit:
+                continue
+            bodies = sorted((m.geom_bodyid[a], m.geom_bodyid[b]))
+            masked = not (m.geom_contype[a] & m.geom_conaffinity[b] or m.geom_contype[b] & m.geom_conaffinity[a])
+            related = weld[a] and weld[b] and (weld[a] == parent_weld[b] or weld[b] == parent_weld[a])
+            if masked or weld[a] == weld[b] or (filter_parent and related):
+                continue
+            if (bodies[0] << 16) + bodies[1] in excluded:
+                continue
+            found.append(_pair(m, *sorted((a, b), key=lambda g: (m.geom_type[g], g))))
+    return found
+
+
+def is_elliptic(m: mujoco.MjModel) -> bool:
+    """Returns whether friction of contacts is bounded by elliptic cones, not by pyramids."""
+    return bool(m.opt.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC))
+
+
+def kind(m: mujoco.MjModel, pair: Pair) -> Kind:
+    """Returns how the shapes of a pair touch: that of no contacts, if it is not compiled."""
+    first, second = m.geom_type[list(pair.geoms)].tolist()
+    return KINDS.get((first, second), NOT_COMPILED)
+
+
+def needs_lanes(m: mujoco.MjModel) -> bool:
+    """Returns whether a model has contacts that only lanes can do.
+
+    These are those of shapes that are not traced and of explicit pairs, and those with elliptic cones or friction
+    against turning.
+    """
+    slides = 1 if is_elliptic(m) else 3
+    return bool(m.npair) or any(pair.condim > slides or not kind(m, pair).traced for pair in pairs(m))
+
+
+def contact_weight(m: mujoco.MjModel, pair: Pair) -> Number:
+    """Returns the approximate inverse inertia along a row of a contact; along the normal, if its cone is elliptic."""
+    if pair.condim == 1 or is_elliptic(m):
+        return pair.weight
+    squared = pair.friction * pair.friction
+    return pair.weight * (1 + squared) * 2 * squared / m.opt.impratio
+
+
+def least_regularisation(pair: Pair) -> Number:
+    """Returns what the regularisation of a row of a contact is at least.
+
+    MuJoCo makes a pyramid of little friction stiffer than its bodies by the inverse square of the friction, 5e5 at
+    0.001: in single precision nothing would be left of the bodies beside it. There it ends where the acceleration
+    along the normal is off by some 1e-4 of itself.
+    """
+    least = largest(MINVAL, LEAST * pair.weight)
+    if pair.condim == 1:
+        return MINVAL
+    if isinstance(pair.friction, Scalar):
+        return select(pair.friction, "<=", SLIPPERY, least, MINVAL)
+    return least if pair.friction <= SLIPPERY else MINVAL
+
+
+def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
+    """Returns a pair with its mixed parameters (MuJoCo's ``mj_contactParam``)."""
+    one_decides = m.geom_priority[a] != m.geom_priority[b]
+    if one_decides:
+        first = 1.0 if m.geom_priority[a] > m.geom_priority[b] else 0.0
+        condim = m.geom_condim[a if first else b]
+        friction = m.geom_friction[a if first else b]
+    else:
+        mix = m.geom_solmix[[a, b]]
+        large = mix >= MINVAL
+        first = mix[0] / mix.sum() if large.all() else (0.5 if not large.any() else float(large[0]))
+        condim = max(m.geom_condim[a], m.geom_condim[b])
+        friction = [largest(m.geom_friction[a, k], m.geom_friction[b, k]) for k in range(3)]
+    solref = m.geom_solref[[a, b]]
+    if one_decides or (solref[:, 0] > 0).all():
+        solref = first * solref[0] + (1 - first) * solref[1]
+    else:
+        solref = solref.min(axis=0)
+    solimp = first * m.geom_solimp[a] + (1 - first) * m.geom_solimp[b]
+    weight = m.body_invweight0[m.geom_bodyid[[a, b]], 0].sum()
+    margin = m.geom_margin[a] + m.geom_margin[b]
+    sliding, torsional, rolling = (
+        largest(x, MINMU) if condim >= least else 0.0 for x, least in zip(friction, (3, 4, 6), strict=True)
+    )
+    return Pair(
+        (a, b), int(condim), sliding, torsional, rolling, float(margin), tuple(solref), tuple(solimp), float(weight)
+    )
+
+
+def _explicit_pair(m: mujoco.MjModel, i: int) -> Pair:
+    """Returns a pair with the parameters that the model gives it."""
+    a, b = sorted((int(m.pair_geom1[i]), int(m.pair_geom2[i])), key=lambda g: m.geom_type[g])
+    condim = int(m.pair_dim[i])
+    sliding, second, torsional, rolling, second_rolling = (
+        largest(x, MINMU) if condim >= least else 0.0
+        for x, least in zip(m.pair_friction[i], (3, 3, 4, 6, 6), strict=True)
+    )
+    return Pair(
+        geoms=(a, b),
+        condim=condim,
+        friction=sliding,
+        torsional=torsional,
+        rolling=rolling,
+        margin=float(m.pair_margin[i]),
+        solref=tuple(m.pair_solref[i]),
+        solimp=tuple(m.pair_solimp[i]),
+        weight=float(m.body_invweight0[m.geom_bodyid[[a, b]], 0].sum()),
+        friction_ratio=_ratio(second, sliding),
+        rolling_ratio=_ratio(second_rolling, rolling),
+    )
+
+
+def _ratio(a: Number, b: Number) -> Number:
+    same = not varies(a) and not varies(b) and a == b
+    return 1.0 if same else a / b

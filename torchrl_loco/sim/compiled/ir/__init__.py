@@ -1,0 +1,1 @@
+"""Scalars that are traced, numbers of a model that vary, and how both become C++."""

@@ -1,0 +1,133 @@
+"""Numbers of a model as the compiled step has them: constants, or read for each world where they vary.
+
+Which rows and axes there are is decided once, on nominal numbers; a number that varies counts as one that is not zero.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeGuard
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.sim.compiled.ir.symbols import Scalar, leaves, maximum
+from torchrl_loco.sim.varied import Varied, field, subtree_masses
+
+Number = float | Scalar
+"""A constant, or what varies."""
+
+
+class VariedModel:
+    """Stands in for an ``MjModel``: where numbers vary, its arrays hold scalars that read them for each world.
+
+    Args:
+        m: the model.
+        varied: which of its numbers vary.
+
+    Attributes:
+        nominal: the model.
+        varied: which of its numbers vary.
+        opt: its options, likewise.
+    """
+
+    def __init__(self, m: mujoco.MjModel, varied: Varied) -> None:
+        self.nominal, self.varied = m, varied
+        self._arrays: dict[str, np.ndarray] = {}
+        for name, places in varied.places.items():
+            values = field(m, name).astype(object)
+            for place, column in zip(places, range(varied.count)[varied.columns[name]], strict=True):
+                values.flat[place] = number(column)
+            self._arrays[name] = values
+        if "dof_frictionloss" in self._arrays:  # MuJoCo leaves out what is negative
+            losses = self._arrays["dof_frictionloss"]
+            losses[:] = [maximum(x, 0) if varies(x) else x for x in losses]
+        if "body_mass" in self._arrays:
+            self._arrays["body_subtreemass"] = self._subtree_masses()
+        self.opt = _Options(m.opt, self._arrays.get("gravity"))
+
+    def _subtree_masses(self) -> np.ndarray:
+        m = self.nominal
+        masses = subtree_masses(m, self._arrays["body_mass"])
+        return np.array([x if varies(x) else y for x, y in zip(masses, m.body_subtreemass, strict=True)], dtype=object)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return self._arrays[name] if name in self._arrays else getattr(self.nominal, name)
+
+
+class _Options:
+    def __init__(self, options: Any, gravity: np.ndarray | None) -> None:
+        self._options = options
+        if gravity is not None:
+            self.gravity = gravity
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._options, name)
+
+
+def number(column: int) -> Scalar:
+    """Returns the number at a place in the row of a world, the C++ variable ``number{column}``."""
+    return Scalar("number", f"number{column}", column)
+
+
+def varies(x: Any) -> TypeGuard[Scalar]:
+    """Returns whether a number of a model, or what is made of it, varies."""
+    return isinstance(x, Scalar) and x.constant is None
+
+
+def constant(x: Number) -> float:
+    """Returns the value of a number that does not vary."""
+    return x.args[0] if isinstance(x, Scalar) else float(x)
+
+
+def present(values: np.ndarray) -> bool:
+    """Returns whether any number is not zero, or varies."""
+    return any(varies(x) or constant(x) != 0 for x in values.flat)
+
+
+def largest(a: Number, b: Number) -> Number:
+    """Returns the larger of two numbers of a model."""
+    return maximum(a, b) if varies(a) or varies(b) else max(constant(a), constant(b))
+
+
+def nominal(m: Any) -> mujoco.MjModel:
+    """Returns a model with all its numbers as constants."""
+    return m.nominal if isinstance(m, VariedModel) else m
+
+
+def is_of_model(x: Scalar) -> bool:
+    """Returns whether an expression is made of numbers of the model alone, and not of the state."""
+    parts = [arg for arg in x.args if isinstance(arg, Scalar)]
+    return x.op in ("const", "number") if not parts else all(map(is_of_model, parts))
+
+
+def numbers_in(expressions: Iterable[Scalar]) -> list[Scalar]:
+    """Returns the numbers of the model that expressions read, in the order of their places."""
+    return sorted(leaves(expressions, "number"), key=lambda x: x.args[1])
+
+
+def evaluate(x: Scalar, row: Sequence[float] | np.ndarray) -> float:
+    """Returns the value of an expression of numbers of the model for a row of them."""
+    a = [evaluate(arg, row) for arg in x.args if isinstance(arg, Scalar)]
+    match x.op:
+        case "const":
+            return x.args[0]
+        case "number":
+            return float(row[x.args[1]])
+        case "neg":
+            return -a[0]
+        case "+":
+            return a[0] + a[1]
+        case "-":
+            return a[0] - a[1]
+        case "*":
+            return a[0] * a[1]
+        case "/":
+            return a[0] / a[1]
+        case "call" if x.args[0] == "Math::larger":
+            return max(a)
+        case "select" if x.args[0] == "<=":
+            return a[2] if a[0] <= a[1] else a[3]
+    raise NotImplementedError(f"{x.op} of numbers of a model: add it here")

@@ -1,0 +1,88 @@
+"""Rigid links: bodies that are welded together."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.sim.compiled.ir.parameters import Number, present, varies
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where a body is: in a link, or in the world if ``link`` is -1.
+
+    Attributes:
+        link: index of the link.
+        position: of the body in the frame of the link, ``(3,)`` (m).
+        quaternion: the same for its orientation, ``(4,)``.
+    """
+
+    link: int
+    position: np.ndarray
+    quaternion: np.ndarray
+
+    def point(self, offset: np.ndarray) -> np.ndarray:
+        """Returns a point of the body in the frame of the link."""
+        return self.position + matrix(self.quaternion) @ offset
+
+    def turn(self, quaternion: np.ndarray) -> np.ndarray:
+        """Returns an orientation in the body as one in the link."""
+        return product(self.quaternion, quaternion)
+
+
+@dataclasses.dataclass
+class Mass:
+    """Mass, center and moments of inertia of a part of a link, in its frame: constants, or scalars where they vary."""
+
+    mass: Number
+    center: np.ndarray
+    moments: np.ndarray
+
+    @classmethod
+    def join(cls, m: mujoco.MjModel, places: Sequence[Place], bodies: Sequence[int]) -> "Mass":
+        """Returns several bodies of one link as one."""
+        masses = m.body_mass[bodies]
+        centers = np.array([places[b].point(m.body_ipos[b]) for b in bodies])
+        mass = masses.sum()
+        center = masses @ centers / mass if len(bodies) > 1 and present(masses) else centers[0]
+        moments = np.zeros((3, 3))
+        for b, d in zip(bodies, centers - center, strict=True):
+            axes = matrix(places[b].turn(m.body_iquat[b]))
+            moments = moments + axes @ np.diag(m.body_inertia[b]) @ axes.T
+            moments = moments + m.body_mass[b] * (d @ d * np.eye(3) - np.outer(d, d))
+        return cls(mass if varies(mass) else float(mass), center, moments)
+
+
+def matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Returns the matrix of a quaternion, exact zeros where rounding left something else."""
+    result = np.zeros(9)
+    mujoco.mju_quat2Mat(result, np.asarray(quaternion, float))
+    result[np.abs(result) < 1e-12] = 0
+    return result.reshape(3, 3)
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns the product of two quaternions."""
+    result = np.zeros(4)
+    mujoco.mju_mulQuat(result, a, b)
+    return result
+
+
+def moving_bodies(m: mujoco.MjModel) -> list[int]:
+    """Returns the bodies that have joints, each the first body of a link."""
+    return [b for b in range(1, m.nbody) if m.body_dofnum[b]]
+
+
+def places(m: mujoco.MjModel) -> list[Place]:
+    """Returns where each body is."""
+    links = {b: i for i, b in enumerate(moving_bodies(m))}
+    found = [Place(-1, np.zeros(3), np.array([1.0, 0, 0, 0]))]
+    for b in range(1, m.nbody):
+        parent = found[m.body_parentid[b]]
+        if b in links:
+            found.append(Place(links[b], np.zeros(3), np.array([1.0, 0, 0, 0])))
+        else:
+            found.append(Place(parent.link, parent.point(m.body_pos[b]), parent.turn(m.body_quat[b])))
+    return found

@@ -1,0 +1,187 @@
+"""One world stepped by a group of lanes: the text of a compiled control step for bodies of more than a few joints.
+
+:func:`source` puts what a model has (``members``: sizes, constants and tables) into the algorithm of the headers beside
+this file, as functions of a struct ``Model``: a parameter that is the same everywhere is a constant there, any other a
+table. Those that differ from world to world are functions of struct ``Varied``, which read the row of the world: its
+numbers, and what follows from them, which is computed when the state is evaluated without stepping, or where a lane
+needs it.
+"""
+
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.sim.compiled.collision.kinds import (
+    BOX as BOX,
+)
+from torchrl_loco.sim.compiled.collision.kinds import (
+    CAPSULE as CAPSULE,
+)
+from torchrl_loco.sim.compiled.collision.kinds import (
+    CYLINDER as CYLINDER,
+)
+from torchrl_loco.sim.compiled.collision.kinds import (
+    FUNCTIONS,
+)
+from torchrl_loco.sim.compiled.collision.kinds import (
+    KINDS as KINDS,
+)
+from torchrl_loco.sim.compiled.collision.kinds import (
+    MESH as MESH,
+)
+from torchrl_loco.sim.compiled.collision.kinds import (
+    PLANE as PLANE,
+)
+from torchrl_loco.sim.compiled.collision.kinds import (
+    POINT_BITS as POINT_BITS,
+)
+from torchrl_loco.sim.compiled.collision.kinds import (
+    SHAPES as SHAPES,
+)
+from torchrl_loco.sim.compiled.collision.kinds import (
+    SOLID as SOLID,
+)
+from torchrl_loco.sim.compiled.collision.meshes import Mesh as Mesh
+from torchrl_loco.sim.compiled.collision.pairs import (
+    Pair as Pair,
+)
+from torchrl_loco.sim.compiled.collision.pairs import (
+    contact_weight as contact_weight,
+)
+from torchrl_loco.sim.compiled.collision.pairs import (
+    is_elliptic as is_elliptic,
+)
+from torchrl_loco.sim.compiled.collision.pairs import (
+    kind as kind,
+)
+from torchrl_loco.sim.compiled.collision.pairs import (
+    least_regularisation as least_regularisation,
+)
+from torchrl_loco.sim.compiled.collision.pairs import (
+    pairs as pairs,
+)
+from torchrl_loco.sim.compiled.collision.planes import LEAST_ALIGNED as LEAST_ALIGNED
+from torchrl_loco.sim.compiled.ir import symbols as symbols
+from torchrl_loco.sim.compiled.ir.parameters import Number as Number
+from torchrl_loco.sim.compiled.ir.parameters import VariedModel
+from torchrl_loco.sim.compiled.ir.parameters import nominal as nominal
+from torchrl_loco.sim.compiled.ir.parameters import present as present
+from torchrl_loco.sim.compiled.ir.parameters import varies as varies
+from torchrl_loco.sim.compiled.ir.tables import Tables as Tables
+from torchrl_loco.sim.compiled.physics import spatial
+from torchrl_loco.sim.compiled.physics.actuators import Actuator as Actuator
+from torchrl_loco.sim.compiled.physics.actuators import acting as acting
+from torchrl_loco.sim.compiled.physics.constraints import Softness
+from torchrl_loco.sim.compiled.physics.constraints import both_sides as both_sides
+from torchrl_loco.sim.compiled.physics.constraints import near as near
+from torchrl_loco.sim.compiled.physics.constraints import tolerance as tolerance
+from torchrl_loco.sim.compiled.physics.delicate import LEAST_PIVOT as LEAST_PIVOT
+from torchrl_loco.sim.compiled.physics.delicate import is_delicate as is_delicate
+from torchrl_loco.sim.compiled.physics.dynamics import BALL as BALL
+from torchrl_loco.sim.compiled.physics.dynamics import FREE as FREE
+from torchrl_loco.sim.compiled.physics.dynamics import HINGE as HINGE
+from torchrl_loco.sim.compiled.physics.dynamics import MINVAL as MINVAL
+from torchrl_loco.sim.compiled.physics.dynamics import SLIDE as SLIDE
+from torchrl_loco.sim.compiled.physics.links import Mass as Mass
+from torchrl_loco.sim.compiled.physics.links import matrix as matrix
+from torchrl_loco.sim.compiled.physics.links import moving_bodies as moving_bodies
+from torchrl_loco.sim.compiled.physics.links import places as places
+from torchrl_loco.sim.compiled.physics.sensors import ANGULAR_MOMENTUM as ANGULAR_MOMENTUM
+from torchrl_loco.sim.compiled.physics.sensors import SUBTREE_VELOCITY as SUBTREE_VELOCITY
+from torchrl_loco.sim.compiled.physics.sensors import TOUCH as TOUCH
+from torchrl_loco.sim.compiled.physics.sensors import subtree as subtree
+from torchrl_loco.sim.compiled.schedules import shared
+from torchrl_loco.sim.compiled.schedules.lanes.description import Description as Description
+from torchrl_loco.sim.compiled.schedules.lanes.description import is_implicitfast as is_implicitfast
+from torchrl_loco.sim.compiled.schedules.lanes.members import members
+
+FILES = (
+    "world",
+    "friction",
+    "group",
+    "kinematics",
+    "dynamics",
+    "contacts",
+    "planes",
+    "segments",
+    "boxes",
+    "box_pairs",
+    "collide",
+    "rows",
+    "sides",
+    "eliminate",
+    "limbs",
+    "solve",
+    "outputs",
+    "step",
+)
+"""The headers, in their order: each but the first two and the last has a struct that is built on the one before."""
+HEADERS = "\n".join(pathlib.Path(__file__).with_name(f"{name}.h").read_text() for name in FILES)
+LINE_SEARCH = shared.line_search("Model::scale()", "Model::ls_tolerance()", "Model::ls_near()", "Model::LS_ITERATIONS")
+NEWTON = shared.newton(
+    "Model::scale()",
+    "Model::tolerance()",
+    "Model::ITERATIONS",
+    "Model::IMPLICIT_DAMPING",
+    guesses="guesses",
+    delicate="Model::DELICATE",
+)
+
+
+def source(
+    m: mujoco.MjModel,
+    substeps: int,
+    *,
+    with_subtree_com: bool = False,
+    contact_geoms: Sequence[int] = (),
+    contact_rows: int = 1,
+) -> str:
+    """Returns the C++ of a control step of one world, the body of a function of its arrays.
+
+    Args:
+        m: the model, or a ``VariedModel``.
+        substeps: physics steps; 0 evaluates the state without stepping.
+        with_subtree_com: whether the centers of mass of the trees are written.
+        contact_geoms: geoms whose contact forces are written.
+        contact_rows: how many rows of them: one for the last substep, or one for each.
+    """
+    d = Description(m)
+    contacts: dict[str, Any] = {"contact_geoms": contact_geoms, "contact_rows": contact_rows}
+    tables = members(d, substeps, with_subtree_com=with_subtree_com, **contacts)
+    parts = {
+        "SUBTREE_COM": with_subtree_com,
+        "MOMENTA": len(d.momenta) > 0,
+        "CONTACT_GEOMS": len(contact_geoms) > 0,
+        "ELLIPTIC": d.elliptic,
+        "TURNING": d.layout.directions > 3,
+        "SOME_LACK_EDGES": d.some_lack_edges,
+        "LIMBS": d.limbs is not None,
+        "MESHES": bool(d.meshes),
+        "SOLIDS": d.has_solids,
+        **{function.upper(): function in d.functions for function in FUNCTIONS},
+    }
+    defined = [f"#define WITH_{part} {asked:d}" for part, asked in parts.items()]
+    text = "\n".join([*defined, HEADERS, *(f"#undef WITH_{part}" for part in parts), ""])
+    text = tables.use(text.replace("//ACTUATOR", d.actuator().as_cpp()))
+    for mark, value in {
+        "SHARED": shared.LAWS,
+        "SOFTNESS": Softness.as_cpp(),
+        "SPATIAL": spatial.as_cpp(),
+        "LINE_SEARCH": LINE_SEARCH,
+        "NEWTON": NEWTON,
+        "MODEL": tables.text(),
+        "COLLIDE": d.collide(),
+        "ELIMINATE": d.elimination(),
+        "VARYING": tables.varied_text(),
+        "DERIVE": "" if substeps else tables.row.derive(),
+    }.items():
+        text = text.replace(f"//{mark}\n", f"{value}\n")
+    return text
+
+
+def nominal_row(m: VariedModel) -> np.ndarray:
+    """Returns what the lanes read of the model itself: its numbers, then what follows from them."""
+    return members(Description(m), 0).row.nominal(m.varied)

@@ -1,0 +1,296 @@
+"""What lanes have to know about a model: its links, pairs, limits, and how much of a world fits a multiprocessor."""
+
+import copy
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.sim.compiled.collision.kinds import (
+    CAPSULE,
+    FUNCTIONS,
+    MESH,
+    PLANE,
+    PLANE_FUNCTIONS,
+    SOLID,
+)
+from torchrl_loco.sim.compiled.collision.meshes import Mesh
+from torchrl_loco.sim.compiled.collision.pairs import (
+    Pair,
+    is_elliptic,
+    kind,
+    pairs,
+)
+from torchrl_loco.sim.compiled.ir import symbols
+from torchrl_loco.sim.compiled.ir.parameters import nominal, present, varies
+from torchrl_loco.sim.compiled.physics.actuators import Actuator, acting
+from torchrl_loco.sim.compiled.physics.constraints import Softness, both_sides
+from torchrl_loco.sim.compiled.physics.dynamics import BALL, HINGE, SLIDE
+from torchrl_loco.sim.compiled.physics.links import Mass, matrix, moving_bodies, places
+from torchrl_loco.sim.compiled.physics.sensors import ANGULAR_MOMENTUM, SUBTREE_VELOCITY, TOUCH, subtree
+from torchrl_loco.sim.compiled.schedules.lanes.layout import Layout, Limbs
+from torchrl_loco.sim.models import NEVER, home_pose
+
+MOST_VERTICES = 4000
+"""Vertices of all meshes that touch something: tables count their corners with 16 bits."""
+LANES = 32
+"""Threads of a GPU that step a world."""
+BLOCK_BYTES = 48 * 1024
+"""Static shared memory that a block of a GPU may have."""
+WARP_BYTES = 4 * LANES
+"""What Warp takes of it for the threads of a world, 4 bytes each, whether a kernel has tiles or not."""
+WORLD_BYTES = (
+    11136,
+    BLOCK_BYTES // 4 - WARP_BYTES,
+    18720,
+    22592,
+    BLOCK_BYTES // 2 - WARP_BYTES,
+    BLOCK_BYTES - WARP_BYTES,
+)
+"""Shared memory that a world may fill: the first that leaves room for enough contacts. So 20 and 16 worlds in blocks of
+4, 12, 10 and 8 in blocks of 2, and 4 fit a multiprocessor of an H100 or H200."""
+MULTIPROCESSOR_BYTES, SYSTEM_BYTES = 228 * 1024, 1024
+"""Shared memory of a multiprocessor of an H100 or H200, and what the system takes of it for each block."""
+SCHEDULERS, REGISTERS = 4, 16 * 1024
+"""Of a multiprocessor, and the registers of each, which it deals out to whole warps."""
+MOST_WORLDS = 4
+"""Worlds of a block, at most."""
+ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 28, 16
+"""Places for contacts with friction, which a world should have and may have, and for those without.
+
+A body that touches the floor in more places when it stands should have, and has, those.
+"""
+STANDING, FAR = 0.025, 1e3
+"""Height over its lowest point of what a body stands on or may at once, and a height that no pose exceeds (m)."""
+
+
+def is_implicitfast(m: mujoco.MjModel) -> bool:
+    """Returns whether velocities advance by (M - h D) a' = M a, D the derivatives of the joints' forces by them.
+
+    With ``euler`` D is that of the dampers alone, or zero.
+    """
+    return m.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+
+
+class Description:
+    """What lanes have to know about a model.
+
+    Args:
+        m: the model.
+
+    Attributes:
+        pairs: of geoms that may touch, in the order in which lanes look at them: planes first, in both parts those with
+            friction, and in all parts by their function.
+    """
+
+    def __init__(self, m: mujoco.MjModel) -> None:
+        self.m = m
+        self.places = places(m)
+        self.moving = moving_bodies(m)
+        if not self.moving or m.nv > 64:
+            raise ValueError(f"{m.nv} degrees of freedom, more than 64")
+        self.roots = sorted({int(m.body_rootid[b]) for b in self.moving})
+        self.members = [[b for b in range(1, m.nbody) if self.places[b].link == i] for i in range(len(self.moving))]
+        self.masses = [Mass.join(m, self.places, bodies) for bodies in self.members]
+        self.ancestors = [sum(1 << int(j) for j in self.dofs_to_root(d)) for d in range(m.nv)]
+        self.pairs = self._sorted_pairs(pairs(m))
+        self.functions = [f for f in FUNCTIONS if f in {kind(m, p).function for p in self.pairs}]
+        self.condims = {p.condim for p in self.pairs} - {1}
+        self.elliptic = bool(self.condims) and is_elliptic(m)
+        self.some_lack_edges = len(self.condims) > 1 and not self.elliptic
+        self.geoms = sorted({g for p in self.pairs for g in p.geoms if m.geom_type[g] != PLANE})
+        self.has_solids = any(m.geom_type[g] in SOLID for g in self.geoms)
+        used = sorted({int(m.geom_dataid[g]) for g in self.geoms if m.geom_type[g] == MESH})
+        self.meshes = {mesh: Mesh.of(m, mesh) for mesh in used}
+        vertices = sum(len(mesh.vertices) for mesh in self.meshes.values())
+        if vertices > MOST_VERTICES:
+            raise ValueError(f"meshes with {vertices} vertices, more than {MOST_VERTICES}")
+        limited = [j for j in range(m.njnt) if m.jnt_limited[j]]
+        self.limited = [j for j in limited if m.jnt_type[j] in (SLIDE, HINGE)]
+        self.limit_sides = 2 if any(both_sides(m, j) for j in self.limited) else 1
+        self.limited_balls = [j for j in limited if m.jnt_type[j] == BALL]
+        losses = m.dof_frictionloss
+        self.losses = [d for d in range(m.nv) if varies(losses[d]) or losses[d] > 0]
+        sensors = [(int(m.sensor_type[i]), int(m.sensor_objid[i]), int(m.sensor_adr[i])) for i in range(m.nsensor)]
+        self.subtrees = [s for s in sensors if s[0] == SUBTREE_VELOCITY]
+        self.momenta = [s for s in sensors if s[0] == ANGULAR_MOMENTUM]
+        self.touch = [s for s in sensors if s[0] == TOUCH]
+        self.acting = acting(m)
+        self.actuators = [Actuator.of(m, a) for a in self.acting]
+        self.bias = np.reshape([[0.0] * 3 if a.bias is None else a.bias for a in self.actuators], (-1, 3))
+        self.implicit_actuators = is_implicitfast(m) and present(self.bias[:, 2])
+        self.joint_force_limits = self.implicit_actuators or m.jnt_actfrclimited.any()
+        self.limbs = Limbs.of(m.dof_parentid.tolist())
+        self.layout = self._layout()
+
+    def dofs_to_root(self, dof: int) -> Iterator[int]:
+        """Yields a degree of freedom and those that move it, up to the world."""
+        while dof >= 0:
+            yield dof
+            dof = self.m.dof_parentid[dof]
+
+    def is_plane(self, pair: Pair) -> bool:
+        """Returns whether the first geom of a pair is a plane."""
+        return self.m.geom_type[pair.geoms[0]] == PLANE
+
+    def _sorted_pairs(self, found: list[Pair]) -> list[Pair]:
+        order = FUNCTIONS.index
+        return sorted(found, key=lambda p: (not self.is_plane(p), p.condim == 1, order(kind(self.m, p).function)))
+
+    def points(self, pair: Pair) -> int:
+        """Returns how many contacts a pair can have."""
+        return kind(self.m, pair).points
+
+    def collide(self) -> str:
+        """Returns the calls that find the contacts, those with friction if there is ``friction``, or those without."""
+        calls, kinds = [], [(kind(self.m, pair).function, pair.condim != 1) for pair in self.pairs]
+        for function in self.functions:
+            spans = []
+            for friction in (True, False):
+                found = [i for i, key in enumerate(kinds) if key == (function, friction)]
+                spans.append((found[0], found[-1] + 1) if found else (0, 0))
+            begin, end = (f"friction ? {x} : {y}" for x, y in zip(*spans, strict=True))
+            listed = "" if function in PLANE_FUNCTIONS else "at, count, "
+            calls.append(f"      collide_{function}({listed}{begin}, {end}, friction);")
+        return "\n".join(calls)
+
+    def _standing(self) -> tuple[int, int]:
+        """Returns how many contacts with friction and without there are when the bodies stand in their home pose."""
+        m = copy.copy(nominal(self.m))
+        planes = m.geom_type == PLANE
+        m.geom_margin[planes] = m.body_margin[m.geom_bodyid[planes]] = FAR
+        of_planes = planes[m.pair_geom1] | planes[m.pair_geom2]
+        m.pair_margin[of_planes & (m.pair_margin > NEVER)] = FAR
+        data = mujoco.MjData(m)
+        data.qpos[:] = home_pose(m)
+        mujoco.mj_kinematics(m, data)
+        mujoco.mj_comPos(m, data)
+        mujoco.mj_collision(m, data)
+        heights: dict[tuple[int, int], list[tuple[float, int]]] = {}  # by plane and tree
+        for contact in data.contact:
+            plane, geom = contact.geom
+            if planes[plane] and not contact.exclude:
+                root = m.body_rootid[m.geom_bodyid[geom]]
+                heights.setdefault((plane, root), []).append((contact.dist, contact.dim))
+        touching = [dim for found in heights.values() for height, dim in found if height < min(found)[0] + STANDING]
+        return sum(dim > 1 for dim in touching), sum(dim == 1 for dim in touching)
+
+    def _layout(self) -> Layout:
+        """Returns the sizes, with as many places for contacts as there is room for.
+
+        Raises:
+            ValueError: a world does not fit the shared memory of a GPU.
+        """
+        m = self.m
+        frictional = sum(self.points(p) for p in self.pairs if p.condim != 1)
+        frictionless = sum(self.points(p) for p in self.pairs if p.condim == 1)
+        standing, standing_frictionless = self._standing() if self.pairs else (0, 0)
+        frictionless = min(frictionless, max(MOST_FRICTIONLESS, standing_frictionless)) + len(self.limited_balls)
+        if not frictional and not frictionless:
+            frictionless = 1  # C++ has no empty arrays
+        directions = max(self.condims, default=3)
+        empty = Layout(
+            positions=m.nq,
+            dofs=m.nv,
+            links=len(self.moving),
+            geoms=len(self.geoms),
+            trees=len(self.roots),
+            limits=self.limit_sides * len(self.limited),
+            friction_losses=len(self.losses),
+            touch=len(self.touch),
+            candidates=max(1, sum(not self.is_plane(p) for p in self.pairs)),
+            directions=directions,
+            contact_rows=directions if self.elliptic else 2 * (directions - 1),
+            frictional=0,
+            frictionless=frictionless,
+            jacobian_rows=0,
+            limb_numbers=self.limbs.numbers if self.limbs else 0,
+        )
+
+        balls = len(self.limited_balls)  # their rows are there however many contacts there are
+
+        def sized(places: int, more_rows: int = balls) -> Layout:
+            rows = max(directions * places + more_rows, frictionless, 1)
+            return dataclasses.replace(empty, frictional=places, jacobian_rows=rows)
+
+        least, wanted = (min(frictional, n) for n in (ENOUGH_FRICTIONAL, max(ENOUGH_FRICTIONAL, standing)))
+        enough = max((n for n in range(least, wanted + 1) if sized(n).bytes <= WORLD_BYTES[-1]), default=least)
+        most = min(frictional, max(MOST_FRICTIONAL, enough))
+        budget = next((b for b in WORLD_BYTES if sized(enough).bytes <= b), None)
+        if budget is None:
+            raise ValueError(
+                f"a body so large: a world needs {sized(enough).bytes} bytes of shared memory, of {WORLD_BYTES[-1]}"
+            )
+        count = max(n for n in range(enough, most + 1) if sized(n).bytes <= budget)
+        more = max(r for r in range(balls, frictionless + 1) if sized(count, r).bytes <= budget)
+        return sized(count, more)
+
+    def geom_frame(self, g: int) -> tuple[int, np.ndarray, np.ndarray]:
+        """Returns the link of a geom, and its center and z axis in the frame of the link."""
+        place = self.places[self.m.geom_bodyid[g]]
+        return place.link, place.point(self.m.geom_pos[g]), matrix(place.turn(self.m.geom_quat[g]))[:, 2]
+
+    def half_length(self, g: int) -> float:
+        """Returns the half length of a capsule, 0 for any other geom."""
+        return float(self.m.geom_size[g, 1]) if self.m.geom_type[g] == CAPSULE else 0.0
+
+    def radius(self, g: int) -> float:
+        """Returns the radius of a sphere or capsule, and that of the bounding sphere of a solid."""
+        return float(self.m.geom_rbound[g] if self.m.geom_type[g] in SOLID else self.m.geom_size[g, 0])
+
+    def dofs_of_geom(self, g: int) -> int:
+        """Returns a bit for each degree of freedom that moves a geom."""
+        link = self.places[self.m.geom_bodyid[g]].link
+        if link < 0:
+            return 0
+        body = self.moving[link]
+        return self.ancestors[self.m.body_dofadr[body] + self.m.body_dofnum[body] - 1]
+
+    def apart(self, pair: Pair) -> int:
+        """Returns a bit for each degree of freedom that moves one geom of a pair alone."""
+        return self.dofs_of_geom(pair.geoms[0]) ^ self.dofs_of_geom(pair.geoms[1])
+
+    def softness(self, solref: Sequence[float], solimp: Sequence[float]) -> list[float]:
+        """Returns the members of struct Softness."""
+        return list(dataclasses.astuple(Softness.make(self.m, solref, solimp)))
+
+    def parts_below(self, body: int) -> list[tuple[int, Mass]]:
+        """Returns links of a subtree, and what of each belongs to it."""
+        inside = set(subtree(self.m, body))
+        by_link = [(i, [b for b in bodies if b in inside]) for i, bodies in enumerate(self.members)]
+        return [(i, Mass.join(self.m, self.places, bodies)) for i, bodies in by_link if bodies]
+
+    def actuator(self) -> Actuator:
+        """Returns an actuator that reads the tables."""
+
+        def read(*titles: str) -> list[symbols.Scalar]:
+            return [symbols.name(f"Model::{title}(a)") for title in titles]
+
+        gear, gain = read("gear", "gain")
+        return Actuator(
+            gear,
+            gain,
+            read("bias", "bias_position", "bias_velocity") if present(self.bias) else None,
+            read("control_low", "control_high") if any(a.control_range is not None for a in self.actuators) else None,
+            read("force_low", "force_high") if any(a.force_range is not None for a in self.actuators) else None,
+        )
+
+    def worlds_per_block(self) -> int:
+        """Returns how many worlds share a block of threads: a power of two, as shared memory allows."""
+        fit = max(1, BLOCK_BYTES // (self.layout.bytes + WARP_BYTES))
+        return min(MOST_WORLDS, 1 << int(math.log2(fit)))
+
+    def registers(self) -> int:
+        """Returns how many registers of a thread leave a multiprocessor as many worlds as its shared memory does."""
+        worlds = self.worlds_per_block()
+        worlds *= MULTIPROCESSOR_BYTES // (worlds * (self.layout.bytes + WARP_BYTES) + SYSTEM_BYTES)
+        return min(REGISTERS // (LANES * math.ceil(worlds / SCHEDULERS)) // 8 * 8, 255)
+
+    def elimination(self) -> str:
+        """Returns calls that eliminate all rows, in blocks of four: first those of which a lane has several."""
+        last = self.layout.stride // 4 - 1
+        edges = [last, *([LANES // 4] if last > LANES // 4 else []), -1]
+        return "\n".join(f"    eliminate(h, {first}, {end});" for first, end in itertools.pairwise(edges))

@@ -1,0 +1,415 @@
+"""Struct ``Model`` of what lanes run: sizes, constants and tables; and ``Varied``, for what worlds differ in."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.sim.compiled.collision.kinds import MESH, POINT_BITS, SHAPES, SOLID
+from torchrl_loco.sim.compiled.collision.pairs import (
+    Pair,
+    contact_weight,
+    least_regularisation,
+)
+from torchrl_loco.sim.compiled.collision.planes import LEAST_ALIGNED
+from torchrl_loco.sim.compiled.ir import symbols
+from torchrl_loco.sim.compiled.ir.parameters import Number, VariedModel, nominal, present, varies
+from torchrl_loco.sim.compiled.ir.tables import Tables
+from torchrl_loco.sim.compiled.physics.constraints import near, tolerance
+from torchrl_loco.sim.compiled.physics.delicate import LEAST_PIVOT, is_delicate
+from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE, MINVAL, SLIDE
+from torchrl_loco.sim.compiled.physics.links import matrix
+from torchrl_loco.sim.compiled.schedules.lanes.description import LANES, Description, is_implicitfast
+from torchrl_loco.sim.compiled.schedules.lanes.layout import pad
+
+TRANSLATION, ROTATION = 0, 1
+"""Kinds of a degree of freedom in ``lanes.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
+UNLIMITED = 1e30
+LOCKSTEP = True
+"""Whether the worlds of a block begin each substep, and each iteration of its solver, together, so that they share what
+they fetch of the text."""
+MOST_ROUNDS = 4
+"""Pairs of geoms whose bounding spheres a lane compares side by side, at most."""
+
+
+def members(
+    d: Description,
+    substeps: int,
+    *,
+    with_subtree_com: bool = False,
+    contact_geoms: Sequence[int] = (),
+    contact_rows: int = 1,
+) -> Tables:
+    """Returns structs ``Model`` and ``Varied``."""
+    m, layout = d.m, d.layout
+    tables = Tables(m.varied.count if isinstance(m, VariedModel) else 0)
+    mask = "unsigned" if m.nv <= 32 else "unsigned long long"
+    tables.lines.append(f"  typedef {mask} Dofs;  // a bit for each degree of freedom")
+    tables.size(
+        SUBSTEPS=substeps,
+        ITERATIONS=m.opt.iterations,
+        LS_ITERATIONS=m.opt.ls_iterations,
+        WORLD_BYTES=layout.bytes,
+        WORLDS_PER_BLOCK=d.worlds_per_block(),
+        LOCKSTEP=LOCKSTEP,
+        CONTROLS=m.nu,
+        BODIES=m.nbody,
+        SENSOR_VALUES=m.nsensordata,
+        LIMIT_SIDES=d.limit_sides,
+        VARIED=isinstance(m, VariedModel),
+        DELICATE=is_delicate(nominal(m)),
+        ROWS=layout.rows,
+        **{name.upper(): size for name, size in dataclasses.asdict(layout).items()},
+    )
+    tables.constant(
+        timestep=m.opt.timestep,
+        scale=1 / (m.stat.meaninertia * m.nv),
+        tolerance=tolerance(m),
+        ls_tolerance=tolerance(m) * m.opt.ls_tolerance,
+        ls_near=near(m),
+        least_aligned=LEAST_ALIGNED,
+        least_pivot=LEAST_PIVOT,
+    )
+    tables.vector("gravity", m.opt.gravity)
+    _add_links(tables, d)
+    _add_joints(tables, d)
+    _add_limbs(tables, d)
+    _add_forces(tables, d)
+    _add_geoms(tables, d, mask)
+    _add_limits(tables, d)
+    _add_outputs(tables, d)
+    if with_subtree_com:
+        tables.integers("root_body", d.roots)
+    tables.size(CONTACT_GEOMS=len(contact_geoms), HISTORY=contact_rows)
+    if contact_geoms:
+        _add_contact_geoms(tables, d, contact_geoms)
+    return tables
+
+
+def _add_links(tables: Tables, d: Description) -> None:
+    m, moving = d.m, d.moving
+    parents = [d.places[m.body_parentid[b]] for b in moving]
+    attached = list(zip(parents, moving, strict=True))
+    tables.integers("parent", [p.link for p in parents])
+    above = [p.link for p in parents]  # in each round, the ancestor at twice the distance of the round before
+    rounds: list[int] = []
+    while max(above) >= 0:
+        rounds += above
+        above = [above[i] if i >= 0 else -1 for i in above]
+    tables.size(ROUNDS=len(rounds) // len(moving))
+    tables.integers("above", rounds)
+    tables.structs("Vec", "link_position", [p.point(m.body_pos[b]) for p, b in attached])
+    turns = [p.turn(m.body_quat[b]) for p, b in attached]
+    tables.structs("Quat", "link_orientation", turns)
+    tables.size(JOINTS_TURNED=max(m.body_jntnum[moving]) > 1 or any(abs(turn[0]) < 1 for turn in turns))
+    tables.floats("link_mass", [x.mass for x in d.masses])
+    tables.structs("Vec", "link_center", [x.center for x in d.masses])
+    tables.structs("Symmetric", "link_inertia", [x.moments[np.triu_indices(3)] for x in d.masses])
+    tables.integers("tree", [d.roots.index(m.body_rootid[b]) for b in moving])
+    tables.integers("first_joint", [*m.body_jntadr[moving], m.njnt])
+    tables.integers("first_dof", [*m.body_dofadr[moving], m.nv])
+    moments, totals = [], []
+    for root in d.roots:
+        bodies = [b for b in range(1, m.nbody) if m.body_rootid[b] == root]
+        totals.append(m.body_mass[bodies].sum())
+        fixed = [m.body_mass[b] * d.places[b].point(m.body_ipos[b]) for b in bodies if d.places[b].link < 0]
+        moments.append(np.sum(fixed, axis=0) if fixed else np.zeros(3))
+    tables.structs("Vec", "fixed_moment", moments)
+    tables.floats("inverse_mass", [1 / total for total in totals])
+    steps = [f"x[{p.link}] += x[{i}];" for i, p in reversed(list(enumerate(parents))) if p.link >= 0]
+    tables.procedure("add_children", "float* x", steps)
+
+
+def _add_joints(tables: Tables, d: Description) -> None:
+    m = d.m
+    kinds = set(m.jnt_type.tolist())
+    tables.size(HAS_FREE=FREE in kinds, HAS_BALL=BALL in kinds, HAS_SLIDE=SLIDE in kinds)
+    tables.integers("joint_kind", m.jnt_type)
+    tables.integers("joint_qpos", m.jnt_qposadr)
+    tables.integers("joint_dof", m.jnt_dofadr)
+    tables.structs("Vec", "joint_axis", m.jnt_axis)
+    tables.structs("Vec", "joint_position", m.jnt_pos)
+    tables.size(JOINTS_ASIDE=m.jnt_pos.any())
+    tables.floats("joint_qpos0", m.qpos0[m.jnt_qposadr])
+    of_dof = m.dof_jntid
+    component = np.arange(m.nv) - m.jnt_dofadr[of_dof]
+    joint = m.jnt_type[of_dof]
+    turning = (joint == BALL) | ((joint == FREE) & (component >= 3))
+    kind = np.where(turning, ROTATION, np.where(joint == FREE, TRANSLATION, joint))
+    address = m.jnt_qposadr[of_dof] + np.where(turning, np.where(joint == FREE, 3, 0), component)
+    tables.integers("dof_kind", kind)
+    tables.integers("dof_component", np.where(kind <= ROTATION, component % 3, 0))
+    tables.integers("dof_qpos", address)
+    tables.integers("dof_link", [d.moving.index(b) for b in m.dof_bodyid])
+    tables.structs("Vec", "dof_anchor", m.jnt_pos[of_dof] * (joint == BALL)[:, None])
+    quaternions = [j for j in range(m.njnt) if m.jnt_type[j] in (FREE, BALL)]
+    shift = [3 * (m.jnt_type[j] == FREE) for j in quaternions]
+    tables.size(QUATERNIONS=len(quaternions))
+    tables.integers("quaternion_qpos", [m.jnt_qposadr[j] + s for j, s in zip(quaternions, shift, strict=True)])
+    tables.integers("quaternion_dof", [m.jnt_dofadr[j] + s for j, s in zip(quaternions, shift, strict=True)])
+
+
+def _add_limbs(tables: Tables, d: Description) -> None:
+    if d.limbs is None:
+        return
+    limbs, trunk, rows = d.limbs.limbs, d.limbs.trunk, d.limbs.rows
+    of = [i for i, limb in enumerate(limbs) for _ in limb]
+    tables.size(TRUNK=len(trunk), LIMBS=len(limbs), LIMB=d.limbs.longest, LIMB_ROWS=len(of))
+    tables.integers("limb_row_dof", rows)
+    tables.integers("limb_row_end", [limbs[i].stop for i in of])
+    tables.integers("limb_of_row", of)
+    tables.integers("limb_length", list(map(len, limbs)))
+    places = {dof: t for t, dof in enumerate(trunk)}
+    tables.integers("trunk_place", [places.get(dof, -1) for dof in range(d.layout.stride)])
+    gradient = [(i, len(trunk)) for i in range(len(trunk))]
+    lower = [(i, j) for i in range(len(trunk)) for j in range(i + 1)]
+    unused = [(0, 0)] * 3
+    corner = [*gradient, *unused[: -len(trunk) % 4], *lower, *unused[: -len(lower) % 4]]
+    tables.integers("corner_row", [i for i, _ in corner])
+    tables.integers("corner_column", [j for _, j in corner])
+    tables.integers("crosses", [d.limbs.crosses(d.apart(pair)) for pair in d.pairs])
+
+
+def _add_forces(tables: Tables, d: Description) -> None:
+    m = d.m
+    stiffness, damping = m.jnt_stiffness[m.dof_jntid], m.dof_damping
+    explicit = m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP) and not is_implicitfast(m)
+    implicit = present(damping) and not explicit
+    tables.size(HAS_SPRINGS=present(stiffness), IMPLICIT_DAMPING=implicit or d.implicit_actuators)
+    tables.floats("stiffness", stiffness)
+    tables.floats("spring", m.qpos_spring)
+    tables.floats("damping", damping)
+    tables.floats("armature", m.dof_armature)
+    above = [list(d.dofs_to_root(parent)) for parent in m.dof_parentid]
+    entries = [64 * dof + j for dof, ancestors in enumerate(above) for j in ancestors]
+    tables.size(MASS_ENTRIES=len(entries))
+    tables.integers("mass_entry", entries, "unsigned")
+    dofs = m.jnt_dofadr[m.actuator_trnid[d.acting, 0]]
+    order = np.argsort(dofs, kind="stable")
+    actuators = [d.actuators[i] for i in order]
+    tables.integers("first_actuator", [sum(dofs < k) for k in range(m.nv + 1)])
+    tables.integers("control", [d.acting[i] for i in order])
+    tables.floats("gear", [a.gear for a in actuators])
+    tables.floats("gain", [a.gain for a in actuators])
+    for k, name in enumerate(("bias", "bias_position", "bias_velocity")):
+        tables.floats(name, d.bias[order, k])
+    free = (-UNLIMITED, UNLIMITED)
+    of_controls = [free if a.control_range is None else a.control_range for a in actuators]
+    of_forces = [free if a.force_range is None else a.force_range for a in actuators]
+    for k, name in enumerate(("low", "high")):
+        tables.floats(f"control_{name}", [limits[k] for limits in of_controls])
+        tables.floats(f"force_{name}", [limits[k] for limits in of_forces])
+    tables.size(IMPLICIT_ACTUATORS=d.implicit_actuators, JOINT_FORCE_LIMITS=d.joint_force_limits)
+    limited = m.jnt_actfrclimited.astype(bool)
+    forces = np.where(limited[:, None], m.jnt_actfrcrange, [-UNLIMITED, UNLIMITED])[m.dof_jntid]
+    for k, name in enumerate(("low", "high")):
+        tables.floats(f"joint_force_{name}", forces[:, k])
+
+
+def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
+    m, found = d.m, d.pairs
+    geoms = [d.geom_frame(g) for g in d.geoms]
+    half = [d.half_length(g) for g in d.geoms]
+    tables.integers("geom_link", [link for link, _, _ in geoms])
+    tables.structs("Vec", "geom_position", [center for _, center, _ in geoms])
+    tables.structs("Vec", "geom_half_axis", [axis * h for (_, _, axis), h in zip(geoms, half, strict=True)])
+    tables.floats("geom_radius", [d.radius(g) for g in d.geoms])
+    planes = [p for p in found if d.is_plane(p)]
+    others = found[len(planes) :]
+    tables.size(PAIRS=len(found), PLANE_PAIRS=len(planes), POINT_BITS=POINT_BITS)
+    if d.has_solids:
+        tables.integers("geom_shape", [SHAPES.index(m.geom_type[g]) for g in d.geoms])
+        tables.structs("Vec", "geom_size", m.geom_size[d.geoms])
+        turns = [d.places[m.geom_bodyid[g]].turn(m.geom_quat[g]) for g in d.geoms]
+        tables.structs("Mat", "geom_orientation", [matrix(turn).ravel() for turn in turns])
+        solid = np.isin(m.geom_type[d.geoms], SOLID)
+        tables.size(SOLIDS_TURNED=any(abs(turn[0]) < 1 for turn in itertools.compress(turns, solid)))
+    if d.meshes:
+        _add_meshes(tables, d)
+    index = {g: i for i, g in enumerate(d.geoms)}
+    tables.integers("first_geom", [index.get(p.geoms[0], 0) for p in found])
+    tables.integers("second_geom", [index[p.geoms[1]] for p in found])
+    tables.integers("first_dofs", [d.dofs_of_geom(p.geoms[0]) for p in found], mask)
+    tables.integers("second_dofs", [d.dofs_of_geom(p.geoms[1]) for p in found], mask)
+    apart = [d.apart(pair) for pair in found]
+    of_balls = [-1] * len(d.limited_balls)  # all of them
+    quads = [sum(1 << i for i in range(d.layout.stride // 4) if dofs >> 4 * i & 15) for dofs in apart + of_balls]
+    tables.integers("quads", quads, "unsigned")
+    frames = [d.geom_frame(p.geoms[0]) for p in planes]
+    tables.structs("Vec", "plane_normal", [normal for _, _, normal in frames])
+    tables.floats("plane_offset", [normal @ center for _, center, normal in frames])
+    half = [d.half_length(p.geoms[1]) for p in planes]
+    tables.floats("inverse_half_length", [1 / h if h else 0.0 for h in half])
+    reach = [sum(d.radius(g) + d.half_length(g) for g in p.geoms) + p.margin for p in others]
+    _add_near_pairs(tables, d, [(index[a], index[b]) for a, b in (p.geoms for p in others)], reach)
+    _add_friction(tables, d)
+    # The limits of ball joints follow the pairs.
+    balls = d.limited_balls
+    tables.size(BALL_LIMITS=len(balls))
+    tables.integers("ball_qpos", [m.jnt_qposadr[j] for j in balls])
+    tables.integers("ball_dof", [m.jnt_dofadr[j] for j in balls])
+    tables.floats("ball_range", [m.jnt_range[j].max() for j in balls])
+    tables.floats("margin", [*(p.margin for p in found), *m.jnt_margin[balls]])
+    soft = [*((p.solref, p.solimp) for p in found), *((m.jnt_solref[j], m.jnt_solimp[j]) for j in balls)]
+    tables.structs("Softness", "contact_softness", [d.softness(*s) for s in soft])
+    inertias = m.dof_invweight0[m.jnt_dofadr[balls]]
+    plain = not d.elliptic and d.layout.directions == 3
+    if plain and any(varies(pair.friction) for pair in found):
+        tables.floats("pair_weight", [*(pair.weight for pair in found), *inertias])
+        _add_formulas(tables, d, found[0])
+    else:
+        weights = [contact_weight(m, pair) for pair in found]
+        least = [MINVAL if d.elliptic else least_regularisation(pair) for pair in found]
+        tables.floats("least_regularisation", [*least, *(MINVAL for _ in balls)])
+        tables.floats("inverse_inertia", [*weights, *inertias])
+
+
+def _add_near_pairs(tables: Tables, d: Description, of: list[tuple[int, int]], reach: list[float]) -> None:
+    """Adds a number for each pair of moving geoms: the square of its reach, with the geoms in its lowest bits.
+
+    The square is rounded up, as the exact tests follow. Pairs beside them, which are none, fill the last rounds.
+    """
+    bits, rounds = max(1, (len(d.geoms) - 1).bit_length()), -(-len(of) // LANES)
+    together = -(-rounds // max(1, -(-rounds // MOST_ROUNDS)))
+    tables.size(GEOM_BITS=bits, NEAR_ROUNDS=together)
+    lowest = (1 << 2 * bits) - 1
+    squared = [(int(np.float32(r * r).view(np.uint32)) + lowest) & ~lowest for r in reach]
+    near = [r | a | b << bits for r, (a, b) in zip(squared, of, strict=True)]
+    none = pad(len(near), max(1, together) * LANES) - len(near)
+    tables.integers("near_pair", near + [0] * none, "unsigned")
+
+
+def _add_formulas(tables: Tables, d: Description, pair: Pair) -> None:
+    """Adds what follows from friction: the row of a world has less to read without it, as pairs are many."""
+    friction, weight = symbols.name("mu"), symbols.name("weight")
+    of_pair = "Model::BALL_LIMITS && i >= Model::PAIRS ? 0.0f : friction(i)"
+    parts = {"mu": of_pair, "weight": "Model::pair_weight(i)"}
+    pair = dataclasses.replace(pair, condim=3, friction=friction, weight=weight)
+    for name, found, otherwise in (
+        ("least_regularisation", least_regularisation(pair), MINVAL),
+        ("inverse_inertia", contact_weight(d.m, pair), weight),
+    ):
+        tables.formula(name, symbols.select(friction, ">", 0, found, otherwise), **parts)
+
+
+def _add_friction(tables: Tables, d: Description) -> None:
+    """Adds the factors of the rows of the Jacobian off the normal, and what else the laws of friction read.
+
+    The factors of a pyramid are the coefficients of friction. An elliptic cone becomes a round one of slope ``mu``,
+    with the normal as it is, by factors that are the coefficients over ``mu``; the ratio of impedances makes it
+    less steep than sliding friction.
+    """
+    found, ratio = d.pairs, math.sqrt(d.m.opt.impratio)
+    tables.size(ELLIPTIC=d.elliptic)
+    slopes: list[Number] = [1.0] * len(found)
+    if d.elliptic:
+        slopes = [p.friction / ratio if p.condim > 1 else 1.0 for p in found]
+        tables.floats("mu", slopes)
+    tables.floats("friction", [ratio if d.elliptic else p.friction for p in found])
+    tables.floats("friction_ratio", [p.friction_ratio for p in found])
+    if d.layout.directions > 3:
+        tables.floats("torsional", [p.torsional / mu for p, mu in zip(found, slopes, strict=True)])
+        tables.floats("rolling", [p.rolling / mu for p, mu in zip(found, slopes, strict=True)])
+        tables.floats("rolling_ratio", [p.rolling_ratio for p in found])
+    if d.some_lack_edges:
+        tables.integers("edges", [2 * (p.condim - 1) for p in found])
+
+
+def _add_meshes(tables: Tables, d: Description) -> None:
+    of = [int(d.m.geom_dataid[g]) if d.m.geom_type[g] == MESH else -1 for g in d.geoms]
+    used = list(d.meshes)
+    meshes = list(d.meshes.values())
+    sizes = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    corners = [
+        (normal, [sizes[i] + vertex for vertex in others] + [-1] * (3 - len(others)))
+        for i, mesh in enumerate(meshes)
+        for of_vertex in mesh.corners
+        for normal, others in of_vertex
+    ]
+    counts = [len(of_vertex) for mesh in meshes for of_vertex in mesh.corners]
+    tables.integers("first_vertex", [sizes[used.index(mesh)] if mesh >= 0 else 0 for mesh in of])
+    tables.integers("last_vertex", [sizes[used.index(mesh) + 1] if mesh >= 0 else 0 for mesh in of])
+    tables.structs("Vec", "vertex", np.concatenate([mesh.vertices for mesh in meshes]))
+    tables.integers("first_corner", np.cumsum([0, *counts]))
+    tables.structs("Vec", "corner_normal", [normal for normal, _ in corners])
+    tables.integers("corner_vertex", [vertex for _, others in corners for vertex in others])
+
+
+def _add_limits(tables: Tables, d: Description) -> None:
+    m = d.m
+    joint = {int(m.jnt_dofadr[j]): j for j in d.limited}
+    of = [joint.get(dof) for dof in range(m.nv)]
+    tables.floats("limit_low", [-UNLIMITED if j is None else m.jnt_range[j, 0] for j in of])
+    tables.floats("limit_high", [UNLIMITED if j is None else m.jnt_range[j, 1] for j in of])
+    some = [d.limited[0] if j is None and d.limited else j for j in of]  # so that equal ones fold
+    tables.floats("limit_margin", [0.0 if j is None else m.jnt_margin[j] for j in some])
+    tables.floats("limit_inverse_inertia", m.dof_invweight0)
+    soft = [d.softness(m.jnt_solref[j], m.jnt_solimp[j]) for j in some if j is not None]
+    tables.structs("Softness", "limit_softness", soft)
+    # Dry friction: a row at distance zero, so that its weight and damping are constant.
+    friction = [d.softness(m.dof_solref[dof], m.dof_solimp[dof]) for dof in d.losses]
+    damping, impedance = [s[1] for s in friction], np.array([s[2] for s in friction])
+    weight = 1 / np.maximum(MINVAL, m.dof_invweight0[d.losses] * (1 - impedance) / impedance)
+    tables.integers("friction_row", [d.losses.index(dof) if dof in d.losses else -1 for dof in range(m.nv)])
+    tables.integers("friction_dof", d.losses)
+    tables.floats("friction_damping", damping)
+    tables.floats("friction_weight", weight)
+    tables.floats("friction_bound", m.dof_frictionloss[d.losses] / weight)
+
+
+def _add_outputs(tables: Tables, d: Description) -> None:
+    m = d.m
+    tables.integers("body_link", [p.link for p in d.places])
+    tables.structs("Vec", "body_position", [p.position for p in d.places])
+    tables.structs("Mat", "body_orientation", [matrix(p.quaternion).ravel() for p in d.places])
+    parts = [
+        [(i, x.center, x.mass / m.body_subtreemass[body]) for i, x in d.parts_below(body)] for _, body, _ in d.subtrees
+    ]
+    flat = [part for group in parts for part in group]
+    tables.size(SUBTREES=len(d.subtrees))
+    tables.integers("subtree_address", [address for _, _, address in d.subtrees])
+    tables.integers("first_part", np.cumsum([0, *map(len, parts)]))
+    tables.integers("part_link", [link for link, _, _ in flat])
+    tables.structs("Vec", "part_center", [center for _, center, _ in flat])
+    tables.floats("part_share", [share for _, _, share in flat])
+    _add_momenta(tables, d)
+    _add_touch(tables, d)
+
+
+def _add_momenta(tables: Tables, d: Description) -> None:
+    parts = [d.parts_below(body) for _, body, _ in d.momenta]
+    flat = [part for group in parts for part in group]
+    tables.size(MOMENTA=len(d.momenta))
+    tables.integers("momentum_address", [address for _, _, address in d.momenta])
+    tables.floats("momentum_inverse_mass", [1 / d.m.body_subtreemass[body] for _, body, _ in d.momenta])
+    tables.integers("first_momentum_part", np.cumsum([0, *map(len, parts)]))
+    tables.integers("momentum_link", [link for link, _ in flat])
+    tables.structs("Vec", "momentum_center", [x.center for _, x in flat])
+    tables.structs("Symmetric", "momentum_inertia", [x.moments[np.triu_indices(3)] for _, x in flat])
+    tables.floats("momentum_mass", [x.mass for _, x in flat])
+
+
+def _add_touch(tables: Tables, d: Description) -> None:
+    m, sites = d.m, [site for _, site, _ in d.touch]
+    at = [(s, d.places[m.site_bodyid[s]]) for s in sites]
+    sphere = int(mujoco.mjtGeom.mjGEOM_SPHERE)
+    sizes = [m.site_size[s, [0, 0, 0]] if m.site_type[s] == sphere else m.site_size[s] for s in sites]
+    tables.integers("touch_address", [address for _, _, address in d.touch])
+    tables.integers("site_body", m.site_bodyid[sites])
+    tables.integers("site_link", [p.link for _, p in at])
+    tables.integers("site_shape", [SHAPES.index(m.site_type[s]) for s in sites])
+    tables.structs("Vec", "site_size", sizes)
+    tables.structs("Vec", "site_position", [p.point(m.site_pos[s]) for s, p in at])
+    tables.structs("Mat", "site_orientation", [matrix(p.turn(m.site_quat[s])).ravel() for s, p in at])
+    bodies = [m.geom_bodyid[list(p.geoms)] for p in d.pairs] if sites else []
+    tables.integers("first_body", [first for first, _ in bodies])
+    tables.integers("second_body", [second for _, second in bodies])
+
+
+def _add_contact_geoms(tables: Tables, d: Description, geoms: Sequence[int]) -> None:
+    index, balls = {geom: i for i, geom in enumerate(geoms)}, [-1] * len(d.limited_balls)
+    for i, title in enumerate(("first", "second")):
+        tables.integers(f"{title}_contact_geom", [*(index.get(p.geoms[i], -1) for p in d.pairs), *balls])

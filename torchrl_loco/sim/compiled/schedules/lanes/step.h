@@ -1,0 +1,145 @@
+// One substep.
+struct Step : Outputs {
+  using Outputs::Outputs;
+
+  // ---- Integration: semi-implicit Euler
+
+  INLINE void integrate() {
+    const float h = Model::timestep();
+    OWN_DOFS(slot, d) {
+      if (d >= DOFS) continue;
+      const float v = w.qvel[d] + h * (Model::IMPLICIT_DAMPING ? w.qacc[d] + w.search[d] : w.qacc[d]);
+      w.qvel[d] = v;
+      if (Model::dof_kind(d) != ROTATION) w.qpos[Model::dof_qpos(d)] += h * v;
+    }
+    sync();
+    SHARED_LOOP(i, Model::QUATERNIONS) {
+      const int q = Model::quaternion_qpos(i), d = Model::quaternion_dof(i);
+      const Vec rate = {w.qvel[d], w.qvel[d + 1], w.qvel[d + 2]};
+      const Quat next = Quat{w.qpos[q], w.qpos[q + 1], w.qpos[q + 2], w.qpos[q + 3]}.turned(rate, h);
+      w.qpos[q] = next.w;
+      w.qpos[q + 1] = next.x;
+      w.qpos[q + 2] = next.y;
+      w.qpos[q + 3] = next.z;
+    }
+    sync();
+  }
+
+  INLINE void kinematics() {
+    poses();
+    velocities();
+  }
+
+  INLINE void dynamics() {
+    subtrees();
+    mass_matrix();
+    find_contacts();
+    jacobians();
+    set_rows();
+  }
+};
+
+// ---- The control step ----------------------------------------------------------------------------------------------
+
+static_assert(sizeof(World) == Model::WORLD_BYTES, "lanes.py counts on this size");
+#ifdef __CUDA_ARCH__
+static __shared__ World worlds[Model::WORLDS_PER_BLOCK];
+World& w = worlds[threadIdx.x / LANES];
+// Warps that run in step share what they fetch of the text. Lanes without a world keep to the step but do nothing else.
+#define LOCKSTEP() \
+  if (Model::LOCKSTEP) __syncthreads()
+#else
+World storage;
+World& w = storage;
+#define LOCKSTEP()
+#endif
+const unsigned this_world = live ? world : 0;
+const auto row_of = [=](auto* data, unsigned size) {  // products of 32 bits could wrap
+  return data + static_cast<size_t>(this_world) * size;
+};
+float* const sensors = row_of(sensordata_out.data, Model::SENSOR_VALUES);
+float* const row = row_of(numbers_out.data, numbers_out.shape[1]);
+Step step(w, lane, row_of(ctrl_in.data, Model::CONTROLS), overflow_out.data[this_world], row);
+if (live && lane == 0) {  // in a step that is not taken, numbers may have changed
+  //DERIVE
+}
+if (live) {
+  step.sync();  // the first lane may have written the state
+  SHARED_LOOP(i, Model::POSITIONS) w.qpos[i] = row_of(qpos_out.data, Model::POSITIONS)[i];
+  SHARED_LOOP(i, STRIDE) {
+    w.qvel[i] = i < DOFS ? row_of(qvel_out.data, DOFS)[i] : 0.0f;
+    w.qacc[i] = i < DOFS ? row_of(qacc_warmstart_out.data, DOFS)[i] : 0.0f;
+    w.search[i] = 0.0f;
+  }
+  SHARED_LOOP(i, DOFS * STRIDE) w.mass[i] = 0.0f;
+  step.sync();
+}
+#if WITH_CONTACT_GEOMS
+const int contacts = Model::HISTORY * Model::CONTACT_GEOMS;
+float* const contact_forces = reinterpret_cast<float*>(row_of(contact_force_out.data, contacts));
+bool* const in_contact = row_of(in_contact_out.data, contacts);
+#endif
+if (live && Model::SUBSTEPS == 0 && Model::TOUCH + Model::CONTACT_GEOMS > 0) {  // a step that is not taken finds forces
+  step.kinematics();
+  step.dynamics();
+#if WITH_CONTACT_GEOMS
+  step.keep_contacts();
+#endif
+  step.solve(true);
+  step.write_touch(sensors);
+#if WITH_CONTACT_GEOMS
+  ROLLED_FOR(int row = 0; row < Model::HISTORY; ++row)
+    step.write_contact_forces(contact_forces + 3 * Model::CONTACT_GEOMS * row, in_contact + Model::CONTACT_GEOMS * row);
+#endif
+}
+ROLLED_FOR(int substep = 0;; ++substep) {
+  LOCKSTEP();
+  if (live) step.kinematics();
+  if (substep == Model::SUBSTEPS) break;
+  if (live) {
+    step.dynamics();
+#if WITH_CONTACT_GEOMS
+    if (substep >= Model::SUBSTEPS - Model::HISTORY) step.keep_contacts();
+#endif
+  }
+  step.solve(live);
+  if (live) {
+    if (Model::TOUCH && substep == Model::SUBSTEPS - 1) step.write_touch(sensors);
+#if WITH_CONTACT_GEOMS
+    const int first = Model::CONTACT_GEOMS * (substep - (Model::SUBSTEPS - Model::HISTORY));
+    if (first >= 0) step.write_contact_forces(contact_forces + 3 * first, in_contact + first);
+#endif
+    step.integrate();
+  }
+}
+if (live) {
+  step.write_bodies(reinterpret_cast<float*>(row_of(xpos_out.data, Model::BODIES)),
+                    reinterpret_cast<float*>(row_of(xmat_out.data, Model::BODIES)),
+                    cvel_out.data ? reinterpret_cast<float*>(row_of(cvel_out.data, Model::BODIES)) : nullptr);
+#if WITH_SUBTREE_COM
+  step.write_centers(reinterpret_cast<float*>(row_of(subtree_com_out.data, Model::BODIES)));
+#endif
+  step.write_subtree_velocities(sensors);
+#if WITH_MOMENTA
+  step.write_angular_momenta(sensors);
+#endif
+  if (Model::SUBSTEPS > 0) {
+    SHARED_LOOP(i, Model::POSITIONS) row_of(qpos_out.data, Model::POSITIONS)[i] = w.qpos[i];
+    SHARED_LOOP(i, DOFS) {
+      row_of(qvel_out.data, DOFS)[i] = w.qvel[i];
+      row_of(qacc_warmstart_out.data, DOFS)[i] = w.qacc[i];
+    }
+    if (lane == 0) time_out.data[this_world] += Model::SUBSTEPS * Model::timestep();
+  }
+  step.sync();  // the first lane may read it
+}
+#undef INLINE
+#undef ROLLED_FOR
+#undef UNROLLED_FOR
+#undef OWN_DOFS
+#undef OWN_LINKS
+#undef OWN_PLACES
+#undef CLOSED_CONTACTS
+#undef SHARED_LOOP
+#undef OWN_ROWS
+#undef LOCKSTEP
