@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 import torchrl_loco
 from torchrl_loco import LocoEnv, SimConfig, nan_dump
-from torchrl_loco.envs import base
+from torchrl_loco.envs import access
 from torchrl_loco.known_files import UnnamedFileError
 from torchrl_loco.policy import Policy, shipped_policies
 
@@ -50,7 +50,7 @@ BAD = {
 def test_every_argument_is_checked(monkeypatch):
     arguments = [*inspect.signature(LocoEnv.__init__).parameters][1:-1]
     assert set(BAD) == {*arguments, *(field.name for field in dataclasses.fields(SimConfig))}
-    monkeypatch.setattr(base, "World", None)  # nothing is made before
+    monkeypatch.setattr(access, "World", None)  # nothing is made before
     for name, (value, error) in BAD.items():
         with pytest.raises(error, match=name):
             torchrl_loco.make("walker_walk", **{"num_envs": 2, "device": "cpu", name: value})

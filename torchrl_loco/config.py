@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -177,3 +177,8 @@ def sim_config(
         return config
     scaled = math.ceil(config.naconmax * num_envs / NACONMAX_WORLDS)
     return dataclasses.replace(config, naconmax=min(max(scaled, NACONMAX_FLOOR), NACONMAX_CEILING))
+
+
+def sim_of(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the fields of :class:`SimConfig` that a policy's information names."""
+    return {name: value for name, value in info.get("sim", {}).items() if value is not None}

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from torchrl_loco.config import sim_of
 from torchrl_loco.registry import resolve
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def of_robot(policy: "Policy") -> dict[str, Any]:
     cls, spec = resolve(policy.info["task"]), specification(policy.info["task"])
     m = spec.compile()
     low, high = m.actuator_ctrlrange.T
-    sim = {name: value for name, value in policy.info.get("sim", {}).items() if value is not None}
+    sim = sim_of(policy.info)
     env = cls(
         1, "cpu", 0, policy.info["protocol"], **{**sim, "engine": "mujoco"}, compile_hooks=False
     )  # tells the terms
@@ -69,7 +70,7 @@ def specification(task: str) -> mujoco.MjSpec:
         OSError: there is no such file.
         ImportError: the file or module of the task raises an error.
     """
-    from torchrl_loco.envs.base import folder_of
+    from torchrl_loco.envs.task import folder_of
     from torchrl_loco.sim import models
 
     cls = resolve(task)

@@ -14,6 +14,7 @@ import numpy as np
 
 from torchrl_loco.checks import check_bool, check_packages
 from torchrl_loco.conditions import DEFAULT, Conditions
+from torchrl_loco.config import sim_of
 
 if TYPE_CHECKING:
     import torch
@@ -143,7 +144,7 @@ def _worlds(cls: Any, exported: Exported, conditions: Conditions, engine: str, d
     from torchrl_loco.envs.vary import Vary
 
     facts = exported.facts
-    options = {name: value for name, value in facts.get("info", {}).get("sim", {}).items() if value is not None}
+    options = sim_of(facts.get("info", {}))
     if conditions.friction is not None:
         options["randomize"] = [Vary("geom_friction", *conditions.friction, how="set", once=True)]
     if engine == ENGINES[0]:
@@ -241,7 +242,7 @@ def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str)
     import torch
     from tqdm.auto import trange
 
-    from torchrl_loco.envs.base import set_stage
+    from torchrl_loco.envs.access import set_stage
 
     n, steps, dt = env.num_envs, env.config.episode_length, env.config.ctrl_dt
     if conditions.seconds is not None:

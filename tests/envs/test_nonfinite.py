@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from torchrl_loco.envs.episode import FiniteCheck, Outputs, observer, zero_non_finite
 from torchrl_loco.sim import WorldFunc, fill
-from torchrl_loco.sim.world_func import launch_together
+from torchrl_loco.sim.world_func import WorldKernels
 
 STATE = ("qpos", "qvel", "qacc_warmstart")
 BAD = [math.nan, math.inf, -math.inf]
@@ -174,7 +174,7 @@ def test_everything_that_can_be_not_finite_is_looked_at():
         marked, state = wp.from_torch(bad), {name: given.pop(name) for name in STATE}
         observe = observer(observe_given, fill(Given, **given), outputs, marked, 4, coalesced=coalesced)
         check = WorldFunc(zero_non_finite, fill(FiniteCheck, **state, outputs=outputs, non_finite=marked))
-        launch_together([observe, check], wp.from_torch(mask))
+        WorldKernels().launch([observe, check], wp.from_torch(mask))
         assert bad.tolist() == [False, spoilt is not None, False]
         for array in written.values():
             assert (array[0] == 1).all()

@@ -60,7 +60,7 @@ def test_scratch_memory_is_used_again():
 def test_too_many_worlds_are_refused_before_they_are_allocated(engine, monkeypatch):
     """A billion not for contacts, which the compiled step does not list; under MuJoCo-Warp they would exceed 2**31."""
     monkeypatch.setattr(mujoco_warp, "MujocoWarpEngine", None)
-    monkeypatch.setattr(compiled, "CompiledEngine", None)
+    monkeypatch.setitem(simulation.ENGINES, "compiled", None)
     for num_envs in (10**7, 10**9):
         monkeypatch.setattr(simulation, "free_memory", lambda device, free=107 * num_envs: free)
         with pytest.raises(MemoryError, match=rf"num_envs={num_envs} needs about \d+\.\d GiB on cpu.* \d+ worlds fit"):

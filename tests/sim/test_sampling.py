@@ -18,7 +18,7 @@ from torchrl_loco.sim.sampling import (
     make_skeleton,
     segment_distance,
 )
-from torchrl_loco.sim.world_func import launch_together
+from torchrl_loco.sim.world_func import WorldKernels
 
 
 @wp.kernel
@@ -105,7 +105,7 @@ def test_poses_near_the_floor_do_not_touch_it():
         skeleton, stream = make_skeleton(model, pairs, device), wp.array(np.arange(n), dtype=wp.uint32)
         xpos, xquat = (wp.zeros((n, model.nbody), dtype=dtype) for dtype in (wp.vec3, wp.quat))
         inputs = fill(FreePose, skeleton=skeleton, qpos=qpos, xpos=xpos, xquat=xquat)
-        launch_together([poser(draw_free_pose, inputs, stream)], wp.ones(n, dtype=bool))
+        WorldKernels().launch([poser(draw_free_pose, inputs, stream)], wp.ones(n, dtype=bool))
         drawn = qpos.numpy().astype(np.float64)
     data = mujoco.MjData(model)
     for q in drawn:

@@ -18,7 +18,7 @@ from compare import assert_same
 from small_runs import made, networks
 
 from torchrl_loco import cli, registry, storage
-from torchrl_loco.envs.base import folder_of
+from torchrl_loco.envs.task import folder_of
 from torchrl_loco.sim import models
 from torchrl_loco.training import RunFolder, Trainer, preset
 

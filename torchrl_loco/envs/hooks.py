@@ -1,10 +1,9 @@
 """The hooks of a task: which are its own, what they return and ask for, and the parts of a control step they make."""
 
 import contextlib
-import math
 import weakref
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import torch
@@ -12,19 +11,16 @@ import torch
 from torchrl_loco.checks import Interval, check_choice, check_float, check_int, suggestion
 from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.fixed_order import fixed_order
+from torchrl_loco.envs.resets import NESTED
 from torchrl_loco.envs.state import State
-from torchrl_loco.envs.tables import Entry, constants, entries
+from torchrl_loco.envs.tables import Entry, constants
+from torchrl_loco.envs.task import Task, declared, draws_by_warp, draws_states, own_hooks
 from torchrl_loco.envs.view import CONTACT_HISTORY, Catalog, View, usable
 from torchrl_loco.sim import models
 from torchrl_loco.sim.overflow import Overflow
 
-if TYPE_CHECKING:
-    from torchrl_loco.envs.base import LocoEnv
-
 Arrays = Mapping[str, torch.Tensor]
 """The arrays of all worlds by name: physics, ``memory.<name>``, ``out.<group>``, counters and flags."""
-
-HOOKS = ("control", "update", "reward", "terminated", "metrics", "events", "adapt", "observation", "begin")
 
 PARTS = {
     "control": ("control",),
@@ -36,79 +32,6 @@ PARTS = {
     "observe_restored": ("observation",),
 }
 """The hooks that each part of a step or reset calls, in their order."""
-
-FUSED = {
-    "reward": ("observation_func",),
-    "observation": ("observation_func",),
-    "begin": ("pose_func", "initial_states"),
-}
-"""The methods that name a Warp function instead of a hook."""
-
-
-def own_hooks(cls: type) -> frozenset[str]:
-    """Returns the hooks that are plain torch in a class: of each, the most derived definition wins, torch or Warp."""
-    from torchrl_loco.envs.base import LocoEnv
-
-    found = set()
-    for hook in HOOKS:
-        for base in cls.__mro__[: cls.__mro__.index(LocoEnv)]:
-            if hook in vars(base):
-                found.add(hook)
-            if {hook, *FUSED.get(hook, ())} & vars(base).keys():
-                break
-    return frozenset(found)
-
-
-def _draws_states(cls: type["LocoEnv"]) -> bool:
-    """Returns whether a class has a hook, a Warp function or a table that begins its episodes."""
-    from torchrl_loco.envs.base import LocoEnv
-
-    return cls.begin is not LocoEnv.begin or draws_by_warp(cls)
-
-
-def draws_by_warp(cls: type["LocoEnv"]) -> bool:
-    """Returns whether a class has a Warp function or a table that begins its episodes."""
-    from torchrl_loco.envs.base import LocoEnv
-
-    return any(getattr(cls, name) is not getattr(LocoEnv, name) for name in FUSED["begin"])
-
-
-def declared(cls: type["LocoEnv"]) -> tuple[dict[str, Entry], dict[str, Entry]]:
-    """Returns the entries of ``memory`` and of ``shared`` that a class declares.
-
-    Raises:
-        TypeError: one is no table of names and shapes.
-        ValueError: a name is taken, or a size is less than 1.
-    """
-    taken = {name for name in vars(View) if not name.startswith("_")}
-    memory = entries(cls, "memory", taken)
-    return memory, entries(cls, "shared", {*taken, *memory})
-
-
-def check_commands(cls: type["LocoEnv"], memory: Mapping[str, Entry]) -> None:
-    """Checks the commands that a class declares.
-
-    Args:
-        cls: the class.
-        memory: the entries of its memory.
-
-    Raises:
-        ValueError: there is no such entry, it has another number of numbers, or a range is empty.
-        TypeError: ``command_ranges`` is no table of names and ranges.
-    """
-    title, entries = f"{cls.__name__}.command_ranges", cls.command_ranges
-    if not isinstance(entries, Mapping) or not all(isinstance(ranges, Mapping) for ranges in entries.values()):
-        raise TypeError(f"{title} must be a dict such as {{'command': {{'forward (m/s)': (-1.0, 2.0)}}}}")
-    for entry, ranges in entries.items():
-        if entry not in memory:
-            raise ValueError(f"{title}: {entry!r} is no entry of memory, which has {', '.join(memory) or 'none'}")
-        shape, dtype = memory[entry]
-        if len(shape) > 1 or len(ranges) != math.prod(shape) or dtype != torch.float32:
-            raise ValueError(f"{title}: {entry!r} must be a row of {len(ranges)} numbers, as many as there are ranges")
-        for name, bounds in ranges.items():
-            low, high = bounds
-            if not -MAX_VALUE < low < high < MAX_VALUE:
-                raise ValueError(f"{title}: {name!r} must have a least and a greatest value, got {bounds}")
 
 
 def _noting(cls: Any) -> type:
@@ -169,19 +92,17 @@ class Hooks:
     """
 
     @torch.inference_mode(False)  # writes of hooks are noticed by versions of tensors
-    def __init__(self, env: "LocoEnv", mj_model: mujoco.MjModel) -> None:
-        from torchrl_loco.envs.base import LocoEnv
-
+    def __init__(self, env: Any, mj_model: mujoco.MjModel) -> None:
         self._env = weakref.ref(env)
         self._title = type(env).__name__
         self.own = own_hooks(type(env))
-        if models.has_home(mj_model) and not _draws_states(type(env)):
+        if models.has_home(mj_model) and not draws_states(type(env)):
             self.own |= {"begin"}
         bounded = env.action_range != (-float("inf"), float("inf"))
         self._substeps, (memory, shared) = env.config.substeps, declared(type(env))
         settings = env.num_envs, env.device, memory, shared, env.config.ctrl_dt
         self.catalog = Catalog(mj_model, *settings, bounded=bounded, variation=env.variation)
-        if type(env).observation_func is not LocoEnv.observation_func:
+        if type(env).observation_func is not Task.observation_func:
             self.catalog.warp_outputs = type(env).observation_size
         self.catalog.draws_states = draws_by_warp(type(env))
         starts = {name: value for name, value in type(env).shared.items() if isinstance(value, torch.Tensor)}
@@ -554,26 +475,22 @@ class Hooks:
 
     def observe_begun(self, a: Arrays) -> None:
         """After a reset: writes the observation of the masked worlds, which is all of their history."""
+        self._observe_first(a, restored=False)
+
+    def observe_restored(self, a: Arrays) -> None:
+        """After a state was written: writes the observation of the masked worlds, with the state's history, if any."""
+        self._observe_first(a, restored=True)
+
+    def _observe_first(self, a: Arrays, *, restored: bool) -> None:
         groups = self._groups(a)
         for name, count in self.history.items():
             past = a[f"memory.{HISTORY.format(name)}"]
             values = groups[name].unsqueeze(1).expand(-1, count, -1)
+            if restored:
+                has_past = past.isfinite().flatten(1).all(-1)
+                values = torch.where(_by_world(has_past, past), past, values)
             past.copy_(torch.where(_by_world(a["mask"], past), values, past))
             groups[name] = values.flatten(1)
-        self._show_begun(a, groups)
-
-    def observe_restored(self, a: Arrays) -> None:
-        """After a state was written: writes the observation of the masked worlds, with the state's history, if any."""
-        groups = self._groups(a)
-        for name, count in self.history.items():
-            past = a[f"memory.{HISTORY.format(name)}"]
-            has_past = past.isfinite().flatten(1).all(-1)
-            values = torch.where(_by_world(has_past, past), past, groups[name].unsqueeze(1).expand(-1, count, -1))
-            past.copy_(torch.where(_by_world(a["mask"], past), values, past))
-            groups[name] = values.flatten(1)
-        self._show_begun(a, groups)
-
-    def _show_begun(self, a: Arrays, groups: Mapping[str, torch.Tensor]) -> None:
         wrong = _beyond(a["qpos"], a["qvel"], *groups.values()) | self._lost(a)
         a["non_finite"].copy_(torch.where(a["mask"], a["non_finite"] | wrong, a["non_finite"]))
         for name, values in groups.items():
@@ -602,19 +519,8 @@ CRITIC = "privileged"
 HISTORY = "{}.history"
 """Name of the entry of memory that keeps the last observations of a group."""
 NO_GROUPS = (
-    *(
-        "reward",
-        "done",
-        "terminated",
-        "truncated",
-        "action",
-        "next",
-        "reward_terms",
-        "metrics",
-        "observation_terms",
-        "_reset",
-        "_step",
-    ),
+    *("reward", "done", "terminated", "truncated", "action", "next", "_reset", "_step"),
+    *NESTED,
     *State.KEYS,
 )
 """Names that a tensor of the observation cannot have: those of a step's other entries, and of a state."""

@@ -1,13 +1,10 @@
 """Velocities of bodies, poses of what is attached to them, and the sensors that are functions of both."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
 import torch
-
-if TYPE_CHECKING:
-    from torchrl_loco.envs.view import View
 
 FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 Sensor, Object = mujoco.mjtSensor, mujoco.mjtObj
@@ -21,7 +18,7 @@ def _free_joint(m: mujoco.MjModel, body: int) -> int:
     return int(m.body_dofadr[body]) if body and floats else -1
 
 
-def linear_velocity(s: "View", bodies: list[int], one: bool) -> torch.Tensor:
+def linear_velocity(s: Any, bodies: list[int], one: bool) -> torch.Tensor:
     """Returns velocities of the origins of bodies, world frame (m/s), ``(num_envs, 3)`` or ``(num_envs, count, 3)``."""
     m, pick = s._catalog.mj_model, s._catalog.pick
     if one and (dof := _free_joint(m, bodies[0])) >= 0:
@@ -32,7 +29,7 @@ def linear_velocity(s: "View", bodies: list[int], one: bool) -> torch.Tensor:
     return velocity[..., 3:] + torch.linalg.cross(velocity[..., :3], lever)
 
 
-def angular_velocity(s: "View", bodies: list[int], one: bool) -> torch.Tensor:
+def angular_velocity(s: Any, bodies: list[int], one: bool) -> torch.Tensor:
     """Returns angular velocities of bodies, world frame (rad/s), shaped as :func:`linear_velocity`."""
     m = s._catalog.mj_model
     if one and (dof := _free_joint(m, bodies[0])) >= 0:  # that of a free joint is in the body's frame
@@ -44,7 +41,7 @@ def angular_velocity(s: "View", bodies: list[int], one: bool) -> torch.Tensor:
 # What is attached to a body: sites, geoms, its inertial frame.
 
 
-def _offset(s: "View", kind: str, ids: list[int]) -> tuple[list[int], torch.Tensor, torch.Tensor]:
+def _offset(s: Any, kind: str, ids: list[int]) -> tuple[list[int], torch.Tensor, torch.Tensor]:
     """Returns bodies of attached elements, and their positions ``(count, 3)`` and axes ``(count, 3, 3)`` there."""
     m, key = s._catalog.mj_model, tuple(ids)
     if kind == "inertia":
@@ -62,27 +59,27 @@ def _matrix(quaternion: np.ndarray) -> np.ndarray:
     return matrix.reshape(3, 3)
 
 
-def _lever(s: "View", kind: str, ids: list[int], one: bool) -> tuple[list[int], torch.Tensor]:
+def _lever(s: Any, kind: str, ids: list[int], one: bool) -> tuple[list[int], torch.Tensor]:
     """Returns bodies, and vectors from their origins to what is attached, world frame (m)."""
     bodies, position, _ = _offset(s, kind, ids)
     xmat = s._catalog.pick(s._array("xmat"), bodies, one)
     return bodies, (xmat * (position[0] if one else position).unsqueeze(-2)).sum(-1)
 
 
-def attached_position(s: "View", kind: str, ids: list[int], one: bool) -> torch.Tensor:
+def attached_position(s: Any, kind: str, ids: list[int], one: bool) -> torch.Tensor:
     """Returns positions of sites, geoms or centers of inertia (m), ``(num_envs, 3)`` or ``(num_envs, count, 3)``."""
     bodies, lever = _lever(s, kind, ids, one)
     return s._catalog.pick(s._array("xpos"), bodies, one) + lever
 
 
-def attached_orientation(s: "View", kind: str, ids: list[int], one: bool) -> torch.Tensor:
+def attached_orientation(s: Any, kind: str, ids: list[int], one: bool) -> torch.Tensor:
     """Returns orientations of the same, ``(num_envs, 3, 3)`` or ``(num_envs, count, 3, 3)``."""
     bodies, _, axes = _offset(s, kind, ids)
     xmat = s._catalog.pick(s._array("xmat"), bodies, one)
     return (xmat.unsqueeze(-1) * (axes[0] if one else axes).unsqueeze(-3)).sum(-2)
 
 
-def attached_velocity(s: "View", kind: str, ids: list[int], one: bool) -> torch.Tensor:
+def attached_velocity(s: Any, kind: str, ids: list[int], one: bool) -> torch.Tensor:
     """Returns velocities of the same, world frame (m/s), shaped as their positions."""
     bodies, lever = _lever(s, kind, ids, one)
     return linear_velocity(s, bodies, one) + torch.linalg.cross(angular_velocity(s, bodies, one), lever)
@@ -100,7 +97,7 @@ class Frame:
         index: its id.
     """
 
-    def __init__(self, s: "View", kind: int, index: int) -> None:
+    def __init__(self, s: Any, kind: int, index: int) -> None:
         kinds = {Object.mjOBJ_SITE: "site", Object.mjOBJ_GEOM: "geom", Object.mjOBJ_BODY: "inertia"}
         self.s, self.kind, self.index = s, {int(key): name for key, name in kinds.items()}.get(kind, ""), index
         m = s._catalog.mj_model
@@ -137,7 +134,7 @@ FRAMES = {int(kind) for kind in (Object.mjOBJ_BODY, Object.mjOBJ_XBODY, Object.m
 AXES = {int(Sensor.mjSENS_FRAMEXAXIS): 0, int(Sensor.mjSENS_FRAMEYAXIS): 1, int(Sensor.mjSENS_FRAMEZAXIS): 2}
 
 
-def evaluate(s: "View", sensor: int) -> torch.Tensor | None:
+def evaluate(s: Any, sensor: int) -> torch.Tensor | None:
     """Returns a sensor that is a function of pose and velocity, ``(num_envs, size)``; ``None`` for any other."""
     m = s._catalog.mj_model
     if m.sensor_interval[sensor].any() or m.sensor_delay[sensor]:
@@ -147,7 +144,7 @@ def evaluate(s: "View", sensor: int) -> torch.Tensor | None:
     return values.clamp(-cutoff, cutoff) if values is not None and cutoff > 0 else values
 
 
-def _evaluate(s: "View", kind: int, sensor: int) -> torch.Tensor | None:
+def _evaluate(s: Any, kind: int, sensor: int) -> torch.Tensor | None:
     m = s._catalog.mj_model
     index, of = int(m.sensor_objid[sensor]), int(m.sensor_objtype[sensor])
     if kind in (Sensor.mjSENS_JOINTPOS, Sensor.mjSENS_JOINTVEL):

@@ -38,7 +38,7 @@ from torchrl.envs import (
 )
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
-from torchrl_loco.envs.base import reset_done_worlds, rows_of
+from torchrl_loco.envs.resets import reset_done_worlds, rows_of
 from torchrl_loco.envs.state import without_state
 
 

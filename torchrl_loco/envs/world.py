@@ -39,6 +39,7 @@ from torchrl_loco.envs.view import CONTACT_HISTORY
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import (
     EXCLUSIVE,
+    Around,
     Buffer,
     Direct,
     Graph,
@@ -54,7 +55,7 @@ from torchrl_loco.sim import (
 )
 
 
-class Task(Protocol):
+class Owner(Protocol):
     """What :class:`World` needs of an environment: its model, its settings and its functions."""
 
     config: SimConfig
@@ -118,7 +119,7 @@ class World:
         fixed: attributes of the task that were read when this was made, and never again.
     """
 
-    def __init__(self, task: Task, mj_model: mujoco.MjModel) -> None:
+    def __init__(self, task: Owner, mj_model: mujoco.MjModel) -> None:
         self._closed = True  # until it is made in full
         n, nu, hooks = task.num_envs, mj_model.nu, task.hooks
         self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own if hooks else frozenset()
@@ -208,7 +209,7 @@ class World:
 
     # What each world does besides the physics, in Warp.
 
-    def _make_funcs(self, task: Task) -> None:
+    def _make_funcs(self, task: Owner) -> None:
         data, n, device = self.sim.data, task.num_envs, self.sim.device
         flags = fill(
             Flags,
@@ -260,7 +261,7 @@ class World:
             self._start.append(poser(func, inputs, self.stream.warp))
             self._starts_at_rest = not holds(inputs, data.qvel)
 
-    def _fused_outputs(self, task: Task) -> tuple[Any, int, int]:
+    def _fused_outputs(self, task: Owner) -> tuple[Any, int, int]:
         """Returns where a fused function writes, and the sizes of its rows; what a hook returns instead is not used."""
         cls, n, device = type(task), task.num_envs, self.sim.device
         if "observation" in self._own:
@@ -279,12 +280,13 @@ class World:
         sim, action = self.sim, self.action.warp if action is None else action
         control = {"ctrlrange": sim.model.actuator_ctrlrange, "ctrl": sim.data.ctrl, "non_finite": self.non_finite.warp}
         apply = [WorldFunc(apply_action, fill(Control, action=action, **control))]
-        sim.step(
+        around = Around(
+            first=[func for monitor in self._monitors for func in monitor.first_of_step(action)],
             before=[] if "control" in self._own else apply,
             after=[*self._fused, *self._check_finite, *([] if self._own else [self._finish])],
-            first=[func for monitor in self._monitors for func in monitor.first_of_step(action)],
             last=[] if self._own else self._last_of_step(),
         )
+        sim.step(around)
 
     def _launch_conclude(self) -> None:
         self.sim.apart([self._finish, *self._last_of_step()])
@@ -310,7 +312,7 @@ class World:
 
     # The parts of the step, and what they become on the device.
 
-    def _make_parts(self, task: Task) -> None:
+    def _make_parts(self, task: Owner) -> None:
         sim, hooks, own, variation = self.sim, task.hooks, self._own, self._variation
         self._moved = Buffer(task.num_envs, bool, sim.device)
         streams = self._streams(task) if hooks or variation else {}
@@ -365,7 +367,7 @@ class World:
         self._run_step = self._as_graph("_take_step", several=bool(own))
         self._run_reset = self._as_graph("_begin_masked", several=bool(own) or variation is not None)
 
-    def _streams(self, task: Task) -> dict[str, torch.Tensor]:
+    def _streams(self, task: Owner) -> dict[str, torch.Tensor]:
         """Returns the arrays that tell where random streams begin, and the numbers of the model that vary."""
         first = task.world_offset or 0
         numbers = {"numbers": self.sim.numbers} if self._variation is not None else {}

@@ -14,6 +14,7 @@ from torchrl_loco.sim.graph import joined_to_torch as joined_to_torch
 from torchrl_loco.sim.graph import torch_is_recording as torch_is_recording
 from torchrl_loco.sim.overflow import Overflow as Overflow
 from torchrl_loco.sim.simulation import Simulation as Simulation
+from torchrl_loco.sim.world_func import Around as Around
 from torchrl_loco.sim.world_func import WorldFunc as WorldFunc
 from torchrl_loco.sim.world_func import fill as fill
 from torchrl_loco.sim.world_func import holds as holds

@@ -9,15 +9,17 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from typing_extensions import override
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.batched_model import nominal_numbers
 from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.compiled.engine import Model
+from torchrl_loco.sim.engine import Engine
 from torchrl_loco.sim.overflow import Overflow
 from torchrl_loco.sim.varied import Varied
-from torchrl_loco.sim.world_func import WorldFunc, WorldKernel
+from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, WorldKernels
 
 STATE = ("qpos", "qvel", "act", "qacc_warmstart", "time", "mocap_pos", "mocap_quat")
 """What hooks, states and resets may change between two steps; all else follows from it."""
@@ -92,32 +94,15 @@ class World:
         return self._views[name]
 
 
-class MujocoEngine:
+class MujocoEngine(Engine):
     """Steps all worlds with C MuJoCo, each in an ``mjData`` of its own.
 
     Time step, integrator and contacts are those of ``config``, all else the options of the model; the solver has at
     least MuJoCo's default limits, which many models lower for speed.
 
-    Args:
-        mj_model: the compiled model.
-        config: settings of the simulation.
-        num_envs: number of worlds.
-        device: the CPU.
-        contact_geoms: geoms whose contact forces are computed.
-        varied: which numbers of the model differ from world to world.
-        contact_rows: of how many substeps contact forces are kept: of the last, or of all.
-
     Attributes:
-        model: the model on the device, to be read only.
-        data: the state of all worlds.
         worlds: the ``mjData`` of each world, in float64.
-        numbers: the numbers that differ, ``(nworld, varied.count)``; none without ``varied``.
-        peak_constraints: most constraint rows that a substep needed since the last reset, by world, ``(nworld,)``.
-        peak_contacts: most contacts that a substep of any one world needed, ``(1,)``.
-        coalesced: false: the numbers of a world are contiguous.
     """
-
-    coalesced = False
 
     def __init__(
         self,
@@ -132,7 +117,7 @@ class MujocoEngine:
         m = mj_model
         self._varied, self._substeps, self._rows = varied, config.substeps, contact_rows
         self.model, self.data = Model(m, device), Data(m, num_envs)
-        self._kernels: dict[tuple[wp.Function, ...], WorldKernel] = {}
+        self._kernels = WorldKernels()
         self._nominal = m
         self._passive = _without_actuation(m)
         home: Any = mujoco.MjData(m)
@@ -162,36 +147,21 @@ class MujocoEngine:
         """The ``mjData`` of each world."""
         return [world.data for world in self._worlds]
 
+    @override
     def remedy(self, dropped: str, most: int) -> str:
-        """Returns advice for the warning about dropped constraints or contacts, of which a substep needed ``most``."""
         return f'C MuJoCo had no memory for more {dropped} than {most}: raise <size memory="..."/> in the model'
 
+    @override
     def contact_arrays(self) -> tuple[wp.array, wp.array]:
-        """Returns net contact forces vec3 and whether there is a contact, ``(nworld, contact_rows * geoms)`` each."""
         return self._force, self._in_contact
 
+    @override
     def subtree_com(self) -> wp.array:
-        """Returns ``data.subtree_com``."""
         return self.data.subtree_com
 
-    def step(
-        self,
-        before: Sequence[WorldFunc] = (),
-        after: Sequence[WorldFunc] = (),
-        first: Sequence[WorldFunc] = (),
-        last: Sequence[WorldFunc] = (),
-    ) -> None:
-        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state.
-
-        Forces, contacts and the sensors of forces are those of the last substep.
-
-        Args:
-            before: what each world does first.
-            after: what it does at the end.
-            first: what it does before that.
-            last: what it does after that.
-        """
-        self._launch([*first, *before], self._all)
+    @override
+    def step(self, around: Around = ALONE) -> None:
+        self._kernels.launch([*around.first, *around.before], self._all)
         shown, substeps, rows = self.data.shown(), self._substeps, self._rows
         changed = {name: _differ(rows, self._written[name]) for name, rows in self._state.items()}
         anything = np.any(list(changed.values()), axis=0)
@@ -215,8 +185,9 @@ class MujocoEngine:
 
         self._each(np.arange(len(self._worlds)), advance)
         self._keep_written(np.arange(len(self._worlds)))
-        self._launch([*after, *last], self._all)
+        self._kernels.launch([*around.after, *around.last], self._all)
 
+    @override
     def forward(
         self,
         mask: wp.array,
@@ -226,18 +197,7 @@ class MujocoEngine:
         at_rest: bool = False,
         contacts: bool = True,
     ) -> None:
-        """Updates poses and sensors where ``mask`` ``(nworld,)`` is set, those of forces without control.
-
-        Numbers of the model that were changed there count from now on.
-
-        Args:
-            mask: the worlds.
-            before: what each of them does first.
-            after: what it does at the end.
-            at_rest: whether they are at rest, which makes no difference here.
-            contacts: whether contact forces are found.
-        """
-        self._launch(before, mask)
+        self._kernels.launch(before, mask)
         shown = self.data.shown()
 
         def update(i: int) -> None:
@@ -257,14 +217,7 @@ class MujocoEngine:
         worlds = np.flatnonzero(mask.numpy())
         self._each(worlds, update)
         self._keep_written(worlds)
-        self._launch(after, mask)
-
-    def _launch(self, funcs: Sequence[WorldFunc], mask: wp.array) -> None:
-        """Launches functions of worlds in a kernel of their own, which is kept: nothing records it."""
-        key = tuple(func for func, _ in funcs)
-        if key not in self._kernels:
-            self._kernels[key] = WorldKernel(funcs)
-        self._kernels[key].launch(funcs, mask)
+        self._kernels.launch(after, mask)
 
     def _each(self, worlds: np.ndarray, work: Callable[[int], None]) -> None:
         """Does something in worlds, a share of them in each thread; MuJoCo computes without Python's lock."""

@@ -8,17 +8,19 @@ from typing import Any
 
 import mujoco
 import warp as wp
+from typing_extensions import override
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.batched_model import BatchedModel, batched_bytes, nominal_numbers, with_every_row
 from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.contact_forces import ContactForces, contact_forces_bytes
+from torchrl_loco.sim.engine import Engine
 from torchrl_loco.sim.graph import torch_is_recording
 from torchrl_loco.sim.models import FORCE_SENSORS
 from torchrl_loco.sim.row_order import RowOrder
 from torchrl_loco.sim.varied import Varied
-from torchrl_loco.sim.world_func import WorldFunc, holds, launch_together
+from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, WorldKernels, holds
 
 UNROLLED_ITERATIONS = 10
 """Up to this many solver iterations, the recorded step contains all of them, without an early exit."""
@@ -129,27 +131,12 @@ def _instead(m: mujoco.MjModel) -> str:
     return ""
 
 
-class MujocoWarpEngine:
+class MujocoWarpEngine(Engine):
     """Steps all worlds with MuJoCo-Warp.
 
-    Args:
-        mj_model: the compiled model, with the options of ``config``.
-        config: settings of the simulation.
-        num_envs: number of worlds.
-        device: where they live.
-        contact_geoms: geoms whose contact forces are computed.
-        varied: which numbers of the model differ from world to world.
-        contact_rows: of how many substeps contact forces are kept: of the last, or of all.
-
     Attributes:
-        model: the model on the device.
-        data: the state of all worlds.
-        numbers: the numbers that differ, ``(nworld, varied.count)``; none without ``varied``.
         contact_forces: what is computed of them, if any were asked for.
         with_subtree_com: whether ``data.subtree_com`` is up to date in a world at rest too.
-        peak_constraints: most constraint rows that a substep needed, by world, ``(nworld,)``.
-        peak_contacts: most contacts that a substep needed, over all worlds, ``(1,)``.
-        coalesced: false: the numbers of a world are contiguous.
     """
 
     coalesced = False
@@ -199,45 +186,30 @@ class MujocoWarpEngine:
             self._kept_sensors = wp.clone(self.data.sensordata), wp.clone(self.data.overflow)
         self._row_order = RowOrder(self.model, self.data) if config.deterministic else None
         self._all = wp.ones(num_envs, dtype=bool, device=device)
+        self._kernels = WorldKernels()
         self._any = wp.zeros(1, dtype=int, device=device)
         self.peak_constraints = Buffer(num_envs, int, device)
         self.peak_contacts = Buffer(1, int, device)
 
+    @override
     def remedy(self, dropped: str, most: int) -> str:
-        """Returns advice for the warning about dropped constraints or contacts, of which a substep needed ``most``."""
         return f"a physics step needed up to {most}: pass {ROOM[dropped]}={with_margin(most)}"
 
+    @override
     def contact_arrays(self) -> tuple[wp.array, wp.array]:
-        """Returns net contact forces vec3 and whether there is a contact, ``(nworld, contact_rows * geoms)`` each."""
         assert self.contact_forces is not None
         return self.contact_forces.force, self.contact_forces.in_contact
 
+    @override
     def subtree_com(self) -> wp.array:
-        """Returns ``data.subtree_com``, which from now on is up to date in worlds at rest too."""
         self.with_subtree_com = True
         return self.data.subtree_com
 
-    def step(
-        self,
-        before: Sequence[WorldFunc] = (),
-        after: Sequence[WorldFunc] = (),
-        first: Sequence[WorldFunc] = (),
-        last: Sequence[WorldFunc] = (),
-    ) -> None:
-        """Advances every world by one control step under ``ctrl``.
-
-        Afterwards poses, velocities and sensors belong to the new state, as in dm_control. dm_control reaches this by
-        running the first half of the next step. Here only what an observation can read is computed, so a reset has
-        nothing else to update. Forces, contacts and constraints are those of the last substep, and so are the sensors
-        of forces.
-
-        Args:
-            before: what each world does first.
-            after: what it does at the end.
-            first: what it does before that, in a kernel before the physics.
-            last: what it does after that, in a kernel after the physics.
-        """
-        launch_together([*first, *before], self._all)
+    @override
+    def step(self, around: Around = ALONE) -> None:
+        # dm_control updates poses, velocities and sensors by the first half of the next step. Here only what an
+        # observation can read is computed, so a reset has nothing else to update.
+        self._kernels.launch([*around.first, *around.before], self._all)
         for i in range(self._substeps):
             with self._substep_only(sensors=self._has_force_sensors and i == self._substeps - 1):
                 self._substep()
@@ -246,7 +218,7 @@ class MujocoWarpEngine:
                 row = i - self._substeps + self.contact_forces.rows
                 self.contact_forces.update(self.model, self.data, self._all, row)
         self._evaluate()
-        launch_together([*after, *last], self._all)
+        self._kernels.launch([*around.after, *around.last], self._all)
 
     def _substep(self) -> None:
         if self._row_order is None:
@@ -282,6 +254,7 @@ class MujocoWarpEngine:
         finally:
             model.opt.disableflags, model.ncam, model.nlight = kept
 
+    @override
     def forward(
         self,
         mask: wp.array,
@@ -291,21 +264,10 @@ class MujocoWarpEngine:
         at_rest: bool = False,
         contacts: bool = True,
     ) -> None:
-        """Updates poses and sensors where ``mask`` ``(nworld,)`` is set. It costs almost nothing if none is.
-
-        Numbers of the model that were changed there count from now on.
-
-        Args:
-            mask: the worlds.
-            before: what each of them does first.
-            after: what it does at the end.
-            at_rest: whether they are at rest, which costs less.
-            contacts: whether contact forces are found.
-        """
         forces = self._kept_sensors if contacts or self._has_force_sensors else None
 
         def update() -> None:
-            launch_together(before, mask)
+            self._kernels.launch(before, mask)
             if self._batched is not None:
                 self._batched.update(mask)
             self._clear_constraints(mask)
@@ -318,7 +280,7 @@ class MujocoWarpEngine:
                     mjw.com_pos(self.model, self.data)
             else:
                 self._evaluate()
-            launch_together(after, mask)
+            self._kernels.launch(after, mask)
 
         if torch_is_recording(self._device):
             update()

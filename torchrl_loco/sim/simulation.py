@@ -16,10 +16,11 @@ from torchrl_loco.sim import compiled, mjw, models, mujoco_warp
 from torchrl_loco.sim import mujoco as c_mujoco
 from torchrl_loco.sim.batched_model import BatchedModel, with_every_row
 from torchrl_loco.sim.compilation import compile_kernels
+from torchrl_loco.sim.engine import Engine
 from torchrl_loco.sim.graph import Direct, Graph, ScratchPool
 from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.warp_init import init_warp
-from torchrl_loco.sim.world_func import WorldFunc, WorldKernel, copy_row, fill, zero_row
+from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, WorldKernels, copy_row, fill, zero_row
 
 SCRATCH = 1.4
 """Memory of a simulation as a multiple of its ``mjData``; the rest is scratch memory (measured: 1.3 to 1.4)."""
@@ -29,6 +30,13 @@ TOLERANCE = 1e-8
 
 DETERMINISTIC_SCRATCH = 11.0
 """The same with ``deterministic=True`` on CUDA (measured: 6 to 8 times the memory of a world)."""
+
+
+ENGINES: dict[str, Callable[..., Engine]] = {
+    "compiled": compiled.CompiledEngine,
+    "mujoco_warp": mujoco_warp.MujocoWarpEngine,
+    "mujoco": c_mujoco.MujocoEngine,
+}
 
 
 @wp.struct
@@ -114,8 +122,6 @@ class Simulation:
         MemoryError: the device has no room for so many worlds.
     """
 
-    engine: compiled.CompiledEngine | mujoco_warp.MujocoWarpEngine | c_mujoco.MujocoEngine
-
     def __init__(
         self,
         mj_model: mujoco.MjModel,
@@ -142,17 +148,12 @@ class Simulation:
         self.num_envs = num_envs
         init_warp()
         self.device = wp.get_device(str(device))
-        engines: dict[str, type] = {
-            "compiled": compiled.CompiledEngine,
-            "mujoco_warp": mujoco_warp.MujocoWarpEngine,
-            "mujoco": c_mujoco.MujocoEngine,
-        }
-        self.engine = engines[name](mj_model, config, num_envs, self.device, geoms, differing, rows)
+        self.engine = ENGINES[name](mj_model, config, num_envs, self.device, geoms, differing, rows)
         self.model, self.data = self.engine.model, self.engine.data
         self._mujoco_data: dict[int, mjw.Data] = {}
         self._batched: BatchedModel | None = None
         self._every = wp.ones(num_envs, dtype=bool, device=self.device)
-        self._kernels: dict[tuple[wp.Function, ...], WorldKernel] = {}
+        self._kernels = WorldKernels()
         self._scratch = ScratchPool(self.device) if self.device.is_cuda else None
 
         self.qpos = wp.to_torch(self.data.qpos)
@@ -188,22 +189,13 @@ class Simulation:
         """
         return wp.to_torch(self.engine.subtree_com())
 
-    def step(
-        self,
-        before: Sequence[WorldFunc] = (),
-        after: Sequence[WorldFunc] = (),
-        first: Sequence[WorldFunc] = (),
-        last: Sequence[WorldFunc] = (),
-    ) -> None:
+    def step(self, around: Around = ALONE) -> None:
         """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state.
 
         Args:
-            before: what each world does first.
-            after: what it does at the end.
-            first: what it does before that, in a kernel before the physics.
-            last: what it does after that, in a kernel after the physics.
+            around: what each world does before and after the physics.
         """
-        self.engine.step(before, after, first, last)
+        self.engine.step(around)
 
     def reset(
         self,
@@ -231,17 +223,11 @@ class Simulation:
             mask: the worlds, bool ``(nworld,)``.
             then: what each of them does after that.
         """
-        self._apart([WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0)), *then], mask)
+        self._kernels.launch([WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0)), *then], mask)
 
     def apart(self, funcs: Sequence[WorldFunc]) -> None:
         """Calls functions in every world, in a kernel of their own."""
-        self._apart(funcs, self._every)
-
-    def _apart(self, funcs: Sequence[WorldFunc], mask: wp.array) -> None:
-        key = tuple(func for func, _ in funcs)
-        if key not in self._kernels:
-            self._kernels[key] = WorldKernel(funcs)
-        self._kernels[key].launch(funcs, mask)
+        self._kernels.launch(funcs, self._every)
 
     def forward(self, mask: wp.array, after: Sequence[WorldFunc] = (), *, contacts: bool = True) -> None:
         """Updates poses and sensors after ``qpos``, ``qvel`` or ``numbers`` were changed.

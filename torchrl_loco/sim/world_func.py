@@ -69,6 +69,26 @@ def holds(args: Any, array: wp.array) -> bool:
     return any(field is array or (hasattr(field, "_cls") and holds(field, array)) for field in fields)
 
 
+class Around(NamedTuple):
+    """What each world does around the physics of a control step.
+
+    Attributes:
+        first: what it does first, in a kernel before the physics.
+        before: what it does after that.
+        after: what it does once the physics has stepped.
+        last: what it does at the end, in a kernel after the physics.
+    """
+
+    first: Sequence[WorldFunc] = ()
+    before: Sequence[WorldFunc] = ()
+    after: Sequence[WorldFunc] = ()
+    last: Sequence[WorldFunc] = ()
+
+
+ALONE = Around()
+"""The physics and nothing else."""
+
+
 class Chain:
     """Functions of a world as one, which calls them in their order.
 
@@ -118,9 +138,18 @@ class WorldKernel:
             wp.launch(self._kernel, mask.size, inputs, device=mask.device, block_dim=BLOCK_DIM)
 
 
-def launch_together(funcs: Sequence[WorldFunc], mask: wp.array) -> None:
-    """Launches functions as one kernel; worlds that are not in ``mask`` ``(nworld,)`` do nothing."""
-    WorldKernel(funcs).launch(funcs, mask)
+class WorldKernels:
+    """Functions of a world, launched together: the kernel of each list of them is made once."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[wp.Function, ...], WorldKernel] = {}
+
+    def launch(self, funcs: Sequence[WorldFunc], mask: wp.array) -> None:
+        """Launches functions as one kernel; worlds that are not in ``mask`` ``(nworld,)`` do nothing."""
+        key = tuple(func for func, _ in funcs)
+        if key not in self._kept:
+            self._kept[key] = WorldKernel(funcs)
+        self._kept[key].launch(funcs, mask)
 
 
 @wp.func_native("""

@@ -12,8 +12,9 @@ from typing import Any
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
+from torchrl_loco.config import sim_of
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.envs.base import set_stage
+from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
@@ -175,7 +176,7 @@ def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: 
     """
     refuse_transforms(policy)
     info = policy.info
-    sim = {name: value for name, value in info.get("sim", {}).items() if value is not None}
+    sim = sim_of(info)
     place = resolve(info["task"]), num_envs, device, seed, info["protocol"]
     env = make(*place, **{**sim, "world_offset": 0, **settings})
     set_stage(env, info)

@@ -15,7 +15,7 @@ import torch
 
 from torchrl_loco import known_files, storage
 from torchrl_loco.checks import check_device, check_run
-from torchrl_loco.envs.base import folder_of
+from torchrl_loco.envs.task import folder_of
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models

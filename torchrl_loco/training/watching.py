@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_loco.checks import check_device
-from torchrl_loco.envs.base import set_stage
+from torchrl_loco.envs.access import set_stage
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
 from torchrl_loco.training.actor import deterministic_policy

@@ -1,14 +1,11 @@
 """Steps worlds under a policy, and remembers what curves show."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-
-if TYPE_CHECKING:
-    from torchrl_loco.envs.base import LocoEnv
 
 HISTORY = 20.0
 """Time that curves show (s)."""
@@ -27,7 +24,7 @@ class Player:
         steps: control steps taken.
     """
 
-    def __init__(self, env: "LocoEnv", policy: Callable[[Any], Any] | None, action_repeat: int | None = None) -> None:
+    def __init__(self, env: Any, policy: Callable[[Any], Any] | None, action_repeat: int | None = None) -> None:
         self.env, self.policy, self._action_repeat = env, policy, action_repeat
         self.dt = env.config.ctrl_dt
         self._room = round(HISTORY / self.dt)

@@ -6,14 +6,11 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torchrl_loco.checks import check_float, check_int
 from torchrl_loco.viewer.player import Player
 from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_host, check_viewer, url_of
-
-if TYPE_CHECKING:
-    from torchrl_loco.envs.base import LocoEnv
 
 SPEEDS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
 """Of the simulation, by real time."""
@@ -52,7 +49,7 @@ class Viewer:
 
     def __init__(
         self,
-        env: "LocoEnv",
+        env: Any,
         policy: Callable[[Any], Any] | None,
         action_repeat: int | None = None,
         *,

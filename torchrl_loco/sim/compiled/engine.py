@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from typing_extensions import override
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
@@ -22,8 +23,9 @@ from torchrl_loco.sim.compiled.step import (
     nominal_row,
     structure_of_arrays,
 )
+from torchrl_loco.sim.engine import Engine
 from torchrl_loco.sim.varied import Varied
-from torchrl_loco.sim.world_func import Chain, WorldFunc, WorldKernel
+from torchrl_loco.sim.world_func import ALONE, Around, Chain, WorldFunc, WorldKernels
 
 ROWS = {
     "qpos": ("nq", wp.float32),
@@ -231,29 +233,11 @@ class Model(ReadOnly):
             return mjw.put_model(self._mj_model)
 
 
-class CompiledEngine:
+class CompiledEngine(Engine):
     """Steps all worlds with one kernel, made for the model.
 
     There is no table of constraints, and nothing of one world depends on another: a trajectory is a function of its own
     state and actions, bit for bit, for any number of worlds.
-
-    Args:
-        mj_model: the compiled model, with the options of ``config``.
-        config: settings of the simulation.
-        num_envs: number of worlds.
-        device: where they live.
-        contact_geoms: geoms whose contact forces are computed.
-        varied: which numbers of the model differ from world to world.
-        contact_rows: of how many substeps they are kept: of the last, or of all.
-
-    Attributes:
-        model: the model on the device, with nominal numbers.
-        data: the state of all worlds.
-        numbers: the numbers that differ, ``(nworld, varied.count)``; none without ``varied``.
-        peak_constraints: zero: no row of constraints needs room, ``(nworld,)``.
-        peak_contacts: zero likewise, ``(1,)``.
-        coalesced: whether functions of a world have kernels of their own, in which the threads of a warp take
-            neighbouring worlds whose numbers are neighbours in memory.
 
     Raises:
         ValueError: there are more worlds than Warp can address.
@@ -286,47 +270,36 @@ class CompiledEngine:
             self.numbers = self._rows[:, : self._mj_model.varied.count]
         self.coalesced = by_world and not self._launch_size.one_kernel
         self._kernels: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
-        self._kernels_apart: dict[tuple, WorldKernel] = {}
+        self._kernels_apart = WorldKernels()
         self._all = wp.ones(num_envs, dtype=bool, device=device)
         self.peak_constraints = Buffer(num_envs, int, device)
         self.peak_contacts = Buffer(1, int, device)
 
+    @override
     def remedy(self, dropped: str, most: int) -> str:
-        """Returns advice for the warning about dropped contacts."""
         return f"a world of the compiled engine has no more places for {dropped}: pass engine='mujoco_warp'"
 
+    @override
     def contact_arrays(self) -> tuple[wp.array, wp.array]:
-        """Returns net contact forces vec3 and whether there is a contact, ``(nworld, contact_rows * geoms)`` each."""
         return self.data.contact_force, self.data.in_contact
 
+    @override
     def subtree_com(self) -> wp.array:
-        """Returns ``data.subtree_com``."""
         return self.data.subtree_com
 
-    def step(
-        self,
-        before: Sequence[WorldFunc] = (),
-        after: Sequence[WorldFunc] = (),
-        first: Sequence[WorldFunc] = (),
-        last: Sequence[WorldFunc] = (),
-    ) -> None:
-        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state.
-
-        Args:
-            before: what each world does first.
-            after: what it does at the end.
-            first: what it does before that, in a kernel before the physics.
-            last: what it does after that, in a kernel after the physics.
-        """
+    @override
+    def step(self, around: Around = ALONE) -> None:
+        first, before, after, last = around
         if self._launch_size.one_kernel:
-            self._launch_apart(first)
+            self._kernels_apart.launch(first, self._all)
             self._launch(self._substeps, self._all, before, after, self._contact_geoms)
-            self._launch_apart(last)
+            self._kernels_apart.launch(last, self._all)
         else:
-            self._launch_apart([*first, *before])
+            self._kernels_apart.launch([*first, *before], self._all)
             self._launch(self._substeps, self._all, (), (), self._contact_geoms)
-            self._launch_apart([*after, *last])
+            self._kernels_apart.launch([*after, *last], self._all)
 
+    @override
     def forward(
         self,
         mask: wp.array,
@@ -336,22 +309,7 @@ class CompiledEngine:
         at_rest: bool = False,
         contacts: bool = True,
     ) -> None:
-        """Updates poses and sensors where ``mask`` ``(nworld,)`` is set; ``at_rest`` makes no difference.
-
-        Args:
-            mask: the worlds.
-            before: what each of them does first, in the same kernel.
-            after: what it does at the end, likewise.
-            at_rest: whether they are at rest.
-            contacts: whether contact forces are found.
-        """
         self._launch(0, mask, before, after, self._contact_geoms if contacts else ())
-
-    def _launch_apart(self, funcs: Sequence[WorldFunc]) -> None:
-        key = tuple(func for func, _ in funcs)
-        if key not in self._kernels_apart:
-            self._kernels_apart[key] = WorldKernel(funcs)
-        self._kernels_apart[key].launch(funcs, self._all)
 
     def _launch(
         self,

@@ -1,0 +1,80 @@
+"""What advances the worlds of a simulation: the contract of the three engines."""
+
+import abc
+from collections.abc import Sequence
+from typing import Any
+
+import warp as wp
+
+from torchrl_loco.sim.buffer import Buffer
+from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc
+
+
+class Engine(abc.ABC):
+    """Steps all worlds of a model.
+
+    Engines are made of a compiled model with the options of ``config``, a ``config``, the number of worlds, their
+    device, the geoms whose contact forces are computed, which numbers of the model differ from world to world
+    (``varied``), and of how many substeps contact forces are kept: of the last, or of all.
+
+    Attributes:
+        model: the model on the device, with nominal numbers, to be read only.
+        data: the state of all worlds, and what follows from it.
+        numbers: the numbers that differ, ``(nworld, varied.count)``; none without ``varied``.
+        peak_constraints: most constraint rows that a substep needed since the last reset, by world, ``(nworld,)``; zero
+            where no row needs room.
+        peak_contacts: most contacts that a substep of any one world needed, ``(1,)``; zero likewise.
+        coalesced: whether functions of a world have kernels of their own, in which the threads of a warp take
+            neighbouring worlds whose numbers are neighbours in memory.
+    """
+
+    model: Any
+    data: Any
+    numbers: wp.array
+    peak_constraints: Buffer
+    peak_contacts: Buffer
+    coalesced = False
+
+    @abc.abstractmethod
+    def remedy(self, dropped: str, most: int) -> str:
+        """Returns advice for the warning about dropped constraints or contacts, of which a substep needed ``most``."""
+
+    @abc.abstractmethod
+    def contact_arrays(self) -> tuple[wp.array, wp.array]:
+        """Returns net contact forces vec3 and whether there is a contact, ``(nworld, contact_rows * geoms)`` each."""
+
+    @abc.abstractmethod
+    def subtree_com(self) -> wp.array:
+        """Returns ``data.subtree_com``, which from now on is up to date."""
+
+    @abc.abstractmethod
+    def step(self, around: Around = ALONE) -> None:
+        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state.
+
+        Forces, contacts and the sensors of forces are those of the last substep.
+
+        Args:
+            around: what each world does before and after the physics.
+        """
+
+    @abc.abstractmethod
+    def forward(
+        self,
+        mask: wp.array,
+        before: Sequence[WorldFunc] = (),
+        after: Sequence[WorldFunc] = (),
+        *,
+        at_rest: bool = False,
+        contacts: bool = True,
+    ) -> None:
+        """Updates poses and sensors where ``mask`` ``(nworld,)`` is set, those of forces without control.
+
+        Numbers of the model that were changed there count from now on.
+
+        Args:
+            mask: the worlds.
+            before: what each of them does first.
+            after: what it does at the end.
+            at_rest: whether they are at rest, which may cost less.
+            contacts: whether contact forces are found.
+        """
