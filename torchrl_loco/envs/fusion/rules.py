@@ -46,13 +46,8 @@ EXPM1 = "fabsf({0}) > 0.5f ? expf({0}) - 1.0f : expf({0}) == 1.0f ? {0} : (expf(
 FUNCTIONS = "exp exp2 log log2 log10 sqrt sin cos tan asin acos atan sinh cosh tanh erf floor ceil trunc"
 POINTWISE: dict[str, str | tuple[str, str]] = {
     **{name: f"{name}f({{0}})" for name in FUNCTIONS.split()},
-    **{
-        "atan2": "atan2f({0}, {1})",
-        "log1p": LOG1P,
-        "expm1": EXPM1,
-        "rsqrt": "1.0f / sqrtf({0})",
-        "reciprocal": "1.0f / {0}",
-    },
+    **{"atan2": "atan2f({0}, {1})", "log1p": LOG1P, "expm1": EXPM1},
+    **{"rsqrt": "1.0f / sqrtf({0})", "reciprocal": "1.0f / {0}"},
     **{"sigmoid": "1.0f / (1.0f + expf(-{0}))", "silu": "{0} / (1.0f + expf(-{0}))", "relu": "{0} < 0 ? 0 : {0}"},
     **{"abs": ("fabsf({0})", "{0} < 0 ? -{0} : {0}"), "neg": NEG, "square": "{0} * {0}", "mul": MUL},
     **{"sign": "{0} > 0 ? 1 : {0} < 0 ? -1 : 0", "minimum": LEAST, "maximum": MOST},
