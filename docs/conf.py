@@ -27,7 +27,13 @@ exclude_patterns = ["_build", "generated/fragments", "generated/notebooks/README
 nitpicky = True  # a reference to a name that is gone is an error
 ELSEWHERE = "gymnasium|torch|torchrl|tensordict|mujoco|mujoco_warp|warp|wp|mjw|numpy|collections|pathlib"
 nitpick_ignore_regex = [("py:.*", rf"({ELSEWHERE})\..*")]
-nitpick_ignore = [("py:class", "torchrl_loco.sim.graph.ScratchPool")]  # internal
+# Internal: two classes, an ImportError of files that the user has not named, and a dataclass that is made.
+nitpick_ignore = [
+    ("py:class", "torchrl_loco.sim.graph.ScratchPool"),
+    ("py:exc", "UnnamedFileError"),
+    ("py:class", "types.Sim"),
+    ("py:class", "torchrl_loco.sim.buffer.Buffer"),
+]
 
 # Notebooks are shown as they are: the tests run them.
 nb_execution_mode = "off"

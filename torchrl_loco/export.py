@@ -38,8 +38,8 @@ def export_policy(policy: Policy, path: Path) -> float:
     compared with the policy, on the CPU and on random observations that reach beyond those of the training. Information
     travels with it: task, protocol, sizes, bounds of an action, the time between two control steps (s), for how many of
     them an action is held, and all of ``policy.info``; as ``metadata_props`` in ONNX, in the extra file
-    ``metadata.json`` with torch.export. If the task has a layout (:meth:`torchrl_loco.LocoEnv.layout`), so do the terms
-    of the observation, how actions become controls, and what is known of the robot: :mod:`torchrl_loco.deployment`.
+    ``metadata.json`` with torch.export. So do the terms of the observation where it has
+    names, how actions become controls, and what is known of the robot: :mod:`torchrl_loco.deployment`.
 
     Args:
         policy: the policy, on any device.

@@ -446,7 +446,7 @@ def make(task: "str | type[LocoEnv]", *args: Any, **kwargs: Any) -> "LocoEnv":
     Args:
         task: one of :func:`torchrl_loco.list_envs`, or its alias ``mjx/<id>-v0``; or a class, or where one is, as
             ``"path/to/file.py:Class"``: that file is run. For a name that you read from a file, pass the class that
-            :func:`torchrl_loco.registry.resolve` returns.
+            ``registry.resolve`` returns.
         args: positional arguments of :class:`torchrl_loco.LocoEnv`: ``num_envs``, ``device``, ``seed``, ``protocol``.
         kwargs: keyword arguments of :class:`torchrl_loco.LocoEnv`, fields of :class:`torchrl_loco.SimConfig` among
             them, such as ``episode_length=500``.

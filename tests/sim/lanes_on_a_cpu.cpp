@@ -1,4 +1,4 @@
-// CUDA's words, as far as lanes.h has them, on a CPU: a lane of the warp is a fiber, which runs until it waits for the
+// CUDA's words, as far as the headers of lanes have them, on a CPU: a lane of the warp is a fiber, which runs until it waits for the
 // others. The body of a control step is step.inc, where "line" is that of the statement that waits. What lanes wrote
 // before a shuffle or a ballot, others read after it, which CUDA promises for __syncwarp only.
 

@@ -1,4 +1,4 @@
-"""What of lanes.h only CUDA reads, on a CPU: the 32 lanes of a warp agree with the one lane that steps worlds there."""
+"""What only CUDA reads of the headers of lanes, on a CPU: the 32 lanes of a warp agree with the one there."""
 
 import ctypes
 import pathlib

@@ -60,7 +60,7 @@ class Task:
     """Settings of the simulation under ``playground``; without any, the options of the model
     (:meth:`torchrl_loco.SimConfig.of`). An instance's has all that was overridden."""
     memory: ClassVar[Mapping[str, Any]] = {}
-    """What a world remembers, by name: the shape of a row, its dtype, or both, such as
+    """What a world remembers, by name. The shape of a row, its dtype, or both, such as
     ``{"command": 3, "frame": torch.int32, "bins": ((4,), torch.int32)}``; floats of float32, int32, int64 or bool.
     ``s.command`` reads it; :meth:`update`, :meth:`events` and :meth:`begin` return new rows. The state holds it."""
     shared: ClassVar[Mapping[str, Any]] = {}
@@ -72,7 +72,7 @@ class Task:
     """Names of entries of :attr:`shared`, such as counts, whose changes are added up over the ranks of a training,
     after each batch."""
     constants: ClassVar[Any] = {}
-    """Tables that never change, tensors or arrays by name, or a method that returns them once: ``s.name`` reads them
+    """Tables that never change, tensors or arrays by name, or a method that returns them once. ``s.name`` reads them
     on the device. ``s.table[s.frame]`` looks up a row in each world; where an index is out of range it gives NaN, which
     :meth:`health` counts as ``index_error``."""
     noise: ClassVar[Mapping[str, Any]] = {}

@@ -115,7 +115,7 @@ class World:
         truncated: whether the episode reached the time limit, ``(nworld,)``.
         seed: seed of all random streams, ``(1,)``.
         health: counts what went wrong in the physics.
-        kinds: by hook of the task in torch, how it runs: see :attr:`torchrl_loco.envs.part.Part.kind`.
+        kinds: by hook of the task in torch, how it runs: see ``Part.kind`` in ``part.py``.
         fixed: attributes of the task that were read when this was made, and never again.
     """
 

@@ -99,9 +99,6 @@ class MujocoEngine(Engine):
 
     Time step, integrator and contacts are those of ``config``, all else the options of the model; the solver has at
     least MuJoCo's default limits, which many models lower for speed.
-
-    Attributes:
-        worlds: the ``mjData`` of each world, in float64.
     """
 
     def __init__(

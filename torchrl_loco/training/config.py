@@ -146,7 +146,7 @@ class TrainingConfig:
     checkpoint_seconds: float = 60.0
     """Time between two checkpoints (s)."""
     keep: int = 1
-    """Checkpoints that stay: the last one, and beside it, under the number of its frames, those before it."""
+    """How many checkpoints stay. The last one does, and beside it, under the number of its frames, those before it."""
     logger: tuple[LoggerName, ...] = ("tensorboard",)
     """Where metrics go besides the run's CSV files, which are always written; csv adds nothing to them."""
 
@@ -205,12 +205,12 @@ class TrainingConfig:
 
     @property
     def frames_per_batch(self) -> int:
-        """Steps of the policy in one batch, over all worlds: what :class:`torchrl_loco.RolloutCollector` calls so."""
+        """Steps of the policy in one batch, over all worlds; frames of a :class:`torchrl_loco.RolloutCollector`."""
         return self.num_envs * self.num_steps
 
     @property
     def control_steps_per_batch(self) -> int:
-        """Control steps in one batch, over all worlds: what ``total_frames`` counts."""
+        """Control steps in one batch, over all worlds, which is what ``total_frames`` counts."""
         return self.frames_per_batch * self.action_repeat
 
     @property

@@ -135,7 +135,7 @@ class RunFolder:
 
     @property
     def task(self) -> str:
-        """Where the class of its task is: as the user or its settings say, or in ``source/`` if that file is gone."""
+        """Where the class of its task is. As the user or its settings say, or in ``source/`` if that file is gone."""
         return self._named or known_files.place_of(self.load_config().task, self.path)
 
     def keep_source(self) -> None:

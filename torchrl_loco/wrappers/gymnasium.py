@@ -94,8 +94,8 @@ class GymnasiumEnv(Env):
             action: array or tensor.
 
         Returns:
-            Observation, reward, whether the episode terminated or was truncated, and the infos: with
-            ``reward_terms=True``, ``reward_terms`` by name.
+            Observation, reward, whether the episode terminated or was truncated, and the infos, which have
+            ``reward_terms`` by name with ``reward_terms=True``.
 
         Raises:
             gymnasium.error.ResetNeeded: ``reset()`` was never called, or the episode is over.

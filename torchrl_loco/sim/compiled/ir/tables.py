@@ -1,4 +1,4 @@
-"""Constants and tables of a model as C++: functions of ``struct Model``, which ``lanes.h`` reads."""
+"""Constants and tables of a model as C++: functions of ``struct Model``, which lanes read."""
 
 from collections.abc import Sequence
 from typing import ClassVar

@@ -66,7 +66,7 @@ def cross_force(v: np.ndarray, force: np.ndarray) -> np.ndarray:
 
 
 def as_cpp() -> str:
-    """Returns a C++ struct of these functions, on structs of ``lanes.h`` and ``arithmetic.h``."""
+    """Returns a C++ struct of these functions, on structs of ``world.h`` and ``arithmetic.h``."""
     inertia = Inertia(_symmetric("i.rotational"), vec("i.first"), name("i.mass"))
     moved = Inertia.moved(_symmetric("s"), name("mass"), vec("offset"))
     six = [moved.rotational[i, j] for i in range(3) for j in range(i, 3)]

@@ -26,7 +26,7 @@ from torchrl_loco.sim.compiled.schedules.lanes.description import LANES, Descrip
 from torchrl_loco.sim.compiled.schedules.lanes.layout import pad
 
 TRANSLATION, ROTATION = 0, 1
-"""Kinds of a degree of freedom in ``lanes.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
+"""Kinds of a degree of freedom in ``world.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
 UNLIMITED = 1e30
 LOCKSTEP = True
 """Whether the worlds of a block begin each substep, and each iteration of its solver, together, so that they share what

@@ -41,7 +41,7 @@ struct Step : Outputs {
 
 // ---- The control step ----------------------------------------------------------------------------------------------
 
-static_assert(sizeof(World) == Model::WORLD_BYTES, "lanes.py counts on this size");
+static_assert(sizeof(World) == Model::WORLD_BYTES, "layout.py counts on this size");
 #ifdef __CUDA_ARCH__
 static __shared__ World worlds[Model::WORLDS_PER_BLOCK];
 World& w = worlds[threadIdx.x / LANES];

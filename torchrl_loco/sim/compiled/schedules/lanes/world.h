@@ -1,6 +1,6 @@
 // One control step of one world, taken by a group of lanes: a warp of a GPU with the world's state in shared memory, or
 // one lane of a CPU. All of it is the body of a single function, so that Warp can carry it; what depends on the model
-// (struct Model: sizes, constants and tables) is written into it by lanes.py.
+// (struct Model: sizes, constants and tables) is written into it by members.py.
 //
 // The lanes share every loop over links, geoms, contacts or rows. Each of them owns the degrees of freedom lane,
 // lane + LANES, ... (its slots), and with them their rows of the mass matrix and of the Hessian, which it keeps in
