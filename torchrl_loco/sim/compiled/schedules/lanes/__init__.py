@@ -119,7 +119,9 @@ FILES = (
     "step",
 )
 """The headers, in their order: each but the first two and the last has a struct that is built on the one before."""
-HEADERS = "\n".join(pathlib.Path(__file__).with_name(f"{name}.h").read_text() for name in FILES)
+TEMPLATE = pathlib.Path(__file__).with_name("step.h")
+"""The last of them: a control step from the arrays of all worlds and back."""
+HEADERS = "\n".join(TEMPLATE.with_name(f"{name}.h").read_text() for name in FILES)
 LINE_SEARCH = shared.line_search("Model::scale()", "Model::ls_tolerance()", "Model::ls_near()", "Model::LS_ITERATIONS")
 NEWTON = shared.newton(
     "Model::scale()",
