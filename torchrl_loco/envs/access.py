@@ -42,9 +42,9 @@ class WorldAccess(EnvBase):
     variation: Variation | None
     _pid: int
     _stepped_model: mujoco.MjModel
-    _world: World | None = None
-    _episodes: torch.Tensor | None = None  # of a closed environment
-    _stage: Mapping[str, Any] = {}  # likewise
+    _world: World | None
+    _episodes: torch.Tensor | None  # of a closed environment
+    _stage: Mapping[str, Any]  # likewise
 
     # Opening and closing.
 

@@ -163,6 +163,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         self.on_overflow, self.nan_dump = on_overflow, nan_dump
         self._action_shape = torch.Size([*self.batch_size, mj_model.nu])
         self._pid = os.getpid()
+        self._world, self._episodes, self._stage = None, None, {}
         self.hooks = (
             Hooks(self, mj_model)
             if own_hooks(type(self)) or self.memory or self.shared or models.has_home(mj_model)

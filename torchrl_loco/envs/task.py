@@ -397,7 +397,7 @@ def check_commands(cls: type[Task], memory: Mapping[str, Entry]) -> None:
 
 def _warn_of_misspelt_names(cls: type[Task]) -> None:
     """Warns of what a class defines by a name that is almost that of a hook or an attribute: nobody would call it."""
-    meant = {*HOOKS, *Task.__annotations__}
+    meant = {*HOOKS, *Task.__annotations__} - {"mj_model"}
     for base in cls.__mro__[: cls.__mro__.index(Task)]:
         if base.__module__.startswith("torchrl_loco."):
             continue

@@ -23,7 +23,8 @@ class Engine(abc.ABC):
         numbers: the numbers that differ, ``(nworld, varied.count)``; none without ``varied``.
         peak_constraints: most constraint rows that a substep needed since the last reset, by world, ``(nworld,)``; zero
             where no row needs room.
-        peak_contacts: most contacts that a substep of any one world needed, ``(1,)``; zero likewise.
+        peak_contacts: most contacts that a substep needed, ``(1,)``: of all worlds together under MuJoCo-Warp, where
+            they share a pool, else of any one; zero likewise.
         coalesced: whether functions of a world have kernels of their own, in which the threads of a warp take
             neighbouring worlds whose numbers are neighbours in memory.
     """

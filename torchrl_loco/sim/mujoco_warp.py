@@ -139,8 +139,6 @@ class MujocoWarpEngine(Engine):
         with_subtree_com: whether ``data.subtree_com`` is up to date in a world at rest too.
     """
 
-    coalesced = False
-
     def __init__(
         self,
         mj_model: mujoco.MjModel,

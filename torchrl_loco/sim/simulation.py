@@ -194,7 +194,12 @@ class Simulation:
 
         Args:
             around: what each world does before and after the physics.
+
+        Raises:
+            TypeError: it is something else.
         """
+        if not isinstance(around, Around):
+            raise TypeError(f"around must be a torchrl_loco.sim.Around, got {type(around).__name__}")
         self.engine.step(around)
 
     def reset(

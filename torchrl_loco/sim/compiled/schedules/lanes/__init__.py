@@ -14,85 +14,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled.collision.kinds import (
-    BOX as BOX,
-)
-from torchrl_loco.sim.compiled.collision.kinds import (
-    CAPSULE as CAPSULE,
-)
-from torchrl_loco.sim.compiled.collision.kinds import (
-    CYLINDER as CYLINDER,
-)
-from torchrl_loco.sim.compiled.collision.kinds import (
-    FUNCTIONS,
-)
-from torchrl_loco.sim.compiled.collision.kinds import (
-    KINDS as KINDS,
-)
-from torchrl_loco.sim.compiled.collision.kinds import (
-    MESH as MESH,
-)
-from torchrl_loco.sim.compiled.collision.kinds import (
-    PLANE as PLANE,
-)
-from torchrl_loco.sim.compiled.collision.kinds import (
-    POINT_BITS as POINT_BITS,
-)
-from torchrl_loco.sim.compiled.collision.kinds import (
-    SHAPES as SHAPES,
-)
-from torchrl_loco.sim.compiled.collision.kinds import (
-    SOLID as SOLID,
-)
-from torchrl_loco.sim.compiled.collision.meshes import Mesh as Mesh
-from torchrl_loco.sim.compiled.collision.pairs import (
-    Pair as Pair,
-)
-from torchrl_loco.sim.compiled.collision.pairs import (
-    contact_weight as contact_weight,
-)
-from torchrl_loco.sim.compiled.collision.pairs import (
-    is_elliptic as is_elliptic,
-)
-from torchrl_loco.sim.compiled.collision.pairs import (
-    kind as kind,
-)
-from torchrl_loco.sim.compiled.collision.pairs import (
-    least_regularisation as least_regularisation,
-)
-from torchrl_loco.sim.compiled.collision.pairs import (
-    pairs as pairs,
-)
-from torchrl_loco.sim.compiled.collision.planes import LEAST_ALIGNED as LEAST_ALIGNED
-from torchrl_loco.sim.compiled.ir import symbols as symbols
-from torchrl_loco.sim.compiled.ir.parameters import Number as Number
+from torchrl_loco.sim.compiled.collision.kinds import FUNCTIONS
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel
-from torchrl_loco.sim.compiled.ir.parameters import nominal as nominal
-from torchrl_loco.sim.compiled.ir.parameters import present as present
-from torchrl_loco.sim.compiled.ir.parameters import varies as varies
-from torchrl_loco.sim.compiled.ir.tables import Tables as Tables
 from torchrl_loco.sim.compiled.physics import spatial
-from torchrl_loco.sim.compiled.physics.actuators import Actuator as Actuator
-from torchrl_loco.sim.compiled.physics.actuators import acting as acting
 from torchrl_loco.sim.compiled.physics.constraints import Softness
-from torchrl_loco.sim.compiled.physics.constraints import both_sides as both_sides
-from torchrl_loco.sim.compiled.physics.constraints import near as near
-from torchrl_loco.sim.compiled.physics.constraints import tolerance as tolerance
-from torchrl_loco.sim.compiled.physics.delicate import LEAST_PIVOT as LEAST_PIVOT
-from torchrl_loco.sim.compiled.physics.delicate import is_delicate as is_delicate
-from torchrl_loco.sim.compiled.physics.dynamics import BALL as BALL
-from torchrl_loco.sim.compiled.physics.dynamics import FREE as FREE
-from torchrl_loco.sim.compiled.physics.dynamics import HINGE as HINGE
-from torchrl_loco.sim.compiled.physics.dynamics import MINVAL as MINVAL
-from torchrl_loco.sim.compiled.physics.dynamics import SLIDE as SLIDE
-from torchrl_loco.sim.compiled.physics.links import Mass as Mass
-from torchrl_loco.sim.compiled.physics.links import matrix as matrix
-from torchrl_loco.sim.compiled.physics.links import moving_bodies as moving_bodies
-from torchrl_loco.sim.compiled.physics.links import places as places
-from torchrl_loco.sim.compiled.physics.sensors import ANGULAR_MOMENTUM as ANGULAR_MOMENTUM
-from torchrl_loco.sim.compiled.physics.sensors import SUBTREE_VELOCITY as SUBTREE_VELOCITY
-from torchrl_loco.sim.compiled.physics.sensors import TOUCH as TOUCH
-from torchrl_loco.sim.compiled.physics.sensors import subtree as subtree
 from torchrl_loco.sim.compiled.schedules import shared
 from torchrl_loco.sim.compiled.schedules.lanes.description import Description as Description
 from torchrl_loco.sim.compiled.schedules.lanes.description import is_implicitfast as is_implicitfast

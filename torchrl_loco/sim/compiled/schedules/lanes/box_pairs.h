@@ -172,8 +172,7 @@ struct BoxPairContacts : BoxContacts {
       Vec columns[3];
       UNROLLED_FOR(int i = 0; i < 3; ++i) columns[i] = axes.transposed_times(others.column(i));
       const Mat turn = of_columns(columns[0], columns[1], columns[2]);
-      Touching found;
-      found.count = 0;
+      Touching found = {};
       if (own.valid)
         touch_boxes(axes.transposed_times(w.geoms[h].center - origin), turn, Model::geom_size(g), Model::geom_size(h),
                     Model::margin(pair), found);
