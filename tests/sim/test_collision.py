@@ -249,3 +249,14 @@ def test_there_are_places_for_what_a_body_stands_on():
     feet = "".join(f'<geom type="box" size=".1 .03 .02" pos="0 {0.1 * i} {0.001 * i}"/>' for i in range(7))
     m = model(FLOORS, f'<body pos="0 0 1"><freejoint/>{feet}<geom type="box" size=".1 .1 .1" pos="0 0 .2"/></body>')
     assert description.Description(m).layout.frictional >= 28
+
+
+def test_there_are_places_for_what_a_body_stands_on_boxes():
+    """Of nine feet on a box of the world; one that is out of reach asks for none."""
+    feet = "".join(f'<geom type="box" size=".1 .03 .02" pos="0 {0.1 * i} 0"/>' for i in range(9))
+    body = f'<body pos="0 0 .07"><freejoint/>{feet}</body>'
+    near, far = (model(f'<geom type="box" size="5 5 .05" pos="0 0 {z}"/>', body) for z in (0, -3))
+    data = mujoco.MjData(near)
+    mujoco.mj_forward(near, data)
+    assert description.Description(near).layout.frictional == data.ncon == 36
+    assert description.Description(far).layout.frictional == description.MOST_FRICTIONAL

@@ -162,6 +162,8 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         self.action_range = check_pair("action_range", self.action_range)  # a class may have a list or an array
         self.on_overflow, self.nan_dump = on_overflow, nan_dump
         self._action_shape = torch.Size([*self.batch_size, mj_model.nu])
+        replaceable = ("step", "_reset", "maybe_reset")
+        self._steps_as_base = all(getattr(type(self), name) is getattr(LocoEnv, name) for name in replaceable)
         self._pid = os.getpid()
         self._world, self._episodes, self._stage = None, None, {}
         self.hooks = (

@@ -16,6 +16,8 @@ NESTED = ("reward_terms", "metrics", "observation_terms")
 class QuickResets(EnvBase):
     """TorchRL's ``step_and_maybe_reset`` and ``maybe_reset`` for worlds that a mask on the device resets."""
 
+    _steps_as_base: bool  # whether step, _reset and maybe_reset are those of the package
+
     def _step_and_maybe_reset(
         self, tensordict: TensorDictBase, rewritten: frozenset[str] = frozenset()
     ) -> tuple[TensorDictBase, TensorDictBase]:
@@ -43,10 +45,8 @@ class QuickResets(EnvBase):
 
         Those are partial steps, results given in advance, nested entries, checks of types, hooks.
         """
-        cls = type(self)
-        base = next(each for each in cls.__mro__ if QuickResets in each.__bases__)
         return (
-            all(getattr(cls, name) is getattr(base, name) for name in ("step", "_reset", "maybe_reset"))
+            self._steps_as_base
             and type(tensordict) is TensorDict
             and tensordict.batch_size == self.batch_size
             and tensordict.device == self.device

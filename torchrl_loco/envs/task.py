@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import mujoco
 import numpy as np
@@ -108,8 +108,8 @@ class Task:
     term_names: tuple[str, ...] = ()
     """Names of the reward's terms; to be set beside :meth:`observation_func`."""
 
-    mj_model: mujoco.MjModel
-    """The model."""
+    if TYPE_CHECKING:
+        mj_model: mujoco.MjModel  # which LocoEnv sets
 
     # The hooks, in the order in which they are called.
 
@@ -397,7 +397,7 @@ def check_commands(cls: type[Task], memory: Mapping[str, Entry]) -> None:
 
 def _warn_of_misspelt_names(cls: type[Task]) -> None:
     """Warns of what a class defines by a name that is almost that of a hook or an attribute: nobody would call it."""
-    meant = {*HOOKS, *Task.__annotations__} - {"mj_model"}
+    meant = {*HOOKS, *Task.__annotations__}
     for base in cls.__mro__[: cls.__mro__.index(Task)]:
         if base.__module__.startswith("torchrl_loco."):
             continue

@@ -141,7 +141,7 @@ def _contacts(m: mujoco.MjModel) -> list[str]:
             kinds.add(" and ".join(title(m.geom_type[geom]) for geom in pair.geoms))
     if kinds:
         choice = "; contacts='ground' leaves out those of moving bodies with each other" if moving else ""
-        found.append(f"contacts of {', '.join(sorted(kinds))}: compiled are {described()}{choice}")
+        found.append(f"contacts of {', '.join(sorted(kinds))}: it has those of {described()}{choice}")
     if is_elliptic(m) and m.pair_solreffriction.any():  # pyramids do without
         found.append("solreffriction of an explicit pair with an elliptic cone")
     return found

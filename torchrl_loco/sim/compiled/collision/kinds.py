@@ -46,6 +46,7 @@ KINDS = {
 """What is compiled, by the two shapes, the one of the smaller number first. A plane belongs to the world."""
 
 NOT_COMPILED = Kind(0, "")
+"""That of all other shapes."""
 
 FUNCTIONS = tuple(dict.fromkeys(kind.function for kind in KINDS.values()))
 """The functions of lanes, in the order in which they look at their pairs."""
@@ -67,5 +68,5 @@ def described() -> str:
     with_: dict[int, list[str]] = {}
     for first, second in KINDS:
         with_.setdefault(first, []).append(title(second))
-    titles = {shape: "plane of the world" if shape == PLANE else title(shape) for shape in with_}
+    titles = {shape: "plane (of the world)" if shape == PLANE else title(shape) for shape in with_}
     return "; ".join(f"{titles[shape]} with {', '.join(others)}" for shape, others in with_.items())

@@ -15,7 +15,7 @@ static constexpr unsigned INFINITE_BITS = 0x7f800000u, NAN_BITS = 0x7fc00000u;
 
 struct Math {
   // Of a number and a bound; what is no number stays none, and does not become the bound. On a GPU that has an instruction
-  // for it this spares a predicate.
+  // for it this spares a predicate, and the result is none where the bound is.
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
   static INLINE float smaller(float a, float b) {
     float x;

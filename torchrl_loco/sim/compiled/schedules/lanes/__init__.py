@@ -43,7 +43,7 @@ FILES = (
     "outputs",
     "step",
 )
-"""The headers, in their order: each but the first two and the last has a struct that is built on the one before."""
+"""The headers, in their order: from ``group`` on, each adds a struct that is built on the one before."""
 TEMPLATE = pathlib.Path(__file__).with_name("step.h")
 """The last of them: a control step from the arrays of all worlds and back."""
 HEADERS = "\n".join(TEMPLATE.with_name(f"{name}.h").read_text() for name in FILES)

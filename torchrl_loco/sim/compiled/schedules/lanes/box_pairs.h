@@ -21,28 +21,32 @@ struct BoxPairContacts : BoxContacts {
   static INLINE Mat of_columns(Vec a, Vec b, Vec c) { return {{a.x, b.x, c.x}, {a.y, b.y, c.y}, {a.z, b.z, c.z}}; }
   static INLINE int next(int axis) { return axis < 2 ? axis + 1 : 0; }
 
-  // The nearest points of two edges, along axis i of the first box and j of the second, on the side to which `normal` points.
-  // Where it has nothing along an axis, both edges there are as far out: then the nearer ones count.
+  // An axis besides `along` in which a direction has nothing, so that both edges there are as far out, or -1.
+  static INLINE int level_axis(Vec n, int along) {
+    const int k = next(along), l = next(k);
+    return fabsf(n.component(k)) < 1e-5f ? k : fabsf(n.component(l)) < 1e-5f ? l : -1;
+  }
+
+  // The middle of the edge along an axis that is farthest in the direction n times `facing`; mirrored in an axis, or -1.
+  static INLINE Vec edge_of(Vec size, Vec n, float facing, int along, int mirrored) {
+    Vec middle = by_component(signs(n) * facing, size);
+    if (mirrored >= 0) middle = middle - unit(mirrored) * (2.0f * middle.component(mirrored));
+    return middle - unit(along) * middle.component(along);
+  }
+
+  // The nearest points of two edges, along axis i of the first box and j of the second, on the side to which `normal`
+  // points; of several edges that are as far out there, the nearest.
   static INLINE void touch_edges(Vec offset, const Mat& turn, Vec first, Vec second, int i, int j, Vec normal,
                                  Touching& found) {
     const Vec of_second = turn.transposed_times(normal), along = turn.column(j);
     const float cosine = along.component(i), across = 1.0f - cosine * cosine;
+    const int level = level_axis(normal, i), other_level = level_axis(of_second, j);
     float nearest = 1e30f;
     ROLLED_FOR(int choice = 0; choice < 4; ++choice) {
-      const Vec side = signs(normal), other_side = signs(of_second) * -1.0f;
-      Vec corner = by_component(side, first), other = by_component(other_side, second);
-      bool chosen[2];
-      UNROLLED_FOR(int box = 0; box < 2; ++box) {
-        const Vec n = box ? of_second : normal;
-        const int k = next(box ? j : i), l = next(k);
-        const int level = fabsf(n.component(k)) < 1e-5f ? k : fabsf(n.component(l)) < 1e-5f ? l : -1;
-        chosen[box] = choice >> box & 1;
-        Vec& c = box ? other : corner;
-        if (chosen[box] && level >= 0) c = c - unit(level) * (2.0f * c.component(level));
-        chosen[box] = chosen[box] && level < 0;  // there is no second choice
-        c = c - unit(box ? j : i) * c.component(box ? j : i);
-      }
-      if (chosen[0] || chosen[1]) continue;
+      const bool mirrored = choice & 1, other_mirrored = choice & 2;
+      if ((mirrored && level < 0) || (other_mirrored && other_level < 0)) continue;
+      const Vec corner = edge_of(first, normal, 1.0f, i, mirrored ? level : -1);
+      const Vec other = edge_of(second, of_second, -1.0f, j, other_mirrored ? other_level : -1);
       const Vec start = turn * other + offset, between = start - corner;
       const float ahead = between.component(i), behind = along.dot(between);
       const float reach = first.component(i), other_reach = second.component(j);
@@ -99,7 +103,6 @@ struct BoxPairContacts : BoxContacts {
     ROLLED_FOR(int edge = 0; edge < 4 && count > 0; ++edge)
       count = cut(corners, count, edge > 1, edge & 1 ? -1.0f : 1.0f, edge > 1 ? height : width);
     const float same = 1e-10f * (width * width + height * height);
-    found.count = 0;
     found.normal = unit(axis) * side;
     ROLLED_FOR(int k = 0; k < count; ++k) {
       const Vec c = corners[k];
@@ -115,7 +118,7 @@ struct BoxPairContacts : BoxContacts {
     }
   }
 
-  // Takes the second's center and axes (columns) in the frame of the first.
+  // Takes the second's center and axes (columns) in the frame of the first, and nothing found so far.
   static INLINE void touch_boxes(Vec center, const Mat& turn, Vec first, Vec second, float margin, Touching& found) {
     const Vec back = turn.transposed_times(center) * -1.0f;
     const Vec ones = {1.0f, 1.0f, 1.0f};
@@ -123,7 +126,6 @@ struct BoxPairContacts : BoxContacts {
     float gap = -1e30f, face_gap = -1e30f;
     int face = 0, edges = -1;
     Vec normal = {0.0f, 0.0f, 0.0f};
-    found.count = 0;
     ROLLED_FOR(int i = 0; i < 15; ++i) {
       const int k = i % 3, l = (i - 6) / 3;
       const bool is_edge = i >= 6;

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.collision.kinds import (
+    BOX,
     CAPSULE,
     FUNCTIONS,
     MESH,
@@ -161,6 +162,9 @@ class Description:
         """Returns how many contacts with friction and without there are when the bodies stand in their home pose."""
         m = copy.copy(nominal(self.m))
         planes = m.geom_type == PLANE
+        floors = planes | ((m.geom_type == BOX) & (m.body_weldid[m.geom_bodyid] == 0))  # boxes only where they are near
+        m.geom_margin[floors] = np.maximum(m.geom_margin[floors], STANDING)
+        np.maximum.at(m.body_margin, m.geom_bodyid[floors], STANDING)
         m.geom_margin[planes] = m.body_margin[m.geom_bodyid[planes]] = FAR
         of_planes = planes[m.pair_geom1] | planes[m.pair_geom2]
         m.pair_margin[of_planes & (m.pair_margin > NEVER)] = FAR
@@ -169,13 +173,18 @@ class Description:
         mujoco.mj_kinematics(m, data)
         mujoco.mj_comPos(m, data)
         mujoco.mj_collision(m, data)
-        heights: dict[tuple[int, int], list[tuple[float, int]]] = {}  # by plane and tree
+        heights: dict[tuple[int, int], list[tuple[float, int]]] = {}  # by plane or box, and tree
         for contact in data.contact:
-            plane, geom = contact.geom
-            if planes[plane] and not contact.exclude:
+            floor, geom = sorted(contact.geom, key=lambda g: not floors[g])
+            if floors[floor] and not contact.exclude:
                 root = m.body_rootid[m.geom_bodyid[geom]]
-                heights.setdefault((plane, root), []).append((contact.dist, contact.dim))
-        touching = [dim for found in heights.values() for height, dim in found if height < min(found)[0] + STANDING]
+                heights.setdefault((floor, root), []).append((contact.dist, contact.dim))
+        touching = [
+            dim
+            for (floor, _), found in heights.items()
+            for height, dim in found
+            if height < STANDING + (min(found)[0] if planes[floor] else 0.0)
+        ]
         return sum(dim > 1 for dim in touching), sum(dim == 1 for dim in touching)
 
     def _layout(self) -> Layout:
