@@ -1,9 +1,16 @@
 """torch.compile, as trainings use it."""
 
+import importlib
 from collections.abc import Callable
 from typing import Any
 
 import torch
+
+
+def start() -> None:
+    """Imports the compiler, and with it starts the processes that compile kernels: they take seconds to be ready."""
+    importlib.import_module("torch._inductor.compile_fx")
+    importlib.import_module("torch._inductor.async_compile").maybe_warm_pool()
 
 
 def compiled(function: Callable[..., Any], what: str, **settings: Any) -> Callable[..., Any]:

@@ -53,7 +53,8 @@ class PPO(Algorithm):
         key, after = self.spaces.critic_key, batch["next"]
         ends = after["done"], after["terminated"]
         advantage, target = self._compiled_estimates(batch[key], after[key], after["reward"], *ends)
-        read = batch.select(*{"observation", key}, "action", "action_log_prob")
+        # In an order that every process repeats: torch.compile finds what it made of the entries in that order.
+        read = batch.select(*dict.fromkeys(("observation", key)), "action", "action_log_prob")
         return read.update({"advantage": advantage, "value_target": target})
 
     def _estimates(

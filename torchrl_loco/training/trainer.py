@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 from torchrl_loco.checks import check_device
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.policy import Policy
-from torchrl_loco.training import distributed
+from torchrl_loco.training import compiling, distributed
 from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.config import check_loggers
@@ -100,6 +100,8 @@ class Trainer:
                 f"{part} ({frames}) must be at least {self.frames_per_iteration}: one batch of "
                 f"{config.control_steps_per_batch} on each of {distributed.ranks()} ranks"
             )
+        if config.compile and torch.device(config.device).type == "cuda":
+            compiling.start()  # while the environment's kernels are compiled
         torch.manual_seed(config.seed)
         first, rank = distributed.is_first(), distributed.rank()
         self.environments = Environments(dataclasses.replace(config, task=run.task), given.env)

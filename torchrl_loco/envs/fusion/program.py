@@ -191,7 +191,10 @@ class Program:
                 f"{{op}} takes {f'a large tensor of {x.dtype}' if isinstance(x, torch.Tensor) else repr(x)}"
             )
         array: Any = np.empty(x.shape, dtype=object)
-        array.flat = [self.constant(number, x.dtype) for number in x.flatten().tolist()]
+        numbers = x.flatten().tolist()
+        keys = list(zip(numbers, np.signbit(numbers).tolist(), strict=True))  # 0.0 == -0.0
+        made = {key: self.constant(key[0], x.dtype) for key in dict.fromkeys(keys)}  # tables repeat a few numbers
+        array.flat = [made[key] for key in keys]
         return Value(array, x.dtype, None)
 
     def cast(self, x: Any, dtype: torch.dtype) -> Value:
