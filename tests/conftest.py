@@ -32,11 +32,11 @@ def pytest_collection_finish():
 
 
 def pytest_collection_modifyitems(items):
-    """Leaves what cannot run here, and MuJoCo-Warp's engine, which the quadruped takes, out of the everyday part."""
+    """Leaves what cannot run here, and MuJoCo-Warp's engine, out of the everyday part."""
     import torch
 
     for item in items:
-        if hasattr(item, "callspec") and ("mujoco_warp" in item.callspec.id or "quadruped" in item.callspec.id):
+        if hasattr(item, "callspec") and "mujoco_warp" in item.callspec.id:
             item.add_marker(pytest.mark.slow)
         if "gpu" in item.keywords and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason="no CUDA device here"))

@@ -546,6 +546,7 @@ def test_a_hook_that_cannot_be_compiled_runs_as_it_is_and_says_why(caplog):
 BASE = {"model": DOG, "config": CONFIG, "reward": lambda self, s: s.time, "observation": lambda self, s: s.qpos}
 
 
+MAGNETIC = DOG.replace("<accelerometer", "<magnetometer").replace("<option", '<option magnetic="0 1 -2"', 1)
 WRONG = [
     ({"reward": None}, TypeError, "must define reward"),
     ({"config": 1}, TypeError, "config must be a torchrl_loco.SimConfig"),
@@ -578,7 +579,11 @@ WRONG = [
     ({"reward": lambda self, s: s.comand}, AttributeError, "memory, shared and constants have no entries"),
     ({"reward": lambda self, s: s.model("geom_fiction")}, AttributeError, "no array 'geom_fiction'"),
     ({"reward": lambda self, s: s.joint_qpos(".*")[:, 0]}, ValueError, "name a free or ball joint alone"),
-    ({"reward": lambda self, s: s.sensor("unread")[:, 0], "engine": "compiled"}, ValueError, "'unread'"),
+    (
+        {"model": MAGNETIC, "reward": lambda self, s: s.sensor("unread")[:, 0], "engine": "compiled"},
+        ValueError,
+        "'unread'",
+    ),
 ]
 
 
@@ -642,10 +647,10 @@ def test_wrong_tasks_are_refused():
             type("Wrong", (LocoEnv,), entries)(4, "cpu", seed=0, **options)
 
 
-def test_a_sensor_of_forces_is_asked_of_mujoco_warp():
+@pytest.mark.parametrize("engine", ["compiled", "mujoco_warp", "mujoco"])
+def test_an_accelerometer_feels_what_holds_a_body(engine):
     task = type("Feels", (LocoEnv,), {**BASE, "reward": lambda self, s: s.sensor("unread")[:, 2]})
-    env = task(2, "cpu", seed=0)
-    assert env.engine == "mujoco_warp"
+    env = task(2, "cpu", seed=0, engine=engine)
     td = env.rollout(100, Still(env))
     assert (td["next", "reward"][:, -1].abs() < 100).all()
     assert (td["next", "reward"] != 0).all()

@@ -78,7 +78,9 @@ def contacts_of_c(m, data):
     return found, unclear
 
 
-def assert_same(m, states, may_differ=lambda data, geoms: False):
+def assert_same(
+    m, states, may_differ=lambda data, geoms: False, undecided=lambda data, geoms: False, atol=2e-6, place=5e-6
+):
     """Every state has the contacts of C MuJoCo; returns how many pairs had how many."""
     assert unsupported(m) == []
     counts, data = collections.Counter(), mujoco.MjData(m)
@@ -90,15 +92,15 @@ def assert_same(m, states, may_differ=lambda data, geoms: False):
         for geoms, row in ours:
             found[geoms].append(row)
         for geoms in set(expected) | set(found):
-            if geoms in unclear:
+            if geoms in unclear or undecided(data, geoms):
                 continue
             a, b = np.array(expected[geoms]), np.array(found[geoms])
             assert len(a) == len(b), (geoms, qpos)
             counts[tuple(m.geom(g).name for g in geoms), len(a)] += 1
-            np.testing.assert_allclose(np.sort(b[:, 0]), np.sort(a[:, 0]), rtol=0, atol=2e-6)
+            np.testing.assert_allclose(np.sort(b[:, 0]), np.sort(a[:, 0]), rtol=0, atol=atol)
             if not may_differ(data, geoms):
                 apart = np.abs(a[:, None] - b).max(axis=2)
-                assert max(apart.min(axis=0).max(), apart.min(axis=1).max()) < 5e-6, (geoms, qpos)
+                assert max(apart.min(axis=0).max(), apart.min(axis=1).max()) < place, (geoms, qpos)
     return counts
 
 
@@ -148,6 +150,40 @@ def test_spheres_and_capsules_touch_boxes():
         counts
     )
     assert all(counts[(name, "box"), 2] > 100 for name in ("short", "long")), counts
+
+
+def is_inside(data, geoms):
+    """Whether the axis of a sphere or capsule enters a solid: which way it leaves again, C MuJoCo searches."""
+    radius = data.model.geom_size[geoms[0], 0]
+    return any(c.dist < -0.98 * radius for c in data.contact if tuple(c.geom) == geoms)
+
+
+def test_spheres_and_capsules_touch_ellipsoids_and_cylinders():
+    """From all sides; half of the capsules lie nearly flat on a cap or beyond its rim, where there are two contacts.
+
+    C MuJoCo searches for the normal there, which it finds to some 1e-3.
+    """
+    shapes = {"ball": ("sphere", ".05"), "short": ("capsule", ".03 .05"), "long": ("capsule", ".02 .3")}
+    bodies = [
+        f'<body pos="0 0 1"><freejoint/><geom name="{name}" type="{kind}" size="{size}" contype="0"/></body>'
+        for name, (kind, size) in shapes.items()
+    ]
+    rng = np.random.default_rng(0)
+    for solid, size in (("ellipsoid", ".1 .07 .04"), ("ellipsoid", ".12 .12 .006"), ("cylinder", ".06 .09")):
+        m = model(f'<geom name="solid" type="{solid}" size="{size}" margin=".01"/>', *bodies)
+        m.opt.ccd_tolerance, m.opt.ccd_iterations = 1e-9, 200
+        states = np.zeros((3 * STATES, m.nq))
+        for body in range(len(shapes)):
+            states[:, 7 * body : 7 * body + 3] = rng.uniform((-0.2, -0.2, -0.15), (0.2, 0.2, 0.15), (len(states), 3))
+            states[:, 7 * body + 3 : 7 * body + 7] = rng.normal(size=(len(states), 4))
+        flat = rng.normal(size=(2 * STATES, 3)) * (1, 1, 0.06)
+        x, y, z = (flat / np.linalg.norm(flat, axis=1, keepdims=True)).T
+        for body, axes in ((1, slice(0, STATES)), (2, slice(STATES, None))):
+            states[:STATES, 7 * body + 3 : 7 * body + 7] = np.stack([1 + z, -y, x, 0 * z], axis=1)[axes]
+            states[:STATES, 7 * body + 2] = rng.choice([-1, 1], STATES) * (0.09 + rng.uniform(-0.03, 0.04, STATES))
+        counts = assert_same(m, states.astype(np.float32), undecided=is_inside, atol=5e-5, place=1e-3)
+        assert all(counts[(name, "solid"), 1] > 50 for name in shapes), counts
+        assert (counts[("long", "solid"), 2] > 30) == (solid == "cylinder"), counts
 
 
 def test_boxes_touch_boxes(monkeypatch):

@@ -266,12 +266,23 @@ def test_an_edited_model_is_one_that_was_compiled_so():
         for name in FIELDS:
             field(x, name)[...] = varied.full(name, row)
         x.body_invweight0[:], x.dof_invweight0[:] = model.body_invweight0, model.dof_invweight0
-        x.stat.meaninertia = model.stat.meaninertia
+        x.stat.meaninertia, x.dof_M0[:] = model.stat.meaninertia, edited.dof_M0
     for state in zip(*start_of(XML), strict=True):
         a, b = data_of(edited, *state), data_of(compiled_so, *state)
         mujoco.mj_step(edited, a)
         mujoco.mj_step(compiled_so, b)
         np.testing.assert_allclose(a.qvel, b.qvel, atol=1e-9)
+
+
+def test_a_body_whose_mass_matrix_is_diagonal_has_the_mass_of_its_world():
+    text = "<mujoco><worldbody><body><freejoint/><geom type='box' size='.1 .2 .3'/></body></worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(text)
+    varied = Varied(model, {"body_mass": [1], "body_inertia": [3, 4, 5], "dof_armature": [0]})
+    edited = varied.edited([5.0, 0.1, 0.2, 0.15, 0.5])
+    data, matrix = mujoco.MjData(edited), np.zeros((6, 6))
+    mujoco.mj_forward(edited, data)
+    mujoco.mj_fullM(edited, data, matrix)
+    np.testing.assert_allclose(np.diag(matrix), [5.5, 5.0, 5.0, 0.1, 0.2, 0.15])
 
 
 @pytest.mark.parametrize(

@@ -359,8 +359,9 @@ class View:
     def sensor(self, name: str) -> torch.Tensor:
         """Returns a sensor of the model, ``(num_envs, size)``, in MuJoCo's units.
 
-        Those of poses and velocities (gyro, velocimeter, frame*, joint*) are computed here; touch, and velocity and
-        angular momentum of a subtree, by every engine; any other by ``mujoco_warp`` and ``mujoco``.
+        Those of poses and velocities (gyro, velocimeter, frame*, joint*) are computed here; touch, accelerometer, force
+        and torque at a site, and velocity and angular momentum of a subtree, by the engine. Any other is refused where
+        the task is made.
         """
         (sensor,), _ = self._catalog.ids("sensor", _one("sensor", name))
         derived = sensors.evaluate(self, sensor)

@@ -1,10 +1,8 @@
 """Everything of an environment that lives on its device, and the control step from top to bottom."""
 
-import atexit
 import contextlib
 import logging
 import os
-import warnings
 import weakref
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -17,6 +15,7 @@ import warp as wp
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.body_funcs import check_pair, check_rows
+from torchrl_loco.envs.closing import OPEN, close_quietly
 from torchrl_loco.envs.episode import (
     Control,
     EpisodeStart,
@@ -185,7 +184,7 @@ class World:
                 monitor.restart()
         self._renderers: dict[tuple[str, int, int, int], Renderer] = {}
         self._pid, self._closed = os.getpid(), False
-        _WORLDS.add(self)
+        OPEN.add(self)
 
     # The control step and the reset, from top to bottom. Each line is a recorded launch, a part of hooks, or nothing.
 
@@ -578,26 +577,7 @@ class World:
                 stack.callback(monitor.check)
 
     def __del__(self) -> None:
-        _close_quietly(self)
-
-
-def _close_quietly(world: World) -> None:
-    """Closes a world in a finalizer, where errors can only be warnings."""
-    with contextlib.suppress(Warning):  # warnings may be configured as errors
-        try:
-            world.close()
-        except Exception as error:
-            warnings.warn(str(error), RuntimeWarning, stacklevel=2)
-
-
-_WORLDS: "weakref.WeakSet[World]" = weakref.WeakSet()
-
-
-@atexit.register
-def _close_all() -> None:
-    """Closes all worlds before torch is torn down."""
-    for world in list(_WORLDS):
-        _close_quietly(world)
+        close_quietly(self)
 
 
 def _nothing(*args: Any) -> None:

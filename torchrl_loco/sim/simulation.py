@@ -268,8 +268,11 @@ class Simulation:
                         njmax=self.config.njmax,
                     )
             data = self._mujoco_data[worlds]
-            moved = ("mocap_pos", "mocap_quat") if self.mj_model.nmocap else ()
-            for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time", *moved):
+            more = [
+                *(("mocap_pos", "mocap_quat") if self.mj_model.nmocap else ()),
+                *(["act"] if self.mj_model.na else []),
+            ]
+            for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time", *more):
                 wp.copy(getattr(data, name), getattr(self.data, name)[:worlds])
             model = self._model_of_each_world()
             mjw.kinematics(model, data)

@@ -12,8 +12,9 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 ``ir``               ``symbols``: scalars whose arithmetic is traced, and blocks of C++;
                      ``parameters``: numbers of the model that differ from world to world;
                      ``tables``: constants and tables as C++
-``physics``          ``spatial``, ``links``, ``dynamics``, ``actuators``, ``constraints``,
-                     ``pyramid``, ``sensors``, ``delicate``; ``arithmetic.h``, ``laws.h``
+``physics``          ``spatial``, ``links``, ``dynamics``, ``lengths``, ``actuators``,
+                     ``constraints``, ``equalities``, ``pyramid``, ``sensors``, ``delicate``;
+                     ``arithmetic.h``, ``laws.h``
 ``collision``        ``kinds``: how the shapes of two geoms touch; ``pairs``: which geoms may,
                      and with which parameters; ``planes``, ``meshes``
 ``schedules``        ``traced``, with ``solver``, ``ground_contacts``, ``dense_contacts``: one

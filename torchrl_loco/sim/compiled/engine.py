@@ -30,6 +30,7 @@ from torchrl_loco.sim.world_func import ALONE, Around, Chain, WorldFunc, WorldKe
 ROWS = {
     "qpos": ("nq", wp.float32),
     "qvel": ("nv", wp.float32),
+    "act": ("na", wp.float32),
     "qacc_warmstart": ("nv", wp.float32),
     "ctrl": ("nu", wp.float32),
     "time": (None, wp.float32),
@@ -61,6 +62,7 @@ class Data:
     Attributes:
         qpos: positions, ``(nworld, nq)``.
         qvel: velocities, ``(nworld, nv)``.
+        act: activations of the actuators, ``(nworld, na)``.
         qacc_warmstart: accelerations of the last substep, from which the solver starts, ``(nworld, nv)``.
         ctrl: controls, ``(nworld, nu)``.
         time: time since the world's reset (s), ``(nworld,)``.
@@ -71,11 +73,11 @@ class Data:
         in_contact: whether they have any, ``(nworld, contacts)`` bool.
         sensordata: sensors, ``(nworld, nsensordata)``.
         overflow: ``Overflow`` bits, ``(nworld,)``.
-        act: activations of the actuators, ``(nworld, 0)``: a supported model has none.
     """
 
     qpos: wp.array
     qvel: wp.array
+    act: wp.array
     qacc_warmstart: wp.array
     ctrl: wp.array
     time: wp.array
@@ -85,7 +87,6 @@ class Data:
     in_contact: wp.array
     sensordata: wp.array
     overflow: wp.array
-    act: wp.array
 
     def __init__(
         self,
@@ -100,7 +101,6 @@ class Data:
             shape = _shape(m, nworld, name, contacts)
             return _zeros(shape, ROWS[name][1], device, structure_of_arrays=structure_of_arrays)
 
-        self.act = wp.zeros((nworld, 0), dtype=float, device=device)
         self._make: Callable[[str], wp.array] | None = make
         self._later: dict[str, wp.array] = {}
         for name in ROWS:
@@ -368,6 +368,7 @@ def _kernel(
         numbers_out: wp.array2d[float],
         qpos_out: wp.array2d[float],
         qvel_out: wp.array2d[float],
+        act_out: wp.array2d[float],
         qacc_warmstart_out: wp.array2d[float],
         time_out: wp.array[float],
         xpos_out: wp.array2d[wp.vec3],
@@ -395,6 +396,7 @@ def _kernel(
         # Data out:
         qpos_out: wp.array2d[float],
         qvel_out: wp.array2d[float],
+        act_out: wp.array2d[float],
         qacc_warmstart_out: wp.array2d[float],
         time_out: wp.array[float],
         xpos_out: wp.array2d[wp.vec3],
@@ -422,6 +424,7 @@ def _kernel(
             numbers_out,
             qpos_out,
             qvel_out,
+            act_out,
             qacc_warmstart_out,
             time_out,
             xpos_out,

@@ -11,6 +11,7 @@ import warp as wp
 
 from torchrl_loco.sim.compiled.collision.pairs import needs_lanes
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel, nominal
+from torchrl_loco.sim.compiled.physics.sensors import AT_SITES
 from torchrl_loco.sim.compiled.schedules import lanes, traced
 
 TRACED_DOFS = 16
@@ -40,11 +41,12 @@ rows: dict[tuple, np.ndarray] = {}
 def is_traced(m: mujoco.MjModel) -> bool:
     """Returns whether one thread steps a world, in straight-line code; else a group of lanes does, in loops.
 
-    Lanes alone have integrators other than Euler, joints that limit the forces of their actuators, and contacts that
-    are more than friction that slides on spheres and capsules.
+    Lanes alone have integrators other than Euler, joints that limit the forces of their actuators, tendons, equalities,
+    activations, sensors at sites, and contacts that are more than friction that slides on spheres and capsules.
     """
     euler = m.opt.integrator == int(mujoco.mjtIntegrator.mjINT_EULER)
-    return m.nv <= TRACED_DOFS and euler and not m.jnt_actfrclimited.any() and not needs_lanes(m)
+    plain = not (m.jnt_actfrclimited.any() or m.na or m.neq or m.ntendon or np.isin(m.sensor_type, AT_SITES).any())
+    return m.nv <= TRACED_DOFS and euler and plain and not needs_lanes(m)
 
 
 def structure_of_arrays(m: mujoco.MjModel, device: wp.Device) -> bool:

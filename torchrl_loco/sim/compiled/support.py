@@ -1,13 +1,23 @@
 """Lists what a model needs that the compiled step does not support. Everything else is supported."""
 
 import mujoco
+import numpy as np
 
 from torchrl_loco.sim.compiled.collision.kinds import PLANE, described, title
 from torchrl_loco.sim.compiled.collision.pairs import Pair, is_elliptic, kind, pairs
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel, nominal
-from torchrl_loco.sim.compiled.physics.actuators import BIASES
+from torchrl_loco.sim.compiled.physics import equalities
+from torchrl_loco.sim.compiled.physics.actuators import BIASES, FILTERS, acting
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE
-from torchrl_loco.sim.compiled.physics.sensors import ANGULAR_MOMENTUM, SUBTREE_VELOCITY, TOUCH
+from torchrl_loco.sim.compiled.physics.lengths import OF_JOINT, OF_TENDON
+from torchrl_loco.sim.compiled.physics.sensors import (
+    ANGULAR_MOMENTUM,
+    AT_SITES,
+    FORCE,
+    SUBTREE_VELOCITY,
+    TORQUE,
+    TOUCH,
+)
 from torchrl_loco.sim.compiled.schedules import lanes
 from torchrl_loco.sim.compiled.step import is_traced
 from torchrl_loco.sim.varied import Varied
@@ -65,6 +75,8 @@ def _options(m: mujoco.MjModel) -> list[str]:
     if option.density or option.viscosity:
         found.append("forces of a fluid")
     allowed = sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}", 0)) for flag in IGNORED_FLAGS)
+    if option.disableflags & int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD) and any(kind(m, p).searched for p in pairs(m)):
+        found.append("disabled nativeccd, by which C MuJoCo finds contacts of ellipsoids and cylinders")
     found += [f"disabled {flag}" for flag in _flags(mujoco.mjtDisableBit, option.disableflags & ~allowed)]
     found += [f"enabled {flag}" for flag in _flags(mujoco.mjtEnableBit, option.enableflags)]
     return found
@@ -77,8 +89,6 @@ def _flags(kind: type, bits: int) -> list[str]:
 
 def _elements(m: mujoco.MjModel) -> list[str]:
     counts = {
-        "tendons": m.ntendon,
-        "equality constraints": m.neq,
         "flexes": m.nflex,
         "plugins": m.nplugin,
         "mocap bodies": m.nmocap,
@@ -88,9 +98,25 @@ def _elements(m: mujoco.MjModel) -> list[str]:
         "moving surfaces": m.flg_surfacevel,
     }
     found = [title for title, count in counts.items() if count]
+    if not all(_is_plain(m, t) for t in range(m.ntendon)):
+        found.append("tendons that are not fixed, or have more than a length")
+    if not set(m.eq_type[m.eq_active0 != 0].tolist()) <= set(equalities.KINDS):
+        found.append("equality constraints but for those of joints, tendons, connections and welds")
+    for i in equalities.active(m, (equalities.CONNECT, equalities.WELD)):
+        first, second = m.body_weldid[list(equalities.Weld.of(nominal(m), i).bodies)]
+        if first == second != 0:
+            found.append(f"equality {m.equality(i).name!r}, which holds a body to itself")
     if m.nv == 0:
         found.append("a model without joints")
     return found
+
+
+def _is_plain(m: mujoco.MjModel, t: int) -> bool:
+    """Returns whether a tendon is fixed, without limit, spring, damper, friction or armature."""
+    wraps = range(m.tendon_adr[t], m.tendon_adr[t] + m.tendon_num[t])
+    fixed = all(m.wrap_type[k] == int(mujoco.mjtWrap.mjWRAP_JOINT) for k in wraps)
+    names = "limited actfrclimited stiffness stiffnesspoly damping dampingpoly frictionloss armature"
+    return fixed and not any(np.any(getattr(m, f"tendon_{name}")[t]) for name in names.split())
 
 
 def _joints(m: mujoco.MjModel) -> list[str]:
@@ -101,6 +127,11 @@ def _joints(m: mujoco.MjModel) -> list[str]:
             found.setdefault("stiffness of a free or ball joint", []).append(name)
         if lanes.is_implicitfast(m) and m.jnt_type[j] == FREE and m.tree_dofnum[m.dof_treeid[m.jnt_dofadr[j]]] == 6:
             found.setdefault("implicitfast for a body that is alone in its tree", []).append(name)
+        last = m.body_jntadr[m.jnt_bodyid[j]] + m.body_jntnum[m.jnt_bodyid[j]] - 1
+        if m.jnt_type[j] == BALL and j != last and not is_traced(m):
+            found.setdefault("a ball joint that another joint of the body follows, in a world of lanes", []).append(
+                name
+            )
         if m.jnt_stiffnesspoly[j].any():
             found.setdefault("springs that are not linear", []).append(name)
     dampers = ["dampers that are not linear"] if m.dof_dampingpoly.any() else []
@@ -110,13 +141,17 @@ def _joints(m: mujoco.MjModel) -> list[str]:
 def _actuators(m: mujoco.MjModel) -> list[str]:
     found: Found = {}
     for i in range(m.nactuator):  # not nu: an actuator may have several controls
-        name, joint = m.actuator(i).name, m.actuator_trnid[i, 0]
+        name, of = m.actuator(i).name, m.actuator_trnid[i, 0]
+        of_tendon = m.actuator_trntype[i] == OF_TENDON
         if m.actuator_ctrlnum[i] != 1:
             found.setdefault("other than one control", []).append(name)
-        if m.actuator_trntype[i] != int(mujoco.mjtTrn.mjTRN_JOINT) or m.jnt_type[joint] in (FREE, BALL):
-            found.setdefault("a transmission other than a hinge or slide", []).append(name)
-        if m.actuator_dyntype[i] != int(mujoco.mjtDyn.mjDYN_NONE):
-            found.setdefault("activation dynamics", []).append(name)
+        if not of_tendon and (m.actuator_trntype[i] != OF_JOINT or m.jnt_type[of] in (FREE, BALL)):
+            found.setdefault("a transmission other than a hinge, slide or fixed tendon", []).append(name)
+        if of_tendon and lanes.is_implicitfast(m) and m.actuator_biasprm[i, 2]:
+            found.setdefault("implicitfast for a tendon's bias by velocity", []).append(name)
+        plain = m.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
+        if not plain and (m.actuator_dyntype[i] not in FILTERS or m.actuator_actearly[i] or i not in acting(m)):
+            found.setdefault("activation other than a filter or integrator that acts", []).append(name)
         if m.actuator_gaintype[i] != int(mujoco.mjtGain.mjGAIN_FIXED) or m.actuator_biastype[i] not in BIASES:
             found.setdefault("a gain that is not fixed or a bias that is not affine", []).append(name)
         if m.actuator_delay[i] or m.actuator_damping[i] or m.actuator_armature[i] or m.actuator_dampingpoly[i].any():
@@ -157,19 +192,29 @@ def _sensors(m: mujoco.MjModel) -> list[str]:
     names = [
         m.sensor(i).name
         for i in range(m.nsensor)
-        if m.sensor_type[i] not in (SUBTREE_VELOCITY, ANGULAR_MOMENTUM, TOUCH)
-        or (m.sensor_type[i] == ANGULAR_MOMENTUM and m.body_weldid[m.sensor_objid[i]] == 0)
-        or (m.sensor_type[i] != TOUCH and nominal(m).body_subtreemass[m.sensor_objid[i]] == 0)
+        if not _is_sensed(m, m.sensor_type[i], m.sensor_objid[i])
         or m.sensor_cutoff[i]
         or m.sensor_interval[i].any()
         or m.sensor_delay[i]
     ]
-    found = (
-        {"anything but touch, and velocity and angular momentum of a moving subtree with mass, as they are": names}
-        if names
-        else {}
+    what = (
+        "anything but touch; velocimeter, gyro, accelerometer, force and torque of what moves (the last two where "
+        "neither friction resists turning nor a weld or connection holds); and velocity and angular momentum of a "
+        "moving subtree with mass, as they are"
     )
+    found = {what: names} if names else {}
     touch = [m.sensor(i).name for i in range(m.nsensor) if m.sensor_type[i] == TOUCH]
     if len(touch) > MAX_TOUCH:
         found[f"more than {MAX_TOUCH} sensors of touch"] = touch[MAX_TOUCH:]
     return _lines("sensor", found)
+
+
+def _is_sensed(m: mujoco.MjModel, kind: int, of: int) -> bool:
+    """Returns whether there is a sensor of a kind, of a body or site."""
+    if kind in AT_SITES:
+        welded = equalities.active(m, (equalities.CONNECT, equalities.WELD))
+        not_added = kind in (FORCE, TORQUE) and (welded or any(pair.condim > 3 for pair in pairs(m)))
+        return bool(m.body_weldid[m.site_bodyid[of]]) and not not_added
+    if kind == ANGULAR_MOMENTUM and m.body_weldid[of] == 0:
+        return False
+    return kind == TOUCH or (kind in (SUBTREE_VELOCITY, ANGULAR_MOMENTUM) and nominal(m).body_subtreemass[of] > 0)

@@ -22,11 +22,13 @@ class Kind:
         points: contacts that a pair of geoms can have.
         function: the function of lanes that finds them, ``collide_...`` in ``schedules/lanes``.
         traced: whether the schedule of one thread a world has it too.
+        searched: whether C MuJoCo searches for it in general ways, of which it has two.
     """
 
     points: int
     function: str
     traced: bool = False
+    searched: bool = False
 
 
 KINDS = {
@@ -39,6 +41,10 @@ KINDS = {
     (SPHERE, SPHERE): Kind(1, "round_and_round", traced=True),
     (SPHERE, CAPSULE): Kind(1, "round_and_round", traced=True),
     (CAPSULE, CAPSULE): Kind(2, "round_and_round", traced=True),
+    (SPHERE, ELLIPSOID): Kind(1, "round_and_solid", searched=True),
+    (SPHERE, CYLINDER): Kind(1, "round_and_solid"),
+    (CAPSULE, ELLIPSOID): Kind(1, "round_and_solid", searched=True),
+    (CAPSULE, CYLINDER): Kind(2, "round_and_solid", searched=True),
     (SPHERE, BOX): Kind(1, "round_and_box"),
     (CAPSULE, BOX): Kind(2, "round_and_box"),
     (BOX, BOX): Kind(8, "box_and_box"),

@@ -117,6 +117,16 @@ struct Quat {  // of unit length, as MuJoCo orders it
     const Vec u = {x, y, z}, t = u.cross(v) * 2.0f;
     return v + t * w + u.cross(t);
   }
+  // That of a matrix, given by its rows: the largest of the four comes first, whose square is not small.
+  static INLINE Quat from(Vec a, Vec b, Vec c) {
+    const float trace = a.x + b.y + c.z, most = Math::larger(Math::larger(a.x, b.y), Math::larger(c.z, trace));
+    Quat q = {1.0f + trace, c.y - b.z, a.z - c.x, b.x - a.y};
+    if (most == trace) return q.normalized();
+    if (most == a.x) q = {c.y - b.z, 1.0f + a.x - b.y - c.z, a.y + b.x, a.z + c.x};
+    else if (most == b.y) q = {a.z - c.x, a.y + b.x, 1.0f + b.y - a.x - c.z, b.z + c.y};
+    else q = {b.x - a.y, a.z + c.x, b.z + c.y, 1.0f + c.z - a.x - b.y};
+    return q.normalized();
+  }
   // The rotation as a unit axis (zero at rest) and an angle of at most half a turn.
   INLINE Vec axis(float& angle) const {
     const float sine = Vec{x, y, z}.norm();

@@ -26,6 +26,7 @@ def is_delicate(m: mujoco.MjModel) -> bool:
         m.pair_solimp,
         m.jnt_solimp[m.jnt_limited != 0],
         m.dof_solimp[m.dof_frictionloss > 0],
+        m.eq_solimp[m.eq_active0 != 0],
     ]
     stiffest = min(max((rows[:, :2].max() for rows in impedances if len(rows)), default=0.0), MAXIMP)
     return _least_pivot_of_mass(m) * (1 - stiffest) < SAFE

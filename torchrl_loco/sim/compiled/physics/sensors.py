@@ -17,9 +17,12 @@ from torchrl_loco.sim.compiled.collision.kinds import SHAPES, SPHERE
 from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, array, cross, name, scalar, total
 from torchrl_loco.sim.compiled.physics.dynamics import Dynamics, Poses, constant_matrix
 
-SUBTREE_VELOCITY, ANGULAR_MOMENTUM, TOUCH = (
-    int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}")) for kind in ("SUBTREELINVEL", "SUBTREEANGMOM", "TOUCH")
+SUBTREE_VELOCITY, ANGULAR_MOMENTUM, TOUCH, VELOCIMETER, GYRO, ACCELEROMETER, FORCE, TORQUE = (
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}"))
+    for kind in ("SUBTREELINVEL", "SUBTREEANGMOM", "TOUCH", "VELOCIMETER", "GYRO", "ACCELEROMETER", "FORCE", "TORQUE")
 )
+AT_SITES = VELOCIMETER, GYRO, ACCELEROMETER, FORCE, TORQUE
+"""Sensors at sites that lanes alone have."""
 
 
 def subtree(m: mujoco.MjModel, root: int) -> list[int]:

@@ -1,6 +1,6 @@
 // Contacts of spheres and capsules with boxes, in the frame of the box.
-struct BoxContacts : SegmentContacts {
-  using SegmentContacts::SegmentContacts;
+struct BoxContacts : SolidContacts {
+  using SolidContacts::SolidContacts;
 
 #if WITH_ROUND_AND_BOX
   struct Depth {

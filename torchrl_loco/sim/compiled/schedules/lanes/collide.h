@@ -2,6 +2,40 @@
 struct Collision : BoxPairContacts {
   using BoxPairContacts::BoxPairContacts;
 
+#if WITH_EQUALITIES
+  // Equalities are rows that lie before the contacts without friction. The slope is that of the second length's polynomial.
+  INLINE void hold_equalities() {
+    ROLLED_FOR(int base = 0; base < Model::EQUALITIES; base += LANES) {
+      const bool valid = base + lane < Model::EQUALITIES;
+      const int i = valid ? base + lane : 0, end = Model::first_share(i + 1);
+      float first = -Model::equality_reference(i), second = -Model::other_reference(i);
+      ROLLED_FOR(int k = Model::first_share(i); k < end; ++k) {
+        const float position = Model::share(k) * w.qpos[Model::dof_qpos(Model::share_dof(k))];
+        if (Model::of_second(k)) second = second + position;
+        else first = first + position;
+      }
+      float wanted = 0.0f, slope = 0.0f;
+      UNROLLED_FOR(int power = 4; power >= 0; --power) {
+        slope = wanted + second * slope;
+        wanted = Model::polynomial(5 * i + power) + second * wanted;
+      }
+      add_contact(valid, false, Model::PAIRS + Model::BALL_LIMITS + i, 0, {0.0f, 0.0f, 0.0f}, first - wanted,
+                  {slope, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f});
+    }
+  }
+
+#endif
+#if WITH_WELDS
+  INLINE void hold_welds() {
+    ROLLED_FOR(int base = 0; base < Model::WELD_ROWS; base += LANES) {
+      const bool valid = base + lane < Model::WELD_ROWS;
+      const int i = valid ? base + lane : 0;
+      const WeldRow row = weld_row(i);
+      add_contact(valid, false, Model::FIRST_WELD + i, 0, row.point, row.distance, row.other, {0.0f, 0.0f, 0.0f});
+    }
+  }
+
+#endif
   // The limit of a ball joint is a row along three degrees of freedom; it lies among the contacts without friction.
   INLINE void limit_balls() {
     ROLLED_FOR(int base = 0; base < Model::BALL_LIMITS; base += LANES) {
@@ -45,6 +79,12 @@ struct Collision : BoxPairContacts {
     // Those with friction, then those without, by one text.
     ROLLED_FOR(int kind = 0; kind < 2; ++kind) {
       const bool friction = kind == 0;
+#if WITH_EQUALITIES
+      if (!friction) hold_equalities();
+#endif
+#if WITH_WELDS
+      if (!friction) hold_welds();
+#endif
       if (!friction) limit_balls();
       //COLLIDE
     }

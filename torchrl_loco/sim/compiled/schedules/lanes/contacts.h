@@ -18,7 +18,7 @@ struct Contacts : Dynamics {
   }
 
   // The deepest contacts stay: one that finds no place takes that of the shallowest. Returns the place of this lane's
-  // contact, or none of them. Limits of ball joints, which come first and always find a place, are not displaced.
+  // contact, or none of them. Equalities and limits of ball joints come first, always find a place, and keep it.
   INLINE int make_room(bool touches, Contact* stored, int place, int places, int id, float depth) const {
     if (touches && place < places) {
       stored[place].distance = depth;
@@ -31,7 +31,7 @@ struct Contacts : Dynamics {
       float shallowest = -1e30f;
       int at = places;
       SHARED_LOOP(i, places) {
-        if (stored[i].distance <= shallowest || (Model::BALL_LIMITS && stored[i].pair() >= Model::PAIRS)) continue;
+        if (stored[i].distance <= shallowest || (Model::LASTING && stored[i].pair() >= Model::PAIRS)) continue;
         shallowest = stored[i].distance;
         at = i;
       }

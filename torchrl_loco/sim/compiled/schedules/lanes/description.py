@@ -30,8 +30,20 @@ from torchrl_loco.sim.compiled.ir.parameters import nominal, present, varies
 from torchrl_loco.sim.compiled.physics.actuators import Actuator, acting
 from torchrl_loco.sim.compiled.physics.constraints import Softness, both_sides
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, HINGE, SLIDE
+from torchrl_loco.sim.compiled.physics.equalities import CONNECT, JOINT, TENDON, WELD, Equality, Weld, active
+from torchrl_loco.sim.compiled.physics.lengths import OF_TENDON
 from torchrl_loco.sim.compiled.physics.links import Mass, matrix, moving_bodies, places
-from torchrl_loco.sim.compiled.physics.sensors import ANGULAR_MOMENTUM, SUBTREE_VELOCITY, TOUCH, subtree
+from torchrl_loco.sim.compiled.physics.sensors import (
+    ACCELEROMETER,
+    ANGULAR_MOMENTUM,
+    FORCE,
+    GYRO,
+    SUBTREE_VELOCITY,
+    TORQUE,
+    TOUCH,
+    VELOCIMETER,
+    subtree,
+)
 from torchrl_loco.sim.compiled.schedules.lanes.layout import Layout, Limbs
 from torchrl_loco.sim.models import NEVER, home_pose
 
@@ -119,12 +131,24 @@ class Description:
         self.subtrees = [s for s in sensors if s[0] == SUBTREE_VELOCITY]
         self.momenta = [s for s in sensors if s[0] == ANGULAR_MOMENTUM]
         self.touch = [s for s in sensors if s[0] == TOUCH]
+        self.motions = [s for s in sensors if s[0] in (VELOCIMETER, GYRO)]
+        self.accelerometers = [s for s in sensors if s[0] == ACCELEROMETER]
+        self.wrenches = [s for s in sensors if s[0] in (FORCE, TORQUE)]
         self.acting = acting(m)
         self.actuators = [Actuator.of(m, a) for a in self.acting]
         self.bias = np.reshape([[0.0] * 3 if a.bias is None else a.bias for a in self.actuators], (-1, 3))
         self.implicit_actuators = is_implicitfast(m) and present(self.bias[:, 2])
         self.joint_force_limits = self.implicit_actuators or m.jnt_actfrclimited.any()
+        self.pulls_tendons = bool((m.actuator_trntype[self.acting] == OF_TENDON).any())
+        # Without those of what cannot move, which C MuJoCo leaves out too.
+        equalities = [Equality.of(nominal(m), i) for i in active(m, (JOINT, TENDON))]
+        self.equalities = [equality for equality in equalities if dofs_of(equality)]
+        welds = [Weld.of(nominal(m), i) for i in active(m, (CONNECT, WELD))]
+        self.welds = [weld for weld in welds if self.dofs_of_weld(weld)]
         self.limbs = Limbs.of(m.dof_parentid.tolist())
+        coupled = [*map(dofs_of, self.equalities), *map(self.dofs_of_weld, self.welds)]
+        if self.limbs and any(map(self.limbs.crosses, coupled)):
+            self.limbs = None
         self.layout = self._layout()
 
     def dofs_to_root(self, dof: int) -> Iterator[int]:
@@ -140,6 +164,11 @@ class Description:
     def _sorted_pairs(self, found: list[Pair]) -> list[Pair]:
         order = FUNCTIONS.index
         return sorted(found, key=lambda p: (not self.is_plane(p), p.condim == 1, order(kind(self.m, p).function)))
+
+    @property
+    def lasting(self) -> int:
+        """Rows among those of contacts without friction that are there however many contacts there are."""
+        return len(self.limited_balls) + len(self.equalities) + sum(weld.rows for weld in self.welds)
 
     def points(self, pair: Pair) -> int:
         """Returns how many contacts a pair can have."""
@@ -197,12 +226,14 @@ class Description:
         frictional = sum(self.points(p) for p in self.pairs if p.condim != 1)
         frictionless = sum(self.points(p) for p in self.pairs if p.condim == 1)
         standing, standing_frictionless = self._standing() if self.pairs else (0, 0)
-        frictionless = min(frictionless, max(MOST_FRICTIONLESS, standing_frictionless)) + len(self.limited_balls)
+        frictionless = min(frictionless, max(MOST_FRICTIONLESS, standing_frictionless)) + self.lasting
         if not frictional and not frictionless:
             frictionless = 1  # C++ has no empty arrays
         directions = max(self.condims, default=3)
         empty = Layout(
             positions=m.nq,
+            activations=m.na,
+            weld_rows=sum(weld.rows for weld in self.welds),
             dofs=m.nv,
             links=len(self.moving),
             geoms=len(self.geoms),
@@ -219,9 +250,9 @@ class Description:
             limb_numbers=self.limbs.numbers if self.limbs else 0,
         )
 
-        balls = len(self.limited_balls)  # their rows are there however many contacts there are
+        lasting = self.lasting
 
-        def sized(places: int, more_rows: int = balls) -> Layout:
+        def sized(places: int, more_rows: int = lasting) -> Layout:
             rows = max(directions * places + more_rows, frictionless, 1)
             return dataclasses.replace(empty, frictional=places, jacobian_rows=rows)
 
@@ -234,7 +265,7 @@ class Description:
                 f"a body so large: a world needs {sized(enough).bytes} bytes of shared memory, of {WORLD_BYTES[-1]}"
             )
         count = max(n for n in range(enough, most + 1) if sized(n).bytes <= budget)
-        more = max(r for r in range(balls, frictionless + 1) if sized(count, r).bytes <= budget)
+        more = max(r for r in range(lasting, frictionless + 1) if sized(count, r).bytes <= budget)
         return sized(count, more)
 
     def geom_frame(self, g: int) -> tuple[int, np.ndarray, np.ndarray]:
@@ -250,13 +281,21 @@ class Description:
         """Returns the radius of a sphere or capsule, and that of the bounding sphere of a solid."""
         return float(self.m.geom_rbound[g] if self.m.geom_type[g] in SOLID else self.m.geom_size[g, 0])
 
-    def dofs_of_geom(self, g: int) -> int:
-        """Returns a bit for each degree of freedom that moves a geom."""
-        link = self.places[self.m.geom_bodyid[g]].link
+    def dofs_of_body(self, body: int) -> int:
+        """Returns a bit for each degree of freedom that moves a body."""
+        link = self.places[body].link
         if link < 0:
             return 0
         body = self.moving[link]
         return self.ancestors[self.m.body_dofadr[body] + self.m.body_dofnum[body] - 1]
+
+    def dofs_of_geom(self, g: int) -> int:
+        """Returns a bit for each degree of freedom that moves a geom."""
+        return self.dofs_of_body(self.m.geom_bodyid[g])
+
+    def dofs_of_weld(self, weld: Weld) -> int:
+        """Returns a bit for each degree of freedom that moves one of its bodies."""
+        return self.dofs_of_body(weld.bodies[0]) | self.dofs_of_body(weld.bodies[1])
 
     def apart(self, pair: Pair) -> int:
         """Returns a bit for each degree of freedom that moves one geom of a pair alone."""
@@ -283,7 +322,9 @@ class Description:
             gear,
             gain,
             read("bias", "bias_position", "bias_velocity") if present(self.bias) else None,
-            read("control_low", "control_high") if any(a.control_range is not None for a in self.actuators) else None,
+            read("control_low", "control_high")
+            if not self.layout.activations and any(a.control_range is not None for a in self.actuators)
+            else None,
             read("force_low", "force_high") if any(a.force_range is not None for a in self.actuators) else None,
         )
 
@@ -303,3 +344,8 @@ class Description:
         last = self.layout.stride // 4 - 1
         edges = [last, *([LANES // 4] if last > LANES // 4 else []), -1]
         return "\n".join(f"    eliminate(h, {first}, {end});" for first, end in itertools.pairwise(edges))
+
+
+def dofs_of(equality: Equality) -> int:
+    """Returns a bit for each degree of freedom of an equality."""
+    return sum(1 << dof for dof in {dof for dof, share in equality.shares if share})

@@ -1,13 +1,11 @@
 // Inertias, forces, the mass matrix.
-struct Dynamics : Kinematics {
-  using Kinematics::Kinematics;
+struct Dynamics : Welds {
+  using Welds::Welds;
 
   float implicit_damping[SLOTS];  // minus the derivative of the force of each own degree of freedom by its velocity
 
-  // Bias forces (Coriolis, centrifugal, gravity) and inertias of the links, by recursive Newton-Euler; then both of
-  // each subtree, which is all that the mass matrix needs (composite rigid bodies).
-  INLINE void subtrees() {
-    Motion accelerations[LINK_SLOTS];  // that the velocities cause
+  // Accelerations of the own links that the velocities cause, and if asked for, those of the joints.
+  INLINE void accelerate(Motion* accelerations, const bool with_qacc) const {
     OWN_LINKS(slot, link) {
       const int b = link < Model::LINKS ? link : 0, parent = Model::parent(b), end = Model::first_joint(b + 1);
       Motion velocity = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}}, acceleration = velocity;
@@ -17,6 +15,7 @@ struct Dynamics : Kinematics {
         const int kind = Model::joint_kind(j);
         if (Model::HAS_FREE && kind == FREE) {  // its translations have axes that do not move
           velocity.linear = velocity.linear + Vec{w.qvel[d], w.qvel[d + 1], w.qvel[d + 2]};
+          if (with_qacc) acceleration.linear = acceleration.linear + Vec{w.qacc[d], w.qacc[d + 1], w.qacc[d + 2]};
           d += 3;
         }
         Motion relative = w.axes[d] * w.qvel[d];
@@ -24,10 +23,23 @@ struct Dynamics : Kinematics {
           relative = relative + w.axes[d + 1] * w.qvel[d + 1] + w.axes[d + 2] * w.qvel[d + 2];
         acceleration = acceleration + Spatial::cross_motion(velocity, relative);
         velocity = velocity + relative;
+        const int last = d + (Model::QUATERNIONS > 0 && kind <= BALL ? 3 : 1);
+        if (with_qacc)
+          ROLLED_FOR(; d < last; ++d) acceleration = acceleration + w.axes[d] * w.qacc[d];
       }
       accelerations[slot] = acceleration;
     }
     sum_to_root(accelerations);
+  }
+
+  // Bias forces (Coriolis, centrifugal, gravity) and inertias of the links, by recursive Newton-Euler; then both of
+  // each subtree, which is all that the mass matrix needs (composite rigid bodies).
+  INLINE void subtrees() {
+    Motion accelerations[LINK_SLOTS];
+    accelerate(accelerations, false);
+#if WITH_WELDS
+    accelerate_welds(accelerations);
+#endif
     OWN_LINKS(slot, b) {
       if (b >= Model::LINKS) continue;
       const Motion velocity = w.velocity[b];
@@ -57,6 +69,21 @@ struct Dynamics : Kinematics {
   }
 
   //ACTUATOR
+#if WITH_ACTIVATIONS
+  INLINE float control_of(int a) const {
+    return clamp(ctrl[Model::control(a)], Model::control_low(a), Model::control_high(a));
+  }
+
+  // Activations follow their controls, of which each step they take a share, and lose one of themselves.
+  INLINE void activate() {
+    SHARED_LOOP(i, Model::ACTIVATIONS) {
+      const float act = w.act[i], control = control_of(Model::activated(i));
+      const float next = act + (Model::inflow(i) * control - Model::outflow(i) * act);
+      w.act[i] = clamp(next, Model::act_low(i), Model::act_high(i));
+    }
+  }
+#endif
+
   // Passive and actuator forces of a degree of freedom, and its damping: minus the derivative of the force by its
   // velocity. MuJoCo leaves out of that actuators whose force a limit holds.
   INLINE float joint_force(int d, float& damping) const {
@@ -67,11 +94,28 @@ struct Dynamics : Kinematics {
     const int end = Model::first_actuator(d + (Model::SUBSTEPS > 0));  // a step that is not taken has no actuation
     ROLLED_FOR(int a = Model::first_actuator(d); a < end; ++a) {
       const float gear = Model::gear(a);
-      const float f = actuator_force(a, ctrl[Model::control(a)], w.qpos[q], w.qvel[d]);
+#if WITH_TENDONS
+      float position = 0.0f, velocity = 0.0f;
+      ROLLED_FOR(int k = Model::first_pull(a); k < Model::first_pull(a + 1); ++k) {
+        const int other = Model::pull_dof(k);
+        position = position + Model::pull(k) * w.qpos[Model::dof_qpos(other)];
+        velocity = velocity + Model::pull(k) * w.qvel[other];
+      }
+      const float moment = gear * Model::own_pull(a);
+#else
+      const float position = w.qpos[q], velocity = w.qvel[d], moment = gear;
+#endif
+#if WITH_ACTIVATIONS
+      const int activation = Model::activation(a);
+      const float input = activation < 0 ? control_of(a) : w.act[activation];
+#else
+      const float input = ctrl[Model::control(a)];
+#endif
+      const float f = actuator_force(a, input, position, velocity);
       if (Model::IMPLICIT_ACTUATORS && Model::force_low(a) < f && f < Model::force_high(a))
         damping = damping - gear * gear * Model::bias_velocity(a);
-      if (Model::JOINT_FORCE_LIMITS) actuation = actuation + gear * f;
-      else force = force + gear * f;
+      if (Model::JOINT_FORCE_LIMITS) actuation = actuation + moment * f;
+      else force = force + moment * f;
     }
     if (!Model::JOINT_FORCE_LIMITS) return force;
     const float low = Model::joint_force_low(d), high = Model::joint_force_high(d);

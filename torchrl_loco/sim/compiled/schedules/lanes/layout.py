@@ -23,6 +23,8 @@ class Layout:
     """
 
     positions: int
+    activations: int
+    weld_rows: int
     dofs: int
     links: int
     geoms: int
@@ -54,7 +56,13 @@ class Layout:
     def bytes(self) -> int:
         """Size of ``struct World``."""
         contacts = self.frictional + self.frictionless
-        vectors = pad(self.positions, 4) + 4 * self.stride + self.dofs * self.stride
+        vectors = (
+            pad(self.positions, 4)
+            + pad(self.activations, 4)
+            + pad(self.weld_rows, 4)
+            + 4 * self.stride
+            + self.dofs * self.stride
+        )
         vectors += max(8 * self.dofs, self.stride + 2 * self.rows)
         before = 32 * contacts + 12 * (self.frictional + 1)
         quads = self.stride // 4

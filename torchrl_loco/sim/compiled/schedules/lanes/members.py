@@ -18,11 +18,14 @@ from torchrl_loco.sim.compiled.collision.planes import LEAST_ALIGNED
 from torchrl_loco.sim.compiled.ir import symbols
 from torchrl_loco.sim.compiled.ir.parameters import Number, VariedModel, nominal, present, varies
 from torchrl_loco.sim.compiled.ir.tables import Tables
+from torchrl_loco.sim.compiled.physics.actuators import activation_flow
 from torchrl_loco.sim.compiled.physics.constraints import near, tolerance
 from torchrl_loco.sim.compiled.physics.delicate import LEAST_PIVOT, is_delicate
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE, MINVAL, SLIDE
+from torchrl_loco.sim.compiled.physics.lengths import Length
 from torchrl_loco.sim.compiled.physics.links import matrix
-from torchrl_loco.sim.compiled.schedules.lanes.description import LANES, Description, is_implicitfast
+from torchrl_loco.sim.compiled.physics.sensors import GYRO, TORQUE, subtree
+from torchrl_loco.sim.compiled.schedules.lanes.description import LANES, Description, dofs_of, is_implicitfast
 from torchrl_loco.sim.compiled.schedules.lanes.layout import pad
 
 TRANSLATION, ROTATION = 0, 1
@@ -187,11 +190,18 @@ def _add_forces(tables: Tables, d: Description) -> None:
     entries = [64 * dof + j for dof, ancestors in enumerate(above) for j in ancestors]
     tables.size(MASS_ENTRIES=len(entries))
     tables.integers("mass_entry", entries, "unsigned")
-    dofs = m.jnt_dofadr[m.actuator_trnid[d.acting, 0]]
-    order = np.argsort(dofs, kind="stable")
+    lengths = [Length.of_actuator(m, i) for i in d.acting]
+    pulls = sorted((dof, i, share) for i, length in enumerate(lengths) for dof, share in length.shares)
+    order = [i for _, i, _ in pulls]  # an actuator comes once for each degree of freedom that it pulls
     actuators = [d.actuators[i] for i in order]
-    tables.integers("first_actuator", [sum(dofs < k) for k in range(m.nv + 1)])
+    tables.integers("first_actuator", [sum(dof < k for dof, *_ in pulls) for k in range(m.nv + 1)])
     tables.integers("control", [d.acting[i] for i in order])
+    if d.pulls_tendons:
+        shares = [share for i in order for share in lengths[i].shares]
+        tables.floats("own_pull", [share for *_, share in pulls])
+        tables.integers("first_pull", np.cumsum([0, *(len(lengths[i].shares) for i in order)]))
+        tables.integers("pull_dof", [dof for dof, _ in shares])
+        tables.floats("pull", [share for _, share in shares])
     tables.floats("gear", [a.gear for a in actuators])
     tables.floats("gain", [a.gain for a in actuators])
     for k, name in enumerate(("bias", "bias_position", "bias_velocity")):
@@ -202,11 +212,59 @@ def _add_forces(tables: Tables, d: Description) -> None:
     for k, name in enumerate(("low", "high")):
         tables.floats(f"control_{name}", [limits[k] for limits in of_controls])
         tables.floats(f"force_{name}", [limits[k] for limits in of_forces])
+    _add_activations(tables, d, order)
     tables.size(IMPLICIT_ACTUATORS=d.implicit_actuators, JOINT_FORCE_LIMITS=d.joint_force_limits)
     limited = m.jnt_actfrclimited.astype(bool)
     forces = np.where(limited[:, None], m.jnt_actfrcrange, [-UNLIMITED, UNLIMITED])[m.dof_jntid]
     for k, name in enumerate(("low", "high")):
         tables.floats(f"joint_force_{name}", forces[:, k])
+
+
+def _add_activations(tables: Tables, d: Description, order: list[int]) -> None:
+    m = d.m
+    if not m.na:
+        return
+    tables.integers("activation", [m.actuator_actadr[d.acting[i]] for i in order])
+    found = sorted((m.actuator_actadr[i], i) for i in d.acting if m.actuator_actadr[i] >= 0)
+    tables.integers("activated", [order.index(d.acting.index(i)) for _, i in found])
+    flows = [activation_flow(m, i) for _, i in found]
+    tables.floats("inflow", [flow for flow, _ in flows])
+    tables.floats("outflow", [flow for _, flow in flows])
+    limits = [m.actuator_actrange[i] if m.actuator_actlimited[i] else (-UNLIMITED, UNLIMITED) for _, i in found]
+    for k, name in enumerate(("low", "high")):
+        tables.floats(f"act_{name}", [limit[k] for limit in limits])
+
+
+def _add_equalities(tables: Tables, d: Description) -> None:
+    found = d.equalities
+    first = len(d.pairs) + len(d.limited_balls) + len(found)
+    tables.size(EQUALITIES=len(found), FIRST_WELD=first, TWO_SIDED=len(found) + d.layout.weld_rows)
+    if not found:
+        return
+    tables.integers("first_share", np.cumsum([0, *(len(e.shares) for e in found)]))
+    shares = [share for e in found for share in e.shares]
+    tables.integers("share_dof", [dof for dof, _ in shares])
+    tables.floats("share", [share for _, share in shares])
+    tables.integers("of_second", [k >= len(e.first.shares) for e in found for k in range(len(e.shares))])
+    tables.floats("equality_reference", [e.first.at_home for e in found])
+    tables.floats("other_reference", [e.second.at_home if e.second else 0.0 for e in found])
+    tables.floats("polynomial", [x for e in found for x in e.polynomial])
+
+
+def _add_welds(tables: Tables, d: Description, mask: str) -> None:
+    welds = d.welds
+    tables.integers("weld_of_row", [i for i, weld in enumerate(welds) for _ in range(weld.rows)])
+    tables.integers("weld_axis", [k for weld in welds for k in range(weld.rows)])
+    tables.integers("weld_rows", [weld.rows for weld in welds])
+    tables.floats("weld_scale", [weld.scale for weld in welds])
+    for end, title in enumerate(("first", "second")):
+        at = [(weld, d.places[weld.bodies[end]]) for weld in welds]
+        unturned = np.array([1.0, 0.0, 0.0, 0.0])
+        turns = [place.turn(unturned if weld.turns is None else weld.turns[end]) for weld, place in at]
+        tables.integers(f"weld_{title}_link", [place.link for _, place in at])
+        tables.structs("Vec", f"weld_{title}_point", [place.point(weld.points[end]) for weld, place in at])
+        tables.structs("Mat", f"weld_{title}_turn", [matrix(turn).ravel() for turn in turns])
+        tables.integers(f"weld_{title}_dofs", [d.dofs_of_body(weld.bodies[end]) for weld, _ in at], mask)
 
 
 def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
@@ -236,7 +294,10 @@ def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
     tables.integers("second_dofs", [d.dofs_of_geom(p.geoms[1]) for p in found], mask)
     apart = [d.apart(pair) for pair in found]
     of_balls = [-1] * len(d.limited_balls)  # all of them
-    quads = [sum(1 << i for i in range(d.layout.stride // 4) if dofs >> 4 * i & 15) for dofs in apart + of_balls]
+    of_equalities = [dofs_of(equality) for equality in d.equalities]
+    of_equalities += [d.dofs_of_weld(weld) for weld in d.welds for _ in range(weld.rows)]
+    moved = [*apart, *of_balls, *of_equalities]
+    quads = [sum(1 << i for i in range(d.layout.stride // 4) if dofs >> 4 * i & 15) for dofs in moved]
     tables.integers("quads", quads, "unsigned")
     frames = [d.geom_frame(p.geoms[0]) for p in planes]
     tables.structs("Vec", "plane_normal", [normal for _, _, normal in frames])
@@ -246,16 +307,23 @@ def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
     reach = [sum(d.radius(g) + d.half_length(g) for g in p.geoms) + p.margin for p in others]
     _add_near_pairs(tables, d, [(index[a], index[b]) for a, b in (p.geoms for p in others)], reach)
     _add_friction(tables, d)
-    # The limits of ball joints follow the pairs.
+    # The limits of ball joints follow the pairs, then the equalities, then the rows of welds and connections.
+    _add_equalities(tables, d)
+    _add_welds(tables, d, mask)
+    of_welds = [weld for weld in d.welds for _ in range(weld.rows)]  # a row each
     balls = d.limited_balls
-    tables.size(BALL_LIMITS=len(balls))
+    tables.size(BALL_LIMITS=len(balls), LASTING=d.lasting)
     tables.integers("ball_qpos", [m.jnt_qposadr[j] for j in balls])
     tables.integers("ball_dof", [m.jnt_dofadr[j] for j in balls])
     tables.floats("ball_range", [m.jnt_range[j].max() for j in balls])
-    tables.floats("margin", [*(p.margin for p in found), *m.jnt_margin[balls]])
+    tables.floats(
+        "margin", [*(p.margin for p in found), *m.jnt_margin[balls], *(0.0 for _ in [*d.equalities, *of_welds])]
+    )
     soft = [*((p.solref, p.solimp) for p in found), *((m.jnt_solref[j], m.jnt_solimp[j]) for j in balls)]
+    soft += [*((e.solref, e.solimp) for e in d.equalities), *((weld.solref, weld.solimp) for weld in of_welds)]
     tables.structs("Softness", "contact_softness", [d.softness(*s) for s in soft])
-    inertias = m.dof_invweight0[m.jnt_dofadr[balls]]
+    inertias = [*m.dof_invweight0[m.jnt_dofadr[balls]], *(e.weight for e in d.equalities)]
+    inertias += [weld.weights[k // 3] for weld in d.welds for k in range(weld.rows)]
     plain = not d.elliptic and d.layout.directions == 3
     if plain and any(varies(pair.friction) for pair in found):
         tables.floats("pair_weight", [*(pair.weight for pair in found), *inertias])
@@ -263,7 +331,7 @@ def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
     else:
         weights = [contact_weight(m, pair) for pair in found]
         least = [MINVAL if d.elliptic else least_regularisation(pair) for pair in found]
-        tables.floats("least_regularisation", [*least, *(MINVAL for _ in balls)])
+        tables.floats("least_regularisation", [*least, *(MINVAL for _ in inertias)])
         tables.floats("inverse_inertia", [*weights, *inertias])
 
 
@@ -285,7 +353,7 @@ def _add_near_pairs(tables: Tables, d: Description, of: list[tuple[int, int]], r
 def _add_formulas(tables: Tables, d: Description, pair: Pair) -> None:
     """Adds what follows from friction: the row of a world has less to read without it, as pairs are many."""
     friction, weight = symbols.name("mu"), symbols.name("weight")
-    of_pair = "Model::BALL_LIMITS && i >= Model::PAIRS ? 0.0f : friction(i)"
+    of_pair = "Model::LASTING && i >= Model::PAIRS ? 0.0f : friction(i)"
     parts = {"mu": of_pair, "weight": "Model::pair_weight(i)"}
     pair = dataclasses.replace(pair, condim=3, friction=friction, weight=weight)
     for name, found, otherwise in (
@@ -377,6 +445,37 @@ def _add_outputs(tables: Tables, d: Description) -> None:
     tables.floats("part_share", [share for _, _, share in flat])
     _add_momenta(tables, d)
     _add_touch(tables, d)
+    _add_site_sensors(tables, d)
+    bodies = [m.geom_bodyid[list(p.geoms)] for p in d.pairs] if d.touch or d.wrenches else []
+    tables.integers("first_body", [first for first, _ in bodies])
+    tables.integers("second_body", [second for _, second in bodies])
+
+
+def _add_site_sensors(tables: Tables, d: Description) -> None:
+    m, sensors = d.m, [*d.motions, *d.accelerometers, *d.wrenches]
+    tables.size(
+        MOTION_SENSORS=len(d.motions),
+        ACCELEROMETERS=len(d.accelerometers),
+        WRENCHES=len(d.wrenches),
+        FIRST_WRENCH=len(d.motions) + len(d.accelerometers),
+        ACCELERATIONS=len(d.accelerometers) + len(d.wrenches),
+    )
+    at = [(site, d.places[m.site_bodyid[site]]) for _, site, _ in sensors]
+    tables.integers("frame_address", [address for *_, address in sensors])
+    tables.integers("frame_turning", [kind in (GYRO, TORQUE) for kind, *_ in sensors])
+    tables.integers("frame_link", [p.link for _, p in at])
+    tables.structs("Vec", "frame_position", [p.point(m.site_pos[s]) for s, p in at])
+    tables.structs("Mat", "frame_orientation", [matrix(p.turn(m.site_quat[s])).ravel() for s, p in at])
+    roots = [int(m.site_bodyid[site]) for _, site, _ in d.wrenches]
+    parts = [d.parts_below(body) for body in roots]
+    flat = [part for group in parts for part in group]
+    tables.integers("first_wrench_part", np.cumsum([0, *map(len, parts)]))
+    tables.integers("wrench_link", [link for link, _ in flat])
+    tables.structs("Vec", "wrench_center", [x.center for _, x in flat])
+    tables.structs("Symmetric", "wrench_inertia", [x.moments[np.triu_indices(3)] for _, x in flat])
+    tables.floats("wrench_mass", [x.mass for _, x in flat])
+    inside = [set(subtree(m, body)) for body in roots]
+    tables.integers("in_subtree", [body in bodies for bodies in inside for body in range(m.nbody)])
 
 
 def _add_momenta(tables: Tables, d: Description) -> None:
@@ -404,12 +503,9 @@ def _add_touch(tables: Tables, d: Description) -> None:
     tables.structs("Vec", "site_size", sizes)
     tables.structs("Vec", "site_position", [p.point(m.site_pos[s]) for s, p in at])
     tables.structs("Mat", "site_orientation", [matrix(p.turn(m.site_quat[s])).ravel() for s, p in at])
-    bodies = [m.geom_bodyid[list(p.geoms)] for p in d.pairs] if sites else []
-    tables.integers("first_body", [first for first, _ in bodies])
-    tables.integers("second_body", [second for _, second in bodies])
 
 
 def _add_contact_geoms(tables: Tables, d: Description, geoms: Sequence[int]) -> None:
-    index, balls = {geom: i for i, geom in enumerate(geoms)}, [-1] * len(d.limited_balls)
+    index, none = {geom: i for i, geom in enumerate(geoms)}, [-1] * d.lasting
     for i, title in enumerate(("first", "second")):
-        tables.integers(f"{title}_contact_geom", [*(index.get(p.geoms[i], -1) for p in d.pairs), *balls])
+        tables.integers(f"{title}_contact_geom", [*(index.get(p.geoms[i], -1) for p in d.pairs), *none])

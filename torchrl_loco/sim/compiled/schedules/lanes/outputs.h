@@ -2,11 +2,14 @@
 struct Outputs : Solver {
   using Solver::Solver;
 
-#if WITH_CONTACT_GEOMS
+#if WITH_KEPT_CONTACTS
   // What the solver overwrites of the contacts that this lane adds up: number lane, lane + LANES, ...
   enum { OWN_CONTACTS = (CONTACTS + LANES - 1) / LANES };
   struct OwnContact {
     Vec normal, tangent;
+#if WITH_WRENCHES
+    Vec point;
+#endif
     int pair;
   } own_contacts[OWN_CONTACTS];
 #endif
@@ -29,15 +32,19 @@ struct Outputs : Solver {
     }
   }
 
-#if WITH_CONTACT_GEOMS
-  // ---- Contact forces of geoms
+#if WITH_KEPT_CONTACTS
+  // ---- Contact forces
 
   INLINE void keep_contacts() {
     UNROLLED_FOR(int own = 0; own < OWN_CONTACTS; ++own) {
       const int i = lane + LANES * own;
       if (i >= frictional + frictionless) continue;
       const Contact c = contact(i);
-      own_contacts[own] = {c.normal, c.normal, c.pair()};
+      own_contacts[own].normal = own_contacts[own].tangent = c.normal;
+      own_contacts[own].pair = c.pair();
+#if WITH_WRENCHES
+      own_contacts[own].point = c.point;
+#endif
       if (i < frictional) own_contacts[own].tangent = w.tangents[i] * Model::friction(c.pair());
     }
     sync();
@@ -53,7 +60,9 @@ struct Outputs : Solver {
     return c.normal * -cost.gradient[0] + c.tangent * -cost.gradient[1] +
            second_tangent(c.normal, c.tangent, c.pair) * -cost.gradient[2];
   }
+#endif
 
+#if WITH_CONTACT_GEOMS
   // The sum of the contact forces on each geom, and whether there is a contact. A lane adds up those of its geoms.
   INLINE void write_contact_forces(float* forces, bool* touches) const {
     enum { OWN_GEOMS = (Model::CONTACT_GEOMS + LANES - 1) / LANES };

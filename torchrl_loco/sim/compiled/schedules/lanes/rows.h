@@ -1,4 +1,6 @@
 // Constraint rows.
+static constexpr float UNBOUNDED = 1e30f;  // force of a row that holds on both sides
+
 struct Rows : Collision {
   using Collision::Collision;
 
@@ -19,6 +21,8 @@ struct Rows : Collision {
   INLINE int first_limit() const { return CONTACT_ROWS * frictional + frictionless; }
   INLINE int first_friction() const { return first_limit() + limits; }
   INLINE int rows() const { return first_friction() + Model::FRICTION_LOSSES; }
+  // Those of equalities, which come first of what has no friction, hold on both sides.
+  INLINE bool is_equality(int row_without_friction) const { return row_without_friction < Model::TWO_SIDED; }
   // Rows from here on have a cost each; those of a cone have one together.
   INLINE int first_single() const { return Model::ELLIPTIC ? first_frictionless() : 0; }
 
@@ -46,10 +50,10 @@ struct Rows : Collision {
 #endif
     ROLLED_FOR(int i = 0; i < frictional + frictionless; ++i) {
       const Contact c = contact(i);
-      const bool friction = i < frictional, ball = c.pair() >= Model::PAIRS;
-      const int pair = ball ? 0 : c.pair();
+      const bool friction = i < frictional, touches = c.pair() < Model::PAIRS;
+      const int pair = touches ? c.pair() : 0;
 #if WITH_LIMBS
-      crossing = crossing || (!ball && Model::crosses(pair));
+      crossing = crossing || (touches && Model::crosses(pair));
 #endif
       const Model::Dofs against = Model::first_dofs(pair), with = Model::second_dofs(pair);
       Vec tangent = {0.0f, 0.0f, 0.0f}, other = tangent;
@@ -70,7 +74,32 @@ struct Rows : Collision {
         Vec velocity = axes[slot].linear + axes[slot].angular.cross(point);
         const float sign = d < DOFS ? (float)((int)(with >> d & 1) - (int)(against >> d & 1)) : 0.0f;
         velocity = velocity * sign;
-        if (Model::BALL_LIMITS && ball) {
+#if WITH_WELDS
+        if (c.pair() >= Model::FIRST_WELD) {
+          const int row_of_weld = c.pair() - Model::FIRST_WELD, axis = Model::weld_axis(row_of_weld);
+          const int weld = Model::weld_of_row(row_of_weld);
+          const float plus = Model::weld_first_dofs(weld) >> d & 1 ? 1.0f : 0.0f;
+          const float minus = Model::weld_second_dofs(weld) >> d & 1 ? 1.0f : 0.0f;
+          const Vec shift = Model::TREES > 1 ? point - c.point : Vec{0.0f, 0.0f, 0.0f};
+          const Vec pushed = (axes[slot].linear + axes[slot].angular.cross(point)) * plus -
+                             (axes[slot].linear + axes[slot].angular.cross(c.normal + shift)) * minus;
+          row[d] = axis < 3 ? pushed.component(axis) : axes[slot].angular.dot(c.normal) * (plus - minus);
+          continue;
+        }
+#endif
+#if WITH_EQUALITIES
+        if (c.pair() >= Model::PAIRS + Model::BALL_LIMITS) {
+          const int equality = c.pair() - (Model::PAIRS + Model::BALL_LIMITS), end = Model::first_share(equality + 1);
+          float total = 0.0f;
+          ROLLED_FOR(int k = Model::first_share(equality); k < end; ++k) {
+            const float share = Model::share(k) * (Model::of_second(k) ? -c.normal.x : 1.0f);
+            if (Model::share_dof(k) == d) total = total + share;
+          }
+          row[d] = total;
+          continue;
+        }
+#endif
+        if (Model::BALL_LIMITS && !touches) {
           const int k = d - Model::ball_dof(c.pair() - Model::PAIRS);
           row[d] = k >= 0 && k < 3 ? c.normal.component(k) : 0.0f;
           continue;
@@ -117,8 +146,24 @@ struct Rows : Collision {
         continue;
       }
 #endif
-      set_row(r, Model::contact_softness(c.pair()), Model::inverse_inertia(c.pair()), c.distance,
+      float distance = c.distance;
+#if WITH_WELDS
+      if (c.pair() >= Model::FIRST_WELD) {  // the impedance is that of all of its rows together
+        const int i = c.pair() - Model::FIRST_WELD, axis = Model::weld_axis(i);
+        const int first = contact_of_row(r) - axis, count = Model::weld_rows(Model::weld_of_row(i));
+        float squared = 0.0f;
+        ROLLED_FOR(int k = 0; k < count; ++k) squared += contact(first + k).distance * contact(first + k).distance;
+        distance = root(squared);
+      }
+#endif
+      set_row(r, Model::contact_softness(c.pair()), Model::inverse_inertia(c.pair()), distance,
               Model::least_regularisation(c.pair()));
+#if WITH_WELDS
+      if (c.pair() >= Model::FIRST_WELD) {
+        const float share = distance > 0.0f ? divide(c.distance, distance) : 0.0f;
+        w.x[r] = w.x[r] * share + w.weld_bias[c.pair() - Model::FIRST_WELD];
+      }
+#endif
     }
     limits = 0;
     OWN_DOFS(slot, d)

@@ -15,7 +15,8 @@ struct Sides : Rows {
   INLINE unsigned sides(int own) const { return contact_sides[own] & ((1u << SIDE_BITS) - 1); }
   INLINE unsigned sides_now(int own) const {
     if (!exists(own)) return 0;
-    return has_friction(own) ? sides_of(number(own)) : (unsigned)(w.x[first_frictionless() + number(own)] < 0.0f);
+    return has_friction(own) ? sides_of(number(own))
+                             : (unsigned)(is_equality(number(own)) || w.x[first_frictionless() + number(own)] < 0.0f);
   }
   INLINE LimitSide limit_side_now(int row) const { return row < 0 ? NO_LIMIT : w.x[row] < 0.0f ? CLOSED : OPEN; }
 

@@ -99,6 +99,8 @@ struct Solver : Limbs {
   // A row that has a cost of its own.
   INLINE ConstraintRow single(int r) const {
     const bool dry = Model::FRICTION_LOSSES && r >= first_friction();
+    if (Model::TWO_SIDED && r >= first_frictionless() && is_equality(r - first_frictionless()))
+      return {w.x[r], w.change[r], w.weight[r], UNBOUNDED, true};
     return {w.x[r], w.change[r], w.weight[r], dry ? Model::friction_bound(r - first_friction()) : 0.0f, dry};
   }
 

@@ -1,11 +1,14 @@
 // One substep.
-struct Step : Outputs {
-  using Outputs::Outputs;
+struct Step : SiteSensors {
+  using SiteSensors::SiteSensors;
 
   // ---- Integration: semi-implicit Euler
 
   INLINE void integrate() {
     const float h = Model::timestep();
+#if WITH_ACTIVATIONS
+    activate();
+#endif
     OWN_DOFS(slot, d) {
       if (d >= DOFS) continue;
       const float v = w.qvel[d] + h * (Model::IMPLICIT_DAMPING ? w.qacc[d] + w.search[d] : w.qacc[d]);
@@ -71,6 +74,9 @@ if (live) {
     w.qacc[i] = i < DOFS ? row_of(qacc_warmstart_out.data, DOFS)[i] : 0.0f;
     w.search[i] = 0.0f;
   }
+#if WITH_ACTIVATIONS
+  SHARED_LOOP(i, Model::ACTIVATIONS) w.act[i] = row_of(act_out.data, Model::ACTIVATIONS)[i];
+#endif
   SHARED_LOOP(i, DOFS * STRIDE) w.mass[i] = 0.0f;
   step.sync();
 }
@@ -79,10 +85,11 @@ const int contacts = Model::HISTORY * Model::CONTACT_GEOMS;
 float* const contact_forces = reinterpret_cast<float*>(row_of(contact_force_out.data, contacts));
 bool* const in_contact = row_of(in_contact_out.data, contacts);
 #endif
-if (live && Model::SUBSTEPS == 0 && Model::TOUCH + Model::CONTACT_GEOMS > 0) {  // a step that is not taken finds forces
+if (live && Model::SUBSTEPS == 0 &&
+    Model::TOUCH + Model::CONTACT_GEOMS + Model::ACCELERATIONS > 0) {  // a step that is not taken finds forces
   step.kinematics();
   step.dynamics();
-#if WITH_CONTACT_GEOMS
+#if WITH_KEPT_CONTACTS
   step.keep_contacts();
 #endif
   step.solve(true);
@@ -91,6 +98,9 @@ if (live && Model::SUBSTEPS == 0 && Model::TOUCH + Model::CONTACT_GEOMS > 0) {  
   ROLLED_FOR(int row = 0; row < Model::HISTORY; ++row)
     step.write_contact_forces(contact_forces + 3 * Model::CONTACT_GEOMS * row, in_contact + Model::CONTACT_GEOMS * row);
 #endif
+#if WITH_ACCELEROMETERS || WITH_WRENCHES
+  step.write_accelerations(sensors);
+#endif
 }
 ROLLED_FOR(int substep = 0;; ++substep) {
   LOCKSTEP();
@@ -98,7 +108,7 @@ ROLLED_FOR(int substep = 0;; ++substep) {
   if (substep == Model::SUBSTEPS) break;
   if (live) {
     step.dynamics();
-#if WITH_CONTACT_GEOMS
+#if WITH_KEPT_CONTACTS
     if (substep >= Model::SUBSTEPS - Model::HISTORY) step.keep_contacts();
 #endif
   }
@@ -108,6 +118,9 @@ ROLLED_FOR(int substep = 0;; ++substep) {
 #if WITH_CONTACT_GEOMS
     const int first = Model::CONTACT_GEOMS * (substep - (Model::SUBSTEPS - Model::HISTORY));
     if (first >= 0) step.write_contact_forces(contact_forces + 3 * first, in_contact + first);
+#endif
+#if WITH_ACCELEROMETERS || WITH_WRENCHES
+    if (substep == Model::SUBSTEPS - 1) step.write_accelerations(sensors);
 #endif
     step.integrate();
   }
@@ -120,11 +133,17 @@ if (live) {
   step.write_centers(reinterpret_cast<float*>(row_of(subtree_com_out.data, Model::BODIES)));
 #endif
   step.write_subtree_velocities(sensors);
+#if WITH_MOTION_SENSORS
+  step.write_velocities(sensors);
+#endif
 #if WITH_MOMENTA
   step.write_angular_momenta(sensors);
 #endif
   if (Model::SUBSTEPS > 0) {
     SHARED_LOOP(i, Model::POSITIONS) row_of(qpos_out.data, Model::POSITIONS)[i] = w.qpos[i];
+#if WITH_ACTIVATIONS
+    SHARED_LOOP(i, Model::ACTIVATIONS) row_of(act_out.data, Model::ACTIVATIONS)[i] = w.act[i];
+#endif
     SHARED_LOOP(i, DOFS) {
       row_of(qvel_out.data, DOFS)[i] = w.qvel[i];
       row_of(qacc_warmstart_out.data, DOFS)[i] = w.qacc[i];

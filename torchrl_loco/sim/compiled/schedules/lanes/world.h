@@ -125,12 +125,18 @@ struct alignas(16) Contact {
   Vec point;
   float distance;
   Vec normal;
-  int id;  // the pair, and in the lowest bits which of its contacts it is
+  int id;  // the pair, and in the lowest bits which of its contacts it is; or a row that lasts, which has its own use of them
   INLINE int pair() const { return id >> Model::POINT_BITS; }
 };
 
 struct alignas(16) World {
   float qpos[(Model::POSITIONS + 3) / 4 * 4];
+#if WITH_ACTIVATIONS
+  float act[(Model::ACTIVATIONS + 3) / 4 * 4];
+#endif
+#if WITH_WELDS
+  float weld_bias[(Model::WELD_ROWS + 3) / 4 * 4];
+#endif
   float qvel[STRIDE], qacc[STRIDE], search[STRIDE];
   float residual[STRIDE];  // M qacc minus the smooth forces
   float mass[DOFS * STRIDE];
