@@ -120,24 +120,26 @@ def legs():
 
 
 @pytest.mark.parametrize("other", ["difference", "across"])
-def test_steps_and_sensors_are_those_of_c_mujoco(other):
+def test_steps_and_sensors_are_those_of_c_mujoco(other, device):
     """The second model couples two legs, which are not eliminated side by side then."""
     m = mujoco.MjModel.from_xml_string(MODEL.format(legs=legs(), other=other))
     assert unsupported(m) == []
     settings = {"ctrl_dt": SUBSTEPS * 0.002, "sim_dt": 0.002, "iterations": 50, "ls_iterations": 50}
     config = SimConfig(**settings, naconmax=100, njmax=100, engine="compiled", euler_damping=True)
-    sim, rng = Simulation(m, config, WORLDS, torch.device("cpu")), np.random.default_rng(0)
+    sim, rng = Simulation(m, config, WORLDS, torch.device(device)), np.random.default_rng(0)
     data, touched = mujoco.MjData(m), 0
-    sim.qpos[:] = torch.as_tensor(m.qpos0)
-    sim.qpos[:, 7:] += 0.1 * torch.as_tensor(rng.normal(size=(WORLDS, m.nq - 7)))
-    sim.qpos[:, 2] = torch.as_tensor(rng.uniform(0.25, 0.5, WORLDS))
+    start = np.tile(m.qpos0, (WORLDS, 1))
+    start[:, 7:] += 0.1 * rng.normal(size=(WORLDS, m.nq - 7))
+    start[:, 2] = rng.uniform(0.25, 0.5, WORLDS)
+    sim.qpos[:] = torch.as_tensor(start)
     sim.qvel[:] = 0.3 * torch.as_tensor(rng.normal(size=(WORLDS, m.nv)))
     sim.act[:] = 0.02 * torch.as_tensor(rng.normal(size=(WORLDS, m.na)))
     moved = m.sensor_needstage[np.repeat(np.arange(m.nsensor), m.sensor_dim)] < int(mujoco.mjtStage.mjSTAGE_ACC)
     for _ in range(20):
         sim.ctrl[:] = torch.as_tensor(rng.normal(size=(WORLDS, m.nu)))
-        before = [x.numpy().copy() for x in (sim.qpos, sim.qvel, sim.act, sim.qacc_warmstart, sim.ctrl)]
+        before = [x.cpu().numpy().copy() for x in (sim.qpos, sim.qvel, sim.act, sim.qacc_warmstart, sim.ctrl)]
         sim.step()
+        qpos, qvel, act = (x.cpu().numpy() for x in (sim.qpos, sim.qvel, sim.act))
         for world in range(WORLDS):
             mujoco.mj_resetData(m, data)
             names = "qpos", "qvel", "act", "qacc_warmstart", "ctrl"
@@ -149,41 +151,42 @@ def test_steps_and_sensors_are_those_of_c_mujoco(other):
             felt = data.sensordata.copy()  # of the last substep; what moves is sensed in the present state
             mujoco.mj_step1(m, data)
             expected = np.where(moved, data.sensordata, felt)
-            np.testing.assert_allclose(sim.act[world], data.act, rtol=0, atol=1e-6)
-            np.testing.assert_allclose(sim.qpos[world], data.qpos, rtol=0, atol=2e-6)
-            np.testing.assert_allclose(sim.qvel[world], data.qvel, rtol=0, atol=1e-3)
+            np.testing.assert_allclose(act[world], data.act, rtol=0, atol=1e-6)
+            np.testing.assert_allclose(qpos[world], data.qpos, rtol=0, atol=2e-6)
+            np.testing.assert_allclose(qvel[world], data.qvel, rtol=0, atol=1e-3)
             sensors = sim.data.sensordata.numpy()[world]
             scale = np.maximum(1.0, np.abs(expected).max())
             np.testing.assert_allclose(sensors, expected, rtol=0, atol=1e-3 * scale)
     assert touched > WORLDS
     assert sim.overflow.max() == 0
-    np.testing.assert_array_equal(sim.mujoco_data().act.numpy(), sim.act)
+    np.testing.assert_array_equal(sim.mujoco_data().act.numpy(), act)
 
 
 @pytest.mark.parametrize("kind", EQUALITIES)
-def test_welds_and_connections_are_those_of_c_mujoco(kind):
+def test_welds_and_connections_are_those_of_c_mujoco(kind, device):
     m = mujoco.MjModel.from_xml_string(WELDED.format(legs=legs(), equalities=EQUALITIES[kind]))
     assert unsupported(m) == []
     settings = {"ctrl_dt": 0.002, "sim_dt": 0.002, "iterations": 100, "ls_iterations": 50}
     config = SimConfig(**settings, naconmax=100, njmax=100, engine="compiled", euler_damping=True)
-    sim, rng = Simulation(m, config, WORLDS, torch.device("cpu")), np.random.default_rng(0)
+    sim, rng = Simulation(m, config, WORLDS, torch.device(device)), np.random.default_rng(0)
     data = mujoco.MjData(m)
     for world in range(WORLDS):
         data.qpos[:] = m.qpos0
         mujoco.mj_integratePos(m, data.qpos, rng.normal(size=m.nv), 0.2)
-        sim.qpos[world] = torch.as_tensor(data.qpos)
+        sim.qpos[world] = torch.as_tensor(data.qpos, dtype=torch.float32)
     sim.qvel[:] = 0.3 * torch.as_tensor(rng.normal(size=(WORLDS, m.nv)))
     for _ in range(3):
-        before = [x.numpy().copy() for x in (sim.qpos, sim.qvel, sim.qacc_warmstart)]
+        before = [x.cpu().numpy().copy() for x in (sim.qpos, sim.qvel, sim.qacc_warmstart)]
         sim.step()
+        qvel, overflow = sim.qvel.cpu().numpy(), sim.overflow.cpu().numpy()
         for world in range(WORLDS):
             mujoco.mj_resetData(m, data)
             for name, rows in zip(("qpos", "qvel", "qacc_warmstart"), before, strict=True):
                 getattr(data, name)[:] = rows[world]
             mujoco.mj_step(m, data)
             change = np.abs(data.qvel - before[1][world]).max()
-            if not sim.overflow[world]:
-                np.testing.assert_allclose(sim.qvel[world], data.qvel, rtol=0, atol=1e-4 + 5e-4 * change)
+            if not overflow[world]:
+                np.testing.assert_allclose(qvel[world], data.qvel, rtol=0, atol=1e-4 + 5e-4 * change)
     assert (sim.overflow > 0).sum() <= 2  # they lie on the floor in more places than there are
 
 
