@@ -218,6 +218,15 @@ WRONG = {
 }
 
 
+def test_a_ball_joint_is_the_last_of_its_body():
+    """In a world of lanes, to which a sensor at a site sends a small body."""
+    joints = '<joint name="turn" type="ball"/><joint type="slide"/>'
+    body = f'<body pos="0 0 1">{joints}<geom size=".1"/><site name="s"/></body>'
+    for sensor, reasons in (("", 0), ('<sensor><accelerometer site="s"/></sensor>', 1)):
+        m = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody>{sensor}</mujoco>")
+        assert ["joint 'turn': a ball joint that another" in reason for reason in unsupported(m)] == [True] * reasons
+
+
 @pytest.mark.parametrize("reason", WRONG)
 def test_what_is_not_there_is_said(reason):
     sites = '<site name="a"/><site name="c"/>'
