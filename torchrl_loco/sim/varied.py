@@ -72,7 +72,7 @@ class Varied:
         m, numbers = copy.copy(self._mj_model if model is None else model), np.asarray(row, dtype=float)
         for name in self.places:
             field(m, name)[...] = self.full(name, numbers)
-        if {"body_mass", "body_inertia", "dof_armature"} & self.places.keys():
+        if m.dof_simplenum.any() and {"body_mass", "body_inertia", "dof_armature"} & self.places.keys():
             again = copy.copy(m)  # for what MuJoCo takes the mass matrix of bodies to be where that is diagonal
             mujoco.mj_setConst(again, mujoco.MjData(again))
             m.dof_M0[:] = again.dof_M0

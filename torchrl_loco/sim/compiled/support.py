@@ -189,10 +189,15 @@ def _collides(m: mujoco.MjModel, pair: Pair) -> bool:
 
 
 def _sensors(m: mujoco.MjModel) -> list[str]:
+    at_sites = set(AT_SITES)
+    if at_sites.intersection((FORCE, TORQUE), m.sensor_type.tolist()):
+        welds = equalities.active(m, (equalities.CONNECT, equalities.WELD))
+        if welds or any(pair.condim > 3 for pair in pairs(m)):
+            at_sites -= {FORCE, TORQUE}
     names = [
         m.sensor(i).name
         for i in range(m.nsensor)
-        if not _is_sensed(m, m.sensor_type[i], m.sensor_objid[i])
+        if not _is_sensed(m, m.sensor_type[i], m.sensor_objid[i], at_sites)
         or m.sensor_cutoff[i]
         or m.sensor_interval[i].any()
         or m.sensor_delay[i]
@@ -209,12 +214,10 @@ def _sensors(m: mujoco.MjModel) -> list[str]:
     return _lines("sensor", found)
 
 
-def _is_sensed(m: mujoco.MjModel, kind: int, of: int) -> bool:
-    """Returns whether there is a sensor of a kind, of a body or site."""
+def _is_sensed(m: mujoco.MjModel, kind: int, of: int, at_sites: set[int]) -> bool:
+    """Returns whether there is a sensor of a kind, of a body or site; sites may have those of ``at_sites``."""
     if kind in AT_SITES:
-        welded = equalities.active(m, (equalities.CONNECT, equalities.WELD))
-        not_added = kind in (FORCE, TORQUE) and (welded or any(pair.condim > 3 for pair in pairs(m)))
-        return bool(m.body_weldid[m.site_bodyid[of]]) and not not_added
+        return kind in at_sites and bool(m.body_weldid[m.site_bodyid[of]])
     if kind == ANGULAR_MOMENTUM and m.body_weldid[of] == 0:
         return False
     return kind == TOUCH or (kind in (SUBTREE_VELOCITY, ANGULAR_MOMENTUM) and nominal(m).body_subtreemass[of] > 0)

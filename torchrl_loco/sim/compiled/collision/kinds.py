@@ -22,7 +22,7 @@ class Kind:
         points: contacts that a pair of geoms can have.
         function: the function of lanes that finds them, ``collide_...`` in ``schedules/lanes``.
         traced: whether the schedule of one thread a world has it too.
-        searched: whether C MuJoCo searches for it in general ways, of which it has two.
+        searched: whether C MuJoCo finds the contacts by a general convex collider, which the flag nativeccd chooses.
     """
 
     points: int

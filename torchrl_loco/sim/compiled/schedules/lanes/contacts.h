@@ -18,7 +18,7 @@ struct Contacts : Dynamics {
   }
 
   // The deepest contacts stay: one that finds no place takes that of the shallowest. Returns the place of this lane's
-  // contact, or none of them. Equalities and limits of ball joints come first, always find a place, and keep it.
+  // contact, or none of them. Rows that last (equalities, welds, limits of balls) come first, and keep theirs.
   INLINE int make_room(bool touches, Contact* stored, int place, int places, int id, float depth) const {
     if (touches && place < places) {
       stored[place].distance = depth;

@@ -4,7 +4,7 @@ struct Dynamics : Welds {
 
   float implicit_damping[SLOTS];  // minus the derivative of the force of each own degree of freedom by its velocity
 
-  // Accelerations of the own links that the velocities cause, and if asked for, those of the joints.
+  // Sets the accelerations of the own links at qacc = 0, or with qacc.
   INLINE void accelerate(Motion* accelerations, const bool with_qacc) const {
     OWN_LINKS(slot, link) {
       const int b = link < Model::LINKS ? link : 0, parent = Model::parent(b), end = Model::first_joint(b + 1);

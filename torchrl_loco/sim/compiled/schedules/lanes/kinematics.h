@@ -109,6 +109,15 @@ struct Kinematics : Group {
     return w.pose[link];
   }
 
+  INLINE Motion velocity_of(int link) const {
+    if (link < 0) return {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
+    return w.velocity[link];
+  }
+  // The acceleration of a point of a body, from that of the body as a spatial vector.
+  static INLINE Vec acceleration_at(Motion acceleration, Motion velocity, Vec point) {
+    return acceleration.at(point) + velocity.angular.cross(velocity.at(point));
+  }
+
   INLINE Vec center_of_mass(int link, const Pose& pose) const {
     return pose.position + pose.orientation * Model::link_center(link);
   }

@@ -460,49 +460,51 @@ def _add_site_sensors(tables: Tables, d: Description) -> None:
         FIRST_WRENCH=len(d.motions) + len(d.accelerometers),
         ACCELERATIONS=len(d.accelerometers) + len(d.wrenches),
     )
-    at = [(site, d.places[m.site_bodyid[site]]) for _, site, _ in sensors]
     tables.integers("frame_address", [address for *_, address in sensors])
     tables.integers("frame_turning", [kind in (GYRO, TORQUE) for kind, *_ in sensors])
-    tables.integers("frame_link", [p.link for _, p in at])
-    tables.structs("Vec", "frame_position", [p.point(m.site_pos[s]) for s, p in at])
-    tables.structs("Mat", "frame_orientation", [matrix(p.turn(m.site_quat[s])).ravel() for s, p in at])
+    _add_frames(tables, d, "frame", [site for _, site, _ in sensors])
     roots = [int(m.site_bodyid[site]) for _, site, _ in d.wrenches]
-    parts = [d.parts_below(body) for body in roots]
-    flat = [part for group in parts for part in group]
-    tables.integers("first_wrench_part", np.cumsum([0, *map(len, parts)]))
-    tables.integers("wrench_link", [link for link, _ in flat])
-    tables.structs("Vec", "wrench_center", [x.center for _, x in flat])
-    tables.structs("Symmetric", "wrench_inertia", [x.moments[np.triu_indices(3)] for _, x in flat])
-    tables.floats("wrench_mass", [x.mass for _, x in flat])
+    _add_parts(tables, d, "wrench", roots)
     inside = [set(subtree(m, body)) for body in roots]
     tables.integers("in_subtree", [body in bodies for bodies in inside for body in range(m.nbody)])
 
 
 def _add_momenta(tables: Tables, d: Description) -> None:
-    parts = [d.parts_below(body) for _, body, _ in d.momenta]
-    flat = [part for group in parts for part in group]
     tables.size(MOMENTA=len(d.momenta))
     tables.integers("momentum_address", [address for _, _, address in d.momenta])
     tables.floats("momentum_inverse_mass", [1 / d.m.body_subtreemass[body] for _, body, _ in d.momenta])
-    tables.integers("first_momentum_part", np.cumsum([0, *map(len, parts)]))
-    tables.integers("momentum_link", [link for link, _ in flat])
-    tables.structs("Vec", "momentum_center", [x.center for _, x in flat])
-    tables.structs("Symmetric", "momentum_inertia", [x.moments[np.triu_indices(3)] for _, x in flat])
-    tables.floats("momentum_mass", [x.mass for _, x in flat])
+    _add_parts(tables, d, "momentum", [body for _, body, _ in d.momenta])
+
+
+def _add_parts(tables: Tables, d: Description, name: str, roots: list[int]) -> None:
+    """Adds what of each link belongs to the subtrees of some bodies."""
+    parts = [d.parts_below(body) for body in roots]
+    flat = [part for group in parts for part in group]
+    tables.integers(f"first_{name}_part", np.cumsum([0, *map(len, parts)]))
+    tables.integers(f"{name}_link", [link for link, _ in flat])
+    tables.structs("Vec", f"{name}_center", [x.center for _, x in flat])
+    tables.structs("Symmetric", f"{name}_inertia", [x.moments[np.triu_indices(3)] for _, x in flat])
+    tables.floats(f"{name}_mass", [x.mass for _, x in flat])
+
+
+def _add_frames(tables: Tables, d: Description, name: str, sites: list[int]) -> None:
+    """Adds where sites are in the frames of their links."""
+    m, at = d.m, [(site, d.places[d.m.site_bodyid[site]]) for site in sites]
+    tables.integers(f"{name}_link", [place.link for _, place in at])
+    tables.structs("Vec", f"{name}_position", [place.point(m.site_pos[site]) for site, place in at])
+    turns = [matrix(place.turn(m.site_quat[site])) for site, place in at]
+    tables.structs("Mat", f"{name}_orientation", [turn.ravel() for turn in turns])
 
 
 def _add_touch(tables: Tables, d: Description) -> None:
     m, sites = d.m, [site for _, site, _ in d.touch]
-    at = [(s, d.places[m.site_bodyid[s]]) for s in sites]
     sphere = int(mujoco.mjtGeom.mjGEOM_SPHERE)
     sizes = [m.site_size[s, [0, 0, 0]] if m.site_type[s] == sphere else m.site_size[s] for s in sites]
     tables.integers("touch_address", [address for _, _, address in d.touch])
     tables.integers("site_body", m.site_bodyid[sites])
-    tables.integers("site_link", [p.link for _, p in at])
     tables.integers("site_shape", [SHAPES.index(m.site_type[s]) for s in sites])
     tables.structs("Vec", "site_size", sizes)
-    tables.structs("Vec", "site_position", [p.point(m.site_pos[s]) for s, p in at])
-    tables.structs("Mat", "site_orientation", [matrix(p.turn(m.site_quat[s])).ravel() for s, p in at])
+    _add_frames(tables, d, "site", sites)
 
 
 def _add_contact_geoms(tables: Tables, d: Description, geoms: Sequence[int]) -> None:

@@ -112,7 +112,7 @@ struct Outputs : Solver {
       const Pose pose = pose_of(link);
       const Vec position = pose.position + pose.orientation * Model::body_position(b);
       const Mat orientation = Model::body_orientation(b);
-      const Motion velocity = link < 0 ? Motion{{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}} : w.velocity[link];
+      const Motion velocity = velocity_of(link);
       xpos[3 * b] = position.x;
       xpos[3 * b + 1] = position.y;
       xpos[3 * b + 2] = position.z;
@@ -146,7 +146,7 @@ struct Outputs : Solver {
         const Pose pose = w.pose[link];
         const Vec offset = pose.position + pose.orientation * Model::part_center(i) - w.com[Model::tree(link)];
         const Motion velocity = w.velocity[link];
-        const Vec v = velocity.linear + velocity.angular.cross(offset);
+        const Vec v = velocity.at(offset);
         UNROLLED_FOR(int k = 0; k < 3; ++k) total[k] += Model::part_share(i) * v.component(k);
       }
       sum(total, 3);
@@ -167,7 +167,7 @@ struct Outputs : Solver {
         const Vec offset = pose.position + pose.orientation * Model::momentum_center(i) - w.com[Model::tree(link)];
         const Motion velocity = w.velocity[link];
         const float mass = Model::momentum_mass(i);
-        const Vec push = (velocity.linear + velocity.angular.cross(offset)) * mass;
+        const Vec push = velocity.at(offset) * mass;
         const Symmetric inertia = Model::momentum_inertia(i).turned(pose.orientation);
         momentum = momentum + inertia * velocity.angular + offset.cross(push);
         linear = linear + push;

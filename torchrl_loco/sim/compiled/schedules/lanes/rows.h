@@ -71,7 +71,7 @@ struct Rows : Collision {
         if (d >= STRIDE) continue;
         Vec point = c.point;
         if (Model::TREES > 1) point = point + w.com[0] - w.com[Model::tree(Model::dof_link(d < DOFS ? d : 0))];
-        Vec velocity = axes[slot].linear + axes[slot].angular.cross(point);
+        Vec velocity = axes[slot].at(point);
         const float sign = d < DOFS ? (float)((int)(with >> d & 1) - (int)(against >> d & 1)) : 0.0f;
         velocity = velocity * sign;
 #if WITH_WELDS
@@ -81,8 +81,7 @@ struct Rows : Collision {
           const float plus = Model::weld_first_dofs(weld) >> d & 1 ? 1.0f : 0.0f;
           const float minus = Model::weld_second_dofs(weld) >> d & 1 ? 1.0f : 0.0f;
           const Vec shift = Model::TREES > 1 ? point - c.point : Vec{0.0f, 0.0f, 0.0f};
-          const Vec pushed = (axes[slot].linear + axes[slot].angular.cross(point)) * plus -
-                             (axes[slot].linear + axes[slot].angular.cross(c.normal + shift)) * minus;
+          const Vec pushed = axes[slot].at(point) * plus - axes[slot].at(c.normal + shift) * minus;
           row[d] = axis < 3 ? pushed.component(axis) : axes[slot].angular.dot(c.normal) * (plus - minus);
           continue;
         }

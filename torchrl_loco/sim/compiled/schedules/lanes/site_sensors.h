@@ -19,19 +19,18 @@ struct SiteSensors : Outputs {
     out[1] = seen.y;
     out[2] = seen.z;
   }
-  INLINE Vec velocity_at(Motion velocity, Vec offset) const { return velocity.linear + velocity.angular.cross(offset); }
 
   INLINE void write_velocities(float* sensordata) const {
     SHARED_LOOP(s, Model::MOTION_SENSORS) {
       const Motion velocity = w.velocity[Model::frame_link(s)];
-      write(s, Model::frame_turning(s) ? velocity.angular : velocity_at(velocity, offset_of(s)), sensordata);
+      write(s, Model::frame_turning(s) ? velocity.angular : velocity.at(offset_of(s)), sensordata);
     }
   }
 #endif
 
 #if WITH_WRENCHES
-  // What moves a subtree (about the centre of mass of its tree) but for the contacts, which push it: the force in the joint
-  // above. Own parts and own contacts.
+  // This lane's share of the force in the joint above a subtree, about the centre of mass of its tree: what accelerates its
+  // parts, less what contacts push.
   INLINE Motion own_wrench(int s, const Vec* pushes) const {
     Motion wrench = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
     const int end = Model::first_wrench_part(s + 1);
@@ -74,15 +73,13 @@ struct SiteSensors : Outputs {
     accelerate(accelerations, true);
     OWN_LINKS(slot, b) {
       if (b >= Model::LINKS) continue;
-      w.momentum[b] = accelerations[slot];
+      w.momentum[b] = accelerations[slot];  // in memory that is free now
       w.momentum[b].linear = w.momentum[b].linear - Model::gravity();
     }
     sync();
     SHARED_LOOP(i, Model::ACCELEROMETERS) {
       const int s = Model::MOTION_SENSORS + i, link = Model::frame_link(s);
-      const Motion velocity = w.velocity[link];
-      const Vec offset = offset_of(s), turning = velocity.angular.cross(velocity_at(velocity, offset));
-      write(s, velocity_at(w.momentum[link], offset) + turning, sensordata);
+      write(s, acceleration_at(w.momentum[link], w.velocity[link], offset_of(s)), sensordata);
     }
 #if WITH_WRENCHES
     ROLLED_FOR(int i = 0; i < Model::WRENCHES; ++i) {

@@ -55,7 +55,7 @@ struct SolidContacts : SegmentContacts {
   }
 
   // The point of a segment that is nearest to a solid, as a share of the half axis from the center: there the distance,
-  // which is convex outside, ends to fall. By false position, where an end that stays counts half (Illinois).
+  // which is convex outside, stops falling. By false position (Illinois).
   static INLINE float nearest_on_segment(int shape, Vec size, Vec center, Vec half) {
     const auto slope_at = [&](const float t) { return surface(shape, center + half * t, size).normal.dot(half); };
     float low = -1.0f, high = 1.0f, low_slope = slope_at(low), high_slope = slope_at(high);

@@ -38,20 +38,12 @@ struct Welds : Kinematics {
     return {point, frames.second.transposed_times(turning), scale * v.component(axis)};
   }
 
-  INLINE Motion weld_velocity(int link) const {
-    if (link < 0) return {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};
-    return w.velocity[link];
-  }
-  // Of a point of a body, whose acceleration about the centre of mass of its tree that is.
   INLINE Vec weld_acceleration(int link, Vec point, Motion acceleration) const {
     if (link < 0) return {0.0f, 0.0f, 0.0f};
-    const Motion v = w.velocity[link];
-    const Vec offset = point + w.com[0] - w.com[Model::tree(link)];
-    return acceleration.linear + acceleration.angular.cross(offset) +
-           v.angular.cross(v.linear + v.angular.cross(offset));
+    return acceleration_at(acceleration, w.velocity[link], point + w.com[0] - w.com[Model::tree(link)]);
   }
 
-  // How the rows accelerate by the velocities alone, from the accelerations of the own links by these.
+  // Sets how fast the rows would change their velocity at qacc = 0, from the accelerations of the own links there.
   INLINE void accelerate_welds(const Motion* accelerations) {
     ROLLED_FOR(int base = 0; base < Model::WELD_ROWS; base += LANES) {
       const int i = base + lane < Model::WELD_ROWS ? base + lane : 0, weld = Model::weld_of_row(i);
@@ -68,7 +60,7 @@ struct Welds : Kinematics {
       } else {
         const WeldFrames frames = weld_frames(weld);
         const Vec v = {frames.turn.x, frames.turn.y, frames.turn.z};
-        const Vec turning = weld_velocity(link).angular, about = weld_velocity(other).angular;
+        const Vec turning = velocity_of(link).angular, about = velocity_of(other).angular;
         const Vec between = turning - about;
         const Vec change =
             (link < 0 ? none : first.angular) - (other < 0 ? none : second.angular) - about.cross(turning);

@@ -21,6 +21,7 @@ struct alignas(16) Motion {
   INLINE Motion operator+(Motion b) const { return {angular + b.angular, linear + b.linear}; }
   INLINE Motion operator*(float k) const { return {angular * k, linear * k}; }
   INLINE float dot(Motion b) const { return angular.dot(b.angular) + linear.dot(b.linear); }
+  INLINE Vec at(Vec point) const { return linear + angular.cross(point); }  // how a point of the body moves
 };
 
 struct Inertia {
@@ -125,7 +126,7 @@ struct alignas(16) Contact {
   Vec point;
   float distance;
   Vec normal;
-  int id;  // the pair, and in the lowest bits which of its contacts it is; or a row that lasts, which has its own use of them
+  int id;  // the pair, and in the lowest bits which of its contacts it is; or beyond the pairs, a row that lasts, whose numbers these are then
   INLINE int pair() const { return id >> Model::POINT_BITS; }
 };
 
