@@ -179,6 +179,6 @@ def sim_config(
     return dataclasses.replace(config, naconmax=min(max(scaled, NACONMAX_FLOOR), NACONMAX_CEILING))
 
 
-def sim_of(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the fields of :class:`SimConfig` that a policy's information names."""
-    return {name: value for name, value in info.get("sim", {}).items() if value is not None}
+def arguments_of(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the fields of :class:`SimConfig` and the options of its task that a policy's information names."""
+    return {name: value for name, value in info.get("sim", {}).items() if value is not None} | info.get("options", {})

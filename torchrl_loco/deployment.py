@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from torchrl_loco.config import sim_of
+from torchrl_loco.config import arguments_of
 from torchrl_loco.registry import resolve
 
 if TYPE_CHECKING:
@@ -23,8 +23,10 @@ def why_not(policy: "Policy") -> str:
     return ""
 
 
-def of_robot(policy: "Policy") -> dict[str, Any]:
-    """Returns what the file of a policy tells of its task and robot; nothing where :func:`why_not` says why.
+def of_robot(policy: "Policy") -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns what the file of a policy tells of its task and robot, and the reference that it follows, if any.
+
+    Nothing where :func:`why_not` says why.
 
     Returns:
         The facts by name. ``observation``, names and sizes of its terms in their order, none where they have no names;
@@ -33,24 +35,24 @@ def of_robot(policy: "Policy") -> dict[str, Any]:
         ``actuators``, their names; ``joints``, those of the joints that they move, empty for a tendon; ``stiffness``,
         ``damping`` and ``force_limit`` of position actuators, 0 and ``None`` for others; ``home``, the home pose
         ``(nq,)``; ``physics_timestep`` of the training (s); ``mjcf``, the model as text, with six digits, unless it
-        needs further files; and whatever else :meth:`torchrl_loco.LocoEnv.facts` holds, such as ``velocity``.
+        needs further files; ``cases``, their control steps by name, if the task has any; and whatever else
+        :meth:`torchrl_loco.LocoEnv.facts` holds, such as ``velocity``. And the tables of the reference by name.
     """
     if why_not(policy):
-        return {}
+        return {}, {}
     from torchrl_loco.envs.hooks import own_hooks
     from torchrl_loco.sim import models
 
     cls, spec = resolve(policy.info["task"]), specification(policy.info["task"])
     m = spec.compile()
     low, high = m.actuator_ctrlrange.T
-    sim = sim_of(policy.info)
     env = cls(
-        1, "cpu", 0, policy.info["protocol"], **{**sim, "engine": "mujoco"}, compile_hooks=False
+        1, "cpu", 0, policy.info["protocol"], **{**arguments_of(policy.info), "engine": "mujoco"}, compile_hooks=False
     )  # tells the terms
-    terms = env.observation_layout["observation"]
+    terms, cases, reference = env.observation_layout["observation"], env.cases(), dict(env.reference())
     env.close()
     scaled = {"action_offset": (0.5 * (low + high)).tolist(), "action_scale": (0.5 * (high - low)).tolist()}
-    return {
+    facts = {
         "observation": [{"term": name, "size": size} for name, size in terms.items()],
         "history": cls.history.get("observation", 1),
         **({} if "control" in own_hooks(cls) else scaled),
@@ -58,8 +60,10 @@ def of_robot(policy: "Policy") -> dict[str, Any]:
         "home": models.home_pose(m).tolist(),
         "physics_timestep": env.config.sim_dt,
         **_text(spec),
+        **({"cases": dict(cases)} if cases else {}),
         **cls.facts(m, policy.info),
     }
+    return facts, reference
 
 
 def specification(task: str) -> mujoco.MjSpec:

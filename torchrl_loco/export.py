@@ -6,7 +6,7 @@ import json
 import logging
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +38,11 @@ def export_policy(policy: Policy, path: Path) -> float:
     compared with the policy, on the CPU and on random observations that reach beyond those of the training. Information
     travels with it: task, protocol, sizes, bounds of an action, the time between two control steps (s), for how many of
     them an action is held, and all of ``policy.info``; as ``metadata_props`` in ONNX, in the extra file
-    ``metadata.json`` with torch.export. So do the terms of the observation where it has
-    names, how actions become controls, and what is known of the robot: :mod:`torchrl_loco.deployment`.
+    ``metadata.json`` with torch.export. So do the terms of the observation where it has names, how actions become
+    controls, and what is known of the robot: :mod:`torchrl_loco.deployment`.
+
+    Of a task that follows a reference the file takes ``time_step`` too, int64 ``(batch,)``, a frame of it, and gives
+    rows of the tables of :meth:`torchrl_loco.LocoEnv.reference` beside the action.
 
     Args:
         policy: the policy, on any device.
@@ -60,8 +63,10 @@ def export_policy(policy: Policy, path: Path) -> float:
     original = _Network(policy)
     observations = _random_observations(original)
     expected = original(observations)
-    facts = _facts(policy, n=observations.shape[-1], m=expected.shape[-1])
-    content, play = (_as_onnx if path.suffix == ".onnx" else _as_program)(original, observations[:2], facts)
+    facts, reference = of_robot(policy)
+    facts = {**_facts(policy, n=observations.shape[-1], m=expected.shape[-1]), **facts}
+    network = _WithReference(original, reference) if reference else original
+    content, play = (_as_onnx if path.suffix == ".onnx" else _as_program)(network, observations[:2], facts)
     error = max(_difference(play(observations[:size]), expected[:size]) for size in BATCH_SIZES)
     if not error <= TOLERANCE:  # true for NaN too
         rounding = _difference(copy.deepcopy(original).double()(observations.double()), expected)
@@ -84,6 +89,38 @@ class _Network(nn.Module):
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """Returns the actions, shape ``(batch, m)``, for observations of shape ``(batch, n)``."""
         return self.layers(observation)
+
+
+class _WithReference(nn.Module):
+    """A network, and beside it the reference that it follows.
+
+    Args:
+        network: the network.
+        reference: tables ``(frames, ...)`` by name.
+    """
+
+    def __init__(self, network: _Network, reference: Mapping[str, torch.Tensor]) -> None:
+        super().__init__()
+        self.network, self.names = network, tuple(reference)
+        for name, table in reference.items():
+            self.register_buffer(name, table)
+
+    def forward(self, observation: torch.Tensor, time_step: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Returns the actions, and of each table the rows of ``time_step`` ``(batch,)``, int64."""
+        return self.network(observation), *(getattr(self, name)[time_step] for name in self.names)
+
+
+def _inputs(network: nn.Module, observations: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Returns the inputs of a network by name; of a reference the first frame."""
+    inputs = {"observation": observations}
+    if isinstance(network, _WithReference):
+        inputs["time_step"] = torch.zeros(len(observations), dtype=torch.int64)
+    return inputs
+
+
+def _outputs(network: nn.Module) -> list[str]:
+    """Returns the names of the outputs of a network."""
+    return ["action", *(network.names if isinstance(network, _WithReference) else ())]
 
 
 def _random_observations(network: _Network) -> torch.Tensor:
@@ -114,7 +151,6 @@ def _facts(policy: Policy, n: int, m: int) -> dict[str, Any]:
         "action_repeat": info["action_repeat"],
         "torchrl_loco": torchrl_loco.__version__,
         "info": info,
-        **of_robot(policy),
     }
 
 
@@ -129,19 +165,26 @@ Exported = tuple[bytes, Callable[[torch.Tensor], torch.Tensor]]
 """A file's content, and what it computes when it is loaded."""
 
 
-def _as_program(network: _Network, example: torch.Tensor, facts: dict[str, Any]) -> Exported:
-    shapes = {"observation": {0: torch.export.Dim("batch")}}
-    program = torch.export.export(network, (example,), dynamic_shapes=shapes)
+def _as_program(network: nn.Module, example: torch.Tensor, facts: dict[str, Any]) -> Exported:
+    inputs = _inputs(network, example)
+    shapes = {name: {0: torch.export.Dim("batch")} for name in inputs}
+    program = torch.export.export(network, tuple(inputs.values()), dynamic_shapes=shapes)
     file = io.BytesIO()
     torch.export.save(program, file, extra_files={"metadata.json": json.dumps(facts, indent=2)})
     content = file.getvalue()
-    return content, torch.export.load(io.BytesIO(content)).module()
+    loaded = torch.export.load(io.BytesIO(content)).module()
+
+    def play(observations: torch.Tensor) -> torch.Tensor:
+        found = loaded(*_inputs(network, observations).values())
+        return found if isinstance(found, torch.Tensor) else found[0]
+
+    return content, play
 
 
-def _as_onnx(network: _Network, example: torch.Tensor, facts: dict[str, Any]) -> Exported:
+def _as_onnx(network: nn.Module, example: torch.Tensor, facts: dict[str, Any]) -> Exported:
     import onnxruntime
 
-    log = logging.getLogger("torch.onnx")
+    inputs, log = _inputs(network, example), logging.getLogger("torch.onnx")
     level = log.level
     log.setLevel(logging.ERROR)  # it warns of operators of packages that are not there
     try:
@@ -149,10 +192,10 @@ def _as_onnx(network: _Network, example: torch.Tensor, facts: dict[str, Any]) ->
             warnings.simplefilter("ignore")  # torch's own deprecations
             program = torch.onnx.export(
                 network,
-                (example,),
-                input_names=["observation"],
-                output_names=["action"],
-                dynamic_shapes={"observation": {0: "batch"}},
+                tuple(inputs.values()),
+                input_names=list(inputs),
+                output_names=_outputs(network),
+                dynamic_shapes={name: {0: "batch"} for name in inputs},
                 dynamo=True,
                 verbose=False,
             )
@@ -165,7 +208,8 @@ def _as_onnx(network: _Network, example: torch.Tensor, facts: dict[str, Any]) ->
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
 
     def play(observations: torch.Tensor) -> torch.Tensor:
-        (actions,) = session.run(["action"], {"observation": observations.numpy()})
+        of_them = {name: values.numpy() for name, values in _inputs(network, observations).items()}
+        (actions,) = session.run(["action"], of_them)
         return torch.from_numpy(actions)
 
     return content, play

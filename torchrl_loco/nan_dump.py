@@ -34,8 +34,8 @@ class NanDump:
             activations, ``model.<field>`` (numbers that vary,) if ``randomize`` names any, and ``action`` ``(nu,)``,
             before the step.
         settings: ``env`` (module and name of the class), ``file`` (of the module), ``protocol``, ``config``,
-            ``randomize``, ``seed``, ``device``, ``num_envs``, ``world_offset``, and before the step ``world``,
-            ``episode``, ``elapsed_steps``.
+            ``randomize``, ``options``, ``seed``, ``device``, ``num_envs``, ``world_offset``, and before the step
+            ``world``, ``episode``, ``elapsed_steps``.
     """
 
     tensors: dict[str, torch.Tensor]
@@ -44,7 +44,7 @@ class NanDump:
     def make_env(self, device: torch.device | str | None = None, **config: Any) -> LocoEnv:
         """Returns an environment of one world with the settings of the dump, and ``config`` on top."""
         of_file = dataclasses.asdict(SimConfig(**self.settings["config"]))  # nothing else, such as a file to write
-        env, settings = _class_of(self.settings), {**of_file, **config}
+        env, settings = _class_of(self.settings), {**of_file, **self.settings.get("options", {}), **config}
         arguments = (1, device, self.settings["seed"], self.settings["protocol"])
         varys = [Vary(**vary) for vary in self.settings.get("randomize", [])]
         return env(*arguments, world_offset=0, on_overflow="ignore", randomize=varys, **settings)

@@ -6,6 +6,7 @@ Both are the policy's own task, with ``engine="mujoco"`` and as it was trained: 
 import contextlib
 import dataclasses
 import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from torchrl_loco.checks import check_bool, check_packages
 from torchrl_loco.conditions import DEFAULT, Conditions
-from torchrl_loco.config import sim_of
+from torchrl_loco.config import arguments_of
 
 if TYPE_CHECKING:
     import torch
@@ -27,6 +28,8 @@ PUSH_EVERY = (1.0, 3.0)
 """Least and greatest time between two pushes (s)."""
 
 ENGINES = ("C MuJoCo", "training simulator")
+UNDISTURBED = Conditions(delay=(0, 0), noise=0.0, pushes=0.0)
+"""In which each case of a task is played once."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +85,10 @@ class Exported:
         """Returns the actions ``(n, nu)`` for observations ``(n, size)``, on their device."""
         import torch
 
-        (action,) = self._session.run(["action"], {"observation": observation.cpu().numpy()})
+        inputs = {"observation": observation.cpu().numpy()}
+        if len(self._session.get_inputs()) > 1:  # the frame of a reference that it gives too
+            inputs["time_step"] = np.zeros(len(observation), dtype=np.int64)
+        (action,) = self._session.run(["action"], inputs)
         return torch.from_numpy(action).to(observation.device)
 
 
@@ -93,6 +99,7 @@ def verify(
     *,
     alone: bool = False,
     task: str | None = None,
+    options: Callable[[str], Mapping[str, Any]] | None = None,
 ) -> Report:
     """Plays an exported policy in C MuJoCo, beside the engine in which it was trained.
 
@@ -105,6 +112,7 @@ def verify(
         device: where the engine of the training computes; ``None`` takes CUDA if there is any.
         alone: whether to play it in C MuJoCo alone, which is quicker on a CPU.
         task: the name of its task, as the user says; ``None`` for what the file says.
+        options: returns options of the task that replace those of its training, from the task's name.
 
     Returns:
         What was found.
@@ -121,21 +129,85 @@ def verify(
 
     exported = Exported(path, task)
     cls = resolve(exported.facts["task"])
+    if options is not None and (given := options(exported.facts["task"])):
+        info = exported.facts.get("info", {})
+        exported.facts["info"] = {**info, "options": {**info.get("options", {}), **given}}
     conditions = conditions.of(cls.holds)
     if alone and conditions.min_return is None and not {"falls", "return"} & cls.holds.keys():
         raise ValueError(f"{cls.__name__} is held to its return in the training simulator: it cannot be played alone")
+    engines = ENGINES[:1] if alone else ENGINES
+    cases = _by_case(cls, exported, conditions, engines, device)
+    if cases:  # each is played
+        least = len(cases[ENGINES[0]])
+        conditions = dataclasses.replace(conditions, episodes=max(conditions.episodes, least))
     outcomes, env = dict[str, Outcome](), None
-    for name in ENGINES[:1] if alone else ENGINES:
+    for name in engines:
         env = _worlds(cls, exported, conditions, name, device)
         if env.num_envs > 1 and name == ENGINES[0] and _begins_alike(env, conditions):
             conditions = dataclasses.replace(conditions, episodes=1)
             env = _worlds(cls, exported, conditions, name, device)
         outcomes[name] = play(exported, env, conditions, name)
     assert env is not None
-    return _report(exported, cls, conditions, outcomes, outcomes[ENGINES[0]].steps_of_episode * env.config.ctrl_dt)
+    seconds = outcomes[ENGINES[0]].steps_of_episode * env.config.ctrl_dt
+    report = _report(exported, cls, conditions, outcomes, seconds, cases)
+    return dataclasses.replace(
+        report, lines=[*_case_lines(cases), *report.lines], figures={**report.figures, "cases": cases}
+    )
 
 
-def _worlds(cls: Any, exported: Exported, conditions: Conditions, engine: str, device: str | None) -> "LocoEnv":
+def _by_case(
+    cls: Any, exported: "Exported", conditions: Conditions, engines: tuple[str, ...], device: str | None
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Plays each case of a task once from its beginning, without delay, noise, pushes or another friction.
+
+    Returns:
+        By engine and case: what it earned of the terms that tell how well it was played, as a share of what is perfect,
+        nothing after it has ended too soon; whether it has; and the share of its steps until then. Nothing where a task
+        has no cases.
+    """
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    one = _worlds(cls, exported, dataclasses.replace(UNDISTURBED, episodes=1), ENGINES[0], device, compile_hooks=False)
+    if not (cases := one.cases()):
+        return {}
+    once = dataclasses.replace(UNDISTURBED, episodes=len(cases), seconds=conditions.seconds)
+    for engine in engines:
+        env = _worlds(cls, exported, once, engine, device)
+        played = play(exported, env, once, f"cases, {engine}")
+        steps = np.minimum(list(cases.values()), played.steps_of_episode)
+        earned = np.sum([played.sums[name][0] for name in cls.perfect], axis=0)
+        shares = earned / (sum(cls.perfect.values()) * env.config.ctrl_dt * steps)
+        found[engine] = {
+            name: {
+                "return": float(shares[k]),
+                "failed": bool(played.fell[k]),
+                "lasted": float(played.steps[k] / steps[k]),
+            }
+            for k, name in enumerate(cases)
+        }
+    return found
+
+
+def _case_lines(cases: dict[str, dict[str, dict[str, Any]]]) -> list[str]:
+    """Returns how each case was played by itself, the worst in C MuJoCo first."""
+    if not cases:
+        return []
+    there, width = cases[ENGINES[0]], max(len(name) for name in cases[ENGINES[0]])
+    lines = [f"{'each once, undisturbed; return of 1 is perfect':<{width}}{''.join(f'{name:>22}' for name in cases)}"]
+    for name in sorted(there, key=lambda name: there[name]["return"]):
+        words = []
+        for played in cases.values():
+            row = played[name]
+            words.append(f"{row['return']:.3f}" + (f", failed at {row['lasted']:.0%}" if row["failed"] else ""))
+        lines.append(f"{name:<{width}}{''.join(f'{word:>22}' for word in words)}")
+    means = {engine: np.mean([row["return"] for row in played.values()]) for engine, played in cases.items()}
+    failed = {engine: sum(row["failed"] for row in played.values()) for engine, played in cases.items()}
+    words = [f"{means[engine]:.4f}, {failed[engine]} failed" for engine in cases]
+    return [*lines, f"{f'{len(there)} in all':<{width}}{''.join(f'{word:>22}' for word in words)}"]
+
+
+def _worlds(
+    cls: Any, exported: Exported, conditions: Conditions, engine: str, device: str | None, **more: Any
+) -> "LocoEnv":
     """Returns worlds of a policy's task, a world for each episode.
 
     Raises:
@@ -144,15 +216,16 @@ def _worlds(cls: Any, exported: Exported, conditions: Conditions, engine: str, d
     from torchrl_loco.envs.vary import Vary
 
     facts = exported.facts
-    options = sim_of(facts.get("info", {}))
+    settings = arguments_of(facts.get("info", {}))
     if conditions.friction is not None:
-        options["randomize"] = [Vary("geom_friction", *conditions.friction, how="set", once=True)]
+        settings["randomize"] = [Vary("geom_friction", *conditions.friction, how="set", once=True)]
     if engine == ENGINES[0]:
-        device, options["engine"] = "cpu", "mujoco"
+        device, settings["engine"] = "cpu", "mujoco"
     env = cls(
         *(conditions.episodes, device, conditions.seed, facts["protocol"]),
         **{"world_offset": 0, "play": True, "noise_scale": conditions.noise, "metrics": True, "reward_terms": True},
-        **options,
+        **settings,
+        **more,
     )
     for name, size, own in (
         ("observation", facts["observation_size"], env.observation_spec["observation"].shape[-1]),
@@ -244,7 +317,8 @@ def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str)
 
     from torchrl_loco.envs.access import set_stage
 
-    n, steps, dt = env.num_envs, env.config.episode_length, env.config.ctrl_dt
+    n, dt = env.num_envs, env.config.ctrl_dt
+    steps = env.config.episode_length
     if conditions.seconds is not None:
         steps = min(steps, max(round(conditions.seconds / dt), 1))
     generator, hold = np.random.default_rng(conditions.seed), int(exported.facts["action_repeat"])
@@ -340,7 +414,12 @@ def _fix_commands(env: "LocoEnv", info: dict[str, Any]) -> np.ndarray:
 
 
 def _report(
-    exported: Exported, cls: Any, conditions: Conditions, outcomes: dict[str, Outcome], seconds: float
+    exported: Exported,
+    cls: Any,
+    conditions: Conditions,
+    outcomes: dict[str, Outcome],
+    seconds: float,
+    cases: dict[str, dict[str, dict[str, Any]]],
 ) -> Report:
     """Returns whether a policy holds, and the figures by engine and kind of episodes."""
     table = {
@@ -354,6 +433,10 @@ def _report(
         share = there["falls"] / there["episodes"]
         words = f"falls in {share:.1%} of the episodes, {max_falls:.1%} are allowed"
         bounds.append((share <= max_falls, words))
+        if cases:
+            failed = sum(row["failed"] for row in cases[ENGINES[0]].values())
+            words = f"{failed} of {len(cases[ENGINES[0]])} fail undisturbed"
+            bounds.append((failed <= max_falls * len(cases[ENGINES[0]]), words))
     if (least := cls.holds.get("return")) is not None:
         bounds.append((there["return"] >= least, f"return {there['return']:.1f}, at least {least:.1f} is asked for"))
     kept = conditions.min_return

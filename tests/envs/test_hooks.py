@@ -1,6 +1,7 @@
 """Tasks in plain torch: what hooks see, what becomes of what they return, and what is said where they are wrong."""
 
 import contextlib
+import json
 import math
 
 import mujoco
@@ -11,7 +12,7 @@ from cases import COARSE
 from hook_tasks import DOG, Still, WalkBackwards, WalkBlindly
 from oracle import tolerance as numpy_tolerance
 
-from torchrl_loco import LocoEnv, SimConfig, State, Vary, WalkerWalk
+from torchrl_loco import LocoEnv, SimConfig, State, Vary, WalkerWalk, training
 from torchrl_loco.envs.fusion import trace
 from torchrl_loco.envs.fusion.rules import RULES
 from torchrl_loco.envs.hooks import own_hooks
@@ -726,3 +727,55 @@ def test_a_body_without_a_floor_or_actuators_is_told_of(caplog):
 def test_torchs_own_random_numbers_are_told_of(caplog):
     type("Drawn", (WalkerWalk,), {"reward": lambda self, s: torch.rand(s.time.shape)})(2, "cpu", 0)
     assert "draws by torch.rand instead of s.uniform" in caplog.text
+
+
+class Falling(LocoEnv):
+    """A ball that falls from a height that is an option; the episode is cut off after some steps, or ends far below."""
+
+    model = """<mujoco><worldbody><body pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""
+    config = CONFIG
+    options = {"height": (1.0, "Height at the start (m)."), "steps": (5, "Steps to cut it off after.")}
+
+    def begin(self, s):
+        return {"qpos": s.home + torch.tensor([0, 0, self.height - 1.0, 0, 0, 0, 0], device=s.device)}
+
+    def reward(self, s):
+        return s.qpos[:, 2]
+
+    def observation(self, s):
+        return s.qpos[:, 2:3]
+
+    def terminated(self, s):
+        return s.qpos[:, 2] < self.height - 0.05
+
+    def truncated(self, s):
+        return s.time > (self.steps - 0.5) * s.dt
+
+
+def test_an_episode_is_cut_off_by_its_own_hook(device):
+    for steps, at in ((3, 2), (100, 4)):  # 0.05 m take five steps
+        env = Falling(2, device, 0, height=3.0, steps=steps, on_overflow="ignore")
+        td = env.rollout(8, break_when_any_done=False)
+        truncated, terminated, done = (
+            td["next", flag][0, :, 0].tolist() for flag in ("truncated", "terminated", "done")
+        )
+        assert done.index(True) == at
+        assert (truncated[at], terminated[at]) == (steps == 3, steps != 3)
+        assert td["observation"][:, at + 1].allclose(torch.tensor(3.0, device=env.device))
+
+
+def test_options_are_arguments_attributes_and_part_of_a_run(tmp_path):
+    env = Falling(1, "cpu", 0, height=2.0, on_overflow="ignore")
+    assert (env.height, env.steps) == (2.0, 5)
+    assert env.options_given == env.settings()["options"] == {"height": 2.0}
+    with pytest.raises(ValueError, match="unknown argument 'heigth', did you mean 'height'"):
+        Falling(1, "cpu", 0, heigth=2.0)
+    for options in ({"height": 1.0}, {"reward": (1.0, "taken")}, {"sim_dt": (0.1, "taken")}):
+        with pytest.raises((TypeError, ValueError), match=r"Wrong\.options"):
+            type("Wrong", (Falling,), {"options": options})(1, "cpu")
+    config = training.preset(Falling, "cpu", height=3.0)
+    assert config.options == {"height": 3.0}
+    assert config.of_env["height"] == 3.0
+    assert training.config.config_from_json(json.loads(json.dumps(config.to_json()))) == config
+    with pytest.raises(ValueError, match="setting"):
+        training.preset(Falling, "cpu", heigth=3.0)

@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
@@ -128,11 +128,28 @@ SEEDS = Annotated[
 
 def _options(config: "training.TrainingConfig") -> "training.TrainingConfig":
     """Returns the settings as options: with their task fixed, as a preset belongs to one, several seeds and GPUs."""
-    hidden = Annotated[str, tyro.conf.Suppress, tyro.conf.Fixed]
+    hidden = tyro.conf.Suppress, tyro.conf.Fixed
     kind = type(config)
-    fields = [("task", hidden, config.task), ("seeds", SEEDS, ()), ("gpus", GPUS, None)]
+    fields: list[Any] = [("task", Annotated[str, *hidden], config.task), ("seeds", SEEDS, ()), ("gpus", GPUS, None)]
+    fields.append(("options", Annotated[dict[str, Any], *hidden], dataclasses.field(default_factory=dict)))
+    fields += [(name, _annotated(value, words), value) for name, (value, words) in _of_task(config.task).items()]
     cls = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=True)
     return cls(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
+
+
+def _of_task(task: str) -> Mapping[str, tuple[Any, str]]:
+    """Returns the options of a task, which is imported only if it has any."""
+    from torchrl_loco import tasks
+    from torchrl_loco.registry import resolve
+
+    own = tasks.found().get(task)
+    return {} if own is not None and not own.has_options else resolve(task).options
+
+
+def _annotated(value: Any, words: str) -> Any:
+    """Returns the type of an option by the value that holds without it: of a tuple, that of its first, else words."""
+    first: Any = type(value[0]) if isinstance(value, tuple) and value else str
+    return Annotated[tuple[first, ...] if isinstance(value, tuple) else type(value), tyro.conf.arg(help=words)]
 
 
 def _check_names(args: list[str], config: Any) -> None:
@@ -144,7 +161,7 @@ def _check_names(args: list[str], config: Any) -> None:
     from torchrl_loco.training.config import CONFIGS, Sim
 
     settings_of = {algorithm: {field.name for field in dataclasses.fields(kind)} for algorithm, kind in CONFIGS.items()}
-    mine = {field.name for field in dataclasses.fields(config)} - {"task"}
+    mine = {field.name for field in dataclasses.fields(config)} - {"task", "options"} | set(_of_task(config.task))
     for arg in args:
         name = arg.partition("=")[0].removeprefix("--").replace("-", "_")
         if not arg.startswith("--") or name.removeprefix("no_") in mine or name in ("", "help"):
@@ -161,8 +178,17 @@ def _check_names(args: list[str], config: Any) -> None:
 def settings(options: Any) -> tuple["training.TrainingConfig", tuple[int, ...], int | None]:
     """Returns the settings, the seeds and the number of GPUs of what :func:`_options` returned."""
     (kind,) = type(options).__bases__
-    config = kind(**{field.name: getattr(options, field.name) for field in dataclasses.fields(kind)})
-    return config, options.seeds, options.gpus
+    values = {field.name: getattr(options, field.name) for field in dataclasses.fields(kind)}
+    given = {
+        name: getattr(options, name)
+        for name, (value, _) in _of_task(options.task).items()
+        if getattr(options, name) != value
+    }
+    if given:
+        from torchrl_loco.registry import resolve
+
+        values["options"] = resolve(options.task).checked_options(given)
+    return kind(**values), options.seeds, options.gpus
 
 
 def _take(flag: str, args: list[str]) -> str | None:

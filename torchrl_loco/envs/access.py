@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import logging
 import os
 import sys
@@ -17,10 +18,12 @@ from torchrl_loco.checks import ANY, Interval, check_choice, check_int
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.hooks import Hooks
 from torchrl_loco.envs.state import State, write_state
+from torchrl_loco.envs.task import folder_of
 from torchrl_loco.envs.variation import Variation, constant_of
 from torchrl_loco.envs.vary import Vary
 from torchrl_loco.envs.world import World
-from torchrl_loco.sim import Simulation
+from torchrl_loco.rendering import OPACITY, to_bytes, with_ghost
+from torchrl_loco.sim import Simulation, models
 
 STAGE_WORLDS = 64
 """Of how many worlds a stage keeps the memory, at most."""
@@ -37,6 +40,7 @@ class WorldAccess(EnvBase):
     body: ClassVar[str]
     mj_model: mujoco.MjModel
     hooks: Hooks | None
+    options_given: dict[str, Any]
     play: bool
     randomize: Sequence[Vary]
     variation: Variation | None
@@ -154,8 +158,18 @@ class WorldAccess(EnvBase):
         check_choice("camera", camera, [model.camera(i).name for i in range(model.ncam)])
         size = check_int("width", width), check_int("height", height)
         worlds = self.num_envs if worlds is None else check_int("worlds", worlds, Interval(1, self.num_envs + 1))
-        pixels = self.world.render(camera, *size, worlds)
-        return pixels if self.batch_size else pixels[0]
+        plain = self.world.renderer(self.mj_model, camera, *size, worlds)
+        pixels, ghost = plain.render(self.sim.mujoco_data(worlds=worlds)), self.ghost()
+        if ghost is not None:
+            poses = torch.cat([self.sim.qpos, ghost], dim=-1)[:worlds]
+            both = self.world.renderer(self.model_with_ghost, camera, *size, worlds).render_poses(poses)
+            pixels = torch.lerp(pixels, both, OPACITY)
+        return to_bytes(pixels if self.batch_size else pixels[0])
+
+    @functools.cached_property
+    def model_with_ghost(self) -> mujoco.MjModel:
+        """The model for pictures, with its first body once more, as :func:`torchrl_loco.rendering.with_ghost` does."""
+        return with_ghost(models.specification(type(self).model, folder_of(type(self))))
 
     def health(self) -> TensorDict:
         """Returns what went wrong in the physics since the environment was opened.
@@ -305,6 +319,7 @@ class WorldAccess(EnvBase):
             "device": str(self.device),
             "config": dataclasses.asdict(self.config),
             "randomize": [dataclasses.asdict(vary) for vary in self.randomize],
+            "options": self.options_given,
         }
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -328,6 +343,8 @@ class WorldAccess(EnvBase):
         """Returns what two environments must share to exchange their ``state_dict``."""
         settings = self.settings()
         same = {name: settings[name] for name in ("protocol", "world_offset")}
+        if cases := self.cases():  # the memory of another set of motions points elsewhere
+            same["cases"] = dict(cases)
         return {"body": self.body or type(self).__name__, "batch_size": list(self.batch_size), **same}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> Any:

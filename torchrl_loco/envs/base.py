@@ -80,9 +80,10 @@ class LocoEnv(Task, WorldAccess, QuickResets):
             them as they are at every step, to print from them or to debug them.
         play: whether the worlds are for looking at a policy, not for training: commands can be set with
             :meth:`set_command`, ``randomize=None`` varies nothing, and tasks leave out noise and pushes.
-        config: fields of :class:`torchrl_loco.SimConfig` to override.
+        config: fields of :class:`torchrl_loco.SimConfig` to override, and the task's own :attr:`options`.
 
     Attributes:
+        options_given: options of the task that were passed, as JSON can hold them.
         num_envs: number of worlds, 1 without a batch dimension.
         seed: the seed, also one that was drawn.
         protocol: the protocol.
@@ -127,7 +128,10 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         worlds = 1 if num_envs is None else check_int("num_envs", num_envs)
         device = check_device(device)
         seed = None if seed is None else check_int("seed", seed, SEED)
-        arguments = list(inspect.signature(LocoEnv.__init__).parameters)[1:-1]
+        given = {name: config.pop(name) for name in self.options if name in config}
+        own = {name: given.get(name, default) for name, (default, _) in self.options.items()}
+        options_given = self.checked_options(given)
+        arguments = [*list(inspect.signature(LocoEnv.__init__).parameters)[1:-1], *own]
         of_class = type(self).config
         if self.episode_length is not None:
             of_class = dataclasses.replace(of_class, episode_length=self.episode_length)
@@ -151,6 +155,9 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         variation = Variation(varys, mj_model, device) if varys else None
 
         super().__init__(device=device, batch_size=[] if num_envs is None else [worlds])
+        self.options_given = options_given
+        for name, value in own.items():
+            setattr(self, name, value)
         self.num_envs, self.world_offset = worlds, world_offset
         self.seed = secrets.randbits(32) if seed is None else seed
         self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
@@ -171,15 +178,15 @@ class LocoEnv(Task, WorldAccess, QuickResets):
             if own_hooks(type(self)) or self.memory or self.shared or models.has_home(mj_model)
             else None
         )
-        own = self.hooks.own if self.hooks else frozenset()
+        hooks = self.hooks.own if self.hooks else frozenset()
         self.groups = dict(self.hooks.groups) if self.hooks else {}
-        if "observation" not in own:
+        if "observation" not in hooks:
             self.groups["observation"] = (self.observation_size,)
         if self.hooks and self.hooks.term_names is not None:
             self.term_names = self.hooks.term_names
         self.metric_names = self.hooks.metric_names if self.hooks else ()
         self.observation_layout = dict(self.hooks.terms) if self.hooks else {}
-        if "observation" not in own:
+        if "observation" not in hooks:
             self.observation_layout["observation"] = dict(self.observation_names)
             if self.noise or self.history:
                 raise ValueError(
@@ -190,7 +197,9 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         if "observation" in self.groups:
             self.observation_size = math.prod(self.groups["observation"])
         self.reward_terms = reward_terms and len(self.term_names) > 0
-        self._stepped_model = self._without_unread_sensors(own)
+        self._stepped_model = self._without_unread_sensors(hooks)
+        if play and (cases := self.cases()) and "episode_length" not in config:  # each is played to its end
+            self.config = dataclasses.replace(self.config, episode_length=max(cases.values()))
         self._open()
         self._make_specs()
 

@@ -191,14 +191,15 @@ def zero_non_finite(world: int, args: FiniteCheck):
 class StepEnd:
     """What ends a control step: all but the length, the bits and ``ended`` is written.
 
-    ``ended`` ``(nworld,)`` is what a task's hook says of the episode; ``counts`` ``(nworld, counters)`` has a last
-    column for steps that end non-finite.
+    ``ended`` and ``cut_off`` ``(nworld,)`` are what a task's hooks say of the episode; ``counts``
+    ``(nworld, counters)`` has a last column for steps that end non-finite.
     """
 
     episode_length: int
     counter_bits: wp.array[int]
     overflow: wp.array[int]
     ended: wp.array[bool]
+    cut_off: wp.array[bool]
     flags: Flags
     elapsed_steps: wp.array[int]
     mask: wp.array[bool]
@@ -209,13 +210,13 @@ class StepEnd:
 def finish_step(world: int, args: StepEnd):
     """Ends a control step: applies the time limit, and counts what went wrong.
 
-    A world is truncated at the time limit, and terminated if the task says so or if it is not finite; what is done is
-    masked for the reset that may follow. The bits of ``overflow`` are cleared.
+    A world is truncated at the time limit, and both as the task says, and terminated if it is not finite; what is done
+    is masked for the reset that may follow. The bits of ``overflow`` are cleared.
     """
     non_finite = args.flags.non_finite[world]
     terminated = non_finite or args.ended[world]
     elapsed_steps = args.elapsed_steps[world] + 1
-    truncated = elapsed_steps >= args.episode_length
+    truncated = elapsed_steps >= args.episode_length or args.cut_off[world]
     args.elapsed_steps[world] = elapsed_steps
     args.flags.terminated[world] = terminated
     args.flags.truncated[world] = truncated

@@ -24,7 +24,7 @@ Arrays = Mapping[str, torch.Tensor]
 
 PARTS = {
     "control": ("control",),
-    "judge": ("update", "reward", "terminated", "metrics", "events"),
+    "judge": ("update", "reward", "terminated", "truncated", "metrics", "events"),
     "adapt": ("adapt",),
     "observe": ("observation",),
     "begin": ("begin",),
@@ -32,6 +32,9 @@ PARTS = {
     "observe_restored": ("observation",),
 }
 """The hooks that each part of a step or reset calls, in their order."""
+
+ENDS = {"terminated": "ended", "truncated": "cut_off"}
+"""The hooks that end an episode, and the flag that each writes."""
 
 
 def _noting(cls: Any) -> type:
@@ -115,7 +118,7 @@ class Hooks:
         kept: dict[str, Any] = {"device": env.device}
         self.commands = {
             entry: (torch.zeros(env.num_envs, *memory[entry].shape, **kept), torch.zeros(env.num_envs, **kept) > 0)
-            for entry in (type(env).command_ranges if env.play else ())
+            for entry in (env.command_ranges if env.play else ())
         }
         self.groups: dict[str, tuple[int, ...]] = {}
         self.terms: dict[str, dict[str, int]] = {}
@@ -222,11 +225,11 @@ class Hooks:
             for name, term in terms.items() if isinstance(terms, Mapping) else [("", terms)]:
                 self._check("reward", term, (n,), name)
             self.term_names = tuple(terms) if isinstance(terms, Mapping) else ()
-        if "terminated" in self.own:
-            ended = self._call("terminated", arrays, steps=1)
-            self._check("terminated", ended, (n,))
+        for hook in (hook for hook in ENDS if hook in self.own):
+            ended = self._call(hook, arrays, steps=1)
+            self._check(hook, ended, (n,))
             if ended.dtype != torch.bool:
-                raise TypeError(f"{self._title}.terminated must return a bool tensor, got {ended.dtype}")
+                raise TypeError(f"{self._title}.{hook} must return a bool tensor, got {ended.dtype}")
         if "metrics" in self.own:
             numbers = self._metrics(arrays)
             for name, number in numbers.items():
@@ -410,7 +413,7 @@ class Hooks:
         a["non_finite"].copy_(~(finite & a["action"].isfinite()).all(-1))
 
     def judge(self, a: Arrays) -> None:
-        """After the physics: writes memory, reward, its terms and ``ended``; then what events change, and ``moved``."""
+        """After the physics: writes memory, reward, terms, both flags of the end; what events change, and ``moved``."""
         if "update" in self.own:
             self._remember(a, self._rows("update", a, self.catalog.memory))
         if "reward" in self.own:
@@ -420,8 +423,9 @@ class Hooks:
                 a["terms"].copy_(columns)
                 terms = columns.sum(-1)
             a["reward"].copy_(terms)
-        if "terminated" in self.own:
-            a["ended"].copy_(self._call("terminated", a, steps=1))
+        for hook, flag in ENDS.items():
+            if hook in self.own:
+                a[flag].copy_(self._call(hook, a, steps=1))
         if "metrics" in self.own:
             a["metrics"].copy_(torch.stack([value.float() for value in self._metrics(a).values()], dim=-1))
         if "events" in self.own:
@@ -458,6 +462,7 @@ class Hooks:
     def begin(self, a: Arrays) -> None:
         """At a reset, in the masked worlds, which are at rest: writes pose and memory."""
         memory = self.catalog.memory
+        self._remember(a, self._commanded(a), a["mask"])  # commands may say where to begin
         rows: dict[str, torch.Tensor] = {}
         if "begin" in self.own:
             home = {"qpos": self.catalog.home.expand_as(a["qpos"])}

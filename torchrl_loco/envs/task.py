@@ -24,7 +24,10 @@ from torchrl_loco.envs.view import View
 from torchrl_loco.sim import fill, models
 from torchrl_loco.sim.sampling import Table, draw_from_table
 
-HOOKS = ("control", "update", "reward", "terminated", "metrics", "events", "adapt", "observation", "begin")
+HOOKS = (
+    *("control", "update", "reward", "terminated", "truncated", "metrics", "events", "adapt"),
+    *("observation", "begin"),
+)
 """The hooks of a task, in plain torch."""
 
 FUSED = {
@@ -89,7 +92,7 @@ class Task:
     least return; without either ``kept``, the least share of the return in the training, 0.9. And in which conditions:
     ``delay`` (least and greatest, control steps), ``friction`` (least and greatest), ``pushes`` (a multiple of
     mjlab's), such as ``{"falls": 0.01, "delay": (0, 2), "pushes": 1.0}``."""
-    command_ranges: ClassVar[Mapping[str, Mapping[str, tuple[float, float]]]] = {}
+    command_ranges: Mapping[str, Mapping[str, tuple[float, float]]] = {}
     """Entries of :attr:`memory` that are commands: by entry, the name of each of its numbers, with its unit, and the
     least and greatest value, such as ``{"command": {"forward (m/s)": (-1.0, 2.0)}}``. With ``play=True`` they can be
     set, and the viewer has a slider for each."""
@@ -99,6 +102,12 @@ class Task:
     """Control steps after which an episode is truncated; ``None`` takes that of :attr:`config`."""
     action_range: Sequence[float] = BOUNDED
     """(-1, 1), or (-inf, inf) for actions without bounds, which need an own :meth:`control`."""
+    perfect: ClassVar[Mapping[str, float]] = {}
+    """Terms of the reward that tell how well a case is played, and what each earns in a second without an error."""
+    options: ClassVar[Mapping[str, tuple[Any, str]]] = {}
+    """Settings of the task's own: by name, the value that holds without one, and what it is for. An argument of the
+    environment, an option of ``torchrl-loco train``, and an attribute that hooks read, such as ``self.motion`` of
+    ``{"motion": ("walk.csv", "File of the motion.")}``. Runs, policies and checkpoints keep them."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     """By algorithm, settings of training on CUDA that were tuned for this task."""
     body: ClassVar[str] = ""
@@ -136,6 +145,13 @@ class Task:
 
     def terminated(self, s: View) -> torch.Tensor:
         """Returns whether the episode ends, bool ``(num_envs,)``; by default never."""
+        return torch.zeros(s.num_envs, dtype=torch.bool, device=s.device)
+
+    def truncated(self, s: View) -> torch.Tensor:
+        """Returns whether the episode is cut off before the time limit, bool ``(num_envs,)``; by default never.
+
+        Such as where a reference ends: what comes after counts as it would at the time limit.
+        """
         return torch.zeros(s.num_envs, dtype=torch.bool, device=s.device)
 
     def metrics(self, s: View) -> Mapping[str, torch.Tensor]:
@@ -177,7 +193,22 @@ class Task:
         """
         return s._begun_by_warp()
 
+    def ghost(self) -> torch.Tensor | None:
+        """Returns poses ``(num_envs, nq)`` that pictures show beside those of the worlds, such as of a reference."""
+        return None
+
     # What verify plays, and what a policy's file tells of the task.
+
+    def cases(self) -> Mapping[str, int]:
+        """Returns what there is to play, such as motions, with the control steps of each; by default nothing by name.
+
+        With ``play=True`` world k plays case k, and again the first after the last.
+        """
+        return {}
+
+    def reference(self) -> Mapping[str, torch.Tensor]:
+        """Returns tables ``(frames, ...)`` of which an exported policy gives a row at a time step; by default none."""
+        return {}
 
     @classmethod
     def stage_of(cls, info: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -311,6 +342,7 @@ class Task:
                 raise TypeError(f"{name}.{attribute} must be a dict by name, got {getattr(cls, attribute)!r}")
         if isinstance(cls.summed_over_ranks, str):
             raise TypeError(f"{name}.summed_over_ranks must be a tuple of names, got {cls.summed_over_ranks!r}")
+        check_options(cls)
         for what in cls.holds:
             check_choice(f"{name}.holds", what, HOLDS)
         Conditions().of(cls.holds).check()
@@ -325,6 +357,20 @@ class Task:
                     f"{table.__name__}.initial_states is not used, since an inherited pose_func draws the states: "
                     f"set pose_func = torchrl_loco.LocoEnv.pose_func in {table.__name__}"
                 )
+
+    @classmethod
+    def checked_options(cls, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns values of :attr:`options` that are given, as a run keeps them: as JSON can hold them.
+
+        Args:
+            given: values by name.
+
+        Raises:
+            ValueError: there is no such option.
+        """
+        if given and not cls.options:
+            raise ValueError(f"{cls.__name__} has no options, and so no {', '.join(given)}")
+        return {check_choice("option", name, cls.options): value for name, value in given.items()}
 
     @classmethod
     def check_model(cls, mj_model: mujoco.MjModel) -> None:
@@ -393,6 +439,21 @@ def check_commands(cls: type[Task], memory: Mapping[str, Entry]) -> None:
             low, high = bounds
             if not -MAX_VALUE < low < high < MAX_VALUE:
                 raise ValueError(f"{title}: {name!r} must have a least and a greatest value, got {bounds}")
+
+
+def check_options(cls: type[Task]) -> None:
+    """Checks the options that a class declares.
+
+    Raises:
+        TypeError: they are no table of names, values and words.
+        ValueError: a name is taken.
+    """
+    for name, entry in cls.options.items():
+        if not (isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[1], str)):
+            raise TypeError(f"{cls.__name__}.options[{name!r}] must be a value and what it is for, got {entry!r}")
+        taken = hasattr(Task, name) or name in SimConfig.__dataclass_fields__
+        if taken or not str(name).isidentifier() or str(name).startswith("_"):
+            raise ValueError(f"{cls.__name__}.options: {name!r} is no name that an option can have")
 
 
 def _warn_of_misspelt_names(cls: type[Task]) -> None:

@@ -108,10 +108,10 @@ class World:
         episode: episodes drawn so far, ``(nworld,)``.
         elapsed_steps: control steps since the world's reset, ``(nworld,)``.
         non_finite: whether the world is non-finite, ``(nworld,)``.
-        ended: whether the task's hook ends the episode, ``(nworld,)``.
+        ended, cut_off: whether the task's hooks terminate or truncate the episode, ``(nworld,)``.
         done: terminated or truncated, ``(nworld,)``.
         terminated: whether the episode ended by the task's hook, or because the world is not finite, ``(nworld,)``.
-        truncated: whether the episode reached the time limit, ``(nworld,)``.
+        truncated: whether the episode reached the time limit, or the task's hook cut it off, ``(nworld,)``.
         seed: seed of all random streams, ``(1,)``.
         health: counts what went wrong in the physics.
         kinds: by hook of the task in torch, how it runs: see ``Part.kind`` in ``part.py``.
@@ -157,7 +157,7 @@ class World:
             self.stream = Buffer(n, wp.uint32, device)
             self.episode = Buffer(n, int, device)
             self.elapsed_steps = Buffer(n, int, device)
-            self.non_finite, self.ended = Buffer(n, bool, device), Buffer(n, bool, device)
+            self.non_finite, self.ended, self.cut_off = (Buffer(n, bool, device) for _ in range(3))
             self.seed = Buffer(1, wp.uint32, device)
             self._seed_of_hooks = torch.zeros(1, dtype=torch.long, device=task.device)
             self._stagger = Buffer(1, bool, device)
@@ -182,7 +182,7 @@ class World:
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
             for monitor in self._monitors:
                 monitor.restart()
-        self._renderers: dict[tuple[str, int, int, int], Renderer] = {}
+        self._renderers: dict[Any, Renderer] = {}
         self._pid, self._closed = os.getpid(), False
         OPEN.add(self)
 
@@ -192,7 +192,7 @@ class World:
         """The control step: under the actions in the buffer, unless torch records it with others."""
         self._control()  # own control(): actions to controls
         self._physics(*action)  # default control; the substeps; fused reward and observation
-        self._judge()  # update(), reward(), terminated(), metrics(), events()
+        self._judge()  # update(), reward(), terminated(), truncated(), metrics(), events()
         self._adapt()  # adapt(): what worlds share
         self._move()  # poses and velocities again, if events() changed the state
         self._observe()  # observation(); worlds that are not finite
@@ -235,6 +235,7 @@ class World:
             counter_bits=self.health.counter_bits,
             overflow=data.overflow,
             ended=self.ended.warp,
+            cut_off=self.cut_off.warp,
             flags=flags,
             elapsed_steps=self.elapsed_steps.warp,
             mask=self.mask.warp,
@@ -398,6 +399,7 @@ class World:
             "moved": self._moved.torch,
             "non_finite": self.non_finite.torch,
             "ended": self.ended.torch,
+            "cut_off": self.cut_off.torch,
             "reward": self.reward.torch,
             "terms": self.terms.torch,
             "metrics": self.metrics,
@@ -551,13 +553,12 @@ class World:
         self.seed.torch.fill_(seed)
         self._seed_of_hooks.fill_(seed)
 
-    def render(self, camera: str, width: int, height: int, worlds: int) -> torch.Tensor:
-        """Returns pixels of the first worlds, uint8 of shape ``(worlds, height, width, 3)``."""
-        key = (camera, width, height, worlds)
-        if key not in self._renderers:
+    def renderer(self, m: mujoco.MjModel, *size: Any) -> Renderer:
+        """Returns what renders worlds of a model, made once: its further arguments are a camera, sizes and worlds."""
+        if (m, *size) not in self._renderers:
             with self.sim.qpos.device:
-                self._renderers[key] = Renderer(self.sim, *key)
-        return self._renderers[key].render()
+                self._renderers[m, *size] = Renderer(m, self.sim.device, *size)
+        return self._renderers[m, *size]
 
     # Closing.
 

@@ -1,7 +1,7 @@
 """The tasks: a folder for each body, with its model, its tasks and their settings.
 
-A task is a class whose name begins or ends with that of its folder: ``WalkerWalk`` in ``walker`` has the id
-``walker_walk``, ``Go1Velocity`` in ``velocity`` the id ``go1_velocity``.
+A task is a class in whose name is that of its folder: ``WalkerWalk`` in ``walker`` has the id ``walker_walk``,
+``Go1Velocity`` in ``velocity`` the id ``go1_velocity``.
 """
 
 import ast
@@ -19,11 +19,13 @@ class Task(NamedTuple):
         module: the module of its class.
         name: the name of its class.
         summary: the first line of the docstring of its class.
+        has_options: whether a class of its module declares options.
     """
 
     module: str
     name: str
     summary: str
+    has_options: bool
 
 
 @functools.cache
@@ -33,15 +35,18 @@ def found() -> dict[str, Task]:
     for path in sorted(Path(__file__).parent.glob("*/__init__.py")):
         folder = path.parent.name
         body, environments = folder.title().replace("_", ""), {"LocoEnv"}
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        module = ast.parse(path.read_text(encoding="utf-8"))
+        targets = [target for node in ast.walk(module) if isinstance(node, ast.Assign) for target in node.targets]
+        has_options = any(isinstance(target, ast.Name) and target.id == "options" for target in targets)
+        for node in module.body:
             if isinstance(node, ast.ClassDef) and environments & {
                 base.id for base in node.bases if isinstance(base, ast.Name)
             }:
                 environments.add(node.name)
-                if node.name != body and (node.name.startswith(body) or node.name.endswith(body)):
+                if node.name != body and body in node.name:
                     id = re.sub("(?<!^)(?=[A-Z])", "_", node.name).lower()
                     summary = (ast.get_docstring(node) or "").partition("\n")[0]
-                    tasks[id] = Task(f"{__name__}.{folder}", node.name, summary)
+                    tasks[id] = Task(f"{__name__}.{folder}", node.name, summary, has_options)
     return tasks
 
 

@@ -1,6 +1,7 @@
 """The settings of a training run, field by field, and what is valid."""
 
 import dataclasses
+import json
 import math
 import re
 from collections.abc import Collection, Mapping
@@ -60,6 +61,13 @@ Sim: Any = dataclasses.make_dataclass(
 AS_THE_TASK = Sim()
 
 
+class Options(dict[str, Any]):
+    """Values of a task's own options by name, as JSON can hold them. They do not change."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(json.dumps(self, sort_keys=True))
+
+
 @dataclasses.dataclass(frozen=True)
 class TrainingConfig:
     """Settings of any training run.
@@ -93,6 +101,8 @@ class TrainingConfig:
     """A policy file or a run folder whose weights the networks begin with; without one they are drawn."""
     sim: Sim = AS_THE_TASK
     """Settings of the simulation that replace those of the task, such as ``{"iterations": 20}``."""
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Settings of the task's own, such as the motion that it tracks."""
     randomize: bool = True
     """Whether numbers of the model vary as the task says."""
 
@@ -162,6 +172,7 @@ class TrainingConfig:
         object.__setattr__(self, "out", Path(self.out))
         object.__setattr__(self, "hidden", tuple(self.hidden))
         object.__setattr__(self, "sim", _checked_sim(self.sim))
+        object.__setattr__(self, "options", Options(self.options))
         object.__setattr__(self, "init", str(Path(self.init).expanduser().resolve()) if self.init else "")
         # Whether the machine has the device is checked when the run starts.
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
@@ -201,7 +212,7 @@ class TrainingConfig:
     def of_env(self) -> dict[str, Any]:
         """Arguments of the environments of the run, beside task, worlds, device, seed and protocol."""
         sim = {name: value for name, value in dataclasses.asdict(self.sim).items() if value is not None}
-        return sim if self.randomize else {**sim, "randomize": ()}
+        return {**sim, **self.options, **({} if self.randomize else {"randomize": ()})}
 
     @property
     def frames_per_batch(self) -> int:

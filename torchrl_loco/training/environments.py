@@ -12,7 +12,7 @@ from typing import Any
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
-from torchrl_loco.config import sim_of
+from torchrl_loco.config import arguments_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv
@@ -22,7 +22,7 @@ from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.presets import is_runner
 
-NO_STAGE: Mapping[str, Any] = MappingProxyType({})
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Environments:
@@ -85,33 +85,49 @@ class Environments:
         # The runners' tasks end at the time limit alone, and TorchRL's transform has less to do.
         return TransformedEnv(env, (FrameSkipTransform if runner else ActionRepeat)(config.action_repeat))
 
-    def evaluation(self, episodes: int, seed: int, stage: Mapping[str, Any] = NO_STAGE) -> EnvBase:
+    def evaluation(self, episodes: int, seed: int, info: Mapping[str, Any] = NOTHING) -> EnvBase:
         """Returns worlds in which a policy of the run can be played, each for an episode of the task's own length.
 
         They are made once for a number of episodes; then their random streams begin anew. They have the settings and
         the transforms of the environment that was handed in. With transforms there are as many worlds as there,
-        whatever ``episodes`` is: some transforms keep a row for each. Episodes begin at a stage of the curriculum.
+        whatever ``episodes`` is: some transforms keep a row for each. Episodes begin at the stage of the curriculum
+        that the information of a policy tells.
         """
-        config, base = self._config, self._base
-        worlds = base.num_envs if base is not None and self.transforms else episodes
+        worlds = self._base.num_envs if self._base is not None and self.transforms else episodes
         if worlds not in self._evaluating:
-            if base is None:
-                place = resolve(config.task), worlds, config.device, seed, config.protocol
-                terms = not is_runner(config.task)
-                own = make(*place, world_offset=0, metrics=True, reward_terms=terms, **config.of_env)
-            else:
-                settings = {**dataclasses.asdict(base.config), "randomize": base.randomize}
-                del settings["naconmax"]  # which is for the number of its worlds
-                settings |= {"world_offset": 0, "play": base.play, "metrics": True, "reward_terms": base.reward_terms}
-                own = type(base)(worlds, base.device, seed, base.protocol, **settings)
-            self._evaluating[worlds] = own
+            self._evaluating[worlds] = self._made(worlds, seed)
         own = self._evaluating[worlds]
         own.set_seed(seed)
-        own.set_stage(stage)
+        own.set_stage(own.stage_of(info))
         env: EnvBase = own
         for transform in self.transforms:
             env = TransformedEnv(env, copy.deepcopy(transform.clone()))  # that it learns in evaluations stays apart
         return env
+
+    def shown(self, episodes: int, seed: int, info: Mapping[str, Any]) -> Any:
+        """Returns worlds whose first is filmed: of a task that plays cases, such as motions, one that plays the first.
+
+        Else, and with transforms, those of the evaluation.
+        """
+        if self.transforms or not next(iter(self._evaluating.values())).cases():
+            return self.evaluation(episodes, seed, info)
+        return self._made(1, seed, play=True)
+
+    def _made(self, worlds: int, seed: int, **settings: Any) -> LocoEnv:
+        """Returns worlds as the run's, for evaluations."""
+        config, base = self._config, self._base
+        if base is None:
+            place = resolve(config.task), worlds, config.device, seed, config.protocol
+            terms = not is_runner(config.task)
+            return make(
+                *place, **{**config.of_env, "world_offset": 0, "metrics": True, "reward_terms": terms, **settings}
+            )
+        own = {**dataclasses.asdict(base.config), "randomize": base.randomize, **base.options_given}
+        del own["naconmax"]  # which is for the number of its worlds
+        if settings.get("play"):
+            del own["episode_length"]
+        own |= {"world_offset": 0, "play": base.play, "metrics": True, "reward_terms": base.reward_terms, **settings}
+        return type(base)(worlds, base.device, seed, base.protocol, **own)
 
 
 def _refuse_further_arguments(cls: type[LocoEnv]) -> None:
@@ -176,9 +192,8 @@ def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: 
     """
     refuse_transforms(policy)
     info = policy.info
-    sim = sim_of(info)
     place = resolve(info["task"]), num_envs, device, seed, info["protocol"]
-    env = make(*place, **{**sim, "world_offset": 0, **settings})
+    env = make(*place, **{**arguments_of(info), "world_offset": 0, **settings})
     set_stage(env, info)
     return env
 

@@ -180,7 +180,7 @@ def evaluate_run(
 
 def shipped_return(config: TrainingConfig) -> str:
     """Returns a line that says what the shipped policy of a run's task earns, an empty one if none is shipped."""
-    if config.task not in shipped_policies(config.protocol):
+    if config.task not in shipped_policies(config.protocol) or config.options:  # with which it earns something else
         return ""
     mean = load_policy(config.task, "cpu", config.protocol).info["mean"]
     return f"the policy shipped for {config.task} earns {mean:.1f}"

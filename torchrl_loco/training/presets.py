@@ -34,7 +34,7 @@ def preset(
         device: where to train; ``None`` takes CUDA if there is any.
         algorithm: "ppo" or "reppo"; ``None`` takes PPO on a CPU, and on CUDA the first of the task's ``presets``, REPPO
             if it has none.
-        overrides: fields of the settings.
+        overrides: fields of the settings, and the task's own :attr:`torchrl_loco.LocoEnv.options`.
 
     Raises:
         ValueError: there is no such device, algorithm or setting, or one is out of range; the message names what is
@@ -49,8 +49,14 @@ def preset(
     if algorithm is None:
         algorithm = next(iter(own), "reppo") if on_cuda else "ppo"
     kind = CONFIGS[check_choice("algorithm", algorithm, CONFIGS)]
+    fields = {field.name for field in dataclasses.fields(kind)}
+    if not overrides.keys() <= fields:  # only then, since importing a task takes a while
+        options = {name: overrides.pop(name) for name in resolve(task).options if name in overrides}
+        overrides["options"] = {**overrides.get("options", {}), **options}
     for name in overrides:
         check_setting("setting", name, kind)
+    if overrides.get("options"):
+        overrides["options"] = resolve(task).checked_options(overrides["options"])
     settings = {**kind.presets[device.type], **({} if is_runner(task) else kind.of_others), **own.get(algorithm, {})}
     if not is_runner(task) and kind is REPPOConfig:  # returns of either sign
         settings.setdefault("min_value", -settings.get("max_value", REPPOConfig.max_value))

@@ -116,6 +116,7 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
     base, _ = unwrapped(env)
     own: dict[str, Any] = {"num_envs": base.num_envs, "device": str(base.device), "protocol": base.protocol}
     own |= {"episode_length": base.config.episode_length}
+    own |= {"options": base.options_given} if base.options_given else {}
     for name, value in own.items():
         if name in settings and str(settings[name]) != str(value):
             raise ValueError(f"{name} is that of the environment, {value!r}: leave it out, got {settings[name]!r}")

@@ -6,6 +6,7 @@ import logging
 import math
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ class Trainer:
         total_frames: to how many frames a resumed run is trained; ``None`` leaves that as it was. As the device, it is
             stored in the folder once nothing is left to be refused.
         device: where a resumed run goes on; ``None`` keeps its device.
+        options: of its task; ``None`` keeps them.
 
     Raises:
         FileNotFoundError: there is no checkpoint to resume from.
@@ -72,9 +74,10 @@ class Trainer:
         *,
         total_frames: int | None = None,
         device: str | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> None:
         self.run = run
-        changes = {"total_frames": total_frames, "device": device}
+        changes = {"total_frames": total_frames, "device": device, "options": options}
         taken = distributed.is_first() and lock(run.path)
         if taken:
             run.remove_parts()
@@ -319,7 +322,7 @@ class Trainer:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""
         when = {"frames": self.frames, "seconds": round(self.seconds, 3)}
         of_env: dict[str, Any] = {"trained_on": self.device_name, "control_timestep": self._base.config.ctrl_dt}
-        if stage := self._base.get_stage():
+        if stage := self._base.stage_of({"stage": self._base.get_stage()}):
             of_env["stage"] = stage
         if self.environments.transforms:
             of_env["transforms"] = self.environments.names_of_transforms
@@ -335,7 +338,7 @@ class Trainer:
     def _summary(self, policy: Policy, final: bool) -> dict[str, float]:
         """Returns what a policy earns in the episodes that select the best policy, or in those at the end."""
         config, seed = self.config, evaluation_seed(self.config.seed, final)
-        env = self.environments.evaluation(config.eval_episodes, seed, policy.info.get("stage", {}))
+        env = self.environments.evaluation(config.eval_episodes, seed, policy.info)
         if self._evaluator is None or self._evaluator.env is not env:  # with transforms it is a new one
             self._evaluator = Evaluator(policy, env, config.action_repeat)
         self._evaluator.policy.load_state_dict(policy.state_dict())
@@ -350,10 +353,10 @@ class Trainer:
         summary = self._summary(policy, final=True)
         plot_runs([self.run], self.run.path / "learning_curve.png")
         if config.video_seconds > 0:
-            seed, stage = evaluation_seed(config.seed, final=True), policy.info.get("stage", {})
-            env = self.environments.evaluation(config.eval_episodes, seed, stage)
-            record(policy, env, self.run.video, config.video_seconds, config.action_repeat)
-        policy.info |= summary
+            seed = evaluation_seed(config.seed, final=True)
+            shown = self.environments.shown(config.eval_episodes, seed, policy.info)
+            record(policy, shown, self.run.video, config.video_seconds, config.action_repeat)
+        policy.info |= summary | ({"options": dict(config.options)} if config.options else {})  # files may have moved
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
         print(f"best policy, in new episodes: {describe(summary)}")
         for note in filter(None, (shipped_return(config), self.algorithm.note(self.run.read_metrics()))):
