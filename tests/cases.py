@@ -2,8 +2,8 @@
 
 from torchrl_loco import registry
 
-TASKS = [task for task in registry.OURS if not task.endswith("_velocity")]  # nor those of plug-ins
-"""Those of dm_control; test_velocity.py is for the robots."""
+TASKS = [task for task in registry.OURS if not {"velocity", "tracking"} & set(task.split("_"))]  # nor those of plug-ins
+"""Those of dm_control; test_velocity.py and test_tracking.py are for the robots."""
 PROTOCOLS = ("playground", "dm_control")
 ENGINES = ("compiled", "mujoco_warp")
 COMPILED = ("walker_run", "humanoid_run", "cheetah_run", "hopper_hop")

@@ -11,7 +11,7 @@ import torchrl_loco
 
 ROOT = Path(torchrl_loco.__file__).parent
 LAYERS = [  # a module imports from its own layer or from those before it
-    {"checks", "conditions", "config", "garbage", "known_files", "rewards", "storage"},
+    {"checks", "conditions", "config", "garbage", "known_files", "motion", "rewards", "storage"},
     {"sim"},
     {"rendering"},
     {"envs", "viewer"},

@@ -3,6 +3,7 @@ from . import collector as collector
 from . import config as config
 from . import envs as envs
 from . import export as export
+from . import motion as motion
 from . import policy as policy
 from . import registry as registry
 from . import rendering as rendering
@@ -23,6 +24,7 @@ from .envs.tolerance import tolerance as tolerance
 from .envs.vary import Vary as Vary
 from .envs.view import View as View
 from .export import export_policy as export_policy
+from .motion import Motion as Motion
 from .policy import Policy as Policy
 from .policy import load_policy as load_policy
 from .registry import list_envs as list_envs
@@ -36,6 +38,9 @@ from .tasks.humanoid import HumanoidStand as HumanoidStand
 from .tasks.humanoid import HumanoidWalk as HumanoidWalk
 from .tasks.quadruped import QuadrupedRun as QuadrupedRun
 from .tasks.quadruped import QuadrupedWalk as QuadrupedWalk
+from .tasks.tracking import G1Tracking as G1Tracking
+from .tasks.tracking import G1TrackingNoEstimation as G1TrackingNoEstimation
+from .tasks.tracking import H1Tracking as H1Tracking
 from .tasks.velocity import G1Velocity as G1Velocity
 from .tasks.velocity import Go1Velocity as Go1Velocity
 from .tasks.velocity import Go2Velocity as Go2Velocity

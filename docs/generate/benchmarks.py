@@ -120,7 +120,12 @@ def tables() -> dict[str, str]:
 
 def of_tasks() -> dict[str, str]:
     """Returns what the pages of tasks and bodies take from the package; not of plug-ins that happen to be installed."""
-    made = {"velocity-weights": tasks.velocity_weights(), "velocity-observation": tasks.velocity_observation()}
+    made = {
+        "velocity-weights": tasks.velocity_weights(),
+        "velocity-observation": tasks.observation(("go1_velocity", "g1_velocity")),
+        "tracking-observation": tasks.observation(("g1_tracking", "h1_tracking")),
+        "tracking-reward": tasks.tracking_reward(),
+    }
     for name in tasks.RUNNERS:
         label = name.replace("_", "-")
         made[f"{label}-properties"] = tasks.properties(name, training(name))

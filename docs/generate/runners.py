@@ -44,6 +44,7 @@ class Grid(NamedTuple):
 SHOWN = {
     "runners.webp": Grid((*ROBOTS, *RUNNERS), 3, 272, 204),
     "robots.webp": Grid(ROBOTS, 2, 360, 270),
+    "tracking.webp": Grid((("g1_tracking", "playground"), ("h1_tracking", "playground")), 2, 360, 270, 6.8),
     **{f"tasks/{name}.webp": Grid(((name, "playground"),), 1, 340, 255, 4.0) for name in tasks.RUNNERS},
 }
 """What each file shows. Any task that has a shipped policy can be added."""

@@ -15,6 +15,7 @@ from torchrl_loco.config import NACONMAX_FLOOR, NACONMAX_WORLDS, PROTOCOLS, sim_
 from torchrl_loco.policy import shipped_policies
 from torchrl_loco.registry import ALIASES, OURS, env_class
 from torchrl_loco.sim import models
+from torchrl_loco.tasks.tracking import FOLLOWED, PENALTIES
 from torchrl_loco.training.presets import is_runner
 
 RUNNERS = [name for name in OURS if is_runner(name)]  # the others have pages of their own
@@ -123,8 +124,8 @@ def frames(
     Raises:
         ValueError: the task has no policy under the protocol.
     """
-    policy, commanded = torchrl_loco.load_policy(name, device="cpu", protocol=protocol), not is_runner(name)
-    env = torchrl_loco.make(name, num_envs=1, device="cpu", seed=seed, protocol=protocol, play=commanded)
+    policy, commanded = torchrl_loco.load_policy(name, device="cpu", protocol=protocol), name.endswith("_velocity")
+    env = torchrl_loco.make(name, num_envs=1, device="cpu", seed=seed, protocol=protocol, play=not is_runner(name))
     dt, repeat = env.config.ctrl_dt, policy.info.get("action_repeat", 1)
     wanted = [round(i / RATE / dt) for i in range(round(seconds * RATE))]
     td, found = env.reset(), []
@@ -175,25 +176,52 @@ MEANINGS = {
     "foot_contacts": "whether each touches something, 0 or 1",
     "foot_forces": "`sign(f) log(1 + abs(f))` of the components of each contact force (N)",
     "delay": "of actions (control steps)",
+    "reference_joints": "joints of the reference (rad)",
+    "reference_rates": "their rates (rad/s)",
+    "anchor_position": "of the reference's anchor, in the frame of the robot's (m)",
+    "anchor_orientation": "the same, two columns of a matrix",
+    "bodies": "positions of the bodies in the anchor's frame (m)",
+    "orientations": "theirs, two columns of a matrix each",
 }
 """What the terms of a robot's observation are."""
 
 
-def velocity_observation() -> str:
-    """Returns the terms of a robot's observation: sizes of a quadruped and of a humanoid, noise, and who sees them."""
-    envs = [torchrl_loco.make(name, 1, "cpu", 0, engine="mujoco") for name in ("go1_velocity", "g1_velocity")]
+ERRORS = {
+    "anchor_position": "the anchor in the world (m)",
+    "anchor_orientation": "the same (rad)",
+    "body_positions": "bodies, moved to the anchor (m)",
+    "body_orientations": "the same (rad)",
+    "body_velocities": "bodies in the world (m/s)",
+    "body_turn_rates": "the same (rad/s)",
+    "action_rate": "squared change of the action",
+    "joint_limits": "how far joints are beyond 0.9 of their ranges (rad)",
+    "self_collision": "physics steps with a contact with itself of more than 10 N",
+}
+"""Of what the terms of the reward for following are."""
+
+
+def observation(names: Sequence[str]) -> str:
+    """Returns the terms of the observations of tasks: sizes, a column a task, noise, and who sees them."""
+    envs = [torchrl_loco.make(name, 1, "cpu", 0, engine="mujoco") for name in names]
     seen, rows = envs[0].observation_layout["observation"], []
     for name in envs[0].observation_layout["privileged"]:
         sizes = [env.observation_layout["privileged"][name] for env in envs]
         noise = envs[0].noise.get(name, 0.0)
         most = f"{noise[0]:g}, and `{noise[1]}`" if isinstance(noise, tuple) else f"{noise:g}" if noise else ""
         rows.append((f"`{name}`", MEANINGS[name], *sizes, most, "" if name in seen else "critic"))
-    return table(("term", "", "Go1", "G1", "noise, either way", "seen by"), rows)
+    return table(("term", "", *(f"`{name}`" for name in names), "noise, either way", "seen by"), rows)
+
+
+def tracking_reward() -> str:
+    """Returns the table of the terms of the reward of those that follow motions."""
+    rows = [(f"`{name}`", f"{weight:g}", f"{error:g}", ERRORS[name]) for name, (weight, error) in FOLLOWED.items()]
+    rows += [(f"`{name}`", f"{weight:g}", "", ERRORS[name]) for name, weight in PENALTIES.items()]
+    return table(("term", "weight", "`s`", "of"), rows)
 
 
 def velocity_weights() -> str:
     """Returns the table of the weights of the reward of those that follow a velocity, a column a robot."""
-    followers = {name: env_class(name).weights for name in OURS if not is_runner(name)}
+    followers = {name: env_class(name).weights for name in OURS if name.endswith("_velocity")}
     terms = list(dict.fromkeys(term for weights in followers.values() for term in weights))
     rows = [(f"`{term}`", *(f"{w[term]:g}" if term in w else "" for w in followers.values())) for term in terms]
     return table(("term", *(f"`{name}`" for name in followers)), rows)

@@ -17,6 +17,7 @@ from torchrl_loco.checks import check_choice
 from torchrl_loco.cli import runs
 from torchrl_loco.cli.diagnosis import diagnose, inspect, list_tasks
 from torchrl_loco.cli.errors import process_name, user_errors
+from torchrl_loco.cli.motions import motion
 from torchrl_loco.cli.options import VALUES, task_options
 from torchrl_loco.cli.policies import evaluate, export, play, record, verify, watch
 from torchrl_loco.garbage import no_collection
@@ -59,6 +60,7 @@ def _run(args: list[str]) -> None:
         "plot": runs.plot,
         "export": export,
         "verify": verify,
+        "motion": motion,
         "inspect": inspect,
         "list": list_tasks,
         "doctor": diagnose,

@@ -26,6 +26,7 @@ from torchrl_loco.checks import (
     is_run,
 )
 from torchrl_loco.cli.errors import user_errors
+from torchrl_loco.cli.motions import THOSE_OF_TRAINING, MotionOptions, Motions
 from torchrl_loco.cli.options import OtherTask
 from torchrl_loco.conditions import DEFAULT, Conditions
 from torchrl_loco.known_files import place_of
@@ -52,12 +53,27 @@ Protocol = Annotated[
 
 
 def _policy(
-    run_or_task: str, protocol: str, device: str | None, other: Path | None = None, task: str | None = None
+    run_or_task: str,
+    protocol: str,
+    device: str | None,
+    other: Path | None = None,
+    task: str | None = None,
+    motions: Motions = THOSE_OF_TRAINING,
 ) -> tuple["torchrl_loco.Policy", Path]:
     """Returns a policy, and the path from which the default names of its video and of its export derive.
 
     Its task is the one that is named: ``task``, or ``run_or_task`` if ``other`` says where the policy is.
     """
+    policy, beside = _policy_of(run_or_task, protocol, device, other, task)
+    if motions != THOSE_OF_TRAINING:
+        policy.info["options"] = {**policy.info.get("options", {}), **motions.given(policy.info["task"])}
+    return policy, beside
+
+
+def _policy_of(
+    run_or_task: str, protocol: str, device: str | None, other: Path | None, task: str | None
+) -> tuple["torchrl_loco.Policy", Path]:
+    """Returns a policy as its file has it, and the path beside which its files belong."""
     if task is not None and (other is not None or not Path(run_or_task).exists()):
         raise ValueError(f"{run_or_task} names the task already: leave --task out")
     if other is not None:
@@ -128,6 +144,7 @@ def evaluate(
     policy: OtherPolicy = None,
     task: OtherTask = None,
     device: str | None = None,
+    motions: MotionOptions = THOSE_OF_TRAINING,
 ) -> None:
     """Evaluate a trained policy over full episodes, without exploration.
 
@@ -139,9 +156,10 @@ def evaluate(
         policy: a policy that may be of another task.
         task: the task of the run or the file.
         device: where to play them; default: CUDA if there is any.
+        motions: which motions.
     """
     with user_errors():
-        played, _ = _policy(run_or_task, protocol, device, policy, task)
+        played, _ = _policy(run_or_task, protocol, device, policy, task, motions)
         from torchrl_loco import training
 
         summary = training.evaluate_policy(played, episodes, seed)
@@ -189,7 +207,7 @@ class Video:
         """Returns one world of the policy's task."""
         from torchrl_loco.training.environments import make_for
 
-        return make_for(policy, 1, self.device, self.seed)
+        return make_for(policy, 1, self.device, self.seed, play=True)
 
 
 VideoOptions = Annotated[Video, tyro.conf.arg(name="")]
@@ -242,6 +260,7 @@ def record(
     protocol: Protocol = "playground",
     policy: OtherPolicy = None,
     task: OtherTask = None,
+    motions: MotionOptions = THOSE_OF_TRAINING,
     video: VideoOptions = Video(),
 ) -> None:
     """Record a video of a trained policy.
@@ -251,12 +270,13 @@ def record(
         protocol: which policy of the package.
         policy: a policy that may be of another task.
         task: the task of the run or the file.
+        motions: which motions.
         video: which part of an episode is shown, and how.
     """
     with user_errors():
         video.check()
         video.check_encoder()
-        played, beside = _policy(run_or_task, protocol, video.device, policy, task)
+        played, beside = _policy(run_or_task, protocol, video.device, policy, task, motions)
         video.make(played, _video_file(played, beside))
 
 
@@ -270,6 +290,7 @@ def play(
     protocol: Protocol = "playground",
     policy: OtherPolicy = None,
     task: OtherTask = None,
+    motions: MotionOptions = THOSE_OF_TRAINING,
     browser: BrowserOptions = Browser(),
     video: VideoOptions = Video(),
 ) -> None:
@@ -281,6 +302,7 @@ def play(
         protocol: which policy of the package.
         policy: a policy that may be of another task.
         task: the task of the run or the file.
+        motions: which motions.
         browser: how many worlds the browser shows, and at which address.
         video: which part of an episode is shown, and how; --out always records a video.
     """
@@ -297,7 +319,7 @@ def play(
                 raise ValueError("there is no display for a window: pass --viewer browser or --viewer video")
         if viewer == "video":
             video.check_encoder()
-        played, beside = _policy(run_or_task, protocol, video.device, policy, task)
+        played, beside = _policy(run_or_task, protocol, video.device, policy, task, motions)
         from torchrl_loco import training
         from torchrl_loco.training.environments import make_for
 
@@ -387,6 +409,7 @@ def export(
     protocol: Protocol = "playground",
     policy: OtherPolicy = None,
     task: OtherTask = None,
+    motions: MotionOptions = THOSE_OF_TRAINING,
 ) -> None:
     """Write a policy as a file for programs without this package, and compare it with the policy.
 
@@ -397,9 +420,10 @@ def export(
         protocol: which policy of the package.
         policy: a policy that may be of another task.
         task: the task of the run or the file.
+        motions: which motions.
     """
     with user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
-        written, beside = _policy(run_or_task, protocol, "cpu", policy, task)
+        written, beside = _policy(run_or_task, protocol, "cpu", policy, task, motions)
         from torchrl_loco import storage
         from torchrl_loco.deployment import why_not
         from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy
@@ -434,6 +458,7 @@ def verify(
     device: str | None = None,
     alone: bool = False,
     out: Path | None = None,
+    motions: MotionOptions = THOSE_OF_TRAINING,
     conditions: ConditionOptions = DEFAULT,
 ) -> None:
     """Play a policy, as exported, in its task in C MuJoCo, by the model's own options; status 1 if it does not hold.
@@ -449,6 +474,7 @@ def verify(
         device: where the simulator of the training computes; default: CUDA if there is any.
         alone: whether to play it in C MuJoCo alone, which is quicker on a CPU.
         out: figures as JSON, a new file; default: a new verify.json in the run folder, none elsewhere.
+        motions: which motions.
         conditions: what the policy must hold in.
     """
     with user_errors(), tempfile.TemporaryDirectory() as folder:
@@ -461,10 +487,10 @@ def verify(
             named = task if policy is None else run_task_or_file
             named = None if named is None else _task(named)
         else:
-            path, in_run = _exported_for(run_task_or_file, protocol, policy, task, Path(folder))
+            path, in_run = _exported_for(run_task_or_file, protocol, policy, task, Path(folder), motions)
             out, named = in_run if out is None else out, None
         print(f"verifying: {conditions.episodes} episodes, which take minutes on a CPU", file=sys.stderr, flush=True)
-        report = verification.verify(path, conditions, device, alone=alone, task=named)
+        report = verification.verify(path, conditions, device, alone=alone, task=named, options=motions.given)
         print(*report.lines, sep="\n")
         if out is not None:
             out.write_text(f"{json.dumps(report.figures, indent=2)}\n")
@@ -474,14 +500,14 @@ def verify(
 
 
 def _exported_for(
-    run_or_task: str, protocol: str, other: Path | None, task: str | None, folder: Path
+    run_or_task: str, protocol: str, other: Path | None, task: str | None, folder: Path, motions: Motions
 ) -> tuple[Path, Path | None]:
     """Exports a policy into a folder. Returns the file, and where figures belong in its run folder, if it has one."""
     from torchrl_loco import storage
     from torchrl_loco.deployment import why_not
     from torchrl_loco.export import export_policy
 
-    policy, beside = _policy(run_or_task, protocol, "cpu", other, task)
+    policy, beside = _policy(run_or_task, protocol, "cpu", other, task, motions)
     if reason := why_not(policy):
         raise ValueError(f"{run_or_task} cannot be verified: {reason}")
     path = folder / "policy.onnx"

@@ -11,6 +11,7 @@ import tyro
 
 from torchrl_loco.checks import SEED, check_int, check_run
 from torchrl_loco.cli.errors import user_errors
+from torchrl_loco.cli.motions import THOSE_OF_TRAINING, MotionOptions
 from torchrl_loco.cli.options import OtherTask, settings
 from torchrl_loco.garbage import no_collection
 
@@ -57,6 +58,7 @@ def resume(
     total_frames: int | None = None,
     device: str | None = None,
     task: OtherTask = None,
+    motions: MotionOptions = THOSE_OF_TRAINING,
 ) -> None:
     """Continue a run that was stopped, from its last checkpoint, as if it had not been stopped.
 
@@ -67,6 +69,7 @@ def resume(
             new number from here on. Trials keep the length with which they began.
         device: train on another device from here on.
         task: where its task is now.
+        motions: where its motions are now.
     """
     with user_errors():
         check_run(run)
@@ -77,10 +80,13 @@ def resume(
         training.Given().check(folder)
         asked: dict[str, Any] = {"total_frames": total_frames, "device": device}
         changes = {name: value for name, value in asked.items() if value is not None}
+        if moved := motions.given(folder.task):
+            changes["options"] = {**folder.load_config().options, **moved}
         kind = folder.load_config(**changes).device
         missing = missing_processes(gpus, kind)
     if missing:
-        more = [f"--{name}={value}" for name, value in changes.items()]
+        more = [f"--{name}={value}" for name, value in changes.items() if name != "options"]
+        more += [*(["--motion", *motions.motion] if motions.motion else []), f"--fps={motions.fps}"]
         more += [] if task is None else [f"--task={task}"]
         training.distributed.launch(missing, ["resume", str(run), f"--gpus={gpus}", *more])
     else:

@@ -15,6 +15,7 @@ import websockets.asyncio.server
 from mjviser import ViserMujocoScene
 from viser import uplot
 
+from torchrl_loco.motion import poses
 from torchrl_loco.viewer.player import Player
 from torchrl_loco.viewer.settings import is_foreign
 
@@ -99,7 +100,8 @@ class Page:
             self.server = _Server(host, port, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
-        self._model = player.env.mujoco_model()
+        has_ghost = player.env.ghost() is not None
+        self._model = player.env.model_with_ghost if has_ghost else player.env.mujoco_model()
         for name, value in SOLVER.items():
             setattr(self._model.opt, name, value)
         self.scene = ViserMujocoScene(self.server, self._model, player.env.num_envs)
@@ -115,7 +117,7 @@ class Page:
         self.speed = gui.add_button_group("Speed", ("Slower", "Real time", "Faster"))
         self._make_choice()
         self._sliders: dict[str, list[Any]] = {}
-        for entry, ranges in type(player.env).command_ranges.items() if player.env.play else ():
+        for entry, ranges in player.env.command_ranges.items() if player.env.play else ():
             self._make_command(entry, ranges)
         self._make_curves()
 
@@ -229,9 +231,15 @@ class Page:
         of_forces = {}
         if self.forces.value:
             of_forces = {name: getattr(sim, name).cpu().numpy() for name in ("qpos", "qvel", "ctrl")}
+        pos, mat = sim.xpos.cpu().numpy(), sim.xmat.cpu().numpy().copy()
+        if (ghost := self._player.env.ghost()) is not None:
+            qpos = torch.cat([sim.qpos, ghost], dim=-1).cpu().numpy()
+            pos, mat = (each.astype(np.float32) for each in poses(self._model, qpos))
+            if of_forces:
+                of_forces |= {"qpos": qpos, "qvel": np.pad(of_forces["qvel"], ((0, 0), (0, sim.qvel.shape[1])))}
         self.scene.update_from_arrays(
-            sim.xpos.cpu().numpy() + shift[:, None].astype(np.float32),
-            sim.xmat.cpu().numpy().copy(),
+            pos + shift[:, None].astype(np.float32),
+            mat,
             env_idx=chosen,
             **of_forces,
         )

@@ -291,16 +291,9 @@ class Velocity(LocoEnv):
     @classmethod
     def facts(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
         """Returns how actions become targets of the joints, and what commands the policy follows."""
-        home = models.home_pose(m)[[int(m.joint(name).qposadr[0]) for name in actuated(m)]].tolist()
-        scale = np.full(m.nu, cls.action_scale or 0.0)
-        if cls.action_scale is None:
-            scale = 0.25 * m.actuator_forcerange[:, 1] / m.actuator_gainprm[:, 0]
         low, high = commands.reached(cls.curriculum, steps_of_training(info))
-        return {
-            "action_offset": home,
-            "action_scale": scale.tolist(),
-            "velocity": {"base": cls.base, "trunk": cls.trunk, "command_low": low, "command_high": high},
-        }
+        velocity = {"base": cls.base, "trunk": cls.trunk, "command_low": low, "command_high": high}
+        return {**targets(cls, m), "velocity": velocity}
 
     @classmethod
     def stage_of(cls, info: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -446,6 +439,15 @@ class Velocity(LocoEnv):
 def steps_of_training(info: Mapping[str, Any]) -> int:
     """Returns after how many control steps of each world a policy was saved."""
     return int(info.get("frames", 0)) // int(info.get("num_envs", 1))
+
+
+def targets(cls: Any, m: mujoco.MjModel) -> dict[str, list[float]]:
+    """Returns how actions become targets of the joints (rad): ``action_offset + action_scale * action``."""
+    home = models.home_pose(m)[[int(m.joint(name).qposadr[0]) for name in actuated(m)]].tolist()
+    scale = np.full(m.nu, cls.action_scale or 0.0)
+    if cls.action_scale is None:
+        scale = 0.25 * m.actuator_forcerange[:, 1] / m.actuator_gainprm[:, 0]
+    return {"action_offset": home, "action_scale": scale.tolist()}
 
 
 def actuated(m: mujoco.MjModel) -> list[str]:

@@ -1,0 +1,272 @@
+"""Robots that follow motions: the task by formula in C MuJoCo, starts and ends of episodes, what its files hold."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+import torchrl_loco as loco
+from torchrl_loco import Motion, cli, motion
+from torchrl_loco.tasks import tracking
+from torchrl_loco.tasks.tracking import FOLLOWED, PENALTIES, PIECES, G1Tracking, H1Tracking
+
+PUNCHES = H1Tracking.motion_folder / "punches.csv"
+EXAMPLE = Path(__file__).parents[1] / "examples" / "follow_motion.py"
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """Two motions of 10 and 15 frames of 25 Hz, in which the H1 stands almost still."""
+    folder, rows = tmp_path_factory.mktemp("short"), np.loadtxt(PUNCHES, delimiter=",")
+    for name, count in (("a", 10), ("b", 15)):
+        np.savetxt(folder / f"{name}.csv", rows[:count], delimiter=",")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def h1(short):
+    return loco.make("h1_tracking", 6, "cpu", 0, play=True, motion=short, fps=25, metrics=True, reward_terms=True)
+
+
+def rotation(mat):
+    """The angle of a rotation matrix (rad)."""
+    return np.arccos(np.clip((np.trace(mat) - 1.0) / 2.0, -1.0, 1.0))
+
+
+def by_formula(env, qpos, qvel, frame, action, last_action):
+    """The terms of the reward of one world, in float64, from C MuJoCo."""
+    m, f = env.mj_model, env.frames
+    d = mujoco.MjData(m)
+    d.qpos[:], d.qvel[:] = qpos, qvel
+    mujoco.mj_forward(m, d)
+    names, anchor = list(env.bodies), list(env.bodies).index(env.anchor)
+    ids = [m.body(name).id for name in names]
+    pos, mat = d.xpos[ids], d.xmat[ids].reshape(-1, 3, 3)
+    velocity = np.zeros((len(ids), 6))
+    for row, i in zip(velocity, ids, strict=True):
+        mujoco.mj_objectVelocity(m, d, mujoco.mjtObj.mjOBJ_XBODY, i, row, 0)
+    wanted, frames = f.pos[frame].astype(float), f.mat[frame].astype(float)
+    turn = mat[anchor] @ frames[anchor].T
+    yaw = np.arctan2(turn[1, 0], turn[0, 0])
+    about = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    moved = np.array([*pos[anchor, :2], wanted[anchor, 2]]) + (wanted - wanted[anchor]) @ about.T
+    squared = {
+        "anchor_position": ((wanted - pos)[anchor] ** 2).sum(),
+        "anchor_orientation": rotation(mat[anchor].T @ frames[anchor]) ** 2,
+        "body_positions": ((moved - pos) ** 2).sum(1).mean(),
+        "body_orientations": np.mean([rotation(a.T @ about @ b) ** 2 for a, b in zip(mat, frames, strict=True)]),
+        "body_velocities": ((f.lin[frame] - velocity[:, 3:]) ** 2).sum(1).mean(),
+        "body_turn_rates": ((f.ang[frame] - velocity[:, :3]) ** 2).sum(1).mean(),
+    }
+    terms = {name: weight * np.exp(-squared[name] / sigma**2) for name, (weight, sigma) in FOLLOWED.items()}
+    low, high = m.jnt_range[1:].T
+    beyond = np.abs(qpos[7:] - 0.5 * (low + high)) - 0.45 * (high - low)
+    terms["action_rate"] = PENALTIES["action_rate"] * ((action - last_action) ** 2).sum()
+    terms["joint_limits"] = PENALTIES["joint_limits"] * beyond.clip(min=0.0).sum()
+    return {name: 0.02 * value for name, value in terms.items()}
+
+
+def test_terms_are_those_of_the_formula(device):
+    env = loco.make("h1_tracking", 8, device, 3, reward_terms=True, metrics=True, randomize=[])
+    td = env.reset()
+    last = torch.zeros(8, 19, device=device)
+    for _ in range(12):
+        frame = env.world.memory["frame"].cpu()
+        action = 0.5 * torch.randn(8, 19, device=device)
+        state = env.step(td.set("action", action))["next"]
+        pushed = env.world.memory["until_push"] > 0.98  # velocities of the observation are those after a push
+        for k in np.flatnonzero(~pushed.cpu().numpy())[:3]:
+            rows = (env.sim.qpos, env.sim.qvel, action, last)
+            qpos, qvel, now, before = (row[k].cpu().numpy().astype(float) for row in rows)
+            wanted = by_formula(env, qpos, qvel, int(frame[k]), now, before)
+            for name, value in wanted.items():
+                assert state["reward_terms", name][k].item() == pytest.approx(value, abs=2e-5), name
+        assert torch.allclose(state["reward"], sum(state["reward_terms"].values()), atol=1e-5)
+        last, td = action, state.exclude("reward")
+
+
+def test_worlds_to_play_with_begin_with_their_own_clip_and_end_with_it(h1, short):
+    td = h1.reset()
+    assert h1.cases() == {"a": 18, "b": 28}
+    first = torch.tensor([0, 19] * 3)
+    assert torch.equal(h1.world.memory["frame"].long(), first)
+    assert torch.allclose(h1.sim.qpos, torch.tensor(h1.frames.qpos)[first], atol=1e-6)
+    assert torch.allclose(h1.sim.qvel, torch.tensor(h1.frames.qvel)[first], atol=1e-6)
+    seen = td["observation"]
+    sizes = h1.observation_layout["observation"]
+    terms = dict(zip(sizes, seen.split(list(sizes.values()), dim=-1), strict=True))
+    assert terms["anchor_position"].abs().max() < 1e-6
+    assert torch.allclose(terms["anchor_orientation"], torch.eye(3)[:, :2].flatten().expand(6, 6), atol=1e-5)
+    assert torch.allclose(terms["reference_joints"], h1.sim.qpos[:, 7:], atol=1e-6)
+    ended = torch.zeros(6, dtype=torch.long)
+    for step in range(1, 30):
+        td = h1.step(td.set("action", torch.zeros(6, 19)))["next"].exclude("reward")
+        assert not td["terminated"].any()
+        ended = torch.where((ended == 0) & td["truncated"].squeeze(-1), step, ended)
+    assert ended.tolist() == [18, 28] * 3
+
+
+def test_clip_and_phase_can_be_set(h1):
+    td = h1.reset()
+    h1.set_command(1.0, "clip")  # of world 0, and on from there
+    h1.set_command(0.5, "phase")
+    for _ in range(2):  # it is set in the first step, and begins in the second
+        td = h1.step(td.set("action", torch.zeros(6, 19)))["next"].exclude("reward")
+    assert h1.world.memory["frame"].tolist() == [19 + 14, 9] * 3
+    assert torch.allclose(h1.sim.qpos, torch.tensor(h1.frames.qpos)[[33, 9] * 3], atol=1e-6)
+    h1.reset()
+    assert h1.world.memory["frame"].tolist() == [33, 9] * 3
+    h1.set_command(0.0, "clip")
+    h1.set_command(0.0, "phase")
+    h1.reset()
+    assert h1.world.memory["frame"].tolist() == [0, 19] * 3
+
+
+def test_the_reference_is_shown_beside_the_robot(h1):
+    h1.reset()
+    frame = h1.world.memory["frame"].long()
+    assert torch.allclose(h1.ghost(), torch.tensor(h1.frames.qpos)[frame])
+    model = h1.model_with_ghost
+    assert model.nq == 2 * h1.mj_model.nq
+    assert model.nu == h1.mj_model.nu
+    shown = h1.render(worlds=2, width=64, height=48)
+    td = h1.reset()
+    for _ in range(10):
+        td = h1.step(td.set("action", torch.ones(6, 19)))["next"].exclude("reward")
+    apart = h1.render(worlds=2, width=64, height=48)
+    green = (apart[..., 1].int() - apart[..., 0].int() > 25).sum()
+    assert green > (shown[..., 1].int() - shown[..., 0].int() > 25).sum()
+
+
+def test_starts_follow_failures(device):
+    engine = "mujoco" if device == "cpu" else "compiled"
+    env = loco.make("h1_tracking", 4000, device, 1, engine=engine)
+    tables, pieces = env.hooks.catalog.constants, env.pieces
+    share, piece_of, ends = tables["piece_share"], tables["piece_of"].long(), tables["clip_last"]
+
+    def drawn():
+        env.reset()
+        frame = env.world.memory["frame"].long()
+        assert (frame < ends[torch.searchsorted(ends, frame)]).all()
+        return torch.bincount(piece_of[frame], minlength=PIECES) / 4000
+
+    assert (drawn() - share).abs().max() < 0.02  # nothing is known: anywhere
+    shared = env.world.shared
+    shared["recent"][0, :pieces], shared["recent"][1, 5] = 1e6, 1e5
+    env.step(env.rand_action())
+    found = drawn()
+    assert found[5].item() == pytest.approx((1.0 - tracking.UNIFORM) / (1.0 + tracking.BEFORE), abs=0.05)
+    assert found[4].item() == pytest.approx(
+        tracking.BEFORE * (1.0 - tracking.UNIFORM) / (1.0 + tracking.BEFORE), abs=0.05
+    )
+    for entry in ("visits", "failures", "counted", "recent"):
+        shared[entry].zero_()
+    before = env.world.memory["frame"].long()
+    td = env.step(env.rand_action())["next"]
+    lost = td["terminated"].squeeze(-1)
+    visits = torch.bincount(piece_of[before], minlength=PIECES)
+    failures = torch.bincount(piece_of[before][lost], minlength=PIECES)
+    assert torch.equal(shared["visits"], visits)
+    assert torch.equal(shared["failures"], failures)
+    # What other ranks have counted comes in once, and fades as the own.
+    shared["visits"] += 3 * visits
+    env.step(env.rand_action())
+    own = shared["visits"] - 4 * visits
+    assert torch.allclose(shared["recent"][0], tracking.MEMORY * visits + 3.0 * visits + own, atol=1e-3)
+
+
+def test_what_is_seen():
+    whole = loco.make("g1_tracking", 2, "cpu", 0, play=True, future=(1, 400), engine="mujoco")
+    without = loco.make("g1_tracking_no_estimation", 2, "cpu", 0, play=True, engine="mujoco")
+    sizes = whole.observation_layout["observation"]
+    own = without.observation_layout["observation"]
+    assert sizes.keys() - own.keys() == {
+        *("anchor_position", "linear_velocity"),
+        *(f"{name}_{step}" for name in ("joints", "rates", "base") for step in (1, 400)),
+    }
+    assert {"anchor_position", "linear_velocity"} < without.observation_layout["privileged"].keys()
+    td = whole.reset()
+    terms = dict(zip(sizes, td["observation"].split(list(sizes.values()), dim=-1), strict=True))
+    f = whole.frames
+    assert torch.allclose(terms["joints_1"], torch.tensor(f.qpos[f.first[:2] + 1, 7:]), atol=1e-6)
+    assert torch.allclose(
+        terms["joints_400"], torch.tensor(f.qpos[np.minimum(f.first + 400, f.last)[:2], 7:]), atol=1e-6
+    )
+    assert torch.allclose(terms["base_1"][:, 0], torch.tensor(f.qpos[f.first[:2] + 1, 2]), atol=1e-6)
+
+
+def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_path, short):
+    given = Motion(short / "a.csv", fps=25, ground=True, weight=2.0)
+    one = loco.make("h1_tracking", 1, "cpu", 0, motion=given, engine="mujoco")
+    assert list(one.cases()) == ["a"]
+    again = loco.make("h1_tracking", 1, "cpu", 0, engine="mujoco", **json.loads(json.dumps(one.options_given)))
+    assert np.array_equal(again.frames.qpos, one.frames.qpos)
+    assert again.frames.weights.tolist() == [2.0]
+    other = loco.make("h1_tracking", 1, "cpu", 0, motion=short, fps=25, engine="mujoco")
+    with pytest.raises(ValueError, match="cases"):  # its memory points into other tables
+        other.load_state_dict(one.state_dict())
+    with pytest.raises(FileNotFoundError, match="there is no motion"):
+        loco.make("h1_tracking", 1, "cpu", 0, motion=tmp_path / "none")
+    with pytest.raises(ValueError, match="the robot has 29"):
+        loco.make("g1_tracking", 1, "cpu", 0, motion=short, fps=25)
+    with pytest.raises(ValueError, match="pass fps"):
+        loco.make("h1_tracking", 1, "cpu", 0, motion=short)
+    with pytest.raises(ValueError, match="unknown argument 'motions', did you mean 'motion'"):
+        loco.make("h1_tracking", 1, "cpu", 0, motions=short)
+    for future in ((-1,), (0,), ("a",)):
+        with pytest.raises(ValueError, match="future must be whole numbers"):
+            loco.make("h1_tracking", 1, "cpu", 0, future=future)
+    with pytest.raises(ValueError, match="names none"):
+        loco.make("h1_tracking", 1, "cpu", 0, motion=[])
+    with pytest.raises(ValueError, match="has no options"):
+        loco.WalkerStand.checked_options({"motion": 1})
+
+
+@pytest.mark.slow
+def test_from_a_clip_to_a_file_that_plays_without_torch(tmp_path, short, capsys):
+    settings = {"num_envs": 16, "num_steps": 8, "total_frames": 1024, "minibatch_size": 64, "eval_episodes": 4}
+    arguments = [f"--{name}={value}" for name, value in {**settings, "video_seconds": 0}.items()]
+    cli.main(["train", "h1_tracking", "--motion", str(short), "--fps", "25", *arguments, "--out", str(tmp_path)])
+    (run,) = tmp_path.iterdir()
+    config = json.loads((run / "config.json").read_text())
+    assert config["options"] == {"motion": [str(short)], "fps": 25.0}
+    info = loco.Policy.load(run / "policy.safetensors", "cpu").info
+    assert info["options"] == config["options"]
+    assert "stage" not in info
+    (short / "a.csv").rename(tmp_path / "a.csv")  # the clip of the run is elsewhere now
+    (short / "b.csv").rename(tmp_path / "b.csv")
+    tracking._tables.clear()  # of this process
+    with pytest.raises(SystemExit):
+        cli.main(["eval", str(run), "--episodes", "2"])
+    there = ["--motion", str(tmp_path / "a.csv"), str(tmp_path / "b.csv"), "--fps", "25"]
+    cli.main(["resume", str(run), "--total_frames", "2048", *there])
+    header, *_ = (run / "metrics.csv").read_text().splitlines()
+    assert "metric/body_error" in header
+    cli.main(["verify", str(run), "--episodes", "1"])  # so short a motion is survived without having learned
+    printed = capsys.readouterr().out
+    assert "2 in all" in printed
+    figures = json.loads((run / "verify.json").read_text())["cases"]
+    for name in ("a", "b"):
+        ours, theirs = (figures[engine][name]["return"] for engine in ("training simulator", "C MuJoCo"))
+        assert ours == pytest.approx(theirs, abs=0.02)
+    cli.main(["export", str(run), "--out", str(tmp_path / "h1.onnx")])
+    done = subprocess.run(
+        [sys.executable, EXAMPLE, tmp_path / "h1.onnx", "--clip", "b"], capture_output=True, text=True, check=True
+    )
+    assert "b: bodies were 0." in done.stdout
+
+
+def test_tables_of_the_package_are_those_of_its_models():
+    for cls in (G1Tracking, H1Tracking):
+        env = loco.make(cls, 1, "cpu", 0, engine="mujoco")
+        assert env.bodies[0] == env.base
+        assert len(env.cases()) == 3
+        assert not env.frames.said
+        assert set(env.reference()) >= {"joint_pos", "body_quat_w"}
+        pos, mat = motion.poses(env.mj_model, env.frames.qpos.astype(float))
+        assert motion.lowest_points(env.mj_model, pos, mat).min() > -motion.SUNK

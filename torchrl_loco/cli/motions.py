@@ -1,0 +1,151 @@
+"""Motions at the command line: which are followed, and the command on what is in files."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from torchrl_loco.checks import check_choice, check_output_file, check_packages
+from torchrl_loco.cli.errors import user_errors
+
+if TYPE_CHECKING:
+    import mujoco
+    import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Motions:
+    """Which motions are followed."""
+
+    motion: tuple[str, ...] = ()
+    """Motions for a task that follows some, instead of those of the training: files, folders or globs."""
+    fps: float = 0.0
+    """Frames per second of those in CSV files."""
+
+    def given(self, task: str) -> dict[str, object]:
+        """Returns the options of a task that are given.
+
+        Raises:
+            ValueError: the task follows no motions.
+            OSError: there is no such file.
+        """
+        from torchrl_loco.registry import resolve
+
+        if not (self.motion or self.fps):
+            return {}
+        given = {"motion": list(self.motion), "fps": self.fps} if self.motion else {"fps": self.fps}
+        return resolve(task).checked_options(given)  # the rate is not that of the training
+
+
+MotionOptions = Annotated[Motions, tyro.conf.arg(name="")]
+THOSE_OF_TRAINING = Motions()
+
+
+FRAME_RATE, SIZE = 25, (480, 360)
+"""Of videos: frames per second; width and height."""
+
+
+def motion(
+    files: tyro.conf.Positional[tuple[str, ...]],
+    /,
+    fps: float | None = None,
+    task: str = "g1_tracking",
+    clip: bool = False,
+    ground: bool = False,
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(help="a new file: .mp4 for a video of the first motion, .npz for a copy of it, as mjlab's."),
+    ] = None,
+    camera: str = "side",
+) -> None:
+    """Print what is in files of motions, and what is wrong with it, for a robot.
+
+    Args:
+        files: CSV or npz files, folders or globs.
+        fps: frames per second of CSV files.
+        task: a task that follows motions, whose robot it is.
+        clip: put joints that are beyond their limits at them.
+        ground: shift motions so that their lowest points touch the ground.
+        out: a video of the first, or a copy of it, also with joints clipped and shifted.
+        camera: name of one of the model's cameras, for the video.
+    """
+    with user_errors():
+        if out is not None:
+            check_output_file("out", out, (".mp4", ".npz"))
+            if out.suffix == ".mp4":
+                check_packages("a video", ("imageio", "av"), "train")
+        if not files:
+            raise ValueError("name a CSV or npz file, a folder or a glob")
+        from torchrl_loco import motion as motions
+        from torchrl_loco.envs.task import folder_of
+        from torchrl_loco.registry import resolve
+        from torchrl_loco.sim import models
+
+        cls = resolve(task, by_user=True)
+        m = models.load(cls.model, folder_of(cls))
+        check_choice("camera", camera, [m.camera(i).name for i in range(m.ncam)])
+        named = motions.named(list(files), fps or 0.0)
+        width = max(len(one[0].stem) for one in named if isinstance(one, tuple))
+        print(f"{'motion':<{width}}  frames     Hz  seconds  lowest (m)  speed (m/s)  joints (rad/s)")
+        found, first, wrong = [], None, 0
+        for one in named:
+            assert isinstance(one, tuple)  # none is a Motion
+            try:
+                each = motions.Motion(*one, clip=clip, ground=ground)
+                q, said = each.on(m)
+            except ValueError as error:
+                print(f"{one[0].stem:<{width}}  WRONG: {error}")
+                wrong += 1
+                continue
+            found.append(each)
+            first = q if first is None else first
+            print(f"{each.name:<{width}}  {_row(each, q, m)}  {'; '.join(said)}".rstrip())
+        seconds = sum(each.seconds for each in found)
+        print(f"{len(found)} motions of {seconds:.1f} s in all, for {task}")
+        if wrong:
+            raise ValueError(f"{wrong} of {len(named)} files hold no motion for {task}")
+        if out is not None and first is not None:
+            q = first
+            if out.suffix == ".npz":
+                motions.save(out, q, found[0].fps, m)
+            else:
+                _film(m, motions.resampled(q, found[0].fps, 1.0 / FRAME_RATE), out, camera)
+            print(out)
+
+
+def _row(motion: "object", q: "np.ndarray", m: "mujoco.MjModel") -> str:
+    """Returns figures of a motion."""
+    import numpy as np
+
+    from torchrl_loco.motion import Motion, lowest_points, poses
+
+    assert isinstance(motion, Motion)
+    lowest = lowest_points(m, *poses(m, q)).min()
+    speed = np.linalg.norm(np.diff(q[:, :3], axis=0), axis=1).max() * motion.fps
+    rate = np.abs(np.diff(q[:, 7:], axis=0)).max() * motion.fps
+    return f"{len(q):6d} {motion.fps:6g} {motion.seconds:8.2f} {lowest:11.3f} {speed:12.2f} {rate:15.1f}"
+
+
+def _film(m: "mujoco.MjModel", q: "np.ndarray", out: Path, camera: str) -> None:
+    """Renders poses as a video, at its frame rate."""
+    import io
+
+    import imageio.v3 as imageio
+    import torch
+    import warp as wp
+    from tqdm.auto import tqdm
+
+    from torchrl_loco.rendering import Renderer, to_bytes
+    from torchrl_loco.storage import replace_file
+
+    print(f"rendering {len(q)} frames; on a CPU this takes a while", file=sys.stderr)
+    device = wp.get_device("cuda" if torch.cuda.is_available() else "cpu")
+    renderer, content = Renderer(m, device, camera, *SIZE, 1), io.BytesIO()
+    poses = torch.tensor(q, dtype=torch.float32, device=wp.device_to_torch(device))
+    with imageio.imopen(content, "w", plugin="pyav", extension=".mp4") as video:
+        video.init_video_stream("h264", fps=FRAME_RATE)
+        for row in tqdm(poses, desc="video", leave=False, disable=None):
+            video.write_frame(to_bytes(renderer.render_poses(row[None]))[0].cpu().numpy())
+    replace_file(out, content.getvalue())

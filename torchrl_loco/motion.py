@@ -1,0 +1,518 @@
+"""Motions of a robot: read from what people have, checked against its model, and as tables for a task."""
+
+import dataclasses
+import glob
+import io
+import logging
+import math
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.checks import check_float, suggestion
+from torchrl_loco.storage import replace_file
+
+SUFFIXES = (".csv", ".npz")
+"""Of files that motions are read from."""
+MAX_SPEED, MAX_TURN = 12.0, 40.0
+"""Speed (m/s) and rate of turn (rad/s) of the base between two frames that no robot has: the motion jumps there."""
+QUICK = 40.0
+"""Rate of a joint (rad/s) between two frames that is said."""
+SUNK, FLOATS, PENETRATES = 0.02, 0.03, 0.005
+"""How far the lowest frame may lie below and above the ground (m) before it is said; where a shift puts it, below."""
+BODY_ERROR = 0.05
+"""How far bodies in a file may lie from where the model puts them (m)."""
+MAX_BEYOND = 7.0
+"""How far a joint may be beyond its limit (rad): more are degrees."""
+UNITLESS = 0.05
+"""How far the length of a quaternion may be from 1."""
+
+
+class Motion:
+    """A motion of a robot: a pose at each frame.
+
+    A CSV file has a row for each frame: position of the base (m), its orientation as a quaternion x, y, z, w, and the
+    joints in the order of the model (rad), which a first line may name. It does not say its rate. An npz file is that
+    of mjlab, with ``fps``, ``joint_pos``, ``body_pos_w`` and ``body_quat_w`` (w, x, y, z); the first body is the base.
+
+    Args:
+        path: the file.
+        fps: frames per second; needed for CSV. An npz file says it, and another number is refused.
+        clip: whether joints beyond the limits of the model are put at them.
+        ground: whether the motion is shifted so that its lowest point touches the ground.
+        weight: how often it is practised, by the time it takes, relative to others.
+
+    Attributes:
+        name: the file's, without its suffix.
+        fps: frames per second.
+        qpos: the poses as MuJoCo has them, float64 ``(frames, 7 + joints)``: the quaternion is w, x, y, z.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no motion; the message says what is wrong, and in which frame.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        fps: float | None = None,
+        *,
+        clip: bool = False,
+        ground: bool = False,
+        weight: float = 1.0,
+    ) -> None:
+        self.path, self.clip, self.ground = Path(path).expanduser(), clip, ground
+        self.name, self.weight = self.path.stem, check_float("weight", weight)
+        if not self.path.is_file():
+            raise FileNotFoundError(f"there is no file {self.path}")
+        fps = None if not fps else check_float("fps", fps)
+        self._joints: list[str] = []
+        self._bodies: tuple[np.ndarray, list[str]] | None = None
+        suffix = self.path.suffix.lower()
+        if suffix not in SUFFIXES:
+            hint = ": a pickle can run code, so it is not read" if suffix in (".pkl", ".pt", ".npy") else ""
+            raise ValueError(f"{self.path} must be one of {', '.join(SUFFIXES)}{hint}")
+        if suffix == ".csv" and fps is None:
+            raise ValueError(f"{self.path}: a CSV file does not say its rate: pass fps, often 30, 50, 60 or 120")
+        self.fps, self.qpos = (fps or 0.0, self._from_csv()) if suffix == ".csv" else self._from_npz(fps)
+        self._check()
+
+    def __repr__(self) -> str:
+        return f"Motion({str(self.path)!r}, fps={self.fps:g})"
+
+    @property
+    def seconds(self) -> float:
+        """Time from the first frame to the last (s)."""
+        return (len(self.qpos) - 1) / self.fps
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns the arguments from which an equal motion is read, as JSON can hold them."""
+        path = str(self.path.absolute())
+        return {"path": path, "fps": self.fps, "clip": self.clip, "ground": self.ground, "weight": self.weight}
+
+    def _from_csv(self) -> np.ndarray:
+        try:
+            lines = [line for line in self.path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{self.path} is no text: {error}") from None
+        if lines and not _is_row(lines[0]):
+            names = [name.strip().strip('"') for name in lines.pop(0).split(",")]
+            self._joints = names[7:]
+            if len(names) > 3 and names[3].lower().endswith("w"):
+                raise ValueError(
+                    f"{self.path} has {', '.join(names[3:7])}: the quaternion must be in the order x, y, z, w"
+                )
+        try:
+            table = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.empty((0, 0))
+        except ValueError:
+            widths = sorted({line.count(",") + 1 for line in lines})
+            wrong = next((k for k, line in enumerate(lines) if not _is_row(line)), None)
+            what = f"rows of {widths[0]} to {widths[-1]} numbers"
+            if wrong is not None:
+                what = f"{lines[wrong][:60]!r} in row {wrong}"
+            raise ValueError(f"{self.path} must have rows of as many numbers, it has {what}") from None
+        if table.shape[1] < 8:
+            raise ValueError(
+                f"{self.path} must have rows of 7 numbers of the base and one of each joint, 36 for a G1; it has "
+                f"{f'rows of {table.shape[1]}' if lines else 'none'}"
+            )
+        return table[:, [0, 1, 2, 6, 3, 4, 5, *range(7, table.shape[1])]]
+
+    def _from_npz(self, fps: float | None) -> tuple[float, np.ndarray]:
+        try:
+            with self.path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+                tables = dict(file)
+        except (OSError, EOFError, ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{self.path} cannot be read as an npz file of numbers: {error}") from None
+        if missing := [key for key in ("fps", "joint_pos", "body_pos_w", "body_quat_w") if key not in tables]:
+            raise ValueError(f"{self.path} lacks {', '.join(missing)}: it has {', '.join(tables) or 'nothing'}")
+        rate, joints, pos, quat = (tables[key] for key in ("fps", "joint_pos", "body_pos_w", "body_quat_w"))
+        frames, bodies = len(joints) if joints.ndim else 0, pos.shape[1] if pos.ndim == 3 else 0
+        shapes = rate.size == 1, joints.ndim == 2, bodies > 0
+        if not all(shapes) or pos.shape != (frames, bodies, 3) or quat.shape != (frames, bodies, 4):
+            raise ValueError(
+                f"{self.path} must have fps, a number; joint_pos (frames, joints), body_pos_w (frames, bodies, 3) and "
+                f"body_quat_w (frames, bodies, 4), they are {rate.shape}, {joints.shape}, {pos.shape}, {quat.shape}"
+            )
+        own = check_float(f"fps of {self.path}", float(rate.ravel()[0]))
+        if fps is not None and not math.isclose(fps, own, rel_tol=1e-3):
+            raise ValueError(f"{self.path} has {own:g} frames per second, not {fps:g}")
+        self._joints = [str(name) for name in tables.get("joint_names", ())]
+        self._bodies = pos, [str(name) for name in tables.get("body_names", ())]
+        return own, np.concatenate([pos[:, 0], quat[:, 0], joints], axis=1).astype(float)
+
+    def _check(self) -> None:
+        """Checks all that needs no model.
+
+        Raises:
+            ValueError: there are fewer than two frames, a number is not finite, a quaternion is none, or it jumps.
+        """
+        q = self.qpos
+        if len(q) < 2:
+            raise ValueError(f"{self.path} has {len(q)} frames: a motion has at least 2")
+        if (bad := np.argwhere(~np.isfinite(q))).size:
+            raise ValueError(f"{self.path}: frame {bad[0, 0]} has a number that is not finite, in column {bad[0, 1]}")
+        lengths = np.linalg.norm(q[:, 3:7], axis=1)
+        if (wrong := np.flatnonzero(np.abs(lengths - 1.0) > UNITLESS)).size:
+            raise ValueError(
+                f"{self.path}: columns 3 to 6 of frame {wrong[0]} must be a unit quaternion, their length is "
+                f"{lengths[wrong[0]]:.3g}"
+            )
+        q[:, 3:7] /= lengths[:, None]
+        speed = np.linalg.norm(np.diff(q[:, :3], axis=0), axis=1) * self.fps
+        turn = np.linalg.norm(_rotation(q[:-1, 3:7], q[1:, 3:7]), axis=1) * self.fps
+        for what, values, most, unit in (("moves", speed, MAX_SPEED, "m/s"), ("turns", turn, MAX_TURN, "rad/s")):
+            if values.max() > most:
+                frame = int(values.argmax())
+                raise ValueError(
+                    f"{self.path}: the base {what} at {values[frame]:.0f} {unit} after frame {frame}, more than "
+                    f"{most:g}: the motion jumps there, or fps ({self.fps:g}) is not its rate"
+                )
+
+    def on(self, m: mujoco.MjModel) -> tuple[np.ndarray, list[str]]:
+        """Returns the poses ``(frames, nq)`` for a model, and what is to be said of them.
+
+        Raises:
+            ValueError: it is a motion of another robot, or its joints are in another order.
+        """
+        q, joints = self.qpos.copy(), self._joints_of(m)
+        if m.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE or m.nq != 7 + len(joints):
+            raise ValueError("motions need a robot whose base floats, and whose joints are hinges")
+        if q.shape[1] != m.nq:
+            raise ValueError(f"{self.path} has {q.shape[1] - 7} joints, the robot has {m.nq - 7}: {', '.join(joints)}")
+        if self._joints:
+            for name in self._joints:
+                if name not in joints:
+                    raise ValueError(f"{self.path}: the robot has no joint {name!r}{suggestion(name, joints)}")
+            if len(set(self._joints)) != len(joints):
+                raise ValueError(f"{self.path} names a joint twice: {', '.join(sorted(self._joints))}")
+            q[:, 7:] = q[:, 7:][:, [self._joints.index(name) for name in joints]]
+        said = self._compare_bodies(m, q)
+        low, high = np.where(m.jnt_limited[1:, None].astype(bool), m.jnt_range[1:], (-np.inf, np.inf)).T
+        beyond = np.maximum(low - q[:, 7:], q[:, 7:] - high)
+        frame, joint = np.unravel_index(beyond.argmax(), beyond.shape)
+        if beyond.max() > MAX_BEYOND:
+            raise ValueError(
+                f"{self.path}: {joints[joint]} is {beyond.max():.0f} rad beyond its limit in frame {frame}: joints "
+                "must be in radians"
+            )
+        if beyond.max() > 1e-3 and self.clip:
+            q[:, 7:] = q[:, 7:].clip(low, high)
+        elif beyond.max() > 1e-3:
+            said.append(f"{joints[joint]} is {beyond.max():.2f} rad beyond its limit in frame {frame}")
+        rates = np.abs(np.diff(q[:, 7:], axis=0)) * self.fps
+        if rates.max() > QUICK:
+            frame, joint = np.unravel_index(rates.argmax(), rates.shape)
+            said.append(f"{joints[joint]} turns at {rates.max():.0f} rad/s after frame {frame}")
+        pos, mat = poses(m, q)
+        lowest = lowest_points(m, pos, mat)
+        frame, least = int(lowest.argmin()), float(lowest.min())
+        if self.ground:
+            q[:, 2] -= least + PENETRATES
+        elif least < -SUNK:
+            said.append(f"the robot is {-least:.2f} m below the ground in frame {frame}")
+        elif least > FLOATS:
+            said.append(f"the robot floats: its lowest point is {least:.2f} m above the ground, in frame {frame}")
+        return q, said
+
+    def _compare_bodies(self, m: mujoco.MjModel, q: np.ndarray) -> list[str]:
+        """Returns what is to be said of the bodies of a file, which must lie where the joints put them.
+
+        Raises:
+            ValueError: they lie elsewhere.
+        """
+        if self._bodies is None:
+            return []
+        there, names = self._bodies
+        own = [m.body(i).name for i in range(1, m.nbody)]
+        names = names or (own if there.shape[1] == len(own) else [])
+        both = [name for name in names if name in own]
+        if not both or len(names) != there.shape[1]:
+            return [f"its {there.shape[1]} bodies have no names, so the order of the joints could not be checked"]
+        pos, _ = poses(m, q)
+        here = pos[:, [m.body(name).id for name in both]]
+        apart = np.linalg.norm(here - there[:, [names.index(name) for name in both]], axis=2)
+        if apart.max() > BODY_ERROR:
+            frame, body = np.unravel_index(apart.argmax(), apart.shape)
+            raise ValueError(
+                f"{self.path}: {both[body]} lies {apart.max():.2f} m from where the joints put it in frame {frame}: "
+                f"joints or bodies are in another order than the robot's, {', '.join(self._joints_of(m))}"
+            )
+        return []
+
+    @staticmethod
+    def _joints_of(m: mujoco.MjModel) -> list[str]:
+        return [m.joint(j).name for j in range(1, m.njnt)]
+
+
+def _is_row(line: str) -> bool:
+    try:
+        return bool([float(word) for word in line.split(",")])
+    except ValueError:
+        return False
+
+
+def read(motion: Any, fps: float = 0.0) -> list[Motion]:
+    """Returns the motions that are named.
+
+    Args:
+        motion: a file, a folder with all that is below it, a glob, a :class:`Motion`, or several of these. Of files
+            of a folder with the same name, the npz is read, which says its rate.
+        fps: frames per second of CSV files.
+
+    Raises:
+        FileNotFoundError: there is no such file, or no motion in a folder.
+        ValueError: a file is no motion.
+        TypeError: it is something else.
+    """
+    return [one if isinstance(one, Motion) else Motion(*one) for one in named(motion, fps)]
+
+
+def named(motion: Any, fps: float = 0.0) -> list[Motion | tuple[Path, float]]:
+    """Returns the motions that are named, as :func:`read` takes them, unread: files with the rate that CSV has.
+
+    Raises:
+        FileNotFoundError: there is no such file, or no motion in a folder.
+        ValueError: none is named.
+        TypeError: it is something else.
+    """
+    found = list[Motion | tuple[Path, float]]()
+    for one in motion if isinstance(motion, list | tuple) else [motion]:
+        if isinstance(one, Motion):
+            found.append(one)
+        elif isinstance(one, Mapping):
+            found.append(Motion(**one))
+        elif isinstance(one, str | Path):
+            found += [(file, fps if file.suffix.lower() == ".csv" else 0.0) for file in expand(one)]
+        else:
+            raise TypeError(f"motion must be a path, a Motion, or a list of these, got {one!r}")
+    if not found:
+        raise ValueError("motion must name at least one motion")
+    return found
+
+
+def expand(place: Path | str) -> list[Path]:
+    """Returns the files of a path, a folder or a glob, in the order of their names.
+
+    Raises:
+        FileNotFoundError: there are none.
+    """
+    path = Path(place).expanduser()
+    if path.is_file():
+        return [path]
+    found = path.rglob("*") if path.is_dir() else map(Path, glob.glob(str(path), recursive=True))
+    files = sorted(file for file in found if file.suffix.lower() in SUFFIXES)
+    if path.is_dir():
+        files = list({file.with_suffix(""): file for file in files}.values())  # of one name, the npz comes last
+    if not files:
+        raise FileNotFoundError(f"there is no motion {place}: name a .csv or .npz, a folder, or a glob")
+    return files
+
+
+@dataclasses.dataclass(frozen=True)
+class Frames:
+    """Motions as tables, one after the other, a frame for each control step.
+
+    Attributes:
+        names: of the clips.
+        first: first frame of each clip, ``(clips,)``.
+        last: last frame of each, ``(clips,)``.
+        weights: of each, ``(clips,)``.
+        qpos: poses, ``(frames, nq)``, and
+        qvel: velocities as MuJoCo has them, ``(frames, nv)``.
+        pos: positions of bodies (m), ``(frames, bodies, 3)``.
+        mat: their orientations, ``(frames, bodies, 3, 3)``.
+        lin: their velocities (m/s), world frame, ``(frames, bodies, 3)``.
+        ang: their angular velocities (rad/s), world frame, ``(frames, bodies, 3)``.
+        said: what is to be said of the motions, by name.
+    """
+
+    names: tuple[str, ...]
+    first: np.ndarray
+    last: np.ndarray
+    weights: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    pos: np.ndarray
+    mat: np.ndarray
+    lin: np.ndarray
+    ang: np.ndarray
+    said: Mapping[str, list[str]]
+
+    @classmethod
+    def of(cls, motions: Sequence[Motion], m: mujoco.MjModel, bodies: Sequence[str], dt: float) -> "Frames":
+        """Returns motions on a model, at the rate of its control steps.
+
+        Args:
+            motions: the motions.
+            m: the model.
+            bodies: names of the bodies.
+            dt: time of a control step (s).
+
+        Raises:
+            ValueError: one is of another robot, or shorter than two control steps.
+        """
+        ids, parts, said = [m.body(name).id for name in bodies], [], {}
+        for motion in motions:
+            q, notes = motion.on(m)
+            if notes:
+                said[motion.name] = notes
+            q = resampled(q, motion.fps, dt)
+            if len(q) < 3:
+                raise ValueError(f"{motion.path} takes {motion.seconds:g} s, less than two control steps of {dt:g} s")
+            pos, mat = poses(m, q)
+            pos, mat = pos[:, ids], mat[:, ids]
+            lin, ang = _rate(pos, dt), _turn_rate(mat, dt)
+            of_base = np.einsum("fji,fj->fi", mat_of(q[:, 3:7]), _turn_rate(mat_of(q[:, 3:7])[:, None], dt)[:, 0])
+            qvel = np.concatenate([_rate(q[:, :3], dt), of_base, _rate(q[:, 7:], dt)], axis=1)
+            parts.append((q, qvel, pos, mat, lin, ang))
+        lengths = np.array([len(part[0]) for part in parts])
+        last = lengths.cumsum() - 1
+        joined = (np.concatenate(each) for each in zip(*parts, strict=True))
+        names = ("qpos", "qvel", "pos", "mat", "lin", "ang")
+        tables: dict[str, Any] = {
+            name: np.ascontiguousarray(table, dtype=np.float32) for name, table in zip(names, joined, strict=True)
+        }
+        weights = np.array([motion.weight for motion in motions])
+        of_clips = tuple(motion.name for motion in motions), last - lengths + 1, last, weights
+        if said:
+            name, notes = next(iter(said.items()))
+            more = f", and more of {len(said) - 1} others" if len(said) > 1 else ""
+            words = f"{name}: {'; '.join(notes)}{more}"
+            logging.getLogger("torchrl_loco").warning("motion %s: see torchrl-loco motion", words)
+        return cls(*of_clips, **tables, said=said)
+
+
+def save(path: Path, qpos: np.ndarray, fps: float, m: mujoco.MjModel) -> None:
+    """Writes poses ``(frames, nq)`` as an npz as mjlab's, with the names of joints and bodies.
+
+    Args:
+        path: a file.
+        qpos: the poses.
+        fps: frames per second.
+        m: the model.
+    """
+    pos, mat = poses(m, qpos)
+    quat = quat_of(mat.reshape(-1, 3, 3)).reshape(*mat.shape[:2], 4)
+    tables = {
+        **{"joint_pos": qpos[:, 7:], "joint_vel": _rate(qpos[:, 7:], 1.0 / fps)},
+        **{"body_pos_w": pos[:, 1:], "body_quat_w": quat[:, 1:]},
+        **{"body_lin_vel_w": _rate(pos[:, 1:], 1.0 / fps), "body_ang_vel_w": _turn_rate(mat[:, 1:], 1.0 / fps)},
+    }
+    content = io.BytesIO()
+    names = {"joint_names": [m.joint(j).name for j in range(1, m.njnt)]}
+    names["body_names"] = [m.body(i).name for i in range(1, m.nbody)]
+    written: dict[str, Any] = {"fps": np.array([fps]), **{name: np.array(words) for name, words in names.items()}}
+    written |= {name: table.astype(np.float32) for name, table in tables.items()}
+    np.savez_compressed(content, **written)
+    replace_file(path, content.getvalue())
+
+
+def poses(m: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns positions (m) ``(frames, nbody, 3)`` and orientations ``(frames, nbody, 3, 3)`` of all bodies."""
+    data = mujoco.MjData(m)
+    pos, mat = np.empty((len(qpos), m.nbody, 3)), np.empty((len(qpos), m.nbody, 9))
+    for k, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(m, data)
+        pos[k], mat[k] = data.xpos, data.xmat
+    return pos, mat.reshape(len(qpos), m.nbody, 3, 3)
+
+
+def lowest_points(m: mujoco.MjModel, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
+    """Returns the height of the lowest point of what can touch the ground, in each frame (m), without meshes.
+
+    Args:
+        m: the model.
+        pos: positions of bodies (m), ``(frames, nbody, 3)``.
+        mat: their orientations, ``(frames, nbody, 3, 3)``.
+    """
+    lowest, kinds = np.full(len(pos), np.inf), mujoco.mjtGeom
+    for geom in range(m.ngeom):
+        body, kind, size = m.geom_bodyid[geom], kinds(int(m.geom_type[geom])), m.geom_size[geom]
+        if not body or not (m.geom_contype[geom] or m.geom_conaffinity[geom]):
+            continue
+        axes = mat[:, body, 2] @ mat_of(m.geom_quat[geom][None])[0]  # heights of the geom's axes, (frames, 3)
+        half: Any
+        if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE):
+            half = size[0] + (np.abs(axes[:, 2]) * size[1] if kind == kinds.mjGEOM_CAPSULE else 0.0)
+        elif kind == kinds.mjGEOM_BOX:
+            half = np.abs(axes) @ size
+        elif kind == kinds.mjGEOM_CYLINDER:
+            half = np.hypot(axes[:, 0], axes[:, 1]) * size[0] + np.abs(axes[:, 2]) * size[1]
+        elif kind == kinds.mjGEOM_ELLIPSOID:
+            half = np.linalg.norm(axes * size, axis=1)
+        else:
+            continue
+        lowest = np.minimum(lowest, pos[:, body, 2] + mat[:, body, 2] @ m.geom_pos[geom] - half)
+    return lowest
+
+
+def resampled(qpos: np.ndarray, fps: float, dt: float) -> np.ndarray:
+    """Returns poses at multiples of ``dt`` (s), between frames along the shortest turn of the base."""
+    last = (len(qpos) - 1) / fps
+    at = np.arange(math.floor(last / dt + 1e-6) + 1) * dt * fps
+    before = np.minimum(at.astype(int), len(qpos) - 2)
+    share = (at - before)[:, None]
+    one, other = qpos[before], qpos[before + 1]
+    found = (1.0 - share) * one + share * other
+    found[:, 3:7] = _turned(one[:, 3:7], share * _rotation(one[:, 3:7], other[:, 3:7]))
+    return found
+
+
+def mat_of(quat: np.ndarray) -> np.ndarray:
+    """Returns rotation matrices ``(n, 3, 3)`` of unit quaternions (w, x, y, z) ``(n, 4)``."""
+    found = np.empty((len(quat), 9))
+    for row, one in zip(found, quat, strict=True):
+        mujoco.mju_quat2Mat(row, one)
+    return found.reshape(-1, 3, 3)
+
+
+def quat_of(mat: np.ndarray) -> np.ndarray:
+    """Returns unit quaternions (w, x, y, z) ``(n, 4)`` of rotation matrices ``(n, 3, 3)``."""
+    found = np.empty((len(mat), 4))
+    for row, one in zip(found, mat.reshape(-1, 9).astype(float), strict=True):
+        mujoco.mju_mat2Quat(row, one)
+    return found
+
+
+def _rotation(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Returns rotation vectors (rad) ``(n, 3)``, in the frames of unit quaternions, that turn these to others."""
+    w = (one * other).sum(1)
+    v = one[:, :1] * other[:, 1:] - other[:, :1] * one[:, 1:] - np.cross(one[:, 1:], other[:, 1:])
+    v = np.where(w[:, None] < 0.0, -v, v)
+    size = np.linalg.norm(v, axis=1)
+    angle = 2.0 * np.arctan2(size, np.abs(w))
+    return v * np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0)[:, None]
+
+
+def _turned(quat: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Returns unit quaternions ``(n, 4)`` turned by rotation vectors (rad) ``(n, 3)`` of their frames."""
+    angle = np.linalg.norm(by, axis=1, keepdims=True)
+    v = by * 0.5 * np.sinc(0.5 * angle / np.pi)
+    w = np.cos(0.5 * angle)
+    real = quat[:, :1] * w - (quat[:, 1:] * v).sum(1, keepdims=True)
+    found = np.concatenate([real, quat[:, :1] * v + w * quat[:, 1:] + np.cross(quat[:, 1:], v)], axis=1)
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def _rate(values: np.ndarray, dt: float) -> np.ndarray:
+    """Returns central differences over time, one-sided at the ends."""
+    return np.gradient(values, dt, axis=0)
+
+
+def _turn_rate(mat: np.ndarray, dt: float) -> np.ndarray:
+    """Returns angular velocities (rad/s) ``(frames, n, 3)``, world frame, by central differences on SO(3)."""
+    before, after = np.maximum(np.arange(len(mat)) - 1, 0), np.minimum(np.arange(len(mat)) + 1, len(mat) - 1)
+    turn = mat[after] @ mat[before].swapaxes(-1, -2)
+    axis = np.stack(
+        [turn[..., 2, 1] - turn[..., 1, 2], turn[..., 0, 2] - turn[..., 2, 0], turn[..., 1, 0] - turn[..., 0, 1]], -1
+    )
+    sine, cosine = 0.5 * np.linalg.norm(axis, axis=-1), 0.5 * (np.trace(turn, axis1=-2, axis2=-1) - 1.0)
+    angle = np.arctan2(sine, cosine)
+    scale = np.where(sine > 1e-9, angle / np.maximum(2.0 * sine, 1e-12), 0.5)
+    return axis * (scale / ((after - before) * dt)[:, None])[..., None]
