@@ -105,7 +105,7 @@ class Task:
     perfect: ClassVar[Mapping[str, float]] = {}
     """Terms of the reward that tell how well a case is played, and what each earns in a second without an error."""
     options: ClassVar[Mapping[str, tuple[Any, str]]] = {}
-    """Settings of the task's own: by name, the value that holds without one, and what it is for. An argument of the
+    """Settings of the task's own, by name the value that holds without one, and what it is for. An argument of the
     environment, an option of ``torchrl-loco train``, and an attribute that hooks read, such as ``self.motion`` of
     ``{"motion": ("walk.csv", "File of the motion.")}``. Runs, policies and checkpoints keep them."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}

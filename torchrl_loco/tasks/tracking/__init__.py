@@ -83,14 +83,14 @@ def memory(joints: int) -> dict[str, Any]:
 class Tracking(LocoEnv):
     """What robots that follow motions share; a robot sets the attributes without a value.
 
-    The motions are :attr:`motion`, as :func:`torchrl_loco.motion.read` takes them, in the time of control steps.
+    The motions are ``motion``, as :func:`torchrl_loco.motion.read` takes them, in the time of control steps.
     Episodes begin somewhere in them, more often where the reference was lost, and end with the clip. In worlds to play
     with, world k begins with the first frame of clip k.
 
     Observation:
         ``observation``: joints of the reference and their rates, position (3) and orientation (6) of the reference's
         anchor in the frame of the robot's, linear and angular velocity of the base in its frame (6), joint positions
-        relative to home, joint velocities, last action, and of each frame ahead (:attr:`future`) the reference's
+        relative to home, joint velocities, last action, and of each frame ahead (``future``) the reference's
         joints, their rates, and its base's height, gravity and velocities in its own frame (10); with noise.
         ``privileged``: the same without noise, and position and orientation of all bodies in the frame of the anchor.
 
@@ -98,12 +98,12 @@ class Tracking(LocoEnv):
         Changes of the joints' targets from home, scaled, without bounds.
 
     Reward:
-        :data:`FOLLOWED`: of the anchor in the world, and of all bodies, whose reference is moved and turned about the
-        vertical to the robot's anchor; and :data:`PENALTIES`, both times the control step. A step is compared with the
+        ``FOLLOWED``: of the anchor in the world, and of all bodies, whose reference is moved and turned about the
+        vertical to the robot's anchor; and ``PENALTIES``, both times the control step. A step is compared with the
         frame that the policy has seen.
 
     Start:
-        The pose and velocities of a frame of the reference, up to :data:`NEAR`, :data:`TILT`, :data:`BEND` and a push
+        The pose and velocities of a frame of the reference, up to ``NEAR``, ``TILT``, ``BEND`` and a push
         away from it; in worlds to play with, exactly.
 
     Termination:
@@ -152,7 +152,7 @@ class Tracking(LocoEnv):
     anchor: ClassVar[str]
     """Body about which the reference is moved and turned."""
     bodies: ClassVar[Sequence[str]]
-    """Bodies that follow: the base is the first, the anchor is among them."""
+    """Bodies that follow; the base is the first, the anchor is among them."""
     ends: ClassVar[Sequence[str]]
     """Hands and feet."""
     motion_folder: ClassVar[Path]
