@@ -112,7 +112,9 @@ def test_an_npz_that_does_not_fit_is_refused(tmp_path, g1, rows):
         mixed.on(g1)
     unnamed = as_npz(tmp_path, g1, rows, joint_names=names, body_names=names, **fewer)
     assert any("could not be checked" in note for note in Motion(unnamed).on(g1)[1])
-    for content in (b"", b"no archive", path.read_bytes()[:500]):
+    torn = bytearray(path.read_bytes())
+    torn[400:600] = bytes(200)
+    for content in (b"", b"no archive", path.read_bytes()[:500], torn):
         (tmp_path / "broken.npz").write_bytes(content)
         with pytest.raises(ValueError, match=r"broken\.npz cannot be read"):
             Motion(tmp_path / "broken.npz")

@@ -119,10 +119,11 @@ def test_clip_and_phase_can_be_set(h1):
         td = h1.step(td.set("action", torch.zeros(6, 19)))["next"].exclude("reward")
     assert h1.world.memory["frame"].tolist() == [19 + 14, 9] * 3
     assert torch.allclose(h1.sim.qpos, torch.tensor(h1.frames.qpos)[[33, 9] * 3], atol=1e-6)
-    h1.reset()
+    td = h1.reset()
     assert h1.world.memory["frame"].tolist() == [33, 9] * 3
-    h1.set_command(0.0, "clip")
-    h1.set_command(0.0, "phase")
+    h1.set_command(None, "clip")
+    h1.set_command(None, "phase")
+    h1.step(td.set("action", torch.zeros(6, 19)))
     h1.reset()
     assert h1.world.memory["frame"].tolist() == [0, 19] * 3
 
@@ -218,11 +219,14 @@ def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_p
         loco.make("h1_tracking", 1, "cpu", 0, motion=short)
     with pytest.raises(ValueError, match="unknown argument 'motions', did you mean 'motion'"):
         loco.make("h1_tracking", 1, "cpu", 0, motions=short)
-    for future in ((-1,), (0,), ("a",)):
+    assert loco.make("h1_tracking", 1, "cpu", 0, future=3, engine="mujoco").future == (3,)
+    for future in ((-1,), (0,), ("a",), 1.5):
         with pytest.raises(ValueError, match="future must be whole numbers"):
             loco.make("h1_tracking", 1, "cpu", 0, future=future)
     with pytest.raises(ValueError, match="names none"):
         loco.make("h1_tracking", 1, "cpu", 0, motion=[])
+    with pytest.raises(ValueError, match="motion: options are those of the environment"):
+        loco.training.train(one, motion=short, total_frames=1)
     with pytest.raises(ValueError, match="has no options"):
         loco.WalkerStand.checked_options({"motion": 1})
 
@@ -243,6 +247,9 @@ def test_from_a_clip_to_a_file_that_plays_without_torch(tmp_path, short, capsys)
     tracking._tables.clear()  # of this process
     with pytest.raises(SystemExit):
         cli.main(["eval", str(run), "--episodes", "2"])
+    with pytest.raises(SystemExit):  # its worlds are in the midst of other tables
+        cli.main(["resume", str(run), "--total_frames", "2048", "--motion", str(tmp_path / "a.csv"), "--fps", "25"])
+    assert "is a run of 2 cases, a, b, and not of 1, a" in capsys.readouterr().err
     there = ["--motion", str(tmp_path / "a.csv"), str(tmp_path / "b.csv"), "--fps", "25"]
     cli.main(["resume", str(run), "--total_frames", "2048", *there])
     header, *_ = (run / "metrics.csv").read_text().splitlines()

@@ -106,8 +106,9 @@ class _WithReference(nn.Module):
             self.register_buffer(name, table)
 
     def forward(self, observation: torch.Tensor, time_step: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns the actions, and of each table the rows of ``time_step`` ``(batch,)``, int64."""
-        return self.network(observation), *(getattr(self, name)[time_step] for name in self.names)
+        """Returns the actions, and of each table the rows of ``time_step`` ``(batch,)``, int64, within the table."""
+        frame = time_step.clamp(0, len(getattr(self, self.names[0])) - 1)
+        return self.network(observation), *(getattr(self, name)[frame] for name in self.names)
 
 
 def _inputs(network: nn.Module, observations: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -6,6 +6,7 @@ import io
 import logging
 import math
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,10 @@ BODY_ERROR = 0.05
 """How far bodies in a file may lie from where the model puts them (m)."""
 MAX_BEYOND = 7.0
 """How far a joint may be beyond its limit (rad): more are degrees."""
+LOOKED_AT = 20.0
+"""Frames per second whose bodies are compared with the ground and with the file."""
+FAR_BEYOND = 0.8
+"""From where on it may be another joint (rad)."""
 UNITLESS = 0.05
 """How far the length of a quaternion may be from 1."""
 
@@ -80,6 +85,7 @@ class Motion:
             raise ValueError(f"{self.path}: a CSV file does not say its rate: pass fps, often 30, 50, 60 or 120")
         self.fps, self.qpos = (fps or 0.0, self._from_csv()) if suffix == ".csv" else self._from_npz(fps)
         self._check()
+        self.qpos.setflags(write=False)  # what is made of it is read from the file again
 
     def __repr__(self) -> str:
         return f"Motion({str(self.path)!r}, fps={self.fps:g})"
@@ -126,14 +132,19 @@ class Motion:
         try:
             with self.path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 tables = dict(file)
-        except (OSError, EOFError, ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        except (OSError, EOFError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
             raise ValueError(f"{self.path} cannot be read as an npz file of numbers: {error}") from None
         if missing := [key for key in ("fps", "joint_pos", "body_pos_w", "body_quat_w") if key not in tables]:
             raise ValueError(f"{self.path} lacks {', '.join(missing)}: it has {', '.join(tables) or 'nothing'}")
         rate, joints, pos, quat = (tables[key] for key in ("fps", "joint_pos", "body_pos_w", "body_quat_w"))
         frames, bodies = len(joints) if joints.ndim else 0, pos.shape[1] if pos.ndim == 3 else 0
-        shapes = rate.size == 1, joints.ndim == 2, bodies > 0
-        if not all(shapes) or pos.shape != (frames, bodies, 3) or quat.shape != (frames, bodies, 4):
+        fits = (
+            rate.size == 1,
+            joints.ndim == 2,
+            bodies > 0,
+            *(each.dtype.kind in "fiu" for each in (rate, joints, pos, quat)),
+        )
+        if not all(fits) or pos.shape != (frames, bodies, 3) or quat.shape != (frames, bodies, 4):
             raise ValueError(
                 f"{self.path} must have fps, a number; joint_pos (frames, joints), body_pos_w (frames, bodies, 3) and "
                 f"body_quat_w (frames, bodies, 4), they are {rate.shape}, {joints.shape}, {pos.shape}, {quat.shape}"
@@ -141,8 +152,8 @@ class Motion:
         own = check_float(f"fps of {self.path}", float(rate.ravel()[0]))
         if fps is not None and not math.isclose(fps, own, rel_tol=1e-3):
             raise ValueError(f"{self.path} has {own:g} frames per second, not {fps:g}")
-        self._joints = [str(name) for name in tables.get("joint_names", ())]
-        self._bodies = pos, [str(name) for name in tables.get("body_names", ())]
+        self._joints = [str(name) for name in np.ravel(tables.get("joint_names", ()))]
+        self._bodies = pos, [str(name) for name in np.ravel(tables.get("body_names", ()))]
         return own, np.concatenate([pos[:, 0], quat[:, 0], joints], axis=1).astype(float)
 
     def _check(self) -> None:
@@ -203,14 +214,17 @@ class Motion:
         if beyond.max() > 1e-3 and self.clip:
             q[:, 7:] = q[:, 7:].clip(low, high)
         elif beyond.max() > 1e-3:
-            said.append(f"{joints[joint]} is {beyond.max():.2f} rad beyond its limit in frame {frame}")
+            order = ", as if the joints were in another order" if beyond.max() > FAR_BEYOND else ""
+            said.append(f"{joints[joint]} is {beyond.max():.2f} rad beyond its limit in frame {frame}{order}")
+        if (2.0 * (q[:, 4] ** 2 + q[:, 5] ** 2) > 1.0).mean() > 0.5:
+            said.append("the base is upside down most of the time, as if its quaternion were not x, y, z, w")
         rates = np.abs(np.diff(q[:, 7:], axis=0)) * self.fps
         if rates.max() > QUICK:
             frame, joint = np.unravel_index(rates.argmax(), rates.shape)
             said.append(f"{joints[joint]} turns at {rates.max():.0f} rad/s after frame {frame}")
-        pos, mat = poses(m, q)
-        lowest = lowest_points(m, pos, mat)
-        frame, least = int(lowest.argmin()), float(lowest.min())
+        every = 1 if self.ground else self._stride
+        lowest = lowest_points(m, *poses(m, q[::every]))
+        frame, least = every * int(lowest.argmin()), float(lowest.min())
         if self.ground:
             q[:, 2] -= least + PENETRATES
         elif least < -SUNK:
@@ -233,16 +247,23 @@ class Motion:
         both = [name for name in names if name in own]
         if not both or len(names) != there.shape[1]:
             return [f"its {there.shape[1]} bodies have no names, so the order of the joints could not be checked"]
-        pos, _ = poses(m, q)
+        every = self._stride
+        pos, _ = poses(m, q[::every])
         here = pos[:, [m.body(name).id for name in both]]
-        apart = np.linalg.norm(here - there[:, [names.index(name) for name in both]], axis=2)
+        apart = np.linalg.norm(here - there[::every, [names.index(name) for name in both]], axis=2)
         if apart.max() > BODY_ERROR:
             frame, body = np.unravel_index(apart.argmax(), apart.shape)
+            at = every * frame
             raise ValueError(
-                f"{self.path}: {both[body]} lies {apart.max():.2f} m from where the joints put it in frame {frame}: "
+                f"{self.path}: {both[body]} lies {apart.max():.2f} m from where the joints put it in frame {at}: "
                 f"joints or bodies are in another order than the robot's, {', '.join(self._joints_of(m))}"
             )
         return []
+
+    @property
+    def _stride(self) -> int:
+        """Of every how many frames one is looked at, where not all must be."""
+        return max(1, int(self.fps / LOOKED_AT))
 
     @staticmethod
     def _joints_of(m: mujoco.MjModel) -> list[str]:
@@ -269,25 +290,25 @@ def read(motion: Any, fps: float = 0.0) -> list[Motion]:
         ValueError: a file is no motion.
         TypeError: it is something else.
     """
-    return [one if isinstance(one, Motion) else Motion(*one) for one in named(motion, fps)]
+    return [one if isinstance(one, Motion) else Motion(**one) for one in named(motion, fps)]
 
 
-def named(motion: Any, fps: float = 0.0) -> list[Motion | tuple[Path, float]]:
-    """Returns the motions that are named, as :func:`read` takes them, unread: files with the rate that CSV has.
+def named(motion: Any, fps: float = 0.0) -> list[Motion | dict[str, Any]]:
+    """Returns the motions that are named, as :func:`read` takes them; of files, the arguments of :class:`Motion`.
 
     Raises:
         FileNotFoundError: there is no such file, or no motion in a folder.
         ValueError: none is named.
         TypeError: it is something else.
     """
-    found = list[Motion | tuple[Path, float]]()
+    found = list[Motion | dict[str, Any]]()
     for one in motion if isinstance(motion, list | tuple) else [motion]:
         if isinstance(one, Motion):
             found.append(one)
         elif isinstance(one, Mapping):
-            found.append(Motion(**one))
+            found.append(dict(one))
         elif isinstance(one, str | Path):
-            found += [(file, fps if file.suffix.lower() == ".csv" else 0.0) for file in expand(one)]
+            found += [{"path": file, "fps": fps if file.suffix.lower() == ".csv" else 0.0} for file in expand(one)]
         else:
             raise TypeError(f"motion must be a path, a Motion, or a list of these, got {one!r}")
     if not found:
@@ -309,7 +330,10 @@ def expand(place: Path | str) -> list[Path]:
     if path.is_dir():
         files = list({file.with_suffix(""): file for file in files}.values())  # of one name, the npz comes last
     if not files:
-        raise FileNotFoundError(f"there is no motion {place}: name a .csv or .npz, a folder, or a glob")
+        raise FileNotFoundError(
+            f"there is no motion {place}: name a .csv or .npz, a folder, or a glob; of a run or a policy, --motion and "
+            "--fps tell where its motions are now"
+        )
     return files
 
 
@@ -365,9 +389,10 @@ class Frames:
             if len(q) < 3:
                 raise ValueError(f"{motion.path} takes {motion.seconds:g} s, less than two control steps of {dt:g} s")
             pos, mat = poses(m, q)
+            base = mat[:, m.jnt_bodyid[0]]
             pos, mat = pos[:, ids], mat[:, ids]
             lin, ang = _rate(pos, dt), _turn_rate(mat, dt)
-            of_base = np.einsum("fji,fj->fi", mat_of(q[:, 3:7]), _turn_rate(mat_of(q[:, 3:7])[:, None], dt)[:, 0])
+            of_base = np.einsum("fji,fj->fi", base, _turn_rate(base[:, None], dt)[:, 0])
             qvel = np.concatenate([_rate(q[:, :3], dt), of_base, _rate(q[:, 7:], dt)], axis=1)
             parts.append((q, qvel, pos, mat, lin, ang))
         lengths = np.array([len(part[0]) for part in parts])
@@ -436,7 +461,9 @@ def lowest_points(m: mujoco.MjModel, pos: np.ndarray, mat: np.ndarray) -> np.nda
         body, kind, size = m.geom_bodyid[geom], kinds(int(m.geom_type[geom])), m.geom_size[geom]
         if not body or not (m.geom_contype[geom] or m.geom_conaffinity[geom]):
             continue
-        axes = mat[:, body, 2] @ mat_of(m.geom_quat[geom][None])[0]  # heights of the geom's axes, (frames, 3)
+        own = np.empty(9)
+        mujoco.mju_quat2Mat(own, m.geom_quat[geom])
+        axes = mat[:, body, 2] @ own.reshape(3, 3)  # heights of the geom's axes, (frames, 3)
         half: Any
         if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE):
             half = size[0] + (np.abs(axes[:, 2]) * size[1] if kind == kinds.mjGEOM_CAPSULE else 0.0)
@@ -462,14 +489,6 @@ def resampled(qpos: np.ndarray, fps: float, dt: float) -> np.ndarray:
     found = (1.0 - share) * one + share * other
     found[:, 3:7] = _turned(one[:, 3:7], share * _rotation(one[:, 3:7], other[:, 3:7]))
     return found
-
-
-def mat_of(quat: np.ndarray) -> np.ndarray:
-    """Returns rotation matrices ``(n, 3, 3)`` of unit quaternions (w, x, y, z) ``(n, 4)``."""
-    found = np.empty((len(quat), 9))
-    for row, one in zip(found, quat, strict=True):
-        mujoco.mju_quat2Mat(row, one)
-    return found.reshape(-1, 3, 3)
 
 
 def quat_of(mat: np.ndarray) -> np.ndarray:

@@ -87,16 +87,16 @@ def motion(
         m = models.load(cls.model, folder_of(cls))
         check_choice("camera", camera, [m.camera(i).name for i in range(m.ncam)])
         named = motions.named(list(files), fps or 0.0)
-        width = max(len(one[0].stem) for one in named if isinstance(one, tuple))
+        width = max(len(Path(one["path"]).stem) for one in named if isinstance(one, dict))
         print(f"{'motion':<{width}}  frames     Hz  seconds  lowest (m)  speed (m/s)  joints (rad/s)")
         found, first, wrong = [], None, 0
         for one in named:
-            assert isinstance(one, tuple)  # none is a Motion
+            assert isinstance(one, dict)  # none is a Motion
             try:
-                each = motions.Motion(*one, clip=clip, ground=ground)
+                each = motions.Motion(**one, clip=clip, ground=ground)
                 q, said = each.on(m)
             except ValueError as error:
-                print(f"{one[0].stem:<{width}}  WRONG: {error}")
+                print(f"{Path(one['path']).stem:<{width}}  WRONG: {error}")
                 wrong += 1
                 continue
             found.append(each)

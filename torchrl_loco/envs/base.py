@@ -129,8 +129,8 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         device = check_device(device)
         seed = None if seed is None else check_int("seed", seed, SEED)
         given = {name: config.pop(name) for name in self.options if name in config}
-        own = {name: given.get(name, default) for name, (default, _) in self.options.items()}
         options_given = self.checked_options(given)
+        own = {name: options_given.get(name, default) for name, (default, _) in self.options.items()}
         arguments = [*list(inspect.signature(LocoEnv.__init__).parameters)[1:-1], *own]
         of_class = type(self).config
         if self.episode_length is not None:

@@ -7,6 +7,8 @@ import time
 import warnings
 from pathlib import Path
 
+import torch
+
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.rendering import to_the_horizon
 from torchrl_loco.storage import replace_file
@@ -64,7 +66,7 @@ def view(policy: PolicyFunc, env: LocoEnv, action_repeat: int = 1) -> None:
     """
     import mujoco.viewer  # needs a display
 
-    model = to_the_horizon(env.mj_model)
+    model = to_the_horizon(env.mj_model if env.ghost() is None else env.model_with_ghost)
     data = mujoco.MjData(model)
     with mujoco.viewer.launch_passive(model, data) as window:
         with window.lock():  # a free camera would lose a body that runs
@@ -72,7 +74,8 @@ def view(policy: PolicyFunc, env: LocoEnv, action_repeat: int = 1) -> None:
         while window.is_running():
             due = time.perf_counter()
             for _ in play(policy, env, action_repeat, env.config.episode_length, "episode"):
-                data.qpos[:] = env.sim.qpos[0].cpu()
+                ghost = env.ghost()
+                data.qpos[:] = (env.sim.qpos if ghost is None else torch.cat([env.sim.qpos, ghost], dim=-1))[0].cpu()
                 for update in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):  # all that is seen
                     update(model, data)
                 window.sync()

@@ -116,6 +116,8 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
     base, _ = unwrapped(env)
     own: dict[str, Any] = {"num_envs": base.num_envs, "device": str(base.device), "protocol": base.protocol}
     own |= {"episode_length": base.config.episode_length}
+    if twice := [name for name in ("options", *base.options) if name in settings]:
+        raise ValueError(f"{', '.join(twice)}: options are those of the environment, leave them out")
     own |= {"options": base.options_given} if base.options_given else {}
     for name, value in own.items():
         if name in settings and str(settings[name]) != str(value):

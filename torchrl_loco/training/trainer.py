@@ -378,6 +378,7 @@ class Trainer:
             counters = {"frames": self.frames, "iteration": self.iteration, "seconds": self.seconds}
             of = {
                 "settings": self._identity(),
+                "cases": list(self._base.cases().items()),
                 "source": self._source,
                 "spaces": dataclasses.asdict(self.algorithm.spaces),
                 "algorithm": self.algorithm.state_dict(),
@@ -411,6 +412,13 @@ class Trainer:
             )
         if checkpoint.get("source", self._source) != self._source and distributed.is_first():
             print(f"{self.run.task} was edited since the checkpoint: the run goes on as it is now", file=sys.stderr)
+        cases = list(self._base.cases().items())
+        if (old := checkpoint.get("cases", cases)) != cases:  # the state of the worlds points into other tables
+            of = [f"{', '.join(name for name, _ in each[:3])}{' ...' * (len(each) > 3)}" for each in (old, cases)]
+            raise ValueError(
+                f"{self.run.path} is a run of {len(old)} cases, {of[0]}, and not of {len(cases)}, {of[1]}: train "
+                "anew, with its weights by --init"
+            )
         terms = checkpoint.get("terms", self._terms)
         if set(terms) != set(self._terms) and distributed.is_first():
             names = [", ".join(each) or "none" for each in (terms, self._terms)]

@@ -183,7 +183,9 @@ class Tracking(LocoEnv):
         if "future" in kept:
             steps = kept["future"] if isinstance(kept["future"], list | tuple) else [kept["future"]]
             try:
-                kept["future"] = [check_int("each of future", int(step), AHEAD) for step in steps]
+                kept["future"] = [
+                    check_int("each of future", int(step) if isinstance(step, str) else step, AHEAD) for step in steps
+                ]
             except (TypeError, ValueError) as error:
                 raise ValueError(f"future must be whole numbers of control steps, 1 or more: {error}") from None
         return kept
@@ -238,19 +240,19 @@ class Tracking(LocoEnv):
         Raises:
             FileNotFoundError: a file is not there.
         """
-        given = self.options_given.get("motion")
-        places, fps = (self.motion_folder, OWN_RATE) if given is None else (self.motion, self.fps)
-        key = type(self), json.dumps(given), fps, self.config.ctrl_dt
+        own = "motion" not in self.options_given
+        places, fps = (self.motion_folder, OWN_RATE) if own else (self.motion, self.fps)
+        key = type(self), json.dumps([] if own else places), fps, self.config.ctrl_dt
         try:
             named = motions.named(places, fps)
-            stamp = [one[0].stat().st_mtime_ns for one in named if isinstance(one, tuple)]
+            stamp = [Path(one["path"]).stat().st_mtime_ns for one in named if isinstance(one, dict)]
         except FileNotFoundError:
             if key not in _tables:
                 raise
             return _tables[key][1]
         if key not in _tables or _tables[key][0] != stamp:
             _tables.clear()
-            read = [one if isinstance(one, motions.Motion) else motions.Motion(*one) for one in named]
+            read = motions.read(named)
             _tables[key] = stamp, motions.Frames.of(read, self.mj_model, self.bodies, self.config.ctrl_dt)
         return _tables[key][1]
 
@@ -452,10 +454,12 @@ class Tracking(LocoEnv):
         other = (s.clip != s.began_clip) | (s.phase != s.began_phase)
         begun = self.begun(s)
         held = {"frame": torch.minimum(s.frame + 1, s.last[s.frame]), "qpos": s.qpos, "qvel": s.qvel}
-        held |= {"clip": s.clip, "phase": s.phase, "began_clip": s.began_clip, "began_phase": s.began_phase}
-        return {
+        held |= {"began_clip": s.began_clip, "began_phase": s.began_phase}
+        rows = {
             name: torch.where(other.view(-1, *[1] * (row.ndim - 1)), begun[name], row) for name, row in held.items()
         }
+        unset = torch.zeros_like(s.clip)  # what is set is written over it
+        return {**rows, "clip": unset, "phase": unset}
 
     def cases(self) -> dict[str, int]:
         """Returns the clips by name, with their control steps."""
