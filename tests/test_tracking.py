@@ -16,6 +16,8 @@ from torchrl_loco.tasks import tracking
 from torchrl_loco.tasks.tracking import FOLLOWED, PENALTIES, PIECES, G1Tracking, H1Tracking
 
 PUNCHES = H1Tracking.motion_folder / "punches.csv"
+MANY = 500
+"""Worlds of which shares are counted."""
 EXAMPLE = Path(__file__).parents[1] / "examples" / "follow_motion.py"
 
 
@@ -145,8 +147,7 @@ def test_the_reference_is_shown_beside_the_robot(h1):
 
 
 def test_starts_follow_failures(device):
-    engine = "mujoco" if device == "cpu" else "compiled"
-    env = loco.make("h1_tracking", 4000, device, 1, engine=engine)
+    env = loco.make("h1_tracking", MANY, device, 1, randomize=[], sim_dt=0.02)
     tables, pieces = env.hooks.catalog.constants, env.pieces
     share, piece_of, ends = tables["piece_share"], tables["piece_of"].long(), tables["clip_last"]
 
@@ -154,16 +155,16 @@ def test_starts_follow_failures(device):
         env.reset()
         frame = env.world.memory["frame"].long()
         assert (frame < ends[torch.searchsorted(ends, frame)]).all()
-        return torch.bincount(piece_of[frame], minlength=PIECES) / 4000
+        return torch.bincount(piece_of[frame], minlength=PIECES) / MANY
 
-    assert (drawn() - share).abs().max() < 0.02  # nothing is known: anywhere
+    assert (drawn() - share).abs().max() < 0.04  # nothing is known: anywhere
     shared = env.world.shared
     shared["recent"][0, :pieces], shared["recent"][1, 5] = 1e6, 1e5
     env.step(env.rand_action())
     found = drawn()
-    assert found[5].item() == pytest.approx((1.0 - tracking.UNIFORM) / (1.0 + tracking.BEFORE), abs=0.05)
+    assert found[5].item() == pytest.approx((1.0 - tracking.UNIFORM) / (1.0 + tracking.BEFORE), abs=0.1)
     assert found[4].item() == pytest.approx(
-        tracking.BEFORE * (1.0 - tracking.UNIFORM) / (1.0 + tracking.BEFORE), abs=0.05
+        tracking.BEFORE * (1.0 - tracking.UNIFORM) / (1.0 + tracking.BEFORE), abs=0.1
     )
     for entry in ("visits", "failures", "counted", "recent"):
         shared[entry].zero_()
