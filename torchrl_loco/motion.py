@@ -33,7 +33,7 @@ LOOKED_AT = 20.0
 """Frames per second whose bodies are compared with the ground and with the file."""
 FAR_BEYOND = 0.8
 """From where on it may be another joint (rad)."""
-UNITLESS = 0.05
+NORM_ERROR = 0.05
 """How far the length of a quaternion may be from 1."""
 
 
@@ -168,7 +168,7 @@ class Motion:
         if (bad := np.argwhere(~np.isfinite(q))).size:
             raise ValueError(f"{self.path}: frame {bad[0, 0]} has a number that is not finite, in column {bad[0, 1]}")
         lengths = np.linalg.norm(q[:, 3:7], axis=1)
-        if (wrong := np.flatnonzero(np.abs(lengths - 1.0) > UNITLESS)).size:
+        if (wrong := np.flatnonzero(np.abs(lengths - 1.0) > NORM_ERROR)).size:
             raise ValueError(
                 f"{self.path}: columns 3 to 6 of frame {wrong[0]} must be a unit quaternion, their length is "
                 f"{lengths[wrong[0]]:.3g}"
@@ -190,7 +190,7 @@ class Motion:
         Raises:
             ValueError: it is a motion of another robot, or its joints are in another order.
         """
-        q, joints = self.qpos.copy(), self._joints_of(m)
+        q, joints = self.qpos.copy(), _joints_of(m)
         if m.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE or m.nq != 7 + len(joints):
             raise ValueError("motions need a robot whose base floats, and whose joints are hinges")
         if q.shape[1] != m.nq:
@@ -200,7 +200,7 @@ class Motion:
                 if name not in joints:
                     raise ValueError(f"{self.path}: the robot has no joint {name!r}{suggestion(name, joints)}")
             if len(set(self._joints)) != len(joints):
-                raise ValueError(f"{self.path} names a joint twice: {', '.join(sorted(self._joints))}")
+                raise ValueError(f"{self.path} must name each joint once, it names {', '.join(sorted(self._joints))}")
             q[:, 7:] = q[:, 7:][:, [self._joints.index(name) for name in joints]]
         said = self._compare_bodies(m, q)
         low, high = np.where(m.jnt_limited[1:, None].astype(bool), m.jnt_range[1:], (-np.inf, np.inf)).T
@@ -242,7 +242,7 @@ class Motion:
         if self._bodies is None:
             return []
         there, names = self._bodies
-        own = [m.body(i).name for i in range(1, m.nbody)]
+        own = _bodies_of(m)
         names = names or (own if there.shape[1] == len(own) else [])
         both = [name for name in names if name in own]
         if not both or len(names) != there.shape[1]:
@@ -256,7 +256,7 @@ class Motion:
             at = every * frame
             raise ValueError(
                 f"{self.path}: {both[body]} lies {apart.max():.2f} m from where the joints put it in frame {at}: "
-                f"joints or bodies are in another order than the robot's, {', '.join(self._joints_of(m))}"
+                f"joints or bodies are in another order than the robot's, {', '.join(_joints_of(m))}"
             )
         return []
 
@@ -265,9 +265,13 @@ class Motion:
         """Of every how many frames one is looked at, where not all must be."""
         return max(1, int(self.fps / LOOKED_AT))
 
-    @staticmethod
-    def _joints_of(m: mujoco.MjModel) -> list[str]:
-        return [m.joint(j).name for j in range(1, m.njnt)]
+
+def _joints_of(m: mujoco.MjModel) -> list[str]:
+    return [m.joint(j).name for j in range(1, m.njnt)]
+
+
+def _bodies_of(m: mujoco.MjModel) -> list[str]:
+    return [m.body(i).name for i in range(1, m.nbody)]
 
 
 def _is_row(line: str) -> bool:
@@ -429,8 +433,7 @@ def save(path: Path, qpos: np.ndarray, fps: float, m: mujoco.MjModel) -> None:
         **{"body_lin_vel_w": _rate(pos[:, 1:], 1.0 / fps), "body_ang_vel_w": _turn_rate(mat[:, 1:], 1.0 / fps)},
     }
     content = io.BytesIO()
-    names = {"joint_names": [m.joint(j).name for j in range(1, m.njnt)]}
-    names["body_names"] = [m.body(i).name for i in range(1, m.nbody)]
+    names = {"joint_names": _joints_of(m), "body_names": _bodies_of(m)}
     written: dict[str, Any] = {"fps": np.array([fps]), **{name: np.array(words) for name, words in names.items()}}
     written |= {name: table.astype(np.float32) for name, table in tables.items()}
     np.savez_compressed(content, **written)

@@ -165,10 +165,14 @@ def _by_case(
         nothing after it has ended too soon; whether it has; and the share of its steps until then. Nothing where a task
         has no cases.
     """
+    from torchrl_loco.envs import LocoEnv
+
     found: dict[str, dict[str, dict[str, Any]]] = {}
+    if cls.cases is LocoEnv.cases:
+        return found
     one = _worlds(cls, exported, dataclasses.replace(UNDISTURBED, episodes=1), ENGINES[0], device, compile_hooks=False)
     if not (cases := one.cases()):
-        return {}
+        return found
     once = dataclasses.replace(UNDISTURBED, episodes=len(cases), seconds=conditions.seconds)
     for engine in engines:
         env = _worlds(cls, exported, once, engine, device)
@@ -317,8 +321,7 @@ def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str)
 
     from torchrl_loco.envs.access import set_stage
 
-    n, dt = env.num_envs, env.config.ctrl_dt
-    steps = env.config.episode_length
+    n, steps, dt = env.num_envs, env.config.episode_length, env.config.ctrl_dt
     if conditions.seconds is not None:
         steps = min(steps, max(round(conditions.seconds / dt), 1))
     generator, hold = np.random.default_rng(conditions.seed), int(exported.facts["action_repeat"])

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     import mujoco
     import numpy as np
 
+    from torchrl_loco.motion import Motion
+
 
 @dataclasses.dataclass(frozen=True)
 class Motions:
@@ -29,7 +31,6 @@ class Motions:
 
         Raises:
             ValueError: the task follows no motions.
-            OSError: there is no such file.
         """
         from torchrl_loco.registry import resolve
 
@@ -43,8 +44,8 @@ MotionOptions = Annotated[Motions, tyro.conf.arg(name="")]
 THOSE_OF_TRAINING = Motions()
 
 
-FRAME_RATE, SIZE = 25, (480, 360)
-"""Of videos: frames per second; width and height."""
+FRAME_RATE = 25
+"""Frames per second of videos."""
 
 
 def motion(
@@ -115,13 +116,12 @@ def motion(
             print(out)
 
 
-def _row(motion: "object", q: "np.ndarray", m: "mujoco.MjModel") -> str:
+def _row(motion: "Motion", q: "np.ndarray", m: "mujoco.MjModel") -> str:
     """Returns figures of a motion."""
     import numpy as np
 
-    from torchrl_loco.motion import Motion, lowest_points, poses
+    from torchrl_loco.motion import lowest_points, poses
 
-    assert isinstance(motion, Motion)
     lowest = lowest_points(m, *poses(m, q)).min()
     speed = np.linalg.norm(np.diff(q[:, :3], axis=0), axis=1).max() * motion.fps
     rate = np.abs(np.diff(q[:, 7:], axis=0)).max() * motion.fps
@@ -130,22 +130,16 @@ def _row(motion: "object", q: "np.ndarray", m: "mujoco.MjModel") -> str:
 
 def _film(m: "mujoco.MjModel", q: "np.ndarray", out: Path, camera: str) -> None:
     """Renders poses as a video, at its frame rate."""
-    import io
-
-    import imageio.v3 as imageio
     import torch
     import warp as wp
     from tqdm.auto import tqdm
 
     from torchrl_loco.rendering import Renderer, to_bytes
-    from torchrl_loco.storage import replace_file
+    from torchrl_loco.training.playback import SIZE, write_video
 
     print(f"rendering {len(q)} frames; on a CPU this takes a while", file=sys.stderr)
     device = wp.get_device("cuda" if torch.cuda.is_available() else "cpu")
-    renderer, content = Renderer(m, device, camera, *SIZE, 1), io.BytesIO()
+    renderer = Renderer(m, device, camera, *SIZE, 1)
     poses = torch.tensor(q, dtype=torch.float32, device=wp.device_to_torch(device))
-    with imageio.imopen(content, "w", plugin="pyav", extension=".mp4") as video:
-        video.init_video_stream("h264", fps=FRAME_RATE)
-        for row in tqdm(poses, desc="video", leave=False, disable=None):
-            video.write_frame(to_bytes(renderer.render_poses(row[None]))[0].cpu().numpy())
-    replace_file(out, content.getvalue())
+    shown = tqdm(poses, desc="video", leave=False, disable=None)
+    write_video(out, (to_bytes(renderer.render_poses(row[None]))[0] for row in shown), FRAME_RATE)

@@ -5,6 +5,7 @@ import os
 import sys
 import time
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -32,16 +33,21 @@ def record(
         action_repeat: frames for which an action is held.
         camera: name of one of the model's cameras.
     """
+    frame_rate = round(1 / env.config.ctrl_dt)
+    steps = play(policy, env, action_repeat, round(seconds * frame_rate), "video")
+    with settings_for_small_networks():
+        write_video(path, (env.render(camera, *SIZE, worlds=1)[0] for _ in steps), frame_rate)
+
+
+def write_video(path: Path, frames: Iterable[torch.Tensor], frame_rate: int) -> None:
+    """Writes frames, uint8 ``(height, width, 3)``, as a video file, whole or not at all, as :func:`record` does."""
     import imageio.v3 as imageio  # of the extra "train"
 
-    frame_rate, content = round(1 / env.config.ctrl_dt), io.BytesIO()
-    with (
-        settings_for_small_networks(),
-        imageio.imopen(content, "w", plugin="pyav", extension=path.suffix) as video,
-    ):
+    content = io.BytesIO()
+    with imageio.imopen(content, "w", plugin="pyav", extension=path.suffix) as video:
         video.init_video_stream("h264", fps=frame_rate)
-        for _ in play(policy, env, action_repeat, round(seconds * frame_rate), "video"):
-            video.write_frame(env.render(camera, *SIZE, worlds=1)[0].cpu().numpy())
+        for frame in frames:
+            video.write_frame(frame.cpu().numpy())
     replace_file(path, content.getvalue())
 
 

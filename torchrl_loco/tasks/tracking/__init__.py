@@ -14,13 +14,26 @@ from torchrl_loco import motion as motions
 from torchrl_loco.checks import Interval, check_int
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.tasks.velocity import FOLDER as ROBOTS
-from torchrl_loco.tasks.velocity import G1Velocity, H1Velocity, actuated, com, sliding, squares, targets
+from torchrl_loco.tasks.velocity import (
+    PUSH_EVERY,
+    G1Velocity,
+    H1Velocity,
+    actuated,
+    beyond_limits,
+    com,
+    hard_contacts,
+    limits,
+    pushed,
+    reach,
+    sliding,
+    squares,
+    targets,
+)
 
 if TYPE_CHECKING:
     from torchrl_loco.envs.view import View
 
 FOLDER = Path(__file__).parent
-SIDES = ("left", "right")
 
 AHEAD = Interval(1, 10_000)
 """Control steps that a policy may look ahead."""
@@ -38,16 +51,12 @@ BIAS = 0.01
 """Greatest error of a joint's encoder in an episode (rad)."""
 PUSH = (0.5, 0.5, 0.2, 0.52, 0.52, 0.78)
 """Greatest change of the base's velocity by a push, and at the start (m/s, rad/s)."""
-PUSH_EVERY = (1.0, 3.0)
-"""Least and greatest time between pushes (s)."""
 NEAR, TILT, BEND = (0.05, 0.05, 0.01), (0.1, 0.1, 0.2), 0.1
 """Greatest distance of a start from the reference: place (m), rotation (rad), joints (rad)."""
 MAX_HEIGHT, MAX_TILT = 0.25, 0.8
 """Differences from the reference at which it is lost: of heights (m), of the height of an axis."""
 OWN_RATE = 25.0
 """Frames per second of the motions of the package."""
-HARD_CONTACT = 10.0
-"""Force from which a contact of the robot with itself counts (N)."""
 
 FOLLOWED = {
     "anchor_position": (0.5, 0.3),  # m
@@ -169,8 +178,8 @@ class Tracking(LocoEnv):
         """Returns options as a run keeps them: with the whole paths of files.
 
         Raises:
-            FileNotFoundError: a motion is not there.
-            ValueError: there is no such option, or a motion is none that a run can keep.
+            ValueError: there is no such option, or a value is out of range.
+            TypeError: a motion is neither a path nor a :class:`torchrl_loco.Motion`.
         """
         kept = super().checked_options(given)
         if "motion" in kept:
@@ -304,10 +313,7 @@ class Tracking(LocoEnv):
 
     def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
         """Returns the targets of the joints (rad): the home pose and a multiple of the action."""
-        if self.action_scale is not None:
-            return self.home(s) + self.action_scale * action
-        greatest, stiffness = s.model("actuator_forcerange")[..., 1], s.model("actuator_gainprm")[..., 0]
-        return self.home(s) + 0.25 * greatest / stiffness * action
+        return self.home(s) + reach(s, self.action_scale) * action
 
     def reward(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the terms of the reward."""
@@ -321,12 +327,9 @@ class Tracking(LocoEnv):
             "body_turn_rates": (s.ang[s.frame] - s.angvel(self.bodies)).square().sum(-1).mean(-1),
         }
         terms = {name: weight * torch.exp(-squared[name] / error**2) for name, (weight, error) in FOLLOWED.items()}
-        low, high = s.model("jnt_range")[:, [self.mj_model.joint(name).id for name in self.joints]].unbind(-1)
-        beyond = (s.joint_qpos(self.joints) - 0.5 * (low + high)).abs() - 0.45 * (high - low)
-        penalties = {"action_rate": squares(s.action - s.last_action), "joint_limits": beyond.clamp(min=0.0).sum(-1)}
+        penalties = {"action_rate": squares(s.action - s.last_action), "joint_limits": beyond_limits(self, s)}
         if self.own_geoms:
-            hard = s.contact_force([self.own_geoms], history=True).norm(dim=-1) > HARD_CONTACT
-            penalties["self_collision"] = hard.any(-1).float().sum(-1)
+            penalties["self_collision"] = hard_contacts(s, self.own_geoms)
         terms |= {name: PENALTIES[name] * value for name, value in penalties.items()}
         return {name: s.dt * term for name, term in terms.items()}
 
@@ -359,11 +362,7 @@ class Tracking(LocoEnv):
         rows = {"frame": torch.minimum(s.frame + 1, s.last[s.frame]), "last_action": s.action}
         if self.play:
             return {**rows, **self.moved(s)}
-        push = s.until_push <= 0.0
-        change = s.uniform(-1.0, 1.0, 6) * torch.tensor(PUSH, device=s.device)
-        base = s.qvel[:, :6] + torch.where(push.unsqueeze(-1), change, 0.0)
-        until_push = torch.where(push, s.uniform(*PUSH_EVERY), s.until_push - s.dt)
-        return {**rows, "qvel": torch.cat([base, s.qvel[:, 6:]], dim=-1), "until_push": until_push}
+        return {**rows, **pushed(s, PUSH)}
 
     def adapt(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns how often pieces were visited and the reference lost in them, and where starts are drawn."""
@@ -426,7 +425,7 @@ class Tracking(LocoEnv):
         place = root[:, :3] + s.uniform(-1.0, 1.0, 3) * torch.tensor(NEAR, device=s.device)
         half = 0.5 * s.uniform(-1.0, 1.0, 3) * torch.tensor(TILT, device=s.device)
         small = torch.cat([(1.0 - squares(half)).sqrt().unsqueeze(-1), half], dim=-1)
-        low, high = s.model("jnt_range")[:, [self.mj_model.joint(name).id for name in self.joints]].unbind(-1)
+        low, high = limits(self, s)
         push = s.uniform(-1.0, 1.0, 6) * torch.tensor(PUSH, device=s.device)
         return {
             "frame": frame,
@@ -490,7 +489,6 @@ def _kept(motion: Any) -> Any:
     """Returns a motion as a run keeps it: its whole path, or the arguments of a :class:`torchrl_loco.Motion`.
 
     Raises:
-        FileNotFoundError: there is no such file.
         TypeError: it is something else.
     """
     if isinstance(motion, motions.Motion):
@@ -527,6 +525,11 @@ def product(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     )
 
 
+def both(*links: str) -> list[str]:
+    """Returns the names of links on the left, then on the right."""
+    return [f"{side}_{link}" for side in ("left", "right") for link in links]
+
+
 class G1Tracking(Tracking):
     """A Unitree G1, a humanoid of 29 joints and 33 kg, follows motions."""
 
@@ -534,11 +537,11 @@ class G1Tracking(Tracking):
     model = ROBOTS / "g1.xml"
     memory = memory(joints=29)
     base, anchor = "pelvis", "torso_link"
-    ends = [f"{side}_{link}" for link in ("ankle_roll_link", "wrist_yaw_link") for side in SIDES]
+    ends = both("ankle_roll_link", "wrist_yaw_link")
     bodies = [
-        *("pelvis", "torso_link"),
-        *(f"{side}_{link}" for side in SIDES for link in ("hip_roll_link", "knee_link", "ankle_roll_link")),
-        *(f"{side}_{link}" for side in SIDES for link in ("shoulder_roll_link", "elbow_link", "wrist_yaw_link")),
+        *(base, anchor),
+        *both("hip_roll_link", "knee_link", "ankle_roll_link"),
+        *both("shoulder_roll_link", "elbow_link", "wrist_yaw_link"),
     ]
     own_geoms = G1Velocity.own_geoms
     motion_folder = FOLDER / "g1"
@@ -560,11 +563,11 @@ class H1Tracking(Tracking):
     config = H1Velocity.config
     memory = memory(joints=19)
     base, anchor = "pelvis", "torso_link"
-    ends = [f"{side}_{link}" for link in ("ankle_link", "elbow_link") for side in SIDES]
+    ends = both("ankle_link", "elbow_link")
     bodies = [
-        *("pelvis", "torso_link"),
-        *(f"{side}_{link}" for side in SIDES for link in ("hip_roll_link", "knee_link", "ankle_link")),
-        *(f"{side}_{link}" for side in SIDES for link in ("shoulder_roll_link", "elbow_link")),
+        *(base, anchor),
+        *both("hip_roll_link", "knee_link", "ankle_link"),
+        *both("shoulder_roll_link", "elbow_link"),
     ]
     action_scale = H1Velocity.action_scale
     motion_folder = FOLDER / "h1"

@@ -314,10 +314,7 @@ class Velocity(LocoEnv):
         late, arrived = s.delay.unsqueeze(-1), action
         for steps, earlier in enumerate([s.last_action, *s.earlier_actions.unbind(1)], start=1):
             arrived = torch.where(late < steps, arrived, earlier)
-        if self.action_scale is not None:
-            return self.home(s) + self.action_scale * arrived
-        greatest, stiffness = s.model("actuator_forcerange")[..., 1], s.model("actuator_gainprm")[..., 0]
-        return self.home(s) + 0.25 * greatest / stiffness * arrived
+        return self.home(s) + reach(s, self.action_scale) * arrived
 
     def update(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the greatest height of each foot since it left the ground."""
@@ -338,9 +335,6 @@ class Velocity(LocoEnv):
         moves, stands, runs = speed > STANDS, (speed < STANDS).unsqueeze(-1), (speed >= RUNS).unsqueeze(-1)
         walking = torch.where(runs, self.stray(s, self.run), self.stray(s, self.walk))
         spread = torch.where(stands, self.stray(s, self.stand), walking)
-        low, high = s.model("jnt_range")[:, [self.mj_model.joint(name).id for name in self.joints]].unbind(-1)
-        beyond = (s.joint_qpos(self.joints) - 0.5 * (low + high)).abs() - 0.45 * (high - low)
-
         touching, heights = self.touching(s), self.heights(s)
         landed = touching & (s.air_time > 0.0)
         slides = s.site_linvel(list(self.feet))[..., :2].square().sum(-1)
@@ -349,7 +343,7 @@ class Velocity(LocoEnv):
             "track_angular": torch.exp(-((command - angular)[:, 2].square() + squares(angular[:, :2])) / 0.5),
             "upright": torch.exp(-squares(s.projected_gravity(self.trunk)[:, :2]) / 0.2),
             "pose": torch.exp(-(stray / spread).square().mean(-1)),
-            "joint_limits": beyond.clamp(min=0.0).sum(-1),
+            "joint_limits": beyond_limits(self, s),
             "action_rate": squares(s.action - s.last_action),
             "foot_clearance": moves * ((heights - self.step_height).abs() * slides.sqrt()).sum(-1),
             "foot_swing_height": moves * (landed * (s.peak / self.step_height - 1.0).square()).sum(-1),
@@ -361,8 +355,7 @@ class Velocity(LocoEnv):
         if "angular_momentum" in self.weights:
             terms["angular_momentum"] = squares(s.sensor("angular_momentum"))
         if "self_collision" in self.weights:
-            hard = s.contact_force([self.own_geoms], history=True).norm(dim=-1) > HARD_CONTACT
-            terms["self_collision"] = hard.any(-1).float().sum(-1)
+            terms["self_collision"] = hard_contacts(s, self.own_geoms)
         return terms
 
     def terminated(self, s: "View") -> torch.Tensor:
@@ -402,11 +395,7 @@ class Velocity(LocoEnv):
 
     def pushed(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns velocities, which a push changes every 1 to 3 s, and the time until the next."""
-        push = s.until_push <= 0.0
-        change = self.push_scale * s.uniform(-1.0, 1.0, 6) * torch.tensor(PUSH, device=s.device)
-        base = s.qvel[:, :6] + torch.where(push.unsqueeze(-1), change, 0.0)
-        until_push = torch.where(push, s.uniform(*PUSH_EVERY), s.until_push - s.dt)
-        return {"qvel": torch.cat([base, s.qvel[:, 6:]], dim=-1), "until_push": until_push}
+        return pushed(s, PUSH, self.push_scale)
 
     def observation(self, s: "View") -> dict[str, dict[str, torch.Tensor]]:
         """Returns what the policy sees, and for the critic the same without noise and the feet."""
@@ -464,6 +453,41 @@ def _some(names: list[str], which: np.ndarray) -> str:
 def squares(values: torch.Tensor) -> torch.Tensor:
     """Returns the sum of the squares of each row, ``(num_envs,)``."""
     return values.square().sum(-1)
+
+
+def reach(s: "View", scale: float | None) -> float | torch.Tensor:
+    """Returns how far an action of 1 moves the target of a joint (rad); by default a quarter of the greatest torque."""
+    if scale is not None:
+        return scale
+    return 0.25 * s.model("actuator_forcerange")[..., 1] / s.model("actuator_gainprm")[..., 0]
+
+
+def limits(task: Any, s: "View") -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the least and greatest positions of a task's joints (rad), each ``(num_envs, joints)``."""
+    low, high = s.model("jnt_range")[:, [task.mj_model.joint(name).id for name in task.joints]].unbind(-1)
+    return low, high
+
+
+def beyond_limits(task: Any, s: "View") -> torch.Tensor:
+    """Returns how far a task's joints are beyond 0.9 of their ranges (rad), summed, ``(num_envs,)``."""
+    low, high = limits(task, s)
+    beyond = (s.joint_qpos(task.joints) - 0.5 * (low + high)).abs() - 0.45 * (high - low)
+    return beyond.clamp(min=0.0).sum(-1)
+
+
+def hard_contacts(s: "View", geoms: str) -> torch.Tensor:
+    """Returns in how many physics steps one of some geoms had a hard contact, ``(num_envs,)``."""
+    hard = s.contact_force([geoms], history=True).norm(dim=-1) > HARD_CONTACT
+    return hard.any(-1).float().sum(-1)
+
+
+def pushed(s: "View", greatest: Sequence[float], scale: float = 1.0) -> dict[str, torch.Tensor]:
+    """Returns velocities, which a push changes every 1 to 3 s, and the time until the next."""
+    push = s.until_push <= 0.0
+    change = scale * s.uniform(-1.0, 1.0, 6) * torch.tensor(greatest, device=s.device)
+    base = s.qvel[:, :6] + torch.where(push.unsqueeze(-1), change, 0.0)
+    until_push = torch.where(push, s.uniform(*PUSH_EVERY), s.until_push - s.dt)
+    return {"qvel": torch.cat([base, s.qvel[:, 6:]], dim=-1), "until_push": until_push}
 
 
 def find(table: Mapping[str, float], name: str) -> float:
