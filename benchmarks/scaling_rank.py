@@ -70,11 +70,11 @@ def exchange(learner: Algorithm) -> dict[str, float]:
     """Returns the milliseconds that averaging all gradients over the ranks takes, directly and recorded on CUDA."""
     if distributed.ranks() == 1:
         return {"exchange": 0.0, "exchange, recorded": 0.0}
-    groups = [[p for group in o.param_groups for p in group["params"]] for o in learner.optimizers.values()]
+    groups = [[torch.zeros_like(p) for g in o.param_groups for p in g["params"]] for o in learner.optimizers.values()]
 
     def average() -> None:
-        for parameters in groups:
-            distributed.average_gradients(parameters)
+        for gradients in groups:
+            distributed.average(gradients)
 
     direct = seconds(average, EXCHANGES, learner.device)
     recorded = direct

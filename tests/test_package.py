@@ -11,7 +11,7 @@ import torchrl_loco
 
 ROOT = Path(torchrl_loco.__file__).parent
 LAYERS = [  # a module imports from its own layer or from those before it
-    {"checks", "conditions", "config", "garbage", "known_files", "motion", "rewards", "storage"},
+    {"checks", "conditions", "config", "garbage", "known_files", "lazy_compiler", "motion", "rewards", "storage"},
     {"sim"},
     {"rendering"},
     {"envs", "viewer"},
@@ -93,3 +93,29 @@ main(["train", "walker_stand", "--device=cpu", "--out", sys.argv[1]])
     assert ended.returncode == 2, ended.stderr
     assert "pip install 'torchrl-loco[train]'" in ended.stderr
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.slow
+def test_torchs_compiler_is_imported_when_somebody_compiles(tmp_path):
+    """Not by a training with PPO; and what tensordict and TorchRL asked of it at their import is done then."""
+    code = """
+import sys
+import quickly
+from torchrl_loco import training
+sizes = {"num_envs": 4, "num_steps": 8, "minibatch_size": 16, "epochs": 1, "hidden": (8,), "total_frames": 256}
+settings = {**sizes, "eval_episodes": 2, "video_seconds": 0.0, "logger": ("csv",)}
+training.train("walker_stand", device="cpu", out=sys.argv[1], algorithm="ppo", episode_length=40, **settings)
+assert "torch._dynamo" not in sys.modules
+import torch, tensordict.base
+from torchrl.modules.distributions import utils
+assert torch.compiler.disable(lambda x: x + 1.0)(torch.ones(())) == 2.0
+assert torch.compiler.disable.__module__ == torch.compiler.allow_in_graph.__module__ == "torch.compiler"
+from torch._dynamo import trace_rules
+assert id(tensordict.base._foreach_copy_) in trace_rules._allowed_callable_ids
+assert any(getattr(value, "_dynamo_marked_constant", False) for value in vars(utils).values())
+doubled = torch.compile(lambda x: 2 * x, backend="eager")
+assert doubled(torch.ones(2)).sum() == 4.0
+"""
+    command = [sys.executable, "-c", code, tmp_path]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=Path(__file__).parent)
+    assert ended.returncode == 0, ended.stderr

@@ -62,4 +62,4 @@ def collected(algorithm, num_envs):
     env = make_once("walker_stand", num_envs, "cpu")
     env.set_seed(0)
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        return env.rollout(algorithm.config.num_steps, algorithm.actor)
+        return env.rollout(algorithm.config.num_steps, algorithm.acting())

@@ -24,7 +24,12 @@ def knowledge(trainer):
 
 def moments(trainer):
     optimizers = trainer.algorithm.optimizers.values()
-    return [value for optimizer in optimizers for state in optimizer.state.values() for value in state.values()]
+    return [
+        value
+        for optimizer in optimizers
+        for state in optimizer.state_dict()["state"].values()
+        for value in state.values()
+    ]
 
 
 def addresses(trainer):

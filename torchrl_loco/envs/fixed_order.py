@@ -14,13 +14,13 @@ def fixed_order() -> Iterator[None]:
 
     Running sums, which have none on CUDA, are :func:`running_sum` there.
     """
-    before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
-    torch.use_deterministic_algorithms(True)
+    before = torch.get_deterministic_debug_mode()
+    torch.set_deterministic_debug_mode("error")  # use_deterministic_algorithms would import torch's compiler, for seconds
     try:
         with _RunningSums():
             yield
     finally:
-        torch.use_deterministic_algorithms(before[0], warn_only=before[1])
+        torch.set_deterministic_debug_mode(before)
 
 
 class _RunningSums(TorchFunctionMode):

@@ -1,139 +1,158 @@
-"""Adam on clipped gradients in few kernels: parameters and moments lie in one vector each."""
+"""Adam on clipped gradients in one kernel: parameters and moments lie in one vector each."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.adam import adam
 
-from torchrl_loco.training.compiling import compiled
+from torchrl_loco.training import distributed
+from torchrl_loco.training.kernels import launch, step_of_adam
 
-SETTINGS = "lr", "betas", "eps", "weight_decay", "maximize"
-"""Of a group of parameters, which a step follows."""
-
-ALIGNED = 4
-"""Numbers at a multiple of which each parameter begins: matrix products read 16 bytes at a time."""
+ALIGNED = 8
+"""Numbers at a multiple of which each parameter and each row of a matrix begins: products of matrices in bfloat16 read
+16 bytes at a time."""
 
 
-class CompiledAdam(torch.optim.Adam):
-    """Adam whose step clips the gradients of all parameters together, compiled.
+class FlatAdam:
+    """Adam (Kingma and Ba, 2015) that clips the gradients of all parameters together, on one vector for each group.
 
-    It moves the parameters into one vector for each group, of which they are views then. torch's own kernels of several
-    tensors give a block of threads 65,536 numbers, so that networks of a few hundred thousand parameters leave most
-    multiprocessors idle; a kernel that is compiled for each of many tensors takes seconds to compile.
+    It moves the parameters into the vectors, of which they are views then. torch's kernels of several tensors give a
+    block of threads 65,536 numbers, so that networks of a few hundred thousand parameters leave most multiprocessors
+    idle. States are those of ``torch.optim.Adam``.
 
     Args:
-        parameters: parameters, or groups of them.
-        lr: the learning rate, a tensor.
+        parameters: parameters, or groups of them with settings of their own.
+        lr: the learning rate, a tensor, which recorded steps follow.
         eps: what is added to the root of the second moment.
+        betas: decay of the moments.
+
+    Attributes:
+        param_groups: the groups, each a dict of ``params`` and its settings.
     """
 
-    def __init__(self, parameters: Iterable[Any], lr: Tensor, eps: float) -> None:
-        super().__init__(parameters, lr=lr, eps=eps, capturable=True, fused=True)
-        self._clipped_step = compiled(clipped_step, "a step of Adam")
-        self._vectors = [
-            (index, vectors) for index, group in enumerate(self.param_groups) for vectors in of_group(group)
-        ]
-        for _, vectors in self._vectors:
-            for parameter, state in vectors.states():
-                self.state[parameter] = state
+    def __init__(
+        self, parameters: Iterable[Any], lr: Tensor, eps: float = 1e-8, betas: tuple[float, float] = (0.9, 0.999)
+    ) -> None:
+        given = list(parameters)
+        groups = given if given and isinstance(given[0], dict) else [{"params": given}]
+        settings: dict[str, Any] = {"lr": lr, "eps": eps, "betas": betas}
+        self.param_groups = [{**settings, **group, "params": list(group["params"])} for group in groups]
+        self._vectors = [Vectors(group["params"]) for group in self.param_groups]
+
+    def wide(self, dtype: torch.dtype) -> dict[nn.Parameter, Tensor]:
+        """Returns all parameters in another type, each row with zeros up to a multiple of :data:`ALIGNED`.
+
+        Gradients flow from them into the vectors at once, instead of parameter by parameter.
+        """
+        return {part: view for vectors in self._vectors for part, view in vectors.wide(dtype)}
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients."""
+        for vectors in self._vectors:
+            vectors.forget_gradients()
 
     @torch.no_grad()
     def clipped_step(self, max_norm: float) -> Tensor:
-        """Clips the gradients to a norm, and makes a step.
+        """Averages the gradients over the ranks, clips them to a norm, and makes a step.
 
         Returns:
             The norm before, a scalar.
         """
-        vectors = [(v.parameters, v.gradients(), v.first, v.second, v.steps) for _, v in self._vectors]
-        settings = [{name: self.param_groups[index][name] for name in SETTINGS} for index, _ in self._vectors]
-        return self._clipped_step(vectors, settings, max_norm)
+        gradients = [vectors.gradient() for vectors in self._vectors]
+        distributed.average(gradients)
+        norms = [gradient.norm() for gradient in gradients]
+        norm = norms[0] if len(norms) == 1 else torch.stack(norms).norm()
+        for group, vectors, gradient in zip(self.param_groups, self._vectors, gradients, strict=True):
+            vectors.step += 1
+            scalars = [number.view(1) for number in (norm, group["lr"], vectors.step)]
+            settings = [max_norm, *group["betas"], group["eps"]]
+            launch(step_of_adam, len(gradient), [gradient, *scalars, *settings], [vectors.whole, *vectors.moments])
+        return norm
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns moments and steps by the number of the parameter, and settings by group, as they are."""
+        states = [state for vectors in self._vectors for state in vectors.states()]
+        numbers = iter(range(len(states)))
+        groups = [{**group, "params": [next(numbers) for _ in group["params"]]} for group in self.param_groups]
+        return {"state": dict(enumerate(states)), "param_groups": groups}
 
     @torch.no_grad()
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continues from a state, whose moments are copied; those that it lacks begin at zero."""
-        own = dict(self.state)
-        super().load_state_dict(state_dict)
-        for parameter, state in own.items():
-            loaded = self.state.get(parameter, {})
+    def load_moments(self, states: dict[int, dict[str, Tensor]]) -> None:
+        """Copies moments and steps, by the number of the parameter; those that ``states`` lacks begin at zero."""
+        for number, state in self.state_dict()["state"].items():
+            loaded = states.get(number, {})
             for name, value in state.items():
                 value.copy_(loaded[name]) if name in loaded else value.zero_()
-            self.state[parameter] = state
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continues from a state, which is copied."""
+        self.load_moments(state_dict["state"])
+        for group, loaded in zip(self.param_groups, state_dict["param_groups"], strict=True):
+            group["lr"].copy_(torch.as_tensor(loaded["lr"]))
+            group.update({name: loaded[name] for name in ("betas", "eps")})
 
 
 class Vectors:
-    """Parameters of one type, one after the other, and what Adam keeps of them, as vectors of one length.
+    """Parameters one after the other, and what Adam keeps of them, as vectors of one length.
 
     Args:
         parameters: the parameters, which become views.
+
+    Raises:
+        TypeError: they are of another type than single precision.
     """
 
     def __init__(self, parameters: Sequence[nn.Parameter]) -> None:
+        if others := {str(part.dtype) for part in parameters} - {"torch.float32"}:
+            raise TypeError(f"the parameters of networks must be torch.float32, not {', '.join(sorted(others))}")
         self._parts = parameters
-        self._gaps = [part.new_zeros(-part.numel() % ALIGNED) for part in parameters]
-        self.parameters = torch.cat(self._with_gaps([part.detach() for part in parameters]))
-        self.first, self.second = torch.zeros_like(self.parameters), torch.zeros_like(self.parameters)
-        self.steps = torch.zeros((), device=self.parameters.device)
-        for part, view in zip(parameters, self._views_of(self.parameters), strict=True):
-            part.data = view
+        rows = [(part.shape[:-1].numel(), part.shape[-1]) if part.ndim else (1, 1) for part in parameters]
+        self._wide_rows = [(count, size + -size % ALIGNED) for count, size in rows]
+        # Of a matrix and its gaps, or of a row and the gap behind it.
+        sizes = [
+            (count * wide, 0) if part.ndim > 1 else (size, wide - size)
+            for part, (_, size), (count, wide) in zip(parameters, rows, self._wide_rows, strict=True)
+        ]
+        self._sizes = [size for pair in sizes for size in pair]
+        self.whole = nn.Parameter(parameters[0].new_zeros(sum(self._sizes)))
+        self.moments = torch.zeros_like(self.whole.detach()), torch.zeros_like(self.whole.detach())
+        self.step = torch.zeros((), device=self.whole.device)
+        with torch.no_grad():
+            for part, view in zip(parameters, self._views(self.whole), strict=True):
+                part.data = view.copy_(part)
 
-    def _with_gaps(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        pairs = zip(tensors, self._gaps, strict=True)
-        return [piece for tensor, gap in pairs for piece in (tensor.flatten(), gap)]
+    def _wide_views(self, vector: Tensor) -> list[Tensor]:
+        """Returns the parts of a vector in the shapes of the parameters, but for the rows of matrices with gaps."""
+        pieces = zip(self._parts, vector.split(self._sizes)[::2], self._wide_rows, strict=True)
+        return [
+            piece.view(*part.shape[:-1], wide) if part.ndim > 1 else piece.view(part.shape)
+            for part, piece, (_, wide) in pieces
+        ]
 
-    def _views_of(self, vector: Tensor) -> list[Tensor]:
-        pieces = vector.split([len(piece) for piece in self._with_gaps(self._parts)])[::2]
-        return [piece.view(part.shape) for part, piece in zip(self._parts, pieces, strict=True)]
+    def _views(self, vector: Tensor) -> list[Tensor]:
+        """Returns the parts of a vector in the shapes of the parameters."""
+        views = zip(self._parts, self._wide_views(vector), strict=True)
+        return [view[..., : part.shape[-1]] if part.ndim > 1 else view for part, view in views]
 
-    def gradients(self) -> Tensor:
-        """Returns the gradients as a new vector, zero where there is none."""
-        found = [torch.zeros_like(part) if part.grad is None else part.grad for part in self._parts]
-        return torch.cat(self._with_gaps(found))
+    def wide(self, dtype: torch.dtype) -> Iterator[tuple[nn.Parameter, Tensor]]:
+        """Yields each parameter with itself in another type, with rows as long as they lie in the vector."""
+        yield from zip(self._parts, self._wide_views(self.whole.to(dtype)), strict=True)
 
-    def states(self) -> Iterator[tuple[nn.Parameter, dict[str, Tensor]]]:
-        """Yields each parameter with what torch's Adam keeps of it, as views."""
-        views = zip(self._parts, self._views_of(self.first), self._views_of(self.second), strict=True)
-        for part, first, second in views:
-            yield part, {"step": self.steps, "exp_avg": first, "exp_avg_sq": second}
+    def gradient(self) -> Tensor:
+        """Returns the gradient, zero where there is none: that of the vector, and the parameters' own beside it."""
+        gradient = torch.zeros_like(self.whole) if self.whole.grad is None else self.whole.grad
+        own = [(part.grad, view) for part, view in zip(self._parts, self._views(gradient), strict=True)]
+        found = [(of_part, view) for of_part, view in own if of_part is not None]
+        torch._foreach_add_([view for _, view in found], [of_part for of_part, _ in found])
+        return gradient
 
+    def forget_gradients(self) -> None:
+        """Forgets them."""
+        for part in (self.whole, *self._parts):
+            part.grad = None
 
-def of_group(group: dict[str, Any]) -> list[Vectors]:
-    """Returns the vectors of a group's parameters, one for each of their types."""
-    types = dict.fromkeys(parameter.dtype for parameter in group["params"])
-    return [Vectors([parameter for parameter in group["params"] if parameter.dtype == kind]) for kind in types]
-
-
-def clipped_step(
-    vectors: Sequence[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]],
-    settings: Sequence[dict[str, Any]],
-    max_norm: float,
-) -> Tensor:
-    """Makes a step of Adam on gradients that are clipped to a norm, in place.
-
-    Args:
-        vectors: of each group the parameters, gradients, first and second moments, and the number of steps.
-        settings: of each the :data:`SETTINGS`.
-        max_norm: of all gradients together.
-
-    Returns:
-        The norm before, a scalar.
-    """
-    norm = torch.stack([gradient.norm() for _, gradient, *_ in vectors]).norm()
-    factor = (max_norm / (norm + 1e-6)).clamp(max=1.0)  # that of clip_grad_norm_
-    for (parameters, gradients, first, second, steps), own in zip(vectors, settings, strict=True):
-        numbers, (beta1, beta2) = {name: own[name] for name in SETTINGS if name != "betas"}, own["betas"]
-        kind: dict[str, Any] = {"foreach": False, "capturable": True, "amsgrad": False}
-        adam(
-            [parameters],
-            [gradients * factor],
-            [first],
-            [second],
-            [],
-            [steps],
-            **kind,
-            **numbers,
-            beta1=beta1,
-            beta2=beta2,
-        )
-    return norm
+    def states(self) -> Iterator[dict[str, Tensor]]:
+        """Yields what Adam keeps of each parameter, as views."""
+        for moments in zip(*map(self._views, self.moments), strict=True):
+            yield dict(zip(("step", "exp_avg", "exp_avg_sq"), (self.step, *moments), strict=True))

@@ -1,13 +1,13 @@
 """What all algorithms share: gradient steps over the minibatches of a batch, recorded as a graph on CUDA."""
 
 import contextlib
-import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
@@ -15,13 +15,13 @@ from torchrl_loco.policy import ObservationNorm, moments
 from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
-from torchrl_loco.training.adam import CompiledAdam
-from torchrl_loco.training.compiling import compiled
+from torchrl_loco.training.adam import FlatAdam
 from torchrl_loco.training.config import TrainingConfig
+from torchrl_loco.training.packed import Packed
 from torchrl_loco.training.spaces import Spaces
 
-WARMUP = 3
-"""Gradient steps before one is recorded: optimizers and cuBLAS allocate at their first."""
+WARMUP = 1
+"""Epochs before one is recorded: cuBLAS allocates at its first product, and torch.compile compiles."""
 
 
 class Algorithm(ABC):
@@ -50,14 +50,13 @@ class Algorithm(ABC):
     def __init__(self, config: TrainingConfig, spaces: Spaces, network: Network | None = None) -> None:
         self.config, self.spaces, self.network = config, spaces, network
         self.device = torch.device(config.device)
-        self.optimizers: dict[str, torch.optim.Adam] = {}
+        self.optimizers: dict[str, FlatAdam] = {}
         self.generator = torch.Generator(config.device).manual_seed(distributed.own_seed(config.seed))
-        self._indices = torch.zeros(config.minibatch_size, dtype=torch.long, device=config.device)
+        self._order = torch.zeros(0, dtype=torch.long, device=config.device)
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
-        self._data: TensorDictBase | None = None
+        self._data: Packed | None = None
         on_cuda = self.device.type == "cuda"
-        self._index = self.fused(operator.getitem)
-        self._step = TorchGraph(self._minibatch_step, self.device, warmup=WARMUP) if on_cuda else self._minibatch_step
+        self._epoch = TorchGraph(self._gradient_steps, self.device, warmup=WARMUP) if on_cuda else self._gradient_steps
 
     @abstractmethod
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
@@ -85,46 +84,19 @@ class Algorithm(ABC):
         """Returns what a user should know of ``metrics``, by name from one batch or several, or an empty string."""
         return ""
 
-    def fused(self, function: Callable[..., Any], bf16: bool = False) -> Callable[..., Any]:
-        """Returns a function of tensors as kernels of torch.compile on CUDA, if the settings ask for that.
-
-        Between the matrix products of small networks, torch spends most of a step reading and writing activations.
-
-        Args:
-            function: the function.
-            bf16: whether its matrix products are in bfloat16 on CUDA.
-        """
-
-        def in_bf16(*args: Any) -> Any:
-            with torch.autocast("cuda", torch.bfloat16):
-                return function(*args)
-
-        if self.device.type != "cuda":
-            return function
-        chosen = in_bf16 if bf16 else function
-        if not self.config.compile:
-            return chosen
-        # Rows whose length is no multiple of 8 are slow to multiply: those that a Go1's critic reads have 73 numbers.
-        what = getattr(function, "__name__", type(function).__name__)
-        return compiled(chosen, what, options={"force_shape_pad": True})
-
     def acting(self) -> nn.Module:
-        """Returns the actor as a policy for collectors, compiled on CUDA if the settings ask for that."""
-        return Acting(self.actor, self.fused(self.actor))
+        """Returns the actor as a policy for collectors."""
+        return self.actor
 
-    def make_optimizer(self, name: str, parameters: Iterable[Any]) -> torch.optim.Adam:
+    def make_optimizer(self, name: str, parameters: Iterable[Any]) -> FlatAdam:
         """Makes an optimizer of ``parameters`` or groups, whose learning rate recorded steps follow.
 
         Returns:
             The optimizer, which is kept as ``optimizers[name]``.
         """
-        settings: dict[str, Any] = {"lr": torch.tensor(self.config.lr, device=self.device), "eps": 1e-5}
-        on_cuda = self.device.type == "cuda"
-        if on_cuda and self.config.compile:
-            self.optimizers[name] = CompiledAdam(parameters, **settings)
-        else:
-            self.optimizers[name] = torch.optim.Adam(parameters, **settings, capturable=on_cuda, fused=True)
-        return self.optimizers[name]
+        lr = torch.tensor(self.config.lr, device=self.device)
+        self.optimizers[name] = optimizer = FlatAdam(parameters, lr=lr, eps=1e-5)
+        return optimizer
 
     def update(self, batch: TensorDictBase, progress: float) -> torch.Tensor:
         """Updates on one batch, without synchronising with the device.
@@ -143,21 +115,21 @@ class Algorithm(ABC):
             data = self.prepare(batch).reshape(-1)
             of_batch = self.batch_metrics(data)
             if self._data is None:
-                self._data = data.clone()
+                self._data = Packed(data)
+                # A remainder smaller than a minibatch is left out: it would weigh as much as a full one.
+                self._order = self._order.new_zeros(len(data) // config.minibatch_size * config.minibatch_size)
             else:
-                self._data.update_(data)
+                self._data.fill(data)
         self._totals.zero_()
-        # A remainder smaller than a minibatch is left out: it would weigh as much as a full one.
-        minibatches = len(data) // config.minibatch_size
         for _ in range(config.epochs):
             order = torch.randperm(len(data), generator=self.generator, device=self.device)
-            for indices in order[: minibatches * config.minibatch_size].split(config.minibatch_size):
-                self._indices.copy_(indices)
-                self._step()
+            self._order.copy_(order[: len(self._order)])
+            self._epoch()
         # After the update: the losses need the normalisation used while collecting.
         for key, norm in self.norms.items():
             norm.merge(*distributed.merged_moments(*moments(batch[key])))
-        return torch.cat([self._totals / (config.epochs * minibatches), of_batch])
+        steps = config.epochs * (len(self._order) // config.minibatch_size)
+        return torch.cat([self._totals / steps, of_batch])
 
     def schedule(self, progress: float) -> None:
         """Sets the learning rate for a batch after ``progress`` of the policy's training, in [0, 1]."""
@@ -166,21 +138,21 @@ class Algorithm(ABC):
             for group in optimizer.param_groups:
                 group["lr"].fill_(lr)
 
-    def _minibatch_step(self) -> None:
+    def _gradient_steps(self) -> None:
+        """Makes those of one epoch."""
         assert self._data is not None
-        minibatch = self._index(self._data, self._indices)
-        self._totals += torch.stack([metric.detach() for metric in self.gradient_step(minibatch)])
+        for minibatch in self._data[self._order].split(self.config.minibatch_size):
+            self._totals += torch.stack([metric.detach() for metric in self.gradient_step(minibatch)])
 
     def release(self) -> None:
-        """Forgets the recorded gradient step: NCCL's communicators wait at their end for graphs that contain them."""
-        if isinstance(self._step, TorchGraph):
-            self._step.release()
+        """Forgets the recorded gradient steps: NCCL's communicators wait at their end for graphs that contain them."""
+        if isinstance(self._epoch, TorchGraph):
+            self._epoch.release()
 
     def begin_anew(self) -> None:
         """Draws parameters as at the start of a run, in place, so that what was recorded stays valid."""
         self.restore(type(self)(self.config, self.spaces, self.network).state_dict())
 
-    @torch.no_grad()
     def restore(self, state: dict[str, Any]) -> None:
         """Goes back to the networks and moments of a copy of an earlier :meth:`state_dict`, in place as well.
 
@@ -188,10 +160,7 @@ class Algorithm(ABC):
         """
         self.networks.load_state_dict(state["networks"])
         for name, optimizer in self.optimizers.items():
-            kept = state["optimizers"][name]["state"]
-            for index, moments_of_one in optimizer.state_dict()["state"].items():
-                for key, value in moments_of_one.items():
-                    value.copy_(kept[index][key]) if index in kept else value.zero_()
+            optimizer.load_moments(state["optimizers"][name]["state"])
 
     def state_dict(self) -> dict[str, Any]:
         """Returns all that an exact continuation needs, as it is: not as a copy."""
@@ -210,42 +179,45 @@ class Algorithm(ABC):
         """
         self.networks.load_state_dict(state["networks"])
         for name, optimizer in self.optimizers.items():
-            own = [{kind: group[kind] for kind in ("capturable", "fused")} for group in optimizer.param_groups]
             optimizer.load_state_dict(state["optimizers"][name])
-            for group, of_device in zip(optimizer.param_groups, own, strict=True):
-                group.update(of_device)
         if draws:
             self.generator.set_state(state["generator"].cpu())
 
 
-class Acting(nn.Module):
-    """An actor that is called through another function of the same result: a compiled one.
+class Acting(TensorDictModuleBase):
+    """An actor that is called through a faster function.
 
     Args:
-        actor: the actor, whose parameters and keys this has.
+        actor: the actor, whose parameters this has.
         act: the function.
+        written: the entries that it writes; ``None`` are those of the actor.
     """
 
-    def __init__(self, actor: ProbabilisticActor, act: Callable[[TensorDictBase], TensorDictBase]) -> None:
+    def __init__(
+        self,
+        actor: ProbabilisticActor,
+        act: Callable[[TensorDictBase], TensorDictBase],
+        written: Sequence[str] | None = None,
+    ) -> None:
         super().__init__()
         self.actor, self._act = actor, act
-        self.in_keys, self.out_keys = actor.in_keys, actor.out_keys
+        self.in_keys, self.out_keys = actor.in_keys, actor.out_keys if written is None else list(written)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns ``tensordict`` with the actor's entries."""
         return self._act(tensordict)
 
 
-def clip_and_step(optimizer: torch.optim.Optimizer, max_norm: float) -> torch.Tensor:
+def clip_and_step(optimizer: FlatAdam | torch.optim.Optimizer, max_norm: float) -> torch.Tensor:
     """Averages the gradients of an optimizer's parameters over the ranks, clips them to a norm and makes its step.
 
     Returns:
         The norm before, a scalar.
     """
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    distributed.average_gradients(parameters)
-    if isinstance(optimizer, CompiledAdam):
+    if isinstance(optimizer, FlatAdam):
         return optimizer.clipped_step(max_norm)
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    distributed.average([parameter.grad for parameter in parameters if parameter.grad is not None])
     norm = nn.utils.clip_grad_norm_(parameters, max_norm)
     optimizer.step()
     return norm

@@ -141,9 +141,6 @@ class TrainingConfig:
     """Norm to which gradients are clipped."""
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers of actor and critic."""
-    compile: bool = False
-    """Whether torch.compile makes kernels of losses, optimizer and acting policy on CUDA. Gradient steps are up to
-    twice as fast then, after half a minute at the first start on a machine."""
     bf16: bool = False
     """Whether networks compute in bfloat16 on CUDA."""
 
@@ -414,5 +411,6 @@ def config_from_json(values: dict[str, Any]) -> TrainingConfig:
         LookupError: a field is missing.
     """
     algorithm = check_choice("algorithm", values.get("algorithm"), CONFIGS)
-    fields = {name: value for name, value in values.items() if name != "algorithm"}
+    retired = {"ppo": ("compile",)}.get(algorithm, ())  # settings of earlier revisions
+    fields = {name: value for name, value in values.items() if name not in ("algorithm", *retired)}
     return CONFIGS[algorithm](**fields)

@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-from torch import nn
 from torch.distributed.rendezvous import rendezvous
 
 TIMEOUT = datetime.timedelta(hours=2)
@@ -186,21 +185,18 @@ def handlers_restored() -> Iterator[None]:
 # What ranks tell each other. All ranks must make the same calls in the same order.
 
 
-def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Replaces gradients by their mean over the ranks, in one message; CUDA can record it.
+def average(tensors: Sequence[torch.Tensor]) -> None:
+    """Replaces tensors of any shapes ``(...)``, such as gradients, by their mean over the ranks, in one message.
 
-    Args:
-        parameters: parameters of any shape ``(...)``; those without a gradient must be the same on all ranks.
+    CUDA can record it.
     """
-    if ranks() == 1:
+    if ranks() == 1 or not tensors:
         return
-    with_gradient = [(parameter, parameter.grad) for parameter in parameters if parameter.grad is not None]
-    bucket = torch.cat([gradient.flatten() for _, gradient in with_gradient])
+    bucket = torch.cat([tensor.flatten() for tensor in tensors])
     _sum(bucket)
     bucket /= ranks()
-    parts = bucket.split([gradient.numel() for _, gradient in with_gradient])
-    for (parameter, gradient), part in zip(with_gradient, parts, strict=True):
-        parameter.grad = part.view_as(gradient)
+    for tensor, part in zip(tensors, bucket.split([tensor.numel() for tensor in tensors]), strict=True):
+        tensor.copy_(part.view_as(tensor))
 
 
 def merged_moments(
@@ -272,8 +268,10 @@ def copy_from_first(tensors: Iterable[torch.Tensor]) -> None:
     """Overwrites ``tensors``, each of any shape ``(...)``, with those of rank 0."""
     if ranks() > 1:
         for tensor in tensors:
+            whole = tensor.contiguous()  # rows of weights may have gaps, which are not sent
             with _peers():
-                dist.broadcast(tensor, src=0)
+                dist.broadcast(whole, src=0)
+            tensor.copy_(whole)
 
 
 def from_first(value: Any) -> Any:

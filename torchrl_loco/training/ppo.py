@@ -1,29 +1,37 @@
-"""Proximal policy optimization (Schulman et al., 2017), by TorchRL's ClipPPOLoss."""
+"""Proximal policy optimization (Schulman et al., 2017)."""
 
+import contextlib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale
 from torch import nn
-from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
-from torchrl.objectives import ClipPPOLoss
+from torch.func import functional_call
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 
-from torchrl_loco.policy import ObservationNorm
+from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, make_actor, network_of
-from torchrl_loco.training.algorithm import Algorithm, clip_and_step
+from torchrl_loco.training.adam import ALIGNED
+from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
 from torchrl_loco.training.config import PPOConfig
+from torchrl_loco.training.kernels import clipped_loss, drawn, normalised
 from torchrl_loco.training.spaces import Spaces
+from torchrl_loco.training.squashed_normal import log_slope
 
 LR_RANGE = (1e-5, 1e-2)
 """Of a learning rate that follows the divergence."""
 
 
 class PPO(Algorithm):
-    """Generalised advantage estimates, then epochs of minibatches over the clipped loss."""
+    """Generalised advantage estimates, then epochs of minibatches over the clipped loss.
+
+    Networks compute in bfloat16 on CUDA if the settings ask for that, with weights that are rounded as one vector.
+    """
 
     config_type = PPOConfig
     metric_names = ("loss_objective", "loss_critic", "entropy", "kl_approx", "clip_fraction", "grad_norm")
@@ -33,76 +41,101 @@ class PPO(Algorithm):
         super().__init__(config, spaces, network)
         self.actor, self.critic, self.norms = make_actor_critic(config, spaces, network)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic})
-        self.loss = ClipPPOLoss(
-            self.actor,
-            self.critic,
-            clip_epsilon=config.clip_epsilon,
-            entropy_bonus=spaces.bounded,
-            entropy_coeff=config.entropy_coeff,
-            critic_coeff=0.5,
-            loss_critic_type="smooth_l1",
-            normalize_advantage=True,
-            functional=False,  # else torch.compile would trace for seconds how parameters enter the modules
-        )
-        self.optimizer = self.make_optimizer("actor and critic", self.loss.parameters())
-        self._compiled_losses, self._compiled_estimates = self.fused(self._losses), self.fused(self._estimates)
-        self._compiled_lr = self.fused(self._following_lr)
+        parts: Any = self.actor[0].module, self.critic.module
+        (_, mean, self._scale), (_, value) = parts
+        self._mean, self._value = Rows(mean, spaces.observation), Rows(value, spaces.critic)
+        self._dtype = torch.bfloat16 if config.bf16 and self.device.type == "cuda" else torch.float32
+        parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        self.optimizer = self.make_optimizer("actor and critic", parameters)
+        self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
+        # By which a gradient step multiplies the learning rate, between these divergences.
+        self._kl_bounds = torch.tensor([0.0, 0.5 * config.target_kl, 2.0 * config.target_kl], device=self.device)
+        self._lr_factors = torch.tensor([1.0, 1.5, 1.0, 1 / 1.5], device=self.device)
+
+    def _normalised(self, td: TensorDictBase) -> dict[str, torch.Tensor]:
+        """Returns normalised observations, with zeros up to the length of the rows of weights."""
+        return {key: normalised(td[key], norm, self._dtype, ALIGNED) for key, norm in self.norms.items()}
+
+    def _std(self) -> torch.Tensor:
+        """Returns the standard deviations of actions, the same in all states, shape ``(nu,)``."""
+        return self._scale(torch.zeros(self.spaces.action, device=self.device))[1]
+
+    def acting(self) -> nn.Module:
+        """Returns the actor as a policy for collectors, with networks that compute as in gradient steps."""
+        written = ("action", "action_log_prob", *("before_tanh",) * self.spaces.bounded)
+        return Acting(self.actor, self.act, written)
+
+    @torch.no_grad()
+    def act(self, td: TensorDictBase) -> TensorDictBase:
+        """Returns ``td`` with actions and their log-probabilities; with what they were before tanh, if bounded."""
+        rows = normalised(td["observation"], self.norms["observation"], self._dtype, ALIGNED).flatten(0, -2)
+        explores = exploration_type() in (ExplorationType.RANDOM, None)
+        noise = (torch.randn if explores else torch.zeros)(len(rows), self.spaces.action, device=self.device)
+        mean = self._mean(rows, self.optimizer.wide(self._dtype))
+        values = drawn(mean, self._std(), noise, self.spaces.bounded)
+        names = "action", "action_log_prob", *("before_tanh",) * self.spaces.bounded
+        for name, value in zip(names, values, strict=True):
+            td[name] = value.unflatten(0, td.batch_size)
+        return td
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns what the loss reads, of shape ``(num_envs, num_steps)``, with advantages and value targets."""
         key, after = self.spaces.critic_key, batch["next"]
-        ends = after["done"], after["terminated"]
-        advantage, target = self._compiled_estimates(batch[key], after[key], after["reward"], *ends)
-        # In an order that every process repeats: torch.compile finds what it made of the entries in that order.
-        read = batch.select(*dict.fromkeys(("observation", key)), "action", "action_log_prob")
-        return read.update({"advantage": advantage, "value_target": target})
+        now, weights = self._normalised(batch), self.optimizer.wide(self._dtype)
+        value, later = (self._value(rows[key], weights).float() for rows in (now, self._normalised(after)))
+        advantage, target = self._estimates(value, later, after)
+        action, log_prob = batch["action"], batch["action_log_prob"]
+        if self.spaces.bounded:  # densities before tanh, whose slope cancels in a ratio
+            action = batch["before_tanh"]
+            log_prob = log_prob + log_slope(action).sum(-1)
+        read = {"action": action, "log_prob": log_prob, "advantage": advantage, "value_target": target}
+        return TensorDict({**now, **read}, batch.batch_size)
 
     def _estimates(
-        self,
-        observation: torch.Tensor,
-        later: torch.Tensor,
-        reward: torch.Tensor,
-        done: torch.Tensor,
-        terminated: torch.Tensor,
+        self, value: torch.Tensor, later: torch.Tensor, after: TensorDictBase
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns generalised advantage estimates and the critic's targets, of shape ``(num_envs, num_steps, 1)``.
 
         At a time limit the value of the true terminal observation is bootstrapped; termination ends the return.
         """
-        config, value = self.config, self.critic.module(observation)
-        next_value = self.critic.module(later) * ~terminated
-        errors = config.reward_scale * reward + config.gamma * next_value - value
-        decay = config.gamma * config.lmbda * ~done
+        config = self.config
+        errors = config.reward_scale * after["reward"] + config.gamma * later * ~after["terminated"] - value
+        decay = config.gamma * config.lmbda * ~after["done"]
         advantage, advantages = torch.zeros_like(errors[:, 0]), []
         for error, factor in zip(reversed(errors.unbind(1)), reversed(decay.unbind(1)), strict=True):
-            advantage = error + factor * advantage
+            advantage = torch.addcmul(error, factor, advantage)
             advantages.append(advantage)
         whole = torch.stack(advantages[::-1], dim=1)
         return whole, whole + value
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
         """Returns the metrics, a scalar each, of a step down the clipped loss, the critic's and the entropy's."""
-        loss, metrics = self._compiled_losses(minibatch)
+        config, weights = self.config, self.optimizer.wide(self._dtype)
+        with self._beside():  # as are the slopes of what is computed there
+            value = self._value(minibatch[self.spaces.critic_key], weights)
+        outputs = self._mean(minibatch["observation"], weights), self._std(), value
+        self._join()
+        bounds = config.clip_epsilon, config.entropy_coeff, self.spaces.bounded
+        *slopes, metrics = clipped_loss(*outputs, minibatch, *bounds)
         self.optimizer.zero_grad()
-        loss.backward()
-        if self.config.target_kl:
+        torch.autograd.backward(outputs, slopes)
+        if config.target_kl:
             self._follow(metrics[self.metric_names.index("kl_approx")])
-        return [*metrics, clip_and_step(self.optimizer, self.config.max_grad_norm)]
+        return [*metrics, clip_and_step(self.optimizer, config.max_grad_norm)]
 
-    def _losses(self, minibatch: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the loss, a scalar, and the metrics but for the norm of its gradient, ``(len(metric_names) - 1,)``.
+    @contextlib.contextmanager
+    def _beside(self) -> Iterator[None]:
+        """Lets CUDA work on another stream, until :meth:`_join`: small networks leave most of it idle."""
+        if self._stream is None:
+            yield
+        else:
+            self._stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(self._stream):
+                yield
 
-        torch.compile leaves out what else TorchRL's loss finds. That samples the entropy where it is compiled, and else
-        waits for the device; neither is needed where actions are unbounded: deviations are the same in all states.
-        """
-        losses = self.loss(minibatch)
-        if not self.spaces.bounded:
-            scale: Any = self.actor[0].module[-1]
-            deviations = scale(torch.zeros_like(minibatch["action"][0]))
-            entropy = IndependentNormal(*deviations, validate_args=False).entropy()
-            losses.update({"entropy": entropy.detach(), "loss_entropy": -self.config.entropy_coeff * entropy})
-        loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
-        return loss, torch.stack([losses[name].detach() for name in self.metric_names[:-1]])
+    def _join(self) -> None:
+        if self._stream is not None:
+            torch.cuda.current_stream().wait_stream(self._stream)
 
     def schedule(self, progress: float) -> None:
         """Sets the learning rate, unless it follows the divergence."""
@@ -114,23 +147,58 @@ class PPO(Algorithm):
 
         A divergence that is not positive, as that of the first step of a batch, says nothing.
         """
-        kl = distributed.mean_of_ranks(kl)
+        factor = self._lr_factors.take(torch.bucketize(distributed.mean_of_ranks(kl), self._kl_bounds))
         for group in self.optimizer.param_groups:
-            group["lr"].copy_(self._compiled_lr(kl, group["lr"]))
-
-    def _following_lr(self, kl: torch.Tensor, lr: torch.Tensor) -> torch.Tensor:
-        target = self.config.target_kl
-        raised = torch.where((kl > 0.0) & (kl < 0.5 * target), 1.5 * lr, lr)
-        return torch.where(kl > 2.0 * target, lr / 1.5, raised).clamp(*LR_RANGE)
+            group["lr"].mul_(factor).clamp_(*LR_RANGE)
 
 
-class InBFloat16(nn.Sequential):
-    """A network whose matrix products are in bfloat16 on CUDA; its results are float32."""
+class Affine(torch.autograd.Function):
+    """A linear layer whose bias gets its gradient from a product of matrices: torch's sums take three times as long."""
 
-    def forward(self, input: torch.Tensor) -> torch.Tensor:
-        """Returns what the network gives, float32."""
-        with torch.autocast("cuda", torch.bfloat16, enabled=input.is_cuda):
-            return super().forward(input).float()
+    @staticmethod
+    def forward(ctx: Any, rows: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
+        """Returns what the layer gives, shape ``(..., outputs)``."""
+        ctx.save_for_backward(rows, weight)
+        return nn.functional.linear(rows, weight, bias)
+
+    @staticmethod
+    def backward(ctx: Any, slope: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        """Returns the slopes by rows, weight and bias."""
+        (rows, weight), (by_rows, _, by_bias) = ctx.saved_tensors, ctx.needs_input_grad
+        of_bias = (slope.new_ones(1, len(slope)) @ slope)[0] if by_bias else None
+        return slope @ weight if by_rows else None, slope.mT @ rows, of_bias
+
+
+class Rows:
+    """A network as a function of rows that are longer than it reads, by zeros, with other weights than its own.
+
+    Args:
+        network: layers one after the other.
+        inputs: how many numbers of a row it reads.
+    """
+
+    def __init__(self, network: nn.Module, inputs: int) -> None:
+        self._layers, self._inputs = layers_of(network), inputs
+
+    def __call__(self, rows: torch.Tensor, weights: Mapping[nn.Parameter, torch.Tensor]) -> torch.Tensor:
+        """Returns what it gives for ``rows``, shape ``(..., outputs)``.
+
+        Args:
+            rows: of at least as many numbers as it reads.
+            weights: what takes the place of each parameter; of matrices, rows may be longer as well.
+        """
+        for index, layer in enumerate(self._layers):
+            reads_long = index == 0 and isinstance(layer, nn.Linear)
+            if index == 0 and not reads_long:
+                rows = rows[..., : self._inputs]
+            own = {name: weights[part] for name, part in layer.named_parameters()}
+            if isinstance(layer, nn.Linear):
+                weight, size = own["weight"], layer.in_features
+                fits = reads_long or weight.shape[-1] == size
+                rows = Affine.apply(rows, weight if fits else weight[:, :size], own.get("bias"))
+            else:
+                rows = functional_call(layer, own, (rows,))
+        return rows
 
 
 def make_actor_critic(
@@ -155,10 +223,9 @@ def make_actor_critic(
     if network is None:
         nn.init.orthogonal_(mean[-1].weight, gain=0.01)  # the first actions are near zero, whatever is observed
     scale = AddStateIndependentNormalScale(spaces.action, init_value=math.log(config.init_std))
-    mean, value = (InBFloat16(part) if config.bf16 else part for part in (mean, make(spaces.critic, 1)))
     whole = nn.Sequential(norms["observation"], mean, scale)
     actor = make_actor(spaces, config.device, whole, log_prob=True)
     if spaces.privileged is not None:
         norms["privileged"] = ObservationNorm(spaces.privileged)
-    critic = ValueOperator(nn.Sequential(norms[spaces.critic_key], value), in_keys=[spaces.critic_key])
+    critic = ValueOperator(nn.Sequential(norms[spaces.critic_key], make(spaces.critic, 1)), in_keys=[spaces.critic_key])
     return actor, critic.to(config.device), norms

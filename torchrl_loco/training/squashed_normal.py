@@ -17,9 +17,13 @@ def sample(loc: torch.Tensor, scale: torch.Tensor, noise: torch.Tensor) -> tuple
         noise: standard normal numbers, of the same shape.
     """
     u = loc + scale * noise
-    log_slope = 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))  # log(1 - tanh(u)^2), exact for large u too
-    log_prob = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2.0 * math.pi) - log_slope
+    log_prob = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2.0 * math.pi) - log_slope(u)
     return u.tanh(), log_prob.sum(-1)
+
+
+def log_slope(u: torch.Tensor) -> torch.Tensor:
+    """Returns log(1 - tanh(u)^2), exact for large u too, of any shape ``(...)``."""
+    return 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))
 
 
 def kl(old_loc: torch.Tensor, old_scale: torch.Tensor, loc: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:

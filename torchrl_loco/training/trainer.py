@@ -103,7 +103,7 @@ class Trainer:
                 f"{part} ({frames}) must be at least {self.frames_per_iteration}: one batch of "
                 f"{config.control_steps_per_batch} on each of {distributed.ranks()} ranks"
             )
-        if config.compile and torch.device(config.device).type == "cuda":
+        if getattr(config, "compile", False) and torch.device(config.device).type == "cuda":
             compiling.start()  # while the environment's kernels are compiled
         torch.manual_seed(config.seed)
         first, rank = distributed.is_first(), distributed.rank()

@@ -144,7 +144,6 @@ class Velocity(LocoEnv):
             "hidden": (512, 256, 128),
             "entropy_coeff": 0.01,
             "eval_interval": 20_000_000,
-            "compile": True,
             "bf16": True,
         },
         "reppo": {
