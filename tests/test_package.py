@@ -108,9 +108,13 @@ training.train("walker_stand", device="cpu", out=sys.argv[1], algorithm="ppo", e
 assert "torch._dynamo" not in sys.modules
 import torch, tensordict.base
 from torchrl.modules.distributions import utils
+before = torch.compiler.allow_in_graph, torch.compiler.disable
 assert torch.compiler.disable(lambda x: x + 1.0)(torch.ones(())) == 2.0
 assert torch.compiler.disable.__module__ == torch.compiler.allow_in_graph.__module__ == "torch.compiler"
 from torch._dynamo import trace_rules
+later = lambda x: x
+assert before[0](later) is later and id(later) in trace_rules._allowed_callable_ids
+assert before[1](fn=abs)(-2) == 2
 assert id(tensordict.base._foreach_copy_) in trace_rules._allowed_callable_ids
 assert any(getattr(value, "_dynamo_marked_constant", False) for value in vars(utils).values())
 doubled = torch.compile(lambda x: 2 * x, backend="eager")

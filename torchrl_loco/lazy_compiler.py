@@ -1,6 +1,9 @@
 """torch's compiler, imported when somebody compiles: tensordict asks for it at its import, which takes two seconds.
 
 tensordict and TorchRL only mark functions for it. The marks are noted, and made as soon as the compiler is imported.
+
+torch's own import of it is not safe in two threads at once: a program whose threads compile, or make optimizers of
+torch, imports ``torch._dynamo`` before it starts them.
 """
 
 import functools
@@ -9,7 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
 COMPILER = "torch._dynamo"
@@ -19,6 +22,7 @@ MARKS = "allow_in_graph", "assume_constant_result"
 _marked: list[tuple[str, Callable[..., Any]]] = []
 _own: dict[str, Callable[..., Any]] = {}
 """Functions of ``torch.compiler`` that ours stand for."""
+_is_imported = False
 
 
 def put_off() -> None:
@@ -40,11 +44,13 @@ class _Finder(MetaPathFinder):
         execute = loader.exec_module
 
         def exec_module(module: ModuleType) -> None:
+            global _is_imported
             vars(sys.modules["torch.compiler"]).update(_own)
             execute(module)
-            for mark, function in _marked:
+            _is_imported = True
+            while _marked:
+                mark, function = _marked.pop()
                 getattr(module, mark)(function)
-            _marked.clear()
 
         loader.exec_module = exec_module
         return spec
@@ -53,22 +59,36 @@ class _Finder(MetaPathFinder):
 def _stand_in() -> None:
     """Replaces what torch offers for marking, until the compiler is imported."""
     torch: Any = importlib.import_module("torch")
-    ours: dict[str, Callable[..., Any]] = {mark: functools.partial(_mark, mark) for mark in MARKS}
-
-    def disable(function: Any = None, recursive: bool = True, **_: Any) -> Any:  # as torch's own functions are
-        if function is None:
-            return functools.partial(torch._disable_dynamo, recursive=recursive)
-        return torch._disable_dynamo(function, recursive)
-
-    ours["disable"] = disable
+    ours = {"allow_in_graph": allow_in_graph, "assume_constant_result": assume_constant_result, "disable": disable}
     _own.update({name: getattr(torch.compiler, name) for name in ours})
     vars(torch.compiler).update(ours)
     torch._dynamo = _Stub(COMPILER)  # which the import of the compiler replaces
 
 
 def _mark(mark: str, function: Any) -> Any:
+    if _is_imported or not callable(function):  # several, or an error
+        return _own[mark](function)
     _marked.append((mark, function))
     return function
+
+
+def allow_in_graph(fn: Any) -> Any:
+    """Returns what ``torch.compiler.allow_in_graph`` does, which has its effect later."""
+    return _mark("allow_in_graph", fn)
+
+
+def assume_constant_result(fn: Any) -> Any:
+    """Returns what ``torch.compiler.assume_constant_result`` does, which has its effect later."""
+    return _mark("assume_constant_result", fn)
+
+
+def disable(fn: Any = None, recursive: bool = True, *, reason: str | None = None) -> Any:
+    """Returns what ``torch.compiler.disable`` does; a plain function imports the compiler when it is called."""
+    if fn is None:
+        return functools.partial(disable, recursive=recursive, reason=reason)
+    if _is_imported or not isinstance(fn, FunctionType):
+        return _own["disable"](fn, recursive, reason=reason)
+    return sys.modules["torch"]._disable_dynamo(fn, recursive)
 
 
 class _Stub(ModuleType):
@@ -76,5 +96,5 @@ class _Stub(ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         if name in MARKS:
-            return functools.partial(_mark, name)
+            return globals()[name]
         return getattr(importlib.import_module(COMPILER), name)

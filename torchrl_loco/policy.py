@@ -43,12 +43,20 @@ class ObservationNorm(nn.Module):
         Raises:
             ValueError: they have another size.
         """
+        self.check(observation)
+        return ((observation - self.mean) * torch.rsqrt(self.var + 1e-6)).clamp(-self.limit, self.limit)
+
+    def check(self, observation: torch.Tensor) -> None:
+        """Checks the size of observations of shape ``(..., size)``.
+
+        Raises:
+            ValueError: it is another one.
+        """
         if observation.shape[-1] != len(self.mean):
             raise ValueError(
                 f"this policy takes observations of size {len(self.mean)}, got size {observation.shape[-1]}: was it "
                 "trained for another body?"
             )
-        return ((observation - self.mean) * torch.rsqrt(self.var + 1e-6)).clamp(-self.limit, self.limit)
 
     def update(self, observation: torch.Tensor) -> None:
         """Updates mean and variance with observations of shape ``(..., size)``."""

@@ -1,12 +1,15 @@
 """Advantages and normalisation against values computed by hand, and what an update does."""
 
+import copy
 import dataclasses
 import functools
+import math
 
 import pytest
 import torch
 from small_runs import WALKER, collected
 from tensordict import TensorDict
+from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 
@@ -309,6 +312,95 @@ def test_gradients_are_clipped_to_a_norm():
         parameter.grad = torch.full((4,), length / 2)
         torch.testing.assert_close(clip_and_step(optimizer, 1.5), torch.tensor(length))
         torch.testing.assert_close(parameter.norm(), torch.tensor(step), rtol=1e-4, atol=0)
+
+
+def one_update(ppo, **changes):
+    """Returns by how much each parameter of the networks moves."""
+    before = {name: parameter.detach().clone() for name, parameter in ppo.networks.named_parameters()}
+    batch = collected(ppo, 8)
+    batch["next"].update(changes)
+    ppo.update(batch, progress=0.0)
+    return {name: (p.detach() - before[name]).abs().max() for name, p in ppo.networks.named_parameters()}
+
+
+EIGHT = {"num_envs": 8, "num_steps": 8, "minibatch_size": 64}
+
+
+def test_what_is_frozen_stays():
+    """As the first layers of a network that was trained before."""
+
+    def network(inputs, outputs):
+        layers = nn.Sequential(nn.Linear(inputs, 12), nn.ELU(inplace=True), nn.Linear(12, outputs))
+        layers[0].requires_grad_(False)
+        return layers
+
+    torch.manual_seed(0)
+    config = preset("walker_stand", "cpu", "ppo", total_frames=10_000, **EIGHT)
+    moved = one_update(PPO(config, WALKER, network))
+    for name, by in moved.items():
+        assert (by == 0.0) == (".0.weight" in name or ".0.bias" in name), name
+
+
+def test_parameters_that_were_moved_still_learn():
+    ppo = made(**EIGHT)
+    ppo.actor.double().float()
+    assert all(by > 0.0 for by in one_update(ppo).values())
+    assert all(by > 0.0 for by in one_update(copy.deepcopy(ppo)).values())
+    shared = nn.Sequential(nn.Linear(24, 6))
+    again = PPO(ppo.config, WALKER, lambda inputs, outputs: shared if outputs == 6 else nn.Linear(inputs, outputs))
+    again.begin_anew()
+    assert all(by > 0.0 for by in one_update(again).values())
+
+
+class Skipping(nn.Sequential):
+    def forward(self, x):
+        return super().forward(x) + x[..., :1]
+
+
+def test_a_critic_may_be_any_module():
+    """Also a Sequential that does more than its layers."""
+    torch.manual_seed(0)
+    config = preset("walker_stand", "cpu", "ppo", total_frames=10_000, **EIGHT)
+
+    def network(inputs, outputs):
+        return nn.Linear(inputs, outputs) if outputs == 6 else Skipping(nn.Linear(inputs, 9), nn.Linear(9, 1))
+
+    ppo = PPO(config, WALKER, network)
+    seen = torch.randn(20, 24)
+    value = ppo._value(
+        ppo._normalised(TensorDict({"observation": seen}, [20]))["observation"], ppo.optimizer.wide(torch.float32)
+    )
+    torch.testing.assert_close(value, ppo.critic.module(seen))
+    assert all(by > 0.0 for by in one_update(ppo).values())
+
+
+def test_what_is_not_a_number_is_seen():
+    """In parameters too, not only in the loss; and it leaves the learning rate alone."""
+    ppo = made(**EIGHT, target_kl=0.01)
+    lr = ppo.optimizer.param_groups[0]["lr"].item()
+    moved = one_update(ppo, reward=torch.full((8, 8, 1), math.nan))
+    assert all(by.isnan() for by in moved.values())
+    assert ppo.optimizer.param_groups[0]["lr"].item() == pytest.approx(lr)
+
+
+def test_settings_and_sizes_that_do_not_fit():
+    with pytest.raises(ValueError, match="no setting 'weight_decay': choose of lr, eps, betas"):
+        made().make_optimizer("other", [{"params": [torch.nn.Parameter(torch.ones(2))], "weight_decay": 0.1}])
+    with pytest.raises(TypeError, match=r"torch.float32, not torch.float64"):
+        made().make_optimizer("other", [torch.nn.Parameter(torch.ones(2).double())])
+    with pytest.raises(ValueError, match="observations of size 24, got size 23"):
+        made().acting()(TensorDict({"observation": torch.zeros(3, 23)}, [3]))
+    assert made().acting()(TensorDict({"observation": torch.zeros(24)}, []))["action"].shape == (6,)
+
+
+def test_networks_of_earlier_runs_in_bfloat16_are_read():
+    """Those were one level deeper."""
+    ppo = made(**EIGHT)
+    state = {name.replace("module.1.", "module.1.0."): value + 1.0 for name, value in ppo.networks.state_dict().items()}
+    assert state.keys() != ppo.networks.state_dict().keys()
+    ppo.load_networks(state)
+    for name, value in ppo.networks.state_dict().items():
+        torch.testing.assert_close(value, state[name.replace("module.1.", "module.1.0.")])
 
 
 @pytest.mark.gpu

@@ -15,7 +15,7 @@ def fixed_order() -> Iterator[None]:
     Running sums, which have none on CUDA, are :func:`running_sum` there.
     """
     before = torch.get_deterministic_debug_mode()
-    torch.set_deterministic_debug_mode("error")  # use_deterministic_algorithms would import torch's compiler, for seconds
+    torch.set_deterministic_debug_mode("error")  # use_deterministic_algorithms imports torch's compiler, for seconds
     try:
         with _RunningSums():
             yield

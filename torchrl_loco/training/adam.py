@@ -27,6 +27,10 @@ class FlatAdam:
         eps: what is added to the root of the second moment.
         betas: decay of the moments.
 
+    Raises:
+        ValueError: a group has another setting.
+        TypeError: parameters are not in single precision.
+
     Attributes:
         param_groups: the groups, each a dict of ``params`` and its settings.
     """
@@ -35,17 +39,27 @@ class FlatAdam:
         self, parameters: Iterable[Any], lr: Tensor, eps: float = 1e-8, betas: tuple[float, float] = (0.9, 0.999)
     ) -> None:
         given = list(parameters)
+        for group in given:
+            if isinstance(group, dict) and (unknown := group.keys() - {"params", "lr", "eps", "betas"}):
+                raise ValueError(f"a group of parameters has no setting {min(unknown)!r}: choose of lr, eps, betas")
         groups = given if given and isinstance(given[0], dict) else [{"params": given}]
         settings: dict[str, Any] = {"lr": lr, "eps": eps, "betas": betas}
         self.param_groups = [{**settings, **group, "params": list(group["params"])} for group in groups]
-        self._vectors = [Vectors(group["params"]) for group in self.param_groups]
+        self._vectors = [Vectors(group["params"], group["betas"]) for group in self.param_groups]
 
     def wide(self, dtype: torch.dtype) -> dict[nn.Parameter, Tensor]:
         """Returns all parameters in another type, each row with zeros up to a multiple of :data:`ALIGNED`.
 
-        Gradients flow from them into the vectors at once, instead of parameter by parameter.
+        Gradients flow from them into the vectors at once, instead of parameter by parameter; none into those that do
+        not require them.
         """
+        self.adopt()
         return {part: view for vectors in self._vectors for part, view in vectors.wide(dtype)}
+
+    def adopt(self) -> None:
+        """Takes parameters back that were moved out of the vectors, as by ``module.to`` or a second optimizer."""
+        for vectors in self._vectors:
+            vectors.adopt()
 
     def zero_grad(self) -> None:
         """Forgets the gradients."""
@@ -64,10 +78,10 @@ class FlatAdam:
         norms = [gradient.norm() for gradient in gradients]
         norm = norms[0] if len(norms) == 1 else torch.stack(norms).norm()
         for group, vectors, gradient in zip(self.param_groups, self._vectors, gradients, strict=True):
-            vectors.step += 1
-            scalars = [number.view(1) for number in (norm, group["lr"], vectors.step)]
+            vectors.count()
+            tensors = gradient, norm.view(1), group["lr"].view(1), vectors.counts
             settings = [max_norm, *group["betas"], group["eps"]]
-            launch(step_of_adam, len(gradient), [gradient, *scalars, *settings], [vectors.whole, *vectors.moments])
+            launch(step_of_adam, len(gradient), [*tensors, *settings], [vectors.whole, *vectors.moments])
         return norm
 
     def state_dict(self) -> dict[str, Any]:
@@ -82,15 +96,17 @@ class FlatAdam:
         """Copies moments and steps, by the number of the parameter; those that ``states`` lacks begin at zero."""
         for number, state in self.state_dict()["state"].items():
             loaded = states.get(number, {})
-            for name, value in state.items():
-                value.copy_(loaded[name]) if name in loaded else value.zero_()
+            for name in ("exp_avg", "exp_avg_sq"):
+                state[name].copy_(loaded[name]) if name in loaded else state[name].zero_()
+        step = max((float(loaded["step"]) for loaded in states.values() if "step" in loaded), default=0.0)
+        for vectors in self._vectors:
+            vectors.restart(step)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continues from a state, which is copied."""
         self.load_moments(state_dict["state"])
         for group, loaded in zip(self.param_groups, state_dict["param_groups"], strict=True):
             group["lr"].copy_(torch.as_tensor(loaded["lr"]))
-            group.update({name: loaded[name] for name in ("betas", "eps")})
 
 
 class Vectors:
@@ -98,12 +114,13 @@ class Vectors:
 
     Args:
         parameters: the parameters, which become views.
+        betas: decay of the moments.
 
     Raises:
         TypeError: they are of another type than single precision.
     """
 
-    def __init__(self, parameters: Sequence[nn.Parameter]) -> None:
+    def __init__(self, parameters: Sequence[nn.Parameter], betas: tuple[float, float]) -> None:
         if others := {str(part.dtype) for part in parameters} - {"torch.float32"}:
             raise TypeError(f"the parameters of networks must be torch.float32, not {', '.join(sorted(others))}")
         self._parts = parameters
@@ -117,10 +134,33 @@ class Vectors:
         self._sizes = [size for pair in sizes for size in pair]
         self.whole = nn.Parameter(parameters[0].new_zeros(sum(self._sizes)))
         self.moments = torch.zeros_like(self.whole.detach()), torch.zeros_like(self.whole.detach())
-        self.step = torch.zeros((), device=self.whole.device)
-        with torch.no_grad():
-            for part, view in zip(parameters, self._views(self.whole), strict=True):
-                part.data = view.copy_(part)
+        # The steps, and the betas to their power; what each is multiplied with at a step, and what is added.
+        doubles: dict[str, Any] = {"dtype": torch.float64, "device": self.whole.device}
+        self.counts = torch.tensor([0.0, 1.0, 1.0], **doubles)
+        self._factors, self._summands = (torch.tensor(x, **doubles) for x in ([1.0, *betas], [1.0, 0.0, 0.0]))
+        self.adopt()
+
+    @torch.no_grad()
+    def adopt(self) -> None:
+        """Makes parameters views, with the values that they have, where they are not.
+
+        Raises:
+            RuntimeError: that would be recorded as part of a step.
+        """
+        views = zip(self._parts, self._views(self.whole), strict=True)
+        moved = [(part, view) for part, view in views if part.data_ptr() != view.data_ptr()]
+        if moved and self.whole.is_cuda and torch.cuda.is_current_stream_capturing():
+            raise RuntimeError("parameters were moved while a step is recorded: move them before the training")
+        for part, view in moved:
+            part.data = view.copy_(part)
+
+    def count(self) -> None:
+        """Counts a step."""
+        torch.addcmul(self._summands, self.counts, self._factors, out=self.counts)
+
+    def restart(self, step: float) -> None:
+        """Goes on after so many steps."""
+        self.counts.copy_(torch.cat([self.counts.new_tensor([step]), self._factors[1:] ** step]))
 
     def _wide_views(self, vector: Tensor) -> list[Tensor]:
         """Returns the parts of a vector in the shapes of the parameters, but for the rows of matrices with gaps."""
@@ -137,7 +177,8 @@ class Vectors:
 
     def wide(self, dtype: torch.dtype) -> Iterator[tuple[nn.Parameter, Tensor]]:
         """Yields each parameter with itself in another type, with rows as long as they lie in the vector."""
-        yield from zip(self._parts, self._wide_views(self.whole.to(dtype)), strict=True)
+        for part, view in zip(self._parts, self._wide_views(self.whole.to(dtype)), strict=True):
+            yield part, view if part.requires_grad else view.detach()
 
     def gradient(self) -> Tensor:
         """Returns the gradient, zero where there is none: that of the vector, and the parameters' own beside it."""
@@ -155,4 +196,4 @@ class Vectors:
     def states(self) -> Iterator[dict[str, Tensor]]:
         """Yields what Adam keeps of each parameter, as views."""
         for moments in zip(*map(self._views, self.moments), strict=True):
-            yield dict(zip(("step", "exp_avg", "exp_avg_sq"), (self.step, *moments), strict=True))
+            yield dict(zip(("step", "exp_avg", "exp_avg_sq"), (self.counts[0], *moments), strict=True))

@@ -1,6 +1,7 @@
 """What all algorithms share: gradient steps over the minibatches of a batch, recorded as a graph on CUDA."""
 
 import contextlib
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
@@ -50,7 +51,7 @@ class Algorithm(ABC):
     def __init__(self, config: TrainingConfig, spaces: Spaces, network: Network | None = None) -> None:
         self.config, self.spaces, self.network = config, spaces, network
         self.device = torch.device(config.device)
-        self.optimizers: dict[str, FlatAdam] = {}
+        self.optimizers: dict[str, FlatAdam | torch.optim.Optimizer] = {}
         self.generator = torch.Generator(config.device).manual_seed(distributed.own_seed(config.seed))
         self._order = torch.zeros(0, dtype=torch.long, device=config.device)
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
@@ -110,6 +111,9 @@ class Algorithm(ABC):
             len(batch_metric_names),)``.
         """
         config = self.config
+        for optimizer in self.optimizers.values():
+            if isinstance(optimizer, FlatAdam):
+                optimizer.adopt()
         self.schedule(progress)
         with torch.no_grad():
             data = self.prepare(batch).reshape(-1)
@@ -153,14 +157,31 @@ class Algorithm(ABC):
         """Draws parameters as at the start of a run, in place, so that what was recorded stays valid."""
         self.restore(type(self)(self.config, self.spaces, self.network).state_dict())
 
+    @torch.no_grad()
     def restore(self, state: dict[str, Any]) -> None:
         """Goes back to the networks and moments of a copy of an earlier :meth:`state_dict`, in place as well.
 
         The generator and the learning rate go on.
         """
-        self.networks.load_state_dict(state["networks"])
+        self.load_networks(state["networks"])
         for name, optimizer in self.optimizers.items():
-            optimizer.load_moments(state["optimizers"][name]["state"])
+            kept = state["optimizers"][name]["state"]
+            if isinstance(optimizer, FlatAdam):
+                optimizer.load_moments(kept)
+                continue
+            for index, of_one in optimizer.state_dict()["state"].items():  # one of torch's, of a user's algorithm
+                for key, value in of_one.items():
+                    value.copy_(kept[index][key]) if index in kept else value.zero_()
+
+    def load_networks(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Copies the parameters of networks, also of runs whose networks in bfloat16 were one level deeper.
+
+        Raises:
+            RuntimeError: they are of other networks.
+        """
+        if state.keys() != self.networks.state_dict().keys():
+            state = {re.sub(r"(module\.1)\.0\.(?=\d+\.)", r"\1.", name): value for name, value in state.items()}
+        self.networks.load_state_dict(state)
 
     def state_dict(self) -> dict[str, Any]:
         """Returns all that an exact continuation needs, as it is: not as a copy."""
@@ -177,7 +198,7 @@ class Algorithm(ABC):
             state: the state.
             draws: whether minibatches are drawn as they would have been: a generator is of one kind of device.
         """
-        self.networks.load_state_dict(state["networks"])
+        self.load_networks(state["networks"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
         if draws:

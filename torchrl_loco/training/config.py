@@ -318,8 +318,8 @@ class REPPOConfig(TrainingConfig):
     of_others: ClassVar[Settings] = {**TrainingConfig.of_others, "num_bins": 301}
 
     compile: bool = True
-    """Whether torch.compile makes kernels of losses, optimizer and acting policy on CUDA; the first start on a machine
-    takes half a minute longer then."""
+    """Whether torch.compile makes kernels of losses and acting policy on CUDA; the first start on a machine takes 20 s
+    longer then."""
     kl_bound: float = 0.1
     """Bound of the KL divergence from the policy that collected the batch, in one state (nats)."""
     init_kl_weight: float = 0.01
@@ -411,6 +411,7 @@ def config_from_json(values: dict[str, Any]) -> TrainingConfig:
         LookupError: a field is missing.
     """
     algorithm = check_choice("algorithm", values.get("algorithm"), CONFIGS)
-    retired = {"ppo": ("compile",)}.get(algorithm, ())  # settings of earlier revisions
+    own = {field.name for field in dataclasses.fields(CONFIGS[algorithm])}
+    retired = {"compile"} - own  # a setting of earlier revisions
     fields = {name: value for name, value in values.items() if name not in ("algorithm", *retired)}
     return CONFIGS[algorithm](**fields)

@@ -39,27 +39,34 @@ def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: Sequence[Any],
         wp.launch(kernel, dim, *arrays, device=device)
 
 
-@wp.kernel(enable_backward=False)
-def normalise(
-    rows: wp.array2d[float],
-    mean: wp.array[float],
-    var: wp.array[float],
-    limit: float,
-    out: wp.array2d[Any],
-):
-    row, column = wp.tid()
-    value = float(0.0)
-    if column < rows.shape[1]:
-        value = wp.clamp((rows[row, column] - mean[column]) / wp.sqrt(var[column] + 1.0e-6), -limit, limit)
-    out[row, column] = out.dtype(value)
+# A kernel is of one type of numbers, in a module of its own: one that is added to a module unloads what graphs replay.
+@functools.cache
+def normalise_of(dtype: torch.dtype) -> wp.Kernel:
+    """Returns the kernel that writes normalised rows."""
+    Rows: Any = wp.array2d(dtype=wp.dtype_from_torch(dtype))  # noqa: N806
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def normalise(rows: wp.array2d[float], mean: wp.array[float], var: wp.array[float], limit: float, out: Rows):
+        row, column = wp.tid()
+        value = float(0.0)
+        if column < rows.shape[1]:
+            value = wp.clamp((rows[row, column] - mean[column]) / wp.sqrt(var[column] + 1.0e-6), -limit, limit)
+        out[row, column] = out.dtype(value)
+
+    return normalise
 
 
 @torch.no_grad()
 def normalised(rows: torch.Tensor, norm: ObservationNorm, dtype: torch.dtype, aligned: int) -> torch.Tensor:
-    """Returns what ``norm`` makes of rows of shape ``(..., n)``, with zeros up to a multiple of ``aligned``."""
+    """Returns what ``norm`` makes of rows of shape ``(..., n)``, with zeros up to a multiple of ``aligned``.
+
+    Raises:
+        ValueError: they have another length.
+    """
+    norm.check(rows)
     wide = rows.new_empty(*rows.shape[:-1], -(-rows.shape[-1] // aligned) * aligned, dtype=dtype)
     flat, out = rows.reshape(-1, rows.shape[-1]), wide.view(-1, wide.shape[-1])
-    launch(normalise, tuple(out.shape), [flat, norm.mean, norm.var, norm.limit], [out])
+    launch(normalise_of(dtype), tuple(out.shape), [flat, norm.mean, norm.var, norm.limit], [out])
     return wide
 
 
@@ -71,12 +78,13 @@ def log_slope(u: float) -> float:
 
 
 @functools.cache
-def draw_of(nu: int, bounded: bool) -> wp.Kernel:
+def draw_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
     """Returns the kernel that draws ``nu`` actions in each state."""
+    Rows: Any = wp.array2d(dtype=wp.dtype_from_torch(dtype))  # noqa: N806
 
     @wp.kernel(enable_backward=False, module="unique")
     def draw(
-        mean: wp.array2d[Any],
+        mean: Rows,
         std: wp.array[float],
         noise: wp.array2d[float],
         normal: wp.array2d[float],
@@ -110,7 +118,7 @@ def drawn(mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor, bounded: b
     """
     normal, log_prob = torch.empty_like(noise), noise.new_empty(len(noise))
     action = torch.empty_like(noise) if bounded else normal
-    launch(draw_of(noise.shape[1], bounded), len(noise), [mean, std, noise], [normal, action, log_prob])
+    launch(draw_of(noise.shape[1], bounded, mean.dtype), len(noise), [mean, std, noise], [normal, action, log_prob])
     return (action, log_prob, normal) if bounded else (action, log_prob)
 
 
@@ -129,14 +137,15 @@ class Slopes(NamedTuple):
 
 
 @functools.cache
-def loss_of(nu: int, bounded: bool) -> wp.Kernel:
+def loss_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
     """Returns the kernel of PPO's loss for ``nu`` actions."""
+    Rows: Any = wp.array2d(dtype=wp.dtype_from_torch(dtype))  # noqa: N806
 
     @wp.kernel(enable_backward=False, module="unique")
     def loss(
-        mean: wp.array2d[Any],
+        mean: Rows,
         std: wp.array[float],
-        value: wp.array2d[Any],
+        value: Rows,
         action: wp.array2d[float],
         old_log_prob: wp.array[float],
         advantage: wp.array[float],
@@ -147,8 +156,8 @@ def loss_of(nu: int, bounded: bool) -> wp.Kernel:
         lowest: float,
         highest: float,
         entropy_coeff: float,
-        slope_mean: wp.array2d[Any],
-        slope_value: wp.array2d[Any],
+        slope_mean: Rows,
+        slope_value: Rows,
         sums: wp.array2d[float],
     ):
         step = wp.tid()
@@ -169,11 +178,14 @@ def loss_of(nu: int, bounded: bool) -> wp.Kernel:
         normal = (advantage[step] - center[0]) / wp.max(spread[0], 1.0e-6)
         gain = wp.exp(log_ratio) * normal
         clipped_gain = wp.exp(clipped) * normal
-        slope = float(0.0)
-        if gain <= clipped_gain:
-            slope = -gain
+        slope = -gain
+        if gain > clipped_gain:  # what is not a number is followed, to be seen
+            slope = 0.0
         error = float(value[step, 0]) - target[step]
-        slope_value[step, 0] = slope_value.dtype(share * CRITIC_COEFF * wp.clamp(error, -1.0, 1.0))
+        of_value = wp.clamp(error, -1.0, 1.0)
+        if wp.isnan(error):
+            of_value = error
+        slope_value[step, 0] = slope_value.dtype(share * CRITIC_COEFF * of_value)
         sums[step, 0] = -wp.min(gain, clipped_gain)
         sums[step, 1] = CRITIC_COEFF * wp.where(wp.abs(error) < 1.0, 0.5 * error * error, wp.abs(error) - 0.5)
         sums[step, 2] = entropy
@@ -225,7 +237,7 @@ def clipped_loss(
     inputs = [mean, std, value, data["action"], *numbers, noise, spread.view(1), center.view(1)]
     slopes = torch.empty_like(mean), torch.empty_like(value), std.new_empty(steps, METRICS + nu)
     bounds = math.log1p(-clip_epsilon), math.log1p(clip_epsilon)
-    launch(loss_of(nu, bounded), steps, [*inputs, *bounds, entropy_coeff], slopes)
+    launch(loss_of(nu, bounded, mean.dtype), steps, [*inputs, *bounds, entropy_coeff], slopes)
     means = slopes[2].mean(0)
     return Slopes(slopes[0], means[METRICS:], slopes[1], means[:METRICS])
 
@@ -235,10 +247,10 @@ def step_of_adam(
     gradient: wp.array[float],
     norm: wp.array[float],
     lr: wp.array[float],
-    step: wp.array[float],
+    counts: wp.array[wp.float64],
     max_norm: float,
-    beta1: wp.float64,
-    beta2: wp.float64,
+    beta1: float,
+    beta2: float,
     eps: float,
     parameter: wp.array[float],
     first: wp.array[float],
@@ -246,9 +258,8 @@ def step_of_adam(
 ):
     i = wp.tid()
     slope = gradient[i] * wp.min(max_norm / (norm[0] + 1.0e-6), 1.0)
-    steps = wp.float64(step[0])
-    of_first = float(wp.float64(1.0) - wp.pow(beta1, steps))
-    of_second = float(wp.float64(1.0) - wp.pow(beta2, steps))
-    first[i] = first[i] + float(wp.float64(1.0) - beta1) * (slope - first[i])
-    second[i] = float(beta2) * second[i] + float(wp.float64(1.0) - beta2) * slope * slope
+    of_first = float(wp.float64(1.0) - counts[1])
+    of_second = float(wp.float64(1.0) - counts[2])
+    first[i] = first[i] + (1.0 - beta1) * (slope - first[i])
+    second[i] = beta2 * second[i] + (1.0 - beta2) * slope * slope
     parameter[i] = parameter[i] - lr[0] / of_first * first[i] / (wp.sqrt(second[i] / of_second) + eps)

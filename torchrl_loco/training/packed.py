@@ -40,4 +40,4 @@ class Packed:
             key: rows[:, columns].view(dtype).unflatten(-1, shape) if shape else rows[:, columns].view(dtype)[:, 0]
             for key, columns, dtype, shape in self._entries
         }
-        return TensorDict(entries, batch_size=len(rows))
+        return TensorDict(entries, batch_size=len(rows), device=rows.device)

@@ -68,14 +68,15 @@ class PPO(Algorithm):
     @torch.no_grad()
     def act(self, td: TensorDictBase) -> TensorDictBase:
         """Returns ``td`` with actions and their log-probabilities; with what they were before tanh, if bounded."""
-        rows = normalised(td["observation"], self.norms["observation"], self._dtype, ALIGNED).flatten(0, -2)
+        rows = normalised(td["observation"], self.norms["observation"], self._dtype, ALIGNED)
+        rows = rows.view(-1, rows.shape[-1])
         explores = exploration_type() in (ExplorationType.RANDOM, None)
         noise = (torch.randn if explores else torch.zeros)(len(rows), self.spaces.action, device=self.device)
         mean = self._mean(rows, self.optimizer.wide(self._dtype))
         values = drawn(mean, self._std(), noise, self.spaces.bounded)
         names = "action", "action_log_prob", *("before_tanh",) * self.spaces.bounded
         for name, value in zip(names, values, strict=True):
-            td[name] = value.unflatten(0, td.batch_size)
+            td[name] = value.view((*td.batch_size, *value.shape[1:]))
         return td
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
@@ -147,7 +148,8 @@ class PPO(Algorithm):
 
         A divergence that is not positive, as that of the first step of a batch, says nothing.
         """
-        factor = self._lr_factors.take(torch.bucketize(distributed.mean_of_ranks(kl), self._kl_bounds))
+        kl = distributed.mean_of_ranks(kl).nan_to_num(0.0)
+        factor = self._lr_factors.take(torch.bucketize(kl, self._kl_bounds))
         for group in self.optimizer.param_groups:
             group["lr"].mul_(factor).clamp_(*LR_RANGE)
 
@@ -164,21 +166,27 @@ class Affine(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, slope: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Returns the slopes by rows, weight and bias."""
-        (rows, weight), (by_rows, _, by_bias) = ctx.saved_tensors, ctx.needs_input_grad
+        (rows, weight), (by_rows, by_weight, by_bias) = ctx.saved_tensors, ctx.needs_input_grad
         of_bias = (slope.new_ones(1, len(slope)) @ slope)[0] if by_bias else None
-        return slope @ weight if by_rows else None, slope.mT @ rows, of_bias
+        return slope @ weight if by_rows else None, slope.mT @ rows if by_weight else None, of_bias
 
 
 class Rows:
     """A network as a function of rows that are longer than it reads, by zeros, with other weights than its own.
 
     Args:
-        network: layers one after the other.
+        network: layers one after the other; any other, as a critic may be, computes as a whole.
         inputs: how many numbers of a row it reads.
     """
 
     def __init__(self, network: nn.Module, inputs: int) -> None:
-        self._layers, self._inputs = layers_of(network), inputs
+        self._inputs, self._layers = inputs, [network]
+        with contextlib.suppress(TypeError):
+            layers = layers_of(network)
+            rows = torch.linspace(-1.0, 1.0, 4 * inputs, device=next(network.parameters()).device).view(4, inputs)
+            with torch.no_grad():  # a Sequential may have a forward of its own
+                found, expected = nn.Sequential(*layers)(rows.clone()), network(rows.clone())
+            self._layers = layers if torch.allclose(found, expected, rtol=1e-4, atol=1e-5) else self._layers
 
     def __call__(self, rows: torch.Tensor, weights: Mapping[nn.Parameter, torch.Tensor]) -> torch.Tensor:
         """Returns what it gives for ``rows``, shape ``(..., outputs)``.
@@ -190,12 +198,14 @@ class Rows:
         for index, layer in enumerate(self._layers):
             reads_long = index == 0 and isinstance(layer, nn.Linear)
             if index == 0 and not reads_long:
-                rows = rows[..., : self._inputs]
-            own = {name: weights[part] for name, part in layer.named_parameters()}
+                rows = rows[..., : self._inputs].clone()  # an activation may write in place
+            own = {
+                name: whole if reads_long or whole.shape == part.shape else whole[..., : part.shape[-1]]
+                for name, part in layer.named_parameters()
+                for whole in (weights[part],)
+            }
             if isinstance(layer, nn.Linear):
-                weight, size = own["weight"], layer.in_features
-                fits = reads_long or weight.shape[-1] == size
-                rows = Affine.apply(rows, weight if fits else weight[:, :size], own.get("bias"))
+                rows = Affine.apply(rows, own["weight"], own.get("bias"))
             else:
                 rows = functional_call(layer, own, (rows,))
         return rows

@@ -23,7 +23,7 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
     """
     if source.is_dir() and (run := RunFolder(source)).has_checkpoint:
         try:
-            algorithm.networks.load_state_dict(run.load_checkpoint(device)["algorithm"]["networks"])
+            algorithm.load_networks(run.load_checkpoint(device)["algorithm"]["networks"])
         except (RuntimeError, KeyError) as error:
             raise ValueError(f"init: the networks of {source} do not fit this run: {error}") from error
         return

@@ -74,6 +74,6 @@ def last_policy(run: RunFolder, device: str | None = None, path: Path | None = N
     stored = checkpoint.get("spaces")  # checkpoints of earlier revisions have none
     spaces = Spaces.of(make(resolve(run.task), 1, device)) if stored is None else Spaces(**stored)
     algorithm = ALGORITHMS[config.algorithm](config, spaces)
-    algorithm.networks.load_state_dict(checkpoint["algorithm"]["networks"])
+    algorithm.load_networks(checkpoint["algorithm"]["networks"])
     counters: dict[str, Any] = {name: checkpoint[name] for name in ("frames", "seconds", "stage") if name in checkpoint}
     return deterministic_policy(algorithm.actor, config, counters)
