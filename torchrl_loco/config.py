@@ -18,6 +18,7 @@ ENGINES = ("auto", "compiled", "mujoco_warp", "mujoco")
 INTEGRATORS = ("euler", "implicitfast", "rk4")
 
 CONTACTS = ("all", "ground")
+SOLIDS_ON_TERRAIN = ("exact", "spheres")
 
 # The documented naconmax is for this many worlds (Playground's default batch) and scales with num_envs.
 NACONMAX_WORLDS = 2048
@@ -55,6 +56,9 @@ class SimConfig:
             another than MuJoCo's default; :meth:`of` keeps those of the model.
         contacts: what bodies touch: ``all`` that the model says, or the ``ground``, that is, what is fixed to the
             world and not each other. Under both engines, and in :attr:`torchrl_loco.LocoEnv.mj_model`.
+        solids_on_terrain: what boxes, cylinders, ellipsoids and meshes do on height fields: ``exact`` is what MuJoCo
+            finds, which the engine ``compiled`` does not have, as it jumps with rounding; ``spheres`` gives the model
+            of an environment spheres in their corners, which touch height fields in their place.
 
     Raises:
         TypeError: a value has the wrong type.
@@ -74,12 +78,14 @@ class SimConfig:
     engine: str = "auto"
     integrator: str = "euler"
     contacts: str = "all"
+    solids_on_terrain: str = "exact"
 
     def __post_init__(self) -> None:
         check_fields(self, {})
         check_choice("engine", self.engine, ENGINES)
         check_choice("integrator", self.integrator, INTEGRATORS)
         check_choice("contacts", self.contacts, CONTACTS)
+        check_choice("solids_on_terrain", self.solids_on_terrain, SOLIDS_ON_TERRAIN)
         if self.deterministic and self.integrator != "euler":
             raise ValueError(f"deterministic=True needs integrator='euler', got {self.integrator!r}")
         check_multiple("ctrl_dt", self.ctrl_dt, "sim_dt", self.sim_dt)

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from torchrl_loco.sim.compiled.collision.ground import Ground
 from torchrl_loco.sim.compiled.engine import Chain, Data, _kernel
 from torchrl_loco.sim.compiled.schedules import lanes
 from torchrl_loco.sim.compiled.step import launch_size
@@ -46,7 +47,8 @@ def find_contacts(m: mujoco.MjModel, qpos: np.ndarray) -> list[list[tuple[tuple[
     found = wp.zeros((count, FIELDS * most), dtype=float, device="cpu")
     everywhere = wp.ones(count, dtype=bool, device="cpu")
     size = launch_size(m, count, wp.get_device("cpu"))
-    inputs = [size.worlds_per_warp, size.lanes, everywhere, before.args(()), after.args(()), data.ctrl]
+    terrain = wp.array(Ground.of(m).numbers(), dtype=float, device="cpu")
+    inputs = [size.worlds_per_warp, size.lanes, everywhere, before.args(()), after.args(()), terrain, data.ctrl]
     wp.launch(kernel, dim=size.threads, inputs=inputs, outputs=[found, *data.outputs().values()], device="cpu")
     result = []
     for rows in found.numpy().reshape(count, most, FIELDS):

@@ -29,6 +29,7 @@ BALL = '<body name="ball" pos="1 0 1"><freejoint name="loose"/><geom name="marbl
 MOTOR = '<motor name="pull" joint="elbow"/>'
 SENSOR = '<subtreelinvel name="speed" body="arm"/>'
 HILLS = '<geom type="hfield" hfield="hills"/>'
+CRATE = '<body pos="3 3 3"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>'
 TOUCH = "".join(f'<touch name="touch{i}" site="sole"/>' for i in range(36))
 MODEL = f"""
 <mujoco>
@@ -54,7 +55,7 @@ OTHERS = [
     ("<option/>", '<option density="1"/>', "forces of a fluid"),
     ("<option/>", '<option><flag gravity="disable"/></option>', "disabled gravity"),
     ("<option/>", '<option><flag warmstart="disable"/></option>', "disabled warmstart"),
-    ('<geom type="plane" size="5 5 0.1"/>', HILLS, "contacts of hfield and capsule, hfield and sphere"),
+    ('<geom type="plane" size="5 5 0.1"/>', f"{HILLS}{CRATE}", "contacts of hfield and box"),
     (SENSOR, f"{SENSOR}{TOUCH}", "'touch31', 'touch32', 'touch33' and 2 more: more than 31 sensors of touch"),
     ("<option/>", '<option><flag energy="enable"/></option>', "enabled energy"),
     ("</worldbody>", f'</worldbody><tendon><fixed springlength="1" stiffness="1">{ELBOW}</fixed></tendon>', "tendons"),

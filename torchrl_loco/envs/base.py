@@ -150,7 +150,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         if randomize is None:
             randomize = () if play else self.randomize
         varys = check_randomize("randomize", randomize)
-        mj_model = models.load(self.model, folder_of(type(self)))
+        mj_model = models.load(self.model, folder_of(type(self)), None, sim_settings.solids_on_terrain)
         self.check_model(mj_model)
         variation = Variation(varys, mj_model, device) if varys else None
 
@@ -209,7 +209,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         by_warp = self.hooks and "warp" in self.hooks.catalog.arrays
         if self.hooks and model.nsensor and {"reward", "observation"} <= own and not by_warp:
             kept = sorted(self.hooks.catalog.sensors)
-            stepped = models.load(self.model, folder_of(type(self)), kept)
+            stepped = models.load(self.model, folder_of(type(self)), kept, self.config.solids_on_terrain)
             sizes = [int(size) for size in model.sensor_dim[kept]]
             self.hooks.catalog.sensor_address = {i: sum(sizes[:k]) for k, i in enumerate(kept)}
             set_options(model, self.config)
@@ -229,7 +229,9 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         device, protocol, seed = str(self.device), self.protocol, self.seed
         engine = self.engine if self.engine == "compiled" else f"{self.engine} ({self.engine_reason})"
         randomize = f", randomize={list(self.randomize)}" if self.randomize else ""
-        contacts = "" if self.config.contacts == "all" else f", contacts={self.config.contacts!r}"
+        of_config = {"contacts": "all", "solids_on_terrain": "exact"}
+        chosen = {name: getattr(self.config, name) for name in of_config}
+        contacts = "".join(f", {name}={own!r}" for name, own in chosen.items() if own != of_config[name])
         replaced = f", replaced={self._replaced}" if self._replaced else ""
         kinds = dict[str, list[str]]()
         for hook, kind in (self._world.kinds if self._world else {}).items():

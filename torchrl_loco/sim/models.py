@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.config import read_mjcf
+from torchrl_loco.sim.corners import stand_on_corners
 
 FOLDERS = ("assetdir", "meshdir", "texturedir")
 """Attributes of MJCF's compiler that name folders of files."""
@@ -35,7 +36,10 @@ FORCE_SENSORS = {
 
 
 def load(
-    source: Path | str | mujoco.MjSpec, folder: Path | None = None, sensors: Collection[int] | None = None
+    source: Path | str | mujoco.MjSpec,
+    folder: Path | None = None,
+    sensors: Collection[int] | None = None,
+    solids_on_terrain: str = "exact",
 ) -> mujoco.MjModel:
     """Returns a model. MJCF may include ``scene.xml``, which is ours unless one lies beside it.
 
@@ -45,6 +49,7 @@ def load(
         source: path of an MJCF file, MJCF text, or a ``mujoco.MjSpec``, which stays as it is.
         folder: where a relative path is looked for first.
         sensors: ids of the sensors that are kept; ``None`` keeps all.
+        solids_on_terrain: that of :class:`torchrl_loco.SimConfig`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -54,6 +59,8 @@ def load(
     for i, sensor in enumerate(list(spec.sensors)):
         if sensors is not None and i not in sensors:
             spec.delete(sensor)
+    if solids_on_terrain == "spheres":
+        stand_on_corners(spec)
     model = spec.compile()
     if "side" in [camera.name for camera in spec.cameras] or model.nbody == 1:
         return model

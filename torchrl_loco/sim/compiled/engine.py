@@ -1,5 +1,6 @@
 """The engine that steps all worlds with the compiled step."""
 
+import collections
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -13,6 +14,8 @@ from typing_extensions import override
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.buffer import Buffer
+from torchrl_loco.sim.compiled.collision.ground import Ground
+from torchrl_loco.sim.compiled.collision.pairs import stand_ins
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel
 from torchrl_loco.sim.compiled.read_only import ReadOnly, read_only
 from torchrl_loco.sim.compiled.step import (
@@ -257,6 +260,7 @@ class CompiledEngine(Engine):
         self._substeps, self._device = config.substeps, device
         self._contact_geoms, self._contact_rows = tuple(contact_geoms), contact_rows
         check_worlds(mj_model, num_envs, device)
+        _check_forces(mj_model, self._contact_geoms)
         self.model = Model(mj_model, device)
         self._launch_size = launch_size(self._mj_model, num_envs, device)
         by_world = structure_of_arrays(mj_model, device)
@@ -268,6 +272,7 @@ class CompiledEngine(Engine):
             self._rows = _zeros((num_envs, row.size), wp.float32, device, structure_of_arrays=by_world)
             _fill_rows(self._rows, row)
             self.numbers = self._rows[:, : self._mj_model.varied.count]
+        self._terrain = wp.array(Ground.of(mj_model).numbers(), dtype=wp.float32, device=device)
         self.coalesced = by_world and not self._launch_size.one_kernel
         self._kernels: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
         self._kernels_apart = WorldKernels()
@@ -333,11 +338,30 @@ class CompiledEngine(Engine):
         wp.launch(
             kernel,
             dim=size.threads,
-            inputs=[size.worlds_per_warp, size.lanes, mask, start.args(before), end.args(after), self.data.ctrl],
+            inputs=[
+                *(size.worlds_per_warp, size.lanes, mask, start.args(before), end.args(after), self._terrain),
+                self.data.ctrl,
+            ],
             outputs=[self._rows, *outputs.values()],
             device=self._device,
             block_dim=size.block,
         )
+
+
+def _check_forces(m: mujoco.MjModel, contact_geoms: Sequence[int]) -> None:
+    """Checks that forces are asked of no geom of the ground that shares its pairs with others.
+
+    Raises:
+        ValueError: they are.
+    """
+    like = stand_ins(m)
+    shared = collections.Counter(like.values())
+    for geom in contact_geoms:
+        if geom in like and shared[like[geom]] > 1:
+            raise ValueError(
+                f"geom {m.geom(geom).name or geom!r} is one of {shared[like[geom]]} of the ground that are alike: ask "
+                "for the contact forces of what touches them, or pass engine='mujoco_warp'"
+            )
 
 
 def _kernel(
@@ -364,6 +388,7 @@ def _kernel(
         world: int,
         lane: int,
         live: bool,
+        terrain_in: wp.array[float],
         ctrl_in: wp.array2d[float],
         numbers_out: wp.array2d[float],
         qpos_out: wp.array2d[float],
@@ -389,6 +414,8 @@ def _kernel(
         mask_in: wp.array[bool],
         before_args: Before,
         after_args: After,
+        # Model in:
+        terrain_in: wp.array[float],
         # Data in:
         ctrl_in: wp.array2d[float],
         # Model out:
@@ -420,6 +447,7 @@ def _kernel(
             world,
             lane,
             live,  # lanes of a block may wait for those that are not
+            terrain_in,
             ctrl_in,
             numbers_out,
             qpos_out,

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled.collision.kinds import PLANE, described, title
+from torchrl_loco.sim.compiled.collision.kinds import FIELD, GROUND, described, title
 from torchrl_loco.sim.compiled.collision.pairs import Pair, is_elliptic, kind, pairs
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel, nominal
 from torchrl_loco.sim.compiled.physics import equalities
@@ -169,13 +169,16 @@ def _lines(kind: str, found: Found) -> list[str]:
 
 
 def _contacts(m: mujoco.MjModel) -> list[str]:
-    kinds, found, moving = set(), [], False
+    kinds, found, moving, on_field = set(), [], False, False
     for pair in pairs(m):
         if not _collides(m, pair):
+            on_field = on_field or m.geom_type[pair.geoms[0]] == FIELD
             moving = moving or m.body_weldid[m.geom_bodyid[list(pair.geoms)]].all()
             kinds.add(" and ".join(title(m.geom_type[geom]) for geom in pair.geoms))
     if kinds:
         choice = "; contacts='ground' leaves out those of moving bodies with each other" if moving else ""
+        if on_field:
+            choice += "; solids_on_terrain='spheres' lets spheres in their corners touch height fields"
         found.append(f"contacts of {', '.join(sorted(kinds))}: it has those of {described()}{choice}")
     if is_elliptic(m) and m.pair_solreffriction.any():  # pyramids do without
         found.append("solreffriction of an explicit pair with an elliptic cone")
@@ -184,7 +187,7 @@ def _contacts(m: mujoco.MjModel) -> list[str]:
 
 def _collides(m: mujoco.MjModel, pair: Pair) -> bool:
     first = pair.geoms[0]
-    of_world = m.geom_type[first] != PLANE or m.body_weldid[m.geom_bodyid[first]] == 0
+    of_world = m.geom_type[first] not in GROUND or m.body_weldid[m.geom_bodyid[first]] == 0
     return bool(kind(m, pair).points and of_world)
 
 

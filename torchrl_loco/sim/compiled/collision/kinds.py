@@ -4,9 +4,9 @@ import dataclasses
 
 import mujoco
 
-PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
+PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
-    for kind in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
+    for kind in ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
 )
 SHAPES = (SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)
 """In the order of ``enum Shape`` in ``laws.h``."""
@@ -19,7 +19,7 @@ class Kind:
     """How two shapes touch.
 
     Attributes:
-        points: contacts that a pair of geoms can have.
+        points: contacts that a pair of geoms can have; with a field, as far as a world has room for those of all pairs.
         function: the function of lanes that finds them, ``collide_...`` in ``schedules/lanes``.
         traced: whether the schedule of one thread a world has it too.
         searched: whether C MuJoCo finds the contacts by a general convex collider, which the flag nativeccd chooses.
@@ -38,6 +38,8 @@ KINDS = {
     (PLANE, CYLINDER): Kind(4, "solid_on_plane"),
     (PLANE, BOX): Kind(4, "solid_on_plane"),
     (PLANE, MESH): Kind(4, "solid_on_plane"),
+    (FIELD, SPHERE): Kind(8, "round_on_field"),
+    (FIELD, CAPSULE): Kind(8, "round_on_field"),
     (SPHERE, SPHERE): Kind(1, "round_and_round", traced=True),
     (SPHERE, CAPSULE): Kind(1, "round_and_round", traced=True),
     (CAPSULE, CAPSULE): Kind(2, "round_and_round", traced=True),
@@ -49,16 +51,22 @@ KINDS = {
     (CAPSULE, BOX): Kind(2, "round_and_box"),
     (BOX, BOX): Kind(8, "box_and_box"),
 }
-"""What is compiled, by the two shapes, the one of the smaller number first. A plane belongs to the world."""
+"""What is compiled, by the two shapes, the one of the smaller number first. Planes and fields belong to the world."""
+
+GROUND = (PLANE, FIELD)
+"""Shapes that belong to the world, whose pairs are never listed."""
+
+ON_BOXES = {"round_and_box": "round_on_boxes", "box_and_box": "box_on_boxes"}
+"""What finds the contacts of a pair instead where the box is one of many of the world."""
 
 NOT_COMPILED = Kind(0, "")
 """That of all other shapes."""
 
-FUNCTIONS = tuple(dict.fromkeys(kind.function for kind in KINDS.values()))
+FUNCTIONS = tuple(dict.fromkeys([*(kind.function for kind in KINDS.values()), *ON_BOXES.values()]))
 """The functions of lanes, in the order in which they look at their pairs."""
 
-PLANE_FUNCTIONS = {kind.function for (first, _), kind in KINDS.items() if first == PLANE}
-"""Those of contacts with planes of the world. The others look at pairs whose bounding spheres are near."""
+GROUND_FUNCTIONS = {kind.function for (first, _), kind in KINDS.items() if first in GROUND} | {*ON_BOXES.values()}
+"""Those of contacts with the ground. The others look at pairs whose bounding spheres are near."""
 
 POINT_BITS = max(kind.points - 1 for kind in KINDS.values()).bit_length()
 """Bits of the number of a contact within its pair."""
@@ -74,5 +82,5 @@ def described() -> str:
     with_: dict[int, list[str]] = {}
     for first, second in KINDS:
         with_.setdefault(first, []).append(title(second))
-    titles = {shape: "plane (of the world)" if shape == PLANE else title(shape) for shape in with_}
+    titles = {shape: f"{title(shape)}{' (of the world)' * (shape in GROUND)}" for shape in with_}
     return "; ".join(f"{titles[shape]} with {', '.join(others)}" for shape, others in with_.items())

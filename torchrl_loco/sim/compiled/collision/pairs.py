@@ -7,8 +7,9 @@ Source: MuJoCo's documentation, chapter Computation ("Collision detection").
 import dataclasses
 
 import mujoco
+import numpy as np
 
-from torchrl_loco.sim.compiled.collision.kinds import KINDS, NOT_COMPILED, Kind
+from torchrl_loco.sim.compiled.collision.kinds import BOX, FIELD, KINDS, NOT_COMPILED, ON_BOXES, Kind
 from torchrl_loco.sim.compiled.ir.parameters import Number, largest, varies
 from torchrl_loco.sim.compiled.ir.symbols import Scalar, select
 from torchrl_loco.sim.compiled.physics.dynamics import MINVAL
@@ -55,8 +56,9 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
     """Returns all pairs of geoms that may touch: explicit ones, then those of MuJoCo's filters.
 
     The filters are by type, body, parent and exclusion; explicit pairs pass them, but for geoms that cannot move
-    relative to each other.
+    relative to each other. Of geoms of the ground that are alike, one stands for all.
     """
+    like = stand_ins(m)
     weld = m.body_weldid[m.geom_bodyid]
     parent_weld = m.body_weldid[m.body_parentid[weld]]
     filter_parent = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
@@ -65,9 +67,11 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
     found = [
         _explicit_pair(m, i) for i, (a, b) in enumerate(explicit) if weld[a] != weld[b] and m.pair_margin[i] > NEVER
     ]
-    for a in range(m.ngeom):
-        for b in range(a + 1, m.ngeom):
-            if (a, b) in explicit:
+    shown = [g for g in range(m.ngeom) if like.get(g, g) == g]
+    moving = [g for g in shown if weld[g]]
+    for a in shown:
+        for b in shown if weld[a] else moving:
+            if b <= a or (a, b) in explicit:
                 continue
             bodies = sorted((m.geom_bodyid[a], m.geom_bodyid[b]))
             masked = not (m.geom_contype[a] & m.geom_conaffinity[b] or m.geom_contype[b] & m.geom_conaffinity[a])
@@ -76,7 +80,34 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
                 continue
             if (bodies[0] << 16) + bodies[1] in excluded:
                 continue
-            found.append(_pair(m, *sorted((a, b), key=lambda g: (m.geom_type[g], g))))
+            found.append(_pair(m, *sorted((a, b), key=lambda g: (m.geom_type[g], g not in like, g))))
+    return found
+
+
+ALIKE = ("type", "bodyid", "contype", "conaffinity", "condim", "priority")
+ALIKE_NUMBERS = ("solmix", "solref", "solimp", "friction", "margin", "gap")
+"""Of geoms whose contacts have the same parameters."""
+AT_ONCE = 8
+"""Contacts of a geom with many boxes, as far as a world has room for all pairs."""
+MOST_LISTED = 8
+"""Boxes of the world up to which each has pairs of its own; more of them are looked up."""
+
+
+def looked_up(m: mujoco.MjModel) -> np.ndarray:
+    """Returns which geoms are looked up, ``(ngeom,)``: height fields of the world, and its boxes if they are many."""
+    of_world = (m.body_weldid[m.geom_bodyid] == 0) & ((m.geom_contype != 0) | (m.geom_conaffinity != 0))
+    boxes, fields = of_world & (m.geom_type == BOX), of_world & (m.geom_type == FIELD)
+    return boxes | fields if boxes.sum() > MOST_LISTED else fields
+
+
+def stand_ins(m: mujoco.MjModel) -> dict[int, int]:
+    """Returns the geoms that are looked up, each with the first of those that are as it is."""
+    named = {*m.pair_geom1.tolist(), *m.pair_geom2.tolist()}
+    first: dict[str, int] = {}
+    found = {}
+    for geom in np.flatnonzero(looked_up(m)).tolist():
+        own = [getattr(m, f"geom_{name}")[geom].tolist() for name in (*ALIKE, *ALIKE_NUMBERS)]
+        found[geom] = first.setdefault(repr([own, geom if geom in named else -1]), geom)
     return found
 
 
@@ -88,7 +119,10 @@ def is_elliptic(m: mujoco.MjModel) -> bool:
 def kind(m: mujoco.MjModel, pair: Pair) -> Kind:
     """Returns how the shapes of a pair touch: that of no contacts, if it is not compiled."""
     first, second = m.geom_type[list(pair.geoms)].tolist()
-    return KINDS.get((first, second), NOT_COMPILED)
+    found = KINDS.get((first, second), NOT_COMPILED)
+    if found.function in ON_BOXES and looked_up(m)[list(pair.geoms)].any():
+        return dataclasses.replace(found, function=ON_BOXES[found.function], points=AT_ONCE)
+    return found
 
 
 def needs_lanes(m: mujoco.MjModel) -> bool:

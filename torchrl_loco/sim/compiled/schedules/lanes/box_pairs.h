@@ -4,7 +4,7 @@
 struct BoxPairContacts : BoxContacts {
   using BoxContacts::BoxContacts;
 
-#if WITH_BOX_AND_BOX
+#if WITH_BOX_AND_BOX || WITH_BOX_ON_BOXES
   enum { CORNERS = 8 };  // of a face that four planes have cut
   struct Touching {
     int count;
@@ -164,29 +164,36 @@ struct BoxPairContacts : BoxContacts {
     }
   }
 
+  // Adds the contacts of a box with the second geom of a pair, where `near`.
+  INLINE void touch_box_and_box(bool near, int pair, Vec origin, const Mat& axes, Vec size, const bool friction) {
+    const int h = Model::second_geom(pair);
+    const Mat others = geom_axes(h);
+    Vec columns[3];
+    UNROLLED_FOR(int i = 0; i < 3; ++i) columns[i] = axes.transposed_times(others.column(i));
+    const Mat turn = of_columns(columns[0], columns[1], columns[2]);
+    Touching found = {};
+    if (near)
+      touch_boxes(axes.transposed_times(w.geoms[h].center - origin), turn, size, Model::geom_size(h),
+                  Model::margin(pair), found);
+    const Vec normal = axes * found.normal;
+    ROLLED_FOR(int k = 0; k < CORNERS; ++k) {
+      const bool exists = k < found.count;
+      if (!ballot(exists)) break;
+      const float distance = exists ? found.distances[k] : 0.0f;
+      add_contact(exists && distance < Model::margin(pair), friction, pair, k,
+                  origin + axes * found.points[exists ? k : 0], distance, normal, {0.0f, 0.0f, 0.0f});
+    }
+  }
+
+#if WITH_BOX_AND_BOX
   INLINE void collide_box_and_box(int& at, const int count, const int begin, const int end, const bool friction) {
     if (begin == end) return;
     ROLLED_FOR(; at < count && w.candidates[at] < end;) {
       const Listed own = listed(at, count, end);
-      const int pair = own.pair, g = Model::first_geom(pair), h = Model::second_geom(pair);
-      const Mat axes = geom_axes(g), others = geom_axes(h);
-      const Vec origin = w.geoms[g].center;
-      Vec columns[3];
-      UNROLLED_FOR(int i = 0; i < 3; ++i) columns[i] = axes.transposed_times(others.column(i));
-      const Mat turn = of_columns(columns[0], columns[1], columns[2]);
-      Touching found = {};
-      if (own.valid)
-        touch_boxes(axes.transposed_times(w.geoms[h].center - origin), turn, Model::geom_size(g), Model::geom_size(h),
-                    Model::margin(pair), found);
-      const Vec normal = axes * found.normal;
-      ROLLED_FOR(int k = 0; k < CORNERS; ++k) {
-        const bool exists = k < found.count;
-        if (!ballot(exists)) break;
-        const float distance = exists ? found.distances[k] : 0.0f;
-        add_contact(exists && distance < Model::margin(pair), friction, pair, k,
-                    origin + axes * found.points[exists ? k : 0], distance, normal, {0.0f, 0.0f, 0.0f});
-      }
+      const int g = Model::first_geom(own.pair);
+      touch_box_and_box(own.valid, own.pair, w.geoms[g].center, geom_axes(g), Model::geom_size(g), friction);
     }
   }
+#endif
 #endif
 };

@@ -2,7 +2,7 @@
 struct BoxContacts : SolidContacts {
   using SolidContacts::SolidContacts;
 
-#if WITH_ROUND_AND_BOX
+#if WITH_ROUND_AND_BOX || WITH_ROUND_ON_BOXES
   struct Depth {
     float distance;
     Vec normal, point;
@@ -133,35 +133,40 @@ struct BoxContacts : SolidContacts {
     return {at, at + sign * further, 2};
   }
 
+  // Adds the contacts of the first geom of a pair with a box, numbered from `first` on, where `near`.
+  INLINE void touch_round_and_box(bool near, int pair, int first, Vec origin, const Mat& axes, Vec size,
+                                  const bool friction) {
+    const Geom geom = w.geoms[Model::first_geom(pair)];
+    const Vec center = axes.transposed_times(geom.center - origin), half = axes.transposed_times(geom.half_axis);
+    const float reach = geom.radius + Model::margin(pair);
+    // Bounding spheres of a trunk hold its legs. Most are clear of one of its faces, nearly all others along a normal of
+    // an edge and the capsule, of length root(width). Rounding does not decide, as the exact test follows.
+    UNROLLED_FOR(int i = 0; i < 3; ++i) {
+      const int j = (i + 1) % 3, k = (i + 2) % 3;
+      near = near && fabsf(center.component(i)) - fabsf(half.component(i)) < size.component(i) + reach;
+      const float y = half.component(j), z = half.component(k), width = y * y + z * z;
+      const float apart = fabsf(center.component(j) * z - center.component(k) * y) -
+                          (size.component(j) * fabsf(z) + size.component(k) * fabsf(y));
+      near = near && !(apart > 0.0f && apart * apart > 1.001f * reach * reach * width);
+    }
+    if (!ballot(near)) return;
+    const Ends ends = half.dot(half) > MINVAL ? capsule_and_box(center, half, size) : Ends{0.0f, 0.0f, 1};
+    ROLLED_FOR(int i = 0; i < 2; ++i) {
+      const Depth depth = sphere_and_box(center + half * (i ? ends.second : ends.first), geom.radius, size);
+      add_contact(near && i < ends.points && depth.distance < Model::margin(pair), friction, pair, first + i,
+                  origin + axes * depth.point, depth.distance, axes * depth.normal, {0.0f, 0.0f, 0.0f});
+    }
+  }
+
+#if WITH_ROUND_AND_BOX
   INLINE void collide_round_and_box(int& at, const int count, const int begin, const int end, const bool friction) {
     if (begin == end) return;
     ROLLED_FOR(; at < count && w.candidates[at] < end;) {
       const Listed own = listed(at, count, end);
-      const int pair = own.pair, g = Model::second_geom(pair);
-      const Geom geom = w.geoms[Model::first_geom(pair)];
-      const Vec origin = w.geoms[g].center, size = Model::geom_size(g);
-      const Mat axes = geom_axes(g);
-      const Vec center = axes.transposed_times(geom.center - origin), half = axes.transposed_times(geom.half_axis);
-      const float reach = geom.radius + Model::margin(pair);
-      // Bounding spheres of a trunk hold its legs. Most are clear of one of its faces, nearly all others along a normal of
-      // an edge and the capsule, of length root(width). Rounding does not decide, as the exact test follows.
-      bool near = own.valid;
-      UNROLLED_FOR(int i = 0; i < 3; ++i) {
-        const int j = (i + 1) % 3, k = (i + 2) % 3;
-        near = near && fabsf(center.component(i)) - fabsf(half.component(i)) < size.component(i) + reach;
-        const float y = half.component(j), z = half.component(k), width = y * y + z * z;
-        const float apart = fabsf(center.component(j) * z - center.component(k) * y) -
-                            (size.component(j) * fabsf(z) + size.component(k) * fabsf(y));
-        near = near && !(apart > 0.0f && apart * apart > 1.001f * reach * reach * width);
-      }
-      if (!ballot(near)) continue;
-      const Ends ends = half.dot(half) > MINVAL ? capsule_and_box(center, half, size) : Ends{0.0f, 0.0f, 1};
-      ROLLED_FOR(int i = 0; i < 2; ++i) {
-        const Depth depth = sphere_and_box(center + half * (i ? ends.second : ends.first), geom.radius, size);
-        add_contact(near && i < ends.points && depth.distance < Model::margin(pair), friction, pair, i,
-                    origin + axes * depth.point, depth.distance, axes * depth.normal, {0.0f, 0.0f, 0.0f});
-      }
+      const int g = Model::second_geom(own.pair);
+      touch_round_and_box(own.valid, own.pair, 0, w.geoms[g].center, geom_axes(g), Model::geom_size(g), friction);
     }
   }
+#endif
 #endif
 };

@@ -1,6 +1,6 @@
 // All contacts: those of each kind of pairs, and the touch sensors that feel them.
-struct Collision : BoxPairContacts {
-  using BoxPairContacts::BoxPairContacts;
+struct Collision : ManyBoxContacts {
+  using ManyBoxContacts::ManyBoxContacts;
 
 #if WITH_EQUALITIES
   // Equalities are rows that lie before the contacts without friction. The slope is that of the second length's polynomial.

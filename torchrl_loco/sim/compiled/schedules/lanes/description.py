@@ -9,13 +9,15 @@ from collections.abc import Iterator, Sequence
 import mujoco
 import numpy as np
 
+from torchrl_loco.sim.compiled.collision.ground import Ground
 from torchrl_loco.sim.compiled.collision.kinds import (
     BOX,
     CAPSULE,
     FUNCTIONS,
+    GROUND,
+    GROUND_FUNCTIONS,
     MESH,
     PLANE,
-    PLANE_FUNCTIONS,
     SOLID,
 )
 from torchrl_loco.sim.compiled.collision.meshes import Mesh
@@ -23,7 +25,9 @@ from torchrl_loco.sim.compiled.collision.pairs import (
     Pair,
     is_elliptic,
     kind,
+    looked_up,
     pairs,
+    stand_ins,
 )
 from torchrl_loco.sim.compiled.ir import symbols
 from torchrl_loco.sim.compiled.ir.parameters import nominal, present, varies
@@ -76,6 +80,10 @@ ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 28, 16
 
 A body that touches the floor in more places when it stands should have, and has, those.
 """
+NEAR_GROUND = 64
+"""Prisms of height fields, or boxes of the ground, that are listed and then looked at together."""
+MOST_PRISMS, MOST_BOXES, MOST_ON_BOXES = 2**16 - 1, 2**24 - 1, 2**8
+"""Prisms of a field near a geom, boxes of the ground, and geoms that may touch these: entries of lists hold no more."""
 STANDING, FAR = 0.025, 1e3
 """Height over its lowest point of what a body stands on or may at once, and a height that no pose exceeds (m)."""
 
@@ -109,15 +117,18 @@ class Description:
         self.members = [[b for b in range(1, m.nbody) if self.places[b].link == i] for i in range(len(self.moving))]
         self.masses = [Mass.join(m, self.places, bodies) for bodies in self.members]
         self.ancestors = [sum(1 << int(j) for j in self.dofs_to_root(d)) for d in range(m.nv)]
+        self.ground = Ground.of(m)
         self.pairs = self._sorted_pairs(pairs(m))
         self.functions = [f for f in FUNCTIONS if f in {kind(m, p).function for p in self.pairs}]
         self.condims = {p.condim for p in self.pairs} - {1}
         self.elliptic = bool(self.condims) and is_elliptic(m)
         self.some_lack_edges = len(self.condims) > 1 and not self.elliptic
-        self.geoms = sorted({g for p in self.pairs for g in p.geoms if m.geom_type[g] != PLANE})
+        touching = {g for p in self.pairs for g in p.geoms}
+        self.geoms = sorted(g for g in touching if m.geom_type[g] not in GROUND and not looked_up(m)[g])
         self.has_solids = any(m.geom_type[g] in SOLID for g in self.geoms)
         used = sorted({int(m.geom_dataid[g]) for g in self.geoms if m.geom_type[g] == MESH})
         self.meshes = {mesh: Mesh.of(m, mesh) for mesh in used}
+        self._check_lists()
         vertices = sum(len(mesh.vertices) for mesh in self.meshes.values())
         if vertices > MOST_VERTICES:
             raise ValueError(f"meshes with {vertices} vertices, more than {MOST_VERTICES}")
@@ -157,18 +168,50 @@ class Description:
             yield dof
             dof = self.m.dof_parentid[dof]
 
-    def is_plane(self, pair: Pair) -> bool:
-        """Returns whether the first geom of a pair is a plane."""
-        return self.m.geom_type[pair.geoms[0]] == PLANE
+    def is_ground(self, pair: Pair) -> bool:
+        """Returns whether a geom of a pair is a plane of the world, or looked up."""
+        return kind(self.m, pair).function in GROUND_FUNCTIONS
 
     def _sorted_pairs(self, found: list[Pair]) -> list[Pair]:
-        order = FUNCTIONS.index
-        return sorted(found, key=lambda p: (not self.is_plane(p), p.condim == 1, order(kind(self.m, p).function)))
+        order, of_ground = FUNCTIONS.index, stand_ins(self.m)
+
+        def key(pair: Pair) -> tuple[bool, bool, int, int]:
+            on = next((g for g in pair.geoms if g in of_ground), -1)
+            return not self.is_ground(pair), pair.condim == 1, order(kind(self.m, pair).function), on
+
+        return sorted(found, key=key)
+
+    def pairs_on(self, geom: int, function: str) -> list[int]:
+        """Returns the first pair of a geom of the ground and the one after the last, without friction and with it."""
+        found = []
+        for friction in (False, True):
+            own = [
+                i
+                for i, p in enumerate(self.pairs)
+                if geom in p.geoms and (p.condim != 1) == friction and kind(self.m, p).function == function
+            ]
+            found += [own[0], own[-1] + 1] if own else [0, 0]
+        return found
 
     @property
     def lasting(self) -> int:
         """Rows among those of contacts without friction that are there however many contacts there are."""
         return len(self.limited_balls) + len(self.equalities) + sum(weld.rows for weld in self.welds)
+
+    def _check_lists(self) -> None:
+        """Checks that what is near a geom can be listed: numbers of 32 bits hold a pair and a prism, or a box.
+
+        Raises:
+            ValueError: it cannot.
+        """
+        for field in self.ground.fields:
+            most = max(2 * (self.radius(g) + self.half_length(g)) for g in self.geoms)
+            prisms = 2 * (most / field.cell[0] + 2) * (most / field.cell[1] + 2)
+            if prisms > MOST_PRISMS:
+                raise ValueError(f"a height field with cells of {min(field.cell):.2g} m under a geom of {most:.2g} m")
+        boxes = self.ground.boxes
+        if boxes is not None and (len(boxes.numbers) > MOST_BOXES or len(self.geoms) > MOST_ON_BOXES):
+            raise ValueError(f"{len(boxes.numbers)} boxes of the world, more than {MOST_BOXES}, or too many that move")
 
     def points(self, pair: Pair) -> int:
         """Returns how many contacts a pair can have."""
@@ -183,13 +226,17 @@ class Description:
                 found = [i for i, key in enumerate(kinds) if key == (function, friction)]
                 spans.append((found[0], found[-1] + 1) if found else (0, 0))
             begin, end = (f"friction ? {x} : {y}" for x, y in zip(*spans, strict=True))
-            listed = "" if function in PLANE_FUNCTIONS else "at, count, "
+            listed = "" if function in GROUND_FUNCTIONS else "at, count, "
             calls.append(f"      collide_{function}({listed}{begin}, {end}, friction);")
         return "\n".join(calls)
 
     def _standing(self) -> tuple[int, int]:
         """Returns how many contacts with friction and without there are when the bodies stand in their home pose."""
         m = copy.copy(nominal(self.m))
+        if of_ground := np.flatnonzero(looked_up(m)).tolist():  # a plane in place of all of it
+            m.geom_contype[of_ground[1:]] = m.geom_conaffinity[of_ground[1:]] = 0
+            m.geom_type[of_ground[0]], m.geom_quat[of_ground[0]], m.geom_rbound[of_ground[0]] = PLANE, (1, 0, 0, 0), 0.0
+            m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
         planes = m.geom_type == PLANE
         floors = planes | ((m.geom_type == BOX) & (m.body_weldid[m.geom_bodyid] == 0))  # boxes only where they are near
         m.geom_margin[floors] = np.maximum(m.geom_margin[floors], STANDING)
@@ -241,7 +288,8 @@ class Description:
             limits=self.limit_sides * len(self.limited),
             friction_losses=len(self.losses),
             touch=len(self.touch),
-            candidates=max(1, sum(not self.is_plane(p) for p in self.pairs)),
+            candidates=max(1, sum(not self.is_ground(p) for p in self.pairs)),
+            near_ground=NEAR_GROUND if self.ground.fields or self.ground.boxes is not None else 0,
             directions=directions,
             contact_rows=directions if self.elliptic else 2 * (directions - 1),
             frictional=0,

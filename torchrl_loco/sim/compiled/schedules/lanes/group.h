@@ -5,9 +5,10 @@ struct Group : Math {
   const float* const ctrl;  // of the world
   int& overflow;            // of the world
   const Varied varied;
+  const float* const terrain;  // heights of all fields
 
-  INLINE Group(World& w, int lane, const float* ctrl, int& overflow, const float* row)
-      : w(w), lane(lane), ctrl(ctrl), overflow(overflow), varied{{row}} {}
+  INLINE Group(World& w, int lane, const float* ctrl, int& overflow, const float* row, const float* terrain)
+      : w(w), lane(lane), ctrl(ctrl), overflow(overflow), varied{{row}}, terrain(terrain) {}
 
 #ifdef __CUDA_ARCH__
   INLINE void sync() const { __syncwarp(); }

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled.collision.kinds import MESH, POINT_BITS, SHAPES, SOLID
+from torchrl_loco.sim.compiled.collision.ground import BOX_NUMBERS
+from torchrl_loco.sim.compiled.collision.kinds import MESH, ON_BOXES, POINT_BITS, SHAPES, SOLID
 from torchrl_loco.sim.compiled.collision.pairs import (
     Pair,
     contact_weight,
@@ -275,10 +276,10 @@ def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
     tables.structs("Vec", "geom_position", [center for _, center, _ in geoms])
     tables.structs("Vec", "geom_half_axis", [axis * h for (_, _, axis), h in zip(geoms, half, strict=True)])
     tables.floats("geom_radius", [d.radius(g) for g in d.geoms])
-    planes = [p for p in found if d.is_plane(p)]
+    planes = [p for p in found if d.is_ground(p)]
     others = found[len(planes) :]
     tables.size(PAIRS=len(found), PLANE_PAIRS=len(planes), POINT_BITS=POINT_BITS)
-    if d.has_solids:
+    if d.has_solids or d.ground.boxes is not None:
         tables.integers("geom_shape", [SHAPES.index(m.geom_type[g]) for g in d.geoms])
         tables.structs("Vec", "geom_size", m.geom_size[d.geoms])
         turns = [d.places[m.geom_bodyid[g]].turn(m.geom_quat[g]) for g in d.geoms]
@@ -287,9 +288,10 @@ def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
         tables.size(SOLIDS_TURNED=any(abs(turn[0]) < 1 for turn in itertools.compress(turns, solid)))
     if d.meshes:
         _add_meshes(tables, d)
+    _add_ground(tables, d)
     index = {g: i for i, g in enumerate(d.geoms)}
     tables.integers("first_geom", [index.get(p.geoms[0], 0) for p in found])
-    tables.integers("second_geom", [index[p.geoms[1]] for p in found])
+    tables.integers("second_geom", [index.get(p.geoms[1], 0) for p in found])
     tables.integers("first_dofs", [d.dofs_of_geom(p.geoms[0]) for p in found], mask)
     tables.integers("second_dofs", [d.dofs_of_geom(p.geoms[1]) for p in found], mask)
     apart = [d.apart(pair) for pair in found]
@@ -404,6 +406,33 @@ def _add_meshes(tables: Tables, d: Description) -> None:
     tables.integers("first_corner", np.cumsum([0, *counts]))
     tables.structs("Vec", "corner_normal", [normal for normal, _ in corners])
     tables.integers("corner_vertex", [vertex for _, others in corners for vertex in others])
+
+
+def _add_ground(tables: Tables, d: Description) -> None:
+    fields, boxes = d.ground.fields, d.ground.boxes
+    if not fields and boxes is None:
+        return
+    tables.size(FIELDS=len(fields))
+    tables.structs("Vec", "field_corner", [field.corner for field in fields])
+    tables.structs("Mat", "field_orientation", [field.orientation.ravel() for field in fields])
+    tables.floats("cell_width", [field.cell[0] for field in fields])
+    tables.floats("cell_height", [field.cell[1] for field in fields])
+    tables.floats("field_columns", [field.heights.shape[1] - 1 for field in fields])
+    tables.floats("field_rows", [field.heights.shape[0] - 1 for field in fields])
+    tables.floats("field_base", [field.base for field in fields])
+    tables.floats("field_top", [field.heights.max() for field in fields])
+    starts = np.cumsum([0, *(field.heights.size for field in fields)])[:-1]
+    tables.integers("field_data", starts, "unsigned")
+    tables.integers("field_pair", [i for field in fields for i in d.pairs_on(field.like, "round_on_field")])
+    if boxes is None:
+        return
+    start, count = sum(field.heights.size for field in fields), len(boxes.numbers)
+    cells = start + BOX_NUMBERS * count
+    tables.size(BOXES=start, CELLS=cells, NAMED=cells + len(boxes.first), BOX_KINDS=len(boxes.kinds))
+    tables.size(BOX_NUMBERS=BOX_NUMBERS, GRID_COLUMNS=boxes.shape[0], GRID_ROWS=boxes.shape[1])
+    tables.constant(grid_x=boxes.corner[0], grid_y=boxes.corner[1], grid_cell=boxes.cell)
+    for function in ON_BOXES.values():
+        tables.integers(f"{function}_pair", [i for kind in boxes.kinds for i in d.pairs_on(kind, function)])
 
 
 def _add_limits(tables: Tables, d: Description) -> None:

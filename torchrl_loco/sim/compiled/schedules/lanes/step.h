@@ -62,7 +62,7 @@ const auto row_of = [=](auto* data, unsigned size) {  // products of 32 bits cou
 };
 float* const sensors = row_of(sensordata_out.data, Model::SENSOR_VALUES);
 float* const row = row_of(numbers_out.data, numbers_out.shape[1]);
-Step step(w, lane, row_of(ctrl_in.data, Model::CONTROLS), overflow_out.data[this_world], row);
+Step step(w, lane, row_of(ctrl_in.data, Model::CONTROLS), overflow_out.data[this_world], row, terrain_in.data);
 if (live && lane == 0) {  // in a step that is not taken, numbers may have changed
   //DERIVE
 }

@@ -174,6 +174,9 @@ struct alignas(16) World {
       Pose pose[Model::LINKS];
       Body bodies[Model::LINKS];
       Geom geoms[Model::GEOMS + 1];
+#if WITH_GROUND
+      unsigned near_ground[Model::NEAR_GROUND];
+#endif
       unsigned short candidates[Model::CANDIDATES];
     };
     float jacobian[Model::JACOBIAN_ROWS * STRIDE];

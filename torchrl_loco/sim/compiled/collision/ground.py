@@ -1,0 +1,127 @@
+"""The ground: height fields and the many boxes of a world, which lie once on the device however many worlds there are.
+
+Pairs of geoms are of moving ones with what the ground has of each kind: geoms of it whose contacts have the same
+parameters share their pairs. A grid of cells names the boxes that a geom may touch.
+"""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.sim.compiled.collision.kinds import BOX, FIELD
+from torchrl_loco.sim.compiled.collision.pairs import stand_ins
+from torchrl_loco.sim.compiled.ir.parameters import nominal
+
+BOX_NUMBERS = 24
+"""Of a box: its bounds (low, high), center, axes by rows, half sizes, number of its kind, and first column and row."""
+CELLS_PER_BOX = 4
+"""Cells of the grid, at most, as a multiple of the boxes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Field:
+    """A height field, in a frame of its own, whose z axis points up from it.
+
+    Attributes:
+        heights: of its points over the frame (m), ``(rows, columns)``: rows along y, columns along x.
+        cell: distance of two points along x and y (m).
+        base: how far its base lies below the frame (m).
+        corner: where the first point lies, without its height, in the world's frame (m).
+        orientation: of the frame.
+        like: the geom whose pairs have the parameters of its contacts.
+    """
+
+    heights: np.ndarray
+    cell: tuple[float, float]
+    base: float
+    corner: np.ndarray
+    orientation: np.ndarray
+    like: int
+
+    @classmethod
+    def of(cls, m: mujoco.MjModel, data: mujoco.MjData, geom: int, like: int) -> "Field":
+        """Returns that of a geom."""
+        field = m.geom_dataid[geom]
+        shape = int(m.hfield_nrow[field]), int(m.hfield_ncol[field])
+        x, y, top, base = m.hfield_size[field]
+        start = m.hfield_adr[field]
+        heights = top * m.hfield_data[start : start + shape[0] * shape[1]].reshape(shape)
+        orientation = data.geom_xmat[geom].reshape(3, 3)
+        corner = data.geom_xpos[geom] - orientation @ [x, y, 0.0]
+        return cls(heights, (2 * x / (shape[1] - 1), 2 * y / (shape[0] - 1)), float(base), corner, orientation, like)
+
+
+@dataclasses.dataclass(frozen=True)
+class Boxes:
+    """Boxes of the world, and the grid of cells that names them.
+
+    Attributes:
+        numbers: :data:`BOX_NUMBERS` of each, ``(boxes, 24)``.
+        kinds: the geoms whose pairs have the parameters of their contacts.
+        corner: the first corner of the grid (m), ``(2,)``.
+        cell: the length of a cell (m).
+        shape: cells along x and y.
+        first: where the boxes of each cell begin, ``(cells + 1,)``; cells along x are next to each other.
+        named: the boxes, cell by cell.
+    """
+
+    numbers: np.ndarray
+    kinds: list[int]
+    corner: np.ndarray
+    cell: float
+    shape: tuple[int, int]
+    first: np.ndarray
+    named: np.ndarray
+
+    @classmethod
+    def of(cls, m: mujoco.MjModel, data: mujoco.MjData, like: dict[int, int]) -> "Boxes":
+        """Returns those of geoms, each of which is as another of them."""
+        geoms, kinds = list(like), sorted(set(like.values()))
+        axes, size = data.geom_xmat[geoms].reshape(-1, 3, 3), m.geom_size[geoms]
+        center = data.geom_xpos[geoms]
+        reach = np.einsum("bij,bj->bi", np.abs(axes), size)
+        low, high = center - reach, center + reach
+        of_kind = [kinds.index(like[geom]) for geom in geoms]
+        corner, extent = low[:, :2].min(axis=0), (high[:, :2].max(axis=0) - low[:, :2].min(axis=0))
+        cell = max(float(np.median(2 * reach[:, :2])), float(np.sqrt(extent.prod() / (CELLS_PER_BOX * len(geoms)))))
+        columns, rows = (max(1, int(np.ceil(x / cell))) for x in extent)
+        # Bounds grow by what single precision may round away.
+        spans = [np.floor((x - corner) / cell + e).astype(int) for x, e in ((low[:, :2], -1e-4), (high[:, :2], 1e-4))]
+        (left, below), (right, above) = (np.clip(span, 0, [columns - 1, rows - 1]).T for span in spans)
+        numbers = np.column_stack([low, high, center, axes.reshape(-1, 9), size, of_kind, left, below])
+        cells = [
+            (y * columns + x, box)
+            for box in range(len(geoms))
+            for y in range(below[box], above[box] + 1)
+            for x in range(left[box], right[box] + 1)
+        ]
+        order = np.array(sorted(cells))
+        first = np.searchsorted(order[:, 0], np.arange(columns * rows + 1))
+        return cls(numbers, kinds, corner, cell, (columns, rows), first, order[:, 1])
+
+
+@dataclasses.dataclass(frozen=True)
+class Ground:
+    """The height fields and the boxes of a model that are looked up; ``boxes`` is ``None`` where they are few."""
+
+    fields: list[Field]
+    boxes: Boxes | None
+
+    @classmethod
+    def of(cls, m: mujoco.MjModel) -> "Ground":
+        """Returns that of a model, or of a ``VariedModel``."""
+        like, plain = stand_ins(m), nominal(m)
+        data = mujoco.MjData(plain)
+        mujoco.mj_kinematics(plain, data)
+        boxes = {geom: other for geom, other in like.items() if plain.geom_type[geom] == BOX}
+        fields = [Field.of(plain, data, geom, other) for geom, other in like.items() if plain.geom_type[geom] == FIELD]
+        return cls(fields, Boxes.of(plain, data, boxes) if boxes else None)
+
+    def numbers(self) -> np.ndarray:
+        """Returns all of it as the compiled step reads it: heights, then boxes, then cells of the grid as integers."""
+        parts = [np.zeros(0, dtype=np.float32), *(field.heights.ravel().astype(np.float32) for field in self.fields)]
+        if self.boxes is not None:
+            parts.append(self.boxes.numbers.ravel().astype(np.float32))
+            parts += [cells.astype(np.int32).view(np.float32) for cells in (self.boxes.first, self.boxes.named)]
+        return np.concatenate(parts)

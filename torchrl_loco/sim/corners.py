@@ -1,0 +1,88 @@
+"""Spheres in the corners of solids, which touch height fields in their place.
+
+Where boxes, cylinders, ellipsoids and meshes meet a height field, C MuJoCo searches for a contact with each prism, and
+what it finds jumps: a pose that is rounded to single precision moves a Go1 by 0.05 m/s. All engines agree on spheres.
+"""
+
+import mujoco
+import numpy as np
+
+MOST_RADIUS, SHARE = 0.02, 0.5
+"""Of a sphere: at most (m), and as a fraction of the least half size of its solid."""
+DIAGONALS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+LIKE = ("condim", "friction", "solref", "solimp", "solmix", "priority", "margin", "gap")
+"""What a sphere has of its solid."""
+BITS = 31
+TYPE = mujoco.mjtGeom
+FIELD, ELLIPSOID, CYLINDER, BOX, MESH = (
+    int(getattr(TYPE, f"mjGEOM_{kind}")) for kind in ("HFIELD", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
+)
+
+
+def stand_on_corners(spec: mujoco.MjSpec) -> list[str]:
+    """Gives solids that may touch a height field of the world spheres that do so instead; else they touch as before.
+
+    Args:
+        spec: the model, which is changed.
+
+    Returns:
+        The names of the solids, or their numbers.
+
+    Raises:
+        ValueError: the bits of contype and conaffinity do not suffice.
+    """
+    m = spec.compile()
+    of_world = m.body_weldid[m.geom_bodyid] == 0
+    fields = np.flatnonzero(of_world & (m.geom_type == FIELD))
+    touched = {
+        g: [f for f in fields if m.geom_contype[g] & m.geom_conaffinity[f] or m.geom_contype[f] & m.geom_conaffinity[g]]
+        for g in np.flatnonzero(~of_world)
+    }
+    solids = [g for g, on in touched.items() if on and m.geom_type[g] in (ELLIPSOID, CYLINDER, BOX, MESH)]
+    if not solids:
+        return []
+    # Each kind of field has a bit of its own, which what may touch it accepts.
+    kinds = sorted({(int(m.geom_contype[f]), int(m.geom_conaffinity[f])) for f in fields})
+    used = int(np.bitwise_or.reduce(m.geom_contype | m.geom_conaffinity))
+    free = [1 << bit for bit in range(BITS) if not used >> bit & 1]
+    if len(kinds) > len(free):
+        raise ValueError(f"solids_on_terrain='spheres' needs {len(kinds)} free bits of contype and conaffinity")
+    bits = {f: free[kinds.index((int(m.geom_contype[f]), int(m.geom_conaffinity[f])))] for f in fields}
+    names = []
+    for g, geom in [(geom.id, geom) for geom in spec.geoms]:  # ids as they are before anything is added
+        if g in bits:
+            geom.contype, geom.conaffinity = bits[g], 0
+        elif touched.get(g):
+            accepted = int(np.bitwise_or.reduce([bits[f] for f in touched[g]]))
+            if g not in solids:
+                geom.conaffinity |= accepted
+                continue
+            names.append(geom.name or str(g))
+            for k, (place, radius) in enumerate(spheres(m, g)):
+                name = f"{geom.name}_corner_{k}" if geom.name else ""
+                own = {"type": TYPE.mjGEOM_SPHERE, "pos": place, "size": [radius, 0, 0], "mass": 0.0, "group": 3}
+                copied = {field: getattr(geom, field) for field in LIKE}
+                geom.parent.add_geom(name=name, contype=0, conaffinity=accepted, **own, **copied)
+    return names
+
+
+def spheres(m: mujoco.MjModel, geom: int) -> list[tuple[np.ndarray, float]]:
+    """Returns the centers of spheres within a solid, in the frame of its body (m), and their radius (m)."""
+    size = m.geom_aabb[geom, 3:]
+    radius = min(MOST_RADIUS, SHARE * float(size.min()))
+    kind = m.geom_type[geom]
+    if kind == ELLIPSOID:
+        places = [sign * (size[k] - radius) * np.eye(3)[k] for k in range(3) for sign in (-1, 1)]
+    elif kind == CYLINDER:
+        places = [(*((size[0] - radius) * d[:2] / np.sqrt(2)), d[2] * (size[2] - radius)) for d in DIAGONALS]
+    elif kind == MESH:
+        mesh = m.geom_dataid[geom]
+        start = m.mesh_vertadr[mesh]
+        vertices = m.mesh_vert[start : start + m.mesh_vertnum[mesh]]
+        corners = [vertices[np.argmax(vertices @ (d / size))] for d in DIAGONALS]
+        places = [corner * max(0.0, 1.0 - radius / np.linalg.norm(corner)) for corner in np.unique(corners, axis=0)]
+    else:
+        places = list(DIAGONALS * (size - radius))
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, m.geom_quat[geom])
+    return [(m.geom_pos[geom] + turn.reshape(3, 3) @ place, radius) for place in places]
