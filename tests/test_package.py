@@ -12,6 +12,7 @@ import torchrl_loco
 ROOT = Path(torchrl_loco.__file__).parent
 LAYERS = [  # a module imports from its own layer or from those before it
     {"checks", "conditions", "config", "garbage", "known_files", "lazy_compiler", "motion", "rewards", "storage"},
+    {"terrain"},
     {"sim"},
     {"rendering"},
     {"envs", "viewer"},

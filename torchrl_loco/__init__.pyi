@@ -10,6 +10,7 @@ from . import rendering as rendering
 from . import rewards as rewards
 from . import sim as sim
 from . import tasks as tasks
+from . import terrain as terrain
 from . import training as training
 from . import wrappers as wrappers
 from .collector import RolloutCollector as RolloutCollector

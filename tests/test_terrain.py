@@ -1,0 +1,172 @@
+"""Patches of ground, the grid that they lie on, and the model that comes of it."""
+
+import functools
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from torchrl_loco import Go1Velocity, SimConfig, terrain
+from torchrl_loco.sim import Simulation
+from torchrl_loco.sim.compiled.support import unsupported
+from torchrl_loco.sim.warp_init import init_warp
+
+SLOPE_DOWN = functools.partial(terrain.slope, down=True)
+STAIRS_DOWN = functools.partial(terrain.stairs, down=True)
+KINDS = {
+    "flat": terrain.flat,
+    "slope": terrain.slope,
+    "slope down": SLOPE_DOWN,
+    "rough": terrain.rough,
+    "wave": terrain.wave,
+    "stairs": terrain.stairs,
+    "stairs down": STAIRS_DOWN,
+    "obstacles": terrain.obstacles,
+    "stepping stones": terrain.stepping_stones,
+    "gap": terrain.gap,
+    "pit": terrain.pit,
+}
+MARBLE = """
+<mujoco>
+  <option timestep="0.002" iterations="100" ls_iterations="50" tolerance="1e-10"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 .1" friction=".6" condim="3"/>
+    <body pos="0 0 2"><freejoint/><geom name="marble" size=".05"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def ground():
+    return terrain.Terrain(KINDS, rows=3, columns=12, size=6.0, border=5.0, seed=1)
+
+
+def test_the_start_of_a_patch_is_its_middle_and_its_edge_is_level(ground):
+    """Of every kind and difficulty."""
+    np.testing.assert_allclose(ground.height(ground.origins[..., :2]), ground.origins[..., 2], atol=1e-9)
+    x, y = ground.half
+    along = np.linspace(-1.0, 1.0, 301)
+    for row in range(ground.rows + 1):
+        edge = np.stack([np.full(301, (row - ground.rows / 2) * ground.size), y * along], axis=-1)
+        assert np.abs(ground.height(edge)).max() < 1e-9
+    assert np.isnan(ground.height([x + 6.0, 0.0]))
+    assert ground.height([x + 3.0, y + 3.0]) == 0.0
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_harder_patches_are_harder(name):
+    """Their ground deviates more from level, but for level ground."""
+    spread = []
+    for difficulty in (0.0, 0.5, 1.0):
+        kinds = {name: lambda _, rng, size, cell, d=difficulty: KINDS[name](d, rng, size, cell)}
+        ground = terrain.Terrain(kinds, rows=1, columns=1, border=1.0)
+        across = np.linspace(-3.9, 3.9, 157)
+        seen = ground.height(np.stack(np.meshgrid(across, across), axis=-1))
+        assert np.isfinite(seen).all()
+        spread.append(np.abs(seen).mean())
+    assert spread == [0.0] * 3 if name == "flat" else spread[0] < spread[1] < spread[2]
+
+
+def test_heights_are_those_of_rays_in_mujoco(ground):
+    m = ground.under(MARBLE).compile()
+    data = mujoco.MjData(m)
+    data.qpos[:3] = 0.0, 0.0, 900.0
+    mujoco.mj_forward(m, data)
+    rng, hit = np.random.default_rng(0), np.zeros(1, dtype=np.int32)
+    xy = rng.uniform(-1.0, 1.0, (3000, 2)) * (np.array(ground.half) + 3.0)
+    down = np.array([0.0, 0.0, -1.0])
+    rays = [50.0 - mujoco.mj_ray(m, data, np.array([*p, 50.0]), down, None, 1, -1, hit) for p in xy]
+    np.testing.assert_allclose(ground.height(xy), rays, atol=2e-6)
+
+
+def test_the_same_seed_makes_the_same_ground(ground):
+    same, other = (terrain.Terrain(KINDS, rows=3, columns=12, size=6.0, border=5.0, seed=seed) for seed in (1, 2))
+    assert np.array_equal(ground.heights, same.heights)
+    assert np.array_equal(ground.boxes, same.boxes)
+    assert not np.array_equal(ground.heights, other.heights)
+    assert not np.array_equal(ground.boxes, other.boxes)
+
+
+def test_columns_follow_the_shares():
+    kinds = {"flat": (terrain.flat, 1.0), "wave": (terrain.wave, 3.0), "pit": (terrain.pit, 0.01)}
+    ground = terrain.Terrain(kinds, rows=1, columns=13, size=4.0)
+    assert [ground.kinds.count(name) for name in kinds] == [3, 9, 1]
+
+
+def test_a_model_stands_on_it_with_the_contacts_of_its_floor(ground, tmp_path):
+    """In a file too; balls come to rest where C MuJoCo has them."""
+    init_warp()
+    spec = ground.under(MARBLE)
+    m = spec.compile()
+    path = tmp_path / "ground.xml"
+    path.write_text(spec.to_xml())
+    assert mujoco.MjModel.from_xml_path(str(path)).ngeom == m.ngeom
+    assert unsupported(m) == []
+    of_ground = [g for g in range(m.ngeom) if m.geom(g).name.startswith("terrain")]
+    assert len(of_ground) == 1 + len(ground.boxes)
+    assert (m.geom_friction[of_ground, 0] == 0.6).all()
+    places = ground.origins.reshape(-1, 3)
+    sim = Simulation(m, SimConfig.of(m, ctrl_dt=0.02, engine="compiled"), len(places), torch.device("cpu"))
+    start = np.tile(m.qpos0, (len(places), 1))
+    start[:, :3] = places + np.array([0.013, 0.021, 0.3])
+    sim.qpos.copy_(torch.tensor(start))
+    for _ in range(25):
+        sim.step()
+    data, expected = mujoco.MjData(m), []
+    for qpos in start:
+        mujoco.mj_resetData(m, data)
+        data.qpos[:] = qpos
+        mujoco.mj_step(m, data, 250)
+        expected.append(data.qpos[2])
+    assert np.abs(sim.qpos[:, 2].numpy() - expected).max() < 2e-3
+    assert (sim.qpos[:, 2].numpy() > ground.height(sim.qpos[:, :2].numpy()) + 0.04).all()
+
+
+def test_a_robot_stands_on_the_ground_of_a_task(ground, tmp_path):
+    spec = ground.under(Go1Velocity.model)
+    m = spec.compile()
+    assert m.nhfield == 1
+    assert "solids_on_terrain='spheres'" in unsupported(m)[0]
+    ground.picture(tmp_path / "ground.png")
+    assert (tmp_path / "ground.png").stat().st_size > 10_000
+
+
+def one(difficulty, rng, size, cell):
+    return terrain.Patch(boxes=np.array([[0.0, 0.0, -0.4, 1.0, 1.0, 0.5]]), start=0.1)
+
+
+def test_a_kind_of_ones_own():
+    ground = terrain.Terrain({"step": one}, rows=2, columns=1, size=4.0)
+    assert ground.height(ground.origins[..., :2]).tolist() == [[pytest.approx(0.1)], [pytest.approx(0.1)]]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "settings", "message"),
+    [
+        ({}, {}, "kinds must be 1 to 20"),
+        ({"a": terrain.flat}, {"size": 1.05}, r"size \(1.05\) must be a multiple of cell \(0.1\)"),
+        ({"a": (terrain.flat, -1.0)}, {}, "share of a"),
+        ({"a": 3}, {}, "kind a must be a function"),
+        ({"a": lambda difficulty: None}, {}, "kind a must take difficulty, generator, size and cell"),
+        ({"a": lambda *args: 3}, {}, "kind a must return a Patch, got int"),
+        ({"a": lambda *args: terrain.Patch(heights=np.zeros((3, 3)))}, {}, "heights of a must be 81 x 81 finite"),
+        ({"a": lambda *args: terrain.Patch(heights=np.full((81, 81), np.nan))}, {}, "81 x 81 finite"),
+        ({"a": lambda *args: terrain.Patch(boxes=np.array([[0, 0, 0, 1, 1, -1]]))}, {}, "positive half sizes"),
+        (
+            {"a": lambda *args: terrain.Patch(boxes=np.array([[4, 0, 0, 1, 1, 1]]))},
+            {},
+            "reach beyond their patch of 8 m",
+        ),
+        ({"a": lambda *args: terrain.Patch(start=np.inf)}, {}, "start of a must be finite"),
+    ],
+)
+def test_bad_input(kinds, settings, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        terrain.Terrain(kinds, **settings)
+
+
+def test_there_must_be_a_floor():
+    with pytest.raises(ValueError, match="no plane 'ground' to replace: choose one of 'floor'"):
+        terrain.Terrain({"a": terrain.flat}, rows=1, columns=1).under(MARBLE, floor="ground")

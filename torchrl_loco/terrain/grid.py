@@ -1,0 +1,224 @@
+"""Patches of ground on a grid, and the model that lies under a robot."""
+
+import dataclasses
+import inspect
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from torchrl_loco.checks import POSITIVE, check_float, check_int
+from torchrl_loco.config import read_mjcf
+from torchrl_loco.terrain.kinds import DEEP, Kind, Patch
+
+CONTACT = ("contype", "conaffinity", "condim", "priority", "friction", "solref", "solimp", "solmix", "margin", "gap")
+"""What the ground has of the plane that it replaces."""
+LEAST = 1e-3
+"""Range of a height field at least (m), which MuJoCo needs to be positive."""
+
+
+class Terrain:
+    """Patches on a grid: rows along x by difficulty, from 0 to 1, columns along y by kind; level ground around them.
+
+    It is a function of its arguments and the seed.
+
+    Args:
+        kinds: functions by name, or a function and its share of the columns, 1 by default.
+        rows: difficulties.
+        columns: how many; each kind has one at least.
+        size: a side of a patch (m).
+        cell: distance of two points of its height field (m), of which a side is a multiple.
+        border: width of the ground around the grid (m).
+        seed: of what is drawn.
+
+    Attributes:
+        origins: where robots begin, in the middle of each patch (m), ``(rows, columns, 3)``.
+        kinds: the kind of each column.
+        difficulties: those of the rows.
+        heights: of the points of the field (m), ``(along y, along x)``.
+        boxes: centers and half sizes of all boxes (m), ``(count, 6)``.
+
+    Raises:
+        ValueError: an argument is out of range, or a kind returns a patch that is none; the message says which.
+        TypeError: an argument has the wrong type, or a kind is no function.
+    """
+
+    def __init__(
+        self,
+        kinds: Mapping[str, Kind | tuple[Kind, float]],
+        rows: int = 10,
+        columns: int = 20,
+        *,
+        size: float = 8.0,
+        cell: float = 0.1,
+        border: float = 20.0,
+        seed: int = 0,
+    ) -> None:
+        self.rows, self.columns = check_int("rows", rows), check_int("columns", columns)
+        self.size, self.cell = check_float("size", size, POSITIVE), check_float("cell", cell, POSITIVE)
+        self.border = check_float("border", border, POSITIVE)
+        if not kinds or len(kinds) > columns:
+            raise ValueError(f"kinds must be 1 to {columns}, the number of columns, got {len(kinds)}")
+        if abs(size / cell - round(size / cell)) > 1e-6:
+            raise ValueError(f"size ({size:g}) must be a multiple of cell ({cell:g})")
+        functions = {name: kind if isinstance(kind, tuple) else (kind, 1.0) for name, kind in kinds.items()}
+        self.kinds = self._of_columns(
+            {name: check_float(f"share of {name}", s, POSITIVE) for name, (_, s) in functions.items()}
+        )
+        self.difficulties = np.linspace(0.0, 1.0, rows) if rows > 1 else np.ones(1)
+        side = round(size / cell)
+        self.heights = np.zeros((columns * side + 1, rows * side + 1))
+        self.origins = np.zeros((rows, columns, 3))
+        boxes = []
+        for row, difficulty in enumerate(self.difficulties):
+            for column, kind in enumerate(self.kinds):
+                rng = np.random.default_rng((seed, row, column))
+                patch = self._checked(kind, functions[kind][0], float(difficulty), rng)
+                center = self.center(row, column)
+                self.origins[row, column] = *center, patch.start
+                part = self.heights[column * side : (column + 1) * side + 1, row * side : (row + 1) * side + 1]
+                inner = part[1:-1, 1:-1]
+                if patch.heights is not None:
+                    inner[:] = patch.heights[1:-1, 1:-1]
+                elif patch.boxes is not None:  # the field lies below them
+                    inner[:] = min(0.0, float((patch.boxes[:, 2] - patch.boxes[:, 5]).min()))
+                if patch.boxes is not None:
+                    boxes.append(patch.boxes + np.array((*center, 0.0, 0.0, 0.0, 0.0)))
+        self.boxes = np.concatenate([*boxes, self._border()])
+
+    def _of_columns(self, shares: dict[str, float]) -> list[str]:
+        """Returns the kind of each column: one for each kind, and the others as the shares say."""
+        whole = sum(shares.values())
+        counts = dict.fromkeys(shares, 1)
+        while sum(counts.values()) < self.columns:
+            name = max(shares, key=lambda n: shares[n] / whole * self.columns - counts[n])
+            counts[name] += 1
+        return [name for name, count in counts.items() for _ in range(count)]
+
+    def _checked(self, name: str, kind: Kind, difficulty: float, rng: np.random.Generator) -> Patch:
+        if not callable(kind):
+            raise TypeError(f"kind {name} must be a function of difficulty, generator, size and cell, got {kind!r}")
+        try:
+            inspect.signature(kind).bind(difficulty, rng, self.size, self.cell)
+        except TypeError as error:
+            raise TypeError(f"kind {name} must take difficulty, generator, size and cell: {error}") from None
+        patch = kind(difficulty, rng, self.size, self.cell)
+        side = round(self.size / self.cell) + 1
+        if not isinstance(patch, Patch):
+            raise TypeError(f"kind {name} must return a Patch, got {type(patch).__name__}")
+        if patch.heights is not None and (
+            np.shape(patch.heights) != (side, side) or not np.isfinite(patch.heights).all()
+        ):
+            raise ValueError(f"heights of {name} must be {side} x {side} finite numbers, got {np.shape(patch.heights)}")
+        if patch.boxes is not None:
+            boxes = np.asarray(patch.boxes, dtype=float)
+            if boxes.ndim != 2 or boxes.shape[1] != 6 or not np.isfinite(boxes).all() or (boxes[:, 3:] <= 0).any():
+                raise ValueError(f"boxes of {name} must be rows of a center and positive half sizes, got {boxes.shape}")
+            if (np.abs(boxes[:, :2]) + boxes[:, 3:5] > self.size / 2 + 1e-6).any():
+                raise ValueError(f"boxes of {name} reach beyond their patch of {self.size:g} m")
+            patch = dataclasses.replace(patch, boxes=boxes)
+        if not math.isfinite(patch.start):
+            raise ValueError(f"start of {name} must be finite, got {patch.start}")
+        return patch
+
+    def center(self, row: int, column: int) -> tuple[float, float]:
+        """Returns where the middle of a patch is (m)."""
+        return (row - (self.rows - 1) / 2) * self.size, (column - (self.columns - 1) / 2) * self.size
+
+    @property
+    def half(self) -> tuple[float, float]:
+        """Half sides of the grid, along x and y (m)."""
+        return self.rows * self.size / 2, self.columns * self.size / 2
+
+    def _border(self) -> np.ndarray:
+        (x, y), w = self.half, self.border / 2
+        sides = [[sign * (x + w), 0.0, w, y + self.border] for sign in (-1, 1)]
+        sides += [[0.0, sign * (y + w), x, w] for sign in (-1, 1)]
+        return np.array([[a, b, -DEEP / 2, c, d, DEEP / 2] for a, b, c, d in sides])
+
+    def height(self, xy: np.ndarray) -> np.ndarray:
+        """Returns the height of the ground below points (m), as a ray from above finds it.
+
+        Args:
+            xy: points ``(..., 2)`` (m). Those beyond the border have none: the result is NaN.
+        """
+        x, y = np.asarray(xy, dtype=float).reshape(-1, 2).T
+        rows, columns = self.heights.shape[0] - 1, self.heights.shape[1] - 1
+        u, v = (x + self.half[0]) / self.cell, (y + self.half[1]) / self.cell
+        i, j = np.clip(np.floor(u).astype(int), 0, columns - 1), np.clip(np.floor(v).astype(int), 0, rows - 1)
+        s, t = u - i, v - j
+        h = self.heights
+        first, last = h[j, i], h[j + 1, i + 1]
+        upper, lower = h[j + 1, i], h[j, i + 1]  # of the two triangles of a cell
+        found = np.where(
+            t > s, first + s * (last - upper) + t * (upper - first), first + s * (lower - first) + t * (last - lower)
+        )
+        on = (u >= 0) & (u <= columns) & (v >= 0) & (v <= rows)
+        found = np.where(on, found, -np.inf)
+        order = np.argsort(x)  # a box is compared with the points that may be over it
+        x, y, found = x[order], y[order], found[order]
+        for a, b, z, half_x, half_y, half_z in self.boxes:
+            near = slice(*np.searchsorted(x, (a - half_x, a + half_x), side="left"))
+            inside = np.abs(y[near] - b) <= half_y
+            found[near][inside] = np.maximum(found[near][inside], z + half_z)
+        found[order] = found.copy()
+        return np.where(np.isfinite(found), found, np.nan).reshape(np.shape(xy)[:-1])
+
+    def under(self, source: Path | str | mujoco.MjSpec, floor: str = "floor") -> mujoco.MjSpec:
+        """Returns a model with this ground in place of a plane, whose properties of contacts it has.
+
+        Geoms are ``terrain``, the height field, and ``terrain_0``, ``terrain_1`` ..., the boxes.
+
+        Args:
+            source: path of an MJCF file, its text, or a ``mujoco.MjSpec``, which stays as it is.
+            floor: name of the plane.
+
+        Raises:
+            ValueError: there is no such plane.
+        """
+        spec = source.copy() if isinstance(source, mujoco.MjSpec) else read_mjcf(source)
+        plane = spec.geom(floor)
+        if plane is None or plane.type != mujoco.mjtGeom.mjGEOM_PLANE:
+            planes = [geom.name for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+            raise ValueError(f"there is no plane {floor!r} to replace: choose one of {', '.join(map(repr, planes))}")
+        like = {name: np.copy(getattr(plane, name)) for name in CONTACT}
+        like |= {"material": plane.material, "rgba": np.copy(plane.rgba), "group": plane.group}
+        like = {name: value.item() if getattr(value, "ndim", 1) == 0 else value for name, value in like.items()}
+        spec.delete(plane)
+        low = float(self.heights.min())
+        extent = max(float(self.heights.max()) - low, LEAST)
+        field = spec.add_hfield(name="terrain", nrow=self.heights.shape[0], ncol=self.heights.shape[1])
+        field.size = [*self.half, extent, DEEP]
+        field.userdata = ((self.heights - low) / extent).astype(np.float32).ravel().tolist()
+        kinds = mujoco.mjtGeom
+        world = spec.worldbody
+        world.add_geom(name="terrain", type=kinds.mjGEOM_HFIELD, hfieldname="terrain", pos=[0, 0, low], **like)
+        for k, box in enumerate(self.boxes):
+            world.add_geom(name=f"terrain_{k}", type=kinds.mjGEOM_BOX, pos=box[:3], size=box[3:], **like)
+        return spec
+
+    def picture(self, path: Path | str) -> None:
+        """Writes a picture of the ground from above, with the kinds and where robots begin.
+
+        Args:
+            path: an image file.
+
+        Raises:
+            ImportError: matplotlib is missing.
+        """
+        from matplotlib.figure import Figure
+
+        x, y = self.half
+        step = max(self.cell / 2, max(x, y) / 700)
+        across, along = np.arange(-x, x, step) + step / 2, np.arange(-y, y, step) + step / 2
+        seen = self.height(np.stack(np.meshgrid(across, along), axis=-1))
+        figure = Figure(figsize=(10.0, max(3.0, 9.0 * y / x)), layout="constrained")
+        axes = figure.add_subplot()
+        shown = axes.imshow(seen, origin="lower", extent=(-x, x, -y, y), cmap="terrain")
+        axes.plot(*self.origins[..., :2].reshape(-1, 2).T, "k.", ms=2)
+        axes.set_yticks([self.center(0, column)[1] for column in range(self.columns)], self.kinds, fontsize=7)
+        axes.set_xlabel("x (m), harder to the right")
+        figure.colorbar(shown, label="height (m)", shrink=0.7)
+        figure.savefig(path)
