@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_loco.envs import draws, sensors
+from torchrl_loco.envs import draws, heights, sensors
 from torchrl_loco.envs.names import Elements, Names
 from torchrl_loco.envs.tables import Entry, Table
 from torchrl_loco.envs.variation import Variation, constant_of
@@ -72,6 +72,7 @@ class Catalog(Elements):
         self.complete = False
         self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}
         self.home = self._tensor(models.home_pose(mj_model))
+        self.ground: heights.Ground | None = None
         self._index: dict[tuple[int, ...], torch.Tensor] = {}
         self._constants: dict[Any, torch.Tensor] = {}
         self._places: dict[tuple[int, int], torch.Tensor] = {}
@@ -315,6 +316,55 @@ class View:
     def site_linvel(self, sites: Names) -> torch.Tensor:
         """Returns velocities of sites in the world's frame (m/s), shaped as :meth:`xpos`."""
         return sensors.attached_velocity(self, "site", *self._catalog.ids("site", sites))
+
+    def terrain_height(self, points: torch.Tensor) -> torch.Tensor:
+        """Returns the height of the ground below points, as a ray from above finds it, ``(num_envs, ...)`` (m).
+
+        The ground is what is fixed to the world and may be touched: height fields, boxes and level planes.
+
+        Args:
+            points: x and y in the world's frame (m), and anything behind them, ``(num_envs, ..., 2 or more)``.
+
+        Returns:
+            The heights, NaN where there is no ground.
+
+        Raises:
+            ValueError: the model has no ground, or a part of it is turned.
+        """
+        return heights.below(self._catalog, points[..., 0], points[..., 1])
+
+    def height_scan(self, body: Names, grid: Any, miss: float = math.nan) -> torch.Tensor:
+        """Returns how far the ground lies below the height of a body, at points that turn with its yaw.
+
+        Yaw is that of the body's x axis laid flat; of its y axis where the x axis stands within 0.1 of upright.
+
+        Args:
+            body: name of the body.
+            grid: where the points are, ahead of the body and to its left (m), ``(points, 2)``.
+            miss: what it is where there is no ground.
+
+        Returns:
+            Height of the body's origin less that of the ground (m), ``(num_envs, points)``.
+
+        Raises:
+            ValueError: as :meth:`terrain_height`; or the grid has another shape.
+        """
+        where = torch.as_tensor(np.asarray(grid), dtype=torch.float32)
+        if where.ndim != 2 or where.shape[1] != 2:
+            raise ValueError(f"grid must be points ahead and to the left, (points, 2), got {tuple(where.shape)}")
+        key = "scan", tuple(where.flatten().tolist())
+        ahead, left = self._catalog.derived(key, lambda: where.T.numpy())
+        place, mat = self.xpos(body), self.xmat(body)
+        x, y = mat[:, 0, 0], mat[:, 1, 0]
+        upright = (x.square() + y.square()).sqrt() < 0.1
+        x, y = torch.where(upright, mat[:, 1, 1], x), torch.where(upright, -mat[:, 0, 1], y)
+        length = (x.square() + y.square()).sqrt()
+        cos, sin = (x / length).unsqueeze(-1), (y / length).unsqueeze(-1)
+        below = heights.below(
+            self._catalog, place[:, :1] + cos * ahead - sin * left, place[:, 1:2] + sin * ahead + cos * left
+        )
+        scan = place[:, 2:] - below
+        return scan if math.isnan(miss) else torch.where(scan.isnan(), miss, scan)
 
     def geom_xpos(self, geoms: Names) -> torch.Tensor:
         """Returns positions of the centers of geoms (m), shaped as :meth:`xpos`."""
