@@ -2,7 +2,6 @@
 
 import dataclasses
 import inspect
-import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -15,6 +14,8 @@ from torchrl_loco.terrain.kinds import DEEP, Kind, Patch
 
 CONTACT = ("contype", "conaffinity", "condim", "priority", "friction", "solref", "solimp", "solmix", "margin", "gap")
 """What the ground has of the plane that it replaces."""
+CLEAR = 0.8
+"""Half a side of the square about the middle of a patch over which a robot may begin (m)."""
 LEAST = 1e-3
 """Range of a height field at least (m), which MuJoCo needs to be positive."""
 
@@ -34,7 +35,8 @@ class Terrain:
         seed: of what is drawn.
 
     Attributes:
-        origins: where robots begin, in the middle of each patch (m), ``(rows, columns, 3)``.
+        origins: where robots begin (m), ``(rows, columns, 3)``: the middle of each patch, as high as the highest ground
+            within :data:`CLEAR` of it.
         kinds: the kind of each column.
         difficulties: those of the rows.
         heights: of the points of the field (m), ``(along y, along x)``.
@@ -70,14 +72,12 @@ class Terrain:
         self.difficulties = np.linspace(0.0, 1.0, rows) if rows > 1 else np.ones(1)
         side = round(size / cell)
         self.heights = np.zeros((columns * side + 1, rows * side + 1))
-        self.origins = np.zeros((rows, columns, 3))
         boxes = []
         for row, difficulty in enumerate(self.difficulties):
             for column, kind in enumerate(self.kinds):
                 rng = np.random.default_rng((seed, row, column))
                 patch = self._checked(kind, functions[kind][0], float(difficulty), rng)
                 center = self.center(row, column)
-                self.origins[row, column] = *center, patch.start
                 part = self.heights[column * side : (column + 1) * side + 1, row * side : (row + 1) * side + 1]
                 inner = part[1:-1, 1:-1]
                 if patch.heights is not None:
@@ -87,6 +87,7 @@ class Terrain:
                 if patch.boxes is not None:
                     boxes.append(patch.boxes + np.array((*center, 0.0, 0.0, 0.0, 0.0)))
         self.boxes = np.concatenate([*boxes, self._border()])
+        self.origins = self._origins()
 
     def _of_columns(self, shares: dict[str, float]) -> list[str]:
         """Returns the kind of each column: one for each kind, and the others as the shares say."""
@@ -119,8 +120,6 @@ class Terrain:
             if (np.abs(boxes[:, :2]) + boxes[:, 3:5] > self.size / 2 + 1e-6).any():
                 raise ValueError(f"boxes of {name} reach beyond their patch of {self.size:g} m")
             patch = dataclasses.replace(patch, boxes=boxes)
-        if not math.isfinite(patch.start):
-            raise ValueError(f"start of {name} must be finite, got {patch.start}")
         return patch
 
     def center(self, row: int, column: int) -> tuple[float, float]:
@@ -131,6 +130,13 @@ class Terrain:
     def half(self) -> tuple[float, float]:
         """Half sides of the grid, along x and y (m)."""
         return self.rows * self.size / 2, self.columns * self.size / 2
+
+    def _origins(self) -> np.ndarray:
+        about = np.arange(-CLEAR, CLEAR + 1e-9, self.cell / 2)
+        square = np.stack(np.meshgrid(about, about), axis=-1).reshape(-1, 2)
+        centers = np.array([[self.center(row, column) for column in range(self.columns)] for row in range(self.rows)])
+        highest = self.height(centers[:, :, None] + square).max(axis=-1)
+        return np.concatenate([centers, highest[..., None]], axis=-1)
 
     def _border(self) -> np.ndarray:
         (x, y), w = self.half, self.border / 2

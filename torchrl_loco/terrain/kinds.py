@@ -18,12 +18,10 @@ class Patch:
         heights: of points that are equally far apart, from edge to edge (m), ``(rows along y, columns along
             x)``. Those at the edges become 0.
         boxes: centers and half sizes (m), ``(count, 6)``. Without ``heights`` they are all that there is.
-        start: height of the ground where a robot begins, in the middle (m).
     """
 
     heights: np.ndarray | None = None
     boxes: np.ndarray | None = None
-    start: float = 0.0
 
 
 Kind = Callable[[float, np.random.Generator, float, float], Patch]
@@ -95,7 +93,7 @@ def slope(
     """
     steep = between(gradient, difficulty) * (-1 if down else 1)
     heights = steep * np.minimum(from_edge(size, cell), size / 2 - platform / 2)
-    return Patch(heights=heights, start=steep * (size / 2 - platform / 2))
+    return Patch(heights=heights)
 
 
 def rough(
@@ -105,7 +103,6 @@ def rough(
     cell: float,
     height: tuple[float, float] = (0.02, 0.1),
     step: float = 0.01,
-    level: float = 0.5,
 ) -> Patch:
     """Returns points of random heights.
 
@@ -116,13 +113,10 @@ def rough(
         cell: distance of two points (m).
         height: the largest, in the easiest patch and in the hardest (m).
         step: of which heights are multiples (m).
-        level: a side of the middle, which is as high as half of that (m).
     """
     most = max(1, round(between(height, difficulty) / step))
     heights = step * rng.integers(0, most + 1, (len(points(size, cell)),) * 2)
-    start = step * most / 2
-    heights = np.where(from_edge(size, cell) > size / 2 - level / 2, start, heights)
-    return Patch(heights=heights, start=start)
+    return Patch(heights=heights)
 
 
 def wave(
@@ -177,8 +171,8 @@ def stairs(
     boxes = ring(size / 2, frame, 0.0, bottom)
     for k in range(steps):
         boxes += ring(size / 2 - frame - k * width, width, sign * (k + 1) * rise, bottom)
-    start = sign * (steps + 1) * rise
-    return Patch(boxes=np.array(boxes + block(size / 2 - frame - steps * width, start, bottom)), start=start)
+    boxes += block(size / 2 - frame - steps * width, sign * (steps + 1) * rise, bottom)
+    return Patch(boxes=np.array(boxes))
 
 
 def obstacles(
@@ -281,7 +275,7 @@ def pit(
     depth: tuple[float, float] = (0.05, 0.5),
     platform: float = 3.0,
 ) -> Patch:
-    """Returns a pit with upright walls, in which a robot begins.
+    """Returns a pit with upright walls.
 
     Args:
         difficulty: from the shallowest to the deepest.
@@ -293,4 +287,4 @@ def pit(
     """
     deep = between(depth, difficulty)
     boxes = ring(size / 2, size / 2 - platform / 2, 0.0, -deep - DEEP) + block(platform / 2, -deep, -deep - DEEP)
-    return Patch(boxes=np.array(boxes), start=-deep)
+    return Patch(boxes=np.array(boxes))
