@@ -44,6 +44,7 @@ BAD = {
     "engine": ("compield", ValueError),
     "integrator": ("eular", ValueError),
     "contacts": ("floor", ValueError),
+    "solids_on_terrain": ("cubes", ValueError),
 }
 
 

@@ -82,6 +82,7 @@ def test_every_field_can_be_overridden():
         "euler_damping": True,
         "integrator": "euler",
         "contacts": "ground",
+        "solids_on_terrain": "spheres",
         "episode_length": 11,
         "deterministic": True,
         "engine": "mujoco_warp",

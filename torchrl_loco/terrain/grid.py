@@ -36,7 +36,7 @@ class Terrain:
 
     Attributes:
         origins: where robots begin (m), ``(rows, columns, 3)``: the middle of each patch, as high as the highest ground
-            within :data:`CLEAR` of it.
+            within 0.8 m of it.
         kinds: the kind of each column.
         difficulties: those of the rows.
         heights: of the points of the field (m), ``(along y, along x)``.

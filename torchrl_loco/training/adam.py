@@ -48,7 +48,7 @@ class FlatAdam:
         self._vectors = [Vectors(group["params"], group["betas"]) for group in self.param_groups]
 
     def wide(self, dtype: torch.dtype) -> dict[nn.Parameter, Tensor]:
-        """Returns all parameters in another type, each row with zeros up to a multiple of :data:`ALIGNED`.
+        """Returns all parameters in another type, each row with zeros up to a multiple of 8.
 
         Gradients flow from them into the vectors at once, instead of parameter by parameter; none into those that do
         not require them.
