@@ -22,6 +22,10 @@ def pytest_collectstart():
     """Prepares the process in which tests will run."""
     import hook_tasks  # noqa: F401, registers its tasks
     import quickly  # noqa: F401, before anything makes a kernel
+    from hypothesis.internal.conjecture import providers
+
+    # So that draws repeat: hypothesis takes constants from all that a process has imported, which differs by its tests.
+    providers._get_local_constants = providers.Constants
 
 
 def pytest_collection_finish():

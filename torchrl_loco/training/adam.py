@@ -138,6 +138,7 @@ class Vectors:
         doubles: dict[str, Any] = {"dtype": torch.float64, "device": self.whole.device}
         self.counts = torch.tensor([0.0, 1.0, 1.0], **doubles)
         self._factors, self._summands = (torch.tensor(x, **doubles) for x in ([1.0, *betas], [1.0, 0.0, 0.0]))
+        self._addresses: list[int] = []
         self.adopt()
 
     @torch.no_grad()
@@ -147,12 +148,17 @@ class Vectors:
         Raises:
             RuntimeError: that would be recorded as part of a step.
         """
-        views = zip(self._parts, self._views(self.whole), strict=True)
-        moved = [(part, view) for part, view in views if part.data_ptr() != view.data_ptr()]
+        if [part.data_ptr() for part in self._parts] == self._addresses:
+            return
+        views = self._views(self.whole)
+        moved = [
+            (part, view) for part, view in zip(self._parts, views, strict=True) if part.data_ptr() != view.data_ptr()
+        ]
         if moved and self.whole.is_cuda and torch.cuda.is_current_stream_capturing():
             raise RuntimeError("parameters were moved while a step is recorded: move them before the training")
         for part, view in moved:
             part.data = view.copy_(part)
+        self._addresses = [view.data_ptr() for view in views]
 
     def count(self) -> None:
         """Counts a step."""

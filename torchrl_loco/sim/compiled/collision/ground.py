@@ -53,52 +53,71 @@ class Field:
 
 
 @dataclasses.dataclass(frozen=True)
-class Boxes:
-    """Boxes of the world, and the grid of cells that names them.
+class Grid:
+    """Cells over the ground, each of which names the boxes that reach over it.
 
     Attributes:
-        numbers: :data:`BOX_NUMBERS` of each, ``(boxes, 24)``.
-        kinds: the geoms whose pairs have the parameters of their contacts.
-        corner: the first corner of the grid (m), ``(2,)``.
+        corner: the first corner (m), ``(2,)``.
         cell: the length of a cell (m).
         shape: cells along x and y.
         first: where the boxes of each cell begin, ``(cells + 1,)``; cells along x are next to each other.
         named: the boxes, cell by cell.
+        begin: first column and row of each box, ``(boxes, 2)``.
     """
 
-    numbers: np.ndarray
-    kinds: list[int]
     corner: np.ndarray
     cell: float
     shape: tuple[int, int]
     first: np.ndarray
     named: np.ndarray
+    begin: np.ndarray
+
+    @classmethod
+    def of(cls, low: np.ndarray, high: np.ndarray, cell: float) -> "Grid":
+        """Returns that of boxes with bounds ``(boxes, 2)`` (m)."""
+        corner = low.min(axis=0)
+        columns, rows = np.maximum(1, np.ceil((high.max(axis=0) - corner) / cell)).astype(int).tolist()
+        # Bounds grow by what single precision may round away.
+        spans = (np.floor((x - corner) / cell + e).astype(int) for x, e in ((low, -1e-4), (high, 1e-4)))
+        begin, end = (np.clip(span, 0, [columns - 1, rows - 1]) for span in spans)
+        cells = [
+            (y * columns + x, box)
+            for box, ((left, below), (right, above)) in enumerate(zip(begin, end, strict=True))
+            for y in range(below, above + 1)
+            for x in range(left, right + 1)
+        ]
+        order = np.array(sorted(cells))
+        first = np.searchsorted(order[:, 0], np.arange(columns * rows + 1))
+        return cls(corner, cell, (columns, rows), first, order[:, 1], begin)
+
+
+@dataclasses.dataclass(frozen=True)
+class Boxes:
+    """Boxes of the world, and the grid that names them.
+
+    Attributes:
+        numbers: :data:`BOX_NUMBERS` of each, ``(boxes, 24)``.
+        kinds: the geoms whose pairs have the parameters of their contacts.
+        grid: the grid.
+    """
+
+    numbers: np.ndarray
+    kinds: list[int]
+    grid: Grid
 
     @classmethod
     def of(cls, m: mujoco.MjModel, data: mujoco.MjData, like: dict[int, int]) -> "Boxes":
         """Returns those of geoms, each of which is as another of them."""
         geoms, kinds = list(like), sorted(set(like.values()))
-        axes, size = data.geom_xmat[geoms].reshape(-1, 3, 3), m.geom_size[geoms]
-        center = data.geom_xpos[geoms]
+        axes, size, center = data.geom_xmat[geoms].reshape(-1, 3, 3), m.geom_size[geoms], data.geom_xpos[geoms]
         reach = np.einsum("bij,bj->bi", np.abs(axes), size)
         low, high = center - reach, center + reach
+        area = np.prod(high[:, :2].max(axis=0) - low[:, :2].min(axis=0))
+        cell = max(float(np.median(2 * reach[:, :2])), float(np.sqrt(area / (CELLS_PER_BOX * len(geoms)))))
+        grid = Grid.of(low[:, :2], high[:, :2], cell)
         of_kind = [kinds.index(like[geom]) for geom in geoms]
-        corner, extent = low[:, :2].min(axis=0), (high[:, :2].max(axis=0) - low[:, :2].min(axis=0))
-        cell = max(float(np.median(2 * reach[:, :2])), float(np.sqrt(extent.prod() / (CELLS_PER_BOX * len(geoms)))))
-        columns, rows = (max(1, int(np.ceil(x / cell))) for x in extent)
-        # Bounds grow by what single precision may round away.
-        spans = [np.floor((x - corner) / cell + e).astype(int) for x, e in ((low[:, :2], -1e-4), (high[:, :2], 1e-4))]
-        (left, below), (right, above) = (np.clip(span, 0, [columns - 1, rows - 1]).T for span in spans)
-        numbers = np.column_stack([low, high, center, axes.reshape(-1, 9), size, of_kind, left, below])
-        cells = [
-            (y * columns + x, box)
-            for box in range(len(geoms))
-            for y in range(below[box], above[box] + 1)
-            for x in range(left[box], right[box] + 1)
-        ]
-        order = np.array(sorted(cells))
-        first = np.searchsorted(order[:, 0], np.arange(columns * rows + 1))
-        return cls(numbers, kinds, corner, cell, (columns, rows), first, order[:, 1])
+        numbers = np.column_stack([low, high, center, axes.reshape(-1, 9), size, of_kind, grid.begin])
+        return cls(numbers, kinds, grid)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,5 +142,7 @@ class Ground:
         parts = [np.zeros(0, dtype=np.float32), *(field.heights.ravel().astype(np.float32) for field in self.fields)]
         if self.boxes is not None:
             parts.append(self.boxes.numbers.ravel().astype(np.float32))
-            parts += [cells.astype(np.int32).view(np.float32) for cells in (self.boxes.first, self.boxes.named)]
+            parts += [
+                cells.astype(np.int32).view(np.float32) for cells in (self.boxes.grid.first, self.boxes.grid.named)
+            ]
         return np.concatenate(parts)

@@ -93,10 +93,14 @@ MOST_LISTED = 8
 """Boxes of the world up to which each has pairs of its own; more of them are looked up."""
 
 
+def of_ground(m: mujoco.MjModel) -> np.ndarray:
+    """Returns which geoms are fixed to the world and may be touched, ``(ngeom,)``."""
+    return (m.body_weldid[m.geom_bodyid] == 0) & ((m.geom_contype != 0) | (m.geom_conaffinity != 0))
+
+
 def looked_up(m: mujoco.MjModel) -> np.ndarray:
     """Returns which geoms are looked up, ``(ngeom,)``: height fields of the world, and its boxes if they are many."""
-    of_world = (m.body_weldid[m.geom_bodyid] == 0) & ((m.geom_contype != 0) | (m.geom_conaffinity != 0))
-    boxes, fields = of_world & (m.geom_type == BOX), of_world & (m.geom_type == FIELD)
+    boxes, fields = (of_ground(m) & (m.geom_type == shape) for shape in (BOX, FIELD))
     return boxes | fields if boxes.sum() > MOST_LISTED else fields
 
 

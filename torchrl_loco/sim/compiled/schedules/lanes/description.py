@@ -14,7 +14,6 @@ from torchrl_loco.sim.compiled.collision.kinds import (
     BOX,
     CAPSULE,
     FUNCTIONS,
-    GROUND,
     GROUND_FUNCTIONS,
     MESH,
     PLANE,
@@ -123,8 +122,8 @@ class Description:
         self.condims = {p.condim for p in self.pairs} - {1}
         self.elliptic = bool(self.condims) and is_elliptic(m)
         self.some_lack_edges = len(self.condims) > 1 and not self.elliptic
-        touching = {g for p in self.pairs for g in p.geoms}
-        self.geoms = sorted(g for g in touching if m.geom_type[g] not in GROUND and not looked_up(m)[g])
+        on_ground = looked_up(m) | (m.geom_type == PLANE)
+        self.geoms = sorted({g for p in self.pairs for g in p.geoms if not on_ground[g]})
         self.has_solids = any(m.geom_type[g] in SOLID for g in self.geoms)
         used = sorted({int(m.geom_dataid[g]) for g in self.geoms if m.geom_type[g] == MESH})
         self.meshes = {mesh: Mesh.of(m, mesh) for mesh in used}
@@ -204,8 +203,8 @@ class Description:
         Raises:
             ValueError: it cannot.
         """
+        most = max((2 * (self.radius(g) + self.half_length(g)) for g in self.geoms), default=0.0)
         for field in self.ground.fields:
-            most = max(2 * (self.radius(g) + self.half_length(g)) for g in self.geoms)
             prisms = 2 * (most / field.cell[0] + 2) * (most / field.cell[1] + 2)
             if prisms > MOST_PRISMS:
                 raise ValueError(f"a height field with cells of {min(field.cell):.2g} m under a geom of {most:.2g} m")

@@ -426,11 +426,11 @@ def _add_ground(tables: Tables, d: Description) -> None:
     tables.integers("field_pair", [i for field in fields for i in d.pairs_on(field.like, "round_on_field")])
     if boxes is None:
         return
-    start, count = sum(field.heights.size for field in fields), len(boxes.numbers)
+    grid, start, count = boxes.grid, sum(field.heights.size for field in fields), len(boxes.numbers)
     cells = start + BOX_NUMBERS * count
-    tables.size(BOXES=start, CELLS=cells, NAMED=cells + len(boxes.first), BOX_KINDS=len(boxes.kinds))
-    tables.size(BOX_NUMBERS=BOX_NUMBERS, GRID_COLUMNS=boxes.shape[0], GRID_ROWS=boxes.shape[1])
-    tables.constant(grid_x=boxes.corner[0], grid_y=boxes.corner[1], grid_cell=boxes.cell)
+    tables.size(BOXES=start, CELLS=cells, NAMED=cells + len(grid.first), BOX_KINDS=len(boxes.kinds))
+    tables.size(BOX_NUMBERS=BOX_NUMBERS, GRID_COLUMNS=grid.shape[0], GRID_ROWS=grid.shape[1])
+    tables.constant(grid_x=grid.corner[0], grid_y=grid.corner[1], grid_cell=grid.cell)
     for function in ON_BOXES.values():
         tables.integers(f"{function}_pair", [i for kind in boxes.kinds for i in d.pairs_on(kind, function)])
 
