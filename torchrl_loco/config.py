@@ -58,7 +58,8 @@ class SimConfig:
             world and not each other. Under both engines, and in :attr:`torchrl_loco.LocoEnv.mj_model`.
         solids_on_terrain: what boxes, cylinders, ellipsoids and meshes do on height fields: ``exact`` is what MuJoCo
             finds, which the engine ``compiled`` does not have, as it jumps with rounding; ``spheres`` gives the model
-            of an environment spheres in their corners, which touch height fields in their place.
+            of an environment spheres in their corners, of up to 0.02 m, which in their place touch height fields and,
+            where there are any, boxes of the world too: an edge between two corners is not felt.
 
     Raises:
         TypeError: a value has the wrong type.

@@ -135,6 +135,19 @@ def test_spheres_and_capsules_touch_fields_as_in_c_mujoco():
     assert np.quantile(errors[:, 2], 0.998) < 1e-2  # directions out that are as short
 
 
+@pytest.mark.parametrize("turn", ["0 90 0", "180 0 0", "0 60 20"])
+def test_a_field_may_lie_on_its_side(turn):
+    """Its base is then beside or above what is its surface."""
+    rng = np.random.default_rng(3)
+    assets = '<hfield name="a" nrow="12" ncol="9" size=".6 .7 .2 1"/>'
+    m = falling(ROUND, f'<geom type="hfield" hfield="a" euler="{turn}"/>', assets)
+    m.hfield_data[:] = rng.uniform(0.0, 1.0, 108)
+    errors, count = compared(m, thrown(m, rng, 150), Description(m).layout.frictional)
+    assert count > 100
+    assert len(errors) > 200
+    np.testing.assert_array_less(np.quantile(errors, 0.98, axis=0), (2e-6, 5e-3, 1e-2))
+
+
 @pytest.mark.parametrize(
     ("geom", "has_floor"),
     [
@@ -154,7 +167,7 @@ def test_shapes_touch_many_boxes_as_in_c_mujoco(geom, has_floor):
     np.testing.assert_array_less(np.quantile(errors, 0.97, axis=0), (5e-6, 1e-2, 1e-3))
 
 
-def test_steps_on_the_ground_are_those_of_c_mujoco():
+def test_steps_on_the_ground_are_those_of_c_mujoco(device):
     """Bodies that lie on a field and on boxes, with friction and without."""
     rng = np.random.default_rng(2)
     for m in (fields(rng), boxes(rng, 20, ROUND)):
@@ -167,7 +180,7 @@ def test_steps_on_the_ground_are_those_of_c_mujoco():
             if np.isfinite(data.qvel).all() and 0 < data.ncon < 12:
                 states.append((data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()))
         config = SimConfig.of(m, ctrl_dt=0.002, engine="compiled")
-        sim = Simulation(m, config, len(states), torch.device("cpu"))
+        sim = Simulation(m, config, len(states), torch.device(device))
         for name, values in zip(("qpos", "qvel", "qacc_warmstart"), zip(*states, strict=True), strict=True):
             getattr(sim, name).copy_(torch.tensor(np.array(values)))
         sim.step()
@@ -177,7 +190,7 @@ def test_steps_on_the_ground_are_those_of_c_mujoco():
             data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos, qvel, warmstart
             mujoco.mj_step(m, data)
             expected.append(data.qvel.copy())
-        errors = np.abs(sim.qvel.numpy() - np.array(expected)).max(axis=1)
+        errors = np.abs(sim.qvel.cpu().numpy() - np.array(expected)).max(axis=1)
         assert len(states) > 12
         assert np.median(errors) < 2e-4
         assert np.quantile(errors, 0.8) < 5e-3

@@ -1,7 +1,8 @@
-"""Spheres in the corners of solids, which touch height fields in their place.
+"""Spheres in the corners of solids, which touch the ground in their place where it has a height field.
 
 Where boxes, cylinders, ellipsoids and meshes meet a height field, C MuJoCo searches for a contact with each prism, and
 what it finds jumps: a pose that is rounded to single precision moves a Go1 by 0.05 m/s. All engines agree on spheres.
+Boxes of the same ground are touched by the spheres too.
 """
 
 import mujoco
@@ -20,7 +21,9 @@ FIELD, ELLIPSOID, CYLINDER, BOX, MESH = (
 
 
 def stand_on_corners(spec: mujoco.MjSpec) -> list[str]:
-    """Gives solids that may touch a height field of the world spheres that do so instead; else they touch as before.
+    """Gives solids that may touch a height field of the world spheres in their place, for its fields and boxes.
+
+    What moves they touch as before; and where there is no field, everything.
 
     Args:
         spec: the model, which is changed.
@@ -33,21 +36,24 @@ def stand_on_corners(spec: mujoco.MjSpec) -> list[str]:
     """
     m = spec.compile()
     of_world = m.body_weldid[m.geom_bodyid] == 0
-    fields = np.flatnonzero(of_world & (m.geom_type == FIELD))
+    ground = np.flatnonzero(of_world & np.isin(m.geom_type, (FIELD, BOX)))
+    if not (of_world & (m.geom_type == FIELD)).any():
+        return []
     touched = {
-        g: [f for f in fields if m.geom_contype[g] & m.geom_conaffinity[f] or m.geom_contype[f] & m.geom_conaffinity[g]]
+        g: [f for f in ground if m.geom_contype[g] & m.geom_conaffinity[f] or m.geom_contype[f] & m.geom_conaffinity[g]]
         for g in np.flatnonzero(~of_world)
     }
-    solids = [g for g, on in touched.items() if on and m.geom_type[g] in (ELLIPSOID, CYLINDER, BOX, MESH)]
+    on_field = {g for g, on in touched.items() if (m.geom_type[on] == FIELD).any()}
+    solids = [g for g in on_field if m.geom_type[g] in (ELLIPSOID, CYLINDER, BOX, MESH)]
     if not solids:
         return []
-    # Each kind of field has a bit of its own, which what may touch it accepts.
-    kinds = sorted({(int(m.geom_contype[f]), int(m.geom_conaffinity[f])) for f in fields})
+    # Each kind of them has a bit of its own, which what may touch it accepts.
+    kinds = sorted({(int(m.geom_contype[f]), int(m.geom_conaffinity[f])) for f in ground})
     used = int(np.bitwise_or.reduce(m.geom_contype | m.geom_conaffinity))
     free = [1 << bit for bit in range(BITS) if not used >> bit & 1]
     if len(kinds) > len(free):
         raise ValueError(f"solids_on_terrain='spheres' needs {len(kinds)} free bits of contype and conaffinity")
-    bits = {f: free[kinds.index((int(m.geom_contype[f]), int(m.geom_conaffinity[f])))] for f in fields}
+    bits = {f: free[kinds.index((int(m.geom_contype[f]), int(m.geom_conaffinity[f])))] for f in ground}
     names = []
     for g, geom in [(geom.id, geom) for geom in spec.geoms]:  # ids as they are before anything is added
         if g in bits:

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.collision.kinds import FIELD, GROUND, described, title
-from torchrl_loco.sim.compiled.collision.pairs import Pair, is_elliptic, kind, pairs
+from torchrl_loco.sim.compiled.collision.pairs import MOST_LISTED, Pair, is_elliptic, kind, looked_up, pairs
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel, nominal
 from torchrl_loco.sim.compiled.physics import equalities
 from torchrl_loco.sim.compiled.physics.actuators import BIASES, FILTERS, acting
@@ -45,6 +45,8 @@ def unsupported(mj_model: mujoco.MjModel, varied: Varied | None = None) -> list[
         varied: which of its numbers differ from world to world.
     """
     m = mj_model if varied is None else VariedModel(mj_model, varied)
+    if isinstance(m, VariedModel) and (count := _varied_ground(m)) > MOST_LISTED:
+        return [f"numbers of {count} geoms of the ground that vary: let those of what touches it vary"]
     found: list[str] = []
     for part in (_options, _elements, _joints, _actuators, _contacts, _sensors):
         try:
@@ -52,6 +54,16 @@ def unsupported(mj_model: mujoco.MjModel, varied: Varied | None = None) -> list[
         except Exception as error:  # a kind of element that nobody has thought of
             found.append(f"{part.__name__[1:]} of an unknown kind ({type(error).__name__}: {error})")
     return found or _size(m)
+
+
+def _varied_ground(m: VariedModel) -> int:
+    """Returns how many geoms that are looked up have numbers that vary."""
+    places = [
+        part // (getattr(m.nominal, name).size // m.nominal.ngeom)
+        for name, part in m.varied.places.items()
+        if name.startswith("geom_")
+    ]
+    return int(looked_up(m.nominal)[np.unique(np.concatenate(places))].sum()) if places else 0
 
 
 def _size(m: mujoco.MjModel) -> list[str]:

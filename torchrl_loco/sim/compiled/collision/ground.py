@@ -15,8 +15,12 @@ from torchrl_loco.sim.compiled.ir.parameters import nominal
 
 BOX_NUMBERS = 24
 """Of a box: its bounds (low, high), center, axes by rows, half sizes, number of its kind, and first column and row."""
-CELLS_PER_BOX = 4
+CELLS_PER_BOX = 64
 """Cells of the grid, at most, as a multiple of the boxes."""
+TOPS_CELL, NEAR_TOPS, MOST_TOPS = 0.25, 2, 4_000_000
+"""Least length of a cell of the greatest heights (m), how many cells around it each knows of, most cells."""
+NOTHING = -1e30
+"""Height where there is no ground."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +55,21 @@ class Field:
         corner = data.geom_xpos[geom] - orientation @ [x, y, 0.0]
         return cls(heights, (2 * x / (shape[1] - 1), 2 * y / (shape[0] - 1)), float(base), corner, orientation, like)
 
+    @property
+    def is_aligned(self) -> bool:
+        """Whether its axes are those of the world."""
+        return bool(np.abs(self.orientation - np.eye(3)).max() < 1e-9)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the least and greatest coordinates of its prisms in the world's frame (m), ``(3,)`` each."""
+        rows, columns = self.heights.shape
+        x, y = self.cell[0] * (columns - 1), self.cell[1] * (rows - 1)
+        z = -self.base, float(self.heights.max())
+        corners = (
+            self.corner + np.array([(a, b, c) for a in (0.0, x) for b in (0.0, y) for c in z]) @ self.orientation.T
+        )
+        return corners.min(axis=0), corners.max(axis=0)
+
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
@@ -80,15 +99,13 @@ class Grid:
         # Bounds grow by what single precision may round away.
         spans = (np.floor((x - corner) / cell + e).astype(int) for x, e in ((low, -1e-4), (high, 1e-4)))
         begin, end = (np.clip(span, 0, [columns - 1, rows - 1]) for span in spans)
-        cells = [
-            (y * columns + x, box)
-            for box, ((left, below), (right, above)) in enumerate(zip(begin, end, strict=True))
-            for y in range(below, above + 1)
-            for x in range(left, right + 1)
-        ]
-        order = np.array(sorted(cells))
-        first = np.searchsorted(order[:, 0], np.arange(columns * rows + 1))
-        return cls(corner, cell, (columns, rows), first, order[:, 1], begin)
+        wide, deep = (end - begin + 1).T
+        box = np.repeat(np.arange(len(begin)), wide * deep)
+        k = np.arange(len(box)) - np.repeat(np.cumsum(wide * deep) - wide * deep, wide * deep)
+        cells = (begin[box, 1] + k // wide[box]) * columns + begin[box, 0] + k % wide[box]
+        order = np.lexsort((box, cells))
+        first = np.searchsorted(cells[order], np.arange(columns * rows + 1))
+        return cls(corner, cell, (columns, rows), first, box[order], begin)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,11 +130,71 @@ class Boxes:
         reach = np.einsum("bij,bj->bi", np.abs(axes), size)
         low, high = center - reach, center + reach
         area = np.prod(high[:, :2].max(axis=0) - low[:, :2].min(axis=0))
-        cell = max(float(np.median(2 * reach[:, :2])), float(np.sqrt(area / (CELLS_PER_BOX * len(geoms)))))
+        cell = max(float(np.median(2 * reach[:, :2].min(axis=1))), float(np.sqrt(area / (CELLS_PER_BOX * len(geoms)))))
         grid = Grid.of(low[:, :2], high[:, :2], cell)
         of_kind = [kinds.index(like[geom]) for geom in geoms]
         numbers = np.column_stack([low, high, center, axes.reshape(-1, 9), size, of_kind, grid.begin])
         return cls(numbers, kinds, grid)
+
+
+@dataclasses.dataclass(frozen=True)
+class Tops:
+    """The greatest heights of the ground around each cell of a grid: what is higher touches nothing.
+
+    Attributes:
+        corner: the first corner (m), ``(2,)``.
+        cell: the length of a cell (m); what reaches no farther from its center looks at the cell of the center alone.
+        heights: in the world's frame (m), ``(along y, along x)``; nothing lies over those at the rim.
+    """
+
+    corner: np.ndarray
+    cell: float
+    heights: np.ndarray
+
+    @classmethod
+    def of(cls, fields: list[Field], boxes: Boxes | None) -> "Tops":
+        """Returns those of fields and boxes."""
+        bounds = [field.bounds() for field in fields]
+        if boxes is not None:
+            bounds += list(zip(boxes.numbers[:, :3], boxes.numbers[:, 3:6], strict=True))
+        cell = max([TOPS_CELL, *(length for field in fields for length in field.cell)])
+        low, high = (pick([each[i][:2] for each in bounds], axis=0) for i, pick in ((0, np.min), (1, np.max)))
+        cell = max(cell, float(np.sqrt(np.prod(high - low) / MOST_TOPS)))
+        corner = low - 2 * NEAR_TOPS * cell
+        columns, rows = np.ceil((high - corner) / cell).astype(int) + 2 * NEAR_TOPS
+        heights = np.full((rows, columns), NOTHING)
+        for field, (a, b) in zip(fields, bounds, strict=False):
+            if field.is_aligned:
+                points = [
+                    corner_ + length * np.arange(n)
+                    for corner_, length, n in zip(field.corner, field.cell, field.heights.shape[::-1], strict=False)
+                ]
+                (x, at_x), (y, at_y) = (
+                    np.unique(np.floor((each - first) / cell).astype(int), return_index=True)
+                    for each, first in zip(points, corner, strict=True)
+                )
+                most = np.maximum.reduceat(np.maximum.reduceat(field.heights, at_x, axis=1), at_y, axis=0)
+                heights[np.ix_(y, x)] = np.maximum(heights[np.ix_(y, x)], field.corner[2] + most)
+            else:
+                _raise(heights, corner, cell, a, b)
+        for a, b in bounds[len(fields) :]:
+            _raise(heights, corner, cell, a, b)
+        for axis in (0, 1):
+            padded = np.pad(
+                heights, [(NEAR_TOPS, NEAR_TOPS) if i == axis else (0, 0) for i in (0, 1)], constant_values=NOTHING
+            )
+            heights = np.full_like(heights, NOTHING)
+            for k in range(2 * NEAR_TOPS + 1):
+                part = np.s_[k : k + rows] if axis == 0 else np.s_[:, k : k + columns]
+                np.maximum(heights, padded[part], out=heights)
+        return cls(corner, cell, heights)
+
+
+def _raise(heights: np.ndarray, corner: np.ndarray, cell: float, low: np.ndarray, high: np.ndarray) -> None:
+    """Raises the greatest heights to those of what has these bounds (m), ``(3,)`` each."""
+    (left, first), (right, last) = (np.floor((each[:2] - corner) / cell).astype(int) for each in (low, high))
+    part = heights[first : last + 1, left : right + 1]
+    np.maximum(part, high[2], out=part)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,6 +203,7 @@ class Ground:
 
     fields: list[Field]
     boxes: Boxes | None
+    tops: Tops | None
 
     @classmethod
     def of(cls, m: mujoco.MjModel) -> "Ground":
@@ -135,14 +213,20 @@ class Ground:
         mujoco.mj_kinematics(plain, data)
         boxes = {geom: other for geom, other in like.items() if plain.geom_type[geom] == BOX}
         fields = [Field.of(plain, data, geom, other) for geom, other in like.items() if plain.geom_type[geom] == FIELD]
-        return cls(fields, Boxes.of(plain, data, boxes) if boxes else None)
+        many = Boxes.of(plain, data, boxes) if boxes else None
+        return cls(fields, many, Tops.of(fields, many) if fields or boxes else None)
 
     def numbers(self) -> np.ndarray:
-        """Returns all of it as the compiled step reads it: heights, then boxes, then cells of the grid as integers."""
+        """Returns all of it as the compiled step reads it.
+
+        Heights, then boxes, then cells of the grid as integers, then the greatest heights.
+        """
         parts = [np.zeros(0, dtype=np.float32), *(field.heights.ravel().astype(np.float32) for field in self.fields)]
         if self.boxes is not None:
             parts.append(self.boxes.numbers.ravel().astype(np.float32))
             parts += [
                 cells.astype(np.int32).view(np.float32) for cells in (self.boxes.grid.first, self.boxes.grid.named)
             ]
+        if self.tops is not None:
+            parts.append(self.tops.heights.ravel().astype(np.float32) + 1e-4)  # which rounding does not exceed
         return np.concatenate(parts)

@@ -2,10 +2,12 @@
 
 #ifdef __CUDA_ARCH__
 #define INLINE __device__ __forceinline__
+#define NOINLINE __device__ __noinline__
 #define UNROLLED_FOR _Pragma("unroll") for
 #define ROLLED_FOR _Pragma("unroll 1") for
 #else
 #define INLINE inline
+#define NOINLINE inline
 #define UNROLLED_FOR for
 #define ROLLED_FOR for
 #endif

@@ -39,7 +39,12 @@ struct BoxContacts : SolidContacts {
 
   // The point of a capsule's segment that is nearest to a box; and if the capsule lies along a face or an edge, the
   // point up to which it does. The choices, and their order where several are as near, are MuJoCo's.
-  static INLINE Ends capsule_and_box(Vec center, Vec half, Vec size) {
+#if WITH_ROUND_AND_BOX && WITH_ROUND_ON_BOXES
+  static NOINLINE  // called twice
+#else
+  static INLINE
+#endif
+      Ends capsule_and_box(Vec center, Vec half, Vec size) {
     const float length_squared = half.dot(half);
     float nearest = 1e30f, at = 0.0f, on_edge = 0.0f;
     int face = -1, edge = -1, side = 1, corner = 0;

@@ -74,6 +74,9 @@ struct Collision : ManyBoxContacts {
   INLINE void find_contacts() {
     frictional = frictionless = 0;
     if (Model::GEOMS > 0) place_geoms();
+#if WITH_ROUND_ON_FIELD || WITH_ROUND_ON_BOXES || WITH_BOX_ON_BOXES
+    find_near_ground();
+#endif
     const int count = Model::PAIRS > Model::PLANE_PAIRS ? near_pairs() : 0;
     int at = 0;  // in the list
     // Those with friction, then those without, by one text.

@@ -203,7 +203,8 @@ class Description:
         Raises:
             ValueError: it cannot.
         """
-        most = max((2 * (self.radius(g) + self.half_length(g)) for g in self.geoms), default=0.0)
+        moving = [g for g in self.geoms if self.m.body_weldid[self.m.geom_bodyid[g]]]
+        most = max((2 * (self.radius(g) + self.half_length(g)) for g in moving), default=0.0)
         for field in self.ground.fields:
             prisms = 2 * (most / field.cell[0] + 2) * (most / field.cell[1] + 2)
             if prisms > MOST_PRISMS:

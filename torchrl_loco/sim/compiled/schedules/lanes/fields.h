@@ -3,6 +3,34 @@
 struct FieldContacts : BoxPairContacts {
   using BoxPairContacts::BoxPairContacts;
 
+#if WITH_ROUND_ON_FIELD || WITH_ROUND_ON_BOXES || WITH_BOX_ON_BOXES
+  static INLINE int cell_of(float x, float cells) { return (int)clamp(x, 0.0f, cells); }
+
+  unsigned lane_near;  // a bit for each geom of this lane: whether it is near the ground
+
+  // Whether a geom is near the ground, by a table of the greatest heights around; a large one always is.
+  INLINE bool reaches_down(int g) const {
+    const Geom geom = w.geoms[g];
+    const Vec center = geom.center + w.com[0];
+    const float r = geom.radius + Model::ground_margin();
+    if (!(fabsf(center.x) + fabsf(center.y) < 1e30f)) return false;  // what is not finite is nowhere
+    if (larger(fabsf(geom.half_axis.x), fabsf(geom.half_axis.y)) + r > Model::tops_cell()) return true;
+    const float x = divide(center.x - Model::tops_x(), Model::tops_cell());
+    const float y = divide(center.y - Model::tops_y(), Model::tops_cell());
+    const int column = cell_of(x, Model::TOPS_COLUMNS - 1), row = cell_of(y, Model::TOPS_ROWS - 1);
+    return center.z - fabsf(geom.half_axis.z) - r <= terrain[Model::TOPS + row * Model::TOPS_COLUMNS + column];
+  }
+  INLINE void find_near_ground() {
+    lane_near = 0;
+    if (LANES > 1)
+      ROLLED_FOR(int g = lane; g < Model::GEOMS; g += LANES)
+        if (reaches_down(g)) lane_near |= 1u << g / LANES;
+  }
+  INLINE bool is_near_ground(int g) const {  // for all lanes together
+    return LANES > 1 ? read(lane_near, g % LANES) >> g / LANES & 1 : reaches_down(g);
+  }
+#endif
+
 #if WITH_ROUND_ON_FIELD
   // A geom in the frame of a field, from the field's corner, and the cells that it may touch.
   struct Over {
@@ -10,8 +38,6 @@ struct FieldContacts : BoxPairContacts {
     int column, row, columns, rows;
     INLINE int prisms() const { return columns > 0 && rows > 0 ? 2 * columns * rows : 0; }
   };
-
-  static INLINE int cell_of(float x, float cells) { return (int)clamp(x, 0.0f, cells); }
 
   INLINE Over over(int field, int pair) const {
     const Geom geom = w.geoms[Model::second_geom(pair)];
@@ -94,6 +120,22 @@ struct FieldContacts : BoxPairContacts {
     Vec normal, on_prism, on_axis;
   };
 
+  // How far an axis through the origin is outside of the plane of a face.
+  static INLINE float above(const Prism& p, int face, Vec half) {
+    return -p.offset(face) - fabsf(p.normal(face).dot(half));
+  }
+
+  // Whether the lower end of an axis is over the upper face: then it is nearest.
+  static INLINE bool lands(const Prism& p, Vec half, Touch& touch) {
+    const Vec end = half * (p.upper.dot(half) > 0.0f ? -1.0f : 1.0f);
+    const float height = p.upper.dot(end) - p.offset(0);
+    const Vec foot = end - p.upper * height;
+    touch = {height, p.upper, foot, end};
+    bool inside = height > 0.0f;
+    ROLLED_FOR(int k = 2; k < 5; ++k) inside = inside && p.normal(k).dot(foot) <= p.offset(k);
+    return inside;
+  }
+
   static INLINE bool crosses(const Prism& p, Vec half) {
     float from = -1.0f, to = 1.0f;
     ROLLED_FOR(int face = 0; face < 5; ++face) {
@@ -110,11 +152,13 @@ struct FieldContacts : BoxPairContacts {
   }
 
   // Outside: the nearest points, of the ends and a face, or of the axis and an edge.
-  static INLINE Touch apart_from(const Prism& p, Vec half) {
+  static INLINE Touch apart_from(const Prism& p, Vec half, bool is_over) {
+    const bool is_low = -fabsf(half.z) <= p.low;  // else the base is farther than what is above it
     float nearest = 1e30f;
     Vec on_prism, on_axis;
-    ROLLED_FOR(int i = 0; i < 10; ++i) {
+    ROLLED_FOR(int i = is_over ? 10 : 0; i < 10; ++i) {
       const int face = i >> 1;
+      if (face == 1 && !is_low) continue;
       const Vec end = half * (i & 1 ? -1.0f : 1.0f), normal = p.normal(face);
       const float above = normal.dot(end) - p.offset(face);
       if (!(above > 0.0f) || !(above * above < nearest)) continue;
@@ -127,7 +171,8 @@ struct FieldContacts : BoxPairContacts {
       on_axis = end;
     }
     const Segment axis = {half * -1.0f, half * 2.0f};
-    ROLLED_FOR(int i = 0; i < 9; ++i) {
+    ROLLED_FOR(int i = 0; i < (is_over ? 3 : 9); ++i) {
+      if (i / 3 == 1 && !is_low) continue;
       const Segment edge = p.edge(i);
       const Nearest points = Nearest::of(axis, edge);
       const Vec of_axis = axis.at(points.first[0]), of_edge = edge.at(points.second[0]), gap = of_axis - of_edge;
@@ -138,7 +183,36 @@ struct FieldContacts : BoxPairContacts {
     }
     const Vec gap = on_axis - on_prism;
     const float length = gap.norm();
-    return {length, gap * divide(1.0f, length), on_prism, on_axis};
+    return {length, length < MINVAL ? p.upper : gap * divide(1.0f, length), on_prism, on_axis};
+  }
+
+  // The same of the origin alone, which is over the base but not over the upper face.
+  static INLINE Touch of_point(const Prism& p, bool is_over) {
+    float nearest = 1e30f;
+    Vec on_prism, out;
+    bool inside = true;
+    ROLLED_FOR(int face = 0; face < 5; ++face) {
+      const float depth = p.offset(face);
+      inside = inside && depth >= 0.0f;
+      if (!(depth < nearest)) continue;
+      nearest = depth;
+      out = p.normal(face);
+    }
+    if (inside) return {-nearest, out, out * nearest, {0.0f, 0.0f, 0.0f}};
+    nearest = 1e30f;
+    ROLLED_FOR(int i = 0; i < (is_over ? 3 : 6); ++i) {  // on an edge of the upper face, then on a side below it
+      const Vec start = p.top(i % 3), along = p.top(i % 3 == 2 ? 0 : i % 3 + 1) - start;
+      const float up = i < 3 ? 1.0f : 0.0f;
+      const float across = along.x * start.x + along.y * start.y + up * along.z * start.z;
+      const float squared = along.x * along.x + along.y * along.y + up * along.z * along.z;
+      Vec at = start + along * clamp(divide(-across, squared), 0.0f, 1.0f);
+      if (i >= 3) at.z = smaller(at.z, 0.0f);
+      if (!(at.dot(at) < nearest)) continue;
+      nearest = at.dot(at);
+      on_prism = at;
+    }
+    const float length = root(nearest);
+    return {length, length < MINVAL ? p.upper : on_prism * divide(-1.0f, length), on_prism, {0.0f, 0.0f, 0.0f}};
   }
 
   // Inside: out by the least depth, through a face or past an edge.
@@ -186,7 +260,16 @@ struct FieldContacts : BoxPairContacts {
       const Over o = over(field, pair);
       float most;
       const Prism p = prism(field, o, k, most);
-      const Touch touch = crosses(p, o.half) ? out_of(p, o.half) : apart_from(p, o.half);
+      Touch touch;
+      const bool landed = lands(p, o.half, touch);
+      const bool is_point = o.half.dot(o.half) < MINVAL && p.low < 0.0f;
+      // What is as high as all of its corners is nearest to an edge of the upper face, if not to that.
+      const bool is_over = o.center.z - fabsf(o.half.z) >= most;
+      if (!landed && is_point) touch = of_point(p, is_over);
+      if (!landed && !is_point) {
+        const bool inside = !is_over && crosses(p, o.half);
+        touch = inside ? out_of(p, o.half) : apart_from(p, o.half, is_over);
+      }
       const Geom geom = w.geoms[Model::second_geom(pair)];
       const float distance = touch.distance - geom.radius;
       const Mat axes = Model::field_orientation(field);
@@ -197,30 +280,49 @@ struct FieldContacts : BoxPairContacts {
     }
   }
 
+  // Whether a geom may touch number k of the prisms below it, by the planes of its upper and its slanted face.
+  INLINE bool reaches(int field, int pair, int k) const {
+    const Over o = over(field, pair);
+    float most;
+    const Prism p = prism(field, o, k, most);
+    const int slanted = k & 1 ? 4 : 2;
+    const float r = w.geoms[Model::second_geom(pair)].radius + Model::margin(pair) + 1e-6f;
+    return most >= o.center.z - o.reach.z && above(p, 0, o.half) <= r && above(p, slanted, o.half) <= r;
+  }
+
   INLINE void collide_round_on_field(const int, const int, const bool friction) {
     ROLLED_FOR(int field = 0; field < Model::FIELDS; ++field) {
       const int begin = Model::field_pair(4 * field + 2 * friction),
                 end = Model::field_pair(4 * field + 2 * friction + 1);
-      ROLLED_FOR(int base = begin; base < end; base += LANES) {
-        const bool valid = base + lane < end;
-        const int pair = valid ? base + lane : begin;
-        const Over o = over(field, pair);
-        const int prisms = valid ? o.prisms() : 0;
-        int k = 0;
-        while (ballot(k < prisms)) {  // lists prisms that reach up to the geoms, then looks at them
-          int count = 0;
-          while (ballot(k < prisms) && count <= Model::NEAR_GROUND - LANES) {
-            float most = -1e30f;
-            if (k < prisms) prism(field, o, k, most);
-            const bool reaches = k < prisms && most >= o.center.z - o.reach.z;
-            const unsigned hits = ballot(reaches);
-            if (reaches) w.near_ground[count + bits(hits & lanes_below())] = (unsigned)pair << 16 | (unsigned)k;
-            count += bits(hits);
-            ++k;
+      // Lists prisms that geoms may touch, and looks at them together when the list is full, and at last.
+      int count = 0, base = begin - LANES, before = 0, all = 0, next = 0;
+      ROLLED_FOR(bool is_last = false; !is_last;) {
+        if (next >= all) {
+          base += LANES;
+          const int pair = base + lane < end ? base + lane : begin;
+          const bool near = is_near_ground(Model::second_geom(pair)) && base + lane < end;
+          all = next = 0;
+          if (ballot(near)) {
+            const int prisms = near ? over(field, pair).prisms() : 0;
+            before = sum_below(prisms);
+            all = read(before + prisms, LANES - 1);
           }
+          is_last = base >= end;
+        }
+        if (next < all) {
+          const Item item = dealt(before, all, next + lane);
+          const int own = item.exists ? base + item.owner : begin, k = item.exists ? item.number : 0;
+          const bool near = item.exists && reaches(field, own, k);
+          const unsigned hits = ballot(near);
+          if (near) w.near_ground[count + bits(hits & lanes_below())] = (unsigned)own << 16 | (unsigned)k;
+          count += bits(hits);
+          next += LANES;
+        }
+        if (count > (is_last ? 0 : Model::NEAR_GROUND - LANES)) {
           sync();
           touch_prisms(field, count, friction);
           sync();
+          count = 0;
         }
       }
     }

@@ -24,6 +24,16 @@ struct Group : Math {
   INLINE unsigned agreed(unsigned x, int from) const { return __shfl_sync(~0u, x, from); }
 #endif
 
+  // The sum of what the lanes below have.
+  INLINE int sum_below(int x) const {
+    int sum = x;
+    UNROLLED_FOR(int o = 1; o < 32; o <<= 1) {
+      const int below = __shfl_up_sync(~0u, sum, o);
+      if (lane >= o) sum += below;
+    }
+    return sum - x;
+  }
+
   // Replaces each of n values by its sum over the lanes. With many of them, pairs of lanes first exchange halves, so
   // that each lane goes on with a quarter of the values.
   INLINE void sum(float* x, const int n) const {
@@ -65,9 +75,22 @@ struct Group : Math {
   INLINE int read(int x, int) const { return x; }
   INLINE unsigned read(unsigned x, int) const { return x; }
   INLINE unsigned agreed(unsigned x, int) const { return x; }
+  INLINE int sum_below(int) const { return 0; }
   INLINE void sum(float*, const int) const {}
   INLINE void largest(float&, int&) const {}
 #endif
+  // Items that the lanes have, some each, are dealt out to all of them, one after another.
+  struct Item {
+    int owner, number;  // the lane that has it, and which of its items it is
+    bool exists;
+  };
+  INLINE Item dealt(int before, int all, int item) const {  // `before`: items of the lanes below
+    int owner = 0;
+    if (LANES > 1)
+      UNROLLED_FOR(int o = 16; o; o >>= 1)
+        if (read(before, owner + o) <= item) owner += o;
+    return {owner, item - read(before, owner), item < all};
+  }
   INLINE unsigned lanes_below() const { return (1u << lane) - 1; }
   INLINE void flag(int bits) const {
     if (lane == 0 && Model::SUBSTEPS) overflow |= bits;

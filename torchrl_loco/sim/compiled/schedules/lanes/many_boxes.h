@@ -25,9 +25,13 @@ struct ManyBoxContacts : FieldContacts {
     return (int)clamp(floorf(divide(x - corner, Model::grid_cell())), 0.0f, (float)(cells - 1));
   }
 
+  static INLINE int moving(const bool round, int pair) {
+    return round ? Model::first_geom(pair) : Model::second_geom(pair);
+  }
+
   // How far a geom that is no box, or is one, reaches from its center along the axes of the world.
   INLINE Vec reach_of(const bool round, int pair) const {
-    const int g = round ? Model::first_geom(pair) : Model::second_geom(pair);
+    const int g = moving(round, pair);
     const float margin = Model::margin(pair);
     const Geom geom = w.geoms[g];
     Vec reach = {fabsf(geom.half_axis.x), fabsf(geom.half_axis.y), fabsf(geom.half_axis.z)};
@@ -59,46 +63,74 @@ struct ManyBoxContacts : FieldContacts {
     }
   }
 
+  // The bounds of a geom in the world, and the cells that it may touch.
+  struct Bounds {
+    Vec low, high;
+    int column, row, columns, rows;
+  };
+  INLINE Bounds bounds_of(const bool round, int pair) const {
+    Bounds b;
+    const Vec center = w.geoms[moving(round, pair)].center + w.com[0], reach = reach_of(round, pair);
+    b.low = center - reach;
+    b.high = center + reach;
+    b.column = cell_along(b.low.x, Model::grid_x(), Model::GRID_COLUMNS);
+    b.row = cell_along(b.low.y, Model::grid_y(), Model::GRID_ROWS);
+    b.columns = cell_along(b.high.x, Model::grid_x(), Model::GRID_COLUMNS) + 1 - b.column;
+    b.rows = cell_along(b.high.y, Model::grid_y(), Model::GRID_ROWS) + 1 - b.row;
+    return b;
+  }
+
+  // Lists boxes whose bounds meet those of geoms, and looks at them together when the list is full, and at last.
   INLINE void look_up_boxes(const bool round, const int first, const int end, const int kind, const bool friction) {
-    ROLLED_FOR(int base = first; base < end; base += LANES) {
-      const bool valid = base + lane < end;
-      const int pair = valid ? base + lane : first;
-      const Vec center = w.geoms[round ? Model::first_geom(pair) : Model::second_geom(pair)].center + w.com[0];
-      const Vec reach = reach_of(round, pair), low = center - reach, high = center + reach;
-      const int column = cell_along(low.x, Model::grid_x(), Model::GRID_COLUMNS);
-      const int row = cell_along(low.y, Model::grid_y(), Model::GRID_ROWS);
-      const int columns = cell_along(high.x, Model::grid_x(), Model::GRID_COLUMNS) + 1 - column;
-      const int rows = cell_along(high.y, Model::grid_y(), Model::GRID_ROWS) + 1 - row;
-      const int cells = valid ? columns * rows : 0;
-      int cell = -1, at = 0, last = 0;
-      // Lists boxes whose bounds meet those of the geoms, each in the first of its cells that a geom has, then looks at them.
-      while (ballot(cell < cells)) {
-        int count = 0;
-        while (ballot(cell < cells) && count <= Model::NEAR_GROUND - LANES) {
-          while (at == last && cell < cells) {
-            ++cell;
-            const int k = (row + cell / columns) * Model::GRID_COLUMNS + column + cell % columns;
-            at = cell < cells ? first_named(k) : 0;
-            last = cell < cells ? first_named(k + 1) : 0;
+    int count = 0, base = first - LANES, before = 0, all = 0, next = 0, at = 0, last = 0, pair = first, row = 0,
+        column = 0;
+    ROLLED_FOR(bool is_last = false; !is_last;) {
+      if (!ballot(at < last)) {  // the next cells of these geoms, or the next geoms
+        if (next >= all) {
+          base += LANES;
+          const int of = base + lane < end ? base + lane : first;
+          const bool near = is_near_ground(moving(round, of)) && base + lane < end;
+          all = next = 0;
+          if (ballot(near)) {
+            const Bounds b = bounds_of(round, of);
+            const int cells = near ? b.columns * b.rows : 0;
+            before = sum_below(cells);
+            all = read(before + cells, LANES - 1);
           }
-          bool near = cell < cells;
-          const int i = near ? named(at++) : 0;
-          if (near) {
-            const GroundBox box = ground_box(i);
-            const Vec a = box.low(), b = box.high();
-            near = a.x <= high.x && a.y <= high.y && a.z <= high.z && low.x <= b.x && low.y <= b.y && low.z <= b.z;
-            const int own_column = box.column() > column ? box.column() : column;
-            const int own_row = box.row() > row ? box.row() : row;
-            near = near && own_column == column + cell % columns && own_row == row + cell / columns;
-            near = near && (Model::BOX_KINDS == 1 || box.kind() == kind);
-          }
-          const unsigned hits = ballot(near);
-          if (near) w.near_ground[count + bits(hits & lanes_below())] = (unsigned)(pair - first) << 24 | (unsigned)i;
-          count += bits(hits);
+          is_last = base >= end;
         }
+        if (next < all) {
+          const Item item = dealt(before, all, next + lane);
+          pair = item.exists ? base + item.owner : first;
+          const Bounds b = bounds_of(round, pair);
+          row = b.row + item.number / b.columns;
+          column = b.column + item.number % b.columns;
+          const int cell = row * Model::GRID_COLUMNS + column;
+          at = item.exists ? first_named(cell) : 0;
+          last = item.exists ? first_named(cell + 1) : 0;
+          next += LANES;
+        }
+      }
+      bool near = at < last;
+      const int i = near ? named(at++) : 0;
+      if (near) {  // each in the first of its cells that the geom has
+        const Bounds own = bounds_of(round, pair);
+        const GroundBox box = ground_box(i);
+        const Vec a = box.low(), b = box.high();
+        near = a.x <= own.high.x && a.y <= own.high.y && a.z <= own.high.z && own.low.x <= b.x && own.low.y <= b.y &&
+               own.low.z <= b.z;
+        near = near && column == (box.column() > own.column ? box.column() : own.column);
+        near = near && row == (box.row() > own.row ? box.row() : own.row);
+        near = near && (Model::BOX_KINDS == 1 || box.kind() == kind);
+      }
+      const unsigned hits = ballot(near);
+      if (near) w.near_ground[count + bits(hits & lanes_below())] = (unsigned)(pair - first) << 24 | (unsigned)i;
+      count += bits(hits);
+      if (count > (is_last ? 0 : Model::NEAR_GROUND - LANES)) {
         sync();
         touch_ground_boxes(round, first, count, friction);
         sync();
+        count = 0;
       }
     }
   }

@@ -409,8 +409,8 @@ def _add_meshes(tables: Tables, d: Description) -> None:
 
 
 def _add_ground(tables: Tables, d: Description) -> None:
-    fields, boxes = d.ground.fields, d.ground.boxes
-    if not fields and boxes is None:
+    fields, boxes, tops = d.ground.fields, d.ground.boxes, d.ground.tops
+    if tops is None:
         return
     tables.size(FIELDS=len(fields))
     tables.structs("Vec", "field_corner", [field.corner for field in fields])
@@ -424,15 +424,19 @@ def _add_ground(tables: Tables, d: Description) -> None:
     starts = np.cumsum([0, *(field.heights.size for field in fields)])[:-1]
     tables.integers("field_data", starts, "unsigned")
     tables.integers("field_pair", [i for field in fields for i in d.pairs_on(field.like, "round_on_field")])
-    if boxes is None:
-        return
-    grid, start, count = boxes.grid, sum(field.heights.size for field in fields), len(boxes.numbers)
-    cells = start + BOX_NUMBERS * count
-    tables.size(BOXES=start, CELLS=cells, NAMED=cells + len(grid.first), BOX_KINDS=len(boxes.kinds))
-    tables.size(BOX_NUMBERS=BOX_NUMBERS, GRID_COLUMNS=grid.shape[0], GRID_ROWS=grid.shape[1])
-    tables.constant(grid_x=grid.corner[0], grid_y=grid.corner[1], grid_cell=grid.cell)
-    for function in ON_BOXES.values():
-        tables.integers(f"{function}_pair", [i for kind in boxes.kinds for i in d.pairs_on(kind, function)])
+    end = sum(field.heights.size for field in fields)
+    if boxes is not None:
+        grid, start, cells = boxes.grid, end, end + BOX_NUMBERS * len(boxes.numbers)
+        named = cells + len(grid.first)
+        end = named + len(grid.named)
+        tables.size(BOXES=start, CELLS=cells, NAMED=named, BOX_KINDS=len(boxes.kinds))
+        tables.size(BOX_NUMBERS=BOX_NUMBERS, GRID_COLUMNS=grid.shape[0], GRID_ROWS=grid.shape[1])
+        tables.constant(grid_x=grid.corner[0], grid_y=grid.corner[1], grid_cell=grid.cell)
+        for function in ON_BOXES.values():
+            tables.integers(f"{function}_pair", [i for kind in boxes.kinds for i in d.pairs_on(kind, function)])
+    tables.size(TOPS=end, TOPS_COLUMNS=tops.heights.shape[1], TOPS_ROWS=tops.heights.shape[0])
+    margin = max((p.margin for p in d.pairs if d.is_ground(p)), default=0.0)
+    tables.constant(ground_margin=margin, tops_x=tops.corner[0], tops_y=tops.corner[1], tops_cell=tops.cell)
 
 
 def _add_limits(tables: Tables, d: Description) -> None:

@@ -153,6 +153,7 @@ if (live) {
   step.sync();  // the first lane may read it
 }
 #undef INLINE
+#undef NOINLINE
 #undef ROLLED_FOR
 #undef UNROLLED_FOR
 #undef OWN_DOFS
