@@ -256,29 +256,29 @@ class Simulation:
             worlds: how many of the first worlds it has; ``None`` is all.
         """
         worlds = self.num_envs if worlds is None else worlds
-        if isinstance(self.data, mjw.Data) and worlds == self.num_envs:
-            data = self.data
-        else:
-            if worlds not in self._mujoco_data:
-                with wp.ScopedDevice(self.device):
+        with wp.ScopedDevice(self.device):  # not that on which the caller makes arrays
+            if isinstance(self.data, mjw.Data) and worlds == self.num_envs:
+                data = self.data
+            else:
+                if worlds not in self._mujoco_data:
                     self._mujoco_data[worlds] = mjw.make_data(
                         with_every_row(self.mj_model, self.varied),
                         nworld=worlds,
                         naconmax=self.config.naconmax,
                         njmax=self.config.njmax,
                     )
-            data = self._mujoco_data[worlds]
-            more = [
-                *(("mocap_pos", "mocap_quat") if self.mj_model.nmocap else ()),
-                *(["act"] if self.mj_model.na else []),
-            ]
-            for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time", *more):
-                wp.copy(getattr(data, name), getattr(self.data, name)[:worlds])
-            model = self._model_of_each_world()
-            mjw.kinematics(model, data)
-            mjw.com_pos(model, data)
-        if contacts:
-            mjw.fwd_position(self._model_of_each_world(), data)
+                data = self._mujoco_data[worlds]
+                more = [
+                    *(("mocap_pos", "mocap_quat") if self.mj_model.nmocap else ()),
+                    *(["act"] if self.mj_model.na else []),
+                ]
+                for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time", *more):
+                    wp.copy(getattr(data, name), getattr(self.data, name)[:worlds])
+                model = self._model_of_each_world()
+                mjw.kinematics(model, data)
+                mjw.com_pos(model, data)
+            if contacts:
+                mjw.fwd_position(self._model_of_each_world(), data)
         return data
 
     def _model_of_each_world(self) -> "mjw.Model":
