@@ -17,6 +17,8 @@ from torchrl_loco.sim.compiled.collision.pairs import of_ground
 CELLS = (2.0, 1.0, 0.5, 0.25, 0.125, 0.0625)
 """Lengths of the cells of the grid of boxes (m), of which the first is taken that has few enough boxes in each."""
 FEW, MOST_CELLS, MOST_BOXES = 6, 4_000_000, 2**24
+SEAM = 1e-5
+"""By how much boxes are wider, so that points between two that meet are on one of them (m)."""
 NOTHING = -1e30
 """Height where there is no ground."""
 
@@ -63,7 +65,7 @@ class Ground:
         chosen = [k for k, g in enumerate(geoms) if m.geom_type[g] == BOX]
         center = data.geom_xpos[[geoms[k] for k in chosen]].reshape(-1, 3)
         half = np.einsum("bij,bj->bi", axes[chosen], m.geom_size[[geoms[k] for k in chosen]]).reshape(-1, 3)
-        boxes = np.column_stack([center[:, :2], half[:, :2], center[:, 2] + half[:, 2]])
+        boxes = np.column_stack([center[:, :2], half[:, :2] + SEAM, center[:, 2] + half[:, 2]])
         highest = max((float(data.geom_xpos[g, 2]) for g in planes), default=NOTHING)
         return cls(highest, fields, np.concatenate([boxes, [[0.0, 0.0, -1.0, -1.0, NOTHING]]]), *_grid(boxes))
 
@@ -88,6 +90,17 @@ def _grid(boxes: np.ndarray) -> tuple[Grid | None, np.ndarray]:
     return grid, cells
 
 
+def of_catalog(catalog: Any) -> Ground:
+    """Returns the ground of the model of hooks, made when it is first asked for.
+
+    Raises:
+        ValueError: as :meth:`Ground.of`.
+    """
+    if catalog.ground is None:
+        catalog.ground = Ground.of(catalog.mj_model)
+    return catalog.ground
+
+
 def below(catalog: Any, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     """Returns the height of the ground below points (m), NaN where there is none.
 
@@ -96,15 +109,13 @@ def below(catalog: Any, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         x: of the points (m), ``(num_envs, ...)``.
         y: likewise.
     """
-    if catalog.ground is None:
-        catalog.ground = Ground.of(catalog.mj_model)
-    ground: Ground = catalog.ground
+    ground = of_catalog(catalog)
     found = torch.full_like(x, ground.plane)
     for k, field in enumerate(ground.fields):
         rows, columns = field.heights.shape[0] - 1, field.heights.shape[1] - 1
-        table = catalog.derived(("heights", k), lambda field=field: field.heights.ravel() + field.corner[2])
+        table = catalog.table(("heights", k), lambda field=field: field.heights.ravel() + field.corner[2])
         u, v = ((a - float(field.corner[i])) / field.cell[i] for i, a in enumerate((x, y)))
-        i, j = u.floor().clamp(0, columns - 1), v.floor().clamp(0, rows - 1)
+        i, j = u.floor().nan_to_num(0.0).clamp(0, columns - 1), v.floor().nan_to_num(0.0).clamp(0, rows - 1)
         at, s, t = j.int() * (columns + 1) + i.int(), u - i, v - j
         first, last, right, up = table[at], table[at + columns + 2], table[at + 1], table[at + columns + 1]
         over = torch.where(t > s, s * (last - up) + t * (up - first), s * (right - first) + t * (last - right))
@@ -113,10 +124,10 @@ def below(catalog: Any, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     if ground.grid is not None:
         grid, most = ground.grid, ground.cells.shape[1]
         columns, rows = grid.shape
-        cells = catalog.derived("cells of boxes", lambda: ground.cells.ravel())  # whole numbers, which floats hold
-        boxes = catalog.derived("boxes", lambda: ground.boxes.T.copy())
-        column = ((x - float(grid.corner[0])) / grid.cell).floor().clamp(0, columns - 1).int()
-        row = ((y - float(grid.corner[1])) / grid.cell).floor().clamp(0, rows - 1).int()
+        cells = catalog.table("cells of boxes", lambda: ground.cells.ravel())  # whole numbers, which floats hold
+        boxes = catalog.table("boxes", lambda: ground.boxes.T.copy())
+        column = ((x - float(grid.corner[0])) / grid.cell).floor().nan_to_num(0.0).clamp(0, columns - 1).int()
+        row = ((y - float(grid.corner[1])) / grid.cell).floor().nan_to_num(0.0).clamp(0, rows - 1).int()
         for k in range(most):
             box = cells[(row * columns + column) * most + k].int()
             inside = ((x - boxes[0][box]).abs() <= boxes[2][box]) & ((y - boxes[1][box]).abs() <= boxes[3][box])

@@ -11,6 +11,7 @@ import torch
 
 from torchrl_loco.envs import draws, heights, sensors
 from torchrl_loco.envs.names import Elements, Names
+from torchrl_loco.envs.scan import Asked
 from torchrl_loco.envs.tables import Entry, Table
 from torchrl_loco.envs.variation import Variation, constant_of
 from torchrl_loco.sim import models
@@ -38,6 +39,8 @@ class Catalog(Elements):
         arrays: names of the arrays that hooks have read.
         sensors: ids of the sensors that only an engine can evaluate.
         contact_geoms: ids of the geoms whose contacts were asked for, in the order of the engine's columns.
+        scans: the scans of the ground that were asked for, by the name of their array.
+        scanning: by hook, the names of the scans that it reads.
         sensor_address: where a sensor's numbers begin in ``sensordata``, by its id.
         constants: the task's tables by name.
         starts: what entries of ``shared`` begin with, by name, where it is not zero.
@@ -69,12 +72,15 @@ class Catalog(Elements):
         self.arrays: set[str] = set()
         self.sensors: set[int] = set()
         self.contact_geoms: list[int] = []
+        self.scans: dict[str, Asked] = {}
+        self.scanning: dict[str, set[str]] = {}
         self.complete = False
         self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}
         self.home = self._tensor(models.home_pose(mj_model))
         self.ground: heights.Ground | None = None
         self._index: dict[tuple[int, ...], torch.Tensor] = {}
         self._constants: dict[Any, torch.Tensor] = {}
+        self._tables: dict[Any, torch.Tensor] = {}
         self._places: dict[tuple[int, int], torch.Tensor] = {}
 
     def pick(self, values: torch.Tensor, ids: list[int], one: bool) -> torch.Tensor:
@@ -97,13 +103,19 @@ class Catalog(Elements):
     def fixed(self) -> list[torch.Tensor]:
         """Returns tensors that never change: of indices, and the task's tables."""
         variation = self.variation.fixed() if self.variation else []
-        return [*self._index.values(), *self.constants.values(), *variation]
+        return [*self._index.values(), *self.constants.values(), *self._tables.values(), *variation]
 
     def places(self, first: int, count: int) -> torch.Tensor:
         """Returns places of random streams, which torch.compile would compute wrongly: they wrap around 64 bits."""
         if (first, count) not in self._places:
             self._places[first, count] = draws.places(first, count, self.device)
         return self._places[first, count]
+
+    def table(self, key: Any, make: Any) -> torch.Tensor:
+        """Returns what :meth:`derived` does, of a table in which hooks look things up."""
+        if key not in self._tables:
+            self._tables[key] = self._tensor(make())
+        return self._tables[key]
 
     def derived(self, key: Any, make: Any) -> torch.Tensor:
         """Returns a tensor made by ``make()`` from the model when it is first asked for."""
@@ -333,7 +345,7 @@ class View:
         """
         return heights.below(self._catalog, points[..., 0], points[..., 1])
 
-    def height_scan(self, body: Names, grid: Any, miss: float = math.nan) -> torch.Tensor:
+    def height_scan(self, body: str, grid: Any, miss: float = math.nan) -> torch.Tensor:
         """Returns how far the ground lies below the height of a body, at points that turn with its yaw.
 
         Yaw is that of the body's x axis laid flat; of its y axis where the x axis stands within 0.1 of upright.
@@ -349,21 +361,23 @@ class View:
         Raises:
             ValueError: as :meth:`terrain_height`; or the grid has another shape.
         """
-        where = torch.as_tensor(np.asarray(grid), dtype=torch.float32)
+        where = np.asarray(grid, dtype=float)
         if where.ndim != 2 or where.shape[1] != 2:
-            raise ValueError(f"grid must be points ahead and to the left, (points, 2), got {tuple(where.shape)}")
-        key = "scan", tuple(where.flatten().tolist())
-        ahead, left = self._catalog.derived(key, lambda: where.T.numpy())
-        place, mat = self.xpos(body), self.xmat(body)
-        x, y = mat[:, 0, 0], mat[:, 1, 0]
-        upright = (x.square() + y.square()).sqrt() < 0.1
-        x, y = torch.where(upright, mat[:, 1, 1], x), torch.where(upright, -mat[:, 0, 1], y)
-        length = (x.square() + y.square()).sqrt()
-        cos, sin = (x / length).unsqueeze(-1), (y / length).unsqueeze(-1)
-        below = heights.below(
-            self._catalog, place[:, :1] + cos * ahead - sin * left, place[:, 1:2] + sin * ahead + cos * left
-        )
-        scan = place[:, 2:] - below
+            raise ValueError(f"grid must be points ahead and to the left, (points, 2), got {where.shape}")
+        if not np.isfinite(where).all():
+            raise ValueError("grid must be finite numbers (m)")
+        (id,), _ = self._catalog.ids("body", _one("body", body))
+        asked = Asked(id, tuple(map(tuple, where.tolist())))
+        scans = self._catalog.scans
+        name = next((name for name, other in scans.items() if other == asked), f"scan.{len(scans)}")
+        if not self._catalog.complete:
+            scans[name] = asked
+            self._catalog.scanning.setdefault(self._hook, set()).add(name)
+            heights.of_catalog(self._catalog)  # which may refuse
+            return self.xpos(body)[:, 2:].expand(-1, len(where)).clone()
+        if name not in self._catalog.scanning.get(self._hook, ()):
+            raise ValueError(f"{self._hook}() did not ask for this scan when it was first called: it is not computed")
+        scan = self._array(name)
         return scan if math.isnan(miss) else torch.where(scan.isnan(), miss, scan)
 
     def geom_xpos(self, geoms: Names) -> torch.Tensor:

@@ -1,6 +1,7 @@
 """Everything of an environment that lives on its device, and the control step from top to bottom."""
 
 import contextlib
+import functools
 import logging
 import os
 import weakref
@@ -33,6 +34,7 @@ from torchrl_loco.envs.episode import (
 from torchrl_loco.envs.hooks import PARTS, Hooks, reads_of
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
+from torchrl_loco.envs.scan import Scans
 from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.view import CONTACT_HISTORY
 from torchrl_loco.rendering import Renderer
@@ -316,7 +318,8 @@ class World:
         sim, hooks, own, variation = self.sim, task.hooks, self._own, self._variation
         self._moved = Buffer(task.num_envs, bool, sim.device)
         streams = self._streams(task) if hooks or variation else {}
-        arrays = {**streams, **self._arrays(task.hooks)} if task.hooks else {}
+        self._scans = Scans(sim, hooks.catalog.scans if hooks else {}, self.mask.warp)
+        arrays = {**streams, **self._arrays(task.hooks), **self._scans.arrays} if task.hooks else {}
 
         parts: list[Part] = []
         read: list[set[str]] = []  # by part, attributes of the task
@@ -352,6 +355,7 @@ class World:
         launches = [self._launch_step, self._launch_reset, *(each.launch for each in kernels)]
         launches += [self._launch_rest] if own or variation else []
         launches += [self._launch_conclude] if own else []
+        launches += [self._scans.all, self._scans.begun] if self._scans.arrays else []
         sim.compile(*launches, *([self._launch_move] if moves else []))
         for each in kernels:
             each.record(sim)
@@ -359,6 +363,8 @@ class World:
         for each, names in zip(parts, read, strict=True):
             if each.kind != "plain torch" or sim.device.is_cuda:  # where the step is recorded as a graph
                 self.fixed |= names
+        if hooks is not None and self._scans.arrays:
+            self._scan_first(hooks.catalog.scanning)
         self._physics, self._settle = self._record(self._launch_step), self._record(self._launch_reset)
         self._rest = self._record(self._launch_rest) if own or variation else _nothing
         self._conclude = self._record(self._launch_conclude) if own else _nothing
@@ -366,6 +372,17 @@ class World:
         self._refresh_graph: Graph | Direct | None = None  # most environments never need it
         self._run_step = self._as_graph("_take_step", several=bool(own))
         self._run_reset = self._as_graph("_begin_masked", several=bool(own) or variation is not None)
+
+    def _scan_first(self, scanning: Collection[str]) -> None:
+        """Lets parts whose hooks read scans of the ground make them first; in resets, those of the masked worlds."""
+        scans = {
+            masked: self._record(launch) for masked, launch in ((False, self._scans.all), (True, self._scans.begun))
+        }
+        for name, hooks in PARTS.items():
+            part = getattr(self, f"_{name}")
+            if part is not _nothing and not {*scanning}.isdisjoint(hooks):
+                masked = name in ("begin", "observe_begun", "observe_restored")
+                setattr(self, f"_{name}", functools.partial(_in_turn, scans[masked], part))
 
     def _streams(self, task: Owner) -> dict[str, torch.Tensor]:
         """Returns the arrays that tell where random streams begin, and the numbers of the model that vary."""
@@ -579,6 +596,11 @@ class World:
 
     def __del__(self) -> None:
         close_quietly(self)
+
+
+def _in_turn(*calls: Callable[[], None]) -> None:
+    for call in calls:
+        call()
 
 
 def _nothing(*args: Any) -> None:

@@ -16,6 +16,8 @@ CONTACT = ("contype", "conaffinity", "condim", "priority", "friction", "solref",
 """What the ground has of the plane that it replaces."""
 CLEAR = 0.8
 """Half a side of the square about the middle of a patch over which a robot may begin (m)."""
+SEAM = 1e-5
+"""By how much boxes are wider, so that points between two that meet are on one of them (m)."""
 LEAST = 1e-3
 """Range of a height field at least (m), which MuJoCo needs to be positive."""
 
@@ -166,8 +168,8 @@ class Terrain:
         order = np.argsort(x)  # a box is compared with the points that may be over it
         x, y, found = x[order], y[order], found[order]
         for a, b, z, half_x, half_y, half_z in self.boxes:
-            near = slice(*np.searchsorted(x, (a - half_x, a + half_x), side="left"))
-            inside = np.abs(y[near] - b) <= half_y
+            near = slice(*np.searchsorted(x, (a - half_x - SEAM, a + half_x + SEAM), side="left"))
+            inside = np.abs(y[near] - b) <= half_y + SEAM
             found[near][inside] = np.maximum(found[near][inside], z + half_z)
         found[order] = found.copy()
         return np.where(np.isfinite(found), found, np.nan).reshape(np.shape(xy)[:-1])

@@ -1,6 +1,7 @@
 """What each operator of torch does to the numbers of a world: rules as data, an operator a line of :data:`RULES`."""
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -132,6 +133,13 @@ def _round(p: Program, x: Value, decimals: int = 0) -> Value:
 def _clamp(p: Program, x: Value, min: Any = None, max: Any = None) -> Value:
     x = x if min is None else p.apply(MOST, p._meta.dtype, x, min)
     return x if max is None else p.apply(LEAST, p._meta.dtype, x, max)
+
+
+def _nan_to_num(p: Program, x: Value, nan: Any = 0.0, *infinite: Any) -> Value:
+    most = torch.finfo(torch.float32).max
+    high, low = (a if a is not None else b for a, b in itertools.zip_longest(infinite, (most, -most)))
+    text = f"{{0}} != {{0}} ? {{1}} : {{0}} > {most}f ? {{2}} : {{0}} < -{most}f ? {{3}} : {{0}}"
+    return p.apply(text, x.dtype, x, nan, high, low)
 
 
 def _filler(number: Any, p: Program, *args: Any, **kwargs: Any) -> Value:
@@ -561,20 +569,13 @@ RULES: dict[str, _Rule] = {
     **{"rsub": lambda p, a, b, alpha=1: _add(SUB, p, b, a, alpha), "remainder": _remainder, "div": _div, "pow": _pow},
     **{"floor_divide": lambda p, a, b: _div(p, a, b, "floor"), "round": _round, "clamp": _clamp},
     **{"where": lambda p, mask, a, b: p.where(mask, a, b)},
-    **{"masked_fill": lambda p, x, mask, new: p.where(mask, new, x)},
+    **{"masked_fill": lambda p, x, mask, new: p.where(mask, new, x), "nan_to_num": _nan_to_num},
     **{"copy": _filled, "fill": _filled, "zero": lambda p, x: _filled(p, x, 0)},
     **{"addcmul": lambda p, x, a, b, value=1: _fused(p, MUL, x, a, b, value)},
     **{"addcdiv": lambda p, x, a, b, value=1: _fused(p, DIV, x, a, b, value)},
     **{"lerp": lambda p, a, b, w: _fused(p, SUB, a, b, a, w)},
-    **{
-        "var": _var,
-        "std": _std,
-        "mean": _mean,
-        "linalg_vector_norm": _norm,
-        "norm": _norm,
-        "cumsum": _cumsum,
-        "linalg_cross": _cross,
-    },
+    **{"var": _var, "std": _std, "mean": _mean, "cumsum": _cumsum, "linalg_cross": _cross},
+    **{"linalg_vector_norm": _norm, "norm": _norm},
     **{name: functools.partial(_extreme, name) for name in BEATS},
     **{f"arg{name}": functools.partial(_place, name) for name in BEATS},
     **{"mm": _matmul, "bmm": _matmul, "mv": _matmul, "dot": _matmul},
