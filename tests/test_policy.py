@@ -151,7 +151,7 @@ def test_shipped_policies_are_small_and_belong_to_their_task_and_protocol():
         assert (policy.info["task"], policy.info["protocol"]) == (name, protocol)
         env_class = torchrl_loco.registry.env_class(name)
         nu = models.load(env_class.model).nu
-        of_robot = 15 + 5 * nu if name.endswith("_tracking") else 12 + 3 * nu
+        of_robot = {"tracking": 15 + 5 * nu, "rough": 12 + 3 * nu + 187}.get(name.split("_")[-1], 12 + 3 * nu)
         zeros = torch.zeros(2, getattr(env_class, "observation_size", of_robot))
         assert policy(observation=zeros).shape == (2, nu)
 

@@ -33,7 +33,7 @@ GOALS = {
 
 def test_our_environments():
     tasks = [f"{body}_{goal}" for body, goals in sorted(GOALS.items()) for goal in goals]
-    robots = [f"{robot}_velocity" for robot in ("go1", "go2", "g1", "h1")]
+    robots = [f"{robot}_{what}" for robot in ("go1", "go2", "g1", "h1") for what in ("velocity", "rough")]
     robots += ["g1_tracking", "g1_tracking_no_estimation", "h1_tracking"]
     assert list_envs()[: len(registry.OURS)] == list(registry.OURS)
     assert set(registry.OURS) == {*tasks, *robots}

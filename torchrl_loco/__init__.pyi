@@ -39,6 +39,10 @@ from .tasks.humanoid import HumanoidStand as HumanoidStand
 from .tasks.humanoid import HumanoidWalk as HumanoidWalk
 from .tasks.quadruped import QuadrupedRun as QuadrupedRun
 from .tasks.quadruped import QuadrupedWalk as QuadrupedWalk
+from .tasks.rough import G1Rough as G1Rough
+from .tasks.rough import Go1Rough as Go1Rough
+from .tasks.rough import Go2Rough as Go2Rough
+from .tasks.rough import H1Rough as H1Rough
 from .tasks.tracking import G1Tracking as G1Tracking
 from .tasks.tracking import G1TrackingNoEstimation as G1TrackingNoEstimation
 from .tasks.tracking import H1Tracking as H1Tracking

@@ -168,7 +168,7 @@ def _by_case(
     from torchrl_loco.envs import LocoEnv
 
     found: dict[str, dict[str, dict[str, Any]]] = {}
-    if cls.cases is LocoEnv.cases:
+    if cls.cases is LocoEnv.cases or not cls.perfect:
         return found
     one = _worlds(cls, exported, dataclasses.replace(UNDISTURBED, episodes=1), ENGINES[0], device, compile_hooks=False)
     if not (cases := one.cases()):
@@ -222,7 +222,9 @@ def _worlds(
     facts = exported.facts
     settings = arguments_of(facts.get("info", {}))
     if conditions.friction is not None:
-        settings["randomize"] = [Vary("geom_friction", *conditions.friction, how="set", once=True)]
+        ground = cls.model.geom("terrain") if isinstance(cls.model, mujoco.MjSpec) else None
+        of = None if ground is None else r"(?!terrain(_\d+)?$).*"  # the feet decide on it
+        settings["randomize"] = [Vary("geom_friction", *conditions.friction, of=of, how="set", once=True)]
     if engine == ENGINES[0]:
         device, settings["engine"] = "cpu", "mujoco"
     env = cls(
@@ -263,6 +265,7 @@ class Outcome:
         is_fixed: whether it had one command throughout, ``(n,)``.
         steps_of_episode: control steps of a whole one.
         metrics: names of the metrics.
+        cases: names of the cases that the episodes play in turn.
     """
 
     fell: np.ndarray
@@ -273,6 +276,13 @@ class Outcome:
     is_fixed: np.ndarray
     steps_of_episode: int
     metrics: tuple[str, ...]
+    cases: tuple[str, ...]
+
+    def by_case(self) -> dict[str, dict[str, Any]]:
+        """Returns the figures of each case that was played, as :meth:`of` has them."""
+        played = np.arange(len(self.fell))
+        named = [(name, played % len(self.cases) == k) for k, name in enumerate(self.cases)]
+        return {name: self.of(episodes) for name, episodes in named if episodes.any()}
 
     def rows(self) -> dict[str, np.ndarray]:
         """Returns by name the episodes of each kind, as masks ``(n,)``."""
@@ -375,6 +385,7 @@ def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str)
         is_fixed=is_fixed,
         steps_of_episode=steps,
         metrics=env.metric_names,
+        cases=tuple(env.cases()),
     )
 
 
@@ -458,9 +469,12 @@ def _report(
     task, n = exported.facts["task"], there["episodes"]
     episodes = "1 episode, since all begin alike," if n == 1 < DEFAULT.episodes else f"{n} episodes"
     lines = [f"{task} in C MuJoCo {mujoco.__version__}, {episodes} of {seconds:g} s, {_describe(conditions)}"]
+    by_case = {} if cls.perfect else {engine: played.by_case() for engine, played in outcomes.items()}
+    lines += _lines_by_case(by_case.get(ENGINES[0], {}), outcomes[ENGINES[0]].metrics)
     lines += [*_lines(table, outcomes[ENGINES[0]].metrics), f"{'holds' if holds else 'DOES NOT HOLD'}: {words}"]
     about = {"task": task, "protocol": exported.facts["protocol"], "mujoco": mujoco.__version__}
     figures = {"holds": holds, **about, "conditions": dataclasses.asdict(conditions), "outcomes": table}
+    figures |= {"by_case": by_case} if any(by_case.values()) else {}
     return Report(holds, lines, figures)
 
 
@@ -471,6 +485,18 @@ def _describe(conditions: Conditions) -> str:
     friction = "" if conditions.friction is None else "friction {:g} to {:g}, ".format(*conditions.friction)
     scales = f"noise x {conditions.noise:g}, pushes x {conditions.pushes:g}"
     return f"actions {delay} control steps late, {friction}{scales}"
+
+
+def _lines_by_case(found: dict[str, dict[str, Any]], metrics: tuple[str, ...]) -> list[str]:
+    """Returns how each case was played in C MuJoCo, the one with the most falls first."""
+    if not found:
+        return []
+    width = max(len(name) for name in found)
+    lines = [f"{'':<{width}}{'falls':>12}{''.join(f'{name:>16}' for name in metrics)}"]
+    for name, row in sorted(found.items(), key=lambda pair: -pair[1]["falls"] / pair[1]["episodes"]):
+        words = f"{row['falls']} of {row['episodes']}"
+        lines.append(f"{name:<{width}}{words:>12}{''.join(f'{_rounded(row[metric]):>16}' for metric in metrics)}")
+    return lines
 
 
 def _lines(table: dict[str, dict[str, dict[str, Any]]], metrics: tuple[str, ...]) -> list[str]:

@@ -49,17 +49,45 @@ def diagnose(
     print("verdict: everything works")
 
 
-def inspect(file: tyro.conf.Positional[Path], /, task: OtherTask = None, device: str | None = None) -> None:
-    """Inspect a NaN dump: step its world again, substep by substep, in Warp and in C MuJoCo.
+def inspect(
+    what: tyro.conf.Positional[str],
+    /,
+    task: OtherTask = None,
+    device: str | None = None,
+    terrain: Path | None = None,
+) -> None:
+    """Inspect a NaN dump: step its world again, substep by substep, in Warp and in C MuJoCo. Or the ground of a task.
 
     Args:
-        file: the file that make(..., nan_dump=FILE) or a training run wrote.
-        task: the task that it is of.
+        what: the file that make(..., nan_dump=FILE) or a training run wrote; with --terrain, a task.
+        task: the task that the file is of.
         device: where Warp computes; default: CUDA if there is any.
+        terrain: a picture of the task's ground from above, which is written instead.
     """
+    if terrain is not None:
+        with user_errors():
+            _draw_ground(what, terrain)
+        return
+    file = Path(what)
     with user_errors():
         from torchrl_loco import nan_dump
 
         check_device(device)  # before the first line is printed
         for line in nan_dump.describe(nan_dump.load(file, task), device):
             print(line)
+
+
+def _draw_ground(task: str, picture: Path) -> None:
+    """Writes a picture of the ground of a task.
+
+    Raises:
+        ValueError: the task is on a floor.
+    """
+    from torchrl_loco.registry import list_envs, resolve
+
+    cls = resolve(task, by_user=True)
+    if not hasattr(cls, "ground"):
+        rough = ", ".join(name for name in list_envs() if name.endswith("_rough"))
+        raise ValueError(f"{task} has no attribute ground, a torchrl_loco.terrain.Terrain, as {rough} have")
+    cls.ground.picture(picture)
+    print(picture)

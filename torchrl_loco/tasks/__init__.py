@@ -39,6 +39,8 @@ def found() -> dict[str, Task]:
         targets = [target for node in ast.walk(module) if isinstance(node, ast.Assign) for target in node.targets]
         has_options = any(isinstance(target, ast.Name) and target.id == "options" for target in targets)
         for node in module.body:
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{__name__}."):
+                environments |= {name.name for name in node.names}
             if isinstance(node, ast.ClassDef) and environments & {
                 base.id for base in node.bases if isinstance(base, ast.Name)
             }:

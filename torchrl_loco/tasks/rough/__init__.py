@@ -1,0 +1,349 @@
+"""Rough: the robots of ``velocity`` on ground that gets harder as they cross it. One recipe, and a table for each."""
+
+import dataclasses
+import functools
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import mujoco
+import numpy as np
+import torch
+
+from torchrl_loco import terrain
+from torchrl_loco.sim import models
+from torchrl_loco.tasks import velocity
+from torchrl_loco.tasks.velocity import (
+    HARD_CONTACT,
+    WEIGHTS,
+    G1Velocity,
+    Go1Velocity,
+    Go2Velocity,
+    H1Velocity,
+    Velocity,
+    com,
+    sliding,
+)
+from torchrl_loco.terrain.kinds import Patch, points
+
+if TYPE_CHECKING:
+    from torchrl_loco.envs.view import View
+
+SCAN = tuple((round(0.1 * x, 1), round(0.1 * y, 1)) for y in range(-5, 6) for x in range(-8, 9))
+"""Where the heights around a robot are seen, ahead of it and to its left (m)."""
+MISS, SCALE = 5.0, 0.2
+"""Height over the ground where there is none (m), and how heights are scaled."""
+FIRST_LEVELS = 6
+"""Levels among which first episodes begin."""
+EXPECTED, LEAST_EXPECTED = 0.5, 2.0
+"""Share of the way that commands led at which a robot still keeps its level, and from which way on it counts (m)."""
+ACROSS = 8.0
+"""Way that commands lead by which a robot must have left its patch, which is half as far (m)."""
+EDGE = 0.3
+"""How near the end of the ground an episode is cut off (m)."""
+AROUND = ((0.4, 0.0), (-0.4, 0.0), (0.0, 0.25), (0.0, -0.25))
+"""Points ahead and to the left by which the slope of the ground is judged (m)."""
+
+
+def hill(difficulty: float, rng: np.random.Generator, size: float, cell: float, down: bool = False) -> Patch:
+    """Returns a hill with a level top, or a hollow, that is as steep as 45 degrees in the middle of its sides.
+
+    Args:
+        difficulty: of the steepness.
+        rng: not used.
+        size: a side (m).
+        cell: distance of two points (m).
+        down: whether it is a hollow.
+    """
+    reach = size / 2 - 0.2  # around it the ground is level
+    along = np.clip(1.0 - np.abs(points(size, cell)) / reach, 0.0, None)
+    heights = reach * difficulty * np.minimum(along[:, None] * along[None], (1.0 - 1.0 / reach) ** 2)
+    return Patch(heights=-heights if down else heights)
+
+
+GROUND = terrain.Terrain(
+    {
+        "stairs": (functools.partial(terrain.stairs, height=(0.0, 0.1)), 2.0),
+        "stairs down": (functools.partial(terrain.stairs, height=(0.0, 0.1), down=True), 2.0),
+        "hill": hill,
+        "hollow": functools.partial(hill, down=True),
+        "rough": functools.partial(terrain.rough, height=(0.1, 0.1), step=0.02),
+        "wave": terrain.wave,
+        "flat": (terrain.flat, 2.0),
+    },
+    rows=10,
+    columns=10,
+)
+"""mjlab's patches: ten difficulties, and its shares of kinds."""
+
+
+def memory(joints: int, feet: int) -> dict[str, Any]:
+    """Returns what a robot with so many actuated joints and feet remembers."""
+    return {
+        **velocity.memory(joints, feet),
+        **{"level": torch.int32, "reached": torch.int32},  # rows of the ground, from 1 on; 0 before the first episode
+        **{"origin": 3, "away": (), "told": 2, "led": ()},  # m, in the world's frame
+        **{"fell": torch.bool, "crossed": torch.bool},
+        **{"patch": 2, "began_patch": 2},  # of play: number of the kind, difficulty
+    }
+
+
+class Rough(Velocity):
+    """What robots share that follow a velocity command over rough ground; a robot sets what ``Velocity`` asks for.
+
+    ``ground`` lies under the robot of the class below. Another ground is a line in a subclass.
+
+    Observation:
+        That of :class:`torchrl_loco.tasks.velocity.Velocity`, and last the height of the base over the ground at the
+        points ``SCAN``, which turn with its yaw, times 0.2; 1 where there is no ground.
+
+    Reward:
+        That on flat ground. Heights of feet are over the ground below them; where :attr:`leans`, the trunk stands
+        upright on the slope below it, and each of the groups of geoms in :attr:`scrapes` costs what
+        ``weights["scrapes"]`` says for each physics step in which one of it has a hard contact.
+
+    Start:
+        At rest in the home pose, just above the ground, in the middle of a patch of its level. The level rises when a
+        robot has left its patch, and falls when it fell, or made less than half of the way that its commands led;
+        after the last level comes a random one.
+
+    Termination:
+        When the trunk is tilted by more than 70 degrees; truncation after 1000 steps, and at the end of the ground.
+
+    Source:
+        mjlab 1.6.0, rough velocity task. There episodes begin in the ground of waves, slow commands let levels fall,
+        and a Go1's episode ends by a thigh that touches the ground instead of by its tilt.
+    """
+
+    noise = {**Velocity.noise, "scan": 0.02}
+    presets = {"ppo": {**Velocity.presets["ppo"], "total_frames": 300_000_000}}
+    holds: ClassVar[Mapping[str, Any]] = {"falls": 0.05, "delay": (0, 2), "friction": (0.6, 1.2), "pushes": 0.5}
+
+    ground: ClassVar[terrain.Terrain] = GROUND
+    """What lies under the robots."""
+    leans: ClassVar[bool] = False
+    """Whether the trunk is to lean with the slope."""
+    scrapes: ClassVar[tuple[str, ...]] = ()
+    """Regular expressions of groups of geoms that are not to touch anything."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Lays the ground under the robot, whose feet decide on friction, as they do on the floor."""
+        super().__init_subclass__(**kwargs)
+        own, above = vars(cls), [base for base in cls.__mro__[1:] if "model" in vars(base)]
+        is_laid = any(issubclass(base, Rough) for base in above)
+        if is_laid and own.keys().isdisjoint(("ground", "robot", "model", "feet")):
+            return
+        if "model" in own or not hasattr(cls, "robot"):
+            if "model" not in own and not above:
+                return  # what several robots share
+            cls.robot = cls.model
+        spec = cls.ground.under(models.specification(cls.robot, velocity.FOLDER))
+        for geom in spec.geoms:
+            if any(re.fullmatch(pattern, geom.name) for pattern in cls.feet.values()):
+                geom.priority = 1
+        kinds = len(dict.fromkeys(cls.ground.kinds))
+        patch = {"kind": (0.0, max(kinds - 1.0, 1.0)), "difficulty": (0.0, 1.0)}
+        cls.model, cls.command_ranges = spec, {**cls.command_ranges, "patch": patch}
+        if not is_laid:
+            cls.config = dataclasses.replace(cls.config, solids_on_terrain="spheres")
+
+    robot: ClassVar[Path | str | mujoco.MjSpec]
+    """The robot on its floor."""
+
+    def constants(self) -> dict[str, np.ndarray]:
+        """Returns patches, the columns of each kind, and where feet are in the home pose, and how deep (m)."""
+        names = list(dict.fromkeys(self.ground.kinds))
+        counts = [self.ground.kinds.count(name) for name in names]
+        m, data = self.mj_model, mujoco.MjData(self.mj_model)
+        data.qpos[:] = models.home_pose(m)
+        mujoco.mj_kinematics(m, data)
+        geoms = [g for g in range(m.ngeom) if any(re.fullmatch(feet, m.geom(g).name) for feet in self.feet.values())]
+        axis = np.abs(data.geom_xmat[geoms, 8]) * (m.geom_type[geoms] == int(mujoco.mjtGeom.mjGEOM_CAPSULE))
+        lowest = (data.geom_xpos[geoms, 2] - m.geom_size[geoms, 0] - axis * m.geom_size[geoms, 1]).min()
+        return {
+            "origins": self.ground.origins.reshape(-1, 3).astype(np.float32),
+            "first_column": np.cumsum([0, *counts[:-1]]).astype(np.int32),
+            "columns_of": np.array(counts, dtype=np.int32),
+            "standing": np.concatenate([data.geom_xpos[geoms, :2] - data.qpos[:2], np.zeros((1, 2))]).astype(
+                np.float32
+            ),
+            "sunk": np.array([max(0.0, -lowest)], dtype=np.float32),
+        }
+
+    @classmethod
+    def stage_of(cls, info: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Returns how far the commands have come, and all levels: evaluations begin on each as often."""
+        trained = {"trained": super().stage_of(info)["memory"]["trained"]}
+        levels = list(range(1, cls.ground.rows + 1))
+        of_last = {"away": [0.0], "led": [0.0], "fell": [False]}  # which would change them
+        return {"memory": {**trained, "level": levels, "reached": levels, **of_last}}
+
+    @classmethod
+    def fixed_commands(cls, info: Mapping[str, Any]) -> dict[str, list[list[float]]]:
+        """Returns one, straight ahead: across the patch."""
+        return {"command": [[1.0, 0.0, 0.0]]}
+
+    def cases(self) -> dict[str, int]:
+        """Returns the patches by kind and difficulty, the hardest first."""
+        kinds, rows = dict.fromkeys(self.ground.kinds), self.ground.difficulties[::-1]
+        return {f"{kind} at {row:.2f}": self.episode_length for row in rows for kind in kinds}
+
+    # What hooks share.
+
+    def heights(self, s: "View") -> torch.Tensor:
+        """Returns the heights of the feet over the ground below them (m), ``(num_envs, feet)``."""
+        sites = s.site_xpos(list(self.feet))
+        return sites[..., 2] - s.terrain_height(sites).nan_to_num(0.0)
+
+    def toward(self, s: "View", vectors: torch.Tensor) -> torch.Tensor:
+        """Returns horizontal vectors ``(..., 2)``, ahead and to the left of the base, in the world's frame."""
+        ahead = torch.nn.functional.normalize(s.xmat(self.base)[:, :2, 0], dim=-1)
+        return turned(vectors, ahead)
+
+    def normal(self, s: "View") -> torch.Tensor:
+        """Returns the direction in which the ground around the base faces, ``(num_envs, 3)``."""
+        around = torch.tensor(AROUND, device=s.device)
+        ahead = torch.nn.functional.normalize(s.xmat(self.base)[:, :2, 0], dim=-1).unsqueeze(1)
+        place = s.xpos(self.base)[:, :2].unsqueeze(1)
+        front, back, left, right = s.terrain_height(place + turned(around, ahead)).nan_to_num(0.0).unbind(-1)
+        rise = torch.stack([(back - front) / (2 * AROUND[0][0]), (right - left) / (2 * AROUND[2][1])], dim=-1)
+        normal = torch.cat([turned(rise, ahead.squeeze(1)), torch.ones_like(rise[:, :1])], dim=-1)
+        return torch.nn.functional.normalize(normal, dim=-1)
+
+    # The hooks, in the order in which they are called.
+
+    def update(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns also how far a robot is from where it began, where its commands led, and whether it fell."""
+        told = s.told + s.dt * self.toward(s, s.command[:, :2])
+        away = (s.qpos[:, :2] - s.origin[:, :2]).norm(dim=-1)
+        far = {"away": torch.maximum(s.away, away), "told": told, "led": torch.maximum(s.led, told.norm(dim=-1))}
+        return {**super().update(s), **far, "fell": self.terminated(s)}
+
+    def terms(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns the terms on flat ground, the trunk being upright on the slope."""
+        terms = super().terms(s)
+        if self.leans:
+            tilt = s.to_body(self.trunk, self.normal(s))[:, :2]
+            terms["upright"] = torch.exp(-velocity.squares(tilt) / 0.2)
+        if self.scrapes:
+            forces = [s.contact_force([geoms], history=True).norm(dim=-1) > HARD_CONTACT for geoms in self.scrapes]
+            terms["scrapes"] = torch.stack([hard.any(-1).float().sum(-1) for hard in forces]).sum(0)
+        return terms
+
+    def truncated(self, s: "View") -> torch.Tensor:
+        """Returns whether the ground ends."""
+        half = torch.tensor(self.ground.half, device=s.device) + (self.ground.border - EDGE)
+        return (s.qpos[:, :2].abs() > half).any(-1)
+
+    def metrics(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns also the level and the best level, from 0 on, and the share of robots that leave their patch.
+
+        A robot is asked once: when it falls, or when its commands have led 8 m away.
+        """
+        asked = ~s.crossed & (s.terminated | (s.led >= ACROSS))
+        return {
+            **super().metrics(s),
+            "level": s.level - 1.0,
+            "reached": s.reached - 1.0,
+            "crossed": torch.where(asked, (s.away > self.ground.size / 2).float(), math.nan),
+        }
+
+    def events(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns also who has been asked; in play, what begins anew where kind or difficulty were set."""
+        rows = {**super().events(s), "crossed": s.led >= ACROSS}
+        if not self.play:
+            return rows
+        other = (s.patch != s.began_patch).any(-1)
+        begun = {**self.begin(s), **{name: torch.zeros_like(getattr(s, name)) for name in ("away", "told", "led")}}
+        held = {**{name: getattr(s, name) for name in begun}, **rows}
+        anew = {
+            name: torch.where(other.view(-1, *[1] * (row.ndim - 1)), begun[name], row)
+            for name, row in held.items()
+            if name in begun
+        }
+        at_rest = torch.where(other.unsqueeze(-1), 0.0, s.qvel)
+        return {**rows, **anew, "qvel": at_rest}
+
+    def observation(self, s: "View") -> dict[str, dict[str, torch.Tensor]]:
+        """Returns that on flat ground, and the heights around the robot."""
+        scan = SCALE * s.height_scan(self.base, SCAN, miss=MISS)
+        return {group: {**terms, "scan": scan} for group, terms in super().observation(s).items()}
+
+    def begin(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns the home pose over the middle of a patch, and a command."""
+        start = super().begin(s)
+        rows = self.chosen(s) if self.play else self.risen(s)
+        level, columns = rows["level"] - 1, self.ground.columns
+        origin = s.origins[(level * columns + rows.pop("column")).int()]
+        place, z = start["qpos"][:, :2] + origin[:, :2], start["qpos"][:, 2:3]
+        half = start["qpos"][:, 3:7]
+        ahead = torch.stack([1.0 - 2.0 * half[:, 3].square(), 2.0 * half[:, 0] * half[:, 3]], dim=-1)
+        under = place.unsqueeze(1) + turned(s.standing, ahead.unsqueeze(1))
+        highest = s.terrain_height(under).amax(-1, keepdim=True).nan_to_num(0.0)
+        pose = torch.cat([place, z + highest + s.sunk, start["qpos"][:, 3:]], dim=-1)
+        return {**start, **rows, "qpos": pose, "origin": origin}
+
+    def risen(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns the next level, the best, and the column, which stays."""
+        rows, columns = self.ground.rows, self.ground.columns
+        up = s.away > self.ground.size / 2
+        slow = (s.led > LEAST_EXPECTED) & (s.away < EXPECTED * s.led.clamp(max=self.ground.size / 2))
+        down = ~up & (s.fell | slow)
+        level = torch.where(up, s.level + 1, torch.where(down, (s.level - 1).clamp(min=1), s.level))
+        reached = torch.where(down, level, torch.maximum(s.reached, level)).clamp(max=rows)
+        anywhere = s.uniform(1.0, rows + 1.0).int().clamp(max=rows)
+        first = s.uniform(1.0, min(FIRST_LEVELS, rows) + 1.0).int().clamp(max=min(FIRST_LEVELS, rows))
+        level = torch.where(level > rows, anywhere, level)
+        level = torch.where(s.level == 0, first, level)
+        column = (s.env_index + torch.div(s.env_index, rows, rounding_mode="floor")) % columns
+        return {"level": level, "reached": torch.where(s.level == 0, level, reached), "column": column}
+
+    def chosen(self, s: "View") -> dict[str, torch.Tensor]:
+        """Returns the level and column that are set, or at first those of the world's own case."""
+        rows, kinds = self.ground.rows, len(s.columns_of)
+        case, turn = s.env_index % (rows * kinds), torch.div(s.env_index, rows * kinds, rounding_mode="floor")
+        own_row = rows - 1 - torch.div(case, kinds, rounding_mode="floor")
+        own = torch.stack([(case % kinds).float(), own_row / max(rows - 1, 1)], dim=-1)
+        patch = torch.where((s.level == 0).unsqueeze(-1), own, s.patch)
+        kind = patch[:, 0].round().clamp(0, kinds - 1).int()
+        row = (patch[:, 1].clamp(0.0, 1.0) * (rows - 1)).round().int()
+        column = s.first_column[kind] + turn % s.columns_of[kind]
+        return {"level": row + 1, "reached": row + 1, "column": column, "patch": patch, "began_patch": patch}
+
+
+def turned(vectors: torch.Tensor, ahead: torch.Tensor) -> torch.Tensor:
+    """Returns horizontal vectors ``(..., 2)`` turned from the x axis to a direction ``(..., 2)``."""
+    x, y = vectors[..., 0], vectors[..., 1]
+    return torch.stack([x * ahead[..., 0] - y * ahead[..., 1], x * ahead[..., 1] + y * ahead[..., 0]], dim=-1)
+
+
+class Go1Rough(Rough, Go1Velocity):
+    """A Unitree Go1, a quadruped of 12 kg, follows a velocity command over rough ground."""
+
+    memory = memory(joints=12, feet=4)
+    leans = True
+    scrapes = (".*_calf_collision.*", "trunk_collision.*|head_collision")
+    weights = {**WEIGHTS, "scrapes": -0.1}
+
+
+class Go2Rough(Rough, Go2Velocity):
+    """A Unitree Go2, a quadruped of 15 kg, follows a velocity command over rough ground."""
+
+    memory = memory(joints=12, feet=4)
+    leans = True
+
+
+class G1Rough(Rough, G1Velocity):
+    """A Unitree G1, a humanoid of 29 joints and 33 kg, follows a velocity command over rough ground."""
+
+    memory = memory(joints=29, feet=2)
+    presets = {"ppo": {**G1Velocity.presets["ppo"]}}
+
+
+class H1Rough(Rough, H1Velocity):
+    """A Unitree H1, a humanoid of 19 joints and 51 kg, follows a velocity command over rough ground."""
+
+    memory = memory(joints=19, feet=2)
+    randomize = [sliding(r".*_foot\d"), com("torso_link")]
