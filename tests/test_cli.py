@@ -128,3 +128,14 @@ def test_a_window_needs_a_display(monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(["play", "walker_walk", "--viewer=window"])
     assert "no display for a window: pass --viewer browser" in capsys.readouterr().err
+
+
+@pytest.mark.ci
+def test_kernels_are_compiled_ahead_and_no_run_is_left(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["warm", "walker_walk", "--device", "cpu"]) == 0
+    assert capsys.readouterr().out.startswith("walker_walk: its kernels are in the caches after ")
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(SystemExit):
+        cli.main(["warm"])
+    assert "name the tasks" in capsys.readouterr().err

@@ -15,7 +15,7 @@ import tyro
 import torchrl_loco
 from torchrl_loco.checks import check_choice
 from torchrl_loco.cli import runs
-from torchrl_loco.cli.diagnosis import diagnose, inspect, list_tasks
+from torchrl_loco.cli.diagnosis import diagnose, inspect, list_tasks, warm
 from torchrl_loco.cli.errors import process_name, user_errors
 from torchrl_loco.cli.motions import motion
 from torchrl_loco.cli.options import VALUES, task_options
@@ -64,6 +64,7 @@ def _run(args: list[str]) -> None:
         "inspect": inspect,
         "list": list_tasks,
         "doctor": diagnose,
+        "warm": warm,
     }
     if args and not args[0].startswith("-"):
         with user_errors():

@@ -1,5 +1,10 @@
-"""Commands about the installation and the physics: list, doctor and inspect."""
+"""Commands about the installation and the physics: list, doctor, inspect and warm."""
 
+import contextlib
+import dataclasses
+import io
+import tempfile
+import time
 from pathlib import Path
 
 import tyro
@@ -75,6 +80,35 @@ def inspect(
         check_device(device)  # before the first line is printed
         for line in nan_dump.describe(nan_dump.load(file, task), device):
             print(line)
+
+
+def warm(
+    tasks: tyro.conf.Positional[tuple[str, ...]],
+    /,
+    algorithm: str | None = None,
+    device: str | None = None,
+) -> None:
+    """Compile ahead what trainings of tasks need, for images and CI: two iterations of each, which leave no run.
+
+    Args:
+        tasks: the tasks, ids or FILE.py:CLASS.
+        algorithm: as in train.
+        device: as in train.
+    """
+    with user_errors():
+        if not tasks:
+            raise ValueError(f"name the tasks that are to be trained: {', '.join(summaries())}")
+        check_device(device)
+        from torchrl_loco import training
+
+        configs = [training.preset(task, device, algorithm) for task in tasks]
+    for task, config in zip(tasks, configs, strict=True):
+        short = dataclasses.replace(config, total_frames=2 * config.control_steps_per_batch, trials=1)
+        short = dataclasses.replace(short, eval_episodes=1, eval_interval=0, video_seconds=0.0)
+        begin, unsaid = time.perf_counter(), contextlib.redirect_stdout(io.StringIO())  # what the policy earns
+        with tempfile.TemporaryDirectory() as folder, user_errors(), unsaid:
+            training.train(task, short, out=folder)
+        print(f"{task}: its kernels are in the caches after {time.perf_counter() - begin:.0f} s", flush=True)
 
 
 def _draw_ground(task: str, picture: Path) -> None:
