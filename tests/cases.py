@@ -2,8 +2,9 @@
 
 from torchrl_loco import registry
 
-TASKS = [task for task in registry.OURS if not {"velocity", "tracking"} & set(task.split("_"))]  # nor those of plug-ins
-"""Those of dm_control; test_velocity.py and test_tracking.py are for the robots."""
+OTHERS = {"velocity", "rough", "tracking"}
+TASKS = [task for task in registry.OURS if OTHERS.isdisjoint(task.split("_"))]  # nor those of plug-ins
+"""Those of dm_control; test_velocity.py, test_rough.py and test_tracking.py are for the robots."""
 PROTOCOLS = ("playground", "dm_control")
 ENGINES = ("compiled", "mujoco_warp")
 COMPILED = ("walker_run", "humanoid_run", "cheetah_run", "hopper_hop")
