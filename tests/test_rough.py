@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from torchrl.envs.utils import check_env_specs
 
 import torchrl_loco as loco
 from torchrl_loco import cli, terrain
@@ -76,6 +77,31 @@ def test_levels_rise_and_fall(env):
     assert (next_levels(env, level=[1] * 24, fell=[True] * 24)[0] == 1).all()
     for rows in ({}, {"led": [1.0] * 24}, {"led": [9.0] * 24, "away": [3.0] * 24}):
         assert (next_levels(env, level=[3] * 24, **rows)[0] == 3).all()
+
+
+def test_specs_hold_and_plain_torch_sees_what_kernels_see(env):
+    """Scans too, also after episodes have begun anew."""
+    check_env_specs(env)
+    plain = Hills(24, "cpu", seed=0, compile_hooks=False, metrics=True, on_overflow="ignore")
+    assert set(env.world.kinds.values()) == {"kernel"}
+    td = env.reset()
+    ours = plain.reset(env.get_state(), set_state=True)
+    torch.testing.assert_close(ours["observation"], td["observation"], atol=1e-4, rtol=1e-4)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(4):
+        action = torch.randn(env.action_spec.shape, generator=generator)
+        state = env.get_state()
+        state["qpos"][:3, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])  # on its back, where an episode ends
+        td = env.step_and_maybe_reset(env.reset(state, set_state=True).set("action", action))[1]
+        ours = plain.step_and_maybe_reset(plain.reset(state, set_state=True).set("action", action))[1]
+        td, ours = (each.step_and_maybe_reset(now.set("action", action))[1] for each, now in ((env, td), (plain, ours)))
+        place, ahead = env.sim.xpos[:, 1], torch.nn.functional.normalize(env.sim.xmat[:, 1, :2, 0], dim=-1)
+        points = place[:, None, :2] + rough.turned(torch.tensor(rough.SCAN), ahead[:, None])
+        expected = 0.2 * (place[:, 2:] - torch.tensor(Hills.ground.height(points.numpy())))
+        assert ((td["privileged"][:, -187:] - expected).abs() < 1e-5).float().mean() > 0.995  # but at edges of steps
+        for group in ("observation", "privileged"):
+            torch.testing.assert_close(ours[group], td[group], atol=1e-3, rtol=1e-3)
+        assert torch.equal(plain.world.memory["level"], env.world.memory["level"])
 
 
 def test_the_way_that_commands_led_is_summed_up_in_the_world(env):

@@ -175,3 +175,12 @@ def test_bad_input(kinds, settings, message):
 def test_there_must_be_a_floor():
     with pytest.raises(ValueError, match="no plane 'ground' to replace: choose one of 'floor'"):
         terrain.Terrain({"a": terrain.flat}, rows=1, columns=1).under(MARBLE, floor="ground")
+
+
+def test_seams_of_boxes_have_no_width():
+    """Steps that meet do so for points in between, whatever rounding makes of their edges."""
+    ground = terrain.Terrain({"stairs": terrain.stairs}, rows=7, columns=3)
+    for row in range(7):
+        center, seams = ground.center(row, 1), np.array([1.5 + 0.3 * k for k in range(6)])
+        for points in (np.stack([seams, 0 * seams + 0.1], -1), np.stack([0.1 + 0 * seams, -seams], -1)):
+            assert (ground.height(points + center) > -0.1).all()
