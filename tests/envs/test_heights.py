@@ -90,6 +90,7 @@ def test_a_plane_is_ground_too():
     [
         ('<geom type="box" size="1 1 1" euler="0 0 30"/>', GRID, "geom 1 is turned"),
         ('<geom name="ramp" type="plane" size="1 1 1" euler="0 9 0"/>', GRID, "geom 'ramp' is turned"),
+        ("", GRID * np.nan, "grid must be finite"),
         ("", GRID[:, 0], r"grid must be points ahead and to the left, \(points, 2\), got \(15,\)"),
     ],
 )

@@ -79,3 +79,11 @@ def _writer(observe: wp.Function, Inputs: Any) -> wp.Kernel:  # noqa: N803
         reward[0] = observe(world, inputs, observation, terms)
 
     return write_rows
+
+
+def of_package(cls: type) -> bool:
+    """Returns whether the function that observes in a class, and the sizes that it must fit, are this package's."""
+    for base in cls.__mro__:
+        if {"observation_func", "observation_size", "term_names"} & vars(base).keys():
+            return base.__module__.startswith("torchrl_loco.")
+    return False

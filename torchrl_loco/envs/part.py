@@ -43,6 +43,7 @@ class Part:
 
     Attributes:
         kind: how it runs, ``"kernel"``, ``"torch.compile"`` or ``"plain torch"``.
+        before: makes what it reads, such as scans of the ground.
     """
 
     def __init__(
@@ -58,10 +59,12 @@ class Part:
         self._traced: torch.fx.GraphModule | None = None  # until its kernel is compared
         self._run: Callable[[], None] = lambda: work(arrays)
         self.kind = "plain torch"
+        self.before: Callable[[], None] = lambda: None
 
     @torch.no_grad()
     def __call__(self) -> None:
         """Runs it, without waiting for the device."""
+        self.before()
         self._run()
 
     def launch(self) -> None:

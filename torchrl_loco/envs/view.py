@@ -366,8 +366,10 @@ class View:
             raise ValueError(f"grid must be points ahead and to the left, (points, 2), got {where.shape}")
         if not np.isfinite(where).all():
             raise ValueError("grid must be finite numbers (m)")
-        (id,), _ = self._catalog.ids("body", _one("body", body))
-        asked = Asked(id, tuple(map(tuple, where.tolist())))
+        ids, _ = self._catalog.ids("body", _one("body", body))
+        if len(ids) > 1:
+            raise ValueError(f"a scan is around one body, {body!r} names {len(ids)}")
+        asked = Asked(ids[0], tuple(map(tuple, where.tolist())))
         scans = self._catalog.scans
         name = next((name for name, other in scans.items() if other == asked), f"scan.{len(scans)}")
         if not self._catalog.complete:

@@ -1,7 +1,6 @@
 """Everything of an environment that lives on its device, and the control step from top to bottom."""
 
 import contextlib
-import functools
 import logging
 import os
 import weakref
@@ -15,7 +14,7 @@ import torch._subclasses.schema_check_mode  # noqa: F401, which closing needs: a
 import warp as wp
 
 from torchrl_loco.config import SimConfig
-from torchrl_loco.envs.body_funcs import check_pair, check_rows
+from torchrl_loco.envs.body_funcs import check_pair, check_rows, of_package
 from torchrl_loco.envs.closing import OPEN, close_quietly
 from torchrl_loco.envs.episode import (
     Control,
@@ -225,7 +224,7 @@ class World:
         if not {"reward", "observation"} <= self._own or "warp" in asked:
             outputs, size, terms = self._fused_outputs(task)
             func, inputs = check_pair("observation_func", task.observation_func(self))
-            if not _of_package(type(task)):  # the tests check those of the package
+            if not of_package(type(task)):  # the tests check those of the package
                 check_rows(func, inputs, n - 1, size, terms, device)
             coalesced = self.sim.engine.coalesced
             self._fused = [observer(func, inputs, outputs, self.non_finite.warp, size, coalesced=coalesced)]
@@ -375,14 +374,11 @@ class World:
 
     def _scan_first(self, scanning: Collection[str]) -> None:
         """Lets parts whose hooks read scans of the ground make them first; in resets, those of the masked worlds."""
-        scans = {
-            masked: self._record(launch) for masked, launch in ((False, self._scans.all), (True, self._scans.begun))
-        }
+        scans = {False: self._record(self._scans.all), True: self._record(self._scans.begun)}
         for name, hooks in PARTS.items():
             part = getattr(self, f"_{name}")
-            if part is not _nothing and not {*scanning}.isdisjoint(hooks):
-                masked = name in ("begin", "observe_begun", "observe_restored")
-                setattr(self, f"_{name}", functools.partial(_in_turn, scans[masked], part))
+            if isinstance(part, Part) and not {*scanning}.isdisjoint(hooks):
+                part.before = scans[name in ("begin", "observe_begun", "observe_restored")]
 
     def _streams(self, task: Owner) -> dict[str, torch.Tensor]:
         """Returns the arrays that tell where random streams begin, and the numbers of the model that vary."""
@@ -598,18 +594,5 @@ class World:
         close_quietly(self)
 
 
-def _in_turn(*calls: Callable[[], None]) -> None:
-    for call in calls:
-        call()
-
-
 def _nothing(*args: Any) -> None:
     """What a part of the step is where no hook takes part in it."""
-
-
-def _of_package(cls: type) -> bool:
-    """Returns whether the function that observes in a class, and the sizes that it must fit, are this package's."""
-    for base in cls.__mro__:
-        if {"observation_func", "observation_size", "term_names"} & vars(base).keys():
-            return base.__module__.startswith("torchrl_loco.")
-    return False
