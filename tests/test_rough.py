@@ -63,19 +63,19 @@ def test_robots_begin_above_the_ground_in_the_middle_of_their_patch(env):
 
 def test_levels_rise_and_fall(env):
     """By what was crossed, and by what was commanded; standing still as told keeps them."""
-    away = {"away": [5.0] * 24, "led": [9.0] * 24}
+    away = {"distance": [5.0] * 24, "commanded_distance": [9.0] * 24}
     level, reached = next_levels(env, level=[2] * 24, reached=[2] * 24, **away)
     assert (level == 3).all()
     assert (reached == 3).all()
     level, reached = next_levels(env, level=[4] * 24, reached=[4] * 24, **away)
     assert len(level.unique()) > 2  # beyond the last, a random one
     assert (reached == 4).all()
-    for rows in ({"fell": [True] * 24}, {"led": [9.0] * 24, "away": [1.5] * 24}):
+    for rows in ({"fell": [True] * 24}, {"commanded_distance": [9.0] * 24, "distance": [1.5] * 24}):
         level, reached = next_levels(env, level=[3] * 24, reached=[4] * 24, **rows)
         assert (level == 2).all()
         assert (reached == 2).all()
     assert (next_levels(env, level=[1] * 24, fell=[True] * 24)[0] == 1).all()
-    for rows in ({}, {"led": [1.0] * 24}, {"led": [9.0] * 24, "away": [3.0] * 24}):
+    for rows in ({}, {"commanded_distance": [1.0] * 24}, {"commanded_distance": [9.0] * 24, "distance": [3.0] * 24}):
         assert (next_levels(env, level=[3] * 24, **rows)[0] == 3).all()
 
 
@@ -114,9 +114,9 @@ def test_the_way_that_commands_led_is_summed_up_in_the_world(env):
     forward = env.sim.xmat[:, 1, :2, 0] / env.sim.xmat[:, 1, :2, 0].norm(dim=-1, keepdim=True)
     for _ in range(5):
         td = env.step(td.set("action", still(env)))["next"]
-    told = env.world.memory["told"]
+    told = env.world.memory["commanded_displacement"]
     torch.testing.assert_close(told, 0.1 * forward, atol=5e-3, rtol=0)
-    torch.testing.assert_close(env.world.memory["led"], told.norm(dim=-1), atol=1e-3, rtol=0)
+    torch.testing.assert_close(env.world.memory["commanded_distance"], told.norm(dim=-1), atol=1e-3, rtol=0)
 
 
 def test_heights_of_feet_are_over_the_ground_and_a_trunk_leans_with_the_slope(env):
@@ -215,7 +215,7 @@ def test_evaluations_begin_on_all_levels(env):
     stage = Hills.stage_of({"stage": {"memory": {"trained": [7.0], "level": [3] * 5}}})
     assert stage["memory"]["trained"] == [7.0]
     env.reset()
-    for name, value in (("fell", True), ("led", 9.0)):
+    for name, value in (("fell", True), ("commanded_distance", 9.0)):
         env.world.memory[name].fill_(value)
     env.set_stage(stage)
     env.reset()

@@ -10,17 +10,14 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_loco.sim.compiled.collision.ground import Field, Grid
+from torchrl_loco.sim.compiled.collision.ground import NOTHING, Field, Grid
 from torchrl_loco.sim.compiled.collision.kinds import BOX, FIELD, PLANE
 from torchrl_loco.sim.compiled.collision.pairs import of_ground
+from torchrl_loco.terrain.grid import SEAM
 
 CELLS = (2.0, 1.0, 0.5, 0.25, 0.125, 0.0625)
 """Lengths of the cells of the grid of boxes (m), of which the first is taken that has few enough boxes in each."""
 FEW, MOST_CELLS, MOST_BOXES = 6, 4_000_000, 2**24
-SEAM = 1e-5
-"""By how much boxes are wider, so that points between two that meet are on one of them (m)."""
-NOTHING = -1e30
-"""Height where there is no ground."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from torchrl_loco.envs.heights import NOTHING, Ground
+from torchrl_loco.envs.heights import Ground
 from torchrl_loco.sim import Buffer, fill
+from torchrl_loco.sim.compiled.collision.ground import NOTHING
 
 if TYPE_CHECKING:
     from torchrl_loco.sim import Simulation
@@ -111,15 +112,16 @@ class Scans:
     Args:
         sim: the physics.
         asked: the scans by the name of their array.
+        ground: what is below; ``None`` where there are no scans.
         mask: the worlds in which episodes begin.
 
     Attributes:
         arrays: heights of the body above the ground at each point (m), NaN where there is none, ``(nworld, points)``.
     """
 
-    def __init__(self, sim: "Simulation", asked: dict[str, Asked], mask: wp.array) -> None:
+    def __init__(self, sim: "Simulation", asked: dict[str, Asked], ground: Ground | None, mask: wp.array) -> None:
         self._sim, self._asked, self._mask = sim, asked, mask
-        self._ground = tables(Ground.of(sim.mj_model), sim.device) if asked else None
+        self._ground = tables(ground, sim.device) if asked and ground is not None else None
         kept = {name: np.array(one.points, dtype=np.float32) for name, one in asked.items()}
         self._points = {name: wp.array(points, dtype=wp.vec2, device=sim.device) for name, points in kept.items()}
         self._out = {name: Buffer((sim.num_envs, len(points)), float, sim.device) for name, points in kept.items()}

@@ -317,7 +317,8 @@ class World:
         sim, hooks, own, variation = self.sim, task.hooks, self._own, self._variation
         self._moved = Buffer(task.num_envs, bool, sim.device)
         streams = self._streams(task) if hooks or variation else {}
-        self._scans = Scans(sim, hooks.catalog.scans if hooks else {}, self.mask.warp)
+        scans, ground = (hooks.catalog.scans, hooks.catalog.ground) if hooks else ({}, None)
+        self._scans = Scans(sim, scans, ground, self.mask.warp)
         arrays = {**streams, **self._arrays(task.hooks), **self._scans.arrays} if task.hooks else {}
 
         parts: list[Part] = []

@@ -16,7 +16,6 @@ from torchrl_loco import terrain
 from torchrl_loco.sim import models
 from torchrl_loco.tasks import velocity
 from torchrl_loco.tasks.velocity import (
-    HARD_CONTACT,
     WEIGHTS,
     G1Velocity,
     Go1Velocity,
@@ -24,6 +23,8 @@ from torchrl_loco.tasks.velocity import (
     H1Velocity,
     Velocity,
     com,
+    either,
+    hard_contacts,
     sliding,
 )
 from torchrl_loco.terrain.kinds import Patch, points
@@ -84,8 +85,9 @@ def memory(joints: int, feet: int) -> dict[str, Any]:
     return {
         **velocity.memory(joints, feet),
         **{"level": torch.int32, "reached": torch.int32},  # rows of the ground, from 1 on; 0 before the first episode
-        **{"origin": 3, "away": (), "told": 2, "led": ()},  # m, in the world's frame
-        **{"fell": torch.bool, "crossed": torch.bool},
+        **{"origin": 3, "distance": ()},  # where it began, and the farthest from there (m)
+        **{"commanded_displacement": 2, "commanded_distance": ()},  # by its commands, and the farthest (m)
+        **{"fell": torch.bool, "asked": torch.bool},  # asked whether it left its patch
         **{"patch": 2, "began_patch": 2},  # of play: number of the kind, difficulty
     }
 
@@ -177,7 +179,7 @@ class Rough(Velocity):
         """Returns how far the commands have come, and all levels: evaluations begin on each as often."""
         trained = {"trained": super().stage_of(info)["memory"]["trained"]}
         levels = list(range(1, cls.ground.rows + 1))
-        of_last = {"away": [0.0], "led": [0.0], "fell": [False]}  # which would change them
+        of_last = {"distance": [0.0], "commanded_distance": [0.0], "fell": [False]}  # which would change them
         return {"memory": {**trained, "level": levels, "reached": levels, **of_last}}
 
     @classmethod
@@ -197,29 +199,32 @@ class Rough(Velocity):
         sites = s.site_xpos(list(self.feet))
         return sites[..., 2] - s.terrain_height(sites).nan_to_num(0.0)
 
-    def toward(self, s: "View", vectors: torch.Tensor) -> torch.Tensor:
-        """Returns horizontal vectors ``(..., 2)``, ahead and to the left of the base, in the world's frame."""
-        ahead = torch.nn.functional.normalize(s.xmat(self.base)[:, :2, 0], dim=-1)
-        return turned(vectors, ahead)
+    def ahead(self, s: "View") -> torch.Tensor:
+        """Returns the horizontal direction in which the base looks, ``(num_envs, 2)``."""
+        return torch.nn.functional.normalize(s.xmat(self.base)[:, :2, 0], dim=-1)
 
     def normal(self, s: "View") -> torch.Tensor:
         """Returns the direction in which the ground around the base faces, ``(num_envs, 3)``."""
-        around = torch.tensor(AROUND, device=s.device)
-        ahead = torch.nn.functional.normalize(s.xmat(self.base)[:, :2, 0], dim=-1).unsqueeze(1)
+        around, ahead = torch.tensor(AROUND, device=s.device), self.ahead(s)
         place = s.xpos(self.base)[:, :2].unsqueeze(1)
-        front, back, left, right = s.terrain_height(place + turned(around, ahead)).nan_to_num(0.0).unbind(-1)
+        front, back, left, right = (
+            s.terrain_height(place + turned(around, ahead.unsqueeze(1))).nan_to_num(0.0).unbind(-1)
+        )
         rise = torch.stack([(back - front) / (2 * AROUND[0][0]), (right - left) / (2 * AROUND[2][1])], dim=-1)
-        normal = torch.cat([turned(rise, ahead.squeeze(1)), torch.ones_like(rise[:, :1])], dim=-1)
+        normal = torch.cat([turned(rise, ahead), torch.ones_like(rise[:, :1])], dim=-1)
         return torch.nn.functional.normalize(normal, dim=-1)
 
     # The hooks, in the order in which they are called.
 
     def update(self, s: "View") -> dict[str, torch.Tensor]:
-        """Returns also how far a robot is from where it began, where its commands led, and whether it fell."""
-        told = s.told + s.dt * self.toward(s, s.command[:, :2])
-        away = (s.qpos[:, :2] - s.origin[:, :2]).norm(dim=-1)
-        far = {"away": torch.maximum(s.away, away), "told": told, "led": torch.maximum(s.led, told.norm(dim=-1))}
-        return {**super().update(s), **far, "fell": self.terminated(s)}
+        """Returns also how far a robot has been from where it began, and how far by its commands."""
+        commanded = s.commanded_displacement + s.dt * turned(s.command[:, :2], self.ahead(s))
+        return {
+            **super().update(s),
+            "distance": torch.maximum(s.distance, (s.qpos[:, :2] - s.origin[:, :2]).norm(dim=-1)),
+            "commanded_displacement": commanded,
+            "commanded_distance": torch.maximum(s.commanded_distance, commanded.norm(dim=-1)),
+        }
 
     def terms(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the terms on flat ground, the trunk being upright on the slope."""
@@ -228,8 +233,7 @@ class Rough(Velocity):
             tilt = s.to_body(self.trunk, self.normal(s))[:, :2]
             terms["upright"] = torch.exp(-velocity.squares(tilt) / 0.2)
         if self.scrapes:
-            forces = [s.contact_force([geoms], history=True).norm(dim=-1) > HARD_CONTACT for geoms in self.scrapes]
-            terms["scrapes"] = torch.stack([hard.any(-1).float().sum(-1) for hard in forces]).sum(0)
+            terms["scrapes"] = torch.stack([hard_contacts(s, geoms) for geoms in self.scrapes]).sum(0)
         return terms
 
     def truncated(self, s: "View") -> torch.Tensor:
@@ -242,27 +246,29 @@ class Rough(Velocity):
 
         A robot is asked once: when it falls, or when its commands have led 8 m away.
         """
-        asked = ~s.crossed & (s.terminated | (s.led >= ACROSS))
+        asked = ~s.asked & (s.terminated | (s.commanded_distance >= ACROSS))
         return {
             **super().metrics(s),
             "level": s.level - 1.0,
             "reached": s.reached - 1.0,
-            "crossed": torch.where(asked, (s.away > self.ground.size / 2).float(), math.nan),
+            "crossed": torch.where(asked, (s.distance > self.ground.size / 2).float(), math.nan),
         }
 
     def events(self, s: "View") -> dict[str, torch.Tensor]:
-        """Returns also who has been asked; in play, what begins anew where kind or difficulty were set."""
-        rows = {**super().events(s), "crossed": s.led >= ACROSS}
+        """Returns also who fell and was asked; in play, what begins anew where kind or difficulty were set."""
+        rows = {**super().events(s), "fell": s.terminated, "asked": s.commanded_distance >= ACROSS}
         if not self.play:
             return rows
         other = (s.patch != s.began_patch).any(-1)
-        begun = {**self.begin(s), **{name: torch.zeros_like(getattr(s, name)) for name in ("away", "told", "led")}}
-        held = {**{name: getattr(s, name) for name in begun}, **rows}
-        anew = {
-            name: torch.where(other.view(-1, *[1] * (row.ndim - 1)), begun[name], row)
-            for name, row in held.items()
-            if name in begun
+        begun = {
+            **self.begin(s),
+            **{
+                name: torch.zeros_like(getattr(s, name))
+                for name in ("distance", "commanded_displacement", "commanded_distance")
+            },
         }
+        held = {**{name: getattr(s, name) for name in begun}, **rows}
+        anew = either(other, begun, {name: held[name] for name in begun})
         at_rest = torch.where(other.unsqueeze(-1), 0.0, s.qvel)
         return {**rows, **anew, "qvel": at_rest}
 
@@ -274,7 +280,7 @@ class Rough(Velocity):
     def begin(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the home pose over the middle of a patch, and a command."""
         start = super().begin(s)
-        rows = self.chosen(s) if self.play else self.risen(s)
+        rows = self.chosen_level(s) if self.play else self.next_level(s)
         level, columns = rows["level"] - 1, self.ground.columns
         origin = s.origins[(level * columns + rows.pop("column")).int()]
         place, z = start["qpos"][:, :2] + origin[:, :2], start["qpos"][:, 2:3]
@@ -285,11 +291,13 @@ class Rough(Velocity):
         pose = torch.cat([place, z + highest + s.sunk, start["qpos"][:, 3:]], dim=-1)
         return {**start, **rows, "qpos": pose, "origin": origin}
 
-    def risen(self, s: "View") -> dict[str, torch.Tensor]:
+    def next_level(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the next level, the best, and the column, which stays."""
         rows, columns = self.ground.rows, self.ground.columns
-        up = s.away > self.ground.size / 2
-        slow = (s.led > LEAST_EXPECTED) & (s.away < EXPECTED * s.led.clamp(max=self.ground.size / 2))
+        up = s.distance > self.ground.size / 2
+        slow = (s.commanded_distance > LEAST_EXPECTED) & (
+            s.distance < EXPECTED * s.commanded_distance.clamp(max=self.ground.size / 2)
+        )
         down = ~up & (s.fell | slow)
         level = torch.where(up, s.level + 1, torch.where(down, (s.level - 1).clamp(min=1), s.level))
         reached = torch.where(down, level, torch.maximum(s.reached, level)).clamp(max=rows)
@@ -300,7 +308,7 @@ class Rough(Velocity):
         column = (s.env_index + torch.div(s.env_index, rows, rounding_mode="floor")) % columns
         return {"level": level, "reached": torch.where(s.level == 0, level, reached), "column": column}
 
-    def chosen(self, s: "View") -> dict[str, torch.Tensor]:
+    def chosen_level(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the level and column that are set, or at first those of the world's own case."""
         rows, kinds = self.ground.rows, len(s.columns_of)
         case, turn = s.env_index % (rows * kinds), torch.div(s.env_index, rows * kinds, rounding_mode="floor")

@@ -21,6 +21,7 @@ from torchrl_loco.tasks.velocity import (
     actuated,
     beyond_limits,
     com,
+    either,
     hard_contacts,
     limits,
     pushed,
@@ -454,9 +455,7 @@ class Tracking(LocoEnv):
         begun = self.begun(s)
         held = {"frame": torch.minimum(s.frame + 1, s.last[s.frame]), "qpos": s.qpos, "qvel": s.qvel}
         held |= {"began_clip": s.began_clip, "began_phase": s.began_phase}
-        rows = {
-            name: torch.where(other.view(-1, *[1] * (row.ndim - 1)), begun[name], row) for name, row in held.items()
-        }
+        rows = either(other, {name: begun[name] for name in held}, held)
         unset = torch.zeros_like(s.clip)  # what is set is written over it
         return {**rows, "clip": unset, "phase": unset}
 

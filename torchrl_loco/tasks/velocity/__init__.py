@@ -374,10 +374,7 @@ class Velocity(LocoEnv):
         due, forward, touching = s.until_command <= 0.0, s.xmat(self.base)[:, :2, 0], self.touching(s)
         goes_on = {name: getattr(s, name) for name in ("command", "heading", "holds_heading")}
         goes_on |= {"until_command": s.until_command - s.dt, "command_age": s.command_age + s.dt}
-        rows = {
-            name: torch.where(due.view(-1, *[1] * (new.ndim - 1)), new, goes_on[name])
-            for name, new in commands.draw(s, self.curriculum).items()
-        }
+        rows = either(due, commands.draw(s, self.curriculum), goes_on)
         return {
             **self.commanded(s, rows, torch.atan2(forward[:, 1], forward[:, 0])),
             **({} if self.play else self.pushed(s)),
@@ -452,6 +449,13 @@ def _some(names: list[str], which: np.ndarray) -> str:
 def squares(values: torch.Tensor) -> torch.Tensor:
     """Returns the sum of the squares of each row, ``(num_envs,)``."""
     return values.square().sum(-1)
+
+
+def either(
+    mask: torch.Tensor, new: Mapping[str, torch.Tensor], old: Mapping[str, torch.Tensor]
+) -> dict[str, torch.Tensor]:
+    """Returns rows by name: the new ones in the worlds of a mask ``(num_envs,)``, else the old ones."""
+    return {name: torch.where(mask.view(-1, *[1] * (row.ndim - 1)), row, old[name]) for name, row in new.items()}
 
 
 def reach(s: "View", scale: float | None) -> float | torch.Tensor:

@@ -163,31 +163,24 @@ class Tops:
         corner = low - 2 * NEAR_TOPS * cell
         columns, rows = np.ceil((high - corner) / cell).astype(int) + 2 * NEAR_TOPS
         heights = np.full((rows, columns), NOTHING)
-        for field, (a, b) in zip(fields, bounds, strict=False):
-            if field.is_aligned:
-                points = [
-                    corner_ + length * np.arange(n)
-                    for corner_, length, n in zip(field.corner, field.cell, field.heights.shape[::-1], strict=False)
-                ]
-                (x, at_x), (y, at_y) = (
-                    np.unique(np.floor((each - first) / cell).astype(int), return_index=True)
-                    for each, first in zip(points, corner, strict=True)
-                )
-                most = np.maximum.reduceat(np.maximum.reduceat(field.heights, at_x, axis=1), at_y, axis=0)
-                heights[np.ix_(y, x)] = np.maximum(heights[np.ix_(y, x)], field.corner[2] + most)
+        for k, (low, high) in enumerate(bounds):
+            if k < len(fields) and fields[k].is_aligned:
+                _raise_to_points(heights, corner, cell, fields[k])
             else:
-                _raise(heights, corner, cell, a, b)
-        for a, b in bounds[len(fields) :]:
-            _raise(heights, corner, cell, a, b)
+                _raise(heights, corner, cell, low, high)
+        heights, around = np.pad(heights, NEAR_TOPS, constant_values=NOTHING), 2 * NEAR_TOPS + 1
         for axis in (0, 1):
-            padded = np.pad(
-                heights, [(NEAR_TOPS, NEAR_TOPS) if i == axis else (0, 0) for i in (0, 1)], constant_values=NOTHING
-            )
-            heights = np.full_like(heights, NOTHING)
-            for k in range(2 * NEAR_TOPS + 1):
-                part = np.s_[k : k + rows] if axis == 0 else np.s_[:, k : k + columns]
-                np.maximum(heights, padded[part], out=heights)
+            heights = np.lib.stride_tricks.sliding_window_view(heights, around, axis=axis).max(axis=-1)
         return cls(corner, cell, heights)
+
+
+def _raise_to_points(heights: np.ndarray, corner: np.ndarray, cell: float, field: Field) -> None:
+    """Raises the greatest heights to those of the points of a field, whose axes are the world's."""
+    x, y = (field.corner[k] + field.cell[k] * np.arange(n) - corner[k] for k, n in enumerate(field.heights.shape[::-1]))
+    (columns, at_x), (rows, at_y) = (np.unique((each // cell).astype(int), return_index=True) for each in (x, y))
+    most = np.maximum.reduceat(np.maximum.reduceat(field.heights, at_x, axis=1), at_y, axis=0)
+    part = np.ix_(rows, columns)
+    heights[part] = np.maximum(heights[part], field.corner[2] + most)
 
 
 def _raise(heights: np.ndarray, corner: np.ndarray, cell: float, low: np.ndarray, high: np.ndarray) -> None:
