@@ -223,7 +223,7 @@ def _worlds(
     settings = arguments_of(facts.get("info", {}))
     if conditions.friction is not None:
         ground = cls.model.geom("terrain") if isinstance(cls.model, mujoco.MjSpec) else None
-        of = None if ground is None else r"(?!terrain(_\d+)?$).*"  # the feet decide on it
+        of = None if ground is None else r"(?!terrain(_\d+)?$).*"  # numbers of many boxes cannot vary
         settings["randomize"] = [Vary("geom_friction", *conditions.friction, of=of, how="set", once=True)]
     if engine == ENGINES[0]:
         device, settings["engine"] = "cpu", "mujoco"
