@@ -157,6 +157,7 @@ def test_shipped_policies_are_small_and_belong_to_their_task_and_protocol():
 
 
 @pytest.mark.ci
+@pytest.mark.filterwarnings("ignore:contacts were dropped")  # a G1's feet on bumps have more than there is room for
 def test_shipped_policies_reach_the_return_that_they_state():
     for name, protocol in SHIPPED:
         policy = torchrl_loco.load_policy(name, "cpu", protocol)

@@ -157,6 +157,24 @@ def test_an_episode_ends_where_the_ground_does(env):
     assert not after["truncated"][1:].any()
 
 
+def test_an_episode_ends_where_a_robot_leaves_its_patch(env, played):
+    """At once, as one that crossed it; in play it goes on."""
+    for made in (env, played):
+        made.reset()
+        state = made.get_state()
+        state["memory", "origin"][:] = state["qpos"][:, :3]
+        state["memory", "origin"][0, 0] -= 4.1
+        td = made.reset(state, set_state=True)
+        after = made.step(td.set("action", still(made)))["next"]
+        assert bool(after["truncated"][0]) is (made is env)
+        assert not after["terminated"][0]
+        assert not after["truncated"][1:].any()
+        crossed = after.get(("metrics", "crossed"), None)
+        if crossed is not None:
+            assert crossed[0] == 1.0
+            assert crossed[1:].isnan().all()
+
+
 def test_a_world_that_is_not_finite_touches_nothing_and_ends_alone(env):
     td = env.reset()
     env.sim.qpos[:2, 0] = torch.tensor([torch.nan, torch.inf])

@@ -287,6 +287,15 @@ def test_the_norm_is_updated_after_the_gradient_steps():
     assert (seen, ppo.norms["observation"].count) == ([0.0, 0.0], 8.0)
 
 
+def test_entries_that_hardly_vary_are_not_blown_up():
+    """By a standard deviation that all entries have besides their own."""
+    ppo = made(num_envs=2, num_steps=4, norm_eps=0.5)
+    td = collected(ppo, 2)
+    ppo.update(td, progress=0.0)
+    seen = td["observation"].flatten(0, 1)
+    torch.testing.assert_close(ppo.norms["observation"].var, seen.var(0, correction=0) + 0.25)
+
+
 def test_steps_of_vectors_are_those_of_adam():
     """Of several groups, with rows that are padded and parameters that have a gradient of their own."""
     torch.manual_seed(0)

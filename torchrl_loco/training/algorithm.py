@@ -131,7 +131,8 @@ class Algorithm(ABC):
             self._epoch()
         # After the update: the losses need the normalisation used while collecting.
         for key, norm in self.norms.items():
-            norm.merge(*distributed.merged_moments(*moments(batch[key])))
+            count, mean, var = distributed.merged_moments(*moments(batch[key]))
+            norm.merge(count, mean, var + config.norm_eps**2)
         steps = config.epochs * (len(self._order) // config.minibatch_size)
         return torch.cat([self._totals / steps, of_batch])
 

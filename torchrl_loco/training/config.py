@@ -42,6 +42,7 @@ INTERVALS = {
     "min_value": ANY,
     "max_value": ANY,
     "episode_length": COUNT,
+    "norm_eps": NOT_NEGATIVE,
 }
 """Intervals of the fields that are not simply positive."""
 
@@ -139,6 +140,9 @@ class TrainingConfig:
     """Steps in one gradient step."""
     max_grad_norm: float = 1.0
     """Norm to which gradients are clipped."""
+    norm_eps: float = 0.0
+    """Standard deviation that every entry of an observation is taken to have besides its own when it is normalised.
+    Entries in which there is little but noise stay small."""
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers of actor and critic."""
     bf16: bool = False

@@ -112,15 +112,16 @@ class Rough(Velocity):
         after the last level comes a random one.
 
     Termination:
-        When the trunk is tilted by more than 70 degrees; truncation after 1000 steps, and at the end of the ground.
+        When the trunk is tilted by more than 70 degrees; truncation after 1000 steps, where a robot has left its patch,
+        so that the next level comes at once, and at the end of the ground.
 
     Source:
-        mjlab 1.6.0, rough velocity task. There episodes begin in the ground of waves, slow commands let levels fall,
-        and a Go1's episode ends by a thigh that touches the ground instead of by its tilt.
+        mjlab 1.6.0, rough velocity task. There episodes begin in the ground of waves and go on beyond their patch,
+        slow commands let levels fall, and a Go1's episode ends by a thigh that touches the ground, not by its tilt.
     """
 
     noise = {**Velocity.noise, "scan": 0.02}
-    presets = {"ppo": {**Velocity.presets["ppo"], "total_frames": 300_000_000}}
+    presets = {"ppo": {**Velocity.presets["ppo"], "total_frames": 300_000_000, "norm_eps": 0.1}}
     holds: ClassVar[Mapping[str, Any]] = {"falls": 0.05, "delay": (0, 2), "friction": (0.6, 1.2), "pushes": 0.5}
 
     ground: ClassVar[terrain.Terrain] = GROUND
@@ -199,6 +200,14 @@ class Rough(Velocity):
         sites = s.site_xpos(list(self.feet))
         return sites[..., 2] - s.terrain_height(sites).nan_to_num(0.0)
 
+    def has_left(self, s: "View") -> torch.Tensor:
+        """Returns whether a robot has been farther from where it began than its patch reaches, ``(num_envs,)``."""
+        return s.distance > self.ground.size / 2
+
+    def is_settled(self, s: "View") -> torch.Tensor:
+        """Returns whether a robot has left its patch, or its commands have led far enough to do so, ``(num_envs,)``."""
+        return self.has_left(s) | (s.commanded_distance >= ACROSS)
+
     def ahead(self, s: "View") -> torch.Tensor:
         """Returns the horizontal direction in which the base looks, ``(num_envs, 2)``."""
         return torch.nn.functional.normalize(s.xmat(self.base)[:, :2, 0], dim=-1)
@@ -237,26 +246,27 @@ class Rough(Velocity):
         return terms
 
     def truncated(self, s: "View") -> torch.Tensor:
-        """Returns whether the ground ends."""
+        """Returns whether the ground ends, or the robot has left its patch; in play it may go on."""
         half = torch.tensor(self.ground.half, device=s.device) + (self.ground.border - EDGE)
-        return (s.qpos[:, :2].abs() > half).any(-1)
+        ends = (s.qpos[:, :2].abs() > half).any(-1)
+        return ends if self.play else ends | self.has_left(s)
 
     def metrics(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns also the level and the best level, from 0 on, and the share of robots that leave their patch.
 
-        A robot is asked once: when it falls, or when its commands have led 8 m away.
+        A robot is asked once: when it falls, when it leaves, or when its commands have led 8 m away.
         """
-        asked = ~s.asked & (s.terminated | (s.commanded_distance >= ACROSS))
+        asked = ~s.asked & (s.terminated | self.is_settled(s))
         return {
             **super().metrics(s),
             "level": s.level - 1.0,
             "reached": s.reached - 1.0,
-            "crossed": torch.where(asked, (s.distance > self.ground.size / 2).float(), math.nan),
+            "crossed": torch.where(asked, self.has_left(s).float(), math.nan),
         }
 
     def events(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns also who fell and was asked; in play, what begins anew where kind or difficulty were set."""
-        rows = {**super().events(s), "fell": s.terminated, "asked": s.commanded_distance >= ACROSS}
+        rows = {**super().events(s), "fell": s.terminated, "asked": self.is_settled(s)}
         if not self.play:
             return rows
         other = (s.patch != s.began_patch).any(-1)
@@ -294,7 +304,7 @@ class Rough(Velocity):
     def next_level(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the next level, the best, and the column, which stays."""
         rows, columns = self.ground.rows, self.ground.columns
-        up = s.distance > self.ground.size / 2
+        up = self.has_left(s)
         slow = (s.commanded_distance > LEAST_EXPECTED) & (
             s.distance < EXPECTED * s.commanded_distance.clamp(max=self.ground.size / 2)
         )
@@ -347,7 +357,7 @@ class G1Rough(Rough, G1Velocity):
     """A Unitree G1, a humanoid of 29 joints and 33 kg, follows a velocity command over rough ground."""
 
     memory = memory(joints=29, feet=2)
-    presets = {"ppo": {**G1Velocity.presets["ppo"]}}
+    presets = {"ppo": {**G1Velocity.presets["ppo"], "norm_eps": 0.1}}
 
 
 class H1Rough(Rough, H1Velocity):
