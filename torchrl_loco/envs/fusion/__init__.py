@@ -20,41 +20,12 @@ from typing import Any
 
 import torch
 import warp as wp
-from torch._decomp import decomposition_table
-from torch.fx.experimental.proxy_tensor import make_fx
 
 from torchrl_loco.envs.fusion.nodes import CannotFuse as CannotFuse
-from torchrl_loco.envs.fusion.program import LONG, NoRule, Program
+from torchrl_loco.envs.fusion.program import LONG, Program
 from torchrl_loco.envs.fusion.rules import RULES
-from torchrl_loco.envs.fusion.source import Source
 from torchrl_loco.envs.fusion.trace import trace as trace
 from torchrl_loco.sim.world_func import BLOCK_DIM, fill
-
-
-def _written(
-    traced: torch.fx.GraphModule,
-    arrays: dict[str, torch.Tensor],
-    num_envs: int,
-    device: torch.device,
-    fixed: Sequence[torch.Tensor],
-    long: float = LONG,
-) -> tuple[Program, Source]:
-    """Returns a graph as C++; operators without a rule are decomposed as torch does it for its compilers.
-
-    Raises:
-        NoRule: and cannot be.
-    """
-    missing, graph = dict[Any, Any](), traced
-    while True:
-        program = Program(arrays, num_envs, device, RULES, fixed, long)
-        try:
-            return program, program.run(graph.graph, functools.partial(getattr, graph))
-        except NoRule as error:
-            if error.target in missing or error.target not in decomposition_table:
-                raise
-            missing[error.target] = decomposition_table[error.target]
-        copies = [tensor.clone() for tensor in arrays.values()]  # tracing runs it
-        graph = make_fx(traced, decomposition_table=missing)(*copies)
 
 
 def _kernel(text: str, Args: Any) -> wp.Kernel:  # noqa: N803
@@ -91,14 +62,15 @@ def fuse(
     Raises:
         CannotFuse: the graph has an operator, type or shape that cannot be written as the code of one world.
     """
+    given = arrays, num_envs, torch.device(wp.device_to_torch(device)), RULES, fixed
+    constants = functools.partial(getattr, traced)
     with torch.no_grad():
-        given = traced, arrays, num_envs, torch.device(wp.device_to_torch(device)), fixed
         try:
-            program, source = _written(*given)
+            source = (program := Program(*given, LONG)).run(traced.graph, constants)
         except CannotFuse:  # a table may have as many rows as there are worlds
             if num_envs not in (len(table) for table in traced.buffers() if table.ndim):
                 raise
-            program, source = _written(*given, long=math.inf)
+            source = (program := Program(*given, math.inf)).run(traced.graph, constants)
     names = [f"p{index}" for index in source.used]
     struct = wp.struct(type("Pointers", (), {"__annotations__": dict.fromkeys(names, wp.uint64)}))
     tensors = [program.tensors[index] for index in source.used]

@@ -19,23 +19,9 @@ LONG = 64
 
 GLOBAL = ("seed", "shared.")
 """How the names of arrays begin that are the same in all worlds."""
-VIEWS = ("view", "reshape", "_unsafe_view", "flatten", "unflatten")
 INFINITE = "(1e30f * 1e30f)"
-FORMS = ("{}", "{}_like", "new_{}")
-FILLERS = ("empty_strided", *(form.format(name) for name in ("zeros", "ones", "empty", "full") for form in FORMS))
+FILLERS = ("empty", "empty_like", "empty_strided", "full", "full_like")
 """Operators that make tensors, which may have a row for each world."""
-
-
-class NoRule(CannotFuse):
-    """An operator that has no rule.
-
-    Attributes:
-        target: the operator.
-    """
-
-    def __init__(self, target: Any) -> None:
-        super().__init__(f"{target} has no rule")
-        self.target = target
 
 
 @dataclass
@@ -71,13 +57,6 @@ class Value:
 
 def _shifted(world: int | None, by: int) -> int | None:
     return None if world is None else world + by
-
-
-@dataclass
-class Worldwise:
-    """Tensors of worlds one after another, which is how torch begins to stack them."""
-
-    parts: list[Value]
 
 
 @dataclass
@@ -368,7 +347,7 @@ class Program:
     # The graph.
 
     def run(self, graph: torch.fx.Graph, constants: Callable[[str], torch.Tensor]) -> Source:
-        """Returns the C++ of a graph whose operators all have a rule.
+        """Returns the C++ of a graph.
 
         Args:
             graph: the graph.
@@ -376,7 +355,6 @@ class Program:
 
         Raises:
             CannotFuse: it cannot be written so.
-            NoRule: an operator has none.
         """
         inputs, found = iter(self._arrays.items()), dict[torch.fx.Node, Any]()
         for node in graph.nodes:
@@ -390,12 +368,10 @@ class Program:
             elif node.op == "call_function":
                 try:
                     found[node] = self._call(node, found)
-                except NoRule:
-                    raise
                 except CannotFuse as error:
-                    raise CannotFuse(str(error).replace("{op}", _title(node.target))) from None
+                    raise CannotFuse(str(error).replace("{op}", str(node.target))) from None
                 except Exception as error:  # operands that its rule did not foresee
-                    raise CannotFuse(f"the rule of {_title(node.target)} fails: {error}") from error
+                    raise CannotFuse(f"the rule of {node.target} fails: {error}") from error
         return self._source()
 
     def _constant(self, node: torch.fx.Node, tensor: torch.Tensor) -> Any:
@@ -422,17 +398,17 @@ class Program:
         if torch.Tag.nondeterministic_seeded in target.tags:
             raise CannotFuse("{op} draws numbers that are no function of the world: use s.uniform or s.normal")
         leaves = torch.utils._pytree.tree_leaves((args, kwargs))
-        if name not in VIEWS and any(isinstance(leaf, Worldwise) for leaf in leaves):
-            raise CannotFuse("{op} mixes worlds")
-        if not any(isinstance(leaf, Value | Worldwise | Huge) for leaf in leaves) and name not in FILLERS:
+        if not any(isinstance(leaf, Value | Huge) for leaf in leaves) and name not in FILLERS:
             # torch computes constants
             kwargs = {**kwargs, "device": "cpu"} if "device" in kwargs else kwargs
             return target(*args, **kwargs)
-        if name in self._rules or not name.endswith("_") or name[:-1] not in self._rules:
-            result = self._rule(name, target)(self, *args, **kwargs)
-        else:
-            self._assign(args[0], self._rule(name[:-1], target)(self, *args, **kwargs))
+        if name in self._rules:
+            result = self._rules[name](self, *args, **kwargs)
+        elif name.endswith("_") and name[:-1] in self._rules and torch.Tag.inplace_view not in target.tags:
+            self._assign(args[0], self._rules[name[:-1]](self, *args, **kwargs))
             result = args[0]
+        else:
+            raise CannotFuse("{op} has no rule")
         if isinstance(result, Value) and isinstance(self._meta, torch.Tensor):
             shape = list(result.array.shape)
             if result.world is not None:
@@ -440,11 +416,6 @@ class Program:
             if tuple(shape) != tuple(self._meta.shape) or result.dtype != self._meta.dtype:
                 raise CannotFuse(f"{{op}} gives shape {tuple(self._meta.shape)} of {self._meta.dtype}")
         return result
-
-    def _rule(self, name: str, target: Any) -> Callable[..., Any]:
-        if name not in self._rules:
-            raise NoRule(target)
-        return self._rules[name]
 
     def _assign(self, target: Any, result: Value) -> None:
         if not isinstance(target, Value) or not target.array.flags.writeable:
@@ -479,7 +450,3 @@ def _varies(x: Value) -> bool:
 def _name(target: Any) -> str:
     """Returns the name of an operator without its overload: that of one in place ends with an underscore."""
     return target._schema.name.split("::")[-1] if hasattr(target, "_schema") else str(target)
-
-
-def _title(target: Any) -> str:
-    return str(target)

@@ -1,7 +1,6 @@
 """What each operator of torch does to the numbers of a world: rules as data, an operator a line of :data:`RULES`."""
 
 import functools
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -25,17 +24,7 @@ from torchrl_loco.envs.fusion.nodes import (
     WHERE,
     CannotFuse,
 )
-from torchrl_loco.envs.fusion.program import (
-    FILLERS,
-    INFINITE,
-    LONG,
-    VIEWS,
-    Program,
-    Value,
-    Worldwise,
-    _shifted,
-    _varies,
-)
+from torchrl_loco.envs.fusion.program import FILLERS, INFINITE, LONG, Program, Value, _shifted, _varies
 
 BEATS = {"max": "{0} > {1} || ({0} != {0} && {1} == {1})", "min": "{0} < {1} || ({0} != {0} && {1} == {1})"}
 REMAINDER = "{0} != 0 && ({0} < 0) != ({1} < 0) ? {0} + {1} : {0}"
@@ -49,8 +38,8 @@ POINTWISE: dict[str, str | tuple[str, str]] = {
     **{name: f"{name}f({{0}})" for name in FUNCTIONS.split()},
     **{"atan2": "atan2f({0}, {1})", "log1p": LOG1P, "expm1": EXPM1},
     **{"rsqrt": "1.0f / sqrtf({0})", "reciprocal": "1.0f / {0}"},
-    **{"sigmoid": "1.0f / (1.0f + expf(-{0}))", "silu": "{0} / (1.0f + expf(-{0}))", "relu": "{0} < 0 ? 0 : {0}"},
-    **{"abs": ("fabsf({0})", "{0} < 0 ? -{0} : {0}"), "neg": NEG, "square": "{0} * {0}", "mul": MUL},
+    **{"sigmoid": "1.0f / (1.0f + expf(-{0}))", "relu": "{0} < 0 ? 0 : {0}", "neg": NEG, "mul": MUL},
+    **{"abs": ("fabsf({0})", "{0} < 0 ? -{0} : {0}"), "square": "{0} * {0}"},
     **{"sign": "{0} > 0 ? 1 : {0} < 0 ? -1 : 0", "minimum": LEAST, "maximum": MOST},
     **{"clamp_min": MOST, "clamp_max": LEAST, "fmod": ("fmodf({0}, {1})", "{1} == 0 ? 0 : {0} % {1}")},
     **{"bitwise_and": AND, "bitwise_or": OR, "bitwise_xor": "{0} ^ {1}", "bitwise_not": "~{0}"},
@@ -135,13 +124,6 @@ def _clamp(p: Program, x: Value, min: Any = None, max: Any = None) -> Value:
     return x if max is None else p.apply(LEAST, p._meta.dtype, x, max)
 
 
-def _nan_to_num(p: Program, x: Value, nan: Any = 0.0, *infinite: Any) -> Value:
-    most = torch.finfo(torch.float32).max
-    high, low = (a if a is not None else b for a, b in itertools.zip_longest(infinite, (most, -most)))
-    text = f"{{0}} != {{0}} ? {{1}} : {{0}} > {most}f ? {{2}} : {{0}} < -{most}f ? {{3}} : {{0}}"
-    return p.apply(text, x.dtype, x, nan, high, low)
-
-
 def _filler(number: Any, p: Program, *args: Any, **kwargs: Any) -> Value:
     """Returns a new tensor: one with a row for each world is one of worlds.
 
@@ -173,10 +155,6 @@ def _copy(p: Program, x: Any, *args: Any, **kwargs: Any) -> Value:
 
 def _view(p: Program, x: Any, *args: Any, **kwargs: Any) -> Value:
     shape = list(p._meta.shape)
-    if isinstance(x, Worldwise):
-        if shape[:2] != [len(x.parts), p._n]:
-            raise CannotFuse("{op} mixes worlds")
-        return _stack(p, x.parts)
     world = x.world
     if world is not None:
         before = math.prod(x.array.shape[:world])
@@ -204,13 +182,6 @@ def _expand(p: Program, x: Value, *args: Any, **kwargs: Any) -> Value:
 def _permute(p: Program, x: Value, dims: Sequence[int]) -> Value:
     dims = [dim % x.array.ndim for dim in dims]
     return x.with_array(x.array.transpose(dims), None if x.world is None else dims.index(x.world))
-
-
-def _transpose(p: Program, x: Value, first: int = 0, second: int = 1) -> Value:
-    dims = list(range(x.array.ndim))
-    if len(dims) > 1:
-        dims[first], dims[second] = dims[second], dims[first]
-    return _permute(p, x, dims)
 
 
 def _unsqueeze(p: Program, x: Value, dim: int) -> Value:
@@ -251,11 +222,6 @@ def _select(p: Program, x: Value, dim: int, index: int) -> Value:
     return x.with_array(x.array[(*[slice(None)] * dim, index, ...)], world)
 
 
-def _unbind(p: Program, x: Value, dim: int = 0) -> list[Value]:
-    (dim,) = x.rowwise([dim])
-    return [_select(p, x, dim, i) for i in range(x.array.shape[dim])]
-
-
 def _split(p: Program, x: Value, size: int | Sequence[int], dim: int = 0) -> list[Value]:
     (dim,) = x.rowwise([dim])
     total = x.array.shape[dim]
@@ -268,21 +234,10 @@ def _flip(p: Program, x: Value, dims: Sequence[int]) -> Value:
     return x.with_array(np.array(np.flip(x.array, tuple(x.rowwise(dims))), dtype=object), x.world)
 
 
-def _repeat(p: Program, x: Value, repeats: Sequence[int]) -> Value:
-    world = _shifted(x.world, len(repeats) - x.array.ndim)
-    if world is not None and repeats[world] != 1:
-        raise CannotFuse("{op} repeats worlds")
-    if world is None and repeats and repeats[0] == p._n and p._meta.shape[0] == p._n:
-        world, repeats = 0, [1, *repeats[1:]]
-    return x.with_array(np.tile(x.array, repeats), world)
-
-
 def _cat(p: Program, tensors: Sequence[Any], dim: int = 0) -> Any:
     parts = [x for x in map(p.value, tensors) if x.array.size or x.array.ndim != 1]
     values, world = p.aligned(*parts)
     whole = Value(values[0].array, p._meta.dtype, world)
-    if dim % whole.array.ndim == world == 0:
-        return Worldwise(values)
     (dim,) = whole.rowwise([dim])
     return Value(np.concatenate([p.cast(x, whole.dtype).array for x in values], axis=dim), whole.dtype, world)
 
@@ -474,22 +429,6 @@ def _var(
     return p.apply(DIV, kind, _fold(ADD, p, p.apply("{0} * {0}", kind, off), dims, keepdim), max(count, 0))
 
 
-def _std(p: Program, *args: Any, **kwargs: Any) -> Value:
-    return p.apply("sqrtf({0})", p._meta.dtype, _var(p, *args, **kwargs))
-
-
-def _norm(p: Program, x: Value, ord: Any = 2, dim: Any = None, keepdim: bool = False, dtype: Any = None) -> Value:
-    kind, ord = p._meta.dtype, 2 if ord is None else ord
-    size = p.apply("fabsf({0})", kind, x)
-    if math.isinf(ord):
-        return _fold(MOST if ord > 0 else LEAST, p, size, dim, keepdim)
-    if ord == 2:
-        return p.apply("sqrtf({0})", kind, _fold(ADD, p, p.apply("{0} * {0}", kind, x), dim, keepdim))
-    if ord == 1:
-        return _fold(ADD, p, size, dim, keepdim)
-    raise CannotFuse(f"{{op}} is of order {ord}")
-
-
 def _best(p: Program, name: str, x: Value, dim: int, keepdim: bool) -> tuple[Value, Value]:
     """Returns the largest or smallest numbers along a dimension, and where each is first."""
 
@@ -527,72 +466,29 @@ def _cumsum(p: Program, x: Value, dim: int, dtype: Any = None) -> Value:
     return Value(rows, p._meta.dtype, x.world)
 
 
-def _cross(p: Program, a: Any, b: Any, dim: int = -1) -> Value:
-    kind = p._meta.dtype
-    (a, b), _ = p.aligned(a, b)
-    x, y = _unbind(p, a, dim), _unbind(p, b, dim)
-    terms = [(p.apply(MUL, kind, x[i], y[j]), p.apply(MUL, kind, x[j], y[i])) for i, j in ((1, 2), (2, 0), (0, 1))]
-    return _stack(p, [p.apply(SUB, kind, *pair) for pair in terms], dim % a.array.ndim)
-
-
 def _matmul(p: Program, a: Any, b: Any) -> Value:
     a, b = p.value(a), p.value(b)
-    if b.array.ndim == 1:
-        return _fold(ADD, p, p.apply(MUL, p._meta.dtype, a, b), -1)
     product = p.apply(MUL, p._meta.dtype, _unsqueeze(p, a, -1), _unsqueeze(p, b, -3))
     return _fold(ADD, p, product, -2)
 
 
-def _fused(p: Program, text: str, x: Any, a: Any, b: Any, value: Any) -> Value:
-    kind = p._meta.dtype
-    return p.apply(ADD, kind, x, p.apply(MUL, kind, p.apply(text, kind, a, b), value))
-
-
-_Rule = Callable[..., Any]
-FILLED_WITH = {"ones": 1, "full": None}
-"""What operators that make tensors write, if it is not 0."""
-
-
-def _stem(name: str) -> str:
-    return name.removeprefix("new_").removesuffix("_like")
-
-
-RULES: dict[str, _Rule] = {
+RULES: dict[str, Callable[..., Any]] = {
     **{name: functools.partial(_pointwise, text) for name, text in POINTWISE.items()},
     **{name: functools.partial(_test, text) for name, text in TESTS.items()},
     **{name: functools.partial(_fold, text) for name, text in FOLDS.items()},
-    **{
-        name: functools.partial(_filler, FILLED_WITH.get(name.removeprefix("new_").removesuffix("_like"), 0))
-        for name in FILLERS
-    },
-    **{"add": functools.partial(_add, ADD), "sub": functools.partial(_add, SUB)},
-    **{"rsub": lambda p, a, b, alpha=1: _add(SUB, p, b, a, alpha), "remainder": _remainder, "div": _div, "pow": _pow},
-    **{"floor_divide": lambda p, a, b: _div(p, a, b, "floor"), "round": _round, "clamp": _clamp},
-    **{"where": lambda p, mask, a, b: p.where(mask, a, b)},
-    **{"masked_fill": lambda p, x, mask, new: p.where(mask, new, x), "nan_to_num": _nan_to_num},
-    **{"copy": _filled, "fill": _filled, "zero": lambda p, x: _filled(p, x, 0)},
-    **{"addcmul": lambda p, x, a, b, value=1: _fused(p, MUL, x, a, b, value)},
-    **{"addcdiv": lambda p, x, a, b, value=1: _fused(p, DIV, x, a, b, value)},
-    **{"lerp": lambda p, a, b, w: _fused(p, SUB, a, b, a, w)},
-    **{"var": _var, "std": _std, "mean": _mean, "cumsum": _cumsum, "linalg_cross": _cross},
-    **{"linalg_vector_norm": _norm, "norm": _norm},
+    **{name: functools.partial(_filler, None if name.startswith("full") else 0) for name in FILLERS},
+    **{"add": functools.partial(_add, ADD), "sub": functools.partial(_add, SUB), "remainder": _remainder, "div": _div},
+    **{"pow": _pow, "round": _round, "clamp": _clamp, "where": lambda p, *of: p.where(*of), "copy": _filled},
+    **{"masked_fill": lambda p, x, mask, new: p.where(mask, new, x)},
+    **{"var": _var, "mean": _mean, "cumsum": _cumsum, "mm": _matmul, "bmm": _matmul},
     **{name: functools.partial(_extreme, name) for name in BEATS},
     **{f"arg{name}": functools.partial(_place, name) for name in BEATS},
-    **{"mm": _matmul, "bmm": _matmul, "mv": _matmul, "dot": _matmul},
-    **dict.fromkeys(("_to_copy", "clone", "lift_fresh_copy", "contiguous"), _copy),
+    **dict.fromkeys(("_to_copy", "clone", "lift_fresh_copy", "copy_strided"), _copy),
     **{name: lambda p, x: x for name in ("alias", "detach", "detach_", "lift_fresh")},
-    **dict.fromkeys(VIEWS, _view),
-    **{"expand": _expand, "permute": _permute, "transpose": _transpose, "t": _transpose, "unsqueeze": _unsqueeze},
-    **{"squeeze": _squeeze, "slice": _slice, "select": _select, "unbind": _unbind, "split": _split},
-    **{
-        "split_with_sizes": _split,
-        "flip": _flip,
-        "repeat": _repeat,
-        "cat": _cat,
-        "stack": _stack,
-        "constant_pad_nd": _pad,
-    },
-    **{"index_select": _index_select, "index": _index, "index_put": _index_put, "gather": _gather},
-    **{"searchsorted": _search, "bucketize": _bucketize},
+    **dict.fromkeys(("view", "_unsafe_view"), _view),
+    **{"expand": _expand, "permute": _permute, "unsqueeze": _unsqueeze, "squeeze": _squeeze, "slice": _slice},
+    **{"select": _select, "split": _split, "split_with_sizes": _split, "flip": _flip},
+    **{"cat": _cat, "stack": _stack, "constant_pad_nd": _pad, "index_select": _index_select, "index": _index},
+    **{"index_put": _index_put, "gather": _gather, "searchsorted": _search, "bucketize": _bucketize},
 }
-"""Operators by name, without overload."""
+"""Operators by name, without overload; what is missing is decomposed as torch does it for its compilers."""

@@ -1,4 +1,4 @@
-"""A function of arrays as a graph of the operators of torch that it calls.
+"""A function of arrays as a graph of the operators of torch that it calls; those without a rule are decomposed.
 
 ``make_fx`` gives the same graph, but takes five times as long: it notes what only torch's compilers read.
 """
@@ -8,9 +8,27 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from torch._decomp import decomposition_table
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from torchrl_loco.envs.fusion.rules import RULES
+
 aten = torch.ops.aten
+
+
+def _decomposed(func: Any) -> Callable[..., Any] | None:
+    """Returns what does by other operators what one without a rule does, if torch has that for its compilers."""
+    name, kept = func._schema.name.removeprefix("aten::"), {torch.Tag.nondeterministic_seeded, torch.Tag.inplace_view}
+    in_place = name.endswith("_") and not name.startswith("_")
+    if name in RULES or (in_place and name[:-1] in RULES) or not kept.isdisjoint(func.tags):
+        return None
+    if func._can_decompose():
+        return func.decompose
+    if not in_place:
+        return decomposition_table.get(func)
+    functional: Any = getattr(getattr(aten, name[:-1], None), func._overloadname, None)
+    new = decomposition_table.get(functional)
+    return new and (lambda target, *args, **kwargs: target.copy_(new(target, *args, **kwargs)))
 
 
 class _Tracer(TorchDispatchMode):
@@ -30,6 +48,9 @@ class _Tracer(TorchDispatchMode):
         kwargs = kwargs or {}
         if func is aten.lift_fresh.default:  # of torch.tensor(...): each run needs a copy
             func = aten.lift_fresh_copy.default
+        if (decomposed := _decomposed(func)) is not None:
+            with self:
+                return decomposed(*args, **kwargs)
         if torch.Tag.data_dependent_output in func.tags:
             self._check_known(args)
             return func(*args, **kwargs)
