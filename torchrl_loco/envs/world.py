@@ -5,15 +5,13 @@ import logging
 import os
 import weakref
 from collections.abc import Callable, Collection
-from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import torch
 import torch._subclasses.schema_check_mode  # noqa: F401, which closing needs: an import while garbage is collected may fail
 import warp as wp
 
-from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.body_funcs import check_pair, check_rows, of_package
 from torchrl_loco.envs.closing import OPEN, close_quietly
 from torchrl_loco.envs.episode import (
@@ -34,7 +32,6 @@ from torchrl_loco.envs.hooks import PARTS, Hooks, reads_of
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.scan import Scans
-from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.view import CONTACT_HISTORY
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import (
@@ -54,32 +51,8 @@ from torchrl_loco.sim import (
     torch_is_recording,
 )
 
-
-class Owner(Protocol):
-    """What :class:`World` needs of an environment: its model, its settings and its functions."""
-
-    config: SimConfig
-    num_envs: int
-    device: torch.device
-    seed: int
-    world_offset: int | None
-    groups: dict[str, tuple[int, ...]]
-    term_names: tuple[str, ...]
-    on_overflow: str
-    nan_dump: Path | None
-    observation_size: int
-    hooks: Hooks | None
-    variation: Variation | None
-    compile_hooks: bool
-
-    def observation_func(self, world: "World") -> tuple[wp.Function, Any]:
-        """Returns the function that writes observation and reward, and its inputs."""
-
-    def pose_func(self, world: "World") -> tuple[wp.Function, Any] | None:
-        """Returns the function that draws initial states, and its inputs, if there is one."""
-
-    def settings(self) -> dict[str, Any]:
-        """Returns what a NaN dump records of the environment."""
+if TYPE_CHECKING:
+    from torchrl_loco.envs.base import LocoEnv
 
 
 class World:
@@ -119,7 +92,7 @@ class World:
         fixed: attributes of the task that were read when this was made, and never again.
     """
 
-    def __init__(self, task: Owner, mj_model: mujoco.MjModel) -> None:
+    def __init__(self, task: "LocoEnv", mj_model: mujoco.MjModel) -> None:
         self._closed = True  # until it is made in full
         n, nu, hooks = task.num_envs, mj_model.nu, task.hooks
         self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own if hooks else frozenset()
@@ -209,7 +182,7 @@ class World:
 
     # What each world does besides the physics, in Warp.
 
-    def _make_funcs(self, task: Owner) -> None:
+    def _make_funcs(self, task: "LocoEnv") -> None:
         data, n, device = self.sim.data, task.num_envs, self.sim.device
         flags = fill(
             Flags,
@@ -262,7 +235,7 @@ class World:
             self._start.append(poser(func, inputs, self.stream.warp))
             self._starts_at_rest = not holds(inputs, data.qvel)
 
-    def _fused_outputs(self, task: Owner) -> tuple[Any, int, int]:
+    def _fused_outputs(self, task: "LocoEnv") -> tuple[Any, int, int]:
         """Returns where a fused function writes, and the sizes of its rows; what a hook returns instead is not used."""
         cls, n, device = type(task), task.num_envs, self.sim.device
         if "observation" in self._own:
@@ -313,7 +286,7 @@ class World:
 
     # The parts of the step, and what they become on the device.
 
-    def _make_parts(self, task: Owner) -> None:
+    def _make_parts(self, task: "LocoEnv") -> None:
         sim, hooks, own, variation = self.sim, task.hooks, self._own, self._variation
         self._moved = Buffer(task.num_envs, bool, sim.device)
         streams = self._streams(task) if hooks or variation else {}
@@ -381,7 +354,7 @@ class World:
             if isinstance(part, Part) and not {*scanning}.isdisjoint(hooks):
                 part.before = scans[name in ("begin", "observe_begun", "observe_restored")]
 
-    def _streams(self, task: Owner) -> dict[str, torch.Tensor]:
+    def _streams(self, task: "LocoEnv") -> dict[str, torch.Tensor]:
         """Returns the arrays that tell where random streams begin, and the numbers of the model that vary."""
         first = task.world_offset or 0
         numbers = {"numbers": self.sim.numbers} if self._variation is not None else {}
