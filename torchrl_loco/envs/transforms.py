@@ -7,36 +7,9 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import (
-    CatTensors,
-    CenterCrop,
-    ClipTransform,
-    Compose,
-    Crop,
-    DoubleToFloat,
-    DTypeCastTransform,
-    EnvBase,
-    ExcludeTransform,
-    FlattenObservation,
-    FrameSkipTransform,
-    GrayScale,
-    InitTracker,
-    ObservationNorm,
-    PermuteTransform,
-    RenameTransform,
-    Resize,
-    RewardClipping,
-    RewardScaling,
-    RewardSum,
-    SelectTransform,
-    SignTransform,
-    SqueezeTransform,
-    StepCounter,
-    ToTensorImage,
-    Transform,
-    UnsqueezeTransform,
-)
+from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
+from torchrl.envs import transforms as t
 
 from torchrl_loco.envs.resets import reset_done_worlds, rows_of
 from torchrl_loco.envs.state import without_state
@@ -66,15 +39,16 @@ class ActionRepeat(FrameSkipTransform):
 
 
 PLAIN_TRANSFORMS = (
-    *(ActionRepeat, ClipTransform, Compose, DoubleToFloat, FrameSkipTransform, InitTracker),
-    *(ObservationNorm, RewardClipping, RewardScaling, RewardSum, StepCounter),
+    ActionRepeat,
+    *(t.ClipTransform, Compose, t.DoubleToFloat, FrameSkipTransform, t.InitTracker, t.ObservationNorm),
+    *(t.RewardClipping, t.RewardScaling, t.RewardSum, t.StepCounter),
 )
 """Transforms that can be recorded, as they keep nothing on the host; a reset changes only the worlds of its mask."""
 
 STATELESS_TRANSFORMS = (
-    *(CatTensors, CenterCrop, Crop, DTypeCastTransform, ExcludeTransform, FlattenObservation, GrayScale),
-    *(PermuteTransform, RenameTransform, Resize, SelectTransform, SignTransform, SqueezeTransform),
-    *(ToTensorImage, UnsqueezeTransform),
+    *(t.CatTensors, t.CenterCrop, t.Crop, t.DTypeCastTransform, t.ExcludeTransform, t.FlattenObservation, t.GrayScale),
+    *(t.PermuteTransform, t.RenameTransform, t.Resize, t.SelectTransform, t.SignTransform, t.SqueezeTransform),
+    *(t.ToTensorImage, t.UnsqueezeTransform),
 )
 """Further transforms that compute the same of the same data, also at a reset."""
 
