@@ -290,8 +290,8 @@ def test_a_body_whose_mass_matrix_is_diagonal_has_the_mass_of_its_world():
     [
         ({"geom_size": [0]}, "'geom_size' cannot vary: choose of geom_friction"),
         ({"body_mass": [7]}, "body_mass has 7 numbers, but the number 7"),
-        ({"actuator_forcerange": [0, 2]}, "actuator 'free' cannot vary, since its force has no limits"),
-        ({"body_ipos": [18]}, "body 'ball' cannot vary, since MuJoCo takes its mass matrix for diagonal"),
+        ({"actuator_forcerange": [0, 2]}, "actuator 'free' cannot vary: no force range limits"),
+        ({"body_ipos": [18]}, "body 'ball' cannot vary: MuJoCo takes the body's mass matrix for diagonal"),
     ],
 )
 def test_what_cannot_vary_is_refused(places, wrong):

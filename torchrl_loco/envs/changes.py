@@ -1,62 +1,47 @@
 """Which numbers of a model a Vary changes."""
 
-import dataclasses
-
 import mujoco
 import numpy as np
 
 from torchrl_loco.envs.names import Elements
 from torchrl_loco.envs.vary import FIELDS, Vary
-from torchrl_loco.sim.varied import field, is_fixed
+from torchrl_loco.sim.varied import field, why_not
 
 
-@dataclasses.dataclass
 class Change:
-    """What a :class:`Vary` does to numbers of a model.
-
-    Attributes:
-        vary: the Vary.
-        label: what its random stream depends on.
-        places: numbers that it changes, as fields and indices of their flattened arrays.
-        which: of each of them, the index of its draw.
-        signs: of each of them, what an offset or number is multiplied by: -1 for the bias of ``kp`` and ``kv``.
-        group_of: of each draw, the group of numbers of an element that it is for.
-    """
-
-    vary: Vary
-    label: str
-    places: list[tuple[str, int]]
-    which: list[int]
-    signs: list[float]
-    group_of: list[int]
-
-
-def change_of(vary: Vary, elements: Elements, label: str) -> Change:
-    """Returns what a Vary does to the numbers of a model.
+    """What a :class:`Vary` does to the numbers of a model.
 
     Args:
         vary: the Vary.
         elements: the elements of the model.
         label: what its random stream depends on.
 
+    Attributes:
+        places: numbers that it changes, as fields and indices of their flattened arrays.
+        which: of each of them, the index of its draw.
+        signs: of each of them, what an offset or number is multiplied by: -1 for the bias of ``kp`` and ``kv``.
+        group_of: of each draw, the group of numbers of an element that it is for.
+
     Raises:
         ValueError: a name is not in the model, an element does not have such a number, or all of them stay 0.
     """
-    m, groups = elements.mj_model, vary.groups
-    per_element = [_places(vary.field, m, i) for i in _ids(vary, elements)]
-    draws = list(range(len(groups))) * (1 if vary.shared else len(per_element))
-    change = Change(vary, label, [], [], [], draws)
-    for rank, numbers in enumerate(per_element):
-        for group, components in enumerate(groups):
-            draw = group if vary.shared else rank * len(groups) + group
-            for name, index, sign in (place for component in components for place in numbers[component]):
-                if vary.how != "scale" or field(m, name).flat[index] != 0:
-                    change.places.append((name, index))
-                    change.which.append(draw)
-                    change.signs.append(sign)
-    if not change.places:
-        raise ValueError(f"{vary}: {vary.field} is 0 in the model, so nothing is scaled: use how='add' or 'set'")
-    return change
+
+    def __init__(self, vary: Vary, elements: Elements, label: str) -> None:
+        m, groups = elements.mj_model, vary.groups
+        per_element = [_places(vary.field, m, i) for i in _ids(vary, elements)]
+        self.vary, self.label = vary, label
+        self.group_of = list(range(len(groups))) * (1 if vary.shared else len(per_element))
+        found = [
+            ((name, index), group if vary.shared else rank * len(groups) + group, sign)
+            for rank, numbers in enumerate(per_element)
+            for group, components in enumerate(groups)
+            for component in components
+            for name, index, sign in numbers[component]
+            if vary.how != "scale" or field(m, name).flat[index] != 0
+        ]
+        if not found:
+            raise ValueError(f"{vary}: {vary.field} is 0 in the model, so nothing is scaled: use how='add' or 'set'")
+        self.places, self.which, self.signs = map(list, zip(*found, strict=True))
 
 
 def _ids(vary: Vary, elements: Elements) -> list[int]:
@@ -91,15 +76,11 @@ def _why_not(name: str, m: mujoco.MjModel, i: int) -> str | None:
     """Returns why an element cannot have a field that varies, if it cannot."""
     if FIELDS[name].of == "body" and i == 0:
         return "the world has neither mass nor inertia"
-    if name == "body_ipos" and is_fixed(m, name, i):
-        return "MuJoCo takes the body's mass matrix for diagonal, so move its center of mass a little in the model"
-    if name == "actuator_forcerange" and is_fixed(m, name, i):
-        return "no force range limits the actuator"
     if name == "kp" and not _is_position(m, i):
         return "kp is of position actuators"
     if name == "kv" and not (_is_position(m, i) or _is_velocity(m, i)):
         return "kv is of position and velocity actuators"
-    return None
+    return why_not(m, name, i)
 
 
 def _is_affine(m: mujoco.MjModel, i: int) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from torchrl_loco.envs import draws
-from torchrl_loco.envs.changes import Change, change_of
+from torchrl_loco.envs.changes import Change
 from torchrl_loco.envs.names import Elements
 from torchrl_loco.envs.vary import FIELDS, Vary
 from torchrl_loco.sim.varied import Varied
@@ -45,7 +45,7 @@ class Variation:
         self._mj_model, self._device, self._elements = mj_model, device, Elements(mj_model)
         labels = [f"{vary.field} of {vary.of}, {vary.component}" for vary in varys]
         self._changes = [
-            change_of(vary, self._elements, f"{label}, {labels[:i].count(label)}")
+            Change(vary, self._elements, f"{label}, {labels[:i].count(label)}")
             for i, (vary, label) in enumerate(zip(varys, labels, strict=True))
         ]
         places: dict[str, set[int]] = {}

@@ -135,10 +135,6 @@ class Vary:
         return f"Vary({', '.join(words)})"
 
     @property
-    def _range(self) -> tuple[Bound, Bound]:
-        return self.low, self.high
-
-    @property
     def groups(self) -> list[tuple[int, ...]]:
         """Which numbers of an element vary; those of a group by one draw.
 
@@ -147,7 +143,9 @@ class Vary:
         """
         field = FIELDS[self.field]
         chosen = (self.component,) if isinstance(self.component, int) else self.component
-        if any(isinstance(bound, tuple) for bound in self._range) or (chosen is not None and self.how != "scale"):
+        if any(isinstance(bound, tuple) for bound in (self.low, self.high)) or (
+            chosen is not None and self.how != "scale"
+        ):
             return [(index,) for index in (range(field.size) if chosen is None else chosen)]
         if self.how == "scale":
             return [tuple(range(field.size) if chosen is None else chosen)]
@@ -163,7 +161,7 @@ class Vary:
             ValueError: there are not as many of them.
         """
         count = len(self.groups)
-        low, high = ([bound] * count if isinstance(bound, float) else list(bound) for bound in self._range)
+        low, high = ([bound] * count if isinstance(bound, float) else list(bound) for bound in (self.low, self.high))
         if not len(low) == len(high) == count:
             raise ValueError(
                 f"{self}: low and high must be numbers, or have {count}, one for each number of an element"

@@ -1,6 +1,7 @@
 """Which numbers of a model differ from world to world."""
 
 import copy
+import math
 from collections.abc import Mapping
 
 import mujoco
@@ -42,10 +43,14 @@ class Varied:
         for name, given in places.items():
             if name not in FIELDS:
                 raise ValueError(f"{name!r} cannot vary: choose of {', '.join(FIELDS)}")
-            indices, size = np.unique(np.asarray(given, dtype=int)), field(mj_model, name).size
+            indices, shape = np.unique(np.asarray(given, dtype=int)), field(mj_model, name).shape
+            size = math.prod(shape)
             if indices.size and not 0 <= indices[0] <= indices[-1] < size:
                 raise ValueError(f"{name} has {size} numbers, but the number {indices[-1]} was to vary")
-            check(mj_model, name, indices)
+            for element in indices // math.prod(shape[1:]):
+                if why := why_not(mj_model, name, element):
+                    kind = name.partition("_")[0]
+                    raise ValueError(f"{name} of {kind} {getattr(mj_model, kind)(element).name!r} cannot vary: {why}")
             self.places[name] = indices
             self.columns[name] = slice(self.count, self.count + indices.size)
             self.count += indices.size
@@ -93,36 +98,13 @@ class Varied:
             m.bvh_aabb[boxes, :3] += offset @ axes.reshape(3, 3)
 
 
-def check(mj_model: mujoco.MjModel, name: str, indices: np.ndarray) -> None:
-    """Checks that a model can follow numbers of a field.
-
-    Raises:
-        ValueError: it cannot: the message names the element, and what to do.
-    """
-    if name == "actuator_forcerange":
-        for i in indices // 2:
-            if is_fixed(mj_model, name, i):
-                raise ValueError(
-                    f"actuator_forcerange of actuator {mj_model.actuator(i).name!r} cannot vary, since its "
-                    "force has no limits: give it a forcerange in the model"
-                )
-    if name == "body_ipos":
-        for body in indices // 3:
-            if is_fixed(mj_model, name, body):
-                raise ValueError(
-                    f"body_ipos of body {mj_model.body(body).name!r} cannot vary, since MuJoCo takes its mass "
-                    "matrix for diagonal: in the model, move its center of mass a little off its joints (inertial)"
-                )
-
-
-def is_fixed(mj_model: mujoco.MjModel, name: str, element: int) -> bool:
-    """Returns whether a model cannot follow numbers of an element.
-
-    These are the limits of a force that is not limited, and the center of mass of a body whose mass matrix is diagonal.
-    """
-    if name == "actuator_forcerange":
-        return not mj_model.actuator_forcelimited[element]
-    return name == "body_ipos" and mj_model.body_simple[element] == 1
+def why_not(mj_model: mujoco.MjModel, name: str, element: int) -> str | None:
+    """Returns why a model cannot follow numbers of an element, if it cannot, and what to do."""
+    if name == "actuator_forcerange" and not mj_model.actuator_forcelimited[element]:
+        return "no force range limits the actuator, so give it a forcerange in the model"
+    if name == "body_ipos" and mj_model.body_simple[element] == 1:
+        return "MuJoCo takes the body's mass matrix for diagonal, so move its center of mass a little in the model"
+    return None
 
 
 def subtree_masses(mj_model: mujoco.MjModel, masses: np.ndarray) -> np.ndarray:
