@@ -89,9 +89,10 @@ class BatchedModel:
             wp.launch(add_up_masses, count, inputs=inputs, outputs=[model.body_subtreemass], device=device)
 
 
-def nominal_numbers(varied: Varied, num_envs: int) -> np.ndarray:
-    """Returns the numbers of the model in every world, ``(num_envs, varied.count)`` float32."""
-    return np.repeat(varied.nominal().astype(np.float32)[None], num_envs, axis=0)
+def nominal_numbers(varied: Varied | None, num_envs: int, device: wp.Device) -> wp.array:
+    """Returns the numbers of the model in every world, ``(num_envs, varied.count)``; none without ``varied``."""
+    row = np.zeros(0) if varied is None else varied.nominal()
+    return wp.array(np.tile(row, (num_envs, 1)), shape=(num_envs, row.size), dtype=float, device=device)
 
 
 def with_every_row(m: mujoco.MjModel, varied: Varied | None) -> mujoco.MjModel:

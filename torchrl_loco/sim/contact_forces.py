@@ -15,18 +15,6 @@ LARGEST = wp.constant(2.0**24)
 
 
 @wp.kernel(enable_backward=False)
-def clear(
-    # Out:
-    sum_out: wp.array3d[wp.int64],
-    touches_out: wp.array2d[bool],
-):
-    world, geom = wp.tid()
-    touches_out[world, geom] = False
-    for i in range(3):
-        sum_out[world, geom, i] = wp.int64(0)
-
-
-@wp.kernel(enable_backward=False)
 def add_contacts(
     # Data in:
     nacon_in: wp.array[int],
@@ -122,7 +110,8 @@ class ContactForces:
         device, contact = data.qpos.device, data.contact
         mjw.contact_force(model, data, self._contacts, True, self._of_contact)  # in the world's frame
         sums, shape = [self._sum, self._touches], self._touches.shape
-        wp.launch(clear, dim=shape, outputs=sums, device=device)
+        for array in sums:
+            array.zero_()
         inputs = [data.nacon, contact.geom, contact.efc_address, contact.worldid, self._index, self._of_contact]
         wp.launch(add_contacts, dim=data.naconmax, inputs=inputs, outputs=sums, device=device)
         bounds = (0, self.rows) if row is None else (row, row + 1)

@@ -120,9 +120,7 @@ class MujocoEngine(Engine):
         home: Any = mujoco.MjData(m)
         names = [name for name in STATE if np.size(getattr(home, name))]
         self._worlds = [World(m, names) for _ in range(num_envs)]
-        count = 0 if varied is None else varied.count
-        numbers = np.zeros((num_envs, 0)) if varied is None else nominal_numbers(varied, num_envs)
-        self.numbers = wp.array(numbers, shape=(num_envs, count), dtype=float, device=device)
+        self.numbers = nominal_numbers(varied, num_envs, device)
         self._state = {name: getattr(self.data, name).numpy() for name in names}
         for name, rows in self._state.items():
             rows[:] = np.reshape(getattr(home, name), rows.shape[1:])

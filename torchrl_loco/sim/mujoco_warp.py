@@ -159,11 +159,8 @@ class MujocoWarpEngine(Engine):
             self.data = mjw.make_data(
                 with_every_row(mj_model, varied), nworld=num_envs, naconmax=config.naconmax, njmax=config.njmax
             )
-        self.numbers = wp.zeros((num_envs, 0), dtype=float, device=device)
-        self._batched: BatchedModel | None = None
-        if varied is not None:
-            self.numbers = wp.array(nominal_numbers(varied, num_envs), dtype=float, device=device)
-            self._batched = BatchedModel(self.model, varied, self.numbers)
+        self.numbers = nominal_numbers(varied, num_envs, device)
+        self._batched = None if varied is None else BatchedModel(self.model, varied, self.numbers)
         option = self.model.opt
         # Printing from kernels costs more than the physics; ``data.overflow`` holds the same information.
         option.warn_overflow = 0

@@ -18,38 +18,20 @@ FIRST_CONTACT = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLES
 """Lowest type of a row whose id is a contact; the ids of all other types are fixed by the model."""
 
 
-@wp.struct
-class RowKey:
-    """Sort key of a row: the members are compared one after the other."""
-
-    type: int
-    first: int
-    second: int
-    id: int
-
-
 @wp.func
-def row_key(efc_type: int, efc_id: int, contact_geom: wp.array[wp.vec2i]) -> RowKey:
-    key = RowKey()
-    key.type = efc_type
+def row_key(efc_type: int, efc_id: int, contact_geom: wp.array[wp.vec2i]) -> wp.vec4i:
+    """Returns the sort key of a row, whose numbers are compared one after the other."""
+    geoms = wp.vec2i()
     if efc_type >= FIRST_CONTACT:
-        geoms = contact_geom[efc_id]
-        key.first = geoms[0]
-        key.second = geoms[1]
-    key.id = efc_id  # contacts of the same two geoms come from one thread, and so in their order
-    return key
+        geoms = contact_geom[efc_id]  # contacts of the same two geoms come from one thread, and so in their order
+    return wp.vec4i(efc_type, geoms[0], geoms[1], efc_id)
 
 
 @wp.func
-def comes_before(a: RowKey, b: RowKey, otherwise: bool) -> bool:
-    if a.type != b.type:
-        return a.type < b.type
-    if a.first != b.first:
-        return a.first < b.first
-    if a.second != b.second:
-        return a.second < b.second
-    if a.id != b.id:
-        return a.id < b.id
+def comes_before(a: wp.vec4i, b: wp.vec4i, otherwise: bool) -> bool:
+    for i in range(4):
+        if a[i] != b[i]:
+            return a[i] < b[i]
     return otherwise
 
 

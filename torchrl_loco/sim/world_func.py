@@ -120,36 +120,25 @@ class Chain:
         return whole
 
 
-class WorldKernel:
-    """Functions of a world as a kernel of their own, where the physics cannot call them or would wait for them.
+class WorldKernels:
+    """Functions of a world as kernels of their own, where the physics cannot call them or would wait for them.
 
-    Args:
-        funcs: the functions.
+    The kernel of each list of functions is made once.
     """
 
-    def __init__(self, funcs: Sequence[WorldFunc]) -> None:
-        self._chain = Chain(funcs)
-        self._kernel = _kernel(self._chain.func, self._chain.struct) if funcs else None
-
-    def launch(self, funcs: Sequence[WorldFunc], mask: wp.array) -> None:
-        """Launches such functions; worlds that are not in ``mask`` ``(nworld,)`` do nothing."""
-        if self._kernel is not None:
-            inputs = [mask, self._chain.args(funcs)]
-            wp.launch(self._kernel, mask.size, inputs, device=mask.device, block_dim=BLOCK_DIM)
-
-
-class WorldKernels:
-    """Functions of a world, launched together: the kernel of each list of them is made once."""
-
     def __init__(self) -> None:
-        self._kept: dict[tuple[wp.Function, ...], WorldKernel] = {}
+        self._kept: dict[tuple[wp.Function, ...], tuple[Chain, wp.Kernel]] = {}
 
     def launch(self, funcs: Sequence[WorldFunc], mask: wp.array) -> None:
         """Launches functions as one kernel; worlds that are not in ``mask`` ``(nworld,)`` do nothing."""
+        if not funcs:
+            return
         key = tuple(func for func, _ in funcs)
         if key not in self._kept:
-            self._kept[key] = WorldKernel(funcs)
-        self._kept[key].launch(funcs, mask)
+            chain = Chain(funcs)
+            self._kept[key] = chain, _kernel(chain.func, chain.struct)
+        chain, kernel = self._kept[key]
+        wp.launch(kernel, mask.size, [mask, chain.args(funcs)], device=mask.device, block_dim=BLOCK_DIM)
 
 
 @wp.func_native("""
