@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torchrl_loco import known_files, storage
 from torchrl_loco.envs.state import State
 from torchrl_loco.sim import Buffer, Overflow, Simulation, WorldFunc, fill
+from torchrl_loco.sim.world_func import copy_row
 
 INTERVAL = 100
 """Control steps between two reads."""
@@ -224,32 +225,18 @@ class StepInputs:
 
 
 @wp.struct
-class Keeper:
-    """What :func:`keep_inputs` copies, until a world was found that is not finite."""
+class Guarded:
+    """What a step begins with, and where it is kept until a world was found that is not finite: ``first``."""
 
     first: wp.array[int]
     found: wp.array[bool]
+    non_finite: wp.array[bool]
     present: StepInputs
     kept: StepInputs
 
 
-@wp.struct
-class Finder:
-    """What :func:`find_first` reads, and where it notes the world."""
-
-    found: wp.array[bool]
-    non_finite: wp.array[bool]
-    first: wp.array[int]
-
-
 @wp.func
-def copy_row(row: wp.array[float], kept: wp.array[float]):
-    for i in range(row.shape[0]):
-        kept[i] = row[i]
-
-
-@wp.func
-def keep_inputs(world: int, args: Keeper):
+def keep_inputs(world: int, args: Guarded):
     """Copies what a control step begins with, until a world that is not finite was found."""
     found = args.first[0] < args.present.episode.shape[0]
     if world == 0:
@@ -267,7 +254,7 @@ def keep_inputs(world: int, args: Keeper):
 
 
 @wp.func
-def find_first(world: int, args: Finder):
+def find_first(world: int, args: Guarded):
     """Notes the first world that is not finite, unless an earlier step had one."""
     if args.non_finite[world] and not args.found[0]:
         wp.atomic_min(args.first, 0, world)
@@ -303,20 +290,24 @@ class NanGuard(Monitor):
         self._kept = {name: wp.zeros_like(array) for name, array in {"action": data.ctrl, **self._inputs}.items()}
         self._first = Buffer(1, int, sim.device)
         self._found = Buffer(1, bool, sim.device)
-        found = {"first": self._first.warp, "found": self._found.warp}
-        self._keeper = {**found, "kept": fill(StepInputs, **self._kept)}
-        self._find = WorldFunc(find_first, fill(Finder, non_finite=non_finite.warp, **found))
+        kept = fill(StepInputs, **self._kept)
+        self._guarded = {
+            "first": self._first.warp,
+            "found": self._found.warp,
+            "non_finite": non_finite.warp,
+            "kept": kept,
+        }
         super().__init__(1, self._first.torch.device)
         self._reported = False
 
     def first_of_step(self, action: wp.array) -> list[WorldFunc]:
         """Returns what keeps what a control step under ``action`` ``(nworld, nu)`` begins with."""
         present = fill(StepInputs, action=action, **self._inputs)
-        return [WorldFunc(keep_inputs, fill(Keeper, present=present, **self._keeper))]
+        return [WorldFunc(keep_inputs, fill(Guarded, present=present, **self._guarded))]
 
     def last_of_step(self) -> list[WorldFunc]:
         """Returns what looks for a non-finite world."""
-        return [self._find]
+        return [WorldFunc(find_first, fill(Guarded, present=self._guarded["kept"], **self._guarded))]
 
     def numbers(self) -> torch.Tensor:
         """Returns the index of the world that was found, or the number of worlds if none was, shape ``(1,)``."""
