@@ -7,7 +7,7 @@ import math
 import multiprocessing
 import os
 import secrets
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -248,21 +248,17 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         observation: dict[str, Any] = {
             name: Unbounded((*batch, *shape), **as_float) for name, shape in self.groups.items()
         }
+
+        def numbers(sizes: Mapping[str, int]) -> Composite:
+            entries = {name: Unbounded((*batch, size), **as_float) for name, size in sizes.items()}
+            return Composite(entries, shape=batch, device=device)
+
         if self.reward_terms:
-            terms = {name: Unbounded((*batch, 1), **as_float) for name in self.term_names}
-            observation["reward_terms"] = Composite(terms, shape=batch, device=device)
+            observation["reward_terms"] = numbers(dict.fromkeys(self.term_names, 1))
         if self.metric_names:
-            metrics = {name: Unbounded((*batch, 1), **as_float) for name in self.metric_names}
-            observation["metrics"] = Composite(metrics, shape=batch, device=device)
+            observation["metrics"] = numbers(dict.fromkeys(self.metric_names, 1))
         if self._apart:
-            apart = {
-                group: Composite(
-                    {name: Unbounded((*batch, size), **as_float) for name, size in sizes.items()},
-                    shape=batch,
-                    device=device,
-                )
-                for group, sizes in self._apart.items()
-            }
+            apart = {group: numbers(sizes) for group, sizes in self._apart.items()}
             observation["observation_terms"] = Composite(apart, shape=batch, device=device)
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.observation_spec = Composite(observation, shape=batch, device=device)
@@ -349,10 +345,9 @@ class LocoEnv(Task, WorldAccess, QuickResets):
                     numbers.masked_fill_(unrewarded, 0.0)
                 result[key] = dict(zip(names, numbers.unsqueeze(-1).unbind(-2), strict=True))
         if self._apart:
+            newest = {group: result[group][..., -sum(sizes.values()) :] for group, sizes in self._apart.items()}
             result["observation_terms"] = {
-                group: dict(
-                    zip(sizes, result[group][..., -sum(sizes.values()) :].split([*sizes.values()], -1), strict=True)
-                )
+                group: dict(zip(sizes, newest[group].split([*sizes.values()], -1), strict=True))
                 for group, sizes in self._apart.items()
             }
         return result
