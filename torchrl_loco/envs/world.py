@@ -1,10 +1,13 @@
 """Everything of an environment that lives on its device, and the control step from top to bottom."""
 
+import atexit
 import contextlib
 import logging
 import os
+import warnings
 import weakref
 from collections.abc import Callable, Collection
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -13,7 +16,6 @@ import torch._subclasses.schema_check_mode  # noqa: F401, which closing needs: a
 import warp as wp
 
 from torchrl_loco.envs.body_funcs import check_pair, check_rows, of_package
-from torchrl_loco.envs.closing import OPEN, close_quietly
 from torchrl_loco.envs.episode import (
     Control,
     EpisodeStart,
@@ -184,13 +186,10 @@ class World:
 
     def _make_funcs(self, task: "LocoEnv") -> None:
         data, n, device = self.sim.data, task.num_envs, self.sim.device
-        flags = fill(
-            Flags,
-            non_finite=self.non_finite.warp,
-            done=self.done.warp,
-            terminated=self.terminated.warp,
-            truncated=self.truncated.warp,
-        )
+        flags = ("non_finite", "done", "terminated", "truncated", "ended", "cut_off", "mask")
+        names = (*flags, "seed", "episode", "stream", "elapsed_steps")
+        of_world = SimpleNamespace(**{name: getattr(self, name).warp for name in names}, overflow=data.overflow)
+        of_world.flags, of_world.episode_length = fill(Flags, of_world), task.config.episode_length
         self._fused: list[WorldFunc] = []
         self._check_finite: list[WorldFunc] = []
         asked = task.hooks.catalog.arrays if task.hooks else set()
@@ -203,31 +202,10 @@ class World:
             self._fused = [observer(func, inputs, outputs, self.non_finite.warp, size, coalesced=coalesced)]
             finite = fill(FiniteCheck, data, outputs=outputs, non_finite=self.non_finite.warp)
             self._check_finite = [] if self._own else [WorldFunc(zero_non_finite, finite)]
-        end = fill(
-            StepEnd,
-            episode_length=task.config.episode_length,
-            counter_bits=self.health.counter_bits,
-            overflow=data.overflow,
-            ended=self.ended.warp,
-            cut_off=self.cut_off.warp,
-            flags=flags,
-            elapsed_steps=self.elapsed_steps.warp,
-            mask=self.mask.warp,
-            counts=self.health.counts.warp,
-        )
-        self._finish = WorldFunc(finish_step, end)
-        start = fill(
-            EpisodeStart,
-            stagger=self._stagger.warp,
-            seed=self.seed.warp,
-            world_offset=task.world_offset or 0,
-            episode_length=task.config.episode_length,
-            episode=self.episode.warp,
-            stream=self.stream.warp,
-            elapsed_steps=self.elapsed_steps.warp,
-            flags=flags,
-        )
-        self._start = [WorldFunc(begin_episode, start)]
+        counted = {"counter_bits": self.health.counter_bits, "counts": self.health.counts.warp}
+        self._finish = WorldFunc(finish_step, fill(StepEnd, of_world, **counted))
+        first = {"world_offset": task.world_offset or 0, "stagger": self._stagger.warp}
+        self._start = [WorldFunc(begin_episode, fill(EpisodeStart, of_world, **first))]
         self._starts_at_rest = True
         pose = task.pose_func(self) if "begin" not in self._own or "warp.begin" in asked else None
         if pose is not None:
@@ -380,18 +358,9 @@ class World:
         if catalog.contact_geoms:
             arrays |= {"contact_force": sim.contact_force, "in_contact": sim.in_contact}
             arrays |= {name: getattr(sim, name) for name in CONTACT_HISTORY if name in catalog.arrays}
-        arrays |= {
-            "action": self.action.torch,
-            "elapsed_steps": self.elapsed_steps.torch,
-            "moved": self._moved.torch,
-            "non_finite": self.non_finite.torch,
-            "ended": self.ended.torch,
-            "cut_off": self.cut_off.torch,
-            "reward": self.reward.torch,
-            "terms": self.terms.torch,
-            "metrics": self.metrics,
-            "overflow": sim.overflow,
-        }
+        own = ("action", "elapsed_steps", "_moved", "non_finite", "ended", "cut_off", "reward", "terms")
+        arrays |= {name.removeprefix("_"): getattr(self, name).torch for name in own}
+        arrays |= {"metrics": self.metrics, "overflow": sim.overflow}
         arrays |= {f"shared.{name}": values for name, values in self.shared.items()}
         arrays |= {f"out.{name}": group for name, group in self.groups.items()}
         return arrays | {f"memory.{name}": rows for name, rows in self.memory.items()}
@@ -564,8 +533,25 @@ class World:
             for monitor in self._monitors:
                 stack.callback(monitor.check)
 
-    def __del__(self) -> None:
-        close_quietly(self)
+    def _close_quietly(self) -> None:
+        """Closes it where errors can only be warnings: when it is collected, and when the process ends."""
+        with contextlib.suppress(Warning):  # warnings may be configured as errors
+            try:
+                self.close()
+            except Exception as error:
+                warnings.warn(str(error), RuntimeWarning, stacklevel=2)
+
+    __del__ = _close_quietly
+
+
+OPEN: weakref.WeakSet[World] = weakref.WeakSet()
+"""Worlds that are closed before torch is torn down."""
+
+
+@atexit.register
+def _close_all() -> None:
+    for world in list(OPEN):
+        world._close_quietly()
 
 
 def _nothing(*args: Any) -> None:
