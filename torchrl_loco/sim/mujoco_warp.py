@@ -204,11 +204,13 @@ class MujocoWarpEngine(Engine):
     def step(self, around: Around = ALONE) -> None:
         # dm_control updates poses, velocities and sensors by the first half of the next step. Here only what an
         # observation can read is computed, so a reset has nothing else to update.
+        d = self.data
         self._kernels.launch([*around.first, *around.before], self._all)
         for i in range(self._substeps):
             with self._substep_only(sensors=self._has_force_sensors and i == self._substeps - 1):
                 self._substep()
-                self._record_peaks()
+                needed, peaks = [d.nefc, d.nacon, d.ncollision], [self.peak_constraints.warp, self.peak_contacts.warp]
+                self._launch(record_peaks, needed, peaks)
             if self.contact_forces is not None and i >= self._substeps - self.contact_forces.rows:
                 row = i - self._substeps + self.contact_forces.rows
                 self.contact_forces.update(self.model, self.data, self._all, row)
@@ -226,15 +228,10 @@ class MujocoWarpEngine(Engine):
         mjw.step2(self.model, self.data)
         self.model.opt.deterministic = mjw.DeterminismType.NONE
 
-    def _record_peaks(self) -> None:
-        d = self.data
-        wp.launch(
-            record_peaks,
-            dim=self._num_envs,
-            inputs=[d.nefc, d.nacon, d.ncollision],
-            outputs=[self.peak_constraints.warp, self.peak_contacts.warp],
-            device=self._device,
-        )
+    def _launch(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any], lanes: int = 1) -> None:
+        """Launches a kernel of a thread, or of several lanes, for each world."""
+        dim = self._num_envs if lanes == 1 else (self._num_envs, lanes)
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
 
     @contextlib.contextmanager
     def _substep_only(self, *, sensors: bool) -> Iterator[None]:
@@ -259,17 +256,18 @@ class MujocoWarpEngine(Engine):
         at_rest: bool = False,
         contacts: bool = True,
     ) -> None:
+        data = self.data
         forces = self._kept_sensors if contacts or self._has_force_sensors else None
 
         def update() -> None:
             self._kernels.launch(before, mask)
             if self._batched is not None:
                 self._batched.update(mask)
-            self._clear_constraints(mask)
+            self._launch(clear_constraints, [mask], [data.efc.J, data.efc.D], LANES)
             if forces is not None:  # they act at rest too
                 self._evaluate_forces(mask, *forces, contacts=contacts)
             elif at_rest:
-                self._rest(mask)
+                self._launch(rest, [mask], [data.cvel, data.sensordata])
                 mjw.kinematics(self.model, self.data)
                 if self.with_subtree_com or any(holds(args, self.data.subtree_com) for _, args in after):
                     mjw.com_pos(self.model, self.data)
@@ -281,7 +279,7 @@ class MujocoWarpEngine(Engine):
             update()
             return
         self._any.zero_()
-        wp.launch(any_world, dim=self._num_envs, inputs=[mask], outputs=[self._any], device=self._device)
+        self._launch(any_world, [mask], [self._any])
         wp.capture_if(self._any, update)
 
     def _evaluate(self) -> None:
@@ -311,29 +309,7 @@ class MujocoWarpEngine(Engine):
         model.opt.disableflags = flags
         if contacts and self.contact_forces is not None:
             self.contact_forces.update(model, data, mask)
-        wp.launch(
-            restore_others,
-            dim=self._num_envs,
-            inputs=[mask, sensordata, overflow],
-            outputs=[data.sensordata, data.overflow],
-            device=self._device,
-        )
-
-    def _rest(self, mask: wp.array) -> None:
-        """Zeroes velocities of bodies and sensors where ``mask`` ``(nworld,)`` is set."""
-        d = self.data
-        wp.launch(rest, dim=self._num_envs, inputs=[mask], outputs=[d.cvel, d.sensordata], device=self._device)
-
-    def _clear_constraints(self, mask: wp.array) -> None:
-        """Removes the constraints of the worlds where ``mask`` ``(nworld,)`` is set."""
-        efc = self.data.efc
-        wp.launch(
-            clear_constraints,
-            dim=(self._num_envs, LANES),
-            inputs=[mask],
-            outputs=[efc.J, efc.D],
-            device=self._device,
-        )
+        self._launch(restore_others, [mask, sensordata, overflow], [data.sensordata, data.overflow])
 
 
 def data_bytes(

@@ -272,18 +272,17 @@ class Program:
             made[at] = self.read(reads[0][0], reads[0][1], steps.pop(), column[0].dtype)
         return np.expand_dims(made, world)
 
-    def apply(self, text: str, dtype: torch.dtype, *operands: Any, of: torch.dtype | None = None) -> Value:
-        """Returns an operator's result of type ``dtype`` on operands of type ``of``, by default the same."""
+    def apply(self, text: str, dtype: torch.dtype, *operands: Any, of: Any = None) -> Value:
+        """Returns an operator's result of type ``dtype`` on operands of type ``of``, or types, by default the same."""
         values, world = self.aligned(*operands)
-        return Value(self.each(text, dtype, *(self.cast(x, of or dtype).array for x in values)), dtype, world)
+        types = of if isinstance(of, tuple) else [of or dtype] * len(values)
+        arrays = [self.cast(x, to).array for x, to in zip(values, types, strict=True)]
+        return Value(self.each(text, dtype, *arrays), dtype, world)
 
     def where(self, mask: Any, a: Any, b: Any, dtype: torch.dtype | None = None) -> Value:
         """Returns ``a`` where ``mask`` is set, else ``b``."""
         dtype = dtype or self._meta.dtype
-        values, world = self.aligned(mask, a, b)
-        types = torch.bool, dtype, dtype
-        arrays = [self.cast(x, to).array for x, to in zip(values, types, strict=True)]
-        return Value(self.each(WHERE, dtype, *arrays), dtype, world)
+        return self.apply(WHERE, dtype, mask, a, b, of=(torch.bool, dtype, dtype))
 
     def numbers(self, x: Any) -> np.ndarray:
         """Returns constants as numbers: for indices.
