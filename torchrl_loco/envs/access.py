@@ -39,7 +39,7 @@ class WorldAccess(EnvBase):
     config: SimConfig
     body: ClassVar[str]
     mj_model: mujoco.MjModel
-    hooks: Hooks | None
+    hooks: Hooks
     options_given: dict[str, Any]
     play: bool
     randomize: Sequence[Vary]
@@ -206,7 +206,7 @@ class WorldAccess(EnvBase):
         """
         if not self.play:
             raise ValueError("commands are drawn in training: make the environment with play=True to set them")
-        settable = self.hooks.commands if self.hooks else {}
+        settable = self.hooks.commands
         if not settable:
             raise ValueError(f"{type(self).__name__} has no command: its command_ranges are empty")
         if entry is None and len(settable) > 1:
@@ -262,7 +262,7 @@ class WorldAccess(EnvBase):
         That is :attr:`shared`, and of :attr:`memory` the entries that :meth:`begin` makes from their former values, as
         a level, in at most 64 worlds, evenly spread. Training keeps it with checkpoint and policy.
         """
-        if self.hooks is None or not (self.world.shared or self.hooks.carried):
+        if not (self.world.shared or self.hooks.carried):
             return {}
         rows = torch.linspace(0, self.num_envs - 1, min(self.num_envs, STAGE_WORLDS)).round().long()
         memory = {name: self.world.memory[name].cpu()[rows].tolist() for name in self.hooks.carried}

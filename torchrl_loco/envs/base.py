@@ -34,7 +34,7 @@ from torchrl_loco.envs.hooks import Hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.resets import QuickResets, rows_of
 from torchrl_loco.envs.state import without_state
-from torchrl_loco.envs.task import BOUNDED, Task, folder_of, own_hooks, replaced_options
+from torchrl_loco.envs.task import BOUNDED, Task, folder_of, replaced_options
 from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.vary import Vary, check_randomize
 from torchrl_loco.sim import models
@@ -173,20 +173,13 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         self._steps_as_base = all(getattr(type(self), name) is getattr(LocoEnv, name) for name in replaceable)
         self._pid = os.getpid()
         self._world, self._episodes, self._stage = None, None, {}
-        self.hooks = (
-            Hooks(self, mj_model)
-            if own_hooks(type(self)) or self.memory or self.shared or models.has_home(mj_model)
-            else None
-        )
-        hooks = self.hooks.own if self.hooks else frozenset()
-        self.groups = dict(self.hooks.groups) if self.hooks else {}
+        self.hooks = Hooks(self, mj_model)
+        hooks, self.groups = self.hooks.own, dict(self.hooks.groups)
+        if self.hooks.term_names is not None:
+            self.term_names = self.hooks.term_names
+        self.metric_names, self.observation_layout = self.hooks.metric_names, dict(self.hooks.terms)
         if "observation" not in hooks:
             self.groups["observation"] = (self.observation_size,)
-        if self.hooks and self.hooks.term_names is not None:
-            self.term_names = self.hooks.term_names
-        self.metric_names = self.hooks.metric_names if self.hooks else ()
-        self.observation_layout = dict(self.hooks.terms) if self.hooks else {}
-        if "observation" not in hooks:
             self.observation_layout["observation"] = dict(self.observation_names)
             if self.noise or self.history:
                 raise ValueError(
@@ -206,8 +199,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
     def _without_unread_sensors(self, own: frozenset[str]) -> mujoco.MjModel:
         """Returns the model that is stepped: without sensors that no hook asks an engine for, if hooks do all."""
         model, stepped = self.mj_model, self.mj_model
-        by_warp = self.hooks and "warp" in self.hooks.catalog.arrays
-        if self.hooks and model.nsensor and {"reward", "observation"} <= own and not by_warp:
+        if model.nsensor and {"reward", "observation"} <= own and "warp" not in self.hooks.catalog.arrays:
             kept = sorted(self.hooks.catalog.sensors)
             stepped = models.load(self.model, folder_of(type(self)), kept, self.config.solids_on_terrain)
             sizes = [int(size) for size in model.sensor_dim[kept]]

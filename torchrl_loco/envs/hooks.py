@@ -68,8 +68,8 @@ def reads_of(env: Any) -> Iterator[set[str]]:
 class Hooks:
     """The hooks of an environment's task that are plain torch.
 
-    They are called once when this is made, in worlds at rest in the home pose, which tells what they return and what of
-    the physics they ask for.
+    If there are any, they are called once when this is made, in worlds at rest in the home pose, which tells what they
+    return and what of the physics they ask for.
 
     Args:
         env: the environment. No reference to it is kept that would keep it alive.
@@ -132,8 +132,9 @@ class Hooks:
         self.carried: tuple[str, ...] = ()
         self._pose = {"qpos": Entry((mj_model.nq,), torch.float32), "qvel": Entry((mj_model.nv,), torch.float32)}
         self.read: dict[str, set[str]] = {}
-        with torch.no_grad():
-            self._probe(self._at_home())
+        if self.own:
+            with torch.no_grad():
+                self._probe(self._at_home())
         self.catalog.complete = True
 
     def _call(

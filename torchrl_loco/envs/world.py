@@ -97,13 +97,13 @@ class World:
     def __init__(self, task: "LocoEnv", mj_model: mujoco.MjModel) -> None:
         self._closed = True  # until it is made in full
         n, nu, hooks = task.num_envs, mj_model.nu, task.hooks
-        self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own if hooks else frozenset()
+        self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own
         self._title, self._variation = type(task).__name__, task.variation
         # Buffers made in inference mode could not be written outside it; without the device, torch's views would be on
         # the caller's default device.
         with torch.inference_mode(False), EXCLUSIVE, task.device:
             asked: dict[str, Any] = {}
-            if hooks and hooks.catalog.contact_geoms:
+            if hooks.catalog.contact_geoms:
                 asked["contact_geoms"] = hooks.catalog.contact_geoms
                 asked["contact_history"] = not hooks.catalog.arrays.isdisjoint(CONTACT_HISTORY)
             if self._variation is not None:
@@ -114,7 +114,7 @@ class World:
             self.action = Buffer((n, nu), float, device)
             shapes = task.groups
             sizes = [torch.Size(shape).numel() for shape in shapes.values()]
-            sizes += [1, len(task.term_names), len(hooks.metric_names) if hooks else 0]
+            sizes += [1, len(task.term_names), len(hooks.metric_names)]
             self.outputs = PackedBuffers([n * size for size in sizes], 3 * n, task.device)
             *groups, reward, terms, metrics, flags = self.outputs.parts(self.outputs.memory)
             self.groups = {name: part.view(n, *shapes[name]) for name, part in zip(shapes, groups, strict=True)}
@@ -123,11 +123,11 @@ class World:
             self.done, self.terminated, self.truncated = map(Buffer.around, flags.view(3, n))
             self.memory = {
                 name: torch.zeros(n, *shape, dtype=dtype, device=task.device)
-                for name, (shape, dtype) in (hooks.catalog.memory if hooks else {}).items()
+                for name, (shape, dtype) in hooks.catalog.memory.items()
             }
             self.shared = {
                 name: torch.zeros(shape, dtype=dtype, device=task.device)
-                for name, (shape, dtype) in (hooks.catalog.shared if hooks else {}).items()
+                for name, (shape, dtype) in hooks.catalog.shared.items()
             }
             self.mask = Buffer(n, bool, device)
             self.stream = Buffer(n, wp.uint32, device)
@@ -152,7 +152,7 @@ class World:
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
             for rows in (*self.memory.values(), *self.shared.values()):
                 rows.zero_()  # recording wrote into it
-            for name, start in (hooks.catalog.starts if hooks else {}).items():
+            for name, start in hooks.catalog.starts.items():
                 self.shared[name].copy_(start)
             self.sim.numbers.copy_(nominal)
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
@@ -192,7 +192,7 @@ class World:
         of_world.flags, of_world.episode_length = fill(Flags, of_world), task.config.episode_length
         self._fused: list[WorldFunc] = []
         self._check_finite: list[WorldFunc] = []
-        asked = task.hooks.catalog.arrays if task.hooks else set()
+        asked = task.hooks.catalog.arrays
         if not {"reward", "observation"} <= self._own or "warp" in asked:
             outputs, size, terms = self._fused_outputs(task)
             func, inputs = check_pair("observation_func", task.observation_func(self))
@@ -267,17 +267,16 @@ class World:
     def _make_parts(self, task: "LocoEnv") -> None:
         sim, hooks, own, variation = self.sim, task.hooks, self._own, self._variation
         self._moved = Buffer(task.num_envs, bool, sim.device)
-        streams = self._streams(task) if hooks or variation else {}
-        scans, ground = (hooks.catalog.scans, hooks.catalog.ground) if hooks else ({}, None)
-        self._scans = Scans(sim, scans, ground, self.mask.warp)
-        arrays = {**streams, **self._arrays(task.hooks), **self._scans.arrays} if task.hooks else {}
+        self._scans = Scans(sim, hooks.catalog.scans, hooks.catalog.ground, self.mask.warp)
+        streams = self._streams(task)
+        arrays = {**streams, **self._arrays(hooks), **self._scans.arrays}
 
         parts: list[Part] = []
         read: list[set[str]] = []  # by part, attributes of the task
         of_hook: dict[str, Part] = {}
 
         def part(name: str, needed: Collection[str] | None = None) -> Callable[[], None]:
-            if hooks is None or not own & set(PARTS[name] if needed is None else needed):
+            if not own & set(PARTS[name] if needed is None else needed):
                 return _nothing
             called = [hook for hook in PARTS[name] if hook in own] or [name]
             title = f"{self._title}: {', '.join(called)}"
@@ -292,34 +291,33 @@ class World:
             read.append(set())
             self._vary = parts[-1]
 
-        self._control, self._judge = part("control"), part("judge", own if hooks and hooks.commands else None)
+        self._control, self._judge = part("control"), part("judge", own if hooks.commands else None)
         self._adapt = part("adapt")
         self._observe = part("observe", own)  # it looks for what is not finite, too
         self._begin = part("begin", own if self.memory else None)  # it zeroes memory, too
         self._observe_begun = self._observe_restored = part("observe_begun")
-        if hooks is not None and hooks.history:
+        if hooks.history:
             self._observe_restored = part("observe_restored")
         alone = [each for each in parts if each is not self._adapt]  # which sums over worlds
         kernels = [each for each in alone if task.compile_hooks and each.compile(task.num_envs, sim.device)]
 
-        moves = hooks is not None and hooks.moves
         launches = [self._launch_step, self._launch_reset, *(each.launch for each in kernels)]
         launches += [self._launch_rest] if own or variation else []
         launches += [self._launch_conclude] if own else []
         launches += [self._scans.all, self._scans.begun] if self._scans.arrays else []
-        sim.compile(*launches, *([self._launch_move] if moves else []))
+        sim.compile(*launches, *([self._launch_move] if hooks.moves else []))
         for each in kernels:
             each.record(sim)
         self.kinds = {hook: part.kind for hook, part in of_hook.items()}
         for each, names in zip(parts, read, strict=True):
             if each.kind != "plain torch" or sim.device.is_cuda:  # where the step is recorded as a graph
                 self.fixed |= names
-        if hooks is not None and self._scans.arrays:
+        if self._scans.arrays:
             self._scan_first(hooks.catalog.scanning)
         self._physics, self._settle = self._record(self._launch_step), self._record(self._launch_reset)
         self._rest = self._record(self._launch_rest) if own or variation else _nothing
         self._conclude = self._record(self._launch_conclude) if own else _nothing
-        self._move = self._keeping_what_was(self._record(self._launch_move)) if moves else _nothing
+        self._move = self._keeping_what_was(self._record(self._launch_move)) if hooks.moves else _nothing
         self._refresh_graph: Graph | Direct | None = None  # most environments never need it
         self._run_step = self._as_graph("_take_step", several=bool(own))
         self._run_reset = self._as_graph("_begin_masked", several=bool(own) or variation is not None)
