@@ -3,7 +3,7 @@
 import itertools
 import math
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +50,11 @@ class Value:
             raise CannotFuse("{op} goes across worlds")
         return found
 
+    @property
+    def varies(self) -> bool:
+        """Whether a number may differ from world to world."""
+        return any(node.varies for node in self.array.flat)
+
     def with_array(self, array: np.ndarray, world: int | None) -> "Value":
         """Returns a value of the same type."""
         return Value(array, self.dtype, world)
@@ -65,15 +70,15 @@ class Huge:
 
     tensor: torch.Tensor
 
-    @property
-    def shape(self) -> torch.Size:
-        """Its shape."""
-        return self.tensor.shape
 
-    @property
-    def ndim(self) -> int:
-        """How many dimensions it has."""
-        return self.tensor.ndim
+def shape_of(x: Value | Huge | torch.Tensor) -> tuple[int, ...]:
+    """Returns the shape of an operand: of a value, that of its nodes."""
+    return tuple((x.array if isinstance(x, Value) else x.tensor if isinstance(x, Huge) else x).shape)
+
+
+def offsets_of(shape: Sequence[int], steps: Sequence[int]) -> np.ndarray:
+    """Returns how many elements behind the first each element of a tensor is in memory."""
+    return np.tensordot(np.array(steps, dtype=int), np.indices(shape), 1)
 
 
 class Program:
@@ -139,15 +144,10 @@ class Program:
             text = literal(number) if plain else INFINITE if number > 0 else f"(-{INFINITE})"
             text = f"({INFINITE} - {INFINITE})" if number != number else f"({text})"
             return self.node(text, dtype, number=float(number))
-        number = bool(number) if dtype == torch.bool else int(number)
-        text = (
-            str(number).lower()
-            if dtype == torch.bool
-            else f"({number}LL)"
-            if number != -(2**63)
-            else f"(-{2**63 - 1}LL - 1)"
-        )
-        return self.node(text, dtype, number=number)
+        if dtype == torch.bool:
+            return self.node(str(bool(number)).lower(), dtype, number=bool(number))
+        text = f"(-{2**63 - 1}LL - 1)" if number == -(2**63) else f"({int(number)}LL)"
+        return self.node(text, dtype, number=int(number))
 
     def each(self, text: str, dtype: torch.dtype, *arrays: Any) -> np.ndarray:
         """Returns the array of an operator's results, of arrays that broadcast."""
@@ -209,15 +209,9 @@ class Program:
             by_world = 0
             if world is not None:
                 shape[world], by_world = 1, tensor.stride(world)
-            offsets = sum(
-                (np.arange(size) * step).reshape(-1, *[1] * (tensor.ndim - dim - 1))
-                for dim, (size, step) in enumerate(zip(shape, tensor.stride(), strict=True))
-            )
+            offsets = offsets_of(shape, tensor.stride()).ravel().tolist()
             array: Any = np.empty(shape, dtype=object)
-            array.flat = [
-                self.read(index, offset, by_world, tensor.dtype)
-                for offset in np.ravel(np.broadcast_to(offsets, shape)).tolist()
-            ]
+            array.flat = [self.read(index, offset, by_world, tensor.dtype) for offset in offsets]
             self.tensors.append(tensor)
             self._sources[key] = index, Value(array, tensor.dtype, world), array.copy()
         return self._sources[key][1]
@@ -235,7 +229,7 @@ class Program:
         values = [self.value(x) for x in operands]
         ndim = max(x.array.ndim for x in values)
         places = [None if x.world is None else x.world + ndim - x.array.ndim for x in values]
-        varying = {place for x, place in zip(values, places, strict=True) if place is not None and _varies(x)}
+        varying = {place for x, place in zip(values, places, strict=True) if place is not None and x.varies}
         if len(varying) > 1:
             raise CannotFuse("{op} mixes worlds")
         world = min(varying) if varying else min((place for place in places if place is not None), default=None)
@@ -317,8 +311,7 @@ class Program:
         steps = [
             int(np.take(offsets, 1, d).flat[0]) - first[1] if size > 1 else 0 for d, size in enumerate(offsets.shape)
         ]
-        affine = sum(i * step for i, step in zip(np.indices(offsets.shape), steps, strict=True))
-        if not np.array_equal(offsets, first[1] + affine):
+        if not np.array_equal(offsets, first[1] + offsets_of(offsets.shape, steps)):
             raise CannotFuse("{op} looks up parts of several tables")
         return first[0], first[1], steps, x.dtype
 
@@ -419,7 +412,7 @@ class Program:
     def _assign(self, target: Any, result: Value) -> None:
         if not isinstance(target, Value) or not target.array.flags.writeable:
             raise CannotFuse("{op} writes to a constant, or to a copy")
-        if target.world is None and _varies(result):
+        if target.world is None and result.varies:
             raise CannotFuse("{op} writes what differs from world to world to a tensor that has no worlds")
         (_, source), world = self.aligned(target, self.cast(result, target.dtype))
         if world != target.world:
@@ -440,10 +433,6 @@ class Program:
                         raise CannotFuse("a tensor that has no worlds is changed")
                     stores.append((before[at], value.array[at]))
         return Source(stores, self.tensors)
-
-
-def _varies(x: Value) -> bool:
-    return any(node.varies for node in x.array.flat)
 
 
 def _name(target: Any) -> str:

@@ -24,7 +24,7 @@ from torchrl_loco.envs.fusion.nodes import (
     WHERE,
     CannotFuse,
 )
-from torchrl_loco.envs.fusion.program import FILLERS, INFINITE, LONG, Program, Value, _shifted, _varies
+from torchrl_loco.envs.fusion.program import FILLERS, INFINITE, LONG, Program, Value, _shifted, offsets_of, shape_of
 
 BEATS = {"max": "{0} > {1} || ({0} != {0} && {1} == {1})", "min": "{0} < {1} || ({0} != {0} && {1} == {1})"}
 REMAINDER = "{0} != 0 && ({0} < 0) != ({1} < 0) ? {0} + {1} : {0}"
@@ -209,7 +209,7 @@ def _slice(
 
 def _plain(p: Program, x: Value, dim: int) -> Value:
     """Returns a value without worlds if it is the same in all, and if their dimension is ``dim``: a model's numbers."""
-    if x.world is None or dim % x.array.ndim != x.world or x.array.shape[x.world] != 1 or _varies(x):
+    if x.world is None or dim % x.array.ndim != x.world or x.array.shape[x.world] != 1 or x.varies:
         return x
     shape = [p._n if d == x.world else size for d, size in enumerate(x.array.shape)]
     return x.with_array(np.broadcast_to(x.array, shape), None)
@@ -258,8 +258,7 @@ def _stack(p: Program, tensors: Sequence[Any], dim: int = 0) -> Any:
 
 def _index_select(p: Program, x: Any, dim: int, index: Any) -> Value:
     if isinstance(index, Value) and not (isinstance(x, Value) and x.world is not None):
-        ndim = x.array.ndim if isinstance(x, Value) else x.ndim
-        return _looked_up(p, x, [*[None] * (dim % ndim), index])
+        return _looked_up(p, x, [*[None] * (dim % len(shape_of(x))), index])
     x = p.value(x)
     (dim,) = x.rowwise([dim])
     return x.with_array(np.take(x.array, p.numbers(index), axis=dim), x.world)
@@ -292,7 +291,7 @@ def _gather(p: Program, x: Any, dim: int, index: Any, sparse_grad: bool = False)
 def _looked_up(p: Program, x: Any, indices: Sequence[Any]) -> Value:
     """Returns what each world looks up in a table: NaN (of integers 0) where an index is beyond its end."""
     dims = [dim for dim, index in enumerate(indices) if index is not None]
-    shape = tuple(x.array.shape if isinstance(x, Value) else x.shape)
+    shape = shape_of(x)
     values, world = p.aligned(*(p.cast(indices[dim], torch.int64) for dim in dims))
     table, first, steps, dtype = p.table(x)
     address, inside = p.value(0), p.value(True)
@@ -301,9 +300,7 @@ def _looked_up(p: Program, x: Any, indices: Sequence[Any]) -> Value:
         inside = p.apply(f"{{0}} && {{1}} >= 0 && {{1}} < {shape[dim]}", torch.bool, inside, index, of=torch.int64)
         address = p.apply(ADD, torch.int64, address, p.apply(MUL, torch.int64, index, steps[dim]))
     rest = [dim for dim in range(len(shape)) if dim not in dims]
-    offsets = np.zeros([shape[dim] for dim in rest], dtype=int)
-    for axis, dim in enumerate(rest):
-        offsets += steps[dim] * np.arange(shape[dim]).reshape(-1, *[1] * (len(rest) - axis - 1))
+    offsets = offsets_of([shape[dim] for dim in rest], [steps[dim] for dim in rest])
     nothing = "0" if dtype != torch.float32 else f"{INFINITE} - {INFINITE}"
     made = np.empty((*address.array.shape, *offsets.shape), dtype=object)
     for at in np.ndindex(*address.array.shape):
@@ -323,12 +320,12 @@ def _search(p: Program, table: Any, x: Any, *, out_int32: bool = False, right: b
     if any(value not in (None, "left") for name, value in others.items() if name != "side"):
         raise CannotFuse("{op} has a sorter")
     right = right or others.get("side") == "right"
-    shape = table.array.shape if isinstance(table, Value) else table.shape
+    shape = shape_of(table)
     if len(shape) != 1:
         raise CannotFuse("{op} searches in more than one row")
     at, first, (step,), dtype = p.table(table)
-    x, start, end = p.cast(x, dtype), p.value(0), p.value(int(shape[0]))
-    for _ in range(int(shape[0]).bit_length()):  # as torch halves it, so that rows that are not sorted give the same
+    x, start, end = p.cast(x, dtype), p.value(0), p.value(shape[0])
+    for _ in range(shape[0].bit_length()):  # as torch halves it, so that rows that are not sorted give the same
         (start, end, x), world = p.aligned(start, end, x)
         middle = f"p{at}_0[{first} + ({{0}} + {{1}}) / 2 * {step}]"
         text = f"{{0}} < {{1}} && !({middle} {'>' if right else '>='} {{2}})"
@@ -338,8 +335,7 @@ def _search(p: Program, table: Any, x: Any, *, out_int32: bool = False, right: b
         more, kept = p.apply("{0} + 1", torch.int64, half), p.apply("{0} < {1}", torch.bool, start, end, of=torch.int64)
         end = p.where(less, end, p.where(kept, half, end, torch.int64), torch.int64)
         start = p.where(less, more, start, torch.int64)
-    found = start
-    return p.cast(found, p._meta.dtype)
+    return p.cast(start, p._meta.dtype)
 
 
 def _bucketize(p: Program, x: Any, boundaries: Any, **options: Any) -> Value:
