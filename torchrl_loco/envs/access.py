@@ -19,7 +19,7 @@ from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.hooks import Hooks
 from torchrl_loco.envs.state import State, write_state
 from torchrl_loco.envs.task import folder_of
-from torchrl_loco.envs.variation import Variation, constant_of
+from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.vary import Vary
 from torchrl_loco.envs.world import World
 from torchrl_loco.rendering import OPACITY, to_bytes, with_ghost
@@ -232,10 +232,7 @@ class WorldAccess(EnvBase):
         Raises:
             AttributeError: ``MjModel`` has no such field, or it is no array of numbers.
         """
-        if self.variation is not None and field in self.variation.varied.places:
-            return self._batched(self.variation.field(field, self.sim.numbers))
-        numbers = torch.tensor(constant_of(self.mj_model, field), dtype=torch.float32, device=self.device)
-        return self._batched(numbers.expand(self.num_envs, *numbers.shape))
+        return self._batched(self.hooks.catalog.field(field, lambda: self.sim.numbers))
 
     def mujoco_model(self, world: int = 0) -> mujoco.MjModel:
         """Returns a copy of the model with the present numbers of a world, for C MuJoCo.

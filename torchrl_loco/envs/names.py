@@ -1,10 +1,11 @@
 """Elements of a model by their names."""
 
-import difflib
 import re
 from collections.abc import Sequence
 
 import mujoco
+
+from torchrl_loco.checks import suggestion
 
 Names = str | Sequence[str]
 """A name, several names, or a regular expression that matches whole names."""
@@ -62,7 +63,6 @@ class Elements:
         except re.error as error:
             raise KeyError(f"{pattern!r} is neither the name of a {kind} nor a regular expression: {error}") from None
         if not found:
-            near = difflib.get_close_matches(pattern, known, n=1)
-            hint = f", did you mean {near[0]!r}?" if near else ""
+            hint = suggestion(pattern, known)
             raise KeyError(f"the model has no {kind} {pattern!r}{hint}: it has {', '.join(filter(None, known))}")
         return found

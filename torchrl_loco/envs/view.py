@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -99,6 +99,13 @@ class Catalog(Elements):
             values = constant_of(self.mj_model, field)
             self._constants[key] = self._tensor(values if ids is None else values[list(ids)])
         return self._constants[key]
+
+    def field(self, name: str, numbers: Callable[[], torch.Tensor]) -> torch.Tensor:
+        """Returns a field in all worlds, ``(num_envs, *shape)``; one that varies, by their ``numbers()``."""
+        if self.variation is not None and name in self.variation.varied.places:
+            return self.variation.field(name, numbers())
+        values = self.constant(name)
+        return values.expand(self.num_envs, *values.shape)
 
     def fixed(self) -> list[torch.Tensor]:
         """Returns tensors that never change: of indices, and the task's tables."""
@@ -229,11 +236,7 @@ class View:
         Raises:
             AttributeError: ``MjModel`` has no such field, or it is no array of numbers.
         """
-        variation = self._catalog.variation
-        if variation is not None and field in variation.varied.places:
-            return variation.field(field, self._array("numbers"))
-        numbers = self._catalog.constant(field)
-        return numbers.expand(self._catalog.num_envs, *numbers.shape)
+        return self._catalog.field(field, lambda: self._array("numbers"))
 
     @property
     def env_index(self) -> torch.Tensor:

@@ -2,6 +2,7 @@
 
 import atexit
 import contextlib
+import functools
 import logging
 import os
 import warnings
@@ -34,6 +35,7 @@ from torchrl_loco.envs.hooks import PARTS, Hooks, reads_of
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.scan import Scans
+from torchrl_loco.envs.state import State
 from torchrl_loco.envs.view import CONTACT_HISTORY
 from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import (
@@ -318,7 +320,6 @@ class World:
         self._rest = self._record(self._launch_rest) if own or variation else _nothing
         self._conclude = self._record(self._launch_conclude) if own else _nothing
         self._move = self._keeping_what_was(self._record(self._launch_move)) if hooks.moves else _nothing
-        self._refresh_graph: Graph | Direct | None = None  # most environments never need it
         self._run_step = self._as_graph("_take_step", several=bool(own))
         self._run_reset = self._as_graph("_begin_masked", several=bool(own) or variation is not None)
 
@@ -451,13 +452,8 @@ class World:
     def state(self) -> dict[str | tuple[str, str], torch.Tensor]:
         """Returns the buffers that make up the state of the worlds, by key of :class:`torchrl_loco.State`."""
         sim = self.sim
-        physics: dict[str | tuple[str, str], torch.Tensor] = {
-            "qpos": sim.qpos,
-            "qvel": sim.qvel,
-            "qacc_warmstart": sim.qacc_warmstart,
-        }
-        if sim.mj_model.na:
-            physics["act"] = sim.act
+        held = [name for name in State.PHYSICS if name != "act" or sim.mj_model.na]
+        physics: dict[str | tuple[str, str], torch.Tensor] = {name: getattr(sim, name) for name in held}
         physics |= {("memory", name): rows for name, rows in self.memory.items()}
         n = sim.num_envs
         physics |= {("shared", name): values.expand(n, *values.shape) for name, values in self.shared.items()}
@@ -477,12 +473,12 @@ class World:
             with joined_to_torch(self.sim.device):
                 self._launch_refresh()
         else:
-            if self._refresh_graph is None:
-                self._refresh_graph = self._record_refresh()
             self._refresh_graph.replay()
         self._observe_restored()
 
-    def _record_refresh(self) -> Graph | Direct:
+    @functools.cached_property
+    def _refresh_graph(self) -> Graph | Direct:
+        """A recording of it: most environments never need one."""
         device = self.sim.device
         with torch.inference_mode(False), EXCLUSIVE, self.sim.qpos.device:
             wp.synchronize_device(device)  # the state was written on torch's stream; Warp's reads it while recording

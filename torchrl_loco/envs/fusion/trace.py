@@ -3,6 +3,7 @@
 ``make_fx`` gives the same graph, but takes five times as long: it notes what only torch's compilers read.
 """
 
+import contextlib
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -49,7 +50,7 @@ class _Tracer(TorchDispatchMode):
         if func is aten.lift_fresh.default:  # of torch.tensor(...): each run needs a copy
             func = aten.lift_fresh_copy.default
         if (decomposed := _decomposed(func)) is not None:
-            with self:
+            with self, contextlib.suppress(Exception):  # what it refuses is noted as it is, or refused by torch
                 return decomposed(*args, **kwargs)
         if torch.Tag.data_dependent_output in func.tags:
             self._check_known(args)
