@@ -36,14 +36,14 @@ def price(names: Sequence[str], worlds: Sequence[int], device: torch.device) -> 
     for name, n in until_interrupted([(name, n) for name in names for n in worlds], "price"):
         m, config = _model(name, n)
         variation = Variation(varied(m, device), m, device)
-        drawn = torch.zeros(n, variation.varied.count, device=device)
+        drawn = torch.zeros(n, variation.count, device=device)
         stream = {"seed": torch.ones(1, dtype=torch.long, device=device), "world": torch.arange(n, device=device)}
         episode, mask = (torch.ones(n, dtype=kind, device=device) for kind in (torch.int32, torch.bool))
         variation.vary({"numbers": drawn, **stream, "episode": episode, "mask": mask})
         sims = {
             "plain": _start(Simulation(m, config, n, device), None),
-            "own": _start(Simulation(m, config, n, device, varied=variation.varied), None),
-            "drawn": _start(Simulation(m, config, n, device, varied=variation.varied), drawn),
+            "own": _start(Simulation(m, config, n, device, varied=variation), None),
+            "drawn": _start(Simulation(m, config, n, device, varied=variation), drawn),
         }
         times, actions = {kind: [] for kind in sims}, _controls(m, n, device)
         for each in sims.values():

@@ -26,23 +26,20 @@ MOST_BITS = 12
 """Draws on which the numbers of an element may depend: all combinations are checked."""
 
 
-class Variation:
-    """The numbers of a model that differ from world to world.
+class Variation(Varied):
+    """The numbers of a model that differ from world to world, and their draws.
 
     Args:
         varys: how, in this order.
         mj_model: the model.
         device: where the worlds live.
 
-    Attributes:
-        varied: which numbers vary.
-
     Raises:
         ValueError: a name is not in the model, nothing is left that varies, or a number could become impossible.
     """
 
     def __init__(self, varys: Sequence[Vary], mj_model: mujoco.MjModel, device: torch.device) -> None:
-        self._mj_model, self._device, self._elements = mj_model, device, Elements(mj_model)
+        self._device, self._elements = device, Elements(mj_model)
         labels = [f"{vary.field} of {vary.of}, {vary.component}" for vary in varys]
         self._changes = [
             Change(vary, self._elements, f"{label}, {labels[:i].count(label)}")
@@ -52,10 +49,10 @@ class Variation:
         for change in self._changes:
             for name, index in change.places:
                 places.setdefault(name, set()).add(index)
-        self.varied = Varied(mj_model, {name: sorted(indices) for name, indices in places.items()})
+        super().__init__(mj_model, {name: sorted(indices) for name, indices in places.items()})
         self._columns = {
-            (name, int(index)): self.varied.columns[name].start + i
-            for name, indices in self.varied.places.items()
+            (name, int(index)): self.columns[name].start + i
+            for name, indices in self.places.items()
             for i, index in enumerate(indices)
         }
         self._indices: list[torch.Tensor] = []
@@ -70,10 +67,10 @@ class Variation:
 
         They have a first dimension of 1: a row for each world would be taken for the worlds' when it is fused.
         """
-        self._nominal = torch.tensor(self.varied.nominal()[None], dtype=torch.float32, device=device)
+        self._nominal = torch.tensor(self.nominal()[None], dtype=torch.float32, device=device)
         self._steps: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]] = []
-        latest = list(range(self.varied.count))  # where each number is among those that were made so far
-        made = self.varied.count
+        latest = list(range(self.count))  # where each number is among those that were made so far
+        made = self.count
         for change in self._changes:
             columns = [self._columns[place] for place in change.places]
             bounds = [change.vary.bounds[group] for group in change.group_of]
@@ -193,7 +190,7 @@ class Variation:
         """Returns a field that varies in all worlds, ``(n, *shape)``, from their numbers ``(n, count)``."""
         nominal = array_of(self._mj_model, name)
         if name not in self._shown:
-            where = [self._columns.get((name, i), self.varied.count + i) for i in range(nominal.size)]
+            where = [self._columns.get((name, i), self.count + i) for i in range(nominal.size)]
             constants = torch.tensor(np.ravel(nominal)[None], dtype=torch.float32, device=self._device)
             self._shown[name] = self._index(where), constants
         columns, constants = self._shown[name]

@@ -102,7 +102,7 @@ class Catalog(Elements):
 
     def field(self, name: str, numbers: Callable[[], torch.Tensor]) -> torch.Tensor:
         """Returns a field in all worlds, ``(num_envs, *shape)``; one that varies, by their ``numbers()``."""
-        if self.variation is not None and name in self.variation.varied.places:
+        if self.variation is not None and name in self.variation.places:
             return self.variation.field(name, numbers())
         values = self.constant(name)
         return values.expand(self.num_envs, *values.shape)

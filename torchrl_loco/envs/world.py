@@ -108,9 +108,7 @@ class World:
             if hooks.catalog.contact_geoms:
                 asked["contact_geoms"] = hooks.catalog.contact_geoms
                 asked["contact_history"] = not hooks.catalog.arrays.isdisjoint(CONTACT_HISTORY)
-            if self._variation is not None:
-                asked["varied"] = self._variation.varied
-            self.sim = Simulation(mj_model, task.config, n, task.device, **asked)
+            self.sim = Simulation(mj_model, task.config, n, task.device, varied=self._variation, **asked)
             nominal = self.sim.numbers.clone()
             device = self.sim.device
             self.action = Buffer((n, nu), float, device)
@@ -458,7 +456,7 @@ class World:
         n = sim.num_envs
         physics |= {("shared", name): values.expand(n, *values.shape) for name, values in self.shared.items()}
         if self._variation is not None:
-            columns = self._variation.varied.columns
+            columns = self._variation.columns
             physics |= {("model", name): sim.numbers[:, which] for name, which in columns.items()}
         return {**physics, "elapsed_steps": self.elapsed_steps.torch, "episode": self.episode.torch}
 
