@@ -12,7 +12,7 @@ from hook_tasks import FollowVelocity, WalkBackwards, WalkBlindly
 from torch.nn import functional as F  # noqa: N812
 
 from torchrl_loco.envs.fusion import CannotFuse, fuse, trace
-from torchrl_loco.envs.part import Part, constants_on
+from torchrl_loco.envs.part import Part
 
 CPU = torch.device("cpu")
 PARTS = ("control", "judge", "observe", "begin", "observe_begun")
@@ -25,7 +25,7 @@ def copies(arrays):
 def fused(work, arrays, n, fixed=(), device=CPU):
     """Returns ``work`` on arrays as a kernel; tracing runs it on copies."""
     with torch.no_grad():
-        traced = constants_on(device, trace(work, copies(arrays)))
+        traced = trace(work, copies(arrays))
     return fuse(traced, arrays, n, wp.get_device(str(device)), fixed)
 
 

@@ -79,10 +79,9 @@ class Part:
         Returns:
             Whether :meth:`record` is to follow, once kernels are compiled.
         """
-        on = torch.device(wp.device_to_torch(device))
         try:
             with no_collection():  # an environment that is dropped meanwhile computes, which would be traced too
-                self._traced = constants_on(on, trace(self._work, self._arrays))
+                self._traced = trace(self._work, self._arrays)
         except Exception as error:  # whatever hooks and tracing raise
             self._stays_plain(error)
             return False
@@ -198,23 +197,3 @@ def changed(rows: torch.Tensor, generator: torch.Generator, spread: float, flags
     if not rows.is_floating_point():
         return rows + (most * noise).to(rows.dtype)
     return rows.nan_to_num(0.0, 0.0, 0.0) + spread * (2 * noise - 1)
-
-
-def constants_on(device: torch.device, traced: torch.fx.GraphModule) -> torch.fx.GraphModule:
-    """Returns a trace in which tensors of other devices are copied to ``device`` once, and not at each step."""
-    copies, copied = (torch.ops.aten._to_copy.default, torch.ops.aten.lift_fresh_copy.default), False
-    for node in list(traced.graph.nodes):
-        if node.target not in copies or node.args[0].op != "get_attr":
-            continue
-        constant = getattr(traced, node.args[0].target)
-        if constant.device == device:
-            continue
-        name = f"{node.args[0].target}_{node.name}"
-        traced.register_buffer(name, node.target(constant, *node.args[1:], **node.kwargs).to(device), persistent=False)
-        with traced.graph.inserting_before(node):
-            node.replace_all_uses_with(traced.graph.get_attr(name))
-        traced.graph.erase_node(node)
-        copied = True
-    if copied:
-        traced.recompile()
-    return traced

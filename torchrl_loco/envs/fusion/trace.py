@@ -15,6 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl_loco.envs.fusion.rules import RULES
 
 aten = torch.ops.aten
+COPIES = (aten._to_copy.default, aten.lift_fresh_copy.default)
 
 
 def _decomposed(func: Any) -> Callable[..., Any] | None:
@@ -41,6 +42,7 @@ class _Tracer(TorchDispatchMode):
     def __init__(self, arrays: dict[str, torch.Tensor]) -> None:
         super().__init__()
         self.graph, self.constants = torch.fx.Graph(), torch.nn.Module()
+        self._device = next(iter(arrays.values())).device
         self._known: set[torch.fx.Node] = set()  # whose numbers are the same in each run
         self._kept = list(arrays.values())  # arrays and constants: no other tensor gets their ids meanwhile
         self._nodes = {id(array): self.graph.placeholder(f"arg{i}") for i, array in enumerate(self._kept)}
@@ -55,6 +57,12 @@ class _Tracer(TorchDispatchMode):
         if torch.Tag.data_dependent_output in func.tags:
             self._check_known(args)
             return func(*args, **kwargs)
+        if func in COPIES and args[0].device != self._device:
+            source = self._noted(args[0])
+            if source is None or source.op == "get_attr":  # a constant: copied to the device once, not in each run
+                result = func(*args, **kwargs)
+                self._note(result, self._constant(result.to(self._device)))
+                return result
         node = self.graph.call_function(func, *torch.fx.node.map_aggregate((args, kwargs), self._argument))
         operands = node.all_input_nodes
         if func is aten.lift_fresh_copy.default or (operands and self._known.issuperset(operands)):
@@ -76,11 +84,14 @@ class _Tracer(TorchDispatchMode):
             return arg
         if (node := self._noted(arg)) is not None:
             return node
-        name = f"constant{len(self._kept)}"
-        self.constants.register_buffer(name, arg.detach(), persistent=False)
-        self._kept.append(arg)
-        self._nodes[id(arg)] = self.graph.get_attr(name)
+        self._nodes[id(arg)] = self._constant(arg)
         return self._nodes[id(arg)]
+
+    def _constant(self, tensor: torch.Tensor) -> torch.fx.Node:
+        name = f"constant{len(self._kept)}"
+        self.constants.register_buffer(name, tensor.detach(), persistent=False)
+        self._kept.append(tensor)
+        return self.graph.get_attr(name)
 
     def _note(self, result: Any, node: torch.fx.Node) -> None:
         if not isinstance(result, torch.Tensor):
