@@ -76,42 +76,34 @@ def _collecting() -> Iterator[dict[tuple[wp.Module, int], None]]:
 
     A launch returns early if its module has no executable. Conditional bodies are visited once.
     """
-    with _COLLECTING:  # one at a time: two would restore each other's functions
-        yield from _collect()
-
-
-def _collect() -> Iterator[dict[tuple[wp.Module, int], None]]:
     variants: dict[tuple[wp.Module, int], None] = {}
     thread = threading.get_ident()
-    originals = wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size
-    load, capture_if, capture_while, suggested_block_size = originals
 
-    def collect(module: wp.Module, device: Any, block_dim: Any = None, *args: Any, **kwargs: Any) -> Any:
-        if threading.get_ident() != thread:
-            return load(module, device, block_dim, *args, **kwargs)
+    def load(module: wp.Module, device: Any, block_dim: Any = None, *args: Any, **kwargs: Any) -> None:
         variants[module, block_dim] = None
-        return None
 
     def both(condition: wp.array, on_true: Any = None, on_false: Any = None, stream: Any = None, **kwargs: Any) -> None:
-        if threading.get_ident() != thread:
-            return capture_if(condition, on_true, on_false, stream, **kwargs)
         for body in filter(callable, (on_true, on_false)):
             body(**kwargs)
 
     def once(condition: wp.array, while_body: Any, stream: Any = None, **kwargs: Any) -> None:
-        if threading.get_ident() != thread:
-            return capture_while(condition, while_body, stream, **kwargs)
-        if callable(while_body):
-            while_body(**kwargs)
+        both(condition, while_body, **kwargs)
 
     def block_size(kernel: wp.Kernel, device: Any = None) -> tuple[int, int]:
-        if threading.get_ident() != thread:
-            return suggested_block_size(kernel, device)
         variants[kernel.module, kernel.module.options["block_dim"]] = None
         return 1, 1
 
-    wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size = collect, both, once, block_size
-    try:
-        yield variants
-    finally:
-        wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size = originals
+    def here(new: Callable[..., Any], original: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *args, **kwargs: (new if threading.get_ident() == thread else original)(*args, **kwargs)
+
+    replaced: list[tuple[Any, str, Callable[..., Any]]] = [(wp.Module, "load", load), (wp, "capture_if", both)]
+    replaced += [(wp, "capture_while", once), (wp, "get_suggested_block_size", block_size)]
+    with _COLLECTING:  # one at a time: two would restore each other's functions
+        originals = [getattr(owner, name) for owner, name, _ in replaced]
+        try:
+            for (owner, name, new), original in zip(replaced, originals, strict=True):
+                setattr(owner, name, here(new, original))
+            yield variants
+        finally:
+            for (owner, name, _), original in zip(replaced, originals, strict=True):
+                setattr(owner, name, original)
