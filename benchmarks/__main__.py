@@ -37,6 +37,8 @@ add("peers", "other simulators compared with ours, in processes of their own", s
 add("fidelity", "deviation from C MuJoCo in double precision", [256])
 commands.choices["fidelity"].add_argument("--picture", type=Path, help="file for a plot")
 add("profile", "time of each kernel (CUDA)", small)
+add("pixels", "what cameras cost, beside MuJoCo-Warp's renderer", small)
+commands.choices["pixels"].add_argument("--sizes", type=int, nargs="+", default=[64], help="sides of pictures")
 add("hooks", "what a task in plain torch costs beside the physics", small)
 commands.choices["hooks"].add_argument("--task", required=True, help="id, or file.py:Class")
 add("soak", "millions of steps under hostile actions and states", small)
@@ -117,6 +119,10 @@ elif args.command == "engines":
     from benchmarks.engines import COLUMNS, engines
 
     rows = engines(args.bodies, args.worlds, args.device, args.base_up_to)
+elif args.command == "pixels":
+    from benchmarks.pixels import COLUMNS, pixels
+
+    rows = pixels(args.bodies, args.worlds, args.sizes, args.device)
 elif args.command == "startup":
     from benchmarks.startup import COLUMNS, startup
 

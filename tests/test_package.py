@@ -14,7 +14,7 @@ LAYERS = [  # a module imports from its own layer or from those before it
     {"checks", "conditions", "config", "garbage", "known_files", "lazy_compiler", "motion", "rewards", "storage"},
     {"terrain"},
     {"sim"},
-    {"rendering"},
+    {"eyes"},
     {"envs", "viewer"},
     {"tasks"},
     {"registry", "collector"},

@@ -106,7 +106,7 @@ def test_arguments_of_other_libraries_get_a_hint():
     walker_walk = functools.partial(make, "walker_walk")
     for of, (name, instead) in itertools.product(
         [walker_walk, registry.resolve("walker_walk")],
-        [("from_pixels", "VideoRecorder"), ("frame_skip", "ctrl_dt"), ("render_mode", "wrappers")],
+        [("frame_skip", "ctrl_dt"), ("render_mode", "wrappers")],
     ):
         with pytest.raises(ValueError, match=f"{name} is no argument: .*{instead}"):
             of(num_envs=2, device="cpu", **{name: 2})

@@ -3,10 +3,10 @@ from . import collector as collector
 from . import config as config
 from . import envs as envs
 from . import export as export
+from . import eyes as eyes
 from . import motion as motion
 from . import policy as policy
 from . import registry as registry
-from . import rendering as rendering
 from . import rewards as rewards
 from . import sim as sim
 from . import tasks as tasks

@@ -146,7 +146,6 @@ CONVERGED: dict[str, Any] = {"iterations": 100, "ls_iterations": 50, "euler_damp
 
 
 NO_ARGUMENTS = {
-    "from_pixels": "pixels come from env.render() or a VideoRecorder around env.render, see docs/api/rendering.md",
     "frame_skip": "pass ctrl_dt, the time between two actions, or use TorchRL's FrameSkipTransform",
     "render_mode": "call env.render(); the Gymnasium wrapper in torchrl_loco.wrappers takes a render_mode",
 }

@@ -134,12 +134,12 @@ def _film(m: "mujoco.MjModel", q: "np.ndarray", out: Path, camera: str) -> None:
     import warp as wp
     from tqdm.auto import tqdm
 
-    from torchrl_loco.rendering import Renderer, to_bytes
+    from torchrl_loco.eyes.pictures import Poses
     from torchrl_loco.training.playback import SIZE, write_video
 
     print(f"rendering {len(q)} frames; on a CPU this takes a while", file=sys.stderr)
     device = wp.get_device("cuda" if torch.cuda.is_available() else "cpu")
-    renderer = Renderer(m, device, camera, *SIZE, 1)
+    renderer = Poses(m, device, camera, *SIZE, 1)
     poses = torch.tensor(q, dtype=torch.float32, device=wp.device_to_torch(device))
     shown = tqdm(poses, desc="video", leave=False, disable=None)
-    write_video(out, (to_bytes(renderer.render_poses(row[None]))[0] for row in shown), FRAME_RATE)
+    write_video(out, (renderer.render(row[None])[0] for row in shown), FRAME_RATE)

@@ -22,7 +22,8 @@ from torchrl_loco.envs.task import folder_of
 from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.vary import Vary
 from torchrl_loco.envs.world import World
-from torchrl_loco.rendering import OPACITY, to_bytes, with_ghost
+from torchrl_loco.eyes.pictures import LOOKS_WELL, OPACITY, Poses, with_ghost
+from torchrl_loco.eyes.tracer import Eye
 from torchrl_loco.sim import Simulation, models
 
 STAGE_WORLDS = 64
@@ -158,17 +159,18 @@ class WorldAccess(EnvBase):
         check_choice("camera", camera, [model.camera(i).name for i in range(model.ncam)])
         size = check_int("width", width), check_int("height", height)
         worlds = self.num_envs if worlds is None else check_int("worlds", worlds, Interval(1, self.num_envs + 1))
-        plain = self.world.renderer(self.mj_model, camera, *size, worlds)
-        pixels, ghost = plain.render(self.sim.mujoco_data(worlds=worlds)), self.ghost()
+        eye = self.world.renderer(functools.partial(Eye, **LOOKS_WELL), model, camera, *size, worlds)
+        eye.look(self.sim.data.xpos, self.sim.data.xmat)
+        pixels, ghost = eye.rgb.clone(), self.ghost()
         if ghost is not None:
             poses = torch.cat([self.sim.qpos, ghost], dim=-1)[:worlds]
-            both = self.world.renderer(self.model_with_ghost, camera, *size, worlds).render_poses(poses)
-            pixels = torch.lerp(pixels, both, OPACITY)
-        return to_bytes(pixels if self.batch_size else pixels[0])
+            both = self.world.renderer(Poses, self.model_with_ghost, camera, *size, worlds).render(poses)
+            pixels = torch.lerp(pixels.float(), both.float(), OPACITY).round().to(torch.uint8)
+        return pixels if self.batch_size else pixels[0]
 
     @functools.cached_property
     def model_with_ghost(self) -> mujoco.MjModel:
-        """The model for pictures, with its first body once more, as :func:`torchrl_loco.rendering.with_ghost` does."""
+        """The model for pictures, with its first body once more: see :func:`torchrl_loco.eyes.pictures.with_ghost`."""
         return with_ghost(models.specification(type(self).model, folder_of(type(self))))
 
     def health(self) -> TensorDict:

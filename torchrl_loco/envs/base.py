@@ -32,6 +32,7 @@ from torchrl_loco.config import sim_config
 from torchrl_loco.envs.access import WorldAccess
 from torchrl_loco.envs.hooks import Hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
+from torchrl_loco.envs.pixels import Pixels
 from torchrl_loco.envs.resets import QuickResets, rows_of
 from torchrl_loco.envs.state import without_state
 from torchrl_loco.envs.task import BOUNDED, Task, folder_of, replaced_options
@@ -80,6 +81,12 @@ class LocoEnv(Task, WorldAccess, QuickResets):
             them as they are at every step, to print from them or to debug them.
         play: whether the worlds are for looking at a policy, not for training: commands can be set with
             :meth:`set_command`, ``randomize=None`` varies nothing, and tasks leave out noise and pushes.
+        from_pixels: whether to return what a camera sees as ``"pixels"``, uint8 ``(num_envs, height, width, 3)``.
+        pixels_only: whether the other observations are left out; ``None`` leaves them out where there are pixels.
+        camera: name or number of a camera of the model; ``None`` takes the first.
+        size: width and height of the pixels; ``None`` is 84 by 84.
+        depth: greatest depth (m); if it is not 0, ``"depth"`` ``(num_envs, height, width)`` tells how far along the
+            camera's axis lies what it sees (m).
         config: fields of :class:`torchrl_loco.SimConfig` to override, and the task's own :attr:`options`.
 
     Attributes:
@@ -122,6 +129,11 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         randomize: Sequence[Vary] | None = None,
         compile_hooks: bool = True,
         play: bool = False,
+        from_pixels: bool = False,
+        pixels_only: bool | None = None,
+        camera: str | int | None = None,
+        size: tuple[int, int] | None = None,
+        depth: float = 0.0,
         **config: Any,
     ) -> None:
         self.check_class()
@@ -152,6 +164,8 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         varys = check_randomize("randomize", randomize)
         mj_model = models.load(self.model, folder_of(type(self)), None, sim_settings.solids_on_terrain)
         self.check_model(mj_model)
+        seen = {"from_pixels": from_pixels, "pixels_only": pixels_only, "camera": camera, "size": size, "depth": depth}
+        pixels = Pixels.checked(mj_model, seen, worlds, device)
         variation = Variation(varys, mj_model, device) if varys else None
 
         super().__init__(device=device, batch_size=[] if num_envs is None else [worlds])
@@ -165,7 +179,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         _say_what_is_missing(mj_model)
         self.with_metrics, self.noise_scale = with_metrics, noise_scale
         self.stagger, self.compile_hooks, self.play = stagger, compile_hooks, play
-        self.randomize, self.variation = varys, variation
+        self.randomize, self.variation, self.pixels = varys, variation, pixels
         self.action_range = check_pair("action_range", self.action_range)  # a class may have a list or an array
         self.on_overflow, self.nan_dump = on_overflow, nan_dump
         self._action_shape = torch.Size([*self.batch_size, mj_model.nu])
@@ -252,6 +266,9 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         if self._apart:
             apart = {group: numbers(sizes) for group, sizes in self._apart.items()}
             observation["observation_terms"] = Composite(apart, shape=batch, device=device)
+        if self.pixels:
+            seen = self.pixels.specs(batch, device)
+            observation = seen if self.pixels.only else {**observation, **seen}
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.observation_spec = Composite(observation, shape=batch, device=device)
         bounded, actions = self.action_range == BOUNDED, (*batch, self.mj_model.nu)
@@ -342,6 +359,10 @@ class LocoEnv(Task, WorldAccess, QuickResets):
                 group: dict(zip(sizes, newest[group].split([*sizes.values()], -1), strict=True))
                 for group, sizes in self._apart.items()
             }
+        if self.pixels:
+            if self.pixels.only:
+                result = result.select(*self.done_keys, *["reward"] * with_reward)
+            result.update(self.pixels.entries(self.world.eye, batch))
         return result
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:

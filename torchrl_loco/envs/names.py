@@ -12,7 +12,7 @@ Names = str | Sequence[str]
 
 KINDS = {
     **{"body": "nbody", "joint": "njnt", "geom": "ngeom", "site": "nsite", "sensor": "nsensor", "actuator": "nu"},
-    "pair": "npair",
+    **{"pair": "npair", "camera": "ncam"},
 }
 """What has names in a model, and how many there are."""
 

@@ -1,4 +1,4 @@
-"""Scans of the ground below a body, as arrays that hooks read: a thread a point, before the part that reads them."""
+"""Scans of the ground below a body, and what cameras see, as arrays: made before the part of hooks that reads them."""
 
 import dataclasses
 from typing import TYPE_CHECKING
@@ -8,6 +8,7 @@ import torch
 import warp as wp
 
 from torchrl_loco.envs.heights import Ground
+from torchrl_loco.eyes.tracer import Eye
 from torchrl_loco.sim import Buffer, fill
 from torchrl_loco.sim.compiled.collision.ground import NOTHING
 
@@ -30,6 +31,22 @@ class Asked:
 
     body: int
     points: tuple[tuple[float, float], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Looked:
+    """What a camera sees, for which hooks have asked.
+
+    Attributes:
+        camera: the camera.
+        width, height: how many pixels.
+        far: greatest depth (m).
+    """
+
+    camera: int
+    width: int
+    height: int
+    far: float
 
 
 @wp.struct
@@ -107,25 +124,37 @@ def scan(
 
 
 class Scans:
-    """The scans that hooks ask for.
+    """The scans and depths that hooks ask for.
 
     Args:
         sim: the physics.
-        asked: the scans by the name of their array.
+        asked: both by the name of their array.
         ground: what is below; ``None`` where there are no scans.
         mask: the worlds in which episodes begin.
 
     Attributes:
-        arrays: heights of the body above the ground at each point (m), NaN where there is none, ``(nworld, points)``.
+        arrays: of scans, heights of the body above the ground at each point (m), NaN where there is none, ``(nworld,
+            points)``; of cameras, depths (m), ``(nworld, height, width)``.
     """
 
-    def __init__(self, sim: "Simulation", asked: dict[str, Asked], ground: Ground | None, mask: wp.array) -> None:
-        self._sim, self._asked, self._mask = sim, asked, mask
+    def __init__(
+        self, sim: "Simulation", asked: dict[str, Asked | Looked], ground: Ground | None, mask: wp.array
+    ) -> None:
+        self._eyes = {
+            name: Eye(
+                sim.mj_model, sim.device, one.camera, one.width, one.height, sim.num_envs, ("depth",), far=one.far
+            )
+            for name, one in asked.items()
+            if isinstance(one, Looked)
+        }
+        self._asked = {name: one for name, one in asked.items() if isinstance(one, Asked)}
+        self._sim, self._mask = sim, mask
         self._ground = tables(ground, sim.device) if asked and ground is not None else None
-        kept = {name: np.array(one.points, dtype=np.float32) for name, one in asked.items()}
+        kept = {name: np.array(one.points, dtype=np.float32) for name, one in self._asked.items()}
         self._points = {name: wp.array(points, dtype=wp.vec2, device=sim.device) for name, points in kept.items()}
         self._out = {name: Buffer((sim.num_envs, len(points)), float, sim.device) for name, points in kept.items()}
         self.arrays: dict[str, torch.Tensor] = {name: out.torch for name, out in self._out.items()}
+        self.arrays |= {name: eye.depth for name, eye in self._eyes.items()}
 
     def all(self) -> None:
         """Launches them, in all worlds."""
@@ -141,6 +170,8 @@ class Scans:
             inputs = [self._ground, one.body, self._points[name], masked, self._mask, data.xpos, data.xmat]
             out = self._out[name].warp
             wp.launch(scan, dim=out.shape, inputs=inputs, outputs=[out], device=self._sim.device)
+        for eye in self._eyes.values():
+            eye.launch(data.xpos, data.xmat, self._mask if masked else None)
 
 
 def tables(ground: Ground, device: wp.Device) -> Tables:

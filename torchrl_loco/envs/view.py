@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 import torch
 
+from torchrl_loco.checks import POSITIVE, check_float, check_int
 from torchrl_loco.envs import draws, heights, sensors
 from torchrl_loco.envs.names import Elements, Names
-from torchrl_loco.envs.scan import Asked
+from torchrl_loco.envs.scan import Asked, Looked
 from torchrl_loco.envs.tables import Entry, Table
 from torchrl_loco.envs.variation import Variation, constant_of
 from torchrl_loco.sim import models
@@ -39,8 +40,8 @@ class Catalog(Elements):
         arrays: names of the arrays that hooks have read.
         sensors: ids of the sensors that only an engine can evaluate.
         contact_geoms: ids of the geoms whose contacts were asked for, in the order of the engine's columns.
-        scans: the scans of the ground that were asked for, by the name of their array.
-        scanning: by hook, the names of the scans that it reads.
+        scans: the scans of the ground and the depths that were asked for, by the name of their array.
+        scanning: by hook, the names of those that it reads.
         sensor_address: where a sensor's numbers begin in ``sensordata``, by its id.
         constants: the task's tables by name.
         starts: what entries of ``shared`` begin with, by name, where it is not zero.
@@ -72,7 +73,7 @@ class Catalog(Elements):
         self.arrays: set[str] = set()
         self.sensors: set[int] = set()
         self.contact_geoms: list[int] = []
-        self.scans: dict[str, Asked] = {}
+        self.scans: dict[str, Asked | Looked] = {}
         self.scanning: dict[str, set[str]] = {}
         self.complete = False
         self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}
@@ -372,18 +373,46 @@ class View:
         ids, _ = self._catalog.ids("body", _one("body", body))
         if len(ids) > 1:
             raise ValueError(f"a scan is around one body, {body!r} names {len(ids)}")
-        asked = Asked(ids[0], tuple(map(tuple, where.tolist())))
+        scan = self._scanned(Asked(ids[0], tuple(map(tuple, where.tolist()))), (len(where),))
+        return scan if math.isnan(miss) else torch.where(scan.isnan(), miss, scan)
+
+    def depth(self, camera: str, width: int, height: int, far: float = 10.0) -> torch.Tensor:
+        """Returns how far along a camera's axis lies what it sees, shapes of all kinds and meshes among it.
+
+        Args:
+            camera: name of a camera of the model. It sees through a shape that it is in.
+            width: pixels in a row.
+            height: rows.
+            far: greatest depth (m), also where there is nothing.
+
+        Returns:
+            Depths (m), ``(num_envs, height, width)``, the upper left pixel first.
+
+        Raises:
+            KeyError: the model has no such camera.
+            ValueError: a number is not positive, or the camera's perspective is not told by ``fovy`` alone.
+        """
+        ids, _ = self._catalog.ids("camera", _one("camera", camera))
+        size = check_int("height", height), check_int("width", width)
+        return self._scanned(Looked(ids[0], size[1], size[0], check_float("far", far, POSITIVE)), size)
+
+    def _scanned(self, asked: Asked | Looked, shape: tuple[int, ...]) -> torch.Tensor:
+        """Returns the array of a scan or of depths, of a shape in each world: at the first call, numbers like them.
+
+        Raises:
+            ValueError: the hook did not ask for it at its first call.
+        """
         scans = self._catalog.scans
         name = next((name for name, other in scans.items() if other == asked), f"scan.{len(scans)}")
         if not self._catalog.complete:
             scans[name] = asked
             self._catalog.scanning.setdefault(self._hook, set()).add(name)
-            heights.of_catalog(self._catalog)  # which may refuse
-            return self.xpos(body)[:, 2:].expand(-1, len(where)).clone()
+            if isinstance(asked, Asked):
+                heights.of_catalog(self._catalog)  # which may refuse
+            return self.qpos[:, :1].view(-1, *[1] * len(shape)).expand(-1, *shape).clone()
         if name not in self._catalog.scanning.get(self._hook, ()):
             raise ValueError(f"{self._hook}() did not ask for this scan when it was first called: it is not computed")
-        scan = self._array(name)
-        return scan if math.isnan(miss) else torch.where(scan.isnan(), miss, scan)
+        return self._array(name)
 
     def geom_xpos(self, geoms: Names) -> torch.Tensor:
         """Returns positions of the centers of geoms (m), shaped as :meth:`xpos`."""

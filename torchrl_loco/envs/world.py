@@ -37,7 +37,6 @@ from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.scan import Scans
 from torchrl_loco.envs.state import State
 from torchrl_loco.envs.view import CONTACT_HISTORY
-from torchrl_loco.rendering import Renderer
 from torchrl_loco.sim import (
     EXCLUSIVE,
     Around,
@@ -91,6 +90,7 @@ class World:
         terminated: whether the episode ended by the task's hook, or because the world is not finite, ``(nworld,)``.
         truncated: whether the episode reached the time limit, or the task's hook cut it off, ``(nworld,)``.
         seed: seed of all random streams, ``(1,)``.
+        eye: what draws pixels, if the environment returns any.
         health: counts what went wrong in the physics.
         kinds: by hook of the task in torch, how it runs: see ``Part.kind`` in ``part.py``.
         fixed: attributes of the task that were read when this was made, and never again.
@@ -138,6 +138,7 @@ class World:
             self._seed_of_hooks = torch.zeros(1, dtype=torch.long, device=task.device)
             self._stagger = Buffer(1, bool, device)
             self.mask.warp.fill_(True)
+            self.eye = task.pixels.eye(self.sim) if task.pixels else None
 
             self.health = Health(self.sim, task.on_overflow)
             self._monitors: list[Monitor] = [self.health]
@@ -158,7 +159,7 @@ class World:
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
             for monitor in self._monitors:
                 monitor.restart()
-        self._renderers: dict[Any, Renderer] = {}
+        self._renderers: dict[Any, Any] = {}
         self._pid, self._closed = os.getpid(), False
         OPEN.add(self)
 
@@ -173,6 +174,7 @@ class World:
         self._move()  # poses and velocities again, if events() changed the state
         self._observe()  # observation(); worlds that are not finite
         self._conclude()  # time limit, flags, counters
+        self._look()  # pixels
 
     def _begin_masked(self) -> None:
         """A new episode in the worlds of the mask."""
@@ -181,6 +183,7 @@ class World:
         self._begin()  # begin(): pose and memory
         self._settle()  # poses and sensors; fused observation
         self._observe_begun()  # observation()
+        self._look_begun()  # pixels
 
     # What each world does besides the physics, in Warp.
 
@@ -259,6 +262,14 @@ class World:
     def _launch_move(self) -> None:
         self.sim.forward(self._moved.warp, after=self._fused, contacts=False)  # which belong to the step
 
+    def _launch_look(self) -> None:
+        assert self.eye is not None
+        self.eye.launch(self.sim.data.xpos, self.sim.data.xmat)
+
+    def _launch_look_begun(self) -> None:
+        assert self.eye is not None
+        self.eye.launch(self.sim.data.xpos, self.sim.data.xmat, self.mask.warp)
+
     def _launch_refresh(self) -> None:
         self.sim.forward(self.mask.warp, after=[*self._fused, *self._check_finite])
 
@@ -305,6 +316,7 @@ class World:
         launches += [self._launch_rest] if own or variation else []
         launches += [self._launch_conclude] if own else []
         launches += [self._scans.all, self._scans.begun] if self._scans.arrays else []
+        launches += [self._launch_look, self._launch_look_begun] if self.eye else []
         sim.compile(*launches, *([self._launch_move] if hooks.moves else []))
         for each in kernels:
             each.record(sim)
@@ -318,11 +330,13 @@ class World:
         self._rest = self._record(self._launch_rest) if own or variation else _nothing
         self._conclude = self._record(self._launch_conclude) if own else _nothing
         self._move = self._keeping_what_was(self._record(self._launch_move)) if hooks.moves else _nothing
-        self._run_step = self._as_graph("_take_step", several=bool(own))
-        self._run_reset = self._as_graph("_begin_masked", several=bool(own) or variation is not None)
+        self._look = self._record(self._launch_look) if self.eye else _nothing
+        self._look_begun = self._record(self._launch_look_begun) if self.eye else _nothing
+        self._run_step = self._as_graph("_take_step", several=bool(own or self.eye))
+        self._run_reset = self._as_graph("_begin_masked", several=bool(own or self.eye) or variation is not None)
 
     def _scan_first(self, scanning: Collection[str]) -> None:
-        """Lets parts whose hooks read scans of the ground make them first; in resets, those of the masked worlds."""
+        """Lets parts whose hooks read scans or depths make them first; in resets, those of the masked worlds."""
         scans = {False: self._record(self._scans.all), True: self._record(self._scans.begun)}
         for name, hooks in PARTS.items():
             part = getattr(self, f"_{name}")
@@ -473,6 +487,7 @@ class World:
         else:
             self._refresh_graph.replay()
         self._observe_restored()
+        self._look_begun()
 
     @functools.cached_property
     def _refresh_graph(self) -> Graph | Direct:
@@ -501,11 +516,11 @@ class World:
         self.seed.torch.fill_(seed)
         self._seed_of_hooks.fill_(seed)
 
-    def renderer(self, m: mujoco.MjModel, *size: Any) -> Renderer:
-        """Returns what renders worlds of a model, made once: its further arguments are a camera, sizes and worlds."""
+    def renderer(self, make: Callable[..., Any], m: mujoco.MjModel, *size: Any) -> Any:
+        """Returns what ``make`` makes of a model, the device, a camera, sizes and worlds: once for each of these."""
         if (m, *size) not in self._renderers:
             with self.sim.qpos.device:
-                self._renderers[m, *size] = Renderer(m, self.sim.device, *size)
+                self._renderers[m, *size] = make(m, self.sim.device, *size)
         return self._renderers[m, *size]
 
     # Closing.

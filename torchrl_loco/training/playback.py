@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.rendering import to_the_horizon
+from torchrl_loco.eyes.scene import to_the_horizon
 from torchrl_loco.storage import replace_file
 from torchrl_loco.training.algorithm import settings_for_small_networks
 from torchrl_loco.training.evaluation import PolicyFunc, play

@@ -1,0 +1,217 @@
+"""What cameras see, against rays of C MuJoCo; pixels and depth as entries of environments and in hooks."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from torchrl.envs import CatFrames, Compose, ToTensorImage
+from torchrl.envs.utils import check_env_specs
+
+import torchrl_loco as loco
+from torchrl_loco.eyes.tracer import Eye
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
+WIDTH, HEIGHT = 40, 30
+SHAPES = """
+<mujoco>
+  <asset>
+    <hfield name="field" nrow="9" ncol="12" size="2 1.5 0.4 0.1"/>
+    <mesh name="wedge" vertex="0 0 0  0.4 0 0  0 0.4 0  0 0 0.5"/>
+  </asset>
+  <worldbody>
+    <geom type="plane" size="0 0 1" pos="0 0 -0.2"/>
+    <geom type="hfield" hfield="field" pos="0.4 0.3 -0.1" euler="0 0 10"/>
+    <geom type="box" size="0.3 0.2 0.1" pos="-0.6 0.5 0.3" euler="10 20 30"/>
+    <body pos="0 0 0.6">
+      <freejoint/>
+      <geom type="sphere" size="0.12"/>
+      <geom type="capsule" size="0.06 0.3" pos="0.3 0.2 0.1" euler="30 40 0"/>
+      <geom type="cylinder" size="0.1 0.2" pos="-0.4 0.1 0.1" euler="60 10 0"/>
+      <geom type="ellipsoid" size="0.1 0.2 0.05" pos="0 -0.4 0.2" euler="10 40 20"/>
+      <geom type="box" size="0.1 0.15 0.05" pos="0.1 0.4 0.3" euler="50 10 0"/>
+      <geom type="mesh" mesh="wedge" pos="-0.3 -0.5 0.1"/>
+      <geom type="sphere" size="0.3" group="3"/>
+      <geom type="sphere" size="0.3" rgba="1 1 1 0"/>
+      <camera name="track" mode="track" pos="0 -2 0.5" xyaxes="1 0 0 0 0.3 1"/>
+      <camera name="trackcom" mode="trackcom" pos="1.5 0.4 1" xyaxes="-0.2 1 0 -0.4 0 1"/>
+      <camera name="held" pos="0.1 -1.2 0.4" xyaxes="1 0.1 0 0 0.5 1" fovy="70"/>
+    </body>
+    <body name="target" pos="0.2 0.1 0.7"><geom type="sphere" size="0.01"/></body>
+    <camera name="fixed" pos="2 2 1.5" xyaxes="-1 1 0 -0.4 -0.4 1"/>
+    <camera name="at_body" pos="-1.5 -1 1.2" mode="targetbody" target="target"/>
+    <camera name="at_com" pos="-1.5 1.5 0.9" mode="targetbodycom" target="target"/>
+  </worldbody>
+</mujoco>"""
+
+
+def shapes():
+    m = mujoco.MjModel.from_xml_string(SHAPES)
+    m.hfield_data[:] = np.random.default_rng(0).random(m.hfield_data.size)
+    return m
+
+
+def seen_by_rays(m, data, camera):
+    """Returns distances along rays through the pixels, infinite where nothing is, and the geoms that they meet."""
+    half = np.tan(np.deg2rad(m.cam_fovy[camera] / 2))
+    x = half * WIDTH / HEIGHT * (2 * (np.arange(WIDTH) + 0.5) / WIDTH - 1)
+    y = half * (1 - 2 * (np.arange(HEIGHT) + 0.5) / HEIGHT)
+    rays = np.stack([*np.meshgrid(x, y), np.full((HEIGHT, WIDTH), -1.0)], -1)
+    rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ data.cam_xmat[camera].reshape(3, 3).T
+    distances, geoms, geom = np.full((HEIGHT, WIDTH), np.inf), np.full((HEIGHT, WIDTH), -1), np.zeros(1, np.int32)
+    groups = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)
+    for at in np.ndindex(HEIGHT, WIDTH):
+        distance = mujoco.mj_ray(m, data, data.cam_xpos[camera], rays[at], groups, 1, -1, geom)
+        if distance >= 0:
+            distances[at], geoms[at] = distance, geom[0]
+    return distances, geoms
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("camera", ["track", "trackcom", "held", "fixed", "at_body", "at_com"])
+def test_depth_and_geoms_are_those_of_rays_of_c_mujoco(camera, device):
+    """Of all shapes and all kinds of cameras; what is transparent or in a hidden group is not seen."""
+    m, device = shapes(), wp.get_device(device)
+    eye = Eye(m, device, camera, WIDTH, HEIGHT, 2, ("rgb", "depth", "geoms"), along_ray=True, far=1e3)
+    eye.depth.fill_(torch.nan)
+    data, rng = mujoco.MjData(m), np.random.default_rng(1)
+    poses = []
+    for _ in range(2):
+        data.qpos[:3] = 0.2 * rng.standard_normal(3) + [0, 0, 0.6]
+        data.qpos[3:7] = [1, *0.3 * rng.standard_normal(3)]
+        mujoco.mj_normalizeQuat(m, data.qpos)
+        mujoco.mj_forward(m, data)
+        poses.append((data.xpos.copy(), data.xmat.copy(), *seen_by_rays(m, data, m.camera(camera).id)))
+    xpos = wp.array(np.stack([pose[0] for pose in poses]), dtype=wp.vec3, device=device)
+    xmat = wp.array(np.stack([pose[1] for pose in poses]).reshape(2, -1, 3, 3), dtype=wp.mat33, device=device)
+    eye.look(xpos, xmat)
+    for world, (_, _, distance, geom) in enumerate(poses):
+        same = eye.geoms[world].cpu().numpy() == geom
+        assert same.mean() > 0.995  # but at silhouettes
+        assert len(np.unique(geom)) > 5
+        found, there = eye.depth[world].cpu().numpy(), same & (geom >= 0)
+        assert (np.abs(found[there] / distance[there] - 1) < 1e-4).mean() > 0.998
+        assert (found[same & (geom < 0)] == 1e3).all()
+    assert not torch.equal(eye.rgb[0], eye.rgb[1])
+
+
+def test_light_falls_off_and_casts_shadows():
+    """A lit floor, the shadow of a ball on it, and colors of materials."""
+    xml = """
+    <mujoco>
+      <visual><headlight active="0"/></visual>
+      <worldbody>
+        <light directional="true" pos="0 0 3" dir="0 0 -1" diffuse="0.8 0.8 0.8"
+               ambient="0.1 0.1 0.1" specular="0 0 0"/>
+        <geom type="plane" size="0 0 1" rgba="0 1 0 1"/>
+        <geom type="sphere" size="0.2" pos="0 0 1" rgba="1 0 0 1"/>
+        <camera name="above" pos="1 0 3" xyaxes="0 1 0 -1 0 0.5"/>
+      </worldbody>
+    </mujoco>"""
+    m = mujoco.MjModel.from_xml_string(xml)
+    nobody = {"dtype": wp.vec3, "device": "cpu"}
+    pixels = {}
+    for shadows in (False, True):
+        eye = Eye(m, wp.get_device("cpu"), "above", 60, 60, 1, shadows=shadows)
+        eye.look(wp.zeros((1, 1), **nobody), wp.array(np.eye(3)[None, None], dtype=wp.mat33, device="cpu"))
+        pixels[shadows] = eye.rgb[0].clone()
+    red, green, _ = pixels[False].int().unbind(-1)
+    assert ((red > 100) & (green == 0)).any()
+    floor = (green > 0) & (red == 0)
+    assert (green[floor] == round(0.9 * 255)).all()
+    dark = (pixels[True][..., 1] == round(0.1 * 255)) & floor
+    assert 0.005 < dark.float().mean() < 0.2
+    assert torch.equal(pixels[True][~dark], pixels[False][~dark])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_pixels_are_entries_that_hold_what_they_held(device):
+    """With the true last frame of an episode; they are the same alone and among others."""
+    options = {"from_pixels": True, "depth": 8.0, "size": (24, 16), "camera": "side", "episode_length": 3}
+    env = loco.make("walker_walk", 3, device, 0, pixels_only=False, **options)
+    check_env_specs(env)
+    env.set_seed(0)
+    td = env.reset()
+    assert td["pixels"].shape == (3, 16, 24, 3)
+    assert td["depth"].shape == (3, 16, 24)
+    first, kept = td["pixels"], td["pixels"].clone()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(3):
+        action = torch.rand(env.action_spec.shape, generator=generator).to(env.device) * 2 - 1
+        before, td = env.step_and_maybe_reset(td.set("action", action))
+    assert torch.equal(first, kept)
+    ended = before["next"]
+    assert ended["truncated"].all()
+    assert not torch.equal(ended["pixels"], td["pixels"])
+    restored = env.reset(env.get_state(), set_state=True)
+    assert torch.equal(restored["pixels"], td["pixels"])
+    alone = loco.make("walker_walk", 1, device, 0, **options)
+    other = alone.reset()
+    assert set(other.keys()) == {"pixels", "depth", "done", "terminated", "truncated"}
+    assert torch.equal(other["pixels"][0], kept[0])
+    assert other["depth"].max() == 8.0
+
+
+def test_transforms_of_torchrl_stack_and_turn_them():
+    env = loco.TransformedEnv(
+        loco.make("walker_walk", 2, "cpu", 0, from_pixels=True, size=(20, 20)),
+        Compose(ToTensorImage(), CatFrames(N=3, dim=-3, in_keys=["pixels"])),
+    )
+    batch = env.rollout(4)
+    assert batch["pixels"].shape == (2, 4, 9, 20, 20)
+    assert torch.equal(batch["pixels"][:, 2, 3:], batch["pixels"][:, 3, :6])
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"pixels_only": True}, "pixels_only needs from_pixels=True"),
+        ({"camera": "side"}, "camera needs from_pixels=True"),
+        ({"from_pixels": True, "camera": "left"}, "unknown camera .left.: choose one of side"),
+        ({"from_pixels": True, "camera": 7}, "camera"),
+        ({"from_pixels": True, "size": 84}, "size must be the width and height"),
+        ({"from_pixels": True, "size": (0, 84)}, "width"),
+        ({"depth": -1.0}, "depth"),
+    ],
+)
+def test_what_cannot_be_seen_is_refused(options, match):
+    with pytest.raises(ValueError, match=match):
+        loco.make("walker_walk", 2, "cpu", 0, **options)
+
+
+def test_pixels_that_do_not_fit_are_refused():
+    with pytest.raises(MemoryError, match="GiB"):
+        loco.make("walker_walk", 2**16, "cpu", 0, from_pixels=True, size=(8192, 8192))
+
+
+class Sees(loco.Go1Velocity):
+    """Go1 that sees the ground ahead."""
+
+    def observation(self, s):
+        return {**super().observation(s), "eye": s.depth("egocentric", 8, 6, far=4.0)}
+
+
+def test_hooks_see_depth():
+    """As kernels and as plain torch, after steps and resets, what the environment's own camera sees."""
+    options = {"depth": 4.0, "camera": "egocentric", "size": (8, 6), "pixels_only": False}
+    env, plain = (Sees(3, "cpu", seed=0, compile_hooks=compiled, **options) for compiled in (True, False))
+    assert env.world.kinds["observation"] == "kernel"
+    td, ours = env.reset(), plain.reset()
+    for _ in range(3):
+        assert td["eye"].shape == (3, 6, 8)
+        assert torch.equal(td["eye"], td["depth"])
+        torch.testing.assert_close(ours["eye"], td["eye"], atol=1e-4, rtol=1e-4)
+        state, action = env.get_state(), torch.zeros(env.action_spec.shape)
+        td = env.step(env.reset(state, set_state=True).set("action", action))["next"]
+        ours = plain.step(plain.reset(state, set_state=True).set("action", action))["next"]
+    assert td["eye"].max() == 4.0
+    assert td["eye"].min() < 1.0
+
+
+def test_a_camera_that_hooks_name_must_be_there():
+    class Blind(Sees):
+        def observation(self, s):
+            return s.depth("left", 8, 6).flatten(1)
+
+    with pytest.raises(KeyError, match=r"no camera 'left'.*egocentric"):
+        Blind(2, "cpu", seed=0)

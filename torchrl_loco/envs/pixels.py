@@ -1,0 +1,92 @@
+"""Pixels as entries of an environment: which camera, how large, and what they are in TorchRL's specs."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import torch
+from torchrl.data import Bounded
+
+from torchrl_loco.checks import Interval, check_bool, check_choice, check_float, check_int
+from torchrl_loco.eyes.tracer import Eye, bytes_of
+from torchrl_loco.sim import Simulation
+from torchrl_loco.sim.simulation import check_memory
+
+SIZE = (84, 84)
+"""Width and height of pixels, those of dm_control's benchmarks from pixels."""
+COPIES = 3
+"""How often pixels lie in memory: where they are drawn, in what a step returns, and in what the next begins with."""
+DEPTHS = Interval(0, float("inf"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Pixels:
+    """What an environment returns of a camera.
+
+    Attributes:
+        camera: number of the camera.
+        width, height: of the pixels.
+        kinds: what is drawn, of :data:`torchrl_loco.eyes.tracer.KINDS`.
+        far: greatest depth (m).
+        only: whether the other observations are left out.
+    """
+
+    camera: int
+    width: int
+    height: int
+    kinds: tuple[str, ...]
+    far: float
+    only: bool
+
+    @classmethod
+    def checked(
+        cls, m: mujoco.MjModel, given: Mapping[str, Any], num_envs: int, device: torch.device
+    ) -> "Pixels | None":
+        """Returns what arguments of :class:`torchrl_loco.LocoEnv` ask for, ``None`` if that is no pixels.
+
+        Raises:
+            ValueError: the model has no such camera, a number is out of range, or an argument needs another.
+            TypeError: an argument has the wrong type.
+            MemoryError: the device has no room for the pixels.
+        """
+        with_rgb, far = check_bool("from_pixels", given["from_pixels"]), check_float("depth", given["depth"], DEPTHS)
+        if not with_rgb and not far:
+            if extra := [name for name in ("pixels_only", "camera", "size") if given[name] is not None]:
+                raise ValueError(f"{extra[0]} needs from_pixels=True, or the greatest depth to be seen (m) as depth")
+            return None
+        names, camera = [m.camera(i).name for i in range(m.ncam)], given["camera"]
+        if not m.ncam:
+            raise ValueError("pixels need a camera: the model has none")
+        if isinstance(camera, str):
+            check_choice("camera", camera, names)
+        elif camera is not None:
+            check_int("camera", camera, Interval(0, m.ncam))
+        size = SIZE if given["size"] is None else given["size"]
+        if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
+            raise ValueError(f"size must be the width and height of pixels, such as {SIZE}, got {size!r}")
+        width, height = check_int("width", size[0]), check_int("height", size[1])
+        kinds = (*("rgb",) * with_rgb, *("depth",) * bool(far))
+        only = True if given["pixels_only"] is None else check_bool("pixels_only", given["pixels_only"])
+        check_memory(COPIES * bytes_of(num_envs, width, height, kinds), num_envs, device)
+        return cls(m.camera(0 if camera is None else camera).id, width, height, kinds, far, only)
+
+    def eye(self, sim: Simulation) -> Eye:
+        """Returns what draws them."""
+        size = self.width, self.height, sim.num_envs, self.kinds
+        return Eye(sim.mj_model, sim.device, self.camera, *size, far=self.far or 1.0)
+
+    def specs(self, batch: torch.Size, device: torch.device) -> dict[str, Bounded]:
+        """Returns the specs of the entries by key."""
+        size = self.height, self.width
+        rgb = Bounded(0, 255, (*batch, *size, 3), dtype=torch.uint8, device=device)
+        depth = Bounded(0.0, self.far, (*batch, *size), dtype=torch.float32, device=device)
+        return {
+            key: spec for kind, key, spec in (("rgb", "pixels", rgb), ("depth", "depth", depth)) if kind in self.kinds
+        }
+
+    def entries(self, eye: Eye | None, batch: torch.Size) -> dict[str, torch.Tensor]:
+        """Returns copies of what is drawn, by key."""
+        assert eye is not None
+        drawn = {"pixels": eye.rgb, "depth": eye.depth}
+        return {key: image.clone().view(*batch, *image.shape[1:]) for key, image in drawn.items() if len(image)}

@@ -1,0 +1,65 @@
+"""Models for pictures, and poses that no simulation is at: of a motion, or with a ghost beside the body."""
+
+from typing import Any
+
+import mujoco
+import torch
+import warp as wp
+
+from torchrl_loco.eyes.tracer import Eye
+from torchrl_loco.sim import EXCLUSIVE, current_stream, mjw
+
+LOOKS_WELL: dict[str, Any] = {"shadows": True, "samples": 2}
+"""Settings of an :class:`~torchrl_loco.eyes.tracer.Eye` for pictures that people look at."""
+
+GHOST, OPACITY = "ghost/", 0.4
+"""What the names of a ghost's bodies begin with, and how much of it is seen."""
+GHOST_COLOR = (0.2, 0.75, 0.35)
+"""Of a ghost: red, green, blue."""
+
+
+def with_ghost(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Returns a model with its first body once more, which touches nothing: its positions follow those of the model.
+
+    Args:
+        spec: the model, which stays as it is.
+    """
+    seen, other = spec.copy(), spec.copy()
+    for geom in other.geoms:
+        geom.contype = geom.conaffinity = 0
+        geom.material, geom.rgba = "", [*GHOST_COLOR, OPACITY]
+    for kind in (other.actuators, other.sensors, other.cameras, other.lights, other.keys, other.pairs, other.excludes):
+        for part in list(kind):
+            other.delete(part)
+    seen.worldbody.add_frame().attach_body(other.worldbody.bodies[0], GHOST, "")
+    return seen.compile()
+
+
+class Poses:
+    """Renders poses of a model through one camera.
+
+    Args:
+        mj_model: the model.
+        device: where.
+        camera: name or number of a camera of the model.
+        width: pixels in a row, at least 1.
+        height: rows, at least 1.
+        worlds: how many poses at a time.
+    """
+
+    def __init__(
+        self, mj_model: mujoco.MjModel, device: wp.Device, camera: str | int, width: int, height: int, worlds: int
+    ) -> None:
+        self._device, self._eye = device, Eye(mj_model, device, camera, width, height, worlds, **LOOKS_WELL)
+        with EXCLUSIVE, wp.ScopedDevice(device):
+            self._model = mjw.put_model(mj_model)
+            self._data = mjw.make_data(mj_model, nworld=worlds, naconmax=1, njmax=1)
+        wp.synchronize_device(device)  # made on Warp's stream, used on torch's
+
+    def render(self, qpos: torch.Tensor) -> torch.Tensor:
+        """Returns poses ``(worlds, nq)`` as pixels, uint8 ``(worlds, height, width, 3)``, until the next call."""
+        with EXCLUSIVE, wp.ScopedDevice(self._device), wp.ScopedStream(current_stream(self._device)):
+            wp.copy(self._data.qpos, wp.from_torch(qpos.float().contiguous()))
+            mjw.kinematics(self._model, self._data)
+            self._eye.launch(self._data.xpos, self._data.xmat)
+        return self._eye.rgb

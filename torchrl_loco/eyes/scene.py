@@ -1,0 +1,304 @@
+"""What cameras see of a model, as tables on a device: shapes, what they look like, lights, textures and the sky."""
+
+import copy
+import logging
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from torchrl_loco.eyes.shapes import BOX, FIELD, MESH, PLANE
+from torchrl_loco.sim import fill
+
+GROUPS = 3
+"""Groups of geoms that are seen, from 0 on, as in MuJoCo's viewer."""
+FULL_SHINE = 128.0
+"""Exponent of a highlight where a material's shininess is 1."""
+HIDDEN = 1e-3
+"""Opacity up to which a geom is not seen."""
+EDGES = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+"""Corners of a box, and of its sides, seen from outside."""
+
+
+@wp.struct
+class Mounts:
+    """The camera, then the lights: what holds each, and where it is and looks (along -z) from there."""
+
+    mode: wp.array[int]
+    body: wp.array[int]
+    target: wp.array[int]
+    pos: wp.array[wp.vec3]
+    mat: wp.array[wp.mat33]
+    # Of bodies: how many are in its subtree, its mass, and where its center of mass is.
+    subtree: wp.array[int]
+    mass: wp.array[float]
+    ipos: wp.array[wp.vec3]
+
+
+@wp.struct
+class Shapes:
+    """What rays are tried against; the number of a look is that of its geom."""
+
+    geom: wp.array[int]  # the geom, or -1: the triangles of all fields and boxes that are fixed to the world
+    kind: wp.array[int]
+    body: wp.array[int]
+    pos: wp.array[wp.vec3]
+    mat: wp.array[wp.mat33]
+    size: wp.array[wp.vec3]
+    radius: wp.array[float]  # of a sphere around it
+    mesh: wp.array[wp.uint64]
+    owner: wp.array[int]  # of the triangles of the ground: the geom
+
+
+@wp.struct
+class Looks:
+    """Of each geom, then the lights after the camera's own, textures by level of detail, and the sky."""
+
+    color: wp.array[wp.vec3]
+    shine: wp.array[wp.vec3]  # emission, specular, exponent
+    texture: wp.array[int]
+    repeat: wp.array[wp.vec2]
+    offset: wp.array[wp.vec2]
+    light_kind: wp.array[int]  # 0 spot, 1 directional
+    shadow: wp.array[bool]
+    diffuse: wp.array[wp.vec3]
+    specular: wp.array[wp.vec3]
+    attenuation: wp.array[wp.vec3]
+    cone: wp.array[wp.vec2]  # cosine of the cutoff, exponent
+    ambient: wp.vec3
+    levels: wp.array2d[wp.vec3i]  # first texel, width, height
+    texels: wp.array[wp.vec3]
+    sky: wp.vec2i  # first texel, width of a side; width 0 is none
+
+
+def to_the_horizon(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """Returns a copy of a model for pictures: its planes have no end, as in the physics."""
+    seen = copy.copy(mj_model)
+    seen.geom_size[seen.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = 0.0
+    return seen
+
+
+def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device) -> Mounts:
+    """Returns what holds a camera and the lights that are on.
+
+    Raises:
+        ValueError: the camera projects along parallel rays, or has a sensor of a size of its own.
+    """
+    name = m.camera(camera).name or camera
+    if m.cam_projection[camera] != int(mujoco.mjtProjection.mjPROJ_PERSPECTIVE) or m.cam_sensorsize[camera].any():
+        raise ValueError(f"camera {name!r} must have a perspective that fovy alone tells, to be drawn from")
+    lights = np.flatnonzero(m.light_active)
+    count = np.ones(m.nbody, dtype=np.int32)
+    for body in range(m.nbody - 1, 0, -1):  # numbered along the tree: a subtree is a row of bodies
+        count[m.body_parentid[body]] += count[body]
+
+    def of(cameras: np.ndarray, of_lights: np.ndarray) -> np.ndarray:
+        return np.concatenate([cameras[[camera]], of_lights[lights]])
+
+    mode = of(m.cam_mode, m.light_mode)
+    frames = [np.zeros(9)]
+    mujoco.mju_quat2Mat(frames[0], m.cam_quat[camera])
+    fixed = [frames[0].reshape(3, 3), *(facing(m.light_dir[light]) for light in lights)]
+    whole = [m.cam_mat0[camera].reshape(3, 3), *(facing(m.light_dir0[light]) for light in lights)]
+    tracks, of_com = mode == 1, mode == 2
+    pos = np.where(tracks[:, None], of(m.cam_pos0, m.light_pos0), of(m.cam_pos, m.light_pos))
+    pos = np.where(of_com[:, None], of(m.cam_poscom0, m.light_poscom0), pos)
+    mat = np.where((tracks | of_com)[:, None, None], np.array(whole), np.array(fixed))
+    return fill(
+        Mounts,
+        mode=array(mode, int, device),
+        body=array(of(m.cam_bodyid, m.light_bodyid), int, device),
+        target=array(of(m.cam_targetbodyid, m.light_targetbodyid), int, device),
+        pos=array(pos, wp.vec3, device),
+        mat=array(mat, wp.mat33, device),
+        subtree=array(count, int, device),
+        mass=array(m.body_mass, float, device),
+        ipos=array(m.body_ipos, wp.vec3, device),
+    )
+
+
+def facing(direction: np.ndarray) -> np.ndarray:
+    """Returns a frame whose -z axis is a direction."""
+    z = -direction / max(np.linalg.norm(direction), 1e-12)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def shapes_of(m: mujoco.MjModel, device: wp.Device) -> tuple[Shapes, list[wp.Mesh]]:
+    """Returns the shapes of a model that are seen, and the meshes among them, which must be kept."""
+    seen = [g for g in range(m.ngeom) if m.geom_group[g] < GROUPS and color_of(m, g)[3] > HIDDEN]
+    of_ground = [g for g in seen if m.geom_bodyid[g] == 0 and m.geom_type[g] in (BOX, FIELD)]
+    alone = [g for g in seen if g not in set(of_ground)]
+    kinds = [int(m.geom_type[g]) for g in alone]
+    meshes: dict[int, wp.Mesh] = {}
+    for g, kind in zip(alone, kinds, strict=True):
+        if kind == MESH and (data := int(m.geom_dataid[g])) not in meshes:
+            first, points = m.mesh_vertadr[data], m.mesh_vertnum[data]
+            faces = m.mesh_face[m.mesh_faceadr[data] :][: m.mesh_facenum[data]]
+            meshes[data] = mesh(m.mesh_vert[first : first + points], faces, device)
+    ids = [meshes[int(m.geom_dataid[g])].id if k == MESH else 0 for g, k in zip(alone, kinds, strict=True)]
+    mats = np.zeros((len(alone), 9))
+    for row, g in zip(mats, alone, strict=True):
+        mujoco.mju_quat2Mat(row, m.geom_quat[g])
+    owner = np.zeros(0)
+    rows = {
+        "geom": [*alone],
+        "kind": kinds,
+        "body": [*m.geom_bodyid[alone]],
+        "pos": [*m.geom_pos[alone]],
+        "mat": [*mats.reshape(-1, 3, 3)],
+        "size": [*m.geom_size[alone]],
+        "radius": [*m.geom_rbound[alone]],
+        "mesh": ids,
+    }
+    kept = [*meshes.values()]
+    if of_ground:
+        points, faces, owner = triangles(m, of_ground)
+        kept.append(mesh(points, faces, device))
+        for name, value in zip(rows, (-1, MESH, 0, np.zeros(3), np.eye(3), np.ones(3), 0.0, kept[-1].id), strict=True):
+            rows[name].append(value)
+    types = (int, int, int, wp.vec3, wp.mat33, wp.vec3, float, wp.uint64)
+    tables = {name: array(np.array(row), kind, device) for (name, row), kind in zip(rows.items(), types, strict=True)}
+    return fill(Shapes, **tables, owner=array(owner, int, device)), kept
+
+
+def triangles(m: mujoco.MjModel, geoms: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns points and triangles of height fields and boxes of the world, and of each triangle its geom."""
+    points, faces, owner, count = [], [], [], 0
+    for g in geoms:
+        mat = np.zeros(9)
+        mujoco.mju_quat2Mat(mat, m.geom_quat[g])
+        if m.geom_type[g] == BOX:
+            own, of_own = EDGES * m.geom_size[g], np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
+        else:
+            own, of_own = of_field(m, int(m.geom_dataid[g]))
+        points.append(own @ mat.reshape(3, 3).T + m.geom_pos[g])
+        faces.append(of_own + count)
+        owner.append(np.full(len(of_own), g))
+        count += len(own)
+    return np.concatenate(points), np.concatenate(faces), np.concatenate(owner)
+
+
+def of_field(m: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns points and triangles of a height field: its surface, cut from low x and y to high, and its walls."""
+    rows, columns = int(m.hfield_nrow[field]), int(m.hfield_ncol[field])
+    half_x, half_y, height, base = m.hfield_size[field]
+    heights = m.hfield_data[m.hfield_adr[field] :][: rows * columns] * height
+    x, y = np.meshgrid(np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows))
+    top = np.stack([x.ravel(), y.ravel(), heights], axis=1)
+    number = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    faces = [np.stack(corners, -1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))]
+    rim = np.concatenate([number[0, :-1], number[:-1, -1], number[-1, :0:-1], number[:0:-1, 0]])
+    below, after = len(top) + np.arange(len(rim)), np.roll(np.arange(len(rim)), -1)
+    faces += [np.stack([rim, below, below[after]], -1), np.stack([rim, below[after], rim[after]], -1)]
+    return np.concatenate([top, np.column_stack([top[rim, :2], np.full(len(rim), -base)])]), np.concatenate(faces)
+
+
+def mesh(points: np.ndarray, faces: np.ndarray, device: wp.Device) -> wp.Mesh:
+    """Returns triangles as what Warp traces rays through."""
+    return wp.Mesh(array(points, wp.vec3, device), array(faces.ravel(), int, device))
+
+
+def color_of(m: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Returns red, green, blue and opacity of a geom: those of its material, unless it has its own."""
+    own = m.geom_rgba[geom]
+    has_own = m.geom_matid[geom] < 0 or not np.array_equal(own, [0.5, 0.5, 0.5, 1.0])
+    return own if has_own else m.mat_rgba[m.geom_matid[geom]]
+
+
+def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
+    """Returns what geoms look like, and what lights them. What is not drawn is said in the log."""
+    head, lights = m.vis.headlight, np.flatnonzero(m.light_active)
+    ambient = m.light_ambient[lights].sum(0) + (head.ambient if head.active else 0.0)
+    shine, texture = np.zeros((m.ngeom, 3)), np.full(m.ngeom, -1)
+    repeat, offset, left_out = np.zeros((m.ngeom, 2)), np.zeros((m.ngeom, 2)), []
+    shine[:, 1:] = 0.5, 0.5 * FULL_SHINE
+    role = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
+    flat = [t for t in range(m.ntex) if m.tex_type[t] == int(mujoco.mjtTexture.mjTEXTURE_2D)]
+    for g in range(m.ngeom):
+        if (material := int(m.geom_matid[g])) < 0:
+            continue
+        shine[g] = m.mat_emission[material], m.mat_specular[material], FULL_SHINE * m.mat_shininess[material]
+        used = int(m.mat_texid[material, role])
+        is_ground = m.geom_bodyid[g] == 0 and m.geom_type[g] in (PLANE, BOX, FIELD)
+        if used >= 0 and (not is_ground or used not in flat):
+            left_out.append(m.geom(g).name or str(g))
+        elif used >= 0:  # texels are counted from a corner of a plane, or from the middle of ground without an end
+            size, times = m.geom_size[g, :2] * (m.geom_type[g] == PLANE), m.mat_texrepeat[material]
+            ends = size > 0.0
+            whole = ends & (not m.mat_texuniform[material])
+            texture[g], repeat[g] = flat.index(used), np.where(whole, times / np.where(whole, 2 * size, 1), 0.5 * times)
+            offset[g] = np.where(ends.all(), repeat[g] * size, -0.5)
+    sees_through = [m.geom(g).name or str(g) for g in range(m.ngeom) if HIDDEN < color_of(m, g)[3] < 1.0]
+    for what, names in (("textures but those of the ground", left_out), ("transparency", sees_through)):
+        if names:
+            logging.getLogger("torchrl_loco").info("cameras do not see %s: geoms %s", what, ", ".join(names[:8]))
+    levels, texels, sky = textures(m, flat)
+    return fill(
+        Looks,
+        color=array(np.array([color_of(m, g)[:3] for g in range(m.ngeom)]), wp.vec3, device),
+        shine=array(shine, wp.vec3, device),
+        texture=array(texture, int, device),
+        repeat=array(repeat, wp.vec2, device),
+        offset=array(offset, wp.vec2, device),
+        light_kind=array(m.light_type[lights] == int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL), int, device),
+        shadow=array(m.light_castshadow[lights], bool, device),
+        diffuse=array(of_head(head, head.diffuse, m.light_diffuse[lights]), wp.vec3, device),
+        specular=array(of_head(head, head.specular, m.light_specular[lights]), wp.vec3, device),
+        attenuation=array(m.light_attenuation[lights], wp.vec3, device),
+        cone=array(np.column_stack([np.cos(np.deg2rad(m.light_cutoff)), m.light_exponent])[lights], wp.vec2, device),
+        ambient=wp.vec3(*map(float, ambient)),
+        levels=array(levels, wp.vec3i, device),
+        texels=array(texels, wp.vec3, device),
+        sky=wp.vec2i(*sky),
+    )
+
+
+def of_head(head: Any, own: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Returns a color of the light that the camera carries, then those of the other lights."""
+    return np.concatenate([[own if head.active else np.zeros(3)], others])
+
+
+def textures(m: mujoco.MjModel, flat: list[int]) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+    """Returns where each level of detail of each texture is, half as large each, their texels, and where the sky is."""
+    texels: list[np.ndarray] = [np.zeros((1, 3))]
+    levels, count = [], 1
+
+    def image(t: int) -> np.ndarray:
+        shape = int(m.tex_height[t]), int(m.tex_width[t]), int(m.tex_nchannel[t])
+        return m.tex_data[m.tex_adr[t] :][: np.prod(shape)].reshape(shape)[..., :3] / 255.0
+
+    for t in flat:
+        now, rows = image(t), []
+        while True:
+            rows.append((count, now.shape[1], now.shape[0]))
+            texels.append(np.broadcast_to(now, (*now.shape[:2], 3)).reshape(-1, 3))
+            count += len(texels[-1])
+            if now.shape[0] == now.shape[1] == 1:
+                break
+            now = np.pad(now, ((0, now.shape[0] % 2), (0, now.shape[1] % 2), (0, 0)), mode="edge")
+            now = now.reshape(now.shape[0] // 2, 2, now.shape[1] // 2, 2, -1).mean((1, 3))
+        levels.append(rows)
+    most = max(map(len, levels), default=1)
+    table = np.zeros((max(len(levels), 1), most, 3))
+    for row, own in zip(table, levels, strict=False):
+        row[:] = [*own, *[own[-1]] * (most - len(own))]
+    skies = [t for t in range(m.ntex) if m.tex_type[t] == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)]
+    if not skies:
+        return table, np.concatenate(texels), (0, 0)
+    sky = image(skies[0])
+    sky = np.tile(sky, (1 if len(sky) > sky.shape[1] else 6, 1, 1))  # one side stands for all
+    return table, np.concatenate([*texels, sky.reshape(-1, 3)]), (count, sky.shape[1])
+
+
+def array(values: np.ndarray, kind: Any, device: wp.Device) -> wp.array:
+    """Returns numbers as an array of Warp's, of vectors or matrices too."""
+    shape = getattr(kind, "_shape_", ())
+    scalar = {int: np.int32, float: np.float32, bool: np.bool_, wp.uint64: np.uint64, wp.vec3i: np.int32}
+    values = np.asarray(values).astype(scalar.get(kind, np.float32))
+    outer = values.shape[: values.ndim - len(shape)] if values.size else (0,) * max(values.ndim - len(shape), 1)
+    return wp.array(np.ascontiguousarray(values.reshape(*outer, *shape)), dtype=kind, device=device)
