@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import inspect
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,7 @@ import torch
 from tensordict.nn import AddStateIndependentNormalScale, NormalParamExtractor, TensorDictModule
 from torch import nn
 from torch.distributions import AffineTransform, Independent, Normal, TransformedDistribution
+from torch.nn.functional import softplus
 from torchrl.data import Bounded, Unbounded
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.modules.distributions.continuous import SafeTanhTransform
@@ -47,6 +49,11 @@ class SquashedNormal(TransformedDistribution):
     def deterministic_sample(self) -> torch.Tensor:
         """The image of the mean, shape ``(..., n)``."""
         return self.bound * self.base_dist.mean.tanh()
+
+
+def log_slope(u: torch.Tensor) -> torch.Tensor:
+    """Returns log(1 - tanh(u)^2), exact for large u too, of any shape ``(...)``."""
+    return 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))
 
 
 def network_of(make: Network, inputs: int, outputs: int) -> nn.Module:
