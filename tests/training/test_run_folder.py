@@ -46,7 +46,7 @@ def test_out_must_be_a_folder(tmp_path):
 HOLD = """
 import sys
 from pathlib import Path
-from torchrl_loco.training.lock import lock
+from torchrl_loco.training.process import lock
 
 lock(Path(sys.argv[1]))
 print("locked", flush=True)

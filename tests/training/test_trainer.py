@@ -20,7 +20,7 @@ from torchrl_loco.tasks.walker import Walker
 from torchrl_loco.training import RunFolder, Trainer, evaluate_run, preset, train, trainer
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.evaluation import Evaluator
-from torchrl_loco.training.interrupts import interruptible
+from torchrl_loco.training.process import interruptible
 from torchrl_loco.training.trainer import ALGORITHMS
 
 FILES = {

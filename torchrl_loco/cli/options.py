@@ -83,8 +83,7 @@ def summaries() -> dict[str, str]:
 def task_options(args: list[str]) -> Any:
     """Returns the type of a task's settings; removes from ``args`` the options that choose the preset."""
     from torchrl_loco.registry import list_envs, resolve, task_name
-    from torchrl_loco.training.config import CONFIGS, TrainingConfig
-    from torchrl_loco.training.presets import preset, tuning_note
+    from torchrl_loco.training.config import CONFIGS, TrainingConfig, preset, tuning_note
 
     about = summaries()
     device, algorithm = (_take(flag, args) for flag in ("--device", "--algorithm"))

@@ -17,11 +17,10 @@ from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 
 from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
-from torchrl_loco.training.actor import Network, log_slope, make_actor, network_of
+from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of
 from torchrl_loco.training.adam import ALIGNED, launch
 from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
 from torchrl_loco.training.config import PPOConfig
-from torchrl_loco.training.spaces import Spaces
 
 LR_RANGE = (1e-5, 1e-2)
 """Of a learning rate that follows the divergence."""

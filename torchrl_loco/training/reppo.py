@@ -20,11 +20,9 @@ from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
-from torchrl_loco.training.actor import Network, log_slope, make_actor, network_of
-from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
-from torchrl_loco.training.compiling import compiled
+from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of
+from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step, compiled
 from torchrl_loco.training.config import REPPOConfig
-from torchrl_loco.training.spaces import Spaces
 
 
 class REPPO(Algorithm):

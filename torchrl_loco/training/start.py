@@ -15,10 +15,8 @@ from torchrl_loco.registry import check_is_run, is_place, task_name
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
-from torchrl_loco.training.config import CONFIGS, TrainingConfig
-from torchrl_loco.training.environments import unwrapped
-from torchrl_loco.training.given import Given
-from torchrl_loco.training.presets import check_setting, preset, tuning_note
+from torchrl_loco.training.config import CONFIGS, TrainingConfig, check_setting, preset, tuning_note
+from torchrl_loco.training.environments import Given, unwrapped
 from torchrl_loco.training.run_folder import RunFolder
 from torchrl_loco.training.trainer import Trainer
 

@@ -7,10 +7,9 @@ from torchrl_loco.checks import check_device
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
-from torchrl_loco.training.actor import deterministic_policy
+from torchrl_loco.training.actor import Spaces, deterministic_policy
 from torchrl_loco.training.environments import refuse_transforms
 from torchrl_loco.training.run_folder import RunFolder
-from torchrl_loco.training.spaces import Spaces
 from torchrl_loco.training.trainer import ALGORITHMS
 
 
