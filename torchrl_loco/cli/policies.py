@@ -399,8 +399,7 @@ def export(
     with user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
         written, beside = which.load(run_or_task, "cpu")
         from torchrl_loco import storage
-        from torchrl_loco.deployment import why_not
-        from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy
+        from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy, why_not
 
         suffix = SUFFIXES[format]
         if out is not None:
@@ -470,8 +469,7 @@ def verify(
 def _exported_for(run_or_task: str, which: Which, folder: Path) -> tuple[Path, Path | None]:
     """Exports a policy into a folder. Returns the file, and where figures belong in its run folder, if it has one."""
     from torchrl_loco import storage
-    from torchrl_loco.deployment import why_not
-    from torchrl_loco.export import export_policy
+    from torchrl_loco.export import export_policy, why_not
 
     policy, beside = which.load(run_or_task, "cpu")
     if reason := why_not(policy):

@@ -1,7 +1,6 @@
 """The settings of a training run: what is valid, and which are used for a task on a device."""
 
 import dataclasses
-import json
 import math
 import re
 from collections.abc import Collection, Mapping
@@ -67,13 +66,6 @@ Sim: Any = dataclasses.make_dataclass(
     frozen=True,
 )
 AS_THE_TASK = Sim()
-
-
-class Options(dict[str, Any]):
-    """Values of a task's own options by name, as JSON can hold them. They do not change."""
-
-    def __hash__(self) -> int:  # type: ignore[override]
-        return hash(json.dumps(self, sort_keys=True))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,7 +172,7 @@ class TrainingConfig:
         object.__setattr__(self, "out", Path(self.out))
         object.__setattr__(self, "hidden", tuple(self.hidden))
         object.__setattr__(self, "sim", _checked_sim(self.sim))
-        object.__setattr__(self, "options", Options(self.options))
+        object.__setattr__(self, "options", dict(self.options))
         object.__setattr__(self, "init", str(Path(self.init).expanduser().resolve()) if self.init else "")
         # Whether the machine has the device is checked when the run starts.
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):

@@ -1,31 +1,29 @@
 """Plots of learning curves."""
 
-import dataclasses
 import io
+import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from torchrl_loco import storage
 from torchrl_loco.checks import check_packages
-from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
 
 check_packages("a plot", ["matplotlib"], "train")  # so that a run fails at its start, though it imports it at its end
 
-IRRELEVANT: dict[str, Any] = {
-    "seed": 0,
-    "out": Path(),
-    "device": "cpu",
-    "eval_interval": 0,
-    "eval_episodes": 1,
-    "video_seconds": 0.0,
-    "checkpoint_seconds": 0.0,
-    "logger": (),
+IRRELEVANT = {
+    "seed",
+    "out",
+    "device",
+    "eval_interval",
+    "eval_episodes",
+    "video_seconds",
+    "checkpoint_seconds",
+    "logger",
 }
-"""Settings that do not affect learning, each with a fixed value, so that runs can be grouped without them."""
+"""Settings that do not affect learning: runs are grouped without them."""
 
 
 def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
@@ -40,14 +38,17 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     """
     if not runs:
         raise ValueError("no runs to plot")
-    groups: dict[TrainingConfig, list[RunFolder]] = {}
+    groups: dict[str, list[RunFolder]] = {}
     for run in runs:
-        groups.setdefault(dataclasses.replace(run.load_config(), **IRRELEVANT), []).append(run)
+        settings = run.load_config().to_json()
+        relevant = {name: value for name, value in settings.items() if name not in IRRELEVANT}
+        groups.setdefault(json.dumps(relevant, sort_keys=True), []).append(run)
     from matplotlib.figure import Figure  # takes a second
 
     figure = Figure(figsize=(7, 4.2), layout="constrained")  # without pyplot: a caller's backend stays as it is
     axes = figure.subplots()
-    for config, group in groups.items():
+    for group in groups.values():
+        config = group[0].load_config()
         label = f"{config.label}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds"
         metrics = [run.read_metrics() for run in group]
         whole = [m for m in metrics if _is_whole(m["frames"], config.total_frames)] or metrics
