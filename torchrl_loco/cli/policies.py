@@ -360,20 +360,15 @@ def watch(
         check_int("seed", seed, SEED)
         check_float("cpu_share", cpu_share, SHARE)
         check_device(device)
-        _yield_to_others()
+        os.nice(19)  # the lowest priority that there is, also of threads that are made from here on
+        if hasattr(os, "SCHED_IDLE"):  # of Linux: a fifth of the share of nice 19
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
         from torchrl_loco import training
         from torchrl_loco.training.watching import Watched
 
         folder = training.RunFolder(run, None if task is None else _task(task))
         watched = Watched(folder, browser.num_envs, device, seed)
         browser.show(watched.env, watched.newer(), watched.newer, cpu_share)
-
-
-def _yield_to_others() -> None:
-    """Gives this process the lowest priority that there is; threads that it makes from here on have the same."""
-    os.nice(19)
-    if hasattr(os, "SCHED_IDLE"):  # of Linux: a fifth of the share of nice 19
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
 def _video_file(policy: "torchrl_loco.Policy", beside: Path) -> Path:

@@ -450,8 +450,13 @@ def preset(
     on_cuda = device.type == "cuda"
     own: Mapping[str, Mapping[str, Any]] = {}
     if on_cuda or task not in tasks.found():  # importing one of ours takes seconds
-        checked = checked_presets(resolve(task))
-        own = checked if on_cuda else {}
+        cls = resolve(task)
+        where = f"in the presets of {cls.__name__}"
+        for name, settings in cls.presets.items():
+            of = CONFIGS[check_choice(f"algorithm {where}", name, CONFIGS)]
+            for setting in settings:
+                check_setting(f"setting of {name} {where}", setting, of)
+        own = cls.presets if on_cuda else {}
     if algorithm is None:
         algorithm = next(iter(own), "reppo") if on_cuda else "ppo"
     kind = CONFIGS[check_choice("algorithm", algorithm, CONFIGS)]
@@ -467,20 +472,6 @@ def preset(
     if not is_runner(task) and kind is REPPOConfig:  # returns of either sign
         settings.setdefault("min_value", -settings.get("max_value", REPPOConfig.max_value))
     return kind(task, **{"device": str(device), **settings, **overrides})
-
-
-def checked_presets(cls: "type[LocoEnv]") -> Mapping[str, Mapping[str, Any]]:
-    """Returns the ``presets`` of a task, by algorithm.
-
-    Raises:
-        ValueError: they name something that is no algorithm or no setting of it.
-    """
-    where = f"in the presets of {cls.__name__}"
-    for algorithm, settings in cls.presets.items():
-        kind = CONFIGS[check_choice(f"algorithm {where}", algorithm, CONFIGS)]
-        for name in settings:
-            check_setting(f"setting of {algorithm} {where}", name, kind)
-    return cls.presets
 
 
 def check_setting(what: str, name: str, kind: type[TrainingConfig]) -> None:

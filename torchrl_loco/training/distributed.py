@@ -53,11 +53,6 @@ def _connected() -> bool:
     return dist.is_available() and dist.is_initialized()
 
 
-def was_launched() -> bool:
-    """Returns whether torchrun, or a launcher with the same environment variables, started this as one of several."""
-    return "RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
-
-
 def launch_id() -> str | None:
     """Returns a name of the launch by torchrun that stays the same when it restarts its processes, if there is one."""
     of = os.environ.get("TORCHELASTIC_RUN_ID")
@@ -111,7 +106,9 @@ def joined(device: str) -> Iterator[None]:
     Raises:
         ValueError: this machine has no GPU for this rank.
     """
-    if not was_launched() or _connected():
+    # torchrun, or a launcher with the same environment variables, may have started this as one of several.
+    launched = "RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
+    if not launched or _connected():
         yield
         return
     on_cuda = torch.device(device).type == "cuda"
@@ -224,11 +221,9 @@ def merged_moments(
 
 def mean_of_ranks(values: torch.Tensor) -> torch.Tensor:
     """Returns the mean over the ranks of ``values``, of any shape ``(...)``."""
-    if ranks() == 1:
-        return values
     values = values.clone()
-    _sum(values)
-    return values / ranks()
+    average([values])
+    return values
 
 
 def add_changes(values: torch.Tensor, before: torch.Tensor) -> None:

@@ -88,14 +88,9 @@ class Episodes:
         return round(sum(row[0] for row in self._window))
 
     @property
-    def mean_return(self) -> float:
-        """Their mean return; there must be some."""
-        return sum(row[1] for row in self._window) / self.count
-
-    @property
-    def mean_length(self) -> float:
-        """Their mean length (control steps), in training; there must be some."""
-        return sum(row[2] for row in self._window) / self.count
+    def means(self) -> tuple[float, float]:
+        """Their mean return, and their mean length (control steps) in training; there must be some."""
+        return sum(row[1] for row in self._window) / self.count, sum(row[2] for row in self._window) / self.count
 
     def restart(self) -> None:
         """Forgets all episodes, also those that are running: another policy plays from here on."""

@@ -13,7 +13,7 @@ from tensordict.nn import AddStateIndependentNormalScale
 from torch import nn
 from torch.func import functional_call
 from torchrl.envs.utils import ExplorationType, exploration_type
-from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP, ValueOperator
 
 from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
@@ -44,10 +44,25 @@ class PPO(Algorithm):
 
     def __init__(self, config: PPOConfig, spaces: Spaces, network: Network | None = None) -> None:
         super().__init__(config, spaces, network)
-        self.actor, self.critic, self.norms = make_actor_critic(config, spaces, network)
+
+        def make(inputs: int, outputs: int) -> nn.Module:
+            if network is not None:
+                return network_of(network, inputs, outputs)
+            return MLP(inputs, outputs, num_cells=list(config.hidden), activation_class=nn.SiLU)
+
+        self.norms = {"observation": ObservationNorm(spaces.observation)}
+        mean: Any = make(spaces.observation, spaces.action)
+        if network is None:
+            nn.init.orthogonal_(mean[-1].weight, gain=0.01)  # the first actions are near zero, whatever is observed
+        self._scale = AddStateIndependentNormalScale(spaces.action, init_value=math.log(config.init_std))
+        whole = nn.Sequential(self.norms["observation"], mean, self._scale)
+        self.actor = make_actor(spaces, config.device, whole, log_prob=True)
+        if spaces.privileged is not None:
+            self.norms["privileged"] = ObservationNorm(spaces.privileged)
+        value = make(spaces.critic, 1)
+        whole = nn.Sequential(self.norms[spaces.critic_key], value)
+        self.critic = ValueOperator(whole, in_keys=[spaces.critic_key]).to(config.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic})
-        parts: Any = self.actor[0].module, self.critic.module
-        (_, mean, self._scale), (_, value) = parts
         self._mean, self._value = Rows(mean, spaces.observation), Rows(value, spaces.critic)
         self._dtype = torch.bfloat16 if config.bf16 and self.device.type == "cuda" else torch.float32
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
@@ -414,32 +429,3 @@ class Rows:
             else:
                 rows = functional_call(layer, own, (rows,))
         return rows
-
-
-def make_actor_critic(
-    config: PPOConfig, spaces: Spaces, network: Network | None = None
-) -> tuple[ProbabilisticActor, ValueOperator, dict[str, ObservationNorm]]:
-    """Returns actor, critic and the norms of what they read, for PPO; the critic writes ``state_value``.
-
-    Args:
-        config: the settings.
-        spaces: what they read and write.
-        network: makes the actor's network, from an observation to means, and the critic's; else both are MLPs.
-    """
-
-    def make(inputs: int, outputs: int) -> nn.Module:
-        if network is not None:
-            return network_of(network, inputs, outputs)
-        return MLP(inputs, outputs, num_cells=list(config.hidden), activation_class=nn.SiLU)
-
-    norms = {"observation": ObservationNorm(spaces.observation)}
-    mean: Any = make(spaces.observation, spaces.action)
-    if network is None:
-        nn.init.orthogonal_(mean[-1].weight, gain=0.01)  # the first actions are near zero, whatever is observed
-    scale = AddStateIndependentNormalScale(spaces.action, init_value=math.log(config.init_std))
-    whole = nn.Sequential(norms["observation"], mean, scale)
-    actor = make_actor(spaces, config.device, whole, log_prob=True)
-    if spaces.privileged is not None:
-        norms["privileged"] = ObservationNorm(spaces.privileged)
-    critic = ValueOperator(nn.Sequential(norms[spaces.critic_key], make(spaces.critic, 1)), in_keys=[spaces.critic_key])
-    return actor, critic.to(config.device), norms

@@ -15,7 +15,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor
 from torch import nn
 from torch.nn.functional import cross_entropy, mse_loss
-from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from torchrl_loco.policy import ObservationNorm, layers_of
@@ -48,7 +47,18 @@ class REPPO(Algorithm):
     def __init__(self, config: REPPOConfig, spaces: Spaces, network: Network | None = None) -> None:
         super().__init__(config, spaces, network)
         self.action_bound = 1.0 if spaces.bounded else config.action_bound
-        self.actor, self.critic, self.norms = make_actor_q(config, spaces, network)
+        self.norms, outputs = {"observation": ObservationNorm(spaces.observation)}, 2 * spaces.action
+        if network is None:
+            head = nn.Linear(config.hidden[-1], outputs)
+            layers = [*normed_layers(spaces.observation, config.hidden), head]
+        else:
+            layers = layers_of(network_of(network, spaces.observation, outputs))
+        whole = nn.Sequential(self.norms["observation"], *layers, NormalParamExtractor("exp"))
+        self.actor = make_actor(spaces, config.device, whole, log_prob=False, bound=config.action_bound)
+        if spaces.privileged is not None:
+            self.norms["privileged"] = ObservationNorm(spaces.privileged).to(config.device)
+        bins = ValueBins(config.min_value, config.max_value, config.num_bins)
+        self.critic = DistributionalQ((spaces.critic, spaces.action), config.hidden, bins).to(config.device)
         self.distribution = self.actor[0].module[1:]  # from normalised observations to means and standard deviations
         self.dual = DualVariables(config).to(self.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "dual": self.dual})
@@ -372,28 +382,3 @@ def normed_layers(inputs: int, hidden: tuple[int, ...]) -> list[nn.Module]:
         layers += [nn.Linear(inputs, width), nn.LayerNorm(width), nn.SiLU()]
         inputs = width
     return layers
-
-
-def make_actor_q(
-    config: REPPOConfig, spaces: Spaces, network: Network | None = None
-) -> tuple[ProbabilisticActor, DistributionalQ, dict[str, ObservationNorm]]:
-    """Returns actor, critic and the norms of what they read, for REPPO.
-
-    Args:
-        config: the settings.
-        spaces: what they read and write.
-        network: makes the actor's network, from an observation to means and log deviations.
-    """
-    norms, outputs = {"observation": ObservationNorm(spaces.observation)}, 2 * spaces.action
-    if network is None:
-        head = nn.Linear(config.hidden[-1], outputs)
-        layers = [*normed_layers(spaces.observation, config.hidden), head]
-    else:
-        layers = layers_of(network_of(network, spaces.observation, outputs))
-    whole = nn.Sequential(norms["observation"], *layers, NormalParamExtractor("exp"))
-    actor = make_actor(spaces, config.device, whole, log_prob=False, bound=config.action_bound)
-    if spaces.privileged is not None:
-        norms["privileged"] = ObservationNorm(spaces.privileged).to(config.device)
-    bins = ValueBins(config.min_value, config.max_value, config.num_bins)
-    critic = DistributionalQ((spaces.critic, spaces.action), config.hidden, bins)
-    return actor, critic.to(config.device), norms

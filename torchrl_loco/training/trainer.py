@@ -304,9 +304,8 @@ class Trainer:
         if not self.episodes.count:
             estimate = round(mean_reward * self.environments.full_length, 3)
             return {"return": estimate, "episode_length": self._training_length, "episodes": 0}
-        episodes = self.episodes
-        means = round(episodes.mean_return, 3), round(episodes.mean_length, 1)
-        return {"return": means[0], "episode_length": means[1], "episodes": episodes.count}
+        earned, length = self.episodes.means
+        return {"return": round(earned, 3), "episode_length": round(length, 1), "episodes": self.episodes.count}
 
     def _evaluation_is_due(self) -> bool:
         interval = self.config.eval_interval
