@@ -113,13 +113,7 @@ def check_bool(name: str, value: Any) -> bool:
 
 
 def check_choice(name: str, value: Any, choices: Collection[str], also: Collection[str] = ()) -> str:
-    """Returns ``value``.
-
-    Args:
-        name: what the value is called.
-        value: the value.
-        choices: what it may be.
-        also: further names that the message may suggest, such as aliases.
+    """Returns ``value``; of ``also``, such as aliases, the message may suggest names too.
 
     Raises:
         ValueError: it is none of the choices.
@@ -202,12 +196,7 @@ def why_no_cuda() -> str:
 
 
 def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> Path:
-    """Returns ``value`` as the absolute path of a file that can be created.
-
-    Args:
-        name: what the value is called.
-        value: the path.
-        suffixes: what the file may end in; anything if empty.
+    """Returns ``value`` as the absolute path of a file that can be created, which ends in one of ``suffixes``, if any.
 
     Raises:
         TypeError: it is no path.
@@ -246,12 +235,7 @@ def is_run(path: Path) -> bool:
 
 
 def check_packages(purpose: str, packages: Collection[str], extra: str) -> None:
-    """Checks that packages are installed, without importing them.
-
-    Args:
-        purpose: what needs them.
-        packages: names by which they are imported.
-        extra: the extra of this package that installs them.
+    """Checks that packages, which an extra of this package installs, are there, without importing them.
 
     Raises:
         ImportError: one is not installed; the message says how to install it.

@@ -173,12 +173,7 @@ def env_class(id: str) -> "type[LocoEnv]":
 
 
 def summary(id: str) -> str:
-    """Returns what a task asks for, in a sentence.
-
-    Raises:
-        ValueError: there is no such task.
-        ImportError: the plug-in that it comes from is broken.
-    """
+    """Returns what a task asks for, in a sentence; errors are those of :func:`env_class`."""
     id = canonical_id(id)
     return registered()[id].summary or _first_line(env_class(id))
 
@@ -217,15 +212,7 @@ def task_name(task: "str | type[LocoEnv]", by_user: bool = False) -> str:
     of a function is found in this process only. A file is run again where it is looked up: what a script does beside
     defining classes belongs under ``if __name__ == "__main__"``.
 
-    Args:
-        task: what :func:`resolve` takes.
-        by_user: as there.
-
-    Raises:
-        ValueError: as :func:`resolve`.
-        TypeError: as :func:`resolve`.
-        FileNotFoundError: as :func:`resolve`.
-        ImportError: as :func:`resolve`.
+    Arguments and errors are those of :func:`resolve`.
     """
     if isinstance(task, str) and not is_place(task) and ALIASES.get(task, task) in installed():
         return canonical_id(task)
@@ -261,11 +248,10 @@ def _class_at(place: str, by_user: bool) -> "type[LocoEnv]":
     """Returns the class at ``"path/to/file.py:Class"`` or ``"module:Class"``.
 
     Raises:
-        UnnamedFileError: the user has not named it.
         ValueError: there is no such class.
         TypeError: it is a class of something else.
         OSError: there is no such file.
-        ImportError: the file or the module raises an error.
+        ImportError: the file or the module raises an error, or the user has not named it.
     """
     source, _, name = place.rpartition(":") if ":" in place else (place, "", "")
     try:

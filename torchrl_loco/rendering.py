@@ -23,11 +23,7 @@ def to_the_horizon(mj_model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def with_ghost(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Returns a model with its first body once more, which touches nothing: its positions follow those of the model.
-
-    Args:
-        spec: the model, which stays as it is.
-    """
+    """Returns a model with its first body once more, which touches nothing: its positions follow those of the model."""
     seen, other = spec.copy(), spec.copy()
     for geom in other.geoms:
         geom.contype = geom.conaffinity = 0
@@ -40,16 +36,7 @@ def with_ghost(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 class Renderer:
-    """Renders worlds of a model through one camera.
-
-    Args:
-        mj_model: the model.
-        device: where.
-        camera: name of a camera of the model.
-        width: pixels in a row, at least 1.
-        height: rows, at least 1.
-        worlds: how many worlds.
-    """
+    """Renders so many worlds of a model through one of its cameras, in ``height`` rows of ``width`` pixels."""
 
     def __init__(
         self, mj_model: mujoco.MjModel, device: wp.Device, camera: str, width: int, height: int, worlds: int

@@ -145,14 +145,8 @@ def make_actor(
 ) -> ProbabilisticActor:
     """Returns a Gaussian actor around a network that gives means and standard deviations, under tanh if it is bounded.
 
-    It reads ``observation`` and writes ``loc``, ``scale``, ``action`` and, if asked to, ``action_log_prob``.
-
-    Args:
-        spaces: what it reads and writes.
-        device: where it computes.
-        network: gives means and standard deviations.
-        log_prob: whether it writes the log-probability of the action.
-        bound: of actions that the environment does not bound; ``None`` leaves them without.
+    It reads ``observation`` and writes ``loc``, ``scale``, ``action`` and, if asked to, ``action_log_prob``. Actions
+    that the environment does not bound have ``bound``, if there is one.
     """
     shape = (spaces.action,)
     if spaces.bounded:

@@ -210,13 +210,7 @@ class Algorithm(ABC):
 
 
 class Acting(TensorDictModuleBase):
-    """An actor that is called through a faster function.
-
-    Args:
-        actor: the actor, whose parameters this has.
-        act: the function.
-        written: the entries that it writes; ``None`` are those of the actor.
-    """
+    """An actor that is called through a faster function, which may write other entries."""
 
     def __init__(
         self,

@@ -231,17 +231,8 @@ def unwrapped(env: EnvBase) -> tuple[LocoEnv, tuple[Transform, ...]]:
 def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: Any) -> LocoEnv:
     """Returns new worlds of the task of a policy, under the protocol that it was trained under, and at its stage.
 
-    Args:
-        policy: the policy.
-        num_envs: number of worlds.
-        device: where they compute.
-        seed: their seed.
-        settings: further arguments of :class:`torchrl_loco.LocoEnv`.
-
-    Raises:
-        ValueError: it was trained behind transforms.
-        OSError: the file of its task is missing.
-        ImportError: the file or module of its task is broken, or not known.
+    Arguments are those of :class:`torchrl_loco.LocoEnv`, and its errors those of :func:`refuse_transforms` and
+    :func:`torchrl_loco.registry.resolve`.
     """
     refuse_transforms(policy)
     info = policy.info

@@ -102,12 +102,7 @@ class Episodes:
         return {"sum": self._sum, "steps": self._steps, "whole": self._whole, "window": list(self._window)}
 
     def load_state_dict(self, state: dict[str, Any], running: bool) -> None:
-        """Continues from a ``state`` that :meth:`state_dict` returned.
-
-        Args:
-            state: the state.
-            running: whether the worlds go on as well, and with them their episodes.
-        """
+        """Continues from what :meth:`state_dict` returned, running episodes only if the worlds are ``running`` on."""
         self._window = collections.deque(state["window"])
         if running:
             self._sum, self._steps, self._whole = state["sum"], state["steps"], state["whole"]
@@ -116,12 +111,8 @@ class Episodes:
 class Trials:
     """Policies that are trained for the same number of frames, one after the other; the best is then trained on.
 
-    Often chance decides early what a policy becomes. With one trial nothing is compared. All ranks make the same calls.
-
-    Args:
-        config: the run's settings.
-        algorithm: what is trained.
-        frames_per_iteration: frames of a batch, over all ranks; a trial has whole ones.
+    Often chance decides early what a policy becomes. With one trial nothing is compared. A trial has whole batches of
+    all ranks, which make the same calls.
     """
 
     def __init__(self, config: TrainingConfig, algorithm: Algorithm, frames_per_iteration: int) -> None:
@@ -157,12 +148,7 @@ class Trials:
         return self.running and self.own_frames(frames) >= self._length
 
     def end(self, frames: int, mean: float) -> None:
-        """Ends a trial: the next policy begins, or after the last trial the best one goes on.
-
-        Args:
-            frames: frames of the run.
-            mean: return of the policy in its evaluation.
-        """
+        """Ends a trial whose policy earned ``mean``: the next begins, or after the last trial the best one goes on."""
         if distributed.is_first():
             tqdm.write(f"trial {self.label}: {mean:.1f} after {self.own_frames(frames):,} frames")
         is_best = mean > self._mean

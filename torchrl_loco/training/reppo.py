@@ -80,10 +80,6 @@ class REPPO(Algorithm):
         """Returns a function of tensors as kernels of torch.compile on CUDA, if the settings ask for that.
 
         Between the matrix products of small networks, torch spends most of a step reading and writing activations.
-
-        Args:
-            function: the function.
-            bf16: whether its matrix products are in bfloat16 on CUDA.
         """
 
         def in_bf16(*args: Any) -> Any:
@@ -151,13 +147,7 @@ class REPPO(Algorithm):
     def _values(
         self, observation: torch.Tensor, of_critic: torch.Tensor, noise: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Returns log-probability, value and features of one action in each state.
-
-        Args:
-            observation: what the actor reads, normalised, shape ``(..., n)``.
-            of_critic: what the critic reads, normalised, shape ``(..., m)``.
-            noise: from which the actions are made, standard normal, shape ``(..., nu)``.
-        """
+        """Returns log-probability, value and features of one action in each state, made of standard normal noise."""
         loc, scale = self.distribution(observation)
         action, log_prob = sample(loc, scale, noise)
         return log_prob, *self.critic.value_and_features(of_critic, action)
