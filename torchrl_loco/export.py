@@ -4,7 +4,6 @@ import copy
 import io
 import json
 import logging
-import math
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,7 +20,7 @@ from torchrl_loco.checks import check_output_file, check_packages
 from torchrl_loco.config import arguments_of
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.task import folder_of
-from torchrl_loco.policy import ObservationNorm, Policy
+from torchrl_loco.policy import Policy, difference, random_observations
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
 
@@ -66,15 +65,15 @@ def export_policy(policy: Policy, path: Path) -> float:
     if path.suffix == ".onnx":
         check_packages("exporting as ONNX", ("onnx", "onnxscript", "onnxruntime"), "onnx")
     original = _Network(policy)
-    observations = _random_observations(original)
+    observations = random_observations(original.layers, max(BATCH_SIZES), 4.0)  # some are clipped
     expected = original(observations)
     facts, reference = of_robot(policy)
     facts = {**_facts(policy, n=observations.shape[-1], m=expected.shape[-1]), **facts}
     network = _WithReference(original, reference) if reference else original
     content, play = (_as_onnx if path.suffix == ".onnx" else _as_program)(network, observations[:2], facts)
-    error = max(_difference(play(observations[:size]), expected[:size]) for size in BATCH_SIZES)
+    error = max(difference(play(observations[:size]), expected[:size]) for size in BATCH_SIZES)
     if not error <= TOLERANCE:  # true for NaN too
-        rounding = _difference(copy.deepcopy(original).double()(observations.double()), expected)
+        rounding = difference(copy.deepcopy(original).double()(observations.double()), expected)
         if not error <= (allowed := max(TOLERANCE, 2.0 * rounding)):
             raise RuntimeError(
                 f"the exported policy differs by {error:.1e} from the original, whose own rounding in float32 is "
@@ -124,25 +123,6 @@ def _inputs(network: nn.Module, observations: torch.Tensor) -> dict[str, torch.T
     return inputs
 
 
-def _outputs(network: nn.Module) -> list[str]:
-    """Returns the names of the outputs of a network."""
-    return ["action", *(network.names if isinstance(network, _WithReference) else ())]
-
-
-def _random_observations(network: _Network) -> torch.Tensor:
-    """Returns random observations, of which some are so far from those of the training that they are clipped.
-
-    Raises:
-        TypeError: the network does not begin by normalising observations.
-    """
-    norm = network.layers[0]
-    if not isinstance(norm, ObservationNorm):
-        raise TypeError(f"a policy must begin with an ObservationNorm, this one begins with {type(norm).__name__}")
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.randn(max(BATCH_SIZES), len(norm.mean), generator=generator)
-    return norm.mean + 4 * noise * (norm.var + 1e-6).sqrt()
-
-
 def _facts(policy: Policy, n: int, m: int) -> dict[str, Any]:
     info = policy.info
     return {
@@ -158,13 +138,6 @@ def _facts(policy: Policy, n: int, m: int) -> dict[str, Any]:
         "torchrl_loco": torchrl_loco.__version__,
         "info": info,
     }
-
-
-def _difference(actions: torch.Tensor, expected: torch.Tensor) -> float:
-    """Returns the largest difference, as a fraction of actions above 1; infinity if the shapes differ."""
-    if actions.shape != expected.shape:
-        return math.inf
-    return ((actions - expected).abs() / expected.abs().clamp(min=1.0)).max().item()
 
 
 Exported = tuple[bytes, Callable[[torch.Tensor], torch.Tensor]]
@@ -200,7 +173,7 @@ def _as_onnx(network: nn.Module, example: torch.Tensor, facts: dict[str, Any]) -
                 network,
                 tuple(inputs.values()),
                 input_names=list(inputs),
-                output_names=_outputs(network),
+                output_names=["action", *(network.names if isinstance(network, _WithReference) else ())],
                 dynamic_shapes={name: {0: "batch"} for name in inputs},
                 dynamo=True,
                 verbose=False,

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.modules.distributions.continuous import SafeTanhTransform
 
-from torchrl_loco.policy import ObservationNorm, Policy, copied, layers_of
+from torchrl_loco.policy import Policy, copied, difference, layers_of, random_observations
 from torchrl_loco.training.config import TrainingConfig
 
 Network = Callable[[int, int], nn.Module]
@@ -227,18 +227,12 @@ def _check_that_they_agree(policy: Policy, actor: ProbabilisticActor) -> None:
     """Compares a policy with the actor that it was made of, on the CPU and on random observations.
 
     Raises:
-        TypeError: the actor does not begin by normalising observations.
         RuntimeError: their actions differ by more than rounding does.
     """
-    norm: Any = policy.module[0]
-    if not isinstance(norm, ObservationNorm):
-        raise TypeError(f"an actor must begin by normalising observations, not with {type(norm).__name__}")
-    noise = torch.randn(64, len(norm.mean), generator=torch.Generator().manual_seed(0))
-    observation = norm.mean.cpu() + 2 * noise * (norm.var.cpu() + 1e-6).sqrt()
+    observation = random_observations(policy.module, 64, 2.0)
     network, last = copy.deepcopy(actor[0].module).cpu(), actor[-1]  # as a module it would import pandas
     expected = last.distribution_class(*network(observation), **last.distribution_kwargs).deterministic_sample
-    action = copy.deepcopy(policy.module).cpu()(observation)
-    error = ((action - expected).abs() / expected.abs().clamp(min=1.0)).max().item()
+    error = difference(copy.deepcopy(policy.module).cpu()(observation), expected)
     if not error <= TOLERANCE:  # true for NaN too
         raise RuntimeError(
             f"the policy would act differently from the actor that was trained, by up to {error:.2g}: a Sequential in "
