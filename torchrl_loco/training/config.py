@@ -276,12 +276,7 @@ class PPOConfig(TrainingConfig):
 
 @dataclasses.dataclass(frozen=True)
 class REPPOConfig(TrainingConfig):
-    """Settings of relative entropy pathwise policy optimization.
-
-    Raises:
-        TypeError: a field has the wrong type.
-        ValueError: a field is out of range, or does not fit another; the message names what is valid.
-    """
+    """Settings of relative entropy pathwise policy optimization."""
 
     algorithm: ClassVar[str] = "reppo"
     presets: ClassVar[dict[str, Settings]] = {

@@ -117,26 +117,22 @@ class Environments:
 
         If a world becomes non-finite, a NaN dump is written to ``nan_dump``, unless one is already there.
         """
-        config, env, runner = self._config, self._given, is_runner(self._config.task)
+        config, env = self._config, self._given
         if env is None:
-            env = make(
-                resolve(config.task),
+            env = self._made(
                 config.num_envs,
-                config.device,
                 config.seed,
-                config.protocol,
                 world_offset=distributed.rank() * config.num_envs,
                 stagger=True,
-                reward_terms=not runner,
-                metrics=True,
                 nan_dump=None if nan_dump.exists() else nan_dump,
                 episode_length=config.episode_length or self.full_length,
-                **config.of_env,
             )
         if config.action_repeat == 1:
             return env
         # The runners' tasks end at the time limit alone, and TorchRL's transform has less to do.
-        return TransformedEnv(env, (FrameSkipTransform if runner else ActionRepeat)(config.action_repeat))
+        return TransformedEnv(
+            env, (FrameSkipTransform if is_runner(config.task) else ActionRepeat)(config.action_repeat)
+        )
 
     def evaluation(self, episodes: int, seed: int, info: Mapping[str, Any] = NOTHING) -> EnvBase:
         """Returns worlds in which a policy of the run can be played, each for an episode of the task's own length.
@@ -167,7 +163,7 @@ class Environments:
         return self._made(1, seed, play=True)
 
     def _made(self, worlds: int, seed: int, **settings: Any) -> LocoEnv:
-        """Returns worlds as the run's, for evaluations."""
+        """Returns worlds as the run's, by themselves those of an evaluation."""
         config, base = self._config, self._base
         if base is None:
             place = resolve(config.task), worlds, config.device, seed, config.protocol

@@ -1,6 +1,7 @@
 """Plots of learning curves."""
 
 import io
+import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -51,7 +52,10 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
         config = group[0].load_config()
         label = f"{config.label}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds"
         metrics = [run.read_metrics() for run in group]
-        whole = [m for m in metrics if _is_whole(m["frames"], config.total_frames)] or metrics
+        # A run is whole if it had no room for a further batch as large as its last.
+        ends = [[0.0, *m["frames"]][-2:] for m in metrics]
+        beyond = [2 * last - before > config.total_frames for before, last in ends]
+        whole = list(itertools.compress(metrics, beyond)) or metrics
         curves = [dict(zip(m["frames"], m["return"], strict=True)) for m in whole]
         shared = sorted(set.intersection(*map(set, curves)))  # runs on several GPUs have fewer and larger batches
         returns = np.array([[curve[frames] for frames in shared] for curve in curves])
@@ -85,9 +89,3 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     content = io.BytesIO()
     figure.savefig(content, dpi=150, format=picture.suffix[1:] or "png")
     storage.replace_file(picture, content.getvalue())
-
-
-def _is_whole(frames: Sequence[float], total: int) -> bool:
-    """Returns whether a run with rows at these frames had no room for a further batch as large as its last."""
-    before, last = [0.0, *frames][-2:]
-    return 2 * last - before > total
