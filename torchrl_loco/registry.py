@@ -284,19 +284,6 @@ def _no_class(module: ModuleType, source: str, name: str) -> str:
     )
 
 
-def _module(name: str) -> ModuleType:
-    """Returns a module by its name.
-
-    Raises:
-        ImportError: there is none, or it raises an error.
-    """
-    try:
-        return importlib.import_module(name)
-    except Exception as error:  # a module may raise anything
-        hint = "; a class in a file is named as path/to/file.py:Class" if isinstance(error, ModuleNotFoundError) else ""
-        raise ImportError(f"the module {name!r} cannot be loaded: {type(error).__name__}: {error}{hint}") from error
-
-
 def _loaded(source: str) -> ModuleType | None:
     """Returns a file or a module that this process has run already, as a script or under its own name too."""
     if not source.endswith(".py"):
@@ -326,7 +313,13 @@ def _run(source: str, name: str, by_user: bool) -> ModuleType:
                 f"is in it, name it yourself, once: add --task {shlex.quote(place)} to the command, or call "
                 f"torchrl_loco.registry.resolve({place!r}, by_user=True)"
             )
-    return _module(source) if path is None else _module_of_file(path)
+    if path is not None:
+        return _module_of_file(path)
+    try:
+        return importlib.import_module(source)
+    except Exception as error:  # a module may raise anything
+        hint = "; a class in a file is named as path/to/file.py:Class" if isinstance(error, ModuleNotFoundError) else ""
+        raise ImportError(f"the module {source!r} cannot be loaded: {type(error).__name__}: {error}{hint}") from error
 
 
 def _file_of(module: str) -> Path | None:

@@ -89,29 +89,23 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
     """Returns the policy of a run folder or a file, and the path of its file.
 
     Of a run that was stopped before a policy was evaluated, it is that of the last checkpoint; a checkpoint can be
-    named, too.
-
-    Args:
-        source: the run folder, or the file.
-        device: where the policy computes.
-        task: the name of its task, as the user says; ``None`` for what the file says.
+    named, too. The user may say the name of its task; else it is what the file says.
     """
     if source.suffix == ".pt" and is_run(source.parent):
-        from torchrl_loco import training
+        from torchrl_loco.training import RunFolder
         from torchrl_loco.training.watching import last_policy
 
-        return last_policy(training.RunFolder(source.parent, task), device, source), source
+        return last_policy(RunFolder(source.parent, task), device, source), source
     if not source.is_dir():
         policy = torchrl_loco.Policy.load(source, device)
         policy.info["task"] = task or place_of(policy.info["task"], source.parent)
         return policy, source
-    from torchrl_loco import training
-
-    run = training.RunFolder(source, task)
-    if run.policy.is_file() or run.given or not run.has_checkpoint:
-        return run.load_policy(device), run.policy
+    from torchrl_loco.training import RunFolder
     from torchrl_loco.training.watching import last_policy
 
+    run = RunFolder(source, task)
+    if run.policy.is_file() or run.given or not run.has_checkpoint:
+        return run.load_policy(device), run.policy
     policy = last_policy(run, device)
     after = f"after {policy.info['frames']:,} frames"
     print(f"{run.path}: no policy was evaluated yet, this is that of the last checkpoint, {after}", file=sys.stderr)

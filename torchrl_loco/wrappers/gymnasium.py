@@ -53,7 +53,7 @@ class GymnasiumEnv(Env):
         height: int = 240,
         **settings: Any,
     ) -> None:
-        self.render_mode = check_render_mode(render_mode)
+        self.render_mode = None if render_mode is None else check_choice("render_mode", render_mode, RENDER_MODES)
         self._picture = (camera, width, height)
         self.env = made(env, None, settings)
         if self.env.batch_size[0] != 1:
@@ -165,7 +165,7 @@ class GymnasiumVectorEnv(VectorEnv):
         **settings: Any,
     ) -> None:
         self._torch = check_choice("arrays", arrays, ARRAYS) == "torch"
-        self.render_mode = check_render_mode(render_mode)
+        self.render_mode = None if render_mode is None else check_choice("render_mode", render_mode, RENDER_MODES)
         self._picture = (camera, width, height)
         self.env = made(env, num_envs, settings)
         self.num_envs = self.env.batch_size[0]
@@ -277,15 +277,6 @@ def rows_as_objects(data: Any, mask: np.ndarray) -> np.ndarray:
     for i in mask.nonzero()[0]:
         rows[i] = {key: x[i] for key, x in data.items()} if isinstance(data, dict) else data[i]
     return rows
-
-
-def check_render_mode(mode: str | None) -> str | None:
-    """Returns a render mode, which may be ``None``.
-
-    Raises:
-        ValueError: there is no such mode.
-    """
-    return None if mode is None else check_choice("render_mode", mode, RENDER_MODES)
 
 
 def render_metadata(env: EnvBase) -> dict[str, Any]:
