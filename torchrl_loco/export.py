@@ -67,8 +67,22 @@ def export_policy(policy: Policy, path: Path) -> float:
     original = _Network(policy)
     observations = random_observations(original.layers, max(BATCH_SIZES), 4.0)  # some are clipped
     expected = original(observations)
-    facts, reference = of_robot(policy)
-    facts = {**_facts(policy, n=observations.shape[-1], m=expected.shape[-1]), **facts}
+    of_task, reference = of_robot(policy)
+    info = policy.info
+    facts = {
+        "task": info["task"],
+        "protocol": info["protocol"],
+        "observation_size": observations.shape[-1],
+        "action_size": expected.shape[-1],
+        "action_low": -1.0 if policy.is_bounded else None,
+        "action_high": 1.0 if policy.is_bounded else None,
+        # Older files do not say it.
+        "control_timestep": info.get("control_timestep") or resolve(info["task"]).config.ctrl_dt,
+        "action_repeat": info["action_repeat"],
+        "torchrl_loco": torchrl_loco.__version__,
+        "info": info,
+        **of_task,
+    }
     network = _WithReference(original, reference) if reference else original
     content, play = (_as_onnx if path.suffix == ".onnx" else _as_program)(network, observations[:2], facts)
     error = max(difference(play(observations[:size]), expected[:size]) for size in BATCH_SIZES)
@@ -96,12 +110,7 @@ class _Network(nn.Module):
 
 
 class _WithReference(nn.Module):
-    """A network, and beside it the reference that it follows.
-
-    Args:
-        network: the network.
-        reference: tables ``(frames, ...)`` by name.
-    """
+    """A network, and beside it the reference that it follows, tables ``(frames, ...)`` by name."""
 
     def __init__(self, network: _Network, reference: Mapping[str, torch.Tensor]) -> None:
         super().__init__()
@@ -121,23 +130,6 @@ def _inputs(network: nn.Module, observations: torch.Tensor) -> dict[str, torch.T
     if isinstance(network, _WithReference):
         inputs["time_step"] = torch.zeros(len(observations), dtype=torch.int64)
     return inputs
-
-
-def _facts(policy: Policy, n: int, m: int) -> dict[str, Any]:
-    info = policy.info
-    return {
-        "task": info["task"],
-        "protocol": info["protocol"],
-        "observation_size": n,
-        "action_size": m,
-        "action_low": -1.0 if policy.is_bounded else None,
-        "action_high": 1.0 if policy.is_bounded else None,
-        # Older files do not say it.
-        "control_timestep": info.get("control_timestep") or resolve(info["task"]).config.ctrl_dt,
-        "action_repeat": info["action_repeat"],
-        "torchrl_loco": torchrl_loco.__version__,
-        "info": info,
-    }
 
 
 Exported = tuple[bytes, Callable[[torch.Tensor], torch.Tensor]]

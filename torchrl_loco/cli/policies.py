@@ -434,7 +434,9 @@ def verify(
         conditions: what the policy must hold in.
     """
     with user_errors(), tempfile.TemporaryDirectory() as folder:
+        from torchrl_loco import storage
         from torchrl_loco import verify as verification
+        from torchrl_loco.export import export_policy, why_not
 
         conditions.check()
         out = None if out is None else check_output_file("out", out, (".json",))
@@ -443,8 +445,14 @@ def verify(
             named = which.task if which.policy is None else run_task_or_file
             named = None if named is None else _task(named)
         else:
-            path, in_run = _exported_for(run_task_or_file, which, Path(folder))
-            out, named = in_run if out is None else out, None
+            exported, beside = which.load(run_task_or_file, "cpu")
+            if reason := why_not(exported):
+                raise ValueError(f"{run_task_or_file} cannot be verified: {reason}")
+            path, named = Path(folder) / "policy.onnx", None
+            with user_errors(RuntimeError):  # of the export alone
+                export_policy(exported, path)
+            if out is None and is_run(beside.parent):
+                out = storage.unused_path(beside.with_name("verify.json"))
         print(f"verifying: {conditions.episodes} episodes, which take minutes on a CPU", file=sys.stderr, flush=True)
         report = verification.verify(path, conditions, device, alone=alone, task=named, options=which.given)
         print(*report.lines, sep="\n")
@@ -453,17 +461,3 @@ def verify(
             print(out)
     if not report.holds:
         raise SystemExit(1)
-
-
-def _exported_for(run_or_task: str, which: Which, folder: Path) -> tuple[Path, Path | None]:
-    """Exports a policy into a folder. Returns the file, and where figures belong in its run folder, if it has one."""
-    from torchrl_loco import storage
-    from torchrl_loco.export import export_policy, why_not
-
-    policy, beside = which.load(run_or_task, "cpu")
-    if reason := why_not(policy):
-        raise ValueError(f"{run_or_task} cannot be verified: {reason}")
-    path = folder / "policy.onnx"
-    with user_errors(RuntimeError):  # of the export alone
-        export_policy(policy, path)
-    return path, storage.unused_path(beside.with_name("verify.json")) if is_run(beside.parent) else None

@@ -296,10 +296,7 @@ class Packed:
 def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
     """Gives networks the weights of a run's checkpoint, actor and critic, or the actor those of a policy file.
 
-    Args:
-        algorithm: its networks are changed.
-        source: a run folder, or a policy file. A run without a checkpoint has a policy.
-        device: where they compute.
+    A run without a checkpoint has a policy.
 
     Raises:
         FileNotFoundError: there is no such run or file.
