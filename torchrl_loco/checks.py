@@ -133,9 +133,7 @@ def suggestion(word: str, choices: Collection[str]) -> str:
 def check_fields(config: Any, intervals: Mapping[str, Interval]) -> None:
     """Checks the fields of a dataclass that are numbers or flags, and stores them in their canonical type.
 
-    Args:
-        config: an instance, which may be frozen and just being made.
-        intervals: intervals of the fields that are not simply positive.
+    It may be frozen and just being made. Fields without an interval are positive.
 
     Raises:
         TypeError: a field has the wrong type.
@@ -143,11 +141,13 @@ def check_fields(config: Any, intervals: Mapping[str, Interval]) -> None:
     """
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
+        if value is None and field.type == float | None:
+            continue
         if field.type is bool:
             value = check_bool(field.name, value)
         elif field.type is int:
             value = check_int(field.name, value, intervals.get(field.name, POSITIVE_INT))
-        elif field.type is float:
+        elif field.type in (float, float | None):
             value = check_float(field.name, value, intervals.get(field.name, POSITIVE))
         object.__setattr__(config, field.name, value)
 

@@ -171,7 +171,12 @@ class TrainingConfig:
         object.__setattr__(self, "device", str(self.device))
         object.__setattr__(self, "out", Path(self.out))
         object.__setattr__(self, "hidden", tuple(self.hidden))
-        object.__setattr__(self, "sim", _checked_sim(self.sim))
+        if not isinstance(self.sim, Sim):
+            if not isinstance(self.sim, Mapping):
+                raise TypeError(f"sim must be a dict of fields of torchrl_loco.SimConfig, got {self.sim!r}")
+            names = [field.name for field in dataclasses.fields(Sim)]
+            chosen = {check_choice("field of sim", name, names): value for name, value in self.sim.items()}
+            object.__setattr__(self, "sim", Sim(**chosen))
         object.__setattr__(self, "options", dict(self.options))
         object.__setattr__(self, "init", str(Path(self.init).expanduser().resolve()) if self.init else "")
         # Whether the machine has the device is checked when the run starts.
@@ -353,21 +358,6 @@ class REPPOConfig(TrainingConfig):
                 raise ValueError(f"init_{name} ({first}) must not be below min_{name} ({least})")
         if self.min_value >= self.max_value:
             raise ValueError(f"min_value ({self.min_value:g}) must be below max_value ({self.max_value:g})")
-
-
-def _checked_sim(sim: Any) -> Any:
-    """Returns fields of the simulation's settings, of a dict too.
-
-    Raises:
-        ValueError: there is no such field.
-        TypeError: they are no dict.
-    """
-    if isinstance(sim, Sim):
-        return sim
-    if not isinstance(sim, Mapping):
-        raise TypeError(f"sim must be a dict of fields of torchrl_loco.SimConfig, got {sim!r}")
-    names = [field.name for field in dataclasses.fields(Sim)]
-    return Sim(**{check_choice("field of sim", name, names): value for name, value in sim.items()})
 
 
 def _stored_name(task: Any) -> str:
