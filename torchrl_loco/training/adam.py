@@ -1,6 +1,6 @@
 """Adam on clipped gradients in one kernel: parameters and moments lie in one vector each."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -56,7 +56,10 @@ class FlatAdam:
         not require them.
         """
         self.adopt()
-        return {part: view for vectors in self._vectors for part, view in vectors.wide(dtype)}
+        views = [
+            zip(vectors.parts, vectors.wide_views(vectors.whole.to(dtype)), strict=True) for vectors in self._vectors
+        ]
+        return {part: view if part.requires_grad else view.detach() for pairs in views for part, view in pairs}
 
     def adopt(self) -> None:
         """Takes parameters back that were moved out of the vectors, as by ``module.to`` or a second optimizer."""
@@ -89,7 +92,10 @@ class FlatAdam:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns moments and steps by the number of the parameter, and settings by group, as they are."""
-        states = [state for vectors in self._vectors for state in vectors.states()]
+        moments = [
+            (of.counts[0], *both) for of in self._vectors for both in zip(*map(of.views, of.moments), strict=True)
+        ]
+        states = [dict(zip(("step", "exp_avg", "exp_avg_sq"), each, strict=True)) for each in moments]
         numbers = iter(range(len(states)))
         groups = [{**group, "params": [next(numbers) for _ in group["params"]]} for group in self.param_groups]
         return {"state": dict(enumerate(states)), "param_groups": groups}
@@ -153,7 +159,7 @@ class Vectors:
         """
         if [part.data_ptr() for part in self.parts] == self._addresses:
             return
-        views = self._views(self.whole)
+        views = self.views(self.whole)
         moved = [
             (part, view) for part, view in zip(self.parts, views, strict=True) if part.data_ptr() != view.data_ptr()
         ]
@@ -163,7 +169,7 @@ class Vectors:
             part.data = view.copy_(part)
         self._addresses = [view.data_ptr() for view in views]
 
-    def _wide_views(self, vector: Tensor) -> list[Tensor]:
+    def wide_views(self, vector: Tensor) -> list[Tensor]:
         """Returns the parts of a vector in the shapes of the parameters, but for the rows of matrices with gaps."""
         pieces = zip(self.parts, vector.split(self._sizes)[::2], self._wide_rows, strict=True)
         return [
@@ -171,28 +177,18 @@ class Vectors:
             for part, piece, (_, wide) in pieces
         ]
 
-    def _views(self, vector: Tensor) -> list[Tensor]:
+    def views(self, vector: Tensor) -> list[Tensor]:
         """Returns the parts of a vector in the shapes of the parameters."""
-        views = zip(self.parts, self._wide_views(vector), strict=True)
+        views = zip(self.parts, self.wide_views(vector), strict=True)
         return [view[..., : part.shape[-1]] if part.ndim > 1 else view for part, view in views]
-
-    def wide(self, dtype: torch.dtype) -> Iterator[tuple[nn.Parameter, Tensor]]:
-        """Yields each parameter with itself in another type, with rows as long as they lie in the vector."""
-        for part, view in zip(self.parts, self._wide_views(self.whole.to(dtype)), strict=True):
-            yield part, view if part.requires_grad else view.detach()
 
     def gradient(self) -> Tensor:
         """Returns the gradient, zero where there is none: that of the vector, and the parameters' own beside it."""
         gradient = torch.zeros_like(self.whole) if self.whole.grad is None else self.whole.grad
-        own = [(part.grad, view) for part, view in zip(self.parts, self._views(gradient), strict=True)]
+        own = [(part.grad, view) for part, view in zip(self.parts, self.views(gradient), strict=True)]
         found = [(of_part, view) for of_part, view in own if of_part is not None]
         torch._foreach_add_([view for _, view in found], [of_part for of_part, _ in found])
         return gradient
-
-    def states(self) -> Iterator[dict[str, Tensor]]:
-        """Yields what Adam keeps of each parameter, as views."""
-        for moments in zip(*map(self._views, self.moments), strict=True):
-            yield dict(zip(("step", "exp_avg", "exp_avg_sq"), (self.counts[0], *moments), strict=True))
 
 
 @wp.kernel(enable_backward=False)

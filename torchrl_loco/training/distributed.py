@@ -227,12 +227,7 @@ def mean_of_ranks(values: torch.Tensor) -> torch.Tensor:
 
 
 def add_changes(values: torch.Tensor, before: torch.Tensor) -> None:
-    """Writes into ``values``, of any shape and type, what they were before plus the changes of all ranks.
-
-    Args:
-        values: those of this rank.
-        before: what they were on all ranks; it becomes the same.
-    """
+    """Writes into ``values`` and ``before``, of any shape and type, what was before plus the changes of all ranks."""
     if ranks() > 1:
         change = (values - before).double()
         _sum(change)
@@ -280,14 +275,7 @@ def from_first(value: Any) -> Any:
 
 
 def gathered(state: dict[str, Any]) -> list[dict[str, Any]]:
-    """Collects a state from each rank.
-
-    Args:
-        state: tensors and numbers, in dictionaries.
-
-    Returns:
-        On rank 0 those of all ranks in their order, with tensors on the CPU; nothing elsewhere.
-    """
+    """Returns on rank 0 the states of all ranks in their order, with tensors on the CPU; nothing elsewhere."""
     if ranks() == 1:
         return [state]
     buffer = io.BytesIO()  # a pickled tensor of CUDA would be put on its rank's GPU again

@@ -409,12 +409,7 @@ class Rows:
             self._layers = layers if torch.allclose(found, expected, rtol=1e-4, atol=1e-5) else self._layers
 
     def __call__(self, rows: torch.Tensor, weights: Mapping[nn.Parameter, torch.Tensor]) -> torch.Tensor:
-        """Returns what it gives for ``rows``, shape ``(..., outputs)``.
-
-        Args:
-            rows: of at least as many numbers as it reads.
-            weights: what takes the place of each parameter; of matrices, rows may be longer as well.
-        """
+        """Returns what it gives, ``(..., outputs)``, with ``weights`` for its own, whose rows may be longer as well."""
         for index, layer in enumerate(self._layers):
             reads_long = index == 0 and isinstance(layer, nn.Linear)
             if index == 0 and not reads_long:
