@@ -24,8 +24,9 @@ from generate.viewer import chrome
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from torchrl_loco.viewer.player import Player
 from torchrl_loco.viewer.settings import is_foreign
-from torchrl_loco.viewer.viewer import Player, Viewer, cores
+from torchrl_loco.viewer.viewer import Viewer, cores
 
 
 class Led(loco.WalkerStand):

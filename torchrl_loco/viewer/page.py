@@ -6,7 +6,7 @@ import http
 import io
 import threading
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,10 +16,8 @@ from mjviser import ViserMujocoScene
 from viser import uplot
 
 from torchrl_loco.motion import poses
+from torchrl_loco.viewer.player import Player
 from torchrl_loco.viewer.settings import is_foreign
-
-if TYPE_CHECKING:
-    from torchrl_loco.viewer.viewer import Player
 
 SOLVER = {"iterations": 100, "ls_iterations": 50}
 """With which C MuJoCo finds the forces that arrows show: it converges, whatever the worlds' own settings are."""
@@ -95,7 +93,7 @@ class Page:
     """
 
     def __init__(
-        self, player: "Player", host: str, port: int, title: str, act: Callable[[Callable[[], None]], None]
+        self, player: Player, host: str, port: int, title: str, act: Callable[[Callable[[], None]], None]
     ) -> None:
         self._player, self._act, self.world = player, act, 0
         with contextlib.redirect_stdout(io.StringIO()), _for_own_page():  # without viser's banner

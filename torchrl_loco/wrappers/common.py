@@ -9,8 +9,11 @@ from torchrl.data import Composite
 from torchrl.envs import EnvBase
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
+from torchrl_loco.checks import check_choice
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.registry import make
+
+RENDER_MODES = ("rgb_array",)
 
 
 def made(env: str | type[LocoEnv] | EnvBase, num_envs: int | None, settings: dict[str, Any]) -> EnvBase:
@@ -53,6 +56,38 @@ def step_worlds(env: EnvBase, td: TensorDictBase, actions: Any) -> tuple[TensorD
 def groups_of(env: EnvBase) -> list[str]:
     """Returns the groups of observations; what is nested is none of them: the terms of the reward."""
     return [key for key, spec in env.observation_spec.items() if not isinstance(spec, Composite)]
+
+
+def observations(td: TensorDictBase, groups: list[str]) -> Any:
+    """Returns the tensor of the policy, or a dictionary where there are further groups."""
+    return td["observation"] if groups == ["observation"] else {key: td[key] for key in groups}
+
+
+def to_numpy(data: Any) -> Any:
+    """Returns a tensor, or those of a dictionary, as arrays on the host."""
+    return {key: x.numpy(force=True) for key, x in data.items()} if isinstance(data, dict) else data.numpy(force=True)
+
+
+def rows_as_objects(data: Any, mask: np.ndarray) -> np.ndarray:
+    """Returns an array of objects, ``(num_envs,)``: the rows of the mask, each an observation; ``None`` elsewhere."""
+    rows = np.full(len(mask), None, dtype=object)
+    for i in mask.nonzero()[0]:
+        rows[i] = {key: x[i] for key, x in data.items()} if isinstance(data, dict) else data[i]
+    return rows
+
+
+def check_render_mode(mode: str | None) -> str | None:
+    """Returns a render mode, which may be ``None``.
+
+    Raises:
+        ValueError: there is no such mode.
+    """
+    return None if mode is None else check_choice("render_mode", mode, RENDER_MODES)
+
+
+def render_metadata(env: EnvBase) -> dict[str, Any]:
+    """Returns what Gymnasium's metadata say of pictures."""
+    return {"render_modes": list(RENDER_MODES), "render_fps": round(1 / base_of(env).config.ctrl_dt)}
 
 
 def pictures(env: EnvBase, picture: tuple[str, int, int]) -> np.ndarray:

@@ -6,18 +6,26 @@ import numpy as np
 import torch
 from gymnasium import Env
 from gymnasium.error import ResetNeeded
-from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from tensordict import TensorDictBase
-from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 
 from torchrl_loco.checks import check_choice
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.wrappers.common import base_of, groups_of, made, pictures, step_worlds
+from torchrl_loco.wrappers.common import (
+    check_render_mode,
+    groups_of,
+    made,
+    observations,
+    pictures,
+    render_metadata,
+    rows_as_objects,
+    step_worlds,
+    to_numpy,
+)
+from torchrl_loco.wrappers.spaces import box, observation_space
 
-RENDER_MODES = ("rgb_array",)
 ARRAYS = ("numpy", "torch")
 
 
@@ -53,7 +61,7 @@ class GymnasiumEnv(Env):
         height: int = 240,
         **settings: Any,
     ) -> None:
-        self.render_mode = None if render_mode is None else check_choice("render_mode", render_mode, RENDER_MODES)
+        self.render_mode = check_render_mode(render_mode)
         self._picture = (camera, width, height)
         self.env = made(env, None, settings)
         if self.env.batch_size[0] != 1:
@@ -165,7 +173,7 @@ class GymnasiumVectorEnv(VectorEnv):
         **settings: Any,
     ) -> None:
         self._torch = check_choice("arrays", arrays, ARRAYS) == "torch"
-        self.render_mode = None if render_mode is None else check_choice("render_mode", render_mode, RENDER_MODES)
+        self.render_mode = check_render_mode(render_mode)
         self._picture = (camera, width, height)
         self.env = made(env, num_envs, settings)
         self.num_envs = self.env.batch_size[0]
@@ -241,44 +249,3 @@ class GymnasiumVectorEnv(VectorEnv):
     def close_extras(self, **_: Any) -> None:
         """Frees the memory of the worlds."""
         self.env.close()
-
-
-def observation_space(env: EnvBase) -> Box | Dict:
-    """Returns the space of an observation of one world, or a dictionary of those of its groups."""
-    groups = groups_of(env)
-    boxes = {key: box(env.observation_spec[key]) for key in groups}
-    return boxes["observation"] if groups == ["observation"] else Dict(boxes)
-
-
-def box(spec: TensorSpec) -> Box:
-    """Returns the space of one world."""
-    shape, dtype = tuple(spec.shape[1:]), torch.empty(0, dtype=spec.dtype).numpy().dtype
-    if dtype.kind == "b":
-        return Box(False, True, shape, np.bool_)
-    if dtype.kind == "f" and not isinstance(spec, Bounded):  # TorchRL says the largest float
-        return Box(-np.inf, np.inf, shape, dtype.type)
-    low, high = (bound[0].numpy(force=True) for bound in (spec.space.low, spec.space.high))
-    return Box(low, high, shape, dtype.type)
-
-
-def observations(td: TensorDictBase, groups: list[str]) -> Any:
-    """Returns the tensor of the policy, or a dictionary where there are further groups."""
-    return td["observation"] if groups == ["observation"] else {key: td[key] for key in groups}
-
-
-def to_numpy(data: Any) -> Any:
-    """Returns a tensor, or those of a dictionary, as arrays on the host."""
-    return {key: x.numpy(force=True) for key, x in data.items()} if isinstance(data, dict) else data.numpy(force=True)
-
-
-def rows_as_objects(data: Any, mask: np.ndarray) -> np.ndarray:
-    """Returns an array of objects, ``(num_envs,)``: the rows of the mask, each an observation; ``None`` elsewhere."""
-    rows = np.full(len(mask), None, dtype=object)
-    for i in mask.nonzero()[0]:
-        rows[i] = {key: x[i] for key, x in data.items()} if isinstance(data, dict) else data[i]
-    return rows
-
-
-def render_metadata(env: EnvBase) -> dict[str, Any]:
-    """Returns what Gymnasium's metadata say of pictures."""
-    return {"render_modes": list(RENDER_MODES), "render_fps": round(1 / base_of(env).config.ctrl_dt)}

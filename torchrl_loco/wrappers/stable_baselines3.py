@@ -7,8 +7,18 @@ from stable_baselines3.common.vec_env import VecEnv
 from torchrl.envs import EnvBase
 
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.wrappers.common import pictures
-from torchrl_loco.wrappers.gymnasium import GymnasiumVectorEnv
+from torchrl_loco.wrappers.common import (
+    check_render_mode,
+    groups_of,
+    made,
+    observations,
+    pictures,
+    render_metadata,
+    rows_as_objects,
+    step_worlds,
+    to_numpy,
+)
+from torchrl_loco.wrappers.spaces import box, observation_space
 
 
 class StableBaselines3VecEnv(VecEnv):
@@ -52,17 +62,21 @@ class StableBaselines3VecEnv(VecEnv):
         height: int = 240,
         **settings: Any,
     ) -> None:
+        self.render_mode = check_render_mode(render_mode)
         self._picture = (camera, width, height)
-        self._worlds = GymnasiumVectorEnv(env, num_envs, render_mode=render_mode, **settings)
-        self.env, self.render_mode = self._worlds.env, render_mode
-        spaces = self._worlds.single_observation_space, self._worlds.single_action_space
-        super().__init__(self._worlds.num_envs, *spaces)
-        self.metadata = self._worlds.metadata
+        self.env = made(env, num_envs, settings)
+        self.num_envs = self.env.batch_size[0]
+        super().__init__(self.num_envs, observation_space(self.env), box(self.env.action_spec))
+        self.metadata = render_metadata(self.env)
+        self._groups = groups_of(self.env)
 
     def reset(self) -> Any:
         """Returns the first observations of all worlds, under the seed that ``seed()`` was given before, if any."""
-        seed, self._seeds = self._seeds[0], [None] * self.num_envs
-        return self._worlds.reset(seed=seed)[0]
+        if self._seeds[0] is not None:
+            self.env.set_seed(self._seeds[0])
+        self._seeds = [None] * self.num_envs
+        self._td = self.env.reset()
+        return to_numpy(observations(self._td, self._groups))
 
     def step_async(self, actions: np.ndarray) -> None:
         """Takes the actions, ``(num_envs, ...)``; ``step_wait`` steps."""
@@ -75,15 +89,14 @@ class StableBaselines3VecEnv(VecEnv):
             The observations after the resets; rewards and dones of the step, ``(num_envs,)`` each; and the infos of
             each world.
         """
-        seen, rewards, terminated, truncated, said = self._worlds.step(self._actions)
-        dones = terminated | truncated
+        after, self._td = step_worlds(self.env, self._td, self._actions)
+        rewards, dones, terminated = (to_numpy(after[key].squeeze(-1)) for key in ("reward", "done", "terminated"))
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for world in dones.nonzero()[0]:
-            infos[world] = {
-                "terminal_observation": said["final_obs"][world],
-                "TimeLimit.truncated": not terminated[world],
-            }
-        return seen, rewards, dones, infos
+        if dones.any():
+            last = rows_as_objects(to_numpy(observations(after, self._groups)), dones)
+            for world in dones.nonzero()[0]:
+                infos[world] = {"terminal_observation": last[world], "TimeLimit.truncated": not terminated[world]}
+        return to_numpy(observations(self._td, self._groups)), rewards, dones, infos
 
     def get_images(self) -> list[np.ndarray]:
         """Returns the current picture of each world, uint8 ``(height, width, 3)``, which ``render()`` joins."""
