@@ -159,3 +159,10 @@ def test_a_device_may_be_torchs_own():
     for wrong in ("cpu:1", 3):
         with pytest.raises(ValueError, match="choose one of cpu, cuda, cuda:0"):
             dataclasses.replace(config, device=wrong)
+
+
+def test_equal_settings_have_equal_hashes():
+    """Settings are keys, also those with options of the task."""
+    configs = {preset("g1_tracking", "cpu", motion=["a.csv"], seed=seed) for seed in (0, 1, 0)}
+    assert {config.seed for config in configs} == {0, 1}
+    assert len(configs) == 2

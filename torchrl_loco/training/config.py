@@ -1,6 +1,7 @@
 """The settings of a training run: what is valid, and which are used for a task on a device."""
 
 import dataclasses
+import json
 import math
 import re
 from collections.abc import Collection, Mapping
@@ -66,6 +67,13 @@ Sim: Any = dataclasses.make_dataclass(
     frozen=True,
 )
 AS_THE_TASK = Sim()
+
+
+class Options(dict[str, Any]):
+    """Values of a task's own options by name, as JSON can hold them. They do not change."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(json.dumps(self, sort_keys=True))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,7 +185,7 @@ class TrainingConfig:
             names = [field.name for field in dataclasses.fields(Sim)]
             chosen = {check_choice("field of sim", name, names): value for name, value in self.sim.items()}
             object.__setattr__(self, "sim", Sim(**chosen))
-        object.__setattr__(self, "options", dict(self.options))
+        object.__setattr__(self, "options", Options(self.options))
         object.__setattr__(self, "init", str(Path(self.init).expanduser().resolve()) if self.init else "")
         # Whether the machine has the device is checked when the run starts.
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
@@ -281,7 +289,12 @@ class PPOConfig(TrainingConfig):
 
 @dataclasses.dataclass(frozen=True)
 class REPPOConfig(TrainingConfig):
-    """Settings of relative entropy pathwise policy optimization."""
+    """Settings of relative entropy pathwise policy optimization.
+
+    Raises:
+        TypeError: a field has the wrong type.
+        ValueError: a field is out of range, or does not fit another; the message names what is valid.
+    """
 
     algorithm: ClassVar[str] = "reppo"
     presets: ClassVar[dict[str, Settings]] = {

@@ -1,30 +1,31 @@
 """Plots of learning curves."""
 
+import dataclasses
 import io
-import itertools
-import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from torchrl_loco import storage
 from torchrl_loco.checks import check_packages
+from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
 
 check_packages("a plot", ["matplotlib"], "train")  # so that a run fails at its start, though it imports it at its end
 
-IRRELEVANT = {
-    "seed",
-    "out",
-    "device",
-    "eval_interval",
-    "eval_episodes",
-    "video_seconds",
-    "checkpoint_seconds",
-    "logger",
+IRRELEVANT: dict[str, Any] = {
+    "seed": 0,
+    "out": Path(),
+    "device": "cpu",
+    "eval_interval": 0,
+    "eval_episodes": 1,
+    "video_seconds": 0.0,
+    "checkpoint_seconds": 0.0,
+    "logger": (),
 }
-"""Settings that do not affect learning: runs are grouped without them."""
+"""Settings that do not affect learning, each with a fixed value, so that runs can be grouped without them."""
 
 
 def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
@@ -39,23 +40,17 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     """
     if not runs:
         raise ValueError("no runs to plot")
-    groups: dict[str, list[RunFolder]] = {}
+    groups: dict[TrainingConfig, list[RunFolder]] = {}
     for run in runs:
-        settings = run.load_config().to_json()
-        relevant = {name: value for name, value in settings.items() if name not in IRRELEVANT}
-        groups.setdefault(json.dumps(relevant, sort_keys=True), []).append(run)
+        groups.setdefault(dataclasses.replace(run.load_config(), **IRRELEVANT), []).append(run)
     from matplotlib.figure import Figure  # takes a second
 
     figure = Figure(figsize=(7, 4.2), layout="constrained")  # without pyplot: a caller's backend stays as it is
     axes = figure.subplots()
-    for group in groups.values():
-        config = group[0].load_config()
+    for config, group in groups.items():
         label = f"{config.label}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds"
         metrics = [run.read_metrics() for run in group]
-        # A run is whole if it had no room for a further batch as large as its last.
-        ends = [[0.0, *m["frames"]][-2:] for m in metrics]
-        beyond = [2 * last - before > config.total_frames for before, last in ends]
-        whole = list(itertools.compress(metrics, beyond)) or metrics
+        whole = [m for m in metrics if _is_whole(m["frames"], config.total_frames)] or metrics
         curves = [dict(zip(m["frames"], m["return"], strict=True)) for m in whole]
         shared = sorted(set.intersection(*map(set, curves)))  # runs on several GPUs have fewer and larger batches
         returns = np.array([[curve[frames] for frames in shared] for curve in curves])
@@ -89,3 +84,9 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     content = io.BytesIO()
     figure.savefig(content, dpi=150, format=picture.suffix[1:] or "png")
     storage.replace_file(picture, content.getvalue())
+
+
+def _is_whole(frames: Sequence[float], total: int) -> bool:
+    """Returns whether a run with rows at these frames had no room for a further batch as large as its last."""
+    before, last = [0.0, *frames][-2:]
+    return 2 * last - before > total
