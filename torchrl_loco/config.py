@@ -147,12 +147,10 @@ CONVERGED: dict[str, Any] = {"iterations": 100, "ls_iterations": 50, "euler_damp
 
 NO_ARGUMENTS = {
     "from_pixels": "pixels come from env.render() or a VideoRecorder around env.render, see docs/api/rendering.md",
-    "auto_reset": "step_and_maybe_reset, rollout and collectors reset by themselves",
-    "policy": "pass it to rollout or to a collector",
     "frame_skip": "pass ctrl_dt, the time between two actions, or use TorchRL's FrameSkipTransform",
     "render_mode": "call env.render(); the Gymnasium wrapper in torchrl_loco.wrappers takes a render_mode",
 }
-"""Arguments that other environments take, or TorchRL before an environment is made, and what to do instead."""
+"""Arguments that other environments take, and what to do instead."""
 
 
 def sim_config(

@@ -65,12 +65,12 @@ def _stand_in() -> None:
     torch._dynamo = _Stub(COMPILER)  # which the import of the compiler replaces
 
 
-def _mark(mark: str, function: Any) -> Any:
+def _mark(mark: str, fn: Any) -> Any:
     """Returns what the function of ``torch.compiler`` that is named ``mark`` does, which has its effect later."""
-    if _is_imported or not callable(function):  # several, or an error
-        return _own[mark](function)
-    _marked.append((mark, function))
-    return function
+    if _is_imported or not callable(fn):  # several, or an error
+        return _own[mark](fn)
+    _marked.append((mark, fn))
+    return fn
 
 
 def disable(fn: Any = None, recursive: bool = True, *, reason: str | None = None) -> Any:

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_loco import known_files, tasks
 from torchrl_loco.checks import check_choice, suggestion
-from torchrl_loco.config import NO_ARGUMENTS
 
 if TYPE_CHECKING:
     from torchrl_loco.envs import LocoEnv
@@ -413,6 +412,13 @@ def _attribute(thing: Any, name: str) -> Any:
     return functools.reduce(lambda owner, part: getattr(owner, part, None), name.split("."), thing)
 
 
+TAKEN_BY_TORCHRL = {
+    "auto_reset": "step_and_maybe_reset, rollout and collectors reset by themselves",
+    "policy": "pass it to rollout or to a collector",
+}
+"""Arguments that TorchRL takes out of those of every environment before it is made, and what to do instead."""
+
+
 def make(task: "str | type[LocoEnv]", *args: Any, **kwargs: Any) -> "LocoEnv":
     """Makes an environment.
 
@@ -439,7 +445,7 @@ def make(task: "str | type[LocoEnv]", *args: Any, **kwargs: Any) -> "LocoEnv":
         >>> env.rollout(100)["next", "reward"].shape
         torch.Size([16, 100, 1])
     """
-    for name, instead in NO_ARGUMENTS.items():  # TorchRL takes some of them out before they are checked
+    for name, instead in TAKEN_BY_TORCHRL.items():
         if kwargs.get(name):
             raise ValueError(f"{name} is no argument: {instead}")
     env = resolve(task, by_user=True)(*args, **kwargs)
