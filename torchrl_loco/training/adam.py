@@ -1,6 +1,6 @@
 """Adam on clipped gradients in one kernel: parameters and moments lie in one vector each."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -56,10 +56,7 @@ class FlatAdam:
         not require them.
         """
         self.adopt()
-        views = [
-            zip(vectors.parts, vectors.wide_views(vectors.whole.to(dtype)), strict=True) for vectors in self._vectors
-        ]
-        return {part: view if part.requires_grad else view.detach() for pairs in views for part, view in pairs}
+        return {part: view for vectors in self._vectors for part, view in vectors.wide(dtype)}
 
     def adopt(self) -> None:
         """Takes parameters back that were moved out of the vectors, as by ``module.to`` or a second optimizer."""
@@ -69,8 +66,7 @@ class FlatAdam:
     def zero_grad(self) -> None:
         """Forgets the gradients."""
         for vectors in self._vectors:
-            for part in (vectors.whole, *vectors.parts):
-                part.grad = None
+            vectors.forget_gradients()
 
     @torch.no_grad()
     def clipped_step(self, max_norm: float) -> Tensor:
@@ -84,7 +80,7 @@ class FlatAdam:
         norms = [gradient.norm() for gradient in gradients]
         norm = norms[0] if len(norms) == 1 else torch.stack(norms).norm()
         for group, vectors, gradient in zip(self.param_groups, self._vectors, gradients, strict=True):
-            torch.addcmul(vectors.summands, vectors.counts, vectors.factors, out=vectors.counts)
+            vectors.count()
             tensors = gradient, norm.view(1), group["lr"].view(1), vectors.counts
             settings = [max_norm, *group["betas"], group["eps"]]
             launch(step_of_adam, len(gradient), [*tensors, *settings], [vectors.whole, *vectors.moments])
@@ -92,10 +88,7 @@ class FlatAdam:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns moments and steps by the number of the parameter, and settings by group, as they are."""
-        moments = [
-            (of.counts[0], *both) for of in self._vectors for both in zip(*map(of.views, of.moments), strict=True)
-        ]
-        states = [dict(zip(("step", "exp_avg", "exp_avg_sq"), each, strict=True)) for each in moments]
+        states = [state for vectors in self._vectors for state in vectors.states()]
         numbers = iter(range(len(states)))
         groups = [{**group, "params": [next(numbers) for _ in group["params"]]} for group in self.param_groups]
         return {"state": dict(enumerate(states)), "param_groups": groups}
@@ -109,7 +102,7 @@ class FlatAdam:
                 state[name].copy_(loaded[name]) if name in loaded else state[name].zero_()
         step = max((float(loaded["step"]) for loaded in states.values() if "step" in loaded), default=0.0)
         for vectors in self._vectors:
-            vectors.counts.copy_(torch.cat([vectors.counts.new_tensor([step]), vectors.factors[1:] ** step]))
+            vectors.restart(step)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continues from a state, which is copied."""
@@ -132,7 +125,7 @@ class Vectors:
     def __init__(self, parameters: Sequence[nn.Parameter], betas: tuple[float, float]) -> None:
         if others := {str(part.dtype) for part in parameters} - {"torch.float32"}:
             raise TypeError(f"the parameters of networks must be torch.float32, not {', '.join(sorted(others))}")
-        self.parts = parameters
+        self._parts = parameters
         rows = [(part.shape[:-1].numel(), part.shape[-1]) if part.ndim else (1, 1) for part in parameters]
         self._wide_rows = [(count, size + -size % ALIGNED) for count, size in rows]
         # Of a matrix and its gaps, or of a row and the gap behind it.
@@ -146,7 +139,7 @@ class Vectors:
         # The steps, and the betas to their power; what each is multiplied with at a step, and what is added.
         doubles: dict[str, Any] = {"dtype": torch.float64, "device": self.whole.device}
         self.counts = torch.tensor([0.0, 1.0, 1.0], **doubles)
-        self.factors, self.summands = (torch.tensor(x, **doubles) for x in ([1.0, *betas], [1.0, 0.0, 0.0]))
+        self._factors, self._summands = (torch.tensor(x, **doubles) for x in ([1.0, *betas], [1.0, 0.0, 0.0]))
         self._addresses: list[int] = []
         self.adopt()
 
@@ -157,11 +150,11 @@ class Vectors:
         Raises:
             RuntimeError: that would be recorded as part of a step.
         """
-        if [part.data_ptr() for part in self.parts] == self._addresses:
+        if [part.data_ptr() for part in self._parts] == self._addresses:
             return
-        views = self.views(self.whole)
+        views = self._views(self.whole)
         moved = [
-            (part, view) for part, view in zip(self.parts, views, strict=True) if part.data_ptr() != view.data_ptr()
+            (part, view) for part, view in zip(self._parts, views, strict=True) if part.data_ptr() != view.data_ptr()
         ]
         if moved and self.whole.is_cuda and torch.cuda.is_current_stream_capturing():
             raise RuntimeError("parameters were moved while a step is recorded: move them before the training")
@@ -169,26 +162,49 @@ class Vectors:
             part.data = view.copy_(part)
         self._addresses = [view.data_ptr() for view in views]
 
-    def wide_views(self, vector: Tensor) -> list[Tensor]:
+    def count(self) -> None:
+        """Counts a step."""
+        torch.addcmul(self._summands, self.counts, self._factors, out=self.counts)
+
+    def restart(self, step: float) -> None:
+        """Goes on after so many steps."""
+        self.counts.copy_(torch.cat([self.counts.new_tensor([step]), self._factors[1:] ** step]))
+
+    def _wide_views(self, vector: Tensor) -> list[Tensor]:
         """Returns the parts of a vector in the shapes of the parameters, but for the rows of matrices with gaps."""
-        pieces = zip(self.parts, vector.split(self._sizes)[::2], self._wide_rows, strict=True)
+        pieces = zip(self._parts, vector.split(self._sizes)[::2], self._wide_rows, strict=True)
         return [
             piece.view(*part.shape[:-1], wide) if part.ndim > 1 else piece.view(part.shape)
             for part, piece, (_, wide) in pieces
         ]
 
-    def views(self, vector: Tensor) -> list[Tensor]:
+    def _views(self, vector: Tensor) -> list[Tensor]:
         """Returns the parts of a vector in the shapes of the parameters."""
-        views = zip(self.parts, self.wide_views(vector), strict=True)
+        views = zip(self._parts, self._wide_views(vector), strict=True)
         return [view[..., : part.shape[-1]] if part.ndim > 1 else view for part, view in views]
+
+    def wide(self, dtype: torch.dtype) -> Iterator[tuple[nn.Parameter, Tensor]]:
+        """Yields each parameter with itself in another type, with rows as long as they lie in the vector."""
+        for part, view in zip(self._parts, self._wide_views(self.whole.to(dtype)), strict=True):
+            yield part, view if part.requires_grad else view.detach()
 
     def gradient(self) -> Tensor:
         """Returns the gradient, zero where there is none: that of the vector, and the parameters' own beside it."""
         gradient = torch.zeros_like(self.whole) if self.whole.grad is None else self.whole.grad
-        own = [(part.grad, view) for part, view in zip(self.parts, self.views(gradient), strict=True)]
+        own = [(part.grad, view) for part, view in zip(self._parts, self._views(gradient), strict=True)]
         found = [(of_part, view) for of_part, view in own if of_part is not None]
         torch._foreach_add_([view for _, view in found], [of_part for of_part, _ in found])
         return gradient
+
+    def forget_gradients(self) -> None:
+        """Forgets them."""
+        for part in (self.whole, *self._parts):
+            part.grad = None
+
+    def states(self) -> Iterator[dict[str, Tensor]]:
+        """Yields what Adam keeps of each parameter, as views."""
+        for moments in zip(*map(self._views, self.moments), strict=True):
+            yield dict(zip(("step", "exp_avg", "exp_avg_sq"), (self.counts[0], *moments), strict=True))
 
 
 @wp.kernel(enable_backward=False)
