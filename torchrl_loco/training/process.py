@@ -29,13 +29,7 @@ def lock(folder: Path) -> bool:
     while folder not in _held:
         descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                owner = os.read(descriptor, 1000).decode(errors="replace").strip() or "another process"
-                raise BlockingIOError(f"{owner} is training in {folder}: wait until it ends, or end it") from None
-            except OSError:  # a file system without locks
-                pass
+            _take(descriptor, folder)
             # Else it is that of a process that has just removed it.
             if file.exists() and os.path.samestat(os.fstat(descriptor), file.stat()):
                 os.ftruncate(descriptor, 0)
@@ -45,6 +39,16 @@ def lock(folder: Path) -> bool:
             if folder not in _held:
                 os.close(descriptor)
     return True
+
+
+def _take(descriptor: int, folder: Path) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        owner = os.read(descriptor, 1000).decode(errors="replace").strip() or "another process"
+        raise BlockingIOError(f"{owner} is training in {folder}: wait until it ends, or end it") from None
+    except OSError:  # a file system without locks
+        pass
 
 
 def unlock(folder: Path) -> None:

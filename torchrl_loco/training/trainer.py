@@ -181,9 +181,7 @@ class Trainer:
                     self.run.append_metrics(row)
                     loggers.log(row, self.frames)
                 trial = {"trial": self.trials.label} if self.trials.running else {}
-                earned = row["return"]
-                shown = f"{earned:.0f}" if abs(earned) >= 100 else f"{earned:.3g}"
-                bar.set_postfix({**trial, "return": shown}, refresh=False)
+                bar.set_postfix({**trial, "return": _rounded(row["return"])}, refresh=False)
                 bar.update(self.frames_per_iteration)
                 if first:
                     self._say_once(row)
@@ -464,3 +462,8 @@ class Trainer:
                 "transforms and counters continue",
                 file=sys.stderr,
             )
+
+
+def _rounded(value: float) -> str:
+    """Returns a number with three digits or more."""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
