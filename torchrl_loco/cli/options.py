@@ -27,24 +27,35 @@ def _integers_and_optionals(info: tyro.constructors.PrimitiveTypeInfo) -> Any:
     if named != [int] and (len(named) != 1 or len(kinds) == 1):
         return None
     if get_origin(named[0]) is tuple:
-        kind = get_args(named[0])[0]
+        return _pair(get_args(named[0])[0])
+    if named == [bool]:
         return tyro.constructors.PrimitiveConstructorSpec(
-            nargs=2,
-            metavar=f"{kind.__name__.upper()} {kind.__name__.upper()}",
-            instance_from_str=lambda words: tuple(map(_integer if kind is int else kind, words)),
-            is_instance=lambda value: value is None or isinstance(value, tuple),
-            str_from_instance=lambda value: ["None"] if value is None else [str(each) for each in value],
+            nargs=1,
+            metavar="{True,False}",
+            instance_from_str=lambda words: {"true": True, "false": False}[words[0].lower()],
+            is_instance=lambda value: isinstance(value, tuple(kinds)),
+            str_from_instance=lambda value: [str(value)],
+            choices=("True", "False"),
         )
     parse: Callable[[str], Any] = _integer if named == [int] else named[0]
-    if named == [bool]:
-        parse = lambda word: {"true": True, "false": False}[word.lower()]  # noqa: E731
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
-        metavar="{True,False}" if named == [bool] else named[0].__name__.upper(),
+        metavar=named[0].__name__.upper(),
         instance_from_str=lambda words: parse(words[0]),
         is_instance=lambda value: isinstance(value, tuple(kinds)),
         str_from_instance=lambda value: [str(value)],
-        choices=("True", "False") if named == [bool] else None,
+    )
+
+
+def _pair(kind: type) -> tyro.constructors.PrimitiveConstructorSpec:
+    """Parses two numbers."""
+    parse: Callable[[str], Any] = _integer if kind is int else kind
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=2,
+        metavar=f"{kind.__name__.upper()} {kind.__name__.upper()}",
+        instance_from_str=lambda words: tuple(map(parse, words)),
+        is_instance=lambda value: value is None or isinstance(value, tuple),
+        str_from_instance=lambda value: ["None"] if value is None else [str(each) for each in value],
     )
 
 

@@ -28,13 +28,7 @@ def train(options: Any, args: list[str]) -> None:
         if {"--seed", "--seeds"} <= {arg.partition("=")[0] for arg in args}:
             raise ValueError("--seed trains one seed, --seeds several: pass one of them")
         config, seeds, gpus = settings(options)
-        for seed in seeds:
-            check_int("each of seeds", seed, SEED)
-        if twice := [seed for seed in seeds if seeds.count(seed) > 1]:
-            raise ValueError(f"seeds must differ, but {twice[0]} is named twice")
-        if seeds and ((gpus or 1) > 1 or int(os.environ.get("WORLD_SIZE", "1")) > 1):  # not tried with several ranks
-            said = "several seeds are trained one after the other by one process: pass --seed with several GPUs"
-            raise ValueError(said)
+        _check_seeds(seeds, gpus)
         missing = missing_processes(gpus, config.device)
     if missing:
         from torchrl_loco.training import distributed
@@ -101,6 +95,20 @@ def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("lear
 
         training.plot_runs([training.RunFolder(run) for run in runs], out)
     print(out)
+
+
+def _check_seeds(seeds: tuple[int, ...], gpus: int | None) -> None:
+    """Checks the seeds that are trained one after the other, by one process: ranks have not been tried with several.
+
+    Raises:
+        ValueError: one is out of range or named twice, or there are several processes.
+    """
+    for seed in seeds:
+        check_int("each of seeds", seed, SEED)
+    if twice := [seed for seed in seeds if seeds.count(seed) > 1]:
+        raise ValueError(f"seeds must differ, but {twice[0]} is named twice")
+    if seeds and ((gpus or 1) > 1 or int(os.environ.get("WORLD_SIZE", "1")) > 1):
+        raise ValueError("several seeds are trained one after the other by one process: pass --seed with several GPUs")
 
 
 def missing_processes(gpus: int | None, device: str) -> int:

@@ -88,9 +88,14 @@ class Episodes:
         return round(sum(row[0] for row in self._window))
 
     @property
-    def means(self) -> tuple[float, float]:
-        """Their mean return, and their mean length (control steps) in training; there must be some."""
-        return sum(row[1] for row in self._window) / self.count, sum(row[2] for row in self._window) / self.count
+    def mean_return(self) -> float:
+        """Their mean return; there must be some."""
+        return sum(row[1] for row in self._window) / self.count
+
+    @property
+    def mean_length(self) -> float:
+        """Their mean length (control steps), in training; there must be some."""
+        return sum(row[2] for row in self._window) / self.count
 
     def restart(self) -> None:
         """Forgets all episodes, also those that are running: another policy plays from here on."""
@@ -102,7 +107,12 @@ class Episodes:
         return {"sum": self._sum, "steps": self._steps, "whole": self._whole, "window": list(self._window)}
 
     def load_state_dict(self, state: dict[str, Any], running: bool) -> None:
-        """Continues from what :meth:`state_dict` returned, running episodes only if the worlds are ``running`` on."""
+        """Continues from what :meth:`state_dict` returned.
+
+        Args:
+            state: the state.
+            running: whether the worlds go on as well, and with them their episodes.
+        """
         self._window = collections.deque(state["window"])
         if running:
             self._sum, self._steps, self._whole = state["sum"], state["steps"], state["whole"]

@@ -78,12 +78,7 @@ def train(
         changes = settings | chosen
         if config is not None or changes.keys() - {"total_frames", "device"} or isinstance(algorithm, str):
             raise ValueError("a run that is resumed keeps its settings: pass no other than total_frames and device")
-        run = resume if isinstance(resume, RunFolder) else RunFolder(Path(resume))
-        named, of = task_name(cls, by_user=True), run.load_config().task
-        moved = is_place(named) and is_place(of) and named.rpartition(":")[2] == of.rpartition(":")[2]
-        if named != of and not moved:
-            raise ValueError(f"{run.path} is a run of {of}, but task is {named}")
-        return run_to_end(RunFolder(run.path, named), given, **changes)
+        return run_to_end(_resumed(resume, cls), given, **changes)
     if given.env is not None:
         chosen |= _settings_of(given.env, {**settings, **chosen})
     config = _config(cls, config, algorithm, {**settings, **chosen})
@@ -128,13 +123,31 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
     return {**own, "seed": settings.get("seed", base.seed), "action_repeat": settings.get("action_repeat", 1)}
 
 
+def _resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
+    """Returns the run that is to be continued.
+
+    Raises:
+        ValueError: it is of another task.
+    """
+    run = resume if isinstance(resume, RunFolder) else RunFolder(Path(resume))
+    named, of = task_name(task, by_user=True), run.load_config().task
+    moved = is_place(named) and is_place(of) and named.rpartition(":")[2] == of.rpartition(":")[2]
+    if named != of and not moved:
+        raise ValueError(f"{run.path} is a run of {of}, but task is {named}")
+    return RunFolder(run.path, named)
+
+
 def run_to_end(
     what: TrainingConfig | RunFolder, given: Given, errors: Callable[..., Any] = contextlib.nullcontext, **changes: Any
 ) -> RunFolder:
     """Trains a new run, or goes on with one, some settings of which have changed.
 
-    ``errors`` makes a context that tells errors of the user: of any kind until the trainer is made, then of those that
-    it is called with. Others are bugs, which keep their traceback.
+    Args:
+        what: the settings of a new run, or the run.
+        given: what is handed in as objects.
+        errors: makes a context that tells errors of the user: of any kind until the trainer is made, then of those that
+            it is called with. Others are bugs, which keep their traceback.
+        changes: of the settings of the run.
 
     Returns:
         Its folder.

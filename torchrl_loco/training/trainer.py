@@ -186,8 +186,7 @@ class Trainer:
                 if first:
                     self._say_once(row)
                 trial_is_over = self.trials.is_over(self.frames)
-                since = self.trials.own_frames(self.frames) % config.eval_interval if config.eval_interval else math.inf
-                if trial_is_over or self.frames >= self.last_frame or since < self.frames_per_iteration:
+                if trial_is_over or self.frames >= self.last_frame or self._evaluation_is_due():
                     mean = None
                     if loggers is not None:
                         mean = self.evaluate()["mean"]
@@ -229,6 +228,13 @@ class Trainer:
             if note and kind not in self._said:
                 self._said.add(kind)
                 tqdm.write(f"after {self.frames:,} frames: {note}")
+
+    @property
+    def device_name(self) -> str:
+        """Name of the device, with the number of ranks if there are several."""
+        device = self.algorithm.device
+        name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+        return name if distributed.ranks() == 1 else f"{distributed.ranks()} x {name}"
 
     @property
     def frames_per_iteration(self) -> int:
@@ -298,16 +304,18 @@ class Trainer:
         if not self.episodes.count:
             estimate = round(mean_reward * self.environments.full_length, 3)
             return {"return": estimate, "episode_length": self._training_length, "episodes": 0}
-        earned, length = self.episodes.means
-        return {"return": round(earned, 3), "episode_length": round(length, 1), "episodes": self.episodes.count}
+        episodes = self.episodes
+        means = round(episodes.mean_return, 3), round(episodes.mean_length, 1)
+        return {"return": means[0], "episode_length": means[1], "episodes": episodes.count}
+
+    def _evaluation_is_due(self) -> bool:
+        interval = self.config.eval_interval
+        return interval > 0 and self.trials.own_frames(self.frames) % interval < self.frames_per_iteration
 
     def evaluate(self) -> dict[str, float]:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""
         when = {"frames": self.frames, "seconds": round(self.seconds, 3)}
-        device, ranks = self.algorithm.device, distributed.ranks()
-        name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
-        trained_on = name if ranks == 1 else f"{ranks} x {name}"
-        of_env: dict[str, Any] = {"trained_on": trained_on, "control_timestep": self._base.config.ctrl_dt}
+        of_env: dict[str, Any] = {"trained_on": self.device_name, "control_timestep": self._base.config.ctrl_dt}
         if stage := self._base.stage_of({"stage": self._base.get_stage()}):
             of_env["stage"] = stage
         if self.environments.transforms:
