@@ -87,7 +87,8 @@ def task_options(args: list[str]) -> Any:
     from torchrl_loco.training.config import CONFIGS, TrainingConfig, preset, tuning_note
 
     about = summaries()
-    preset_options = argparse.ArgumentParser("torchrl-loco train", add_help=False, allow_abbrev=False)
+    usage = "%(prog)s TASK [--device DEVICE] [--algorithm ALGORITHM] [--SETTING VALUE ...]; all settings: --help"
+    preset_options = argparse.ArgumentParser("torchrl-loco train", usage, add_help=False, allow_abbrev=False)
     for flag in ("--device", "--algorithm"):
         preset_options.add_argument(flag)
     chosen, args[:] = preset_options.parse_known_args(args)

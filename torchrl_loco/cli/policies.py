@@ -101,11 +101,12 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
         policy.info["task"] = task or place_of(policy.info["task"], source.parent)
         return policy, source
     from torchrl_loco.training import RunFolder
-    from torchrl_loco.training.watching import last_policy
 
     run = RunFolder(source, task)
     if run.policy.is_file() or run.given or not run.has_checkpoint:
         return run.load_policy(device), run.policy
+    from torchrl_loco.training.watching import last_policy  # which needs what a training needs
+
     policy = last_policy(run, device)
     after = f"after {policy.info['frames']:,} frames"
     print(f"{run.path}: no policy was evaluated yet, this is that of the last checkpoint, {after}", file=sys.stderr)
