@@ -21,7 +21,7 @@ from torchrl_loco.training.actor import Spaces, deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, begin_from, settings_for_small_networks, start_compiler
 from torchrl_loco.training.config import check_loggers
 from torchrl_loco.training.environments import Environments, Given, source_of, unwrapped
-from torchrl_loco.training.episodes import Episodes, Trials
+from torchrl_loco.training.episodes import Episodes
 from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, record, shipped_return, summarize
 from torchrl_loco.training.loggers import Loggers
 from torchrl_loco.training.plots import plot_runs
@@ -29,6 +29,7 @@ from torchrl_loco.training.ppo import PPO
 from torchrl_loco.training.process import interruptible, lock, unlock
 from torchrl_loco.training.reppo import REPPO
 from torchrl_loco.training.run_folder import RunFolder
+from torchrl_loco.training.trials import Trials
 
 ALGORITHMS: dict[str, type[Algorithm]] = {cls.config_type.algorithm: cls for cls in (PPO, REPPO)}
 
