@@ -221,9 +221,11 @@ def merged_moments(
 
 def mean_of_ranks(values: torch.Tensor) -> torch.Tensor:
     """Returns the mean over the ranks of ``values``, of any shape ``(...)``."""
+    if ranks() == 1:
+        return values
     values = values.clone()
-    average([values])
-    return values
+    _sum(values)
+    return values / ranks()
 
 
 def add_changes(values: torch.Tensor, before: torch.Tensor) -> None:
