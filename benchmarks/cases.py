@@ -22,10 +22,10 @@ from torchrl_loco.config import sim_config
 from torchrl_loco.registry import env_class
 from torchrl_loco.sim import Simulation, current_stream, models
 from torchrl_loco.training import preset
+from torchrl_loco.training.actor import Spaces
 from torchrl_loco.training.algorithm import settings_for_small_networks
-from torchrl_loco.training.interrupts import interruptible
+from torchrl_loco.training.process import interruptible
 from torchrl_loco.training.reppo import REPPO
-from torchrl_loco.training.spaces import Spaces
 
 Run = TypeVar("Run")
 INTERRUPTED = threading.Event()

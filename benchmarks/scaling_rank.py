@@ -14,10 +14,10 @@ from benchmarks.cases import waiter
 from torchrl_loco import RolloutCollector
 from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed, preset
+from torchrl_loco.training.actor import Spaces
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.config import CONFIGS
 from torchrl_loco.training.environments import Environments
-from torchrl_loco.training.spaces import Spaces
 from torchrl_loco.training.trainer import ALGORITHMS
 
 WARMUP, ITERATIONS, EXCHANGES = 4, 10, 100

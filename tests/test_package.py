@@ -19,7 +19,7 @@ LAYERS = [  # a module imports from its own layer or from those before it
     {"tasks"},
     {"registry", "collector"},
     {"policy", "nan_dump", "doctor", "wrappers"},
-    {"export", "deployment", "verify"},
+    {"export", "verify"},
     {"training"},
     {"cli", "__main__"},
 ]

@@ -112,6 +112,14 @@ def test_arguments_of_other_libraries_get_a_hint():
             of(num_envs=2, device="cpu", **{name: 2})
 
 
+def test_a_class_may_take_an_argument_of_another_library():
+    class Framed(torchrl_loco.WalkerWalk):
+        def __init__(self, *args, frame_skip, **settings):
+            super().__init__(*args, ctrl_dt=frame_skip * self.config.ctrl_dt, **settings)
+
+    assert make(Framed, 1, "cpu", frame_skip=2).config.ctrl_dt == 2 * Framed.config.ctrl_dt
+
+
 # Classes of users.
 
 

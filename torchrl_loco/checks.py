@@ -113,13 +113,7 @@ def check_bool(name: str, value: Any) -> bool:
 
 
 def check_choice(name: str, value: Any, choices: Collection[str], also: Collection[str] = ()) -> str:
-    """Returns ``value``.
-
-    Args:
-        name: what the value is called.
-        value: the value.
-        choices: what it may be.
-        also: further names that the message may suggest, such as aliases.
+    """Returns ``value``; of ``also``, such as aliases, the message may suggest names too.
 
     Raises:
         ValueError: it is none of the choices.
@@ -139,9 +133,7 @@ def suggestion(word: str, choices: Collection[str]) -> str:
 def check_fields(config: Any, intervals: Mapping[str, Interval]) -> None:
     """Checks the fields of a dataclass that are numbers or flags, and stores them in their canonical type.
 
-    Args:
-        config: an instance, which may be frozen and just being made.
-        intervals: intervals of the fields that are not simply positive.
+    It may be frozen and just being made. Fields without an interval are positive.
 
     Raises:
         TypeError: a field has the wrong type.
@@ -149,11 +141,13 @@ def check_fields(config: Any, intervals: Mapping[str, Interval]) -> None:
     """
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
+        if value is None and field.type == float | None:
+            continue
         if field.type is bool:
             value = check_bool(field.name, value)
         elif field.type is int:
             value = check_int(field.name, value, intervals.get(field.name, POSITIVE_INT))
-        elif field.type is float:
+        elif field.type in (float, float | None):
             value = check_float(field.name, value, intervals.get(field.name, POSITIVE))
         object.__setattr__(config, field.name, value)
 
@@ -202,12 +196,7 @@ def why_no_cuda() -> str:
 
 
 def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> Path:
-    """Returns ``value`` as the absolute path of a file that can be created.
-
-    Args:
-        name: what the value is called.
-        value: the path.
-        suffixes: what the file may end in; anything if empty.
+    """Returns ``value`` as the absolute path of a file that can be created, which ends in one of ``suffixes``, if any.
 
     Raises:
         TypeError: it is no path.
@@ -246,12 +235,7 @@ def is_run(path: Path) -> bool:
 
 
 def check_packages(purpose: str, packages: Collection[str], extra: str) -> None:
-    """Checks that packages are installed, without importing them.
-
-    Args:
-        purpose: what needs them.
-        packages: names by which they are imported.
-        extra: the extra of this package that installs them.
+    """Checks that packages, which an extra of this package installs, are there, without importing them.
 
     Raises:
         ImportError: one is not installed; the message says how to install it.

@@ -221,12 +221,8 @@ def stacks_slowly(entry: Any, dim: int) -> bool:
 class Recording:
     """The steps of a batch as one CUDA graph.
 
-    Args:
-        take_steps: takes the steps of a batch that begins with a TensorDict; returns them, and what the next begins
-            with.
-        carried: what the batch begins with, batch ``(num_envs,)``.
-        policy: the policy, an ``nn.Module``.
-        env: the environment, without transforms.
+    ``take_steps`` takes the steps of a batch that begins with a TensorDict, such as ``carried``; it returns them, and
+    what the next begins with. The environment is without transforms.
 
     Attributes:
         carried: what the next batch begins with, at an address that stays.

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from torchrl_loco.checks import COUNT, FRACTION, NOT_NEGATIVE, SEED, check_float, check_int
+from torchrl_loco.checks import COUNT, FRACTION, NOT_NEGATIVE, SEED, check_fields, check_float, check_int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Conditions:
     delay: tuple[int, int] | None = None
     """Least and greatest delay of an action (control steps); each has as many episodes."""
     friction: tuple[float, float] | None = None
-    """Least and greatest sliding friction, drawn for each episode: of all geoms; of those of the robot alone where the
+    """Least and greatest sliding friction, drawn for each episode, of all geoms; of those of the robot alone where the
     ground is a :class:`torchrl_loco.terrain.Terrain`, so that its feet need the priority, as those of ``go1_rough``."""
     noise: float = 1.0
     """What the task's noise of the observation is multiplied by."""
@@ -38,10 +38,6 @@ class Conditions:
             ValueError: one is out of range.
             TypeError: one has the wrong type.
         """
-        check_int("episodes", self.episodes)
-        check_int("seed", self.seed, SEED)
-        if self.seconds is not None:
-            check_float("seconds", self.seconds)
         for name, check, interval in (("delay", check_int, COUNT), ("friction", check_float, NOT_NEGATIVE)):
             if (values := getattr(self, name)) is not None:
                 if not isinstance(values, tuple | list) or len(values) != 2:
@@ -49,11 +45,8 @@ class Conditions:
                 least, most = (check(name, value, interval) for value in values)
                 if least > most:
                     raise ValueError(f"{name}: the least, {least}, must not be greater than the greatest, {most}")
-        for name in ("noise", "pushes", "min_return"):
-            if getattr(self, name) is not None:
-                check_float(name, getattr(self, name), NOT_NEGATIVE)
-        if self.max_falls is not None:
-            check_float("max_falls", self.max_falls, FRACTION)
+        others = dict.fromkeys(("noise", "pushes", "min_return"), NOT_NEGATIVE)
+        check_fields(self, {"seed": SEED, "max_falls": FRACTION, **others})
 
     def of(self, holds: Mapping[str, Any]) -> "Conditions":
         """Returns the conditions of a task: what is ``None`` here is as its ``holds`` says, else without."""

@@ -161,12 +161,8 @@ def sim_config(
 ) -> SimConfig:
     """Returns the settings of an environment under ``protocol`` for ``num_envs`` worlds, with ``overrides`` on top.
 
-    Args:
-        defaults: the settings of the class under ``playground``, with ``naconmax`` for 2048 worlds.
-        protocol: one of :data:`PROTOCOLS`.
-        num_envs: number of worlds, by which ``naconmax`` is scaled.
-        overrides: fields of :class:`SimConfig`.
-        arguments: other argument names of the caller, for suggestions when a key is misspelt.
+    ``defaults`` are those of the class under ``playground``, with ``naconmax`` for 2048 worlds; ``arguments`` names
+    others of the caller, for suggestions when a key is misspelt.
 
     Raises:
         ValueError: ``protocol`` or a key of ``overrides`` is unknown, or a value is out of range.

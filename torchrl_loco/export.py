@@ -4,21 +4,25 @@ import copy
 import io
 import json
 import logging
-import math
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import mujoco
+import numpy as np
 import torch
 from torch import nn
 
 import torchrl_loco
 from torchrl_loco import storage
 from torchrl_loco.checks import check_output_file, check_packages
-from torchrl_loco.deployment import of_robot
-from torchrl_loco.policy import ObservationNorm, Policy
+from torchrl_loco.config import arguments_of
+from torchrl_loco.envs.hooks import own_hooks
+from torchrl_loco.envs.task import folder_of
+from torchrl_loco.policy import Policy, difference, random_observations
 from torchrl_loco.registry import resolve
+from torchrl_loco.sim import models
 
 SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
 """Formats and the suffixes of their files."""
@@ -39,7 +43,7 @@ def export_policy(policy: Policy, path: Path) -> float:
     travels with it: task, protocol, sizes, bounds of an action, the time between two control steps (s), for how many of
     them an action is held, and all of ``policy.info``; as ``metadata_props`` in ONNX, in the extra file
     ``metadata.json`` with torch.export. So do the terms of the observation where it has names, how actions become
-    controls, and what is known of the robot: :mod:`torchrl_loco.deployment`.
+    controls, and what is known of the robot: :func:`torchrl_loco.export.of_robot`.
 
     Of a task that follows a reference the file takes ``time_step`` too, int64 ``(batch,)``, a frame of it, and gives
     rows of the tables of :meth:`torchrl_loco.LocoEnv.reference` beside the action.
@@ -61,15 +65,29 @@ def export_policy(policy: Policy, path: Path) -> float:
     if path.suffix == ".onnx":
         check_packages("exporting as ONNX", ("onnx", "onnxscript", "onnxruntime"), "onnx")
     original = _Network(policy)
-    observations = _random_observations(original)
+    observations = random_observations(original.layers, max(BATCH_SIZES), 4.0)  # some are clipped
     expected = original(observations)
-    facts, reference = of_robot(policy)
-    facts = {**_facts(policy, n=observations.shape[-1], m=expected.shape[-1]), **facts}
+    of_task, reference = of_robot(policy)
+    info = policy.info
+    facts = {
+        "task": info["task"],
+        "protocol": info["protocol"],
+        "observation_size": observations.shape[-1],
+        "action_size": expected.shape[-1],
+        "action_low": -1.0 if policy.is_bounded else None,
+        "action_high": 1.0 if policy.is_bounded else None,
+        # Older files do not say it.
+        "control_timestep": info.get("control_timestep") or resolve(info["task"]).config.ctrl_dt,
+        "action_repeat": info["action_repeat"],
+        "torchrl_loco": torchrl_loco.__version__,
+        "info": info,
+        **of_task,
+    }
     network = _WithReference(original, reference) if reference else original
     content, play = (_as_onnx if path.suffix == ".onnx" else _as_program)(network, observations[:2], facts)
-    error = max(_difference(play(observations[:size]), expected[:size]) for size in BATCH_SIZES)
+    error = max(difference(play(observations[:size]), expected[:size]) for size in BATCH_SIZES)
     if not error <= TOLERANCE:  # true for NaN too
-        rounding = _difference(copy.deepcopy(original).double()(observations.double()), expected)
+        rounding = difference(copy.deepcopy(original).double()(observations.double()), expected)
         if not error <= (allowed := max(TOLERANCE, 2.0 * rounding)):
             raise RuntimeError(
                 f"the exported policy differs by {error:.1e} from the original, whose own rounding in float32 is "
@@ -92,12 +110,7 @@ class _Network(nn.Module):
 
 
 class _WithReference(nn.Module):
-    """A network, and beside it the reference that it follows.
-
-    Args:
-        network: the network.
-        reference: tables ``(frames, ...)`` by name.
-    """
+    """A network, and beside it the reference that it follows, tables ``(frames, ...)`` by name."""
 
     def __init__(self, network: _Network, reference: Mapping[str, torch.Tensor]) -> None:
         super().__init__()
@@ -117,49 +130,6 @@ def _inputs(network: nn.Module, observations: torch.Tensor) -> dict[str, torch.T
     if isinstance(network, _WithReference):
         inputs["time_step"] = torch.zeros(len(observations), dtype=torch.int64)
     return inputs
-
-
-def _outputs(network: nn.Module) -> list[str]:
-    """Returns the names of the outputs of a network."""
-    return ["action", *(network.names if isinstance(network, _WithReference) else ())]
-
-
-def _random_observations(network: _Network) -> torch.Tensor:
-    """Returns random observations, of which some are so far from those of the training that they are clipped.
-
-    Raises:
-        TypeError: the network does not begin by normalising observations.
-    """
-    norm = network.layers[0]
-    if not isinstance(norm, ObservationNorm):
-        raise TypeError(f"a policy must begin with an ObservationNorm, this one begins with {type(norm).__name__}")
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.randn(max(BATCH_SIZES), len(norm.mean), generator=generator)
-    return norm.mean + 4 * noise * (norm.var + 1e-6).sqrt()
-
-
-def _facts(policy: Policy, n: int, m: int) -> dict[str, Any]:
-    info = policy.info
-    return {
-        "task": info["task"],
-        "protocol": info["protocol"],
-        "observation_size": n,
-        "action_size": m,
-        "action_low": -1.0 if policy.is_bounded else None,
-        "action_high": 1.0 if policy.is_bounded else None,
-        # Older files do not say it.
-        "control_timestep": info.get("control_timestep") or resolve(info["task"]).config.ctrl_dt,
-        "action_repeat": info["action_repeat"],
-        "torchrl_loco": torchrl_loco.__version__,
-        "info": info,
-    }
-
-
-def _difference(actions: torch.Tensor, expected: torch.Tensor) -> float:
-    """Returns the largest difference, as a fraction of actions above 1; infinity if the shapes differ."""
-    if actions.shape != expected.shape:
-        return math.inf
-    return ((actions - expected).abs() / expected.abs().clamp(min=1.0)).max().item()
 
 
 Exported = tuple[bytes, Callable[[torch.Tensor], torch.Tensor]]
@@ -195,7 +165,7 @@ def _as_onnx(network: nn.Module, example: torch.Tensor, facts: dict[str, Any]) -
                 network,
                 tuple(inputs.values()),
                 input_names=list(inputs),
-                output_names=_outputs(network),
+                output_names=["action", *(network.names if isinstance(network, _WithReference) else ())],
                 dynamic_shapes={name: {0: "batch"} for name in inputs},
                 dynamo=True,
                 verbose=False,
@@ -214,3 +184,82 @@ def _as_onnx(network: nn.Module, example: torch.Tensor, facts: dict[str, Any]) -
         return torch.from_numpy(actions)
 
     return content, play
+
+
+# What a file tells of task and robot.
+
+
+def why_not(policy: Policy) -> str:
+    """Returns why the file of a policy cannot tell how to play it, an empty string if it can."""
+    if names := policy.info.get("transforms"):
+        return f"the policy was trained behind {', '.join(names)}"
+    try:
+        resolve(policy.info["task"])
+    except (ValueError, OSError, ImportError) as error:
+        return f"its task is not at hand: {error}"
+    return ""
+
+
+def of_robot(policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns what the file of a policy tells of its task and robot, and the reference that it follows, if any.
+
+    Nothing where :func:`why_not` says why.
+
+    Returns:
+        The facts by name. ``observation``, names and sizes of its terms in their order, none where they have no names;
+        ``history``, how many of the last ones are joined, the newest last; ``action_offset`` and ``action_scale``
+        ``(nu,)``, by which the controls are ``offset + scale * action``, unless the task has another way;
+        ``actuators``, their names; ``joints``, those of the joints that they move, empty for a tendon; ``stiffness``,
+        ``damping`` and ``force_limit`` of position actuators, 0 and ``None`` for others; ``home``, the home pose
+        ``(nq,)``; ``physics_timestep`` of the training (s); ``mjcf``, the model as text, with six digits, unless it
+        needs further files; ``cases``, their control steps by name, if the task has any; and whatever else
+        :meth:`torchrl_loco.LocoEnv.facts` holds, such as ``velocity``. And the tables of the reference by name.
+    """
+    if why_not(policy):
+        return {}, {}
+    cls = resolve(policy.info["task"])
+    spec = models.specification(cls.model, folder_of(cls))
+    m = spec.compile()
+    low, high = m.actuator_ctrlrange.T
+    env = cls(
+        1, "cpu", 0, policy.info["protocol"], **{**arguments_of(policy.info), "engine": "mujoco"}, compile_hooks=False
+    )  # tells the terms
+    terms, cases, reference = env.observation_layout["observation"], env.cases(), dict(env.reference())
+    env.close()
+    scaled = {"action_offset": (0.5 * (low + high)).tolist(), "action_scale": (0.5 * (high - low)).tolist()}
+    facts = {
+        "observation": [{"term": name, "size": size} for name, size in terms.items()],
+        "history": cls.history.get("observation", 1),
+        **({} if "control" in own_hooks(cls) else scaled),
+        **_actuators(m),
+        "home": models.home_pose(m).tolist(),
+        "physics_timestep": env.config.sim_dt,
+        **_text(spec),
+        **({"cases": dict(cases)} if cases else {}),
+        **cls.facts(m, policy.info),
+    }
+    return facts, reference
+
+
+def _actuators(m: mujoco.MjModel) -> dict[str, Any]:
+    """Returns names, joints, gains (N m/rad, N m s/rad) and limits (N m) of a model's actuators."""
+    of_joint = np.isin(m.actuator_trntype, (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)))
+    servo = (m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)) & (m.actuator_biasprm[:, 1] < 0)
+    limited = m.actuator_forcelimited.astype(bool)
+    return {
+        "actuators": [m.actuator(i).name for i in range(m.nu)],
+        "joints": [m.joint(int(m.actuator_trnid[i, 0])).name if of_joint[i] else "" for i in range(m.nu)],
+        "stiffness": np.where(servo, -m.actuator_biasprm[:, 1], 0.0).tolist(),
+        "damping": np.where(servo, -m.actuator_biasprm[:, 2], 0.0).tolist(),
+        "force_limit": [float(m.actuator_forcerange[i, 1]) if limited[i] else None for i in range(m.nu)],
+    }
+
+
+def _text(spec: mujoco.MjSpec) -> dict[str, str]:
+    """Returns the MJCF of a model, unless it cannot be compiled without further files, such as meshes."""
+    text = spec.to_xml()
+    try:
+        mujoco.MjModel.from_xml_string(text)
+    except ValueError:
+        return {}
+    return {"mjcf": text}

@@ -40,11 +40,7 @@ def store() -> Path:
 
 
 def remember(path: Path) -> None:
-    """Remembers a file that runs by the user's word, and the modules beside it that it imports.
-
-    Args:
-        path: its absolute path, without links.
-    """
+    """Remembers a file, by its path without links, that runs by the user's word, and the modules beside it."""
     files = [file for file in with_imports(path) if "\n" not in str(file)] if path.is_file() else []
     new = sorted({f"{_sha256(file)}  {file}" for file in files} - _lines())
     if not new:
@@ -63,13 +59,10 @@ def remember(path: Path) -> None:
 
 
 def is_known(path: Path) -> bool:
-    """Returns whether a file may run where only another file names it.
+    """Returns whether a file, by its absolute path without links, may run where only another file names it.
 
     It may in the place where the user has run it, also after an edit. A copy in a run folder may if every file there
     that Python could run is one that the user has run, byte for byte.
-
-    Args:
-        path: its absolute path, without links.
     """
     lines = _lines()
     if not is_kept(path):
@@ -85,12 +78,7 @@ def is_kept(path: Path) -> bool:
 
 
 def place_of(task: str, folder: Path) -> str:
-    """Returns where the class of a task is that a file names: where it says, or in the copy beside it if that is gone.
-
-    Args:
-        task: the name.
-        folder: where the file lies that names it, which may be a run folder.
-    """
+    """Returns where the class of a task is that a file in a folder names: in the copy there if its own file is gone."""
     source, _, name = str(task).rpartition(":")
     copy = Path(folder).resolve() / KEPT / Path(source).name
     moved = source.endswith(".py") and not Path(source).is_file() and copy.is_file() and is_kept(copy)
@@ -98,11 +86,7 @@ def place_of(task: str, folder: Path) -> str:
 
 
 def with_imports(path: Path) -> list[Path]:
-    """Returns a file and the modules beside it that it imports, or that these import; packages are left out.
-
-    Raises:
-        OSError: there is no such file.
-    """
+    """Returns a file and the modules beside it that it imports, or that these import; packages are left out."""
     found, left = dict[Path, None](), [path]
     while left:
         file = left.pop()

@@ -59,27 +59,18 @@ class _Finder(MetaPathFinder):
 def _stand_in() -> None:
     """Replaces what torch offers for marking, until the compiler is imported."""
     torch: Any = importlib.import_module("torch")
-    ours = {"allow_in_graph": allow_in_graph, "assume_constant_result": assume_constant_result, "disable": disable}
+    ours = {"disable": disable, **{name: functools.partial(_mark, name) for name in MARKS}}
     _own.update({name: getattr(torch.compiler, name) for name in ours})
     vars(torch.compiler).update(ours)
     torch._dynamo = _Stub(COMPILER)  # which the import of the compiler replaces
 
 
-def _mark(mark: str, function: Any) -> Any:
-    if _is_imported or not callable(function):  # several, or an error
-        return _own[mark](function)
-    _marked.append((mark, function))
-    return function
-
-
-def allow_in_graph(fn: Any) -> Any:
-    """Returns what ``torch.compiler.allow_in_graph`` does, which has its effect later."""
-    return _mark("allow_in_graph", fn)
-
-
-def assume_constant_result(fn: Any) -> Any:
-    """Returns what ``torch.compiler.assume_constant_result`` does, which has its effect later."""
-    return _mark("assume_constant_result", fn)
+def _mark(mark: str, fn: Any) -> Any:
+    """Returns what the function of ``torch.compiler`` that is named ``mark`` does, which has its effect later."""
+    if _is_imported or not callable(fn):  # several, or an error
+        return _own[mark](fn)
+    _marked.append((mark, fn))
+    return fn
 
 
 def disable(fn: Any = None, recursive: bool = True, *, reason: str | None = None) -> Any:
@@ -96,5 +87,5 @@ class _Stub(ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         if name in MARKS:
-            return globals()[name]
+            return functools.partial(_mark, name)
         return getattr(importlib.import_module(COMPILER), name)

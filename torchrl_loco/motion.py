@@ -373,13 +373,7 @@ class Frames:
 
     @classmethod
     def of(cls, motions: Sequence[Motion], m: mujoco.MjModel, bodies: Sequence[str], dt: float) -> "Frames":
-        """Returns motions on a model, at the rate of its control steps.
-
-        Args:
-            motions: the motions.
-            m: the model.
-            bodies: names of the bodies.
-            dt: time of a control step (s).
+        """Returns motions on a model, with the bodies that are named, at the rate of control steps of ``dt`` (s).
 
         Raises:
             ValueError: one is of another robot, or shorter than two control steps.
@@ -417,14 +411,7 @@ class Frames:
 
 
 def save(path: Path, qpos: np.ndarray, fps: float, m: mujoco.MjModel) -> None:
-    """Writes poses ``(frames, nq)`` as an npz as mjlab's, with the names of joints and bodies.
-
-    Args:
-        path: a file.
-        qpos: the poses.
-        fps: frames per second.
-        m: the model.
-    """
+    """Writes poses ``(frames, nq)`` as an npz as mjlab's, with the names of joints and bodies."""
     pos, mat = poses(m, qpos)
     quat = quat_of(mat.reshape(-1, 3, 3)).reshape(*mat.shape[:2], 4)
     tables = {
@@ -454,10 +441,7 @@ def poses(m: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def lowest_points(m: mujoco.MjModel, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
     """Returns the height of the lowest point of what can touch the ground, in each frame (m), without meshes.
 
-    Args:
-        m: the model.
-        pos: positions of bodies (m), ``(frames, nbody, 3)``.
-        mat: their orientations, ``(frames, nbody, 3, 3)``.
+    Positions (m) and orientations of bodies are those of :func:`poses`.
     """
     lowest, kinds = np.full(len(pos), np.inf), mujoco.mjtGeom
     for geom in range(m.ngeom):

@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import math
 from pathlib import Path
 from typing import Any
 
@@ -217,6 +218,26 @@ def copied(layer: nn.Module) -> nn.Module:
         norm.load_state_dict({"weight": layer.weight.detach().cpu(), "bias": torch.zeros(size)})
         norm.to(layer.weight.device)
     return norm
+
+
+def random_observations(network: Any, count: int, spread: float) -> torch.Tensor:
+    """Returns observations ``(count, n)`` on the CPU, always the same, ``spread`` times as spread as in the training.
+
+    Raises:
+        TypeError: the network does not begin by normalising observations.
+    """
+    norm = network[0]
+    if not isinstance(norm, ObservationNorm):
+        raise TypeError(f"a policy must begin with an ObservationNorm, this one begins with {type(norm).__name__}")
+    noise = torch.randn(count, len(norm.mean), generator=torch.Generator().manual_seed(0))
+    return norm.mean.cpu() + spread * noise * (norm.var.cpu() + 1e-6).sqrt()
+
+
+def difference(actions: torch.Tensor, expected: torch.Tensor) -> float:
+    """Returns the largest difference, as a fraction of actions above 1; infinity if the shapes differ."""
+    if actions.shape != expected.shape:
+        return math.inf
+    return ((actions - expected).abs() / expected.abs().clamp(min=1.0)).max().item()
 
 
 def _description(layer: nn.Module) -> str | list[Any]:

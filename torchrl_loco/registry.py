@@ -173,12 +173,7 @@ def env_class(id: str) -> "type[LocoEnv]":
 
 
 def summary(id: str) -> str:
-    """Returns what a task asks for, in a sentence.
-
-    Raises:
-        ValueError: there is no such task.
-        ImportError: the plug-in that it comes from is broken.
-    """
+    """Returns what a task asks for, in a sentence; errors are those of :func:`env_class`."""
     id = canonical_id(id)
     return registered()[id].summary or _first_line(env_class(id))
 
@@ -217,15 +212,7 @@ def task_name(task: "str | type[LocoEnv]", by_user: bool = False) -> str:
     of a function is found in this process only. A file is run again where it is looked up: what a script does beside
     defining classes belongs under ``if __name__ == "__main__"``.
 
-    Args:
-        task: what :func:`resolve` takes.
-        by_user: as there.
-
-    Raises:
-        ValueError: as :func:`resolve`.
-        TypeError: as :func:`resolve`.
-        FileNotFoundError: as :func:`resolve`.
-        ImportError: as :func:`resolve`.
+    Arguments and errors are those of :func:`resolve`.
     """
     if isinstance(task, str) and not is_place(task) and ALIASES.get(task, task) in installed():
         return canonical_id(task)
@@ -261,11 +248,10 @@ def _class_at(place: str, by_user: bool) -> "type[LocoEnv]":
     """Returns the class at ``"path/to/file.py:Class"`` or ``"module:Class"``.
 
     Raises:
-        UnnamedFileError: the user has not named it.
         ValueError: there is no such class.
         TypeError: it is a class of something else.
         OSError: there is no such file.
-        ImportError: the file or the module raises an error.
+        ImportError: the file or the module raises an error, or the user has not named it.
     """
     source, _, name = place.rpartition(":") if ":" in place else (place, "", "")
     try:
@@ -298,19 +284,6 @@ def _no_class(module: ModuleType, source: str, name: str) -> str:
     )
 
 
-def _module(name: str) -> ModuleType:
-    """Returns a module by its name.
-
-    Raises:
-        ImportError: there is none, or it raises an error.
-    """
-    try:
-        return importlib.import_module(name)
-    except Exception as error:  # a module may raise anything
-        hint = "; a class in a file is named as path/to/file.py:Class" if isinstance(error, ModuleNotFoundError) else ""
-        raise ImportError(f"the module {name!r} cannot be loaded: {type(error).__name__}: {error}{hint}") from error
-
-
 def _loaded(source: str) -> ModuleType | None:
     """Returns a file or a module that this process has run already, as a script or under its own name too."""
     if not source.endswith(".py"):
@@ -340,7 +313,13 @@ def _run(source: str, name: str, by_user: bool) -> ModuleType:
                 f"is in it, name it yourself, once: add --task {shlex.quote(place)} to the command, or call "
                 f"torchrl_loco.registry.resolve({place!r}, by_user=True)"
             )
-    return _module(source) if path is None else _module_of_file(path)
+    if path is not None:
+        return _module_of_file(path)
+    try:
+        return importlib.import_module(source)
+    except Exception as error:  # a module may raise anything
+        hint = "; a class in a file is named as path/to/file.py:Class" if isinstance(error, ModuleNotFoundError) else ""
+        raise ImportError(f"the module {source!r} cannot be loaded: {type(error).__name__}: {error}{hint}") from error
 
 
 def _file_of(module: str) -> Path | None:

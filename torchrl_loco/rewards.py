@@ -19,69 +19,27 @@ class Sigmoid(enum.IntEnum):
 
 
 @wp.func
-def gaussian(x: float, value_at_1: float) -> float:
-    return wp.exp(wp.log(value_at_1) * x * x)
-
-
-@wp.func
-def linear(x: float, value_at_1: float) -> float:
-    return wp.max(1.0 - wp.abs(x) * (1.0 - value_at_1), 0.0)
-
-
-@wp.func
-def hyperbolic(x: float, value_at_1: float) -> float:
-    inverse = 1.0 / value_at_1
-    scale = wp.log(inverse + wp.sqrt(inverse * inverse - 1.0))  # arccosh
-    return 1.0 / wp.cosh(x * scale)
-
-
-@wp.func
-def long_tail(x: float, value_at_1: float) -> float:
-    return 1.0 / (1.0 + x * x * (1.0 / value_at_1 - 1.0))
-
-
-@wp.func
-def reciprocal(x: float, value_at_1: float) -> float:
-    return 1.0 / (1.0 + wp.abs(x) * (1.0 / value_at_1 - 1.0))
-
-
-@wp.func
-def cosine(x: float, value_at_1: float) -> float:
-    angle = wp.min(wp.abs(x) * wp.acos(2.0 * value_at_1 - 1.0), wp.pi)
-    return 0.5 * (1.0 + wp.cos(angle))
-
-
-@wp.func
-def quadratic(x: float, value_at_1: float) -> float:
-    return wp.max(1.0 - x * x * (1.0 - value_at_1), 0.0)
-
-
-@wp.func
-def tanh_squared(x: float, value_at_1: float) -> float:
-    root = wp.sqrt(1.0 - value_at_1)
-    scale = 0.5 * wp.log((1.0 + root) / (1.0 - root))  # arctanh
-    tanh = wp.tanh(x * scale)
-    return 1.0 - tanh * tanh
-
-
-@wp.func
 def sigmoid(x: float, value_at_1: float, kind: int) -> float:
     """Value at ``x`` of a sigmoid that is 1 at 0 and ``value_at_1`` at 1."""
     if kind == Sigmoid.LINEAR:
-        return linear(x, value_at_1)
+        return wp.max(1.0 - wp.abs(x) * (1.0 - value_at_1), 0.0)
     if kind == Sigmoid.HYPERBOLIC:
-        return hyperbolic(x, value_at_1)
+        inverse = 1.0 / value_at_1
+        return 1.0 / wp.cosh(x * wp.log(inverse + wp.sqrt(inverse * inverse - 1.0)))  # the logarithm is arccosh
     if kind == Sigmoid.LONG_TAIL:
-        return long_tail(x, value_at_1)
+        return 1.0 / (1.0 + x * x * (1.0 / value_at_1 - 1.0))
     if kind == Sigmoid.RECIPROCAL:
-        return reciprocal(x, value_at_1)
+        return 1.0 / (1.0 + wp.abs(x) * (1.0 / value_at_1 - 1.0))
     if kind == Sigmoid.COSINE:
-        return cosine(x, value_at_1)
+        angle = wp.min(wp.abs(x) * wp.acos(2.0 * value_at_1 - 1.0), wp.pi)
+        return 0.5 * (1.0 + wp.cos(angle))
     if kind == Sigmoid.QUADRATIC:
-        return quadratic(x, value_at_1)
+        return wp.max(1.0 - x * x * (1.0 - value_at_1), 0.0)
     if kind == Sigmoid.TANH_SQUARED:
-        return tanh_squared(x, value_at_1)
-    return gaussian(x, value_at_1)
+        root = wp.sqrt(1.0 - value_at_1)
+        tanh = wp.tanh(x * (0.5 * wp.log((1.0 + root) / (1.0 - root))))  # the factor of x is arctanh
+        return 1.0 - tanh * tanh
+    return wp.exp(wp.log(value_at_1) * x * x)  # GAUSSIAN
 
 
 @wp.func

@@ -16,14 +16,7 @@ VERSION = 1
 
 
 def save(path: Path, kind: str, tensors: dict[str, torch.Tensor], settings: dict[str, Any]) -> None:
-    """Writes a safetensors file.
-
-    Args:
-        path: where to.
-        kind: what the file holds, such as "policy"; :func:`load` checks it.
-        tensors: the tensors, of any shape ``(...)`` and on any device.
-        settings: values that JSON can hold.
-    """
+    """Writes tensors of any device, and settings for JSON, as a safetensors file of a kind such as "policy"."""
     metadata = {"format": _format(kind), **{name: json.dumps(value) for name, value in settings.items()}}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     replace_file(Path(path), serialize(tensors, metadata))

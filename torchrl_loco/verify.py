@@ -55,7 +55,7 @@ class Exported:
         task: the name of its task, as the user says; ``None`` for what the file says.
 
     Attributes:
-        facts: what the file says, by name: see :mod:`torchrl_loco.deployment`.
+        facts: what the file says, by name: see :func:`torchrl_loco.export.of_robot`.
 
     Raises:
         FileNotFoundError: there is no such file.

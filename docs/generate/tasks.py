@@ -16,7 +16,7 @@ from torchrl_loco.policy import shipped_policies
 from torchrl_loco.registry import ALIASES, OURS, env_class
 from torchrl_loco.sim import models
 from torchrl_loco.tasks.tracking import FOLLOWED, PENALTIES
-from torchrl_loco.training.presets import is_runner
+from torchrl_loco.training.config import is_runner
 
 RUNNERS = [name for name in OURS if is_runner(name)]  # the others have pages of their own
 CLASSES = {env_class(name).body: env_class(name) for name in RUNNERS}

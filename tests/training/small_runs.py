@@ -10,7 +10,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torchrl_loco
 from torchrl_loco.tasks.walker import Walker
-from torchrl_loco.training import RunFolder, Spaces, Trainer, playback, preset
+from torchrl_loco.training import RunFolder, Spaces, Trainer, evaluation, preset
 
 EPISODE = 40
 """Control steps of an episode of the small walker."""
@@ -35,7 +35,7 @@ def small_walker():
     with pytest.MonkeyPatch.context() as patch:
         small = dataclasses.replace(Walker.config, episode_length=EPISODE, sim_dt=0.0125)
         patch.setattr(Walker, "config", small)
-        patch.setattr(playback, "SIZE", (64, 48))
+        patch.setattr(evaluation, "SIZE", (64, 48))
         yield
 
 

@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchrl_loco.training import Trainer
 from torchrl_loco.training.actor import SquashedNormal
-from torchrl_loco.training.compiling import compiled
+from torchrl_loco.training.algorithm import compiled
 
 HOST = ("_local_scalar_dense", "lift_fresh", "nonzero", "aten.equal")
 """Operations that read a tensor's value, or make a tensor from a value of Python's."""

@@ -9,7 +9,7 @@ import torch
 
 import torchrl_loco
 from torchrl_loco.registry import OURS
-from torchrl_loco.training import PPOConfig, REPPOConfig, TrainingConfig, preset, presets, tuning_note
+from torchrl_loco.training import PPOConfig, REPPOConfig, TrainingConfig, preset, tuning_note
 
 
 def test_a_preset_for_every_task():
@@ -126,7 +126,7 @@ def test_what_was_not_tuned_is_said():
 
 def test_presets_of_a_task(monkeypatch):
     """Its own on CUDA, where the critic of a task that is not of this package has bins for returns of either sign."""
-    monkeypatch.setattr(presets, "check_device", torch.device)
+    monkeypatch.setattr("torchrl_loco.training.config.check_device", torch.device)
     own = {"reppo": {"lr": 3e-3, "max_value": 20.0}}
     cls = type("Own", (torchrl_loco.WalkerWalk,), {"presets": own, "__doc__": "Walk."})
     config = preset(cls, "cuda:0", "reppo", gamma=0.9)
@@ -159,3 +159,10 @@ def test_a_device_may_be_torchs_own():
     for wrong in ("cpu:1", 3):
         with pytest.raises(ValueError, match="choose one of cpu, cuda, cuda:0"):
             dataclasses.replace(config, device=wrong)
+
+
+def test_equal_settings_have_equal_hashes():
+    """Settings are keys, also those with options of the task."""
+    configs = {preset("g1_tracking", "cpu", motion=["a.csv"], seed=seed) for seed in (0, 1, 0)}
+    assert {config.seed for config in configs} == {0, 1}
+    assert len(configs) == 2

@@ -15,8 +15,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 import torchrl_loco
 from torchrl_loco.policy import ObservationNorm, Policy
 from torchrl_loco.training import RunFolder, evaluate_run, preset
-from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, shipped_return, summarize
-from torchrl_loco.training.playback import record
+from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, record, shipped_return, summarize
 
 
 def test_evaluation_can_be_repeated(ppo_run):

@@ -12,8 +12,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torchrl.record.loggers import CSVLogger
 
 from torchrl_loco import cli
-from torchrl_loco.training import Trainer, config, loggers
+from torchrl_loco.cli.errors import user_errors
+from torchrl_loco.training import Given, Trainer, config, loggers
 from torchrl_loco.training.algorithm import Algorithm
+from torchrl_loco.training.start import train_to_end
 
 
 def files(run):
@@ -131,7 +133,7 @@ def test_a_logger_that_cannot_be_opened_is_said_in_a_line(tmp_path, monkeypatch,
     monkeypatch.setattr(loggers, "OPENERS", openers)
     monkeypatch.setattr(config, "check_packages", lambda *_: None)
     with pytest.raises(SystemExit, match="2"):
-        cli.runs.train_to_end(Trainer(made(tmp_path, logger=("wandb", "mlflow"))))
+        train_to_end(Trainer(made(tmp_path, logger=("wandb", "mlflow"))), Given(), user_errors)
     assert capsys.readouterr().err == "torchrl-loco: the logger mlflow cannot be opened: no login\n"
     assert closed == ["first"]
 

@@ -17,10 +17,12 @@ import torch
 from compare import assert_same
 from small_runs import made, networks
 
-from torchrl_loco import cli, registry, storage
+from torchrl_loco import registry, storage
+from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.envs.task import folder_of
 from torchrl_loco.sim import models
-from torchrl_loco.training import RunFolder, Trainer, preset
+from torchrl_loco.training import Given, RunFolder, Trainer, preset
+from torchrl_loco.training.start import train_to_end
 
 
 def test_unused_path(tmp_path):
@@ -46,7 +48,7 @@ def test_out_must_be_a_folder(tmp_path):
 HOLD = """
 import sys
 from pathlib import Path
-from torchrl_loco.training.lock import lock
+from torchrl_loco.training.process import lock
 
 lock(Path(sys.argv[1]))
 print("locked", flush=True)
@@ -157,7 +159,7 @@ def test_a_disk_that_fills_up_while_training(tmp_path, capsys):
     trainer.save()
     before = networks(run)
     with full_disk(2**16), pytest.raises(SystemExit, match="2"):
-        cli.runs.train_to_end(trainer)
+        train_to_end(trainer, Given(), user_errors)
     problem, way = capsys.readouterr().err.splitlines()[-2:]
     assert problem.startswith("torchrl-loco: ")
     assert problem.endswith(f"the previous file is kept: '{run.path / 'checkpoint.pt'}'")

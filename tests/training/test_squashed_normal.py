@@ -5,7 +5,7 @@ import math
 import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
-from torchrl_loco.training.squashed_normal import kl, sample
+from torchrl_loco.training.reppo import kl, sample
 
 
 def normal(shape, seed=0):

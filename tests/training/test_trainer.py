@@ -14,13 +14,15 @@ from small_runs import EPISODE, SMALL, WALKER, made, networks, small_walker, tra
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torchrl_loco
-from torchrl_loco import NonFiniteWarning, cli, nan_dump
+from torchrl_loco import NonFiniteWarning, nan_dump
+from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.policy import Policy
 from torchrl_loco.tasks.walker import Walker
-from torchrl_loco.training import RunFolder, Trainer, evaluate_run, preset, train, trainer
+from torchrl_loco.training import Given, RunFolder, Trainer, evaluate_run, preset, train, trainer
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.evaluation import Evaluator
-from torchrl_loco.training.interrupts import interruptible
+from torchrl_loco.training.process import interruptible
+from torchrl_loco.training.start import train_to_end
 from torchrl_loco.training.trainer import ALGORITHMS
 
 FILES = {
@@ -178,7 +180,7 @@ def test_the_command_says_how_to_continue(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(Algorithm, "update", press)
         before = signal.getsignal(kind)
         with pytest.raises(KeyboardInterrupt):
-            cli.runs.train_to_end(Trainer(run))
+            train_to_end(Trainer(run), Given(), user_errors)
         assert run.load_checkpoint("cpu")["iteration"] == 1
         assert capsys.readouterr().err.splitlines()[-1] == f"to continue: torchrl-loco resume {run.path}"
         assert signal.getsignal(kind) is before

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchrl_loco.training.value_bins import ValueBins
+from torchrl_loco.training.reppo import ValueBins
 
 
 @pytest.mark.parametrize("low", [0.0, -150.0])
@@ -22,12 +22,3 @@ def test_bins_keep_a_return(low):
 def test_bins_clip_returns_beyond_them():
     bins = ValueBins(0.0, 10.0, 11)
     torch.testing.assert_close(bins.encode(torch.tensor([-5.0, 99.0])), bins.encode(torch.tensor([0.0, 10.0])))
-
-
-def test_cross_entropy():
-    """The mean over returns, of which some are beyond the bins."""
-    torch.manual_seed(0)
-    bins, logits = ValueBins(0.0, 150.0, 151), 10 * torch.randn(37, 151)
-    returns = torch.linspace(-20.0, 170.0, 37)
-    expected = -(bins.encode(returns).double() * logits.double().log_softmax(-1)).sum(-1).mean()
-    torch.testing.assert_close(bins.cross_entropy(logits, returns).double(), expected, atol=0, rtol=1e-5)

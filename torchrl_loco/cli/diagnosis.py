@@ -71,7 +71,14 @@ def inspect(
     """
     if terrain is not None:
         with user_errors():
-            _draw_ground(what, terrain)
+            from torchrl_loco.registry import list_envs, resolve
+
+            cls = resolve(what, by_user=True)
+            if not hasattr(cls, "ground"):
+                rough = ", ".join(name for name in list_envs() if name.endswith("_rough"))
+                raise ValueError(f"{what} has no attribute ground, a torchrl_loco.terrain.Terrain, as {rough} have")
+            cls.ground.picture(terrain)
+        print(terrain)
         return
     file = Path(what)
     with user_errors():
@@ -109,19 +116,3 @@ def warm(
         with tempfile.TemporaryDirectory() as folder, user_errors(), unsaid:
             training.train(task, short, out=folder)
         print(f"{task}: its kernels are in the caches after {time.perf_counter() - begin:.0f} s", flush=True)
-
-
-def _draw_ground(task: str, picture: Path) -> None:
-    """Writes a picture of the ground of a task.
-
-    Raises:
-        ValueError: the task is on a floor.
-    """
-    from torchrl_loco.registry import list_envs, resolve
-
-    cls = resolve(task, by_user=True)
-    if not hasattr(cls, "ground"):
-        rough = ", ".join(name for name in list_envs() if name.endswith("_rough"))
-        raise ValueError(f"{task} has no attribute ground, a torchrl_loco.terrain.Terrain, as {rough} have")
-    cls.ground.picture(picture)
-    print(picture)

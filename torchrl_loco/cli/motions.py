@@ -135,7 +135,7 @@ def _film(m: "mujoco.MjModel", q: "np.ndarray", out: Path, camera: str) -> None:
     from tqdm.auto import tqdm
 
     from torchrl_loco.eyes.pictures import Poses
-    from torchrl_loco.training.playback import SIZE, write_video
+    from torchrl_loco.training.evaluation import SIZE, write_video
 
     print(f"rendering {len(q)} frames; on a CPU this takes a while", file=sys.stderr)
     device = wp.get_device("cuda" if torch.cuda.is_available() else "cpu")

@@ -1,5 +1,6 @@
 """How values are parsed, and how the settings of a training run become options."""
 
+import argparse
 import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -83,15 +84,18 @@ def summaries() -> dict[str, str]:
 def task_options(args: list[str]) -> Any:
     """Returns the type of a task's settings; removes from ``args`` the options that choose the preset."""
     from torchrl_loco.registry import list_envs, resolve, task_name
-    from torchrl_loco.training.config import CONFIGS, TrainingConfig
-    from torchrl_loco.training.presets import preset, tuning_note
+    from torchrl_loco.training.config import CONFIGS, TrainingConfig, preset, tuning_note
 
     about = summaries()
-    device, algorithm = (_take(flag, args) for flag in ("--device", "--algorithm"))
+    usage = "%(prog)s TASK [--device DEVICE] [--algorithm ALGORITHM] [--SETTING VALUE ...]; all settings: --help"
+    preset_options = argparse.ArgumentParser("torchrl-loco train", usage, add_help=False, allow_abbrev=False)
+    for flag in ("--device", "--algorithm"):
+        preset_options.add_argument(flag)
+    chosen, args[:] = preset_options.parse_known_args(args)
     if len(args) > 1 and not args[1].startswith("-"):
         with user_errors():
             task = task_name(args[1], by_user=True)
-            config = _options(preset(task, device, algorithm))
+            config = _options(preset(task, chosen.device, chosen.algorithm))
             _check_names(args[2:], config)
             note = tuning_note(config)
             words = about[task] if task in list_envs() else (resolve(task).__doc__ or "").strip().partition("\n")[0]
@@ -189,16 +193,3 @@ def settings(options: Any) -> tuple["training.TrainingConfig", tuple[int, ...], 
 
         values["options"] = resolve(options.task).checked_options(given)
     return kind(**values), options.seeds, options.gpus
-
-
-def _take(flag: str, args: list[str]) -> str | None:
-    """Removes ``flag`` and its value from ``args`` and returns the value, by which the other options are chosen."""
-    for i, arg in enumerate(args):
-        if arg == flag and i + 1 < len(args):
-            value = args[i + 1]
-            del args[i : i + 2]
-            return value
-        if arg.startswith(f"{flag}="):
-            del args[i]
-            return arg.removeprefix(f"{flag}=")
-    return None

@@ -26,7 +26,7 @@ from torchrl_loco.checks import (
     is_run,
 )
 from torchrl_loco.cli.errors import user_errors
-from torchrl_loco.cli.motions import THOSE_OF_TRAINING, MotionOptions, Motions
+from torchrl_loco.cli.motions import Motions
 from torchrl_loco.cli.options import OtherTask
 from torchrl_loco.conditions import DEFAULT, Conditions
 from torchrl_loco.known_files import place_of
@@ -43,76 +43,69 @@ RunOrTask = Annotated[
         "FILE.py:CLASS, with --policy.",
     ),
 ]
-OtherPolicy = Annotated[
-    Path | None, tyro.conf.arg(name="policy", help="a run folder or a policy file, to play in the task that is named.")
-]
-Protocol = Annotated[
-    Literal["playground", "dm_control"],
-    tyro.conf.arg(help="which policy of the package, by what it was trained under; any is played under its own."),
-]
 
 
-def _policy(
-    run_or_task: str,
-    protocol: str,
-    device: str | None,
-    other: Path | None = None,
-    task: str | None = None,
-    motions: Motions = THOSE_OF_TRAINING,
-) -> tuple["torchrl_loco.Policy", Path]:
-    """Returns a policy, and the path from which the default names of its video and of its export derive.
+@dataclasses.dataclass(frozen=True)
+class Which(Motions):
+    """Which policy plays, in which task, and by which motions."""
 
-    Its task is the one that is named: ``task``, or ``run_or_task`` if ``other`` says where the policy is.
-    """
-    policy, beside = _policy_of(run_or_task, protocol, device, other, task)
-    if motions != THOSE_OF_TRAINING:
-        policy.info["options"] = {**policy.info.get("options", {}), **motions.given(policy.info["task"])}
-    return policy, beside
+    protocol: Literal["playground", "dm_control"] = "playground"
+    """Which policy of the package, by what it was trained under; any is played under its own."""
+    policy: Path | None = None
+    """A run folder or a policy file, to play in the task that is named."""
+    task: OtherTask = None
+
+    def load(self, run_or_task: str, device: str | None) -> tuple["torchrl_loco.Policy", Path]:
+        """Returns a policy, and the path from which the default names of its video and of its export derive.
+
+        Its task is the one that is named: ``task``, or ``run_or_task`` if ``policy`` says where the policy is.
+        """
+        policy, beside = self._load(run_or_task, device)
+        if self.motion or self.fps:
+            policy.info["options"] = {**policy.info.get("options", {}), **self.given(policy.info["task"])}
+        return policy, beside
+
+    def _load(self, run_or_task: str, device: str | None) -> tuple["torchrl_loco.Policy", Path]:
+        """Returns a policy as its file has it, and the path beside which its files belong."""
+        if self.task is not None and (self.policy is not None or not Path(run_or_task).exists()):
+            raise ValueError(f"{run_or_task} names the task already: leave --task out")
+        if self.policy is not None:
+            policy, _ = _policy_at(self.policy, device, _task(run_or_task))
+            return policy, Path(_label(policy))
+        if Path(run_or_task).exists():
+            return _policy_at(Path(run_or_task), device, None if self.task is None else _task(self.task))
+        task = _task(run_or_task)
+        if ":" in task:
+            raise ValueError(
+                f"the package has no policy for {task}: name one of yours with --policy, or its run folder"
+            )
+        return torchrl_loco.load_policy(task, device, self.protocol), Path(task)
 
 
-def _policy_of(
-    run_or_task: str, protocol: str, device: str | None, other: Path | None, task: str | None
-) -> tuple["torchrl_loco.Policy", Path]:
-    """Returns a policy as its file has it, and the path beside which its files belong."""
-    if task is not None and (other is not None or not Path(run_or_task).exists()):
-        raise ValueError(f"{run_or_task} names the task already: leave --task out")
-    if other is not None:
-        policy, _ = _policy_at(other, device, _task(run_or_task))
-        return policy, Path(_label(policy))
-    if Path(run_or_task).exists():
-        return _policy_at(Path(run_or_task), device, None if task is None else _task(task))
-    task = _task(run_or_task)
-    if ":" in task:
-        raise ValueError(f"the package has no policy for {task}: name one of yours with --policy, or its run folder")
-    return torchrl_loco.load_policy(task, device, protocol), Path(task)
+WhichOptions = Annotated[Which, tyro.conf.arg(name="")]
 
 
 def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["torchrl_loco.Policy", Path]:
     """Returns the policy of a run folder or a file, and the path of its file.
 
     Of a run that was stopped before a policy was evaluated, it is that of the last checkpoint; a checkpoint can be
-    named, too.
-
-    Args:
-        source: the run folder, or the file.
-        device: where the policy computes.
-        task: the name of its task, as the user says; ``None`` for what the file says.
+    named, too. The user may say the name of its task; else it is what the file says.
     """
     if source.suffix == ".pt" and is_run(source.parent):
-        from torchrl_loco import training
+        from torchrl_loco.training import RunFolder
         from torchrl_loco.training.watching import last_policy
 
-        return last_policy(training.RunFolder(source.parent, task), device, source), source
+        return last_policy(RunFolder(source.parent, task), device, source), source
     if not source.is_dir():
         policy = torchrl_loco.Policy.load(source, device)
         policy.info["task"] = task or place_of(policy.info["task"], source.parent)
         return policy, source
-    from torchrl_loco import training
+    from torchrl_loco.training import RunFolder
 
-    run = training.RunFolder(source, task)
+    run = RunFolder(source, task)
     if run.policy.is_file() or run.given or not run.has_checkpoint:
         return run.load_policy(device), run.policy
-    from torchrl_loco.training.watching import last_policy
+    from torchrl_loco.training.watching import last_policy  # which needs what a training needs
 
     policy = last_policy(run, device)
     after = f"after {policy.info['frames']:,} frames"
@@ -140,11 +133,8 @@ def evaluate(
     /,
     episodes: int | None = None,
     seed: int | None = None,
-    protocol: Protocol = "playground",
-    policy: OtherPolicy = None,
-    task: OtherTask = None,
+    which: WhichOptions = Which(),
     device: str | None = None,
-    motions: MotionOptions = THOSE_OF_TRAINING,
 ) -> None:
     """Evaluate a trained policy over full episodes, without exploration.
 
@@ -152,14 +142,11 @@ def evaluate(
         run_or_task: what to evaluate.
         episodes: number of episodes; default: as the policy was evaluated after its training.
         seed: seed of the episodes; default: those of that evaluation.
-        protocol: which policy of the package.
-        policy: a policy that may be of another task.
-        task: the task of the run or the file.
+        which: which policy, in which task.
         device: where to play them; default: CUDA if there is any.
-        motions: which motions.
     """
     with user_errors():
-        played, _ = _policy(run_or_task, protocol, device, policy, task, motions)
+        played, _ = which.load(run_or_task, device)
         from torchrl_loco import training
 
         summary = training.evaluate_policy(played, episodes, seed)
@@ -257,26 +244,20 @@ BrowserOptions = Annotated[Browser, tyro.conf.arg(name="")]
 def record(
     run_or_task: RunOrTask,
     /,
-    protocol: Protocol = "playground",
-    policy: OtherPolicy = None,
-    task: OtherTask = None,
-    motions: MotionOptions = THOSE_OF_TRAINING,
+    which: WhichOptions = Which(),
     video: VideoOptions = Video(),
 ) -> None:
     """Record a video of a trained policy.
 
     Args:
         run_or_task: what to record.
-        protocol: which policy of the package.
-        policy: a policy that may be of another task.
-        task: the task of the run or the file.
-        motions: which motions.
+        which: which policy, in which task.
         video: which part of an episode is shown, and how.
     """
     with user_errors():
         video.check()
         video.check_encoder()
-        played, beside = _policy(run_or_task, protocol, video.device, policy, task, motions)
+        played, beside = which.load(run_or_task, video.device)
         video.make(played, _video_file(played, beside))
 
 
@@ -287,10 +268,7 @@ def play(
         Literal["auto", "window", "browser", "video"],
         tyro.conf.arg(help="where it is shown; auto is a window if there is a display, else the browser."),
     ] = "auto",
-    protocol: Protocol = "playground",
-    policy: OtherPolicy = None,
-    task: OtherTask = None,
-    motions: MotionOptions = THOSE_OF_TRAINING,
+    which: WhichOptions = Which(),
     browser: BrowserOptions = Browser(),
     video: VideoOptions = Video(),
 ) -> None:
@@ -299,10 +277,7 @@ def play(
     Args:
         run_or_task: what to play.
         viewer: where it is shown.
-        protocol: which policy of the package.
-        policy: a policy that may be of another task.
-        task: the task of the run or the file.
-        motions: which motions.
+        which: which policy, in which task.
         browser: how many worlds the browser shows, and at which address.
         video: which part of an episode is shown, and how; --out always records a video.
     """
@@ -319,7 +294,7 @@ def play(
                 raise ValueError("there is no display for a window: pass --viewer browser or --viewer video")
         if viewer == "video":
             video.check_encoder()
-        played, beside = _policy(run_or_task, protocol, video.device, policy, task, motions)
+        played, beside = which.load(run_or_task, video.device)
         from torchrl_loco import training
         from torchrl_loco.training.environments import make_for
 
@@ -380,20 +355,15 @@ def watch(
         check_int("seed", seed, SEED)
         check_float("cpu_share", cpu_share, SHARE)
         check_device(device)
-        _yield_to_others()
+        os.nice(19)  # the lowest priority that there is, also of threads that are made from here on
+        if hasattr(os, "SCHED_IDLE"):  # of Linux: a fifth of the share of nice 19
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
         from torchrl_loco import training
         from torchrl_loco.training.watching import Watched
 
         folder = training.RunFolder(run, None if task is None else _task(task))
         watched = Watched(folder, browser.num_envs, device, seed)
         browser.show(watched.env, watched.newer(), watched.newer, cpu_share)
-
-
-def _yield_to_others() -> None:
-    """Gives this process the lowest priority that there is; threads that it makes from here on have the same."""
-    os.nice(19)
-    if hasattr(os, "SCHED_IDLE"):  # of Linux: a fifth of the share of nice 19
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
 def _video_file(policy: "torchrl_loco.Policy", beside: Path) -> Path:
@@ -406,10 +376,7 @@ def export(
     /,
     format: Literal["onnx", "torch"] = "onnx",
     out: Path | None = None,
-    protocol: Protocol = "playground",
-    policy: OtherPolicy = None,
-    task: OtherTask = None,
-    motions: MotionOptions = THOSE_OF_TRAINING,
+    which: WhichOptions = Which(),
 ) -> None:
     """Write a policy as a file for programs without this package, and compare it with the policy.
 
@@ -417,16 +384,12 @@ def export(
         run_or_task: what to export.
         format: onnx, or torch for a program of torch.export (.pt2).
         out: the file, a new one; default: a new file beside the policy, or TASK.onnx for a policy of the package.
-        protocol: which policy of the package.
-        policy: a policy that may be of another task.
-        task: the task of the run or the file.
-        motions: which motions.
+        which: which policy, in which task.
     """
     with user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
-        written, beside = _policy(run_or_task, protocol, "cpu", policy, task, motions)
+        written, beside = which.load(run_or_task, "cpu")
         from torchrl_loco import storage
-        from torchrl_loco.deployment import why_not
-        from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy
+        from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy, why_not
 
         suffix = SUFFIXES[format]
         if out is not None:
@@ -452,13 +415,10 @@ def verify(
         ),
     ],
     /,
-    protocol: Protocol = "playground",
-    policy: OtherPolicy = None,
-    task: OtherTask = None,
+    which: WhichOptions = Which(),
     device: str | None = None,
     alone: bool = False,
     out: Path | None = None,
-    motions: MotionOptions = THOSE_OF_TRAINING,
     conditions: ConditionOptions = DEFAULT,
 ) -> None:
     """Play a policy, as exported, in its task in C MuJoCo, by the model's own options; status 1 if it does not hold.
@@ -468,49 +428,37 @@ def verify(
 
     Args:
         run_task_or_file: what to verify.
-        protocol: which policy of the package.
-        policy: a policy that may be of another task, exported or not.
-        task: the task of the run or the file.
+        which: which policy, exported or not, in which task.
         device: where the simulator of the training computes; default: CUDA if there is any.
         alone: whether to play it in C MuJoCo alone, which is quicker on a CPU.
         out: figures as JSON, a new file; default: a new verify.json in the run folder, none elsewhere.
-        motions: which motions.
         conditions: what the policy must hold in.
     """
     with user_errors(), tempfile.TemporaryDirectory() as folder:
+        from torchrl_loco import storage
         from torchrl_loco import verify as verification
+        from torchrl_loco.export import export_policy, why_not
 
         conditions.check()
         out = None if out is None else check_output_file("out", out, (".json",))
-        path = Path(run_task_or_file) if policy is None else policy
+        path = Path(run_task_or_file) if which.policy is None else which.policy
         if path.suffix == ".onnx":
-            named = task if policy is None else run_task_or_file
+            named = which.task if which.policy is None else run_task_or_file
             named = None if named is None else _task(named)
         else:
-            path, in_run = _exported_for(run_task_or_file, protocol, policy, task, Path(folder), motions)
-            out, named = in_run if out is None else out, None
+            exported, beside = which.load(run_task_or_file, "cpu")
+            if reason := why_not(exported):
+                raise ValueError(f"{run_task_or_file} cannot be verified: {reason}")
+            path, named = Path(folder) / "policy.onnx", None
+            with user_errors(RuntimeError):  # of the export alone
+                export_policy(exported, path)
+            if out is None and is_run(beside.parent):
+                out = storage.unused_path(beside.with_name("verify.json"))
         print(f"verifying: {conditions.episodes} episodes, which take minutes on a CPU", file=sys.stderr, flush=True)
-        report = verification.verify(path, conditions, device, alone=alone, task=named, options=motions.given)
+        report = verification.verify(path, conditions, device, alone=alone, task=named, options=which.given)
         print(*report.lines, sep="\n")
         if out is not None:
             out.write_text(f"{json.dumps(report.figures, indent=2)}\n")
             print(out)
     if not report.holds:
         raise SystemExit(1)
-
-
-def _exported_for(
-    run_or_task: str, protocol: str, other: Path | None, task: str | None, folder: Path, motions: Motions
-) -> tuple[Path, Path | None]:
-    """Exports a policy into a folder. Returns the file, and where figures belong in its run folder, if it has one."""
-    from torchrl_loco import storage
-    from torchrl_loco.deployment import why_not
-    from torchrl_loco.export import export_policy
-
-    policy, beside = _policy(run_or_task, protocol, "cpu", other, task, motions)
-    if reason := why_not(policy):
-        raise ValueError(f"{run_or_task} cannot be verified: {reason}")
-    path = folder / "policy.onnx"
-    with user_errors(RuntimeError):  # of the export alone
-        export_policy(policy, path)
-    return path, storage.unused_path(beside.with_name("verify.json")) if is_run(beside.parent) else None

@@ -1,9 +1,7 @@
 """Commands that train, and what they leave: train, resume and plot."""
 
-import contextlib
 import dataclasses
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,16 +35,7 @@ def train(options: Any, args: list[str]) -> None:
 
         distributed.launch(missing, args)
         return
-    runs = []
-    with _joined(config.device):
-        for seed in seeds or (config.seed,):
-            with user_errors():
-                from torchrl_loco import training
-
-                trainer = training.begin(dataclasses.replace(config, seed=seed))
-            train_to_end(trainer)
-            trainer.env.close()  # its memory is for the next seed
-            runs.append(str(trainer.run.path))
+    runs = [_trained(dataclasses.replace(config, seed=seed)) for seed in seeds or (config.seed,)]
     if seeds:
         print(f"all seeds in one picture: torchrl-loco plot {' '.join(runs)}")
 
@@ -74,7 +63,7 @@ def resume(
     with user_errors():
         check_run(run)
         from torchrl_loco import training
-        from torchrl_loco.registry import resolve, task_name
+        from torchrl_loco.registry import task_name
 
         folder = training.RunFolder(run, None if task is None else task_name(task, by_user=True))
         training.Given().check(folder)
@@ -82,19 +71,14 @@ def resume(
         changes = {name: value for name, value in asked.items() if value is not None}
         if moved := motions.given(folder.task):
             changes["options"] = {**folder.load_config().options, **moved}
-        kind = folder.load_config(**changes).device
-        missing = missing_processes(gpus, kind)
+        missing = missing_processes(gpus, folder.load_config(**changes).device)
     if missing:
         more = [f"--{name}={value}" for name, value in changes.items() if name != "options"]
         more += [*(["--motion", *motions.motion] if motions.motion else []), f"--fps={motions.fps}"]
         more += [] if task is None else [f"--task={task}"]
         training.distributed.launch(missing, ["resume", str(run), f"--gpus={gpus}", *more])
     else:
-        with _joined(kind):
-            with user_errors():
-                resolve(folder.task)  # before settings are written
-                trainer = training.Trainer(folder, resume=True, **changes)
-            train_to_end(trainer)
+        _trained(folder, **changes)
 
 
 def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("learning_curves.png")) -> None:
@@ -144,23 +128,11 @@ def missing_processes(gpus: int | None, device: str) -> int:
     return gpus if gpus > 1 else 0
 
 
-@contextlib.contextmanager
-def _joined(device: str) -> Iterator[None]:
-    """Imports what a training needs, and connects the ranks of torchrun while the block lasts, if there are several."""
-    with contextlib.ExitStack() as ranks:
-        with user_errors():
-            with no_collection():
-                from torchrl_loco.training import distributed, start  # noqa: F401
-            ranks.enter_context(distributed.joined(device))
-        yield
-
-
-def train_to_end(trainer: "training.Trainer") -> None:
-    """Trains to the last frame and prints where the results are."""
-    from torchrl_loco.training.distributed import is_first
-    from torchrl_loco.training.start import Given, saying_how_to_continue
-
-    with saying_how_to_continue(trainer, Given()), user_errors(OSError):  # others are bugs and keep their traceback
-        trainer.train()
-    if is_first():
-        print(f"policy, curve, video and logs: {trainer.run.path}")
+def _trained(what: "training.TrainingConfig | training.RunFolder", **changes: Any) -> str:
+    """Trains to the last frame, and prints where the results are. Returns the folder of the run."""
+    with user_errors(), no_collection():
+        from torchrl_loco.training.start import Given, run_to_end
+    run = run_to_end(what, Given(), user_errors, **changes)
+    if os.environ.get("RANK", "0") == "0":
+        print(f"policy, curve, video and logs: {run.path}")
+    return str(run.path)

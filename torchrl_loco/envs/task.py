@@ -230,7 +230,7 @@ class Task:
 
     @classmethod
     def facts(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns what programs without this package must know to play a policy, beside :mod:`torchrl_loco.deployment`.
+        """Returns what programs without this package must know to play a policy, beside :func:`.of_robot`.
 
         Args:
             m: the model.

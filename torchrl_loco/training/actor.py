@@ -1,8 +1,9 @@
-"""The actor that all algorithms share: a Gaussian on raw observations, and the policy it becomes."""
+"""The actor that all algorithms share: what it reads, a Gaussian on raw observations, and the policy it becomes."""
 
 import copy
 import dataclasses
 import inspect
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -10,19 +11,76 @@ import torch
 from tensordict.nn import AddStateIndependentNormalScale, NormalParamExtractor, TensorDictModule
 from torch import nn
 from torch.distributions import AffineTransform, Independent, Normal, TransformedDistribution
+from torch.nn.functional import softplus
 from torchrl.data import Bounded, Unbounded
+from torchrl.envs import EnvBase
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.modules.distributions.continuous import SafeTanhTransform
 
-from torchrl_loco.policy import ObservationNorm, Policy, copied, layers_of
+from torchrl_loco.policy import Policy, copied, difference, layers_of, random_observations
 from torchrl_loco.training.config import TrainingConfig
-from torchrl_loco.training.spaces import Spaces
 
 Network = Callable[[int, int], nn.Module]
 """Makes a network of so many inputs and so many outputs."""
 
 TOLERANCE = 1e-4
 """Largest difference of an action of a saved policy from the actor's, as a fraction of those above 1: rounding."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Spaces:
+    """The sizes of what actor and critic read, and of an action.
+
+    The actor reads ``observation``. The critic reads ``privileged`` where an environment has it, else the same as the
+    actor.
+    """
+
+    observation: int
+    """Length of an observation."""
+    action: int
+    """Length of an action."""
+    privileged: int | None = None
+    """Length of what the critic alone reads; ``None`` where it reads the observation."""
+    bounded: bool = True
+    """Whether actions are bounded by [-1, 1]; else they are any numbers."""
+
+    @property
+    def critic_key(self) -> str:
+        """The entry that the critic reads."""
+        return "observation" if self.privileged is None else "privileged"
+
+    @property
+    def critic(self) -> int:
+        """Length of what the critic reads."""
+        return self.observation if self.privileged is None else self.privileged
+
+    @classmethod
+    def of(cls, env: EnvBase) -> "Spaces":
+        """Returns those of an environment, of any batch size.
+
+        Raises:
+            ValueError: it has no flat observation, or its actions are neither bounded by [-1, 1] nor unbounded.
+        """
+        spec = env.observation_spec
+        sizes = {}
+        for key in ("observation", "privileged"):
+            if key not in spec.keys():  # noqa: SIM118
+                continue
+            shape = spec[key].shape[len(env.batch_size) :]
+            if len(shape) != 1:
+                raise ValueError(
+                    f"{key!r} must be a row of numbers for each world to train on, but has shape {tuple(shape)}: "
+                    "flatten it, for example with torchrl.envs.FlattenObservation"
+                )
+            sizes[key] = shape[0]
+        if "observation" not in sizes:
+            raise ValueError(f"the environment must have an 'observation' to train on, it has {', '.join(spec.keys())}")
+        low, high = env.action_spec.space.low, env.action_spec.space.high
+        largest = torch.finfo(low.dtype).max  # which TorchRL has for infinity
+        bounded = not ((low <= -largest).all() and (high >= largest).all())
+        if bounded and not ((low == -1.0).all() and (high == 1.0).all()):
+            raise ValueError("actions must be bounded by [-1, 1], or by nothing: set action_range in the class")
+        return cls(sizes["observation"], env.action_spec.shape[-1], sizes.get("privileged"), bounded)
 
 
 class SquashedNormal(TransformedDistribution):
@@ -47,6 +105,11 @@ class SquashedNormal(TransformedDistribution):
     def deterministic_sample(self) -> torch.Tensor:
         """The image of the mean, shape ``(..., n)``."""
         return self.bound * self.base_dist.mean.tanh()
+
+
+def log_slope(u: torch.Tensor) -> torch.Tensor:
+    """Returns log(1 - tanh(u)^2), exact for large u too, of any shape ``(...)``."""
+    return 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))
 
 
 def network_of(make: Network, inputs: int, outputs: int) -> nn.Module:
@@ -82,14 +145,8 @@ def make_actor(
 ) -> ProbabilisticActor:
     """Returns a Gaussian actor around a network that gives means and standard deviations, under tanh if it is bounded.
 
-    It reads ``observation`` and writes ``loc``, ``scale``, ``action`` and, if asked to, ``action_log_prob``.
-
-    Args:
-        spaces: what it reads and writes.
-        device: where it computes.
-        network: gives means and standard deviations.
-        log_prob: whether it writes the log-probability of the action.
-        bound: of actions that the environment does not bound; ``None`` leaves them without.
+    It reads ``observation`` and writes ``loc``, ``scale``, ``action`` and, if asked to, ``action_log_prob``. Actions
+    that the environment does not bound have ``bound``, if there is one.
     """
     shape = (spaces.action,)
     if spaces.bounded:
@@ -116,11 +173,8 @@ def deterministic_policy(actor: ProbabilisticActor, config: TrainingConfig, info
         TypeError: the network has a part that a policy's file cannot hold.
         RuntimeError: what can be held acts differently from the actor.
     """
-    network: Any = actor[0].module
-    of_scale = (AddStateIndependentNormalScale, NormalParamExtractor)
-    parts = [part for part in network if not isinstance(part, of_scale)]
-    *layers, last = (copied(layer) for part in parts for layer in layers_of(part))
-    if not any(isinstance(part, AddStateIndependentNormalScale) for part in network):
+    *layers, last = map(copied, layers_of_actor(actor))
+    if not any(isinstance(part, AddStateIndependentNormalScale) for part in actor[0].module):
         last = _first_half(last)
     squashed = _squashed(actor[-1].distribution_kwargs.get("bound"), last)
     settings = {
@@ -131,6 +185,12 @@ def deterministic_policy(actor: ProbabilisticActor, config: TrainingConfig, info
     policy = Policy(nn.Sequential(*layers, last, *squashed), {"algorithm": config.algorithm, **settings, **info})
     _check_that_they_agree(policy, actor)
     return policy
+
+
+def layers_of_actor(actor: ProbabilisticActor) -> list[nn.Module]:
+    """Returns the layers of an actor's network, without what makes a distribution of what the last one gives."""
+    of_scale = (AddStateIndependentNormalScale, NormalParamExtractor)
+    return [layer for part in actor[0].module if not isinstance(part, of_scale) for layer in layers_of(part)]
 
 
 def _squashed(bound: float | None, last: Any) -> list[nn.Module]:
@@ -167,18 +227,12 @@ def _check_that_they_agree(policy: Policy, actor: ProbabilisticActor) -> None:
     """Compares a policy with the actor that it was made of, on the CPU and on random observations.
 
     Raises:
-        TypeError: the actor does not begin by normalising observations.
         RuntimeError: their actions differ by more than rounding does.
     """
-    norm: Any = policy.module[0]
-    if not isinstance(norm, ObservationNorm):
-        raise TypeError(f"an actor must begin by normalising observations, not with {type(norm).__name__}")
-    noise = torch.randn(64, len(norm.mean), generator=torch.Generator().manual_seed(0))
-    observation = norm.mean.cpu() + 2 * noise * (norm.var.cpu() + 1e-6).sqrt()
+    observation = random_observations(policy.module, 64, 2.0)
     network, last = copy.deepcopy(actor[0].module).cpu(), actor[-1]  # as a module it would import pandas
     expected = last.distribution_class(*network(observation), **last.distribution_kwargs).deterministic_sample
-    action = copy.deepcopy(policy.module).cpu()(observation)
-    error = ((action - expected).abs() / expected.abs().clamp(min=1.0)).max().item()
+    error = difference(copy.deepcopy(policy.module).cpu()(observation), expected)
     if not error <= TOLERANCE:  # true for NaN too
         raise RuntimeError(
             f"the policy would act differently from the actor that was trained, by up to {error:.2g}: a Sequential in "

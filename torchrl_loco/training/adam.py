@@ -4,10 +4,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
+import warp as wp
 from torch import Tensor, nn
 
+from torchrl_loco.sim.graph import EXCLUSIVE, current_stream, joined_to_torch, torch_is_recording
+from torchrl_loco.sim.warp_init import init_warp
 from torchrl_loco.training import distributed
-from torchrl_loco.training.kernels import launch, step_of_adam
 
 ALIGNED = 8
 """Numbers at a multiple of which each parameter and each row of a matrix begins: products of matrices in bfloat16 read
@@ -203,3 +205,43 @@ class Vectors:
         """Yields what Adam keeps of each parameter, as views."""
         for moments in zip(*map(self._views, self.moments), strict=True):
             yield dict(zip(("step", "exp_avg", "exp_avg_sq"), (self.counts[0], *moments), strict=True))
+
+
+@wp.kernel(enable_backward=False)
+def step_of_adam(
+    gradient: wp.array[float],
+    norm: wp.array[float],
+    lr: wp.array[float],
+    counts: wp.array[wp.float64],
+    max_norm: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    parameter: wp.array[float],
+    first: wp.array[float],
+    second: wp.array[float],
+):
+    i = wp.tid()
+    slope = gradient[i] * wp.min(max_norm / (norm[0] + 1.0e-6), 1.0)
+    of_first = float(wp.float64(1.0) - counts[1])
+    of_second = float(wp.float64(1.0) - counts[2])
+    first[i] = first[i] + (1.0 - beta1) * (slope - first[i])
+    second[i] = beta2 * second[i] + (1.0 - beta2) * slope * slope
+    parameter[i] = parameter[i] - lr[0] / of_first * first[i] / (wp.sqrt(second[i] / of_second) + eps)
+
+
+def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+    """Launches a kernel on torch's current stream, or adds it to what torch records.
+
+    Args:
+        kernel: the kernel.
+        dim: its threads.
+        inputs: numbers, and tensors on one device, which it reads.
+        outputs: tensors that it writes.
+    """
+    init_warp()
+    device = wp.device_from_torch(outputs[0].device)
+    arrays = [[wp.from_torch(x.detach()) if isinstance(x, torch.Tensor) else x for x in xs] for xs in (inputs, outputs)]
+    stream = current_stream(device)
+    with EXCLUSIVE, joined_to_torch(device) if torch_is_recording(device) else wp.ScopedStream(stream, False):
+        wp.launch(kernel, dim, *arrays, device=device)

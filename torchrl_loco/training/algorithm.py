@@ -1,28 +1,31 @@
-"""What all algorithms share: gradient steps over the minibatches of a batch, recorded as a graph on CUDA."""
+"""What all algorithms share: warm starts, and gradient steps over minibatches, recorded as a graph on CUDA."""
 
 import contextlib
+import importlib
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
-from torchrl_loco.policy import ObservationNorm, moments
+from torchrl_loco.policy import ObservationNorm, Policy, layers_of, moments
 from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed
-from torchrl_loco.training.actor import Network
+from torchrl_loco.training.actor import Network, Spaces, layers_of_actor
 from torchrl_loco.training.adam import FlatAdam
 from torchrl_loco.training.config import TrainingConfig
-from torchrl_loco.training.packed import Packed
-from torchrl_loco.training.spaces import Spaces
+from torchrl_loco.training.run_folder import RunFolder
 
 WARMUP = 1
 """Epochs before one is recorded: cuBLAS allocates at its first product, and torch.compile compiles."""
+ROW_ALIGNED = 16
+"""Bytes at a multiple of which each entry of a row of steps begins."""
 
 
 class Algorithm(ABC):
@@ -207,13 +210,7 @@ class Algorithm(ABC):
 
 
 class Acting(TensorDictModuleBase):
-    """An actor that is called through a faster function.
-
-    Args:
-        actor: the actor, whose parameters this has.
-        act: the function.
-        written: the entries that it writes; ``None`` are those of the actor.
-    """
+    """An actor that is called through a faster function, which may write other entries."""
 
     def __init__(
         self,
@@ -259,3 +256,113 @@ def settings_for_small_networks() -> Iterator[None]:
     finally:
         torch.set_num_threads(threads)
         torch.set_float32_matmul_precision(precision)
+
+
+class Packed:
+    """A copy of steps whose entries lie one after the other in rows of bytes.
+
+    One kernel shuffles them: a row costs it the same however long.
+
+    Args:
+        steps: entries of any type, batch ``(n,)``.
+    """
+
+    def __init__(self, steps: TensorDictBase) -> None:
+        self._entries, end = [], 0
+        for key, entry in steps.items(True, True):
+            size = entry[0].numel() * entry.element_size()
+            self._entries.append((key, slice(end, end + size), entry.dtype, entry.shape[1:]))
+            end += -(-size // ROW_ALIGNED) * ROW_ALIGNED
+        self._rows = entry.new_zeros(len(steps), end, dtype=torch.uint8)
+        self.steps = self._views(self._rows)
+        self.fill(steps)
+
+    def fill(self, steps: TensorDictBase) -> None:
+        """Copies other steps of the same entries."""
+        self.steps.update_(steps)
+
+    def __getitem__(self, order: torch.Tensor) -> TensorDictBase:
+        """Returns the steps with the numbers ``order``, as views of one new matrix."""
+        return self._views(self._rows[order])
+
+    def _views(self, rows: torch.Tensor) -> TensorDictBase:
+        entries = {
+            key: rows[:, columns].view(dtype).unflatten(-1, shape) if shape else rows[:, columns].view(dtype)[:, 0]
+            for key, columns, dtype, shape in self._entries
+        }
+        return TensorDict(entries, batch_size=len(rows), device=rows.device)
+
+
+def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
+    """Gives networks the weights of a run's checkpoint, actor and critic, or the actor those of a policy file.
+
+    A run without a checkpoint has a policy.
+
+    Raises:
+        FileNotFoundError: there is no such run or file.
+        ValueError: the weights do not fit: other sizes, or another algorithm.
+    """
+    if source.is_dir() and (run := RunFolder(source)).has_checkpoint:
+        try:
+            algorithm.load_networks(run.load_checkpoint(device)["algorithm"]["networks"])
+        except (RuntimeError, KeyError) as error:
+            raise ValueError(f"init: the networks of {source} do not fit this run: {error}") from error
+        return
+    policy = RunFolder(source).load_policy(device) if source.is_dir() else Policy.load(source, device)
+    mine = layers_of_actor(algorithm.actor)
+    for own, other in zip(mine, layers_of(policy.module), strict=False):
+        _copy(own, other, source, last=own is mine[-1])
+
+
+def _copy(own: nn.Module, other: nn.Module, source: Path, *, last: bool) -> None:
+    """Copies the weights of a layer; the last of an actor also gives what a policy does not have: its deviations.
+
+    Raises:
+        ValueError: they have other sizes.
+    """
+    mine, theirs = own.state_dict(), other.state_dict()
+    for name, values in theirs.items():
+        fits = name in mine and mine[name].shape[1:] == values.shape[1:]
+        rows = len(values) if values.ndim else 1
+        if type(own) is not type(other) or not fits or (values.ndim and len(mine[name]) not in (rows, 2 * rows * last)):
+            shapes = [tuple(each[name].shape) if name in each else None for each in (theirs, mine)]
+            raise ValueError(f"init: the policy of {source} has {name} of shape {shapes[0]}, this run {shapes[1]}")
+        if values.ndim:
+            mine[name][:rows] = values
+        else:
+            mine[name] = values
+    own.load_state_dict(mine)
+
+
+def start_compiler() -> None:
+    """Imports the compiler, and with it starts the processes that compile kernels: they take seconds to be ready."""
+    importlib.import_module("torch._inductor.compile_fx")
+    importlib.import_module("torch._inductor.async_compile").maybe_warm_pool()
+
+
+def compiled(function: Callable[..., Any], what: str, **settings: Any) -> Callable[..., Any]:
+    """Returns a function that torch.compile makes of another one, as a whole and for one shape, at the first call.
+
+    Args:
+        function: a function of tensors, or a module.
+        what: its name in the error.
+        settings: further ones of ``torch.compile``.
+
+    Returns:
+        The compiled function, which raises a ``TypeError`` if torch.compile cannot trace it.
+    """
+
+    def call(*args: Any) -> Any:
+        return function(*args)
+
+    # torch.compile limits a code object to 8 versions, which further trainings of a process would exceed.
+    call.__code__ = call.__code__.replace()
+    kernels = torch.compile(call, fullgraph=True, dynamic=False, **settings)
+
+    def run(*args: Any) -> Any:
+        try:
+            return kernels(*args)
+        except torch._dynamo.exc.Unsupported as error:
+            raise TypeError(f"torch.compile cannot trace {what}; train with compile=False: {error}") from error
+
+    return run

@@ -1,4 +1,4 @@
-"""The settings of a training run, field by field, and what is valid."""
+"""The settings of a training run: what is valid, and which are used for a task on a device."""
 
 import dataclasses
 import json
@@ -6,8 +6,9 @@ import math
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
+from torchrl_loco import tasks
 from torchrl_loco.checks import (
     ANY,
     COUNT,
@@ -16,12 +17,18 @@ from torchrl_loco.checks import (
     SEED,
     Interval,
     check_choice,
+    check_device,
     check_fields,
     check_int,
     check_packages,
 )
 from torchrl_loco.config import PROTOCOLS, SimConfig
-from torchrl_loco.registry import is_place, task_name
+from torchrl_loco.registry import is_place, resolve, task_name
+
+if TYPE_CHECKING:
+    import torch
+
+    from torchrl_loco.envs import LocoEnv
 
 LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow"]
 INTERVALS = {
@@ -172,7 +179,12 @@ class TrainingConfig:
         object.__setattr__(self, "device", str(self.device))
         object.__setattr__(self, "out", Path(self.out))
         object.__setattr__(self, "hidden", tuple(self.hidden))
-        object.__setattr__(self, "sim", _checked_sim(self.sim))
+        if not isinstance(self.sim, Sim):
+            if not isinstance(self.sim, Mapping):
+                raise TypeError(f"sim must be a dict of fields of torchrl_loco.SimConfig, got {self.sim!r}")
+            names = [field.name for field in dataclasses.fields(Sim)]
+            chosen = {check_choice("field of sim", name, names): value for name, value in self.sim.items()}
+            object.__setattr__(self, "sim", Sim(**chosen))
         object.__setattr__(self, "options", Options(self.options))
         object.__setattr__(self, "init", str(Path(self.init).expanduser().resolve()) if self.init else "")
         # Whether the machine has the device is checked when the run starts.
@@ -361,21 +373,6 @@ class REPPOConfig(TrainingConfig):
             raise ValueError(f"min_value ({self.min_value:g}) must be below max_value ({self.max_value:g})")
 
 
-def _checked_sim(sim: Any) -> Any:
-    """Returns fields of the simulation's settings, of a dict too.
-
-    Raises:
-        ValueError: there is no such field.
-        TypeError: they are no dict.
-    """
-    if isinstance(sim, Sim):
-        return sim
-    if not isinstance(sim, Mapping):
-        raise TypeError(f"sim must be a dict of fields of torchrl_loco.SimConfig, got {sim!r}")
-    names = [field.name for field in dataclasses.fields(Sim)]
-    return Sim(**{check_choice("field of sim", name, names): value for name, value in sim.items()})
-
-
 def _stored_name(task: Any) -> str:
     """Returns the name of a task; of one that says where its class is, with the whole path of its file.
 
@@ -419,3 +416,79 @@ def config_from_json(values: dict[str, Any]) -> TrainingConfig:
     retired = {"compile"} - own  # a setting of earlier revisions
     fields = {name: value for name, value in values.items() if name not in ("algorithm", *retired)}
     return CONFIGS[algorithm](**fields)
+
+
+RUNNERS = ("walker", "humanoid", "cheetah", "hopper", "quadruped")
+"""Bodies of dm_control's runners."""
+
+
+def preset(
+    task: "str | type[LocoEnv]",
+    device: "torch.device | str | None" = None,
+    algorithm: str | None = None,
+    **overrides: Any,
+) -> TrainingConfig:
+    """Returns the settings for ``task`` on ``device``, with ``overrides`` on top.
+
+    They are those of algorithm and device, tuned on the walker and the humanoid, and on CUDA the ``presets`` of the
+    task's class on top: ``{"reppo": {"total_frames": 30_000_000}}``.
+
+    Args:
+        task: id of the environment, its class, or where that is: ``"path/to/file.py:Class"``.
+        device: where to train; ``None`` takes CUDA if there is any.
+        algorithm: "ppo" or "reppo"; ``None`` takes PPO on a CPU, and on CUDA the first of the task's ``presets``, REPPO
+            if it has none.
+        overrides: fields of the settings, and the task's own :attr:`torchrl_loco.LocoEnv.options`.
+
+    Raises:
+        ValueError: there is no such device, algorithm or setting, or one is out of range; the message names what is
+            valid. It may be one in the ``presets`` of the class.
+    """
+    task, device = task_name(task, by_user=True), check_device(device)
+    on_cuda = device.type == "cuda"
+    own: Mapping[str, Mapping[str, Any]] = {}
+    if on_cuda or task not in tasks.found():  # importing one of ours takes seconds
+        cls = resolve(task)
+        where = f"in the presets of {cls.__name__}"
+        for name, settings in cls.presets.items():
+            of = CONFIGS[check_choice(f"algorithm {where}", name, CONFIGS)]
+            for setting in settings:
+                check_setting(f"setting of {name} {where}", setting, of)
+        own = cls.presets if on_cuda else {}
+    if algorithm is None:
+        algorithm = next(iter(own), "reppo") if on_cuda else "ppo"
+    kind = CONFIGS[check_choice("algorithm", algorithm, CONFIGS)]
+    fields = {field.name for field in dataclasses.fields(kind)}
+    if not overrides.keys() <= fields:  # only then, since importing a task takes a while
+        options = {name: overrides.pop(name) for name in resolve(task).options if name in overrides}
+        overrides["options"] = {**overrides.get("options", {}), **options}
+    for name in overrides:
+        check_setting("setting", name, kind)
+    if overrides.get("options"):
+        overrides["options"] = resolve(task).checked_options(overrides["options"])
+    settings = {**kind.presets[device.type], **({} if is_runner(task) else kind.of_others), **own.get(algorithm, {})}
+    if not is_runner(task) and kind is REPPOConfig:  # returns of either sign
+        settings.setdefault("min_value", -settings.get("max_value", REPPOConfig.max_value))
+    return kind(task, **{"device": str(device), **settings, **overrides})
+
+
+def check_setting(what: str, name: str, kind: type[TrainingConfig]) -> None:
+    """Checks that a name is that of a setting.
+
+    Raises:
+        ValueError: it is not; the message names the settings.
+    """
+    check_choice(what, name, [field.name for field in dataclasses.fields(kind) if field.name != "task"])
+
+
+def is_runner(task: "str | type[LocoEnv]") -> bool:
+    """Returns whether a task is one of dm_control's runners: their rewards lie in [0, 1], and they cannot fall."""
+    name = task_name(task)
+    return name in tasks.found() and tasks.found()[name].module.rpartition(".")[2] in RUNNERS
+
+
+def tuning_note(config: TrainingConfig) -> str:
+    """Returns a note if ``config.task`` was not tuned on the CPU by its algorithm, else an empty string."""
+    if config.device != "cpu" or (config.algorithm == "ppo" and config.task in ("walker_stand", "walker_walk")):
+        return ""
+    return "On a CPU only walker_stand and walker_walk by ppo were tuned: other tasks need a GPU, or many more frames."

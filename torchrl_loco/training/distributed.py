@@ -53,11 +53,6 @@ def _connected() -> bool:
     return dist.is_available() and dist.is_initialized()
 
 
-def was_launched() -> bool:
-    """Returns whether torchrun, or a launcher with the same environment variables, started this as one of several."""
-    return "RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
-
-
 def launch_id() -> str | None:
     """Returns a name of the launch by torchrun that stays the same when it restarts its processes, if there is one."""
     of = os.environ.get("TORCHELASTIC_RUN_ID")
@@ -111,7 +106,9 @@ def joined(device: str) -> Iterator[None]:
     Raises:
         ValueError: this machine has no GPU for this rank.
     """
-    if not was_launched() or _connected():
+    # torchrun, or a launcher with the same environment variables, may have started this as one of several.
+    launched = "RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
+    if not launched or _connected():
         yield
         return
     on_cuda = torch.device(device).type == "cuda"
@@ -232,12 +229,7 @@ def mean_of_ranks(values: torch.Tensor) -> torch.Tensor:
 
 
 def add_changes(values: torch.Tensor, before: torch.Tensor) -> None:
-    """Writes into ``values``, of any shape and type, what they were before plus the changes of all ranks.
-
-    Args:
-        values: those of this rank.
-        before: what they were on all ranks; it becomes the same.
-    """
+    """Writes into ``values`` and ``before``, of any shape and type, what was before plus the changes of all ranks."""
     if ranks() > 1:
         change = (values - before).double()
         _sum(change)
@@ -285,14 +277,7 @@ def from_first(value: Any) -> Any:
 
 
 def gathered(state: dict[str, Any]) -> list[dict[str, Any]]:
-    """Collects a state from each rank.
-
-    Args:
-        state: tensors and numbers, in dictionaries.
-
-    Returns:
-        On rank 0 those of all ranks in their order, with tensors on the CPU; nothing elsewhere.
-    """
+    """Returns on rank 0 the states of all ranks in their order, with tensors on the CPU; nothing elsewhere."""
     if ranks() == 1:
         return [state]
     buffer = io.BytesIO()  # a pickled tensor of CUDA would be put on its rank's GPU again

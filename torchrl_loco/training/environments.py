@@ -1,9 +1,10 @@
-"""The environments of a run: where it trains, where it is evaluated, and what is filmed."""
+"""What a run is handed, and its environments: where it trains, where it is evaluated, and what is filmed."""
 
 import copy
 import dataclasses
 import hashlib
 import inspect
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -19,10 +20,62 @@ from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
 from torchrl_loco.training import distributed
-from torchrl_loco.training.config import TrainingConfig
-from torchrl_loco.training.presets import is_runner
+from torchrl_loco.training.actor import Network
+from torchrl_loco.training.algorithm import Algorithm
+from torchrl_loco.training.config import TrainingConfig, is_runner
+from torchrl_loco.training.run_folder import RunFolder
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclasses.dataclass(frozen=True)
+class Given:
+    """What is handed to a trainer as objects, instead of being made from the settings of the run.
+
+    The run's folder cannot hold them.
+
+    Attributes:
+        env: the environment in which it trains.
+        network: makes the networks.
+        algorithm: the class of the algorithm.
+    """
+
+    env: EnvBase | None = None
+    network: Network | None = None
+    algorithm: type[Algorithm] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what is handed in."""
+        return tuple(name for name in ("env", "network", "algorithm") if getattr(self, name) is not None)
+
+    def check(self, run: RunFolder) -> None:
+        """Checks that a run that is continued is handed what it was begun with.
+
+        Raises:
+            ValueError: it is not.
+        """
+        if self.names == run.given:
+            return
+        if extra := [name for name in self.names if name not in run.given]:
+            raise ValueError(f"{run.path} was begun without {' and '.join(extra)} of yours: leave that out")
+        raise ValueError(
+            f"{run.path} was begun with {' and '.join(run.given)} of your own, which the folder does not hold: "
+            f"continue it in Python with {_call_to_resume(run.path, run.given)}"
+        )
+
+    def way_to_resume(self, run: Path, ranks: int) -> str:
+        """Returns the call, or the command with the same number of ranks, that continues a run."""
+        if self.names:
+            return _call_to_resume(run, self.names)
+        if ranks > 1 and os.environ.get("LOCAL_WORLD_SIZE") != str(ranks):
+            return f"torchrun, with the options of this launch, -m torchrl_loco resume {run}"
+        return f"torchrl-loco resume {run}" + (f" --gpus {ranks}" if ranks > 1 else "")
+
+
+def _call_to_resume(run: Path, given: tuple[str, ...]) -> str:
+    arguments = ["env" if "env" in given else "task", *(f"{name}=..." for name in given if name != "env")]
+    return f"torchrl_loco.training.train({', '.join(arguments)}, resume={str(run)!r})"
 
 
 class Environments:
@@ -64,26 +117,22 @@ class Environments:
 
         If a world becomes non-finite, a NaN dump is written to ``nan_dump``, unless one is already there.
         """
-        config, env, runner = self._config, self._given, is_runner(self._config.task)
+        config, env = self._config, self._given
         if env is None:
-            env = make(
-                resolve(config.task),
+            env = self._made(
                 config.num_envs,
-                config.device,
                 config.seed,
-                config.protocol,
                 world_offset=distributed.rank() * config.num_envs,
                 stagger=True,
-                reward_terms=not runner,
-                metrics=True,
                 nan_dump=None if nan_dump.exists() else nan_dump,
                 episode_length=config.episode_length or self.full_length,
-                **config.of_env,
             )
         if config.action_repeat == 1:
             return env
         # The runners' tasks end at the time limit alone, and TorchRL's transform has less to do.
-        return TransformedEnv(env, (FrameSkipTransform if runner else ActionRepeat)(config.action_repeat))
+        return TransformedEnv(
+            env, (FrameSkipTransform if is_runner(config.task) else ActionRepeat)(config.action_repeat)
+        )
 
     def evaluation(self, episodes: int, seed: int, info: Mapping[str, Any] = NOTHING) -> EnvBase:
         """Returns worlds in which a policy of the run can be played, each for an episode of the task's own length.
@@ -114,7 +163,7 @@ class Environments:
         return self._made(1, seed, play=True)
 
     def _made(self, worlds: int, seed: int, **settings: Any) -> LocoEnv:
-        """Returns worlds as the run's, for evaluations."""
+        """Returns worlds as the run's, by themselves those of an evaluation."""
         config, base = self._config, self._base
         if base is None:
             place = resolve(config.task), worlds, config.device, seed, config.protocol
@@ -178,17 +227,8 @@ def unwrapped(env: EnvBase) -> tuple[LocoEnv, tuple[Transform, ...]]:
 def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: Any) -> LocoEnv:
     """Returns new worlds of the task of a policy, under the protocol that it was trained under, and at its stage.
 
-    Args:
-        policy: the policy.
-        num_envs: number of worlds.
-        device: where they compute.
-        seed: their seed.
-        settings: further arguments of :class:`torchrl_loco.LocoEnv`.
-
-    Raises:
-        ValueError: it was trained behind transforms.
-        OSError: the file of its task is missing.
-        ImportError: the file or module of its task is broken, or not known.
+    Arguments are those of :class:`torchrl_loco.LocoEnv`, and its errors those of :func:`refuse_transforms` and
+    :func:`torchrl_loco.registry.resolve`.
     """
     refuse_transforms(policy)
     info = policy.info

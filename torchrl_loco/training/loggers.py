@@ -103,11 +103,6 @@ class _Tensorboard(TensorboardLogger):
         return metrics
 
 
-def _open_wandb(folder: Path, frames: int, id: str | None) -> Logger:
-    project = os.environ.get("WANDB_PROJECT", PROJECT)
-    return WandbLogger(folder.name, save_dir=str(folder), project=project, id=id)
-
-
 class MLflow(MLFlowLogger):
     """As TorchRL's, but the run has the name of its folder and can be continued."""
 
@@ -149,7 +144,9 @@ class MLflow(MLFlowLogger):
 
 OPENERS: dict[str, Callable[[Path, int, str | None], Logger]] = {
     "tensorboard": lambda folder, frames, _: _Tensorboard(folder, frames),
-    "wandb": _open_wandb,
+    "wandb": lambda folder, _, id: WandbLogger(
+        folder.name, save_dir=str(folder), project=os.environ.get("WANDB_PROJECT", PROJECT), id=id
+    ),
     "mlflow": lambda folder, _, id: MLflow(folder, id),
 }
 """Functions of the run's folder, its frames so far, and the id by which the logger knows a run that it continues."""

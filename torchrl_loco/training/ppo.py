@@ -1,30 +1,35 @@
 """Proximal policy optimization (Schulman et al., 2017)."""
 
 import contextlib
+import functools
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import torch
+import warp as wp
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale
 from torch import nn
 from torch.func import functional_call
 from torchrl.envs.utils import ExplorationType, exploration_type
-from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP, ValueOperator
 
 from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
-from torchrl_loco.training.actor import Network, make_actor, network_of
-from torchrl_loco.training.adam import ALIGNED
+from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of
+from torchrl_loco.training.adam import ALIGNED, launch
 from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
 from torchrl_loco.training.config import PPOConfig
-from torchrl_loco.training.kernels import clipped_loss, drawn, normalised
-from torchrl_loco.training.spaces import Spaces
-from torchrl_loco.training.squashed_normal import log_slope
 
 LR_RANGE = (1e-5, 1e-2)
 """Of a learning rate that follows the divergence."""
+
+HALF_LOG_2_PI = wp.constant(0.5 * math.log(2.0 * math.pi))
+LOG_2 = wp.constant(math.log(2.0))
+CRITIC_COEFF = 0.5
+METRICS = 5
+"""Numbers of a step whose means are metrics; the slopes of the deviations follow them."""
 
 
 class PPO(Algorithm):
@@ -39,14 +44,30 @@ class PPO(Algorithm):
 
     def __init__(self, config: PPOConfig, spaces: Spaces, network: Network | None = None) -> None:
         super().__init__(config, spaces, network)
-        self.actor, self.critic, self.norms = make_actor_critic(config, spaces, network)
+
+        def make(inputs: int, outputs: int) -> nn.Module:
+            if network is not None:
+                return network_of(network, inputs, outputs)
+            return MLP(inputs, outputs, num_cells=list(config.hidden), activation_class=nn.SiLU)
+
+        self.norms = {"observation": ObservationNorm(spaces.observation)}
+        mean: Any = make(spaces.observation, spaces.action)
+        if network is None:
+            nn.init.orthogonal_(mean[-1].weight, gain=0.01)  # the first actions are near zero, whatever is observed
+        self._scale = AddStateIndependentNormalScale(spaces.action, init_value=math.log(config.init_std))
+        whole = nn.Sequential(self.norms["observation"], mean, self._scale)
+        self.actor = make_actor(spaces, config.device, whole, log_prob=True)
+        if spaces.privileged is not None:
+            self.norms["privileged"] = ObservationNorm(spaces.privileged)
+        value = make(spaces.critic, 1)
+        whole = nn.Sequential(self.norms[spaces.critic_key], value)
+        self.critic = ValueOperator(whole, in_keys=[spaces.critic_key]).to(config.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic})
-        parts: Any = self.actor[0].module, self.critic.module
-        (_, mean, self._scale), (_, value) = parts
         self._mean, self._value = Rows(mean, spaces.observation), Rows(value, spaces.critic)
         self._dtype = torch.bfloat16 if config.bf16 and self.device.type == "cuda" else torch.float32
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = self.make_optimizer("actor and critic", parameters)
+        self._written = ("action", "action_log_prob", *("before_tanh",) * spaces.bounded)
         self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         # By which a gradient step multiplies the learning rate, between these divergences.
         self._kl_bounds = torch.tensor([0.0, 0.5 * config.target_kl, 2.0 * config.target_kl], device=self.device)
@@ -62,8 +83,7 @@ class PPO(Algorithm):
 
     def acting(self) -> nn.Module:
         """Returns the actor as a policy for collectors, with networks that compute as in gradient steps."""
-        written = ("action", "action_log_prob", *("before_tanh",) * self.spaces.bounded)
-        return Acting(self.actor, self.act, written)
+        return Acting(self.actor, self.act, self._written)
 
     @torch.no_grad()
     def act(self, td: TensorDictBase) -> TensorDictBase:
@@ -74,8 +94,7 @@ class PPO(Algorithm):
         noise = (torch.randn if explores else torch.zeros)(len(rows), self.spaces.action, device=self.device)
         mean = self._mean(rows, self.optimizer.wide(self._dtype))
         values = drawn(mean, self._std(), noise, self.spaces.bounded)
-        names = "action", "action_log_prob", *("before_tanh",) * self.spaces.bounded
-        for name, value in zip(names, values, strict=True):
+        for name, value in zip(self._written, values, strict=True):
             td[name] = value.view((*td.batch_size, *value.shape[1:]))
         return td
 
@@ -154,6 +173,207 @@ class PPO(Algorithm):
             group["lr"].mul_(factor).clamp_(*LR_RANGE)
 
 
+# What is computed of each number, in one kernel each: torch would launch five to a hundred for it. torch.compile fuses
+# them as well, but takes half a minute for that at a first start.
+
+
+# A kernel is of one type of numbers, in a module of its own: one that is added to a module unloads what graphs replay.
+@functools.cache
+def normalise_of(dtype: torch.dtype) -> wp.Kernel:
+    """Returns the kernel that writes normalised rows."""
+    Rows: Any = wp.array2d(dtype=wp.dtype_from_torch(dtype))  # noqa: N806
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def normalise(rows: wp.array2d[float], mean: wp.array[float], var: wp.array[float], limit: float, out: Rows):
+        row, column = wp.tid()
+        value = float(0.0)
+        if column < rows.shape[1]:
+            value = wp.clamp((rows[row, column] - mean[column]) / wp.sqrt(var[column] + 1.0e-6), -limit, limit)
+        out[row, column] = out.dtype(value)
+
+    return normalise
+
+
+@torch.no_grad()
+def normalised(rows: torch.Tensor, norm: ObservationNorm, dtype: torch.dtype, aligned: int) -> torch.Tensor:
+    """Returns what ``norm`` makes of rows of shape ``(..., n)``, with zeros up to a multiple of ``aligned``.
+
+    Raises:
+        ValueError: they have another length.
+    """
+    norm.check(rows)
+    wide = rows.new_empty(*rows.shape[:-1], -(-rows.shape[-1] // aligned) * aligned, dtype=dtype)
+    flat, out = rows.reshape(-1, rows.shape[-1]), wide.view(-1, wide.shape[-1])
+    launch(normalise_of(dtype), tuple(out.shape), [flat, norm.mean, norm.var, norm.limit], [out])
+    return wide
+
+
+@wp.func
+def log_slope_of(u: float) -> float:
+    """Of tanh, exact for large u too."""
+    softplus = wp.max(-2.0 * u, 0.0) + wp.log(1.0 + wp.exp(-2.0 * wp.abs(u)))
+    return 2.0 * (LOG_2 - u - softplus)
+
+
+@functools.cache
+def draw_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
+    """Returns the kernel that draws ``nu`` actions in each state."""
+    Rows: Any = wp.array2d(dtype=wp.dtype_from_torch(dtype))  # noqa: N806
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def draw(
+        mean: Rows,
+        std: wp.array[float],
+        noise: wp.array2d[float],
+        normal: wp.array2d[float],
+        action: wp.array2d[float],
+        log_prob: wp.array[float],
+    ):
+        row = wp.tid()
+        total = float(0.0)
+        for i in range(wp.static(nu)):
+            e = noise[row, i]
+            u = float(mean[row, i]) + std[i] * e
+            total -= 0.5 * e * e + wp.log(std[i]) + HALF_LOG_2_PI
+            normal[row, i] = u
+            if wp.static(bounded):
+                action[row, i] = wp.tanh(u)
+                total -= log_slope_of(u)
+        log_prob[row] = total
+
+    return draw
+
+
+@torch.no_grad()
+def drawn(mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor, bounded: bool) -> tuple[torch.Tensor, ...]:
+    """Returns actions and their log-probabilities; and if they are bounded, what they were before tanh.
+
+    Args:
+        mean: of the variables, shape ``(n, nu)``.
+        std: their standard deviations, shape ``(nu,)``.
+        noise: from which they are made, standard normal, shape ``(n, nu)``.
+        bounded: whether actions are bounded by tanh.
+    """
+    normal, log_prob = torch.empty_like(noise), noise.new_empty(len(noise))
+    action = torch.empty_like(noise) if bounded else normal
+    launch(draw_of(noise.shape[1], bounded, mean.dtype), len(noise), [mean, std, noise], [normal, action, log_prob])
+    return (action, log_prob, normal) if bounded else (action, log_prob)
+
+
+@functools.cache
+def loss_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
+    """Returns the kernel of PPO's loss for ``nu`` actions."""
+    Rows: Any = wp.array2d(dtype=wp.dtype_from_torch(dtype))  # noqa: N806
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def loss(
+        mean: Rows,
+        std: wp.array[float],
+        value: Rows,
+        action: wp.array2d[float],
+        old_log_prob: wp.array[float],
+        advantage: wp.array[float],
+        target: wp.array[float],
+        noise: wp.array2d[float],
+        spread: wp.array[float],
+        center: wp.array[float],
+        lowest: float,
+        highest: float,
+        entropy_coeff: float,
+        slope_mean: Rows,
+        slope_value: Rows,
+        sums: wp.array2d[float],
+    ):
+        step = wp.tid()
+        share = 1.0 / float(mean.shape[0])
+        log_prob = float(0.0)
+        entropy = float(0.0)
+        for i in range(wp.static(nu)):
+            z = (action[step, i] - float(mean[step, i])) / std[i]
+            constant = wp.log(std[i]) + HALF_LOG_2_PI
+            log_prob -= 0.5 * z * z + constant
+            if wp.static(bounded):  # of one sample u under tanh
+                e = noise[step, i]
+                entropy += 0.5 * e * e + constant + log_slope_of(float(mean[step, i]) + std[i] * e)
+            else:
+                entropy += 0.5 + constant
+        log_ratio = log_prob - old_log_prob[step]
+        clipped = wp.clamp(log_ratio, lowest, highest)
+        normal = (advantage[step] - center[0]) / wp.max(spread[0], 1.0e-6)
+        gain = wp.exp(log_ratio) * normal
+        clipped_gain = wp.exp(clipped) * normal
+        slope = -gain
+        if gain > clipped_gain:  # what is not a number is followed, to be seen
+            slope = 0.0
+        error = float(value[step, 0]) - target[step]
+        of_value = wp.clamp(error, -1.0, 1.0)
+        if wp.isnan(error):
+            of_value = error
+        slope_value[step, 0] = slope_value.dtype(share * CRITIC_COEFF * of_value)
+        sums[step, 0] = -wp.min(gain, clipped_gain)
+        sums[step, 1] = CRITIC_COEFF * wp.where(wp.abs(error) < 1.0, 0.5 * error * error, wp.abs(error) - 0.5)
+        sums[step, 2] = entropy
+        sums[step, 3] = -log_ratio
+        sums[step, 4] = wp.where(clipped == log_ratio, 0.0, 1.0)
+        for i in range(wp.static(nu)):
+            z = (action[step, i] - float(mean[step, i])) / std[i]
+            by_mean = slope * z / std[i]
+            by_std = (slope * (z * z - 1.0) - entropy_coeff) / std[i]
+            if wp.static(bounded):
+                e = noise[step, i]
+                turn = 2.0 * entropy_coeff * wp.tanh(float(mean[step, i]) + std[i] * e)
+                by_mean += turn
+                by_std += turn * e
+            slope_mean[step, i] = slope_mean.dtype(share * by_mean)
+            sums[step, METRICS + i] = by_std
+
+    return loss
+
+
+@torch.no_grad()
+def clipped_loss(
+    mean: torch.Tensor,
+    std: torch.Tensor,
+    value: torch.Tensor,
+    data: Mapping[str, torch.Tensor],
+    clip_epsilon: float,
+    entropy_coeff: float,
+    bounded: bool,
+) -> tuple[torch.Tensor, ...]:
+    """Computes the slopes of PPO's loss: clipped objective, smooth L1 error of the critic and entropy bonus.
+
+    It is the loss of TorchRL's ``ClipPPOLoss`` with advantages normalised by minibatch.
+
+    Args:
+        mean: of the actions, shape ``(n, nu)``; before tanh, if they are bounded.
+        std: their standard deviations in all states, shape ``(nu,)``.
+        value: what the critic expects, shape ``(n, 1)``.
+        data: of each step ``action``, before tanh too, shape ``(n, nu)``, ``log_prob`` of that when it was drawn,
+            shape ``(n,)``, ``advantage`` and ``value_target``, shape ``(n, 1)``.
+        clip_epsilon: range of the ratio of probabilities that is not clipped.
+        entropy_coeff: weight of the entropy.
+        bounded: whether actions are bounded by tanh; their entropy is that of one sample then.
+
+    Returns:
+        The slopes by means, deviations and values, in their shapes; and of the metrics ``(5,)`` the means over the
+        steps: the clipped objective's loss, the critic's, the entropy, the divergence from the policy that collected,
+        and the fraction of steps whose ratio of probabilities is clipped.
+    """
+    steps, nu = mean.shape
+    spread, center = torch.std_mean(data["advantage"])
+    noise = torch.randn(mean.shape, device=mean.device) if bounded else std.new_empty(0, nu)
+    numbers = [data[name].reshape(steps) for name in ("log_prob", "advantage", "value_target")]
+    inputs = [mean, std, value, data["action"], *numbers, noise, spread.view(1), center.view(1)]
+    slopes = torch.empty_like(mean), torch.empty_like(value), std.new_empty(steps, METRICS + nu)
+    bounds = math.log1p(-clip_epsilon), math.log1p(clip_epsilon)
+    launch(loss_of(nu, bounded, mean.dtype), steps, [*inputs, *bounds, entropy_coeff], slopes)
+    means = slopes[2].mean(0)
+    return slopes[0], means[METRICS:], slopes[1], means[:METRICS]
+
+
+# The networks.
+
+
 class Affine(torch.autograd.Function):
     """A linear layer whose bias gets its gradient from a product of matrices: torch's sums take three times as long."""
 
@@ -189,12 +409,7 @@ class Rows:
             self._layers = layers if torch.allclose(found, expected, rtol=1e-4, atol=1e-5) else self._layers
 
     def __call__(self, rows: torch.Tensor, weights: Mapping[nn.Parameter, torch.Tensor]) -> torch.Tensor:
-        """Returns what it gives for ``rows``, shape ``(..., outputs)``.
-
-        Args:
-            rows: of at least as many numbers as it reads.
-            weights: what takes the place of each parameter; of matrices, rows may be longer as well.
-        """
+        """Returns what it gives, ``(..., outputs)``, with ``weights`` for its own, whose rows may be longer as well."""
         for index, layer in enumerate(self._layers):
             reads_long = index == 0 and isinstance(layer, nn.Linear)
             if index == 0 and not reads_long:
@@ -209,33 +424,3 @@ class Rows:
             else:
                 rows = functional_call(layer, own, (rows,))
         return rows
-
-
-def make_actor_critic(
-    config: PPOConfig, spaces: Spaces, network: Network | None = None
-) -> tuple[ProbabilisticActor, ValueOperator, dict[str, ObservationNorm]]:
-    """Returns actor, critic and the norms of what they read, for PPO; the critic writes ``state_value``.
-
-    Args:
-        config: the settings.
-        spaces: what they read and write.
-        network: makes the actor's network, from an observation to means, and the critic's; else both are MLPs.
-    """
-
-    def mlp(inputs: int, outputs: int) -> nn.Sequential:
-        return MLP(inputs, outputs, num_cells=list(config.hidden), activation_class=nn.SiLU)
-
-    def make(inputs: int, outputs: int) -> nn.Module:
-        return mlp(inputs, outputs) if network is None else network_of(network, inputs, outputs)
-
-    norms = {"observation": ObservationNorm(spaces.observation)}
-    mean: Any = make(spaces.observation, spaces.action)
-    if network is None:
-        nn.init.orthogonal_(mean[-1].weight, gain=0.01)  # the first actions are near zero, whatever is observed
-    scale = AddStateIndependentNormalScale(spaces.action, init_value=math.log(config.init_std))
-    whole = nn.Sequential(norms["observation"], mean, scale)
-    actor = make_actor(spaces, config.device, whole, log_prob=True)
-    if spaces.privileged is not None:
-        norms["privileged"] = ObservationNorm(spaces.privileged)
-    critic = ValueOperator(nn.Sequential(norms[spaces.critic_key], make(spaces.critic, 1)), in_keys=[spaces.critic_key])
-    return actor, critic.to(config.device), norms

@@ -14,19 +14,14 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor
 from torch import nn
-from torch.nn.functional import mse_loss
-from torchrl.modules import ProbabilisticActor
+from torch.nn.functional import cross_entropy, mse_loss
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
-from torchrl_loco.training.actor import Network, make_actor, network_of
-from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
-from torchrl_loco.training.compiling import compiled
+from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of
+from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step, compiled
 from torchrl_loco.training.config import REPPOConfig
-from torchrl_loco.training.spaces import Spaces
-from torchrl_loco.training.squashed_normal import kl, sample
-from torchrl_loco.training.value_bins import ValueBins
 
 
 class REPPO(Algorithm):
@@ -52,7 +47,18 @@ class REPPO(Algorithm):
     def __init__(self, config: REPPOConfig, spaces: Spaces, network: Network | None = None) -> None:
         super().__init__(config, spaces, network)
         self.action_bound = 1.0 if spaces.bounded else config.action_bound
-        self.actor, self.critic, self.norms = make_actor_q(config, spaces, network)
+        self.norms, outputs = {"observation": ObservationNorm(spaces.observation)}, 2 * spaces.action
+        if network is None:
+            head = nn.Linear(config.hidden[-1], outputs)
+            layers = [*normed_layers(spaces.observation, config.hidden), head]
+        else:
+            layers = layers_of(network_of(network, spaces.observation, outputs))
+        whole = nn.Sequential(self.norms["observation"], *layers, NormalParamExtractor("exp"))
+        self.actor = make_actor(spaces, config.device, whole, log_prob=False, bound=config.action_bound)
+        if spaces.privileged is not None:
+            self.norms["privileged"] = ObservationNorm(spaces.privileged).to(config.device)
+        bins = ValueBins(config.min_value, config.max_value, config.num_bins)
+        self.critic = DistributionalQ((spaces.critic, spaces.action), config.hidden, bins).to(config.device)
         self.distribution = self.actor[0].module[1:]  # from normalised observations to means and standard deviations
         self.dual = DualVariables(config).to(self.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "dual": self.dual})
@@ -74,10 +80,6 @@ class REPPO(Algorithm):
         """Returns a function of tensors as kernels of torch.compile on CUDA, if the settings ask for that.
 
         Between the matrix products of small networks, torch spends most of a step reading and writing activations.
-
-        Args:
-            function: the function.
-            bf16: whether its matrix products are in bfloat16 on CUDA.
         """
 
         def in_bf16(*args: Any) -> Any:
@@ -145,13 +147,7 @@ class REPPO(Algorithm):
     def _values(
         self, observation: torch.Tensor, of_critic: torch.Tensor, noise: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Returns log-probability, value and features of one action in each state.
-
-        Args:
-            observation: what the actor reads, normalised, shape ``(..., n)``.
-            of_critic: what the critic reads, normalised, shape ``(..., m)``.
-            noise: from which the actions are made, standard normal, shape ``(..., nu)``.
-        """
+        """Returns log-probability, value and features of one action in each state, made of standard normal noise."""
         loc, scale = self.distribution(observation)
         action, log_prob = sample(loc, scale, noise)
         return log_prob, *self.critic.value_and_features(of_critic, action)
@@ -180,7 +176,7 @@ class REPPO(Algorithm):
         """Returns the losses of the returns and of the features, of ``n`` steps: scalars."""
         logits, predicted = self.critic(observation, action)
         aux = (mse_loss(predicted, features, reduction="none").mean(-1) * alive).mean()
-        return self.critic.bins.cross_entropy(logits, returns), aux
+        return cross_entropy(logits, self.critic.bins.encode(returns)), aux
 
     def actor_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
         """The actor ascends value and entropy where it is near the old policy, and returns to it where it is not.
@@ -267,7 +263,71 @@ class DualVariables(nn.Module):
         return self.log_kl_weight.exp()
 
 
+def sample(loc: torch.Tensor, scale: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns actions ``tanh(u)``, u = loc + scale * noise, and their log-probabilities, shape ``(...)``.
+
+    The log-probability is computed from u, not from the action, so it stays exact where tanh saturates.
+
+    Args:
+        loc: means before tanh, shape ``(..., nu)``.
+        scale: standard deviations before tanh, of the same shape.
+        noise: standard normal numbers, of the same shape.
+    """
+    u = loc + scale * noise
+    log_prob = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2.0 * math.pi) - log_slope(u)
+    return u.tanh(), log_prob.sum(-1)
+
+
+def kl(old_loc: torch.Tensor, old_scale: torch.Tensor, loc: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+    """Returns KL(old || new) of diagonal Gaussians, shape ``(...)``, which equals that of their images under tanh.
+
+    Means and standard deviations have shape ``(..., nu)``.
+    """
+    ratio, distance = old_scale / scale, (old_loc - loc) / scale
+    return (0.5 * (ratio.square() + distance.square() - 1.0) - ratio.log()).sum(-1)
+
+
 # The networks.
+
+
+class ValueBins(nn.Module):
+    """Returns as distributions over evenly spaced bins (HL-Gauss: Imani and White, 2018; Farebrother et al., 2024).
+
+    A return below the first bin's center counts as one at it, and so does one above the last.
+
+    Args:
+        low: return at the center of the first bin.
+        high: return at the center of the last bin, more than ``low``.
+        count: number of bins.
+
+    Attributes:
+        centers: returns at the centers of the bins, shape ``(count,)``.
+        edges: returns at the edges of the bins, shape ``(count + 1,)``.
+    """
+
+    SPREAD = 0.75
+    """Standard deviation of a target, in widths of a bin."""
+
+    centers: torch.Tensor
+    edges: torch.Tensor
+
+    def __init__(self, low: float, high: float, count: int) -> None:
+        super().__init__()
+        half = (high - low) / (count - 1) / 2
+        self.register_buffer("centers", torch.linspace(low, high, count), persistent=False)
+        self.register_buffer("edges", torch.linspace(low - half, high + half, count + 1), persistent=False)
+        self.low, self.high, self.sigma = low, high, 2 * half * self.SPREAD
+        self.width = 2 * half
+
+    def encode(self, returns: torch.Tensor) -> torch.Tensor:
+        """Returns the probabilities, shape ``(..., count)``, of a Gaussian about each return of shape ``(...)``."""
+        returns = returns.clamp(self.low, self.high).unsqueeze(-1)
+        below = torch.erf((self.edges - returns) / (math.sqrt(2.0) * self.sigma))
+        return below.diff(dim=-1) / (below[..., -1:] - below[..., :1])
+
+    def decode(self, logits: torch.Tensor) -> torch.Tensor:
+        """Returns the mean, shape ``(...)``, of distributions given as logits of shape ``(..., count)``."""
+        return (logits.softmax(-1) * self.centers).sum(-1)
 
 
 class DistributionalQ(nn.Module):
@@ -312,28 +372,3 @@ def normed_layers(inputs: int, hidden: tuple[int, ...]) -> list[nn.Module]:
         layers += [nn.Linear(inputs, width), nn.LayerNorm(width), nn.SiLU()]
         inputs = width
     return layers
-
-
-def make_actor_q(
-    config: REPPOConfig, spaces: Spaces, network: Network | None = None
-) -> tuple[ProbabilisticActor, DistributionalQ, dict[str, ObservationNorm]]:
-    """Returns actor, critic and the norms of what they read, for REPPO.
-
-    Args:
-        config: the settings.
-        spaces: what they read and write.
-        network: makes the actor's network, from an observation to means and log deviations.
-    """
-    norms, outputs = {"observation": ObservationNorm(spaces.observation)}, 2 * spaces.action
-    if network is None:
-        head = nn.Linear(config.hidden[-1], outputs)
-        layers = [*normed_layers(spaces.observation, config.hidden), head]
-    else:
-        layers = layers_of(network_of(network, spaces.observation, outputs))
-    whole = nn.Sequential(norms["observation"], *layers, NormalParamExtractor("exp"))
-    actor = make_actor(spaces, config.device, whole, log_prob=False, bound=config.action_bound)
-    if spaces.privileged is not None:
-        norms["privileged"] = ObservationNorm(spaces.privileged).to(config.device)
-    bins = ValueBins(config.min_value, config.max_value, config.num_bins)
-    critic = DistributionalQ((spaces.critic, spaces.action), config.hidden, bins)
-    return actor, critic.to(config.device), norms

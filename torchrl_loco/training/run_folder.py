@@ -68,12 +68,23 @@ class RunFolder:
         path: an existing run folder.
         task: where the class of its task is now, as the user says; ``None`` for what the folder says.
 
+    Attributes:
+        path: the folder.
+        checkpoint: what the run continues from.
+        policy: the trained policy, without the parts that only training needs.
+        video: the video of that.
+        nan_dump: state and action from which a world first became non-finite, if any.
+
     Raises:
         FileNotFoundError: ``path`` is no folder with a ``config.json``.
     """
 
     def __init__(self, path: Path, task: str | None = None) -> None:
         self.path, self._named = check_run(path), task
+        self.checkpoint = self.path / "checkpoint.pt"
+        self.policy = self.path / "policy.safetensors"
+        self.video = self.path / "video.mp4"
+        self.nan_dump = self.path / "nan_dump.safetensors"
 
     @classmethod
     def create(cls, config: TrainingConfig, given: Collection[str] = ()) -> "RunFolder":
@@ -167,16 +178,6 @@ class RunFolder:
         path = self.path / "given.json"
         return tuple(json.loads(path.read_text())) if path.exists() else ()
 
-    @property
-    def video(self) -> Path:
-        """The video of the trained policy."""
-        return self.path / "video.mp4"
-
-    @property
-    def policy(self) -> Path:
-        """The trained policy, without the parts that only training needs."""
-        return self.path / "policy.safetensors"
-
     def load_policy(self, device: str | None = None) -> Policy:
         """Returns the trained policy on ``device``; ``None`` takes CUDA if there is any.
 
@@ -194,19 +195,9 @@ class RunFolder:
         return policy
 
     @property
-    def checkpoint(self) -> Path:
-        """What a run continues from."""
-        return self.path / "checkpoint.pt"
-
-    @property
     def has_checkpoint(self) -> bool:
         """Whether there is a checkpoint to resume from."""
         return self.checkpoint.is_file()
-
-    @property
-    def nan_dump(self) -> Path:
-        """State and action from which a world first became non-finite, if any."""
-        return self.path / "nan_dump.safetensors"
 
     @property
     def is_finished(self) -> bool:

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,8 @@ from torchrl_loco.registry import check_is_run, is_place, task_name
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
-from torchrl_loco.training.config import CONFIGS, TrainingConfig
-from torchrl_loco.training.environments import unwrapped
-from torchrl_loco.training.given import Given
-from torchrl_loco.training.presets import check_setting, preset, tuning_note
+from torchrl_loco.training.config import CONFIGS, TrainingConfig, check_setting, preset, tuning_note
+from torchrl_loco.training.environments import Given, unwrapped
 from torchrl_loco.training.run_folder import RunFolder
 from torchrl_loco.training.trainer import Trainer
 
@@ -80,11 +78,11 @@ def train(
         changes = settings | chosen
         if config is not None or changes.keys() - {"total_frames", "device"} or isinstance(algorithm, str):
             raise ValueError("a run that is resumed keeps its settings: pass no other than total_frames and device")
-        return _train(_resumed(resume, cls), given, **changes)
+        return run_to_end(_resumed(resume, cls), given, **changes)
     if given.env is not None:
         chosen |= _settings_of(given.env, {**settings, **chosen})
     config = _config(cls, config, algorithm, {**settings, **chosen})
-    return _train(config, given)
+    return run_to_end(config, given)
 
 
 def _config(
@@ -139,27 +137,32 @@ def _resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
     return RunFolder(run.path, named)
 
 
-def _train(what: TrainingConfig | RunFolder, given: Given, **changes: Any) -> RunFolder:
+def run_to_end(
+    what: TrainingConfig | RunFolder, given: Given, errors: Callable[..., Any] = contextlib.nullcontext, **changes: Any
+) -> RunFolder:
     """Trains a new run, or goes on with one, some settings of which have changed.
+
+    Args:
+        what: the settings of a new run, or the run.
+        given: what is handed in as objects.
+        errors: makes a context that tells errors of the user: of any kind until the trainer is made, then of those that
+            it is called with. Others are bugs, which keep their traceback.
+        changes: of the settings of the run.
 
     Returns:
         Its folder.
     """
-    config = what.load_config(**changes) if isinstance(what, RunFolder) else what
-    with distributed.joined(config.device):  # before it, each rank would take itself for the first
-        trainer = Trainer(what, True, given, **changes) if isinstance(what, RunFolder) else begin(what, given)
-        try:
-            with saying_how_to_continue(trainer, given):
-                trainer.train()
-        finally:
-            if given.env is None:
-                trainer.env.close()
+    with contextlib.ExitStack() as ranks:
+        with errors():
+            config = what.load_config(**changes) if isinstance(what, RunFolder) else what
+            ranks.enter_context(distributed.joined(config.device))  # before it, each rank would be the first
+            trainer = Trainer(what, True, given, **changes) if isinstance(what, RunFolder) else begin(what, given)
+        train_to_end(trainer, given, errors)
         return trainer.run
 
 
-@contextlib.contextmanager
-def saying_how_to_continue(trainer: Trainer, given: Given) -> Iterator[None]:
-    """Prints how to continue a run that has a checkpoint, if it is interrupted.
+def train_to_end(trainer: Trainer, given: Given, errors: Callable[..., Any] = contextlib.nullcontext) -> None:
+    """Trains to the last frame; prints how to continue a run that has a checkpoint, if it is interrupted.
 
     Raises:
         KeyboardInterrupt: Ctrl-C or SIGTERM.
@@ -167,11 +170,15 @@ def saying_how_to_continue(trainer: Trainer, given: Given) -> Iterator[None]:
     """
     first, ranks = distributed.is_first(), distributed.ranks()
     try:
-        yield
+        with errors(OSError):
+            trainer.train()
     except (KeyboardInterrupt, SystemExit):
         if first and trainer.run.has_checkpoint:
             print(f"to continue: {given.way_to_resume(trainer.run.path, ranks)}", file=sys.stderr)
         raise
+    finally:
+        if given.env is None:
+            trainer.env.close()
 
 
 def begin(config: TrainingConfig, given: "Given | None" = None) -> Trainer:

@@ -16,25 +16,20 @@ from tqdm.auto import tqdm
 from torchrl_loco.checks import check_device
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.policy import Policy
-from torchrl_loco.training import compiling, distributed
-from torchrl_loco.training.actor import deterministic_policy
-from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
+from torchrl_loco.training import distributed
+from torchrl_loco.training.actor import Spaces, deterministic_policy
+from torchrl_loco.training.algorithm import Algorithm, begin_from, settings_for_small_networks, start_compiler
 from torchrl_loco.training.config import check_loggers
-from torchrl_loco.training.environments import Environments, source_of, unwrapped
+from torchrl_loco.training.environments import Environments, Given, source_of, unwrapped
 from torchrl_loco.training.episodes import Episodes
-from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, shipped_return, summarize
-from torchrl_loco.training.given import Given
-from torchrl_loco.training.interrupts import interruptible
-from torchrl_loco.training.lock import lock, unlock
+from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, record, shipped_return, summarize
 from torchrl_loco.training.loggers import Loggers
-from torchrl_loco.training.playback import record
 from torchrl_loco.training.plots import plot_runs
 from torchrl_loco.training.ppo import PPO
+from torchrl_loco.training.process import interruptible, lock, unlock
 from torchrl_loco.training.reppo import REPPO
 from torchrl_loco.training.run_folder import RunFolder
-from torchrl_loco.training.spaces import Spaces
 from torchrl_loco.training.trials import Trials
-from torchrl_loco.training.warm_start import begin_from
 
 ALGORITHMS: dict[str, type[Algorithm]] = {cls.config_type.algorithm: cls for cls in (PPO, REPPO)}
 
@@ -104,7 +99,7 @@ class Trainer:
                 f"{config.control_steps_per_batch} on each of {distributed.ranks()} ranks"
             )
         if getattr(config, "compile", False) and torch.device(config.device).type == "cuda":
-            compiling.start()  # while the environment's kernels are compiled
+            start_compiler()  # while the environment's kernels are compiled
         torch.manual_seed(config.seed)
         first, rank = distributed.is_first(), distributed.rank()
         self.environments = Environments(dataclasses.replace(config, task=run.task), given.env)

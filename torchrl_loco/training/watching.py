@@ -7,10 +7,9 @@ from torchrl_loco.checks import check_device
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
-from torchrl_loco.training.actor import deterministic_policy
+from torchrl_loco.training.actor import Spaces, deterministic_policy
 from torchrl_loco.training.environments import refuse_transforms
 from torchrl_loco.training.run_folder import RunFolder
-from torchrl_loco.training.spaces import Spaces
 from torchrl_loco.training.trainer import ALGORITHMS
 
 
@@ -19,12 +18,6 @@ class Watched:
 
     That is the one of ``checkpoint.pt`` or of ``policy.safetensors``, whichever was written last. A run that was begun
     with objects of one's own (:class:`torchrl_loco.training.Given`) has them in no file, so it is the latter.
-
-    Args:
-        run: the run.
-        num_envs: number of worlds.
-        device: where they compute.
-        seed: their seed.
 
     Attributes:
         env: the worlds, without noise and pushes.
@@ -59,15 +52,9 @@ class Watched:
 
 
 def last_policy(run: RunFolder, device: str | None = None, path: Path | None = None) -> Policy:
-    """Returns the policy of a run's checkpoint, which no evaluation has chosen.
+    """Returns the policy of a run's last checkpoint or another, which no evaluation has chosen.
 
-    Args:
-        run: a run with a checkpoint, which was begun without objects of one's own.
-        device: where it computes; ``None`` takes CUDA if there is any.
-        path: another of its checkpoints; ``None`` is the last one.
-
-    Raises:
-        ValueError: the checkpoint cannot be read.
+    It computes on CUDA, if there is any, unless ``device`` is given. The run was begun without objects of one's own.
     """
     device = str(check_device(device))
     config, checkpoint = run.load_config(device=device, task=run.task), run.load_checkpoint(device, path)

@@ -109,7 +109,10 @@ class Page:
         self._spacing = SPACING * self._model.stat.extent
         rows, columns = np.divmod(np.arange(player.env.num_envs), side)
         self._places = self._spacing * np.stack([-rows, columns, 0 * rows], axis=1)
-        self._look(1.6 * self._model.stat.extent + 0.4 * (side - 1) * self._spacing)
+        distance = 1.6 * self._model.stat.extent + 0.4 * (side - 1) * self._spacing
+        away = [-np.cos(ELEVATION) * np.cos(AZIMUTH), -np.cos(ELEVATION) * np.sin(AZIMUTH), np.sin(ELEVATION)]
+        self.server.initial_camera.position = tuple(distance * np.array(away))
+        self.server.initial_camera.look_at = (0.0, 0.0, 0.0)  # the chosen world is kept there
         gui = self.server.gui
         gui.add_markdown(f"**{title}**")
         self._status = gui.add_markdown("")
@@ -130,11 +133,6 @@ class Page:
     def watched(self) -> bool:
         """Whether the page is open in a browser."""
         return bool(self.server.get_clients())
-
-    def _look(self, distance: float) -> None:
-        away = [-np.cos(ELEVATION) * np.cos(AZIMUTH), -np.cos(ELEVATION) * np.sin(AZIMUTH), np.sin(ELEVATION)]
-        self.server.initial_camera.position = tuple(distance * np.array(away))
-        self.server.initial_camera.look_at = (0.0, 0.0, 0.0)  # the chosen world is kept there
 
     # Controls. What a page sends is taken only if its controls could have sent it.
 

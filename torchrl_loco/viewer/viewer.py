@@ -77,7 +77,8 @@ class Viewer:
         self._due = {"picture": 0.0, "curves": 0.0, "policy": 0.0}
         self._last, self._owed, self._measured = time.perf_counter(), 0.0, (time.perf_counter(), 0)
         self._real_speed = 0.0
-        self._show()
+        self.page.show_worlds()
+        self._show_numbers()
         self._spent, self._awake = time.process_time(), time.perf_counter()
 
     @property
@@ -132,12 +133,13 @@ class Viewer:
             self._requests.get()()
             self._due["picture"] = self._due["curves"] = 0.0
         if self._newer is not None and self._is_due("policy", now, LOOK_FOR_POLICY):
-            self._swap(self._newer())
+            if (policy := self._newer()) is not None:
+                self.player.policy, self._due["curves"] = policy, 0.0
         elapsed, self._last = now - self._last, now
         if not self.page.watched:
             self._rest(IDLE)
             return
-        if self._plays:
+        if not self.paused and self.player.policy is not None:
             self._owed += elapsed * self.speed
             until = now + PICTURE
             while self._owed >= self.player.dt and time.perf_counter() < until:
@@ -169,15 +171,6 @@ class Viewer:
         if self.player.policy is not None:
             self.player.step()
 
-    @property
-    def _plays(self) -> bool:
-        return not self.paused and self.player.policy is not None
-
-    def _swap(self, policy: Callable[[Any], Any] | None) -> None:
-        if policy is not None:
-            self.player.policy = policy
-            self._due["curves"] = 0.0
-
     # What is clicked.
 
     def _pause(self) -> None:
@@ -196,10 +189,6 @@ class Viewer:
         self.speed = 1.0 if to == "Real time" else SPEEDS[min(max(at, 0), len(SPEEDS) - 1)]
 
     # What is shown.
-
-    def _show(self) -> None:
-        self.page.show_worlds()
-        self._show_numbers()
 
     def _show_numbers(self) -> None:
         player, now = self.player, time.perf_counter()
