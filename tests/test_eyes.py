@@ -9,6 +9,7 @@ from torchrl.envs import CatFrames, Compose, ToTensorImage
 from torchrl.envs.utils import check_env_specs
 
 import torchrl_loco as loco
+from torchrl_loco.eyes.rays import Rays
 from torchrl_loco.eyes.tracer import Eye
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
@@ -208,10 +209,60 @@ def test_hooks_see_depth():
     assert td["eye"].min() < 1.0
 
 
-def test_a_camera_that_hooks_name_must_be_there():
+@pytest.mark.parametrize("device", DEVICES)
+def test_rays_from_a_body_meet_what_those_of_c_mujoco_meet(device):
+    m, device, rng = shapes(), wp.get_device(device), np.random.default_rng(2)
+    directions, mat, start = rng.standard_normal((200, 3)), np.zeros(9), np.array([0.1, -0.9, 0.4])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    data, geom = mujoco.MjData(m), np.zeros(1, np.int32)
+    data.qpos[3:7] = [0.9, 0.2, -0.3, 0.1]
+    mujoco.mj_normalizeQuat(m, data.qpos)
+    mujoco.mj_forward(m, data)
+    mujoco.mju_quat2Mat(mat, np.array([0.8, 0.6, 0, 0]))
+    rays = Rays(m, device, 1, start, mat.reshape(3, 3), directions, 1, far=50.0)
+    body = data.xmat[1].reshape(3, 3)
+    rays.launch(
+        wp.array(data.xpos[None], dtype=wp.vec3, device=device),
+        wp.array(data.xmat.reshape(1, -1, 3, 3), dtype=wp.mat33, device=device),
+    )
+    found, groups = rays.distance[0].cpu().numpy(), np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)
+    for direction, distance in zip(directions @ mat.reshape(3, 3).T @ body.T, found, strict=True):
+        met = mujoco.mj_ray(m, data, data.xpos[1] + body @ start, direction, groups, 1, -1, geom)
+        assert distance == pytest.approx(50.0 if met < 0 else min(met, 50.0), rel=1e-4)
+    assert (found < 50.0).mean() > 0.3
+
+
+def test_hooks_cast_rays():
+    """From a site that turns with its body: the floor is as far below a foot as the foot is high."""
+
+    class Feels(loco.Go1Velocity):
+        noise = {}
+
+        def observation(self, s):
+            return s.ray("FR", [[0, 0, -3.0], [0, 0, 1.0]], far=3.0)
+
+    env, plain = (Feels(2, "cpu", seed=0, compile_hooks=compiled) for compiled in (True, False))
+    env.reset()
+    state = env.get_state()
+    state["qpos"][1, 2:7] = torch.tensor([1.0, 0.0, 1.0, 0.0, 0.0])  # high, and on its back
+    found = env.reset(state, set_state=True)["observation"]
+    assert torch.equal(plain.reset(state, set_state=True)["observation"], found)
+    assert found[0, 0] < 0.2
+    assert found[1, 0] == 3.0  # it points into the sky
+
+
+@pytest.mark.parametrize(
+    ("seen", "error", "match"),
+    [
+        (lambda s: s.depth("left", 8, 6), KeyError, "no camera 'left'.*egocentric"),
+        (lambda s: s.ray("paw", [[0, 0, 1]]), KeyError, "no site 'paw'.*FR"),
+        (lambda s: s.ray("FR", [0, 0, 1]), ValueError, "directions must be rows of 3"),
+    ],
+)
+def test_what_hooks_ask_for_must_be_there(seen, error, match):
     class Blind(Sees):
         def observation(self, s):
-            return s.depth("left", 8, 6).flatten(1)
+            return seen(s).flatten(1)
 
-    with pytest.raises(KeyError, match=r"no camera 'left'.*egocentric"):
+    with pytest.raises(error, match=match):
         Blind(2, "cpu", seed=0)

@@ -3,11 +3,13 @@
 import dataclasses
 from typing import TYPE_CHECKING
 
+import mujoco
 import numpy as np
 import torch
 import warp as wp
 
 from torchrl_loco.envs.heights import Ground
+from torchrl_loco.eyes.rays import Rays
 from torchrl_loco.eyes.tracer import Eye
 from torchrl_loco.sim import Buffer, fill
 from torchrl_loco.sim.compiled.collision.ground import NOTHING
@@ -46,6 +48,21 @@ class Looked:
     camera: int
     width: int
     height: int
+    far: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Cast:
+    """Rays from a site, for which hooks have asked.
+
+    Attributes:
+        site: the site.
+        directions: in its frame, of length 1.
+        far: greatest distance (m).
+    """
+
+    site: int
+    directions: tuple[tuple[float, float, float], ...]
     far: float
 
 
@@ -124,29 +141,23 @@ def scan(
 
 
 class Scans:
-    """The scans and depths that hooks ask for.
+    """The scans, depths and rays that hooks ask for.
 
     Args:
         sim: the physics.
-        asked: both by the name of their array.
+        asked: all by the name of their array.
         ground: what is below; ``None`` where there are no scans.
         mask: the worlds in which episodes begin.
 
     Attributes:
         arrays: of scans, heights of the body above the ground at each point (m), NaN where there is none, ``(nworld,
-            points)``; of cameras, depths (m), ``(nworld, height, width)``.
+            points)``; of cameras, depths (m), ``(nworld, height, width)``; of rays, distances (m), ``(nworld, rays)``.
     """
 
     def __init__(
-        self, sim: "Simulation", asked: dict[str, Asked | Looked], ground: Ground | None, mask: wp.array
+        self, sim: "Simulation", asked: dict[str, Asked | Looked | Cast], ground: Ground | None, mask: wp.array
     ) -> None:
-        self._eyes = {
-            name: Eye(
-                sim.mj_model, sim.device, one.camera, one.width, one.height, sim.num_envs, ("depth",), far=one.far
-            )
-            for name, one in asked.items()
-            if isinstance(one, Looked)
-        }
+        self._eyes = {name: eye_of(sim, one) for name, one in asked.items() if not isinstance(one, Asked)}
         self._asked = {name: one for name, one in asked.items() if isinstance(one, Asked)}
         self._sim, self._mask = sim, mask
         self._ground = tables(ground, sim.device) if asked and ground is not None else None
@@ -154,7 +165,8 @@ class Scans:
         self._points = {name: wp.array(points, dtype=wp.vec2, device=sim.device) for name, points in kept.items()}
         self._out = {name: Buffer((sim.num_envs, len(points)), float, sim.device) for name, points in kept.items()}
         self.arrays: dict[str, torch.Tensor] = {name: out.torch for name, out in self._out.items()}
-        self.arrays |= {name: eye.depth for name, eye in self._eyes.items()}
+        for name, eye in self._eyes.items():
+            self.arrays[name] = eye.depth if isinstance(eye, Eye) else eye.distance
 
     def all(self) -> None:
         """Launches them, in all worlds."""
@@ -172,6 +184,17 @@ class Scans:
             wp.launch(scan, dim=out.shape, inputs=inputs, outputs=[out], device=self._sim.device)
         for eye in self._eyes.values():
             eye.launch(data.xpos, data.xmat, self._mask if masked else None)
+
+
+def eye_of(sim: "Simulation", asked: Looked | Cast) -> Eye | Rays:
+    """Returns what sees for hooks."""
+    m, n = sim.mj_model, sim.num_envs
+    if isinstance(asked, Looked):
+        return Eye(m, sim.device, asked.camera, asked.width, asked.height, n, ("depth",), far=asked.far)
+    mat = np.zeros(9)
+    mujoco.mju_quat2Mat(mat, m.site_quat[asked.site])
+    place = int(m.site_bodyid[asked.site]), m.site_pos[asked.site], mat.reshape(3, 3)
+    return Rays(m, sim.device, *place, np.array(asked.directions), n, asked.far)
 
 
 def tables(ground: Ground, device: wp.Device) -> Tables:

@@ -12,7 +12,7 @@ import torch
 from torchrl_loco.checks import POSITIVE, check_float, check_int
 from torchrl_loco.envs import draws, heights, sensors
 from torchrl_loco.envs.names import Elements, Names
-from torchrl_loco.envs.scan import Asked, Looked
+from torchrl_loco.envs.scan import Asked, Cast, Looked
 from torchrl_loco.envs.tables import Entry, Table
 from torchrl_loco.envs.variation import Variation, constant_of
 from torchrl_loco.sim import models
@@ -40,7 +40,7 @@ class Catalog(Elements):
         arrays: names of the arrays that hooks have read.
         sensors: ids of the sensors that only an engine can evaluate.
         contact_geoms: ids of the geoms whose contacts were asked for, in the order of the engine's columns.
-        scans: the scans of the ground and the depths that were asked for, by the name of their array.
+        scans: the scans of the ground, depths and rays that were asked for, by the name of their array.
         scanning: by hook, the names of those that it reads.
         sensor_address: where a sensor's numbers begin in ``sensordata``, by its id.
         constants: the task's tables by name.
@@ -73,7 +73,7 @@ class Catalog(Elements):
         self.arrays: set[str] = set()
         self.sensors: set[int] = set()
         self.contact_geoms: list[int] = []
-        self.scans: dict[str, Asked | Looked] = {}
+        self.scans: dict[str, Asked | Looked | Cast] = {}
         self.scanning: dict[str, set[str]] = {}
         self.complete = False
         self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}
@@ -396,8 +396,31 @@ class View:
         size = check_int("height", height), check_int("width", width)
         return self._scanned(Looked(ids[0], size[1], size[0], check_float("far", far, POSITIVE)), size)
 
-    def _scanned(self, asked: Asked | Looked, shape: tuple[int, ...]) -> torch.Tensor:
-        """Returns the array of a scan or of depths, of a shape in each world: at the first call, numbers like them.
+    def ray(self, site: str, directions: Any, far: float = 10.0) -> torch.Tensor:
+        """Returns how far from a site lies what rays meet, shapes of all kinds and meshes among it.
+
+        Args:
+            site: name of a site. Rays leave a shape that it is in unhindered.
+            directions: of the rays, in the site's frame, ``(rays, 3)``; their length does not matter.
+            far: greatest distance (m), also where there is nothing.
+
+        Returns:
+            Distances (m), ``(num_envs, rays)``.
+
+        Raises:
+            KeyError: the model has no such site.
+            ValueError: ``far`` is not positive, or the directions have another shape, or one is no direction.
+        """
+        ids, _ = self._catalog.ids("site", _one("site", site))
+        rows = np.array(directions, dtype=float)
+        if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all() or not rows.any(1).all():
+            raise ValueError(f"directions must be rows of 3 finite numbers that are not all 0, (rays, 3), got {rows!r}")
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        asked = Cast(ids[0], tuple(map(tuple, rows.tolist())), check_float("far", far, POSITIVE))
+        return self._scanned(asked, (len(rows),))
+
+    def _scanned(self, asked: Asked | Looked | Cast, shape: tuple[int, ...]) -> torch.Tensor:
+        """Returns the array of a scan, depths or rays, of a shape in each world: at the first call, numbers like them.
 
         Raises:
             ValueError: the hook did not ask for it at its first call.

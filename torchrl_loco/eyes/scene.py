@@ -90,9 +90,6 @@ def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device) -> Mounts:
     if m.cam_projection[camera] != int(mujoco.mjtProjection.mjPROJ_PERSPECTIVE) or m.cam_sensorsize[camera].any():
         raise ValueError(f"camera {name!r} must have a perspective that fovy alone tells, to be drawn from")
     lights = np.flatnonzero(m.light_active)
-    count = np.ones(m.nbody, dtype=np.int32)
-    for body in range(m.nbody - 1, 0, -1):  # numbered along the tree: a subtree is a row of bodies
-        count[m.body_parentid[body]] += count[body]
 
     def of(cameras: np.ndarray, of_lights: np.ndarray) -> np.ndarray:
         return np.concatenate([cameras[[camera]], of_lights[lights]])
@@ -106,11 +103,28 @@ def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device) -> Mounts:
     pos = np.where(tracks[:, None], of(m.cam_pos0, m.light_pos0), of(m.cam_pos, m.light_pos))
     pos = np.where(of_com[:, None], of(m.cam_poscom0, m.light_poscom0), pos)
     mat = np.where((tracks | of_com)[:, None, None], np.array(whole), np.array(fixed))
+    bodies, targets = of(m.cam_bodyid, m.light_bodyid), of(m.cam_targetbodyid, m.light_targetbodyid)
+    return mounts_at(m, device, mode, bodies, targets, pos, mat)
+
+
+def mounts_at(
+    m: mujoco.MjModel,
+    device: wp.Device,
+    mode: np.ndarray,
+    body: np.ndarray,
+    target: np.ndarray,
+    pos: np.ndarray,
+    mat: np.ndarray,
+) -> Mounts:
+    """Returns what holds what is at ``pos`` and ``mat``, as MuJoCo has it of cameras."""
+    count = np.ones(m.nbody, dtype=np.int32)
+    for b in range(m.nbody - 1, 0, -1):  # numbered along the tree: a subtree is a row of bodies
+        count[m.body_parentid[b]] += count[b]
     return fill(
         Mounts,
         mode=array(mode, int, device),
-        body=array(of(m.cam_bodyid, m.light_bodyid), int, device),
-        target=array(of(m.cam_targetbodyid, m.light_targetbodyid), int, device),
+        body=array(body, int, device),
+        target=array(target, int, device),
         pos=array(pos, wp.vec3, device),
         mat=array(mat, wp.mat33, device),
         subtree=array(count, int, device),

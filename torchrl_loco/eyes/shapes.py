@@ -92,6 +92,14 @@ def to_shape(kind: int, o: wp.vec3, d: wp.vec3, size: wp.vec3) -> float:
 
 
 @wp.func
+def to_mesh(mesh: wp.uint64, o: wp.vec3, d: wp.vec3, most: float):
+    """Returns distance, normal and triangle; a miss is far away."""
+    length = wp.length(d)
+    met = wp.mesh_query_ray(mesh, o, d / length, most * length)
+    return wp.where(met.result, met.t / length, MISS), met.normal, met.face
+
+
+@wp.func
 def normal_of(kind: int, p: wp.vec3, size: wp.vec3) -> wp.vec3:
     """Returns where such a shape faces at one of its points."""
     if kind == PLANE:

@@ -1,27 +1,19 @@
-"""What cameras see in all worlds: a thread a pixel, after one a shape has said where in the picture it can be."""
+"""What cameras see in all worlds: a thread a pixel tries the shapes that can be there, and shades the nearest."""
 
 import functools
+import math
 from typing import Any
 
 import mujoco
-import torch
 import warp as wp
 
-from torchrl_loco.eyes.scene import Looks, Mounts, Shapes, looks_of, mounts_of, shapes_of, to_the_horizon
-from torchrl_loco.eyes.shapes import CAPSULE, CYLINDER, FIELD, MESH, MISS, PLANE, normal_of, to_shape
+from torchrl_loco.eyes.placing import Placed
+from torchrl_loco.eyes.scene import Looks, Shapes, looks_of, mounts_of, to_the_horizon
+from torchrl_loco.eyes.shapes import MESH, MISS, PLANE, normal_of, to_mesh, to_shape
 from torchrl_loco.sim import EXCLUSIVE, Buffer, current_stream
 
 KINDS = ("rgb", "depth", "geoms")
 """What a camera tells of each pixel."""
-WHOLE = wp.constant(wp.float32(1.0e6))
-"""Bound of a picture on the plane in front of the camera."""
-NEAR = wp.constant(wp.float32(1.0e-4))
-"""Depth from which a sphere is wholly in front of the camera (m)."""
-TRACKS = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK))
-OF_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
-AT_BODY = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY))
-AT_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM))
-
 Color = wp.types.vector(length=3, dtype=wp.uint8)
 
 
@@ -35,115 +27,6 @@ class View:
     samples: int
     far: float
     along_ray: bool
-
-
-@wp.func
-def center(mounts: Mounts, xpos: wp.array[wp.vec3], xmat: wp.array[wp.mat33], body: int) -> wp.vec3:
-    """Returns the center of mass of a subtree."""
-    whole, found = float(0.0), wp.vec3()
-    for b in range(body, body + mounts.subtree[body]):
-        whole += mounts.mass[b]
-        found += mounts.mass[b] * (xpos[b] + xmat[b] @ mounts.ipos[b])
-    return wp.where(whole > 0.0, found / wp.max(whole, 1.0e-9), xpos[body])
-
-
-@wp.kernel(enable_backward=False)
-def mount(
-    # In:
-    mounts: Mounts,
-    mask: wp.array[bool],
-    xpos: wp.array2d[wp.vec3],
-    xmat: wp.array2d[wp.mat33],
-    # Out:
-    camera_pos_out: wp.array[wp.vec3],
-    camera_mat_out: wp.array[wp.mat33],
-    light_pos_out: wp.array2d[wp.vec3],
-    light_axis_out: wp.array2d[wp.vec3],
-):
-    """Writes where the camera is, and in its frame where lights are, and against what each shines."""
-    world = wp.tid()
-    if mask and not mask[world]:
-        return
-    for k in range(mounts.mode.shape[0]):
-        mode, body = mounts.mode[k], mounts.body[k]
-        pos, mat = 1.0 * mounts.pos[k], 1.0 * mounts.mat[k]
-        if mode == TRACKS:
-            pos = xpos[world, body] + pos
-        elif mode == OF_COM:
-            pos = center(mounts, xpos[world], xmat[world], body) + pos
-        else:
-            pos = xpos[world, body] + xmat[world, body] @ pos
-            mat = xmat[world, body] @ mat
-            if mode >= AT_BODY and mounts.target[k] >= 0:
-                target = 1.0 * xpos[world, mounts.target[k]]
-                if mode == AT_COM:
-                    target = center(mounts, xpos[world], xmat[world], mounts.target[k])
-                z = wp.normalize(pos - target)
-                x = wp.normalize(wp.cross(wp.vec3(0.0, 0.0, 1.0), z))
-                mat = wp.matrix_from_cols(x, wp.cross(z, x), z)
-        if k == 0:
-            camera_pos_out[world] = pos
-            camera_mat_out[world] = mat
-        else:
-            into = wp.transpose(camera_mat_out[world])
-            light_pos_out[world, k - 1] = into @ (pos - camera_pos_out[world])
-            light_axis_out[world, k - 1] = into @ wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2])
-
-
-@wp.func
-def bounds(c: wp.vec3, radius: float) -> wp.vec4:
-    """Returns from where to where in the picture a sphere can be, x and y, of the camera's own frame."""
-    far, near = radius - c[2], -radius - c[2]
-    if far <= 0.0:
-        return wp.vec4(WHOLE, WHOLE, -WHOLE, -WHOLE)
-    if near <= NEAR:
-        return wp.vec4(-WHOLE, -WHOLE, WHOLE, WHOLE)
-    left, right, low, high = c[0] - radius, c[0] + radius, c[1] - radius, c[1] + radius
-    return wp.vec4(
-        wp.min(left / near, left / far),
-        wp.min(low / near, low / far),
-        wp.max(right / near, right / far),
-        wp.max(high / near, high / far),
-    )
-
-
-@wp.kernel(enable_backward=False)
-def place(
-    # In:
-    shapes: Shapes,
-    mask: wp.array[bool],
-    xpos: wp.array2d[wp.vec3],
-    xmat: wp.array2d[wp.mat33],
-    camera_pos: wp.array[wp.vec3],
-    camera_mat: wp.array[wp.mat33],
-    # Out:
-    origin_out: wp.array2d[wp.vec3],
-    turn_out: wp.array2d[wp.mat33],
-    bounds_out: wp.array2d[wp.vec4],
-):
-    world, k = wp.tid()
-    if mask and not mask[world]:
-        return
-    body, kind, size = shapes.body[k], shapes.kind[k], shapes.size[k]
-    pos = xpos[world, body] + xmat[world, body] @ shapes.pos[k]
-    mat = xmat[world, body] @ shapes.mat[k]
-    camera = camera_mat[world]
-    origin_out[world, k] = wp.transpose(mat) @ (camera_pos[world] - pos)
-    turn_out[world, k] = wp.transpose(mat) @ camera
-    at = wp.transpose(camera) @ (pos - camera_pos[world])
-    found = wp.vec4(-WHOLE, -WHOLE, WHOLE, WHOLE)
-    if kind == CAPSULE or kind == CYLINDER:  # noqa: SIM109 (Warp has no "in")
-        axis = size[1] * (wp.transpose(camera) @ wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2]))
-        one, other = bounds(at - axis, size[0]), bounds(at + axis, size[0])
-        behind = one[0] > one[2] or other[0] > other[2]  # a part of it may pass the camera
-        if behind and wp.min(one[0], other[0]) < WHOLE:
-            one = wp.vec4(-WHOLE, -WHOLE, WHOLE, WHOLE)
-        found = wp.vec4(
-            wp.min(one[0], other[0]), wp.min(one[1], other[1]), wp.max(one[2], other[2]), wp.max(one[3], other[3])
-        )
-    elif kind != PLANE and kind != FIELD and shapes.geom[k] >= 0:
-        found = bounds(at, shapes.radius[k])
-    bounds_out[world, k] = found
 
 
 @wp.func
@@ -186,13 +69,6 @@ def sky(looks: Looks, d: wp.vec3) -> wp.vec3:
 @functools.cache
 def tracer(rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool) -> wp.Kernel:
     """Returns the kernel that traces the rays of a pixel, for what is asked for."""
-
-    @wp.func
-    def to_mesh(mesh: wp.uint64, o: wp.vec3, d: wp.vec3, most: float):
-        """Returns distance, normal and triangle; a miss is far away."""
-        length = wp.length(d)
-        met = wp.mesh_query_ray(mesh, o, d / length, most * length)
-        return wp.where(met.result, met.t / length, MISS), met.normal, met.face
 
     @wp.func
     def lit(
@@ -359,21 +235,15 @@ class Eye:
         far: float = 1.0e10,
         along_ray: bool = False,
     ) -> None:
-        m, which = to_the_horizon(m), m.camera(camera).id
-        self._device, half = device, float(torch.tan(torch.deg2rad(torch.tensor(m.cam_fovy[which] / 2.0))))
+        which = m.camera(camera).id
+        self._device, half = device, math.tan(math.radians(m.cam_fovy[which] / 2.0))
         with EXCLUSIVE, wp.ScopedDevice(device):
-            self._mounts, self._looks = mounts_of(m, which, device), looks_of(m, device)
-            self._shapes, self._meshes = shapes_of(m, device)
-            self._view = View()
+            self._placed = Placed(m, device, mounts_of(m, which, device), worlds)
+            self._looks, self._view = looks_of(to_the_horizon(m), device), View()
             self._view.half, self._view.far = wp.vec2(half * width / height, half), far
             self._view.width, self._view.height = width, height
             self._view.samples, self._view.along_ray = samples, along_ray
-            self._trace = tracer(*(kind in kinds for kind in KINDS), shadows, bool(self._meshes))
-            lights, shapes = (worlds, self._mounts.mode.shape[0] - 1), (worlds, self._shapes.kind.shape[0])
-            self._camera = [wp.empty(worlds, dtype=kind) for kind in (wp.vec3, wp.mat33)]
-            self._lights = [wp.empty(lights, dtype=wp.vec3) for _ in range(2)]
-            self._placed = [wp.empty(shapes, dtype=kind) for kind in (wp.vec3, wp.mat33, wp.vec4)]
-            self._everywhere = wp.empty(0, dtype=bool)
+            self._trace = tracer(*(kind in kinds for kind in KINDS), shadows, self._placed.has_meshes)
 
             def pixels(kind: str, dtype: Any) -> Buffer:
                 return Buffer((worlds, height, width) if kind in kinds else (0, 0, 0), dtype, device)
@@ -389,16 +259,12 @@ class Eye:
             xmat: their orientations.
             mask: the worlds that look; ``None`` is all.
         """
-        mask = self._everywhere if mask is None else mask
-        out = [one.warp for one in self._out]
-        (worlds, shapes), size = self._placed[0].shape, next(one.shape for one in out if one.size)
-        here, where = [mask, xpos, xmat], [mask, self._camera[1], *self._lights, *self._placed]
-        for kernel, dim, inputs, outputs in (
-            (mount, worlds, [self._mounts, *here], [*self._camera, *self._lights]),
-            (place, (worlds, shapes), [self._shapes, *here, *self._camera], self._placed),
-            (self._trace, size, [self._view, self._shapes, self._looks, *where], out),
-        ):
-            wp.launch(kernel, dim, inputs, outputs, device=self._device)
+        placed, out = self._placed, [one.warp for one in self._out]
+        mask = placed.everywhere if mask is None else mask
+        placed.launch(xpos, xmat, mask)
+        size = next(one.shape for one in out if one.size)
+        where = [mask, placed.camera, *placed.lights, *placed.placed, placed.bounds]
+        wp.launch(self._trace, size, [self._view, placed.shapes, self._looks, *where], out, device=self._device)
 
     def look(self, xpos: wp.array, xmat: wp.array) -> None:
         """Launches the kernels on torch's stream; arguments as of :meth:`launch`."""

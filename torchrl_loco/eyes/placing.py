@@ -1,0 +1,173 @@
+"""Where cameras, lights and shapes are in each world: shapes before the camera, and where in its picture."""
+
+import mujoco
+import warp as wp
+
+from torchrl_loco.eyes.scene import Mounts, Shapes, shapes_of, to_the_horizon
+from torchrl_loco.eyes.shapes import CAPSULE, CYLINDER, FIELD, PLANE
+from torchrl_loco.sim import EXCLUSIVE
+
+WHOLE = wp.constant(wp.float32(1.0e6))
+"""Bound of a picture on the plane in front of the camera."""
+NEAR = wp.constant(wp.float32(1.0e-4))
+"""Depth from which a sphere is wholly in front of the camera (m)."""
+TRACKS = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK))
+OF_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
+AT_BODY = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY))
+AT_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM))
+
+
+@wp.func
+def center(mounts: Mounts, xpos: wp.array[wp.vec3], xmat: wp.array[wp.mat33], body: int) -> wp.vec3:
+    """Returns the center of mass of a subtree."""
+    whole, found = float(0.0), wp.vec3()
+    for b in range(body, body + mounts.subtree[body]):
+        whole += mounts.mass[b]
+        found += mounts.mass[b] * (xpos[b] + xmat[b] @ mounts.ipos[b])
+    return wp.where(whole > 0.0, found / wp.max(whole, 1.0e-9), xpos[body])
+
+
+@wp.kernel(enable_backward=False)
+def mount(
+    # In:
+    mounts: Mounts,
+    mask: wp.array[bool],
+    xpos: wp.array2d[wp.vec3],
+    xmat: wp.array2d[wp.mat33],
+    # Out:
+    camera_pos_out: wp.array[wp.vec3],
+    camera_mat_out: wp.array[wp.mat33],
+    light_pos_out: wp.array2d[wp.vec3],
+    light_axis_out: wp.array2d[wp.vec3],
+):
+    """Writes where the camera is, and in its frame where lights are, and against what each shines."""
+    world = wp.tid()
+    if mask and not mask[world]:
+        return
+    for k in range(mounts.mode.shape[0]):
+        mode, body = mounts.mode[k], mounts.body[k]
+        pos, mat = 1.0 * mounts.pos[k], 1.0 * mounts.mat[k]
+        if mode == TRACKS:
+            pos = xpos[world, body] + pos
+        elif mode == OF_COM:
+            pos = center(mounts, xpos[world], xmat[world], body) + pos
+        else:
+            pos = xpos[world, body] + xmat[world, body] @ pos
+            mat = xmat[world, body] @ mat
+            if mode >= AT_BODY and mounts.target[k] >= 0:
+                target = 1.0 * xpos[world, mounts.target[k]]
+                if mode == AT_COM:
+                    target = center(mounts, xpos[world], xmat[world], mounts.target[k])
+                z = wp.normalize(pos - target)
+                x = wp.normalize(wp.cross(wp.vec3(0.0, 0.0, 1.0), z))
+                mat = wp.matrix_from_cols(x, wp.cross(z, x), z)
+        if k == 0:
+            camera_pos_out[world] = pos
+            camera_mat_out[world] = mat
+        else:
+            into = wp.transpose(camera_mat_out[world])
+            light_pos_out[world, k - 1] = into @ (pos - camera_pos_out[world])
+            light_axis_out[world, k - 1] = into @ wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2])
+
+
+@wp.func
+def bounds(c: wp.vec3, radius: float) -> wp.vec4:
+    """Returns from where to where in the picture a sphere can be, x and y, of the camera's own frame."""
+    far, near = radius - c[2], -radius - c[2]
+    if far <= 0.0:
+        return wp.vec4(WHOLE, WHOLE, -WHOLE, -WHOLE)
+    if near <= NEAR:
+        return wp.vec4(-WHOLE, -WHOLE, WHOLE, WHOLE)
+    left, right, low, high = c[0] - radius, c[0] + radius, c[1] - radius, c[1] + radius
+    return wp.vec4(
+        wp.min(left / near, left / far),
+        wp.min(low / near, low / far),
+        wp.max(right / near, right / far),
+        wp.max(high / near, high / far),
+    )
+
+
+@wp.kernel(enable_backward=False)
+def place(
+    # In:
+    shapes: Shapes,
+    mask: wp.array[bool],
+    xpos: wp.array2d[wp.vec3],
+    xmat: wp.array2d[wp.mat33],
+    camera_pos: wp.array[wp.vec3],
+    camera_mat: wp.array[wp.mat33],
+    # Out:
+    origin_out: wp.array2d[wp.vec3],
+    turn_out: wp.array2d[wp.mat33],
+    bounds_out: wp.array2d[wp.vec4],
+):
+    world, k = wp.tid()
+    if mask and not mask[world]:
+        return
+    body, kind, size = shapes.body[k], shapes.kind[k], shapes.size[k]
+    pos = xpos[world, body] + xmat[world, body] @ shapes.pos[k]
+    mat = xmat[world, body] @ shapes.mat[k]
+    camera = camera_mat[world]
+    origin_out[world, k] = wp.transpose(mat) @ (camera_pos[world] - pos)
+    turn_out[world, k] = wp.transpose(mat) @ camera
+    at = wp.transpose(camera) @ (pos - camera_pos[world])
+    found = wp.vec4(-WHOLE, -WHOLE, WHOLE, WHOLE)
+    if kind == CAPSULE or kind == CYLINDER:  # noqa: SIM109 (Warp has no "in")
+        axis = size[1] * (wp.transpose(camera) @ wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2]))
+        one, other = bounds(at - axis, size[0]), bounds(at + axis, size[0])
+        behind = one[0] > one[2] or other[0] > other[2]  # a part of it may pass the camera
+        if behind and wp.min(one[0], other[0]) < WHOLE:
+            one = wp.vec4(-WHOLE, -WHOLE, WHOLE, WHOLE)
+        found = wp.vec4(
+            wp.min(one[0], other[0]), wp.min(one[1], other[1]), wp.max(one[2], other[2]), wp.max(one[3], other[3])
+        )
+    elif kind != PLANE and kind != FIELD and shapes.geom[k] >= 0:
+        found = bounds(at, shapes.radius[k])
+    bounds_out[world, k] = found
+
+
+class Placed:
+    """The shapes of a model as they lie before a camera, or before where rays begin, in each of several worlds.
+
+    Args:
+        m: the model.
+        device: where.
+        mounts: what holds the camera and the lights.
+        worlds: how many worlds.
+
+    Attributes:
+        shapes: the shapes.
+        has_meshes: whether there are triangles among them.
+        camera: its frame in the world.
+        lights: where they are, and against what they shine, in the camera's frame.
+        placed: origin and axes of the camera in the frame of each shape.
+        bounds: from where to where each can be in the picture.
+        everywhere: the mask of all worlds.
+    """
+
+    def __init__(self, m: mujoco.MjModel, device: wp.Device, mounts: Mounts, worlds: int) -> None:
+        self._mounts, self._device = mounts, device
+        with EXCLUSIVE, wp.ScopedDevice(device):
+            self.shapes, self._meshes = shapes_of(to_the_horizon(m), device)
+            self.has_meshes = bool(self._meshes)
+            size = worlds, self.shapes.kind.shape[0]
+            self._pos, self.camera = wp.empty(worlds, dtype=wp.vec3), wp.empty(worlds, dtype=wp.mat33)
+            self.lights = [wp.empty((worlds, mounts.mode.shape[0] - 1), dtype=wp.vec3) for _ in range(2)]
+            self.placed = [wp.empty(size, dtype=kind) for kind in (wp.vec3, wp.mat33)]
+            self.bounds = wp.empty(size, dtype=wp.vec4)
+            self.everywhere = wp.empty(0, dtype=bool)
+
+    def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array) -> None:
+        """Launches what places them, on Warp's current stream.
+
+        Args:
+            xpos: positions of the bodies (m), ``(worlds or more, nbody)``.
+            xmat: their orientations.
+            mask: the worlds.
+        """
+        here, camera = [mask, xpos, xmat], [self._pos, self.camera]
+        for kernel, dim, inputs, outputs in (
+            (mount, self.camera.shape, [self._mounts, *here], [*camera, *self.lights]),
+            (place, self.bounds.shape, [self.shapes, *here, *camera], [*self.placed, self.bounds]),
+        ):
+            wp.launch(kernel, dim, inputs, outputs, device=self._device)

@@ -1,0 +1,86 @@
+"""Rays from a place on a body: how far what they meet lies."""
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from torchrl_loco.eyes.placing import Placed
+from torchrl_loco.eyes.scene import Shapes, array, mounts_at
+from torchrl_loco.eyes.shapes import MESH, to_mesh, to_shape
+from torchrl_loco.sim import EXCLUSIVE, Buffer
+
+
+@wp.kernel(enable_backward=False)
+def cast(
+    # In:
+    shapes: Shapes,
+    mask: wp.array[bool],
+    directions: wp.array[wp.vec3],
+    far: float,
+    origin: wp.array2d[wp.vec3],
+    turn: wp.array2d[wp.mat33],
+    # Out:
+    distance_out: wp.array2d[float],
+):
+    world, ray = wp.tid()
+    if mask and not mask[world]:
+        return
+    nearest = float(far)
+    for k in range(shapes.kind.shape[0]):
+        o, d, kind = origin[world, k], turn[world, k] @ directions[ray], shapes.kind[k]
+        t = to_shape(kind, o, d, shapes.size[k])
+        if kind == MESH:
+            t, _n, _f = to_mesh(shapes.mesh[k], o, d, nearest)
+        nearest = wp.min(nearest, t)
+    distance_out[world, ray] = nearest
+
+
+class Rays:
+    """Rays from a place on a body, in each of several worlds of a model.
+
+    Args:
+        m: the model.
+        device: where.
+        body: the body.
+        pos: where they begin, in its frame (m).
+        mat: the frame of their directions in that of the body, ``(3, 3)``.
+        directions: of length 1, ``(count, 3)``.
+        worlds: how many worlds.
+        far: greatest distance (m).
+
+    Attributes:
+        distance: how far what they meet lies, or ``far`` (m), ``(worlds, count)``.
+    """
+
+    def __init__(
+        self,
+        m: mujoco.MjModel,
+        device: wp.Device,
+        body: int,
+        pos: np.ndarray,
+        mat: np.ndarray,
+        directions: np.ndarray,
+        worlds: int,
+        far: float,
+    ) -> None:
+        one = np.zeros(1)
+        mounts = mounts_at(m, device, one, one + body, one - 1, pos[None], mat[None])
+        self._placed, self._device, self._far = Placed(m, device, mounts, worlds), device, far
+        with EXCLUSIVE, wp.ScopedDevice(device):
+            self._directions = array(directions, wp.vec3, device)
+            self._out = Buffer((worlds, len(directions)), float, device)
+        self.distance = self._out.torch
+
+    def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array | None = None) -> None:
+        """Launches the kernels, on Warp's current stream.
+
+        Args:
+            xpos: positions of the bodies (m), ``(worlds, nbody)``.
+            xmat: their orientations.
+            mask: the worlds; ``None`` is all.
+        """
+        placed, out = self._placed, self._out.warp
+        mask = placed.everywhere if mask is None else mask
+        placed.launch(xpos, xmat, mask)
+        inputs = [placed.shapes, mask, self._directions, self._far, *placed.placed]
+        wp.launch(cast, out.shape, inputs, [out], device=self._device)
