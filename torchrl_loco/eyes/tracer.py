@@ -66,6 +66,25 @@ def sky(looks: Looks, d: wp.vec3) -> wp.vec3:
     return looks.texels[looks.sky[0] + (side * width + row) * width + column]
 
 
+@wp.func
+def painted(looks: Looks, geom: int, at: wp.vec3, spread: float) -> wp.vec3:
+    """Returns the color of a geom at a place in its own frame, over which a pixel spreads so far (m)."""
+    color, texture = 1.0 * looks.color[geom], looks.texture[geom]
+    if texture >= 0:
+        repeat, offset = looks.repeat[geom], looks.offset[geom]
+        u, v = repeat[0] * at[0] + offset[0], offset[1] - repeat[1] * at[1]
+        color = wp.cw_mul(color, texel(looks, texture, u, v, spread * repeat[0]))
+    return color
+
+
+@wp.func
+def of_spot(looks: Looks, light: int, distance: float, inner: float) -> float:
+    """Returns how strong a light is that is so far, at an angle to its axis with such a cosine."""
+    fade, cone = looks.attenuation[light], looks.cone[light]
+    strength = 1.0 / (fade[0] + distance * (fade[1] + distance * fade[2]))
+    return wp.where(inner >= cone[0], strength * wp.pow(wp.max(inner, 0.0), cone[1]), 0.0)
+
+
 @functools.cache
 def tracer(rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool) -> wp.Kernel:
     """Returns the kernel that traces the rays of a pixel, for what is asked for."""
@@ -89,6 +108,42 @@ def tracer(rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool) -> 
                     if t < most:
                         return False
         return True
+
+    @wp.func
+    def shaded(
+        shapes: Shapes,
+        looks: Looks,
+        light_pos: wp.array[wp.vec3],
+        light_axis: wp.array[wp.vec3],
+        origin: wp.array[wp.vec3],
+        turn: wp.array[wp.mat33],
+        p: wp.vec3,
+        n: wp.vec3,
+        eye: wp.vec3,
+        base: wp.vec3,
+        shine: wp.vec3,
+    ) -> wp.vec3:
+        """Returns the color of a point that faces along ``n``, seen from ``eye``; the camera has the first light."""
+        light, gloss = looks.ambient + wp.vec3(shine[0], shine[0], shine[0]), wp.vec3()
+        for k in range(looks.diffuse.shape[0]):
+            to, strength, most = eye, float(1.0), float(0.0)
+            if k > 0:
+                to, most = 1.0 * light_axis[k - 1], MISS
+                if looks.light_kind[k - 1] == 0:
+                    way = light_pos[k - 1] - p
+                    most = wp.length(way)
+                    strength = of_spot(looks, k - 1, most, wp.dot(way, to) / most)
+                    to = way / most
+            toward = wp.dot(n, to)
+            if toward > 0.0 and strength > 0.0:
+                if wp.static(shadows):
+                    if k > 0 and looks.shadow[k - 1]:
+                        if not lit(shapes, origin, turn, p + 1.0e-3 * n, to, most):
+                            strength = 0.0
+                light += strength * toward * looks.diffuse[k]
+                half = wp.max(wp.dot(n, wp.normalize(to + eye)), 0.0)
+                gloss += strength * shine[1] * wp.pow(half, wp.max(shine[2], 1.0)) * looks.specular[k]
+        return wp.cw_mul(base, light) + gloss
 
     @wp.kernel(enable_backward=False, module="unique")
     def trace(
@@ -151,39 +206,23 @@ def tracer(rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool) -> 
                         n = normal_of(shapes.kind[found], inside, shapes.size[found])
                     n = wp.transpose(back) @ n
                     n = wp.where(wp.dot(n, d) > 0.0, -n, n)
-                    base, shine, eye = 1.0 * looks.color[geom], looks.shine[geom], -wp.normalize(d)
-                    texture = looks.texture[geom]
-                    if texture >= 0:
-                        repeat, offset = looks.repeat[geom], looks.offset[geom]
-                        spread = 2.0 * view.half[1] / float(view.height * view.samples) * nearest
-                        spread = spread * wp.length(d) / wp.max(wp.abs(wp.dot(n, eye)), 0.02) * repeat[0]
-                        u, v = repeat[0] * inside[0] + offset[0], offset[1] - repeat[1] * inside[1]
-                        base = wp.cw_mul(base, texel(looks, texture, u, v, spread))
-                    light = looks.ambient + wp.vec3(shine[0], shine[0], shine[0])
-                    gloss = wp.vec3()
-                    for k in range(looks.diffuse.shape[0]):
-                        to, strength, most = eye, float(1.0), float(0.0)
-                        if k > 0:  # the first is the camera's own
-                            to, most = 1.0 * light_axis[world, k - 1], MISS
-                            if looks.light_kind[k - 1] == 0:
-                                way = light_pos[world, k - 1] - p
-                                most = wp.length(way)
-                                inner = wp.dot(way, to) / most
-                                to = way / most
-                                fade, cone = looks.attenuation[k - 1], looks.cone[k - 1]
-                                strength = 1.0 / (fade[0] + most * (fade[1] + most * fade[2]))
-                                strength *= wp.where(inner >= cone[0], wp.pow(wp.max(inner, 0.0), cone[1]), 0.0)
-                        toward = wp.dot(n, to)
-                        if toward > 0.0 and strength > 0.0:
-                            if wp.static(shadows):
-                                if most > 0.0 and looks.shadow[k - 1]:
-                                    start = p + 1.0e-3 * n
-                                    if not lit(shapes, origin[world], turn[world], start, to, most):
-                                        strength = 0.0
-                            light += strength * toward * looks.diffuse[k]
-                            half = wp.max(wp.dot(n, wp.normalize(to + eye)), 0.0)
-                            gloss += strength * shine[1] * wp.pow(half, wp.max(shine[2], 1.0)) * looks.specular[k]
-                    color += wp.cw_mul(base, light) + gloss
+                    eye = -wp.normalize(d)
+                    slant = wp.max(wp.abs(wp.dot(n, eye)), 0.02)
+                    spread = 2.0 * view.half[1] / float(view.height * view.samples) * wp.length(p) / slant
+                    base = painted(looks, geom, inside, spread)
+                    color += shaded(
+                        shapes,
+                        looks,
+                        light_pos[world],
+                        light_axis[world],
+                        origin[world],
+                        turn[world],
+                        p,
+                        n,
+                        eye,
+                        base,
+                        looks.shine[geom],
+                    )
         if wp.static(rgb):
             scale = 255.0 * share * share
             rgb_out[world, row, column] = Color(
