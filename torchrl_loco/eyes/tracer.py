@@ -141,8 +141,10 @@ def tracer(rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool) -> 
                         if not lit(shapes, origin, turn, p + 1.0e-3 * n, to, most):
                             strength = 0.0
                 light += strength * toward * looks.diffuse[k]
-                half = wp.max(wp.dot(n, wp.normalize(to + eye)), 0.0)
-                gloss += strength * shine[1] * wp.pow(half, wp.max(shine[2], 1.0)) * looks.specular[k]
+                mirrored = shine[1] * looks.specular[k]
+                if wp.dot(mirrored, mirrored) > 0.0:  # the camera's own light has seldom any
+                    half = wp.max(wp.dot(n, wp.normalize(to + eye)), 0.0)
+                    gloss += strength * wp.pow(half, wp.max(shine[2], 1.0)) * mirrored
         return wp.cw_mul(base, light) + gloss
 
     @wp.kernel(enable_backward=False, module="unique")
