@@ -4,15 +4,9 @@ from torchrl_loco.sim.compiled import step
 
 
 @pytest.fixture(autouse=True)
-def texts_anew():
+def texts_anew(monkeypatch):
     """Tests here change constants of the compiled step."""
+    monkeypatch.setattr(step, "TRACED_DOFS", step.TRACED_DOFS)  # to be restored
     step.texts.clear()
     yield
     step.texts.clear()
-
-
-@pytest.fixture(params=[31, 0], ids=["traced", "lanes"])
-def form(request, monkeypatch):
-    """Takes one of the two forms of the compiled step for any model."""
-    monkeypatch.setattr(step, "TRACED_DOFS", request.param)
-    return "traced" if request.param else "lanes"

@@ -25,7 +25,6 @@ def count(total: wp.array[int]):
     ("device", "body", "protocol", "engine", "launches"),
     [
         ("cpu", "walker", "playground", "compiled", 1),
-        ("cpu", "walker", "playground", "mujoco_warp", 100),
         ("cpu", "humanoid", "dm_control", "mujoco_warp", 100),
         pytest.param("cuda", "humanoid", "dm_control", "mujoco_warp", 100, marks=pytest.mark.gpu),
     ],

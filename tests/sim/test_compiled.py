@@ -8,6 +8,7 @@ import pytest
 import torch
 import warp as wp
 from cases import CONFIGS, MODELS
+from forms import in_both_forms
 from mujoco_warp import OverflowType
 
 import torchrl_loco
@@ -196,6 +197,7 @@ def in_c_mujoco(model, sim, world=0):
     return data
 
 
+@in_both_forms
 def test_the_touch_of_a_state_that_was_set_is_that_of_its_contacts(form):
     """Nothing was stepped yet, and the motor counts as switched off, as in dm_control after a reset."""
     site = '<site name="sole" size="0.2"/>'
@@ -217,6 +219,7 @@ def link(name, joint, inner="", pos="0 0 -0.4"):
     return f'<body name="{name}" pos="{pos}">{joint}{geom}{inner}</body>'
 
 
+@in_both_forms
 def test_a_swinging_chain_keeps_its_energy(form):
     """A hinge, a ball joint and a hinge, without friction, for two seconds."""
     hand = link("hand", '<joint axis="0 1 0"/>')
@@ -235,6 +238,7 @@ def test_a_swinging_chain_keeps_its_energy(form):
     assert np.ptp(total) < 0.1  # as much as C MuJoCo's at this time step
 
 
+@in_both_forms
 def test_a_free_body_keeps_its_momentum(form):
     """A tree that drives itself by actuators and springs, far from everything."""
     hand = link("hand", '<joint name="wrist" axis="0 1 0" range="-20 20" limited="true"/>')
@@ -257,6 +261,7 @@ def test_a_free_body_keeps_its_momentum(form):
     np.testing.assert_allclose(sim.data.sensordata.numpy()[0].reshape(-1, 3), expected, atol=1e-5)
 
 
+@in_both_forms
 def test_constraints_are_no_stiffer_than_the_time_step_allows(form):
     """MuJoCo's flag refsafe: a time constant of less than two steps counts as two."""
     joint = '<joint type="slide" axis="0 0 1" range="-1 0.5" limited="true"/>'
@@ -279,9 +284,9 @@ def test_bodies_that_are_excluded_do_not_touch():
     assert {pair.geoms for pair in collision.pairs(model)} == {tuple(geoms) for geoms in data.contact.geom.tolist()}
 
 
-@pytest.mark.parametrize("form", [31], indirect=True, ids=["traced"])
-def test_more_pairs_of_geoms_than_a_byte_counts(form):
+def test_more_pairs_of_geoms_than_a_byte_counts(monkeypatch):
     """Of 4 rows of 8 balls the last two collide."""
+    monkeypatch.setattr(step, "TRACED_DOFS", 31)
     balls = "".join(f'<geom size="0.04" pos="{0.1 * i} 0 0"/>' for i in range(8))
     rows = [
         f'<body name="{name}" pos="0 {2 * i} 2"><joint type="slide" axis="0 1 0"/>{balls}</body>'
@@ -301,6 +306,7 @@ def test_more_pairs_of_geoms_than_a_byte_counts(form):
     np.testing.assert_allclose(sim.qvel[0], data.qvel, atol=1e-4)
 
 
+@in_both_forms
 def test_contacts_whose_damping_differs_by_rounding_are_all_damped_once(form):
     """0.95 mixed with 0.95 is not always 0.95."""
     surface = 'solref="-800 -30" solimp="0.95 0.95 0.01 0.5 2.5"'
@@ -336,6 +342,7 @@ def settled(model, seconds=2.0):
     return sim.qpos[0], sim.qvel[0], before
 
 
+@in_both_forms
 def test_a_ball_comes_to_rest_on_the_floor(form):
     for condim in (1, 3):
         qpos, qvel, before = settled(scene(PLANE.format(euler="0 0 0"), SPHERE.format(pos="0 0 0.11", condim=condim)))
@@ -344,6 +351,7 @@ def test_a_ball_comes_to_rest_on_the_floor(form):
         torch.testing.assert_close(qpos, before, rtol=0, atol=1e-6)
 
 
+@in_both_forms
 def test_a_ball_comes_to_rest_in_a_corner(form):
     """Of two planes, at the place that is symmetric."""
     qpos, qvel, _ = settled(scene(*CORNER, SPHERE.format(pos="0.02 0 0.2", condim=3)), seconds=4.0)
@@ -353,6 +361,7 @@ def test_a_ball_comes_to_rest_in_a_corner(form):
     assert qvel.abs().max() < 1e-2
 
 
+@in_both_forms
 def test_a_tolerance_below_single_precision_counts_as_the_least(form):
     """Otherwise the solver would iterate over rounding. MuJoCo-Warp has the same bound, 1e-6."""
     ends = []
@@ -363,6 +372,7 @@ def test_a_tolerance_below_single_precision_counts_as_the_least(form):
     assert torch.equal(torch.cat(ends[0]), torch.cat(ends[1]))
 
 
+@in_both_forms
 def test_moving_bodies_touch_within_their_margin(form):
     ball = '<body name="{}" pos="0 0 {}"><joint type="slide" axis="0 0 1"/><geom size="0.1" margin="0.05"/></body>'
     model = scene(ball.format("root", 0), ball.format("upper", 0.23), gravity="0 0 0")
@@ -376,6 +386,7 @@ def test_moving_bodies_touch_within_their_margin(form):
     np.testing.assert_allclose(sim.qvel[0], data.qvel, atol=1e-3)
 
 
+@in_both_forms
 def test_friction_holds_a_stack(form, monkeypatch):
     """A capsule on one across it, which lies on two that are fixed, under gravity that leans by 0.2.
 
@@ -415,6 +426,7 @@ def column(places, monkeypatch, qpos, qvel):
     return sim
 
 
+@in_both_forms
 def test_contacts_without_a_place_are_marked_in_their_world(form, monkeypatch):
     """The others are stepped as if there were places enough."""
     generator = torch.Generator().manual_seed(0)
@@ -430,6 +442,7 @@ def test_contacts_without_a_place_are_marked_in_their_world(form, monkeypatch):
     assert (few.qvel[0] != enough.qvel[0]).any()
 
 
+@in_both_forms
 def test_a_bad_world_harms_no_other(form, monkeypatch):
     generator = torch.Generator().manual_seed(0)
     qpos, qvel = 0.02 * torch.randn(5, 6, generator=generator), torch.randn(5, 6, generator=generator)

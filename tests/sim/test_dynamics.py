@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from cases import COMPILED, MODELS
 from evaluate import evaluate
+from for_each import for_each
 from random_models import models
 
 import torchrl_loco.sim.models
@@ -51,7 +52,7 @@ def assert_agrees(model, rng):
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=40, suppress_health_check=list(hypothesis.HealthCheck), **SETTINGS)
+@hypothesis.settings(max_examples=20, suppress_health_check=list(hypothesis.HealthCheck), **SETTINGS)
 @hypothesis.given(models(max_bodies=5))
 def test_random_models(xml):
     model = mujoco.MjModel.from_xml_string(xml)
@@ -59,6 +60,6 @@ def test_random_models(xml):
     assert_agrees(model, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("body", [task.split("_")[0] for task in COMPILED])
+@for_each("body", [task.split("_")[0] for task in COMPILED])
 def test_our_bodies(body):
     assert_agrees(torchrl_loco.sim.models.load(MODELS[body]), np.random.default_rng(0))

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from for_each import for_each
 from lane_contacts import find_contacts
 
 from torchrl_loco import LocoEnv, SimConfig
@@ -135,7 +136,7 @@ def test_spheres_and_capsules_touch_fields_as_in_c_mujoco():
     assert np.quantile(errors[:, 2], 0.998) < 1e-2  # directions out that are as short
 
 
-@pytest.mark.parametrize("turn", ["0 90 0", "180 0 0", "0 60 20"])
+@for_each("turn", ["0 90 0", "180 0 0", "0 60 20"])
 def test_a_field_may_lie_on_its_side(turn):
     """Its base is then beside or above what is its surface."""
     rng = np.random.default_rng(3)
@@ -148,7 +149,7 @@ def test_a_field_may_lie_on_its_side(turn):
     np.testing.assert_array_less(np.quantile(errors, 0.98, axis=0), (2e-6, 5e-3, 1e-2))
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("geom", "has_floor"),
     [
         ('type="sphere" size=".06"', True),

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from for_each import for_each
 
 import torchrl_loco
 from torchrl_loco.config import SimConfig
@@ -92,7 +93,7 @@ def with_lanes(sim, folder):
 
 @pytest.mark.ci
 @pytest.mark.skipif(COMPILER is None, reason="needs a compiler of C++: c++, g++ or clang++")
-@pytest.mark.parametrize("task", SEEN)
+@for_each("task", SEEN)
 def test_the_lanes_of_a_warp_agree_with_one_lane(task, actions, tmp_path):
     """Nor do they part, or race: in the opposite order they do the same, bit for bit."""
     env = torchrl_loco.make(task, WORLDS, "cpu", seed=0, stagger=True)

@@ -7,6 +7,7 @@ import pytest
 import torch
 import warp as wp
 from cases import CONFIGS, MODELS
+from for_each import for_each
 
 import torchrl_loco
 from torchrl_loco.config import sim_config
@@ -26,7 +27,7 @@ def allocated(thing):
     return found
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("body", "num_envs", "overrides", "geoms", "rows"),
     [
         ("walker", 1, {}, (), 1),

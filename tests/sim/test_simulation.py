@@ -6,6 +6,7 @@ import pytest
 import torch
 import warp as wp
 from cases import CONFIGS, MODELS
+from for_each import for_each
 
 from torchrl_loco.config import SimConfig, sim_config
 from torchrl_loco.sim import Simulation, models
@@ -20,12 +21,16 @@ def simulation(body, device, num_envs=4, **overrides):
     return sim, wp.ones(num_envs, dtype=bool, device=sim.device)
 
 
-KINDS = [("walker", "compiled"), ("humanoid", "compiled"), ("humanoid", "mujoco_warp")]
-of_each_kind = pytest.mark.parametrize(("body", "engine"), KINDS)
-ON_CUDA = [pytest.param(*kind, "cuda", marks=pytest.mark.gpu) for kind in KINDS[::2]]
+of_each_kind = for_each("body", "bodies")
 
 
-@pytest.mark.parametrize(("body", "engine", "device"), [*((*kind, "cpu") for kind in KINDS), *ON_CUDA])
+@pytest.fixture
+def bodies(engine):
+    """Under the compiled engine, one that is traced and one by lanes."""
+    return ["walker", "humanoid"] if engine == "compiled" else ["humanoid"]
+
+
+@of_each_kind
 def test_views_are_zero_copy_and_never_rebound(body, engine, device):
     sim, mask = simulation(body, device, engine=engine)
     pointers = {name: getattr(sim, name).data_ptr() for name in VIEWS}
@@ -176,9 +181,10 @@ def velocity_in_c_mujoco(model, steps):
     return data.qvel.copy()
 
 
-@pytest.mark.parametrize(("chosen", "replaced"), [("euler", "RK4"), ("implicitfast", "Euler"), ("rk4", "implicit")])
+@for_each(("chosen", "replaced"), [("euler", "RK4"), ("implicitfast", "Euler"), ("rk4", "implicit")])
 def test_the_integrator_is_that_of_the_config(chosen, replaced, caplog):
     """What the model names is replaced, which is said once; C MuJoCo with the chosen one does the same."""
+    caplog.clear()
     sim = falling(replaced, integrator=chosen, engine="mujoco_warp")
     (record,) = caplog.records
     assert f"integrator {replaced.upper()} is replaced by {chosen}, which config names" in record.message
@@ -205,7 +211,7 @@ def test_nothing_is_said_where_nothing_is_replaced(caplog):
     assert not caplog.records
 
 
-@pytest.mark.parametrize("name", ["qpos0", "body_mass", "opt.gravity"])
+@for_each("name", ["qpos0", "body_mass", "opt.gravity"])
 def test_the_model_of_the_compiled_step_cannot_be_written(name):
     """Its numbers are constants there, so that nothing would come of it. They can be read, also by kernels."""
     sim = falling()

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from for_each import for_each
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import Simulation
@@ -119,7 +120,7 @@ def legs():
     return "".join(LEG.format(i=i, x=0.15 * (-1) ** (i // 2), y=0.12 * (-1) ** i) for i in range(4))
 
 
-@pytest.mark.parametrize("other", ["difference", "across"])
+@for_each("other", ["difference", "across"])
 def test_steps_and_sensors_are_those_of_c_mujoco(other, device):
     """The second model couples two legs, which are not eliminated side by side then."""
     m = mujoco.MjModel.from_xml_string(MODEL.format(legs=legs(), other=other))
@@ -162,7 +163,7 @@ def test_steps_and_sensors_are_those_of_c_mujoco(other, device):
     np.testing.assert_array_equal(sim.mujoco_data().act.numpy(), act)
 
 
-@pytest.mark.parametrize("kind", EQUALITIES)
+@for_each("kind", EQUALITIES)
 def test_welds_and_connections_are_those_of_c_mujoco(kind, device):
     m = mujoco.MjModel.from_xml_string(WELDED.format(legs=legs(), equalities=EQUALITIES[kind]))
     assert unsupported(m) == []
@@ -227,7 +228,7 @@ def test_a_ball_joint_is_the_last_of_its_body():
         assert ["joint 'turn': a ball joint that another" in reason for reason in unsupported(m)] == [True] * reasons
 
 
-@pytest.mark.parametrize("reason", WRONG)
+@for_each("reason", WRONG)
 def test_what_is_not_there_is_said(reason):
     sites = '<site name="a"/><site name="c"/>'
     body = f'<body name="b" pos="0 0 1"><joint name="j"/><geom size=".1" condim="4"/>{sites}</body>'

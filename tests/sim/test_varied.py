@@ -8,6 +8,7 @@ import pytest
 import torch
 import warp as wp
 from contact_forces import net_forces
+from for_each import for_each
 from random_models import states
 from variation import all_varied, candidates, draw_rows
 
@@ -68,13 +69,13 @@ KINDS = {"traced": 31, "lanes": 0, "mujoco_warp": 31}
 """Ways of stepping, and the largest body that is traced."""
 
 
-@pytest.fixture(params=KINDS)
-def kind(request, monkeypatch):
-    monkeypatch.setattr(step, "TRACED_DOFS", KINDS[request.param])
-    return request.param
+@pytest.fixture
+def kinds(engine):
+    return ["mujoco_warp"] if engine == "mujoco_warp" else ["traced", "lanes"]
 
 
 def simulate(model, kind, count=WORLDS, varied=None, substeps=SUBSTEPS, device="cpu"):
+    step.TRACED_DOFS = KINDS[kind]
     option = model.opt
     config = SimConfig(
         ctrl_dt=substeps * option.timestep,
@@ -147,6 +148,7 @@ def start_of(xml):
 # Each world has its own model.
 
 
+@for_each("kind", "kinds")
 def test_each_world_steps_with_its_numbers(kind, device):
     """With all of them together, and with those of each field alone, which has an effect."""
     model, start, rng = mujoco.MjModel.from_xml_string(XML), start_of(XML), np.random.default_rng(1)
@@ -188,9 +190,8 @@ def test_numbers_of_pairs_vary(kind):
     assert p95(found)[0] < 1e-6 < 0.01 * off[:, 0].max()
 
 
-@pytest.mark.parametrize("kind", ["traced", "lanes"])
-def test_a_world_does_not_depend_on_the_others(kind, device, monkeypatch):
-    monkeypatch.setattr(step, "TRACED_DOFS", KINDS[kind])
+@for_each("kind", ["traced", "lanes"])
+def test_a_world_does_not_depend_on_the_others(kind, device):
     model, start = mujoco.MjModel.from_xml_string(XML), start_of(XML)
     varied = all_varied(model)
     rows = draw_rows(varied, np.random.default_rng(0), WORLDS)
@@ -206,9 +207,8 @@ def test_a_world_does_not_depend_on_the_others(kind, device, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["mujoco_warp", "lanes"])
-def test_a_mask_says_whose_numbers_count(kind, monkeypatch):
+def test_a_mask_says_whose_numbers_count(kind):
     """And a world that is put at rest has its new numbers."""
-    monkeypatch.setattr(step, "TRACED_DOFS", KINDS[kind])
     model, start, rng = mujoco.MjModel.from_xml_string(XML), start_of(XML), np.random.default_rng(0)
     varied = all_varied(model)
     old, new = draw_rows(varied, rng, WORLDS), draw_rows(varied, rng, WORLDS)
@@ -224,6 +224,7 @@ def test_a_mask_says_whose_numbers_count(kind, monkeypatch):
     assert p95(errors(sim, models, start))[0] < 1e-6
 
 
+@for_each("kind", "kinds")
 def test_mujoco_data_has_the_numbers_of_each_world(kind):
     model, start = mujoco.MjModel.from_xml_string(XML), start_of(XML)
     varied = all_varied(model)
@@ -285,7 +286,7 @@ def test_a_body_whose_mass_matrix_is_diagonal_has_the_mass_of_its_world():
     np.testing.assert_allclose(np.diag(matrix), [5.5, 5.0, 5.0, 0.1, 0.2, 0.15])
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("places", "wrong"),
     [
         ({"geom_size": [0]}, "'geom_size' cannot vary: choose of geom_friction"),
@@ -313,6 +314,7 @@ def test_what_only_mujoco_warp_varies_is_named():
 # What it takes.
 
 
+@for_each("kind", ["lanes", "mujoco_warp"])
 def test_memory_counts_the_numbers(kind):
     model, device = mujoco.MjModel.from_xml_string(XML), wp.get_device("cpu")
     varied = all_varied(model)
