@@ -11,11 +11,11 @@ COMPILED = ("walker_run", "humanoid_run", "cheetah_run", "hopper_hop")
 """A task of each body that both engines can step, for what does not depend on the task."""
 KINDS = (
     ("walker_run", "playground", "compiled"),
-    ("humanoid_run", "dm_control", "compiled"),
-    ("quadruped_run", "dm_control", "mujoco_warp"),
+    ("quadruped_run", "dm_control", "compiled"),
+    ("walker_run", "dm_control", "mujoco_warp"),
     ("walker_unsteady", "playground", "compiled"),
 )
-"""A task of each kind (traced, by lanes, with MuJoCo-Warp, with hooks), for what depends on nothing else of a task."""
+"""A task of each kind: traced; by lanes, with activations; with MuJoCo-Warp; with hooks."""
 BODIES = (*COMPILED, "quadruped_run")
 """A task of each body."""
 COARSE = {"sim_dt": 0.0125}

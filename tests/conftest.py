@@ -75,10 +75,10 @@ def cuda_memory():
     return used
 
 
-@pytest.fixture(params=KINDS, ids="-".join)
-def kind(request):
-    """A task, its protocol and its engine."""
-    return request.param
+@pytest.fixture(params=ENGINES)
+def kinds(request):
+    """The kinds of tasks that an engine steps, each a task, its protocol and its engine."""
+    return [kind for kind in KINDS if kind[2] == request.param]
 
 
 @pytest.fixture(params=ENGINES)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from cases import STAGGERED, coarse
+from for_each import for_each
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch._subclasses import FakeTensorMode
@@ -43,6 +44,7 @@ def policy(env):
     return TensorDictModule(module, in_keys=["observation"], out_keys=["action"])
 
 
+@for_each("kind", "kinds")
 def test_exchangeable_with_torchrls_collector(make, kind):
     task, protocol, engine = kind
     for wrap in (False, True):
@@ -160,12 +162,12 @@ def on_cuda(task, wrap=False, num_envs=64, **settings):
     return torchrl_loco.TransformedEnv(env, Compose(InitTracker(), RewardSum())) if wrap else env
 
 
-two_bodies = pytest.mark.parametrize("task", ["walker_run", "humanoid_run"])  # traced, and by lanes
+two_bodies = for_each("task", ["walker_run", "humanoid_run"])  # traced, and by lanes
 RANDOM, DETERMINISTIC = ExplorationType.RANDOM, ExplorationType.DETERMINISTIC
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize(
+@for_each(
     ("task", "protocol", "wrap", "exploration"),
     [
         ("walker_run", "playground", False, RANDOM),
@@ -229,7 +231,7 @@ def test_steps_are_stacked_as_tensordict_does():
 
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")
-@pytest.mark.parametrize(("task", "wrap"), [("walker_run", False), ("humanoid_run", True), ("quadruped_run", True)])
+@for_each(("task", "wrap"), [("walker_run", False), ("humanoid_run", True), ("quadruped_run", True)])
 def test_no_synchronisation(task, wrap):
     env = on_cuda(task, wrap, 256, episode_length=50)
     batches = iter(RolloutCollector(env, policy(env), frames_per_batch=256 * 10))

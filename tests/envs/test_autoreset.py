@@ -3,6 +3,7 @@
 import pytest
 import torch
 from cases import STAGGERED, coarse
+from for_each import for_each
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter, VecNormV2
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
@@ -34,6 +35,7 @@ def play(env, moves, step_and_maybe_reset):
     return torch.stack(trace)
 
 
+@for_each("kind", "kinds")
 def test_same_data_as_torchrl(shared, kind, actions):
     """Worlds end at different times: at the environment's limit, at a transform's, and by a NaN action."""
     task, protocol, engine = kind
@@ -59,7 +61,7 @@ def test_same_data_as_torchrl(shared, kind, actions):
 
 
 @pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # for any batch
-@pytest.mark.parametrize("nested", [False, True])
+@for_each("nested", [False, True])
 def test_statistics_count_what_torchrl_counts(shared, actions, nested):
     """A transform that learns from a reset may not be reset at a step after which no world is done."""
     traces, counts = [], []
@@ -99,6 +101,7 @@ def test_a_step_begins_without_the_last_reward(shared):
     assert "reward" in td["next"]
 
 
+@for_each("kind", "kinds")
 def test_an_empty_mask_changes_nothing(shared, kind):
     task, protocol, engine = kind
     env = shared(task, protocol=protocol, engine=engine, reward_terms=True)
@@ -111,8 +114,8 @@ def test_an_empty_mask_changes_nothing(shared, kind):
 
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")
-@pytest.mark.parametrize("wrap", [False, True])
-@pytest.mark.parametrize("task", ["walker_run", "humanoid_run", "quadruped_run"])
+@for_each("wrap", [False, True])
+@for_each("task", ["walker_run", "humanoid_run", "quadruped_run"])
 def test_no_synchronisation_over_100_steps_with_resets(task, wrap):
     env = torchrl_loco.make(task, 256, "cuda", seed=0, episode_length=50, stagger=True)
     env = torchrl_loco.TransformedEnv(env, transforms()) if wrap else env

@@ -7,6 +7,7 @@ import pytest
 import torch
 from cases import COARSE
 from compare import assert_repeats, played
+from for_each import for_each
 
 import torchrl_loco
 
@@ -104,7 +105,7 @@ def test_an_environment_that_is_dropped_reports_as_if_closed(tmp_path):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize(("engine", "num_envs"), [("compiled", 2**18), ("mujoco_warp", 4096)])
+@for_each(("engine", "num_envs"), [("compiled", 2**18), ("mujoco_warp", 4096)])
 def test_close_frees_device_memory(engine, num_envs, cuda_memory):
     def live():
         env = torchrl_loco.make("humanoid_walk", num_envs, "cuda", 0, engine=engine)

@@ -6,6 +6,7 @@ Under ``mujoco_warp`` it is everything on the CPU; on CUDA the starts, and with 
 import pytest
 import torch
 import warp as wp
+from for_each import for_each
 
 import torchrl_loco
 from torchrl_loco import State
@@ -28,14 +29,7 @@ def rollouts(task, device, protocol, num_envs, steps, **settings):
     return results
 
 
-@pytest.mark.parametrize(
-    ("task", "protocol", "engine"),
-    [
-        ("walker_run", "playground", "compiled"),
-        ("humanoid_run", "dm_control", "compiled"),
-        ("humanoid_run", "dm_control", "mujoco_warp"),
-    ],
-)
+@for_each("task, protocol, engine", "kinds")
 def test_the_cpu_always_repeats(shared, task, protocol, engine, actions):
     """An environment that was used, and in which worlds were not finite, does what a new one does."""
     options = {"protocol": protocol, "engine": engine, "episode_length": 20, "stagger": True}
@@ -51,14 +45,10 @@ def test_the_cpu_always_repeats(shared, task, protocol, engine, actions):
         assert (current == expected).all()
 
 
-@pytest.mark.parametrize(
-    ("device", "task", "protocol", "count"),
-    [
-        ("cpu", "walker_run", "playground", 40),
-        pytest.param("cpu", "humanoid_run", "dm_control", 40, marks=pytest.mark.slow),
-        pytest.param("cuda", "humanoid_run", "dm_control", 131, marks=pytest.mark.gpu),
-        pytest.param("cuda", "walker_run", "playground", 20_000, marks=pytest.mark.gpu),  # in three kernels, not one
-    ],
+@for_each(
+    "task, protocol, count",
+    cpu=[("walker_run", "playground", 40), ("humanoid_run", "dm_control", 40)],
+    cuda=[("humanoid_run", "dm_control", 131), ("walker_run", "playground", 20_000)],  # in three kernels, not one
 )
 def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protocol, count, device, actions):
     """Under ``compiled``, bit for bit, whatever their number, its place, and what happens in the others."""
@@ -85,21 +75,11 @@ def test_a_world_depends_on_its_own_state_and_actions_alone(shared, task, protoc
     assert all(torch.equal(value[places.to(device)], now[key]) for key, value in many.get_state().items())
 
 
-@pytest.mark.parametrize(
-    ("task", "device", "count"),
-    [
-        ("hopper_hop", "cpu", 100),
-        # Warps that are full, in one kernel and in three, and a last one that is not.
-        *(
-            pytest.param(task, "cuda", count, marks=pytest.mark.gpu)
-            for task, count in (
-                ("walker_run", 8203),
-                ("walker_run", 20_011),
-                ("cheetah_run", 8203),
-                ("hopper_hop", 20_011),
-            )
-        ),
-    ],
+@for_each(
+    "task, count",
+    cpu=[("hopper_hop", 100)],
+    # Warps that are full, in one kernel and in three, and a last one that is not.
+    cuda=[("walker_run", 8203), ("walker_run", 20_011), ("cheetah_run", 8203), ("hopper_hop", 20_011)],
 )
 def test_every_world_is_observed_as_among_few(task, device, count, actions):
     many, few = (torchrl_loco.make(task, n, device, 0) for n in (count, 64))
@@ -119,9 +99,9 @@ def test_every_world_is_observed_as_among_few(task, device, count, actions):
 def test_the_order_of_the_memory_changes_no_bit(monkeypatch, actions):
     """On CUDA the world is the fastest index of a small body's arrays; here on the CPU too."""
     settings = {"episode_length": 20, "stagger": True}
-    rows = torchrl_loco.make("cheetah_run", 5, "cpu", 0, **settings)
+    rows = torchrl_loco.make("hopper_hop", 5, "cpu", 0, **settings)
     monkeypatch.setattr(compiled_engine, "structure_of_arrays", lambda model, device: True)
-    columns = torchrl_loco.make("cheetah_run", 5, "cpu", 0, **settings)
+    columns = torchrl_loco.make("hopper_hop", 5, "cpu", 0, **settings)
     assert rows.sim.qpos.is_contiguous()
     assert columns.sim.qpos.stride() == (1, 5)
     tds = [env.reset() for env in (rows, columns)]
@@ -152,7 +132,7 @@ def test_the_setting_leaves_the_physics_as_it_is(shared):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize(
+@for_each(
     ("task", "protocol"),
     [
         ("walker_run", "playground"),
@@ -166,14 +146,14 @@ def test_cuda_always_repeats(task, protocol):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize(("task", "protocol"), [("humanoid_run", "dm_control"), ("dog_follow", "playground")])
+@for_each(("task", "protocol"), [("humanoid_run", "dm_control"), ("dog_follow", "playground")])
 def test_cuda_repeats_bit_for_bit_with_deterministic(task, protocol):
     options = {"engine": "mujoco_warp", "deterministic": True}
     assert torch.equal(*rollouts(task, "cuda", protocol, 1024, 60, **options))
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("task", ["humanoid_run", "quadruped_run"])
+@for_each("task", ["humanoid_run", "quadruped_run"])
 def test_mujoco_warp_on_cuda_repeats_starts_bit_for_bit_and_a_step_nearly(task):
     starts, steps = [], []
     for _ in range(2):

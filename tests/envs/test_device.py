@@ -6,16 +6,22 @@ import pytest
 import torch
 import warp as wp
 from cases import KINDS
+from for_each import for_each
 
 import torchrl_loco
 from torchrl_loco.sim import TorchGraph
 
 
-@pytest.mark.parametrize("task", ["walker_run", "quadruped_run"])  # with hooks there are more
+@for_each("task", ["walker_run", "quadruped_run"])  # with hooks there are more
 def test_each_graph_is_recorded_once(task, device, actions, monkeypatch):
     """And while it is, garbage waits: an environment in it would free memory, which loses a recording on CUDA."""
     captures, capture = [], wp.ScopedCapture
-    monkeypatch.setattr(wp, "ScopedCapture", lambda **options: captures.append(gc.isenabled()) or capture(**options))
+    with monkeypatch.context() as patch:
+        patch.setattr(wp, "ScopedCapture", lambda **options: captures.append(gc.isenabled()) or capture(**options))
+        recorded_once(task, device, actions, captures)
+
+
+def recorded_once(task, device, actions, captures):
     env = torchrl_loco.make(task, 3, device, seed=0, episode_length=4)
     assert len(captures) == 2  # step and reset
     td = env.reset()
@@ -29,35 +35,31 @@ def test_each_graph_is_recorded_once(task, device, actions, monkeypatch):
     assert captures == 3 * [False]  # the third is what follows set_state
 
 
-@pytest.mark.parametrize(
-    ("task", "device", "count", "guarded", "of_step"),
-    [
-        ("walker_run", "cpu", 3, False, 1),
-        ("walker_run", "cpu", 3, True, 3),
-        pytest.param("walker_run", "cuda", 3, False, 1, marks=pytest.mark.gpu),
-        pytest.param("walker_run", "cuda", 20_000, True, 3, marks=pytest.mark.gpu),
-        pytest.param("humanoid_run", "cuda", 3, True, 3, marks=pytest.mark.gpu),
-    ],
+@for_each(
+    "task, count, guarded, of_step",
+    cpu=[("walker_run", 3, False, 1), ("walker_run", 3, True, 3)],
+    cuda=[("walker_run", 3, False, 1), ("walker_run", 20_000, True, 3), ("humanoid_run", 3, True, 3)],
 )
 def test_launches_of_the_compiled_engine(monkeypatch, tmp_path, task, device, count, guarded, of_step):
     """A control step, with observation, reward, time limit, counters and NaN guard, and the resets after it."""
     launches, launch = [], wp.launch
-    monkeypatch.setattr(
-        wp, "launch", lambda kernel, *args, **options: launches.append(kernel) or launch(kernel, *args, **options)
-    )
     nan_dump = tmp_path / "dump.safetensors" if guarded else None
-    env = torchrl_loco.make(task, count, device, seed=0, engine="compiled", episode_length=1, nan_dump=nan_dump)
-    assert len(set(launches)) == of_step + 1
-    launches.clear()
-    env.world._launch_step()
-    assert len(launches) == of_step
-    env.world._launch_reset()
-    assert len(launches) == of_step + 1
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            wp, "launch", lambda kernel, *args, **options: launches.append(kernel) or launch(kernel, *args, **options)
+        )
+        env = torchrl_loco.make(task, count, device, seed=0, engine="compiled", episode_length=1, nan_dump=nan_dump)
+        assert len(set(launches)) == of_step + 1
+        launches.clear()
+        env.world._launch_step()
+        assert len(launches) == of_step
+        env.world._launch_reset()
+        assert len(launches) == of_step + 1
     assert (env.world.elapsed_steps.torch == 0).all()  # they were reset
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize(
+@for_each(
     ("task", "protocol", "engine"),
     [*KINDS[:3], ("hopper_hop", "dm_control", "compiled"), ("humanoid_run", "playground", "mujoco_warp")],
 )

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 import warp as wp
+from for_each import for_each
 from hook_tasks import FollowVelocity, WalkBackwards, WalkBlindly
 from torch.nn import functional as F  # noqa: N812
 
@@ -47,11 +48,9 @@ def by_world(values):
     return values.movedim(0, -1).contiguous().movedim(-1, 0)
 
 
-@pytest.mark.parametrize("cls", [FollowVelocity, WalkBackwards, WalkBlindly])
-@pytest.mark.parametrize(
-    ("device", "n"), [("cpu", 6), pytest.param("cuda:0", 75, marks=pytest.mark.gpu)], ids=["cpu", "cuda"]
-)  # of 75 worlds some fill warps, which write their rows together
-def test_parts_of_tasks_do_what_plain_torch_does(cls, device, n):
+@for_each("cls", [FollowVelocity, WalkBackwards, WalkBlindly])
+def test_parts_of_tasks_do_what_plain_torch_does(cls, device):
+    n = 6 if device == "cpu" else 75  # of which some fill warps, which write their rows together
     env = cls(n, device=device)
     env.reset()
     env.rand_step()
@@ -371,7 +370,7 @@ def test_what_cannot_be_fused_is_named():
             fused(writer(func), with_room(func, operands(5)), 5)
 
 
-@pytest.mark.parametrize("n", [1, 3, 6, 100])
+@for_each("n", [1, 3, 6, 100])
 def test_tensors_of_a_task_are_read_at_each_launch(n):
     """Of each size that may be mistaken for that of the worlds; literals of a hook stay what they are."""
     table = torch.arange(12.0).view(6, 2)

@@ -10,6 +10,7 @@ import warnings
 import pytest
 import torch
 from cases import COMPILED, PROTOCOLS
+from for_each import for_each
 from mujoco_warp import OverflowType
 from tensordict import TensorDict
 
@@ -103,7 +104,7 @@ def test_peaks_hold_for_all_steps():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("field", ["njmax", "naconmax"])
+@for_each("field", ["njmax", "naconmax"])
 def test_the_advice_is_enough(field):
     env = made("cpu", **{field: 2})
     fall(env)

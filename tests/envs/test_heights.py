@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from for_each import for_each
 
 from torchrl_loco import LocoEnv, SimConfig, terrain
 
@@ -85,7 +86,7 @@ def test_a_plane_is_ground_too():
     torch.testing.assert_close(env.reset()["observation"], torch.tensor([[3.0] * len(GRID) + [0.0]]))
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("more", "grid", "message"),
     [
         ('<geom type="box" size="1 1 1" euler="0 0 30"/>', GRID, "geom 1 is turned"),

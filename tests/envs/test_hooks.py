@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from cases import COARSE
+from for_each import for_each
 from hook_tasks import DOG, Still, WalkBackwards, WalkBlindly
 from oracle import tolerance as numpy_tolerance
 
@@ -412,7 +413,7 @@ def fails(*args):
     raise TypeError("unhashable type")
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("rule", "why"),
     [(RULES["cos"], "its kernel gives another reward than the hooks"), (fails, "the rule of aten.sin.default fails")],
 )
@@ -435,7 +436,7 @@ def test_hooks_that_refuse_all_other_numbers_are_not_compiled(caplog):
     assert "nothing can be compared: it moves" in caplog.text
 
 
-@pytest.mark.parametrize("kept", [{}, {"compile_hooks": False}])
+@for_each("kept", [{}, {"compile_hooks": False}])
 def test_an_attribute_that_is_fixed_says_so_when_it_is_set(kept):
     class Faster(WalkerWalk):
         target, notes = 1.0, None

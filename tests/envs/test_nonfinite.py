@@ -3,10 +3,10 @@
 import itertools
 import math
 
-import pytest
 import torch
 import warp as wp
-from cases import COARSE, ENGINES, KINDS, coarse
+from cases import COARSE, ENGINES, coarse
+from for_each import for_each
 from tensordict import TensorDict
 
 from torchrl_loco.envs.episode import FiniteCheck, Outputs, observer, zero_non_finite
@@ -15,11 +15,6 @@ from torchrl_loco.sim.world_func import WorldKernels
 
 STATE = ("qpos", "qvel", "qacc_warmstart")
 BAD = [math.nan, math.inf, -math.inf]
-CASES = [
-    *KINDS,
-    ("walker_backwards", "playground", "compiled"),
-    ("walker_blindly", "playground", "compiled"),
-]
 
 
 def step_all(env, td, action):
@@ -40,13 +35,7 @@ def assert_goes_on_as(env, twin, after, expected, moves, exact):
         td, twin_td = td.exclude("reward"), twin_td.exclude("reward")
 
 
-@pytest.mark.parametrize(
-    ("device", "task", "protocol", "engine"),
-    [
-        *(("cpu", *case) for case in CASES),
-        *(pytest.param("cuda", *KINDS[i], marks=pytest.mark.gpu) for i in (0, 1, 3)),  # MuJoCo-Warp's sums vary there
-    ],
-)
+@for_each("task, protocol, engine", "kinds")
 def test_a_bad_action_ends_only_its_world(shared, task, protocol, engine, device, actions):
     options = {"protocol": protocol, "engine": engine, "reward_terms": task != "walker_backwards", **coarse(task)}
     env, twin = (shared(task, 4, device, copy=copy, **options) for copy in (0, 1))
@@ -70,6 +59,7 @@ def test_a_bad_action_ends_only_its_world(shared, task, protocol, engine, device
         assert_goes_on_as(env, twin, after, expected, more, exact)
 
 
+@for_each("kind", "kinds")
 def test_a_bad_action_counts_as_zeros_and_a_large_one_is_clipped(shared, kind, actions):
     """All of a bad one, so that the state stays finite."""
     task, protocol, engine = kind
@@ -91,7 +81,7 @@ def test_a_bad_action_counts_as_zeros_and_a_large_one_is_clipped(shared, kind, a
     assert torch.equal(after["reward"], expected["reward"])
 
 
-@pytest.mark.parametrize(("task", "protocol", "engine"), CASES)
+@for_each("task, protocol, engine", "kinds")
 def test_a_state_that_is_not_finite_ends_only_its_world(shared, task, protocol, engine, actions):
     options = {"protocol": protocol, "engine": engine, "reward_terms": task != "walker_backwards", **coarse(task)}
     env, twin = (shared(task, copy=copy, **options) for copy in (0, 1))

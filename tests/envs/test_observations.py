@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from for_each import for_each
 from hook_tasks import Still
 
 from torchrl_loco import Go1Velocity, State, WalkerWalk
@@ -35,7 +36,7 @@ def steps(env, count, td=None):
     return torch.stack(found, 1)
 
 
-@pytest.mark.parametrize("kernels", [True, False])
+@for_each("kernels", [True, False])
 def test_terms_are_joined_with_noise_and_history(kernels):
     env = Named(4, "cpu", 0, observation_terms=True, compile_hooks=kernels)
     assert env.observation_layout == {
@@ -98,7 +99,7 @@ def test_robots_name_what_they_see():
     assert 0.0 < noise.abs().max() <= 0.05
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("entries", "error", "message"),
     [
         ({"noise": {"poes": 0.1}}, ValueError, "unknown Wrong.noise 'poes', did you mean 'pose'"),

@@ -7,16 +7,16 @@ import warnings
 import pytest
 import torch
 from cases import COARSE, KINDS, STAGGERED, coarse
+from for_each import for_each
 from torchrl.envs import EnvCreator, ParallelEnv
 
 import torchrl_loco
 
 WHOLE, OFFSET, PART = 4, 1, 2
+
+
 # Under MuJoCo-Warp on CUDA the order of sums depends on the number of worlds.
-CASES = [*(("cpu", *kind) for kind in KINDS), pytest.param("cuda", *KINDS[0], marks=pytest.mark.gpu)]
-
-
-@pytest.mark.parametrize(("device", "task", "protocol", "engine"), CASES)
+@for_each("task, protocol, engine", cpu=[kind for kind in KINDS if kind[2] == "compiled"], cuda=KINDS[:1])
 def test_an_offset_draws_what_these_worlds_of_a_larger_environment_draw(
     shared, actions, task, protocol, engine, device
 ):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from cases import KINDS, MODELS
+from for_each import for_each
 from oracle import DATA, FORCES, Oracle
 from tensordict import TensorDict
 
@@ -13,12 +14,7 @@ from torchrl_loco.sim import models
 
 SIGNIFICANCE = 1e-4
 # Under playground the humanoid draws nothing.
-DRAWING = [
-    *(("cpu", "walker_run", "playground"), ("cpu", "humanoid_run", "dm_control"), ("cpu", "hopper_hop", "playground")),
-    ("cpu", "quadruped_run", "dm_control"),
-    pytest.param("cuda", "humanoid_run", "dm_control", marks=pytest.mark.gpu),
-    pytest.param("cuda", "quadruped_run", "dm_control", marks=pytest.mark.gpu),
-]
+DRAWING = [("walker_run", "playground"), ("humanoid_run", "dm_control"), ("quadruped_run", "dm_control")]
 
 
 def from_one_distribution(ours, theirs):
@@ -54,16 +50,7 @@ def draws(shared):
     return draw
 
 
-@pytest.mark.parametrize(
-    ("device", "task", "protocol", "engine"),
-    [
-        *(("cpu", *kind) for kind in KINDS),
-        ("cpu", "cheetah_run", "playground", "compiled"),
-        ("cpu", "dog_follow", "playground", "mujoco_warp"),
-        ("cpu", "walker_blindly", "playground", "compiled"),
-        *(pytest.param("cuda", *kind, marks=pytest.mark.gpu) for kind in KINDS),
-    ],
-)
+@for_each("task, protocol, engine", cpu=[*KINDS, ("cheetah_run", "playground", "compiled")], cuda=KINDS)
 def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol, engine, device, actions):
     env = shared(task, 4, device, protocol=protocol, engine=engine, reward_terms=True)
     td = env.reset()
@@ -96,7 +83,7 @@ def test_masked_reset_leaves_the_others_bitwise_unchanged(shared, task, protocol
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", ["walker_walk", "hopper_stand"])
+@for_each("task", ["walker_walk", "hopper_stand"])
 def test_planar_bodies_start_uniformly(draws, task):
     body = task.split("_")[0]
     qpos = draws(task, 4096, 1, seed=12)[0].numpy().astype(np.float64)
@@ -193,7 +180,7 @@ def test_humanoid_playground_start_is_the_default_pose(draws):
     assert torch.equal(qpos, expected.expand_as(qpos))
 
 
-@pytest.mark.parametrize(("device", "task", "protocol"), DRAWING)
+@for_each("task, protocol", cpu=DRAWING, cuda=DRAWING[1:])
 def test_a_world_draws_from_seed_world_and_episode_alone(shared, draws, task, protocol, device):
     few, many = (draws(task, n, 3, seed=9, protocol=protocol, device=device) for n in (3, 64))
     assert torch.equal(few, many[:, :3])

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from for_each import for_each
 from hook_tasks import Still
 from tensordict import TensorDict
 
@@ -81,7 +82,7 @@ def test_hooks_with_tables_are_kernels_and_equal_plain_torch():
     assert torch.equal(ours["reward"][:, :5, 0], alike["reward"][..., 0] + small)
 
 
-@pytest.mark.parametrize("kernels", [True, False])
+@for_each("kernels", [True, False])
 def test_an_index_out_of_range_gives_nan_and_is_counted(kernels):
     env = Looks(5, "cpu", 0, compile_hooks=kernels)
     env.reset()
@@ -114,7 +115,7 @@ def test_what_worlds_share_is_part_of_the_state():
         env.reset(state, set_state=True)
 
 
-@pytest.mark.parametrize("shape", [(1,), (2,), (37,), (3, 64), (5, 1)])
+@for_each("shape", [(1,), (2,), (37,), (3, 64), (5, 1)])
 def test_running_sums_of_a_fixed_order(shape):
     """Which stand for ``cumsum`` on CUDA, where its order varies, within ``adapt``."""
     values = torch.rand(shape, dtype=torch.float64)
@@ -274,7 +275,7 @@ class Forms(WalkerWalk):
         return {"observation": found}
 
 
-@pytest.mark.parametrize("num_envs", [4, 70])
+@for_each("num_envs", [4, 70])
 def test_every_form_of_a_lookup_is_a_kernel(num_envs):
     env, plain = (Forms(num_envs, "cpu", 0, compile_hooks=kernels) for kernels in (True, False))
     assert env.world.kinds["observation"] == "kernel"
@@ -338,7 +339,7 @@ def test_built_in_starts_and_controls_can_be_built_on():
         Alone(1, "cpu")
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("entries", "error", "message"),
     [
         (

@@ -5,6 +5,7 @@ import functools
 import pytest
 import torch
 from cases import COARSE
+from for_each import for_each
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import (
     Compose,
@@ -33,7 +34,7 @@ def test_transforms_count_and_sum_by_world(shared):
     assert td["next", "observation"].isfinite().all()
 
 
-@pytest.mark.parametrize("reward_terms", [False, True])
+@for_each("reward_terms", [False, True])
 def test_worlds_that_a_transform_skips_stay_as_they_are(shared, actions, reward_terms):
     options = {"episode_length": 8, "stagger": True, "reward_terms": reward_terms, **COARSE}
     env, twin = (shared("walker_run", 3, copy=copy, **options) for copy in (0, 1))
@@ -66,7 +67,7 @@ def test_worlds_that_are_done_wait_for_the_end_of_a_chunk_of_actions(shared):
 
 
 @pytest.mark.filterwarnings("ignore:The default value of `auto_register_policy_transforms`")
-@pytest.mark.parametrize("track", [True, False])
+@for_each("track", [True, False])
 def test_collector_collects_what_rollout_does_and_closes(shared, track):
     """The environment that it closes at its end opens again at the next reset."""
     env, twin = (shared("walker_run", copy=copy, episode_length=6, **COARSE) for copy in (0, 1))

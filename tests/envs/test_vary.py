@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cases import COARSE
+from for_each import for_each
 from torchrl.envs import Compose, RewardSum, TransformedEnv, check_env_specs
 
 import torchrl_loco as loco
@@ -86,7 +87,7 @@ def varied(shared):
 # What is drawn.
 
 
-@pytest.mark.parametrize(("log", "half"), [(False, 0.55), (True, 0.1**0.5)])
+@for_each(("log", "half"), [(False, 0.55), (True, 0.1**0.5)])
 def test_draws_are_uniform_between_low_and_high(arm, log, half):
     factors = drawn(arm, loco.Vary("body_mass", 0.1, 1.0, of="upper", log=log), worlds=4000)("body_mass")[:, 1] / 2
     assert (factors.min() >= 0.1, factors.max() <= 1.0) == (True, True)
@@ -290,7 +291,7 @@ def test_numbers_do_not_depend_on_batch_engine_or_rank(varied, device):
     torch.testing.assert_close(plain.get_state()["model"].to_dict(), expected[:4].to_dict())
 
 
-@pytest.mark.parametrize("transformed", [False, True])
+@for_each("transformed", [False, True])
 def test_a_state_holds_them(varied, engine, device, actions, transformed):
     env = base = varied(engine, device)
     if transformed:
