@@ -1,18 +1,13 @@
 """Pixels against where the bodies are, and rendering changes nothing but pixels."""
 
 import mujoco
-import pytest
-import quickly
 import torch
-from cases import BODIES
+from for_each import for_each
 
 from torchrl_loco import State
 
-
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch):
-    """They are rendered sooner than the renderer of each body is optimised."""
-    monkeypatch.setattr(quickly, "HOT", ())
+BODIES = ("walker_run", "quadruped_run")
+"""One that slides and one that floats, which have all shapes between them."""
 
 
 def orange(pixels):
@@ -21,10 +16,7 @@ def orange(pixels):
     return red > blue + 40
 
 
-@pytest.mark.parametrize(
-    ("device", "task"),
-    [*(("cpu", task) for task in BODIES), pytest.param("cuda", "walker_run", marks=pytest.mark.gpu)],
-)
+@for_each("task", cpu=BODIES, cuda=BODIES[:1])
 def test_every_camera_sees_its_world_and_changes_nothing(shared, task, device):
     env = shared(task, 2, device)
     env.rollout(2)
@@ -46,7 +38,7 @@ def test_every_camera_sees_its_world_and_changes_nothing(shared, task, device):
         assert torch.equal(pixels, kept)  # a later picture does not overwrite an earlier one
 
 
-@pytest.mark.parametrize("task", BODIES)
+@for_each("task", BODIES)
 def test_the_floor_reaches_the_horizon_wherever_a_body_goes(shared, task):
     env = shared(task, 2)
     m = env.mj_model
