@@ -40,21 +40,16 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     """
     if not runs:
         raise ValueError("no runs to plot")
-    groups: dict[TrainingConfig, list[RunFolder]] = {}
-    for run in runs:
-        groups.setdefault(dataclasses.replace(run.load_config(), **IRRELEVANT), []).append(run)
     from matplotlib.figure import Figure  # takes a second
 
     figure = Figure(figsize=(7, 4.2), layout="constrained")  # without pyplot: a caller's backend stays as it is
     axes = figure.subplots()
-    for config, group in groups.items():
+    for config, group in grouped(runs).items():
         label = f"{config.label}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds"
         metrics = [run.read_metrics() for run in group]
-        whole = [m for m in metrics if _is_whole(m["frames"], config.total_frames)] or metrics
-        curves = [dict(zip(m["frames"], m["return"], strict=True)) for m in whole]
-        shared = sorted(set.intersection(*map(set, curves)))  # runs on several GPUs have fewer and larger batches
-        returns = np.array([[curve[frames] for frames in shared] for curve in curves])
-        millions = np.array(shared) / 1e6
+        whole = [m for m in metrics if is_whole(m["frames"], config.total_frames)] or metrics
+        frames, returns = shared_curve(whole)
+        millions = frames / 1e6
         seconds = np.mean([m["seconds"][-1] for m in whole])
         count = f"{len(group)}" if len(whole) == len(group) else f"{len(whole)} of {len(group)}"
         seeds = "" if len(group) == 1 else f", {count} seeds"
@@ -86,7 +81,22 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     storage.replace_file(picture, content.getvalue())
 
 
-def _is_whole(frames: Sequence[float], total: int) -> bool:
+def grouped(runs: Sequence[RunFolder]) -> dict[TrainingConfig, list[RunFolder]]:
+    """Returns the runs that share a line, by their settings without those that do not change learning."""
+    groups: dict[TrainingConfig, list[RunFolder]] = {}
+    for run in runs:
+        groups.setdefault(dataclasses.replace(run.load_config(), **IRRELEVANT), []).append(run)
+    return groups
+
+
+def shared_curve(metrics: Sequence[dict[str, list[float]]]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the frames at which all of several runs have a row, and their returns there, ``(runs, frames)``."""
+    curves = [dict(zip(m["frames"], m["return"], strict=True)) for m in metrics]
+    shared = sorted(set.intersection(*map(set, curves)))  # runs on several GPUs have fewer and larger batches
+    return np.array(shared), np.array([[curve[frames] for frames in shared] for curve in curves])
+
+
+def is_whole(frames: Sequence[float], total: int) -> bool:
     """Returns whether a run with rows at these frames had no room for a further batch as large as its last."""
     before, last = [0.0, *frames][-2:]
     return 2 * last - before > total
