@@ -127,21 +127,11 @@ def whole_and_resumed(out, algorithm):
     return {"whole": whole.path, "stopped": stopped.path, "stopped_at": iteration, "updates": updates}
 
 
-def learnt(out):
-    """Trains 16 batches with the total batch of the settings for one process; returns the return of the last."""
-    settings = {"num_envs": 128 // distributed.ranks(), "minibatch_size": 1024 // distributed.ranks()}
-    short = {"total_frames": 16 * 8192, "eval_episodes": 1, "video_seconds": 0.0, "logger": ("csv",)}
-    config = preset("walker_stand", "cpu", out=out, **settings, **short)
-    run = RunFolder(distributed.from_first(RunFolder.create(config).path if distributed.is_first() else None))
-    Trainer(run).train()
-    return run.read_metrics()["return"][-1]
-
-
 def of_ranks(out):
     """Returns all of the above."""
     with small_walker():
         runs = {algorithm: whole_and_resumed(out / algorithm, algorithm) for algorithm in ("ppo", "reppo")}
-        return {"messages": messages(), "learnt": learnt(out), "counted": counted(out / "counts"), **runs}
+        return {"messages": messages(), "counted": counted(out / "counts"), **runs}
 
 
 def resumed_by_train(path, frames):

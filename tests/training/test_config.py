@@ -1,7 +1,6 @@
 """Presets are valid, and wrong settings are named."""
 
 import dataclasses
-import inspect
 import re
 
 import pytest
@@ -9,7 +8,7 @@ import torch
 
 import torchrl_loco
 from torchrl_loco.registry import OURS
-from torchrl_loco.training import PPOConfig, REPPOConfig, TrainingConfig, preset, tuning_note
+from torchrl_loco.training import PPOConfig, REPPOConfig, preset, tuning_note
 
 
 def test_a_preset_for_every_task():
@@ -99,15 +98,6 @@ def test_a_name_for_files():
     for task, label in (("walker_run", "walker_run"), ("/some/where/file.py:Outer.Task", "Outer.Task")):
         assert PPOConfig(task).label == label
     assert PPOConfig("module:make.<locals>.Task").label == "make.-locals-.Task"
-
-
-def test_every_setting_is_documented():
-    """The command's help shows the docstring of each field."""
-    for config in (TrainingConfig, PPOConfig, REPPOConfig):
-        lines = inspect.getsource(config).splitlines()
-        for name in config.__annotations__.keys() - {"algorithm", "presets", "of_others"}:
-            at = next(i for i, line in enumerate(lines) if line.startswith(f"    {name}:"))
-            assert lines[at + 1].strip().startswith('"""'), name
 
 
 def test_what_was_not_tuned_is_said():

@@ -6,6 +6,7 @@ import signal
 import pytest
 import torch
 from compare import assert_same
+from for_each import for_each
 from ranks import BATCH, in_ranks, of_ranks, resumed_by_train
 from small_runs import SMALL, made, small_walker
 
@@ -23,7 +24,7 @@ def ranks(tmp_path_factory):
     return in_ranks(of_ranks, tmp_path_factory.mktemp("ranks"))
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+@for_each("algorithm", ["ppo", "reppo"])
 def test_ranks_learn_as_one_from_worlds_of_their_own(ranks, algorithm):
     first, second = (of[algorithm]["updates"] for of in ranks)
     assert len(first) == len(second) == 4
@@ -32,12 +33,6 @@ def test_ranks_learn_as_one_from_worlds_of_their_own(ranks, algorithm):
         assert (batch["action"] != other["action"]).all()
         assert (batch["observation"] != other["observation"]).any(-1).all()
     assert all((first[0][1][i] != first[3][1][i]).any() for i in range(3))  # they learn
-
-
-def test_ranks_learn_as_fast_as_one_process_with_their_total_batch(ranks):
-    """One process ended its 16th batch at 7.5 to 8.0 (seeds 0 to 5), its eighth at 6.3 to 6.8."""
-    for of in ranks:
-        assert 7.3 < of["learnt"] < 8.3
 
 
 def test_worlds_are_numbered_over_all_ranks(ranks):
@@ -61,7 +56,7 @@ def test_observations_of_all_ranks_are_normalised(ranks):
     torch.testing.assert_close(networks[name.replace("count", "var")], var, atol=1e-4, rtol=1e-3)
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+@for_each("algorithm", ["ppo", "reppo"])
 def test_a_resumed_run_equals_one_that_was_not_stopped(ranks, algorithm):
     """It was stopped because one rank was asked to end; the state of each rank is in the checkpoint."""
     runs = ranks[0][algorithm]

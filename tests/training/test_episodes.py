@@ -1,7 +1,7 @@
 """Returns of the episodes that end in training, against a loop over worlds and steps."""
 
-import pytest
 import torch
+from for_each import for_each
 
 from torchrl_loco.training.episodes import WINDOW, Episodes
 
@@ -20,7 +20,7 @@ def by_hand(reward, done, terminated, *, from_start, action_repeat, full_length)
     return [sum(row[i] for row in found) for i in range(3)]
 
 
-@pytest.mark.parametrize("from_start", [True, False])
+@for_each("from_start", [True, False])
 def test_sums_are_those_of_a_loop(from_start):
     """Over batches of several lengths, in one of which no episode ends."""
     torch.manual_seed(0)

@@ -8,6 +8,7 @@ import shutil
 
 import pytest
 import torch
+from for_each import for_each
 from small_runs import EPISODE, made
 from torch import nn
 from torchrl.envs.utils import ExplorationType, exploration_type
@@ -64,7 +65,7 @@ def test_evaluation_plays_full_episodes():
     torch.testing.assert_close(returns[1], expected[1, 0], rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize("action_repeat", [1, 2])
+@for_each("action_repeat", [1, 2])
 def test_an_evaluator_follows_the_weights_of_its_policy(device, action_repeat):
     """On CUDA what was recorded with other weights is replayed; a policy that is no module is played step by step."""
     env = torchrl_loco.make("walker_stand", 3, device)

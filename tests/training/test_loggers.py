@@ -7,6 +7,7 @@ import sys
 import time
 
 import pytest
+from for_each import for_each
 from small_runs import made, trained
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.record.loggers import CSVLogger
@@ -160,8 +161,8 @@ def test_seeds_share_a_group_in_wandb(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("fails", ["log_metrics", "log_hparams"])
-@pytest.mark.parametrize("name", ["wandb", "mlflow"])
+@for_each("fails", ["log_metrics", "log_hparams"])
+@for_each("name", ["wandb", "mlflow"])
 def test_a_failure_of_one_run_leaves_the_next_alone(tmp_path, monkeypatch, name, fails):
     """The process must not keep the failed run open: the next one would be written into it, or be refused."""
     module = pytest.importorskip(name)

@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from for_each import for_each
 from small_runs import WALKER, collected
 from tensordict import TensorDict
 from torch import nn
@@ -108,7 +109,7 @@ def test_the_critic_reads_what_is_privileged():
     assert not torch.equal(ppo.critic(changed)["state_value"], ppo.critic(td.clone())["state_value"])
 
 
-@pytest.mark.parametrize("bounded", [True, False])
+@for_each("bounded", [True, False])
 def test_what_acts_is_the_actor(bounded):
     """Its densities are those of the actor's distribution; without bounds, actions are normal, and so is the policy."""
     spaces = Spaces(21, 6, bounded=bounded)  # rows that are no multiple of 8
@@ -136,7 +137,7 @@ def test_what_acts_is_the_actor(bounded):
     torch.testing.assert_close(policy(observation=td["observation"]), action)
 
 
-@pytest.mark.parametrize("bounded", [True, False])
+@for_each("bounded", [True, False])
 def test_gradients_are_those_of_clip_ppo_loss(bounded):
     """Of TorchRL's loss, through networks that torch differentiates; rows of odd lengths are padded."""
     torch.manual_seed(0)

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from for_each import for_each
 from small_runs import WALKER, collected
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -137,7 +138,7 @@ def test_the_actor_returns_where_the_kl_bound_is_exceeded():
     assert after < before / 2
 
 
-@pytest.mark.parametrize(("slope", "temperature"), [(1.0, 1e-6), (0.0, 1.0)])
+@for_each(("slope", "temperature"), [(1.0, 1e-6), (0.0, 1.0)])
 def test_the_actor_ascends_value_and_entropy(slope, temperature):
     """Within the bound: towards larger actions if the critic prefers them; if it prefers none, towards any action."""
     settings = {"kl_bound": 1e6, "init_temperature": temperature, "min_temperature": 1e-9}

@@ -9,6 +9,7 @@ import sys
 import pytest
 import torch
 from compare import assert_same
+from for_each import for_each
 from hook_tasks import Unsteady
 from small_runs import SMALL, made, networks, trained
 from torch import nn
@@ -48,7 +49,7 @@ def test_what_train_returns_is_what_the_trainer_leaves(tmp_path, capsys):
     assert again.load_config().num_envs == SMALL["num_envs"]
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+@for_each("algorithm", ["ppo", "reppo"])
 def test_networks_of_ones_own(algorithm, tmp_path):
     """They are what is trained, saved and played; PPO's critic is one too."""
     sizes = []
@@ -93,7 +94,7 @@ def test_a_network_that_cannot_be_saved_is_refused_before_the_first_frame(tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+@for_each("algorithm", ["ppo", "reppo"])
 def test_a_wrong_network(algorithm, tmp_path):
     cases = [
         (elu(24, 6), TypeError, "must be a function of the numbers of inputs and outputs .* got Sequential"),

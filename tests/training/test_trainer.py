@@ -10,6 +10,7 @@ import imageio.v3 as imageio
 import pytest
 import torch
 from compare import assert_same
+from for_each import for_each
 from small_runs import EPISODE, SMALL, WALKER, made, networks, small_walker, trained
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -314,8 +315,8 @@ def test_torchs_settings_are_restored(tmp_path, monkeypatch):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("bf16", [False, True])
-@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+@for_each("bf16", [False, True])
+@for_each("algorithm", ["ppo", "reppo"])
 def test_a_run_on_cuda(algorithm, bf16, tmp_path):
     """Recorded gradient steps learn, the run can be stopped and resumed, and its policy plays on the CPU."""
     settings = {**SMALL, "total_frames": 640, "hidden": (32,), "bf16": bf16}

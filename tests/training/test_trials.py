@@ -3,8 +3,8 @@
 import copy
 import itertools
 
-import pytest
 from compare import assert_same
+from for_each import for_each
 from small_runs import made
 
 from torchrl_loco.training import Trainer
@@ -47,7 +47,7 @@ def test_the_return_of_a_trial_is_of_its_own_episodes(tmp_path):
     assert min(episodes[1::2][:3]) > 0
 
 
-@pytest.mark.parametrize(("algorithm", "best"), [("ppo", 0), ("reppo", 1), ("ppo", 2)])
+@for_each(("algorithm", "best"), [("ppo", 0), ("reppo", 1), ("ppo", 2)])
 def test_the_best_goes_on(algorithm, best, tmp_path):
     trainer = Trainer(made(tmp_path, algorithm, **THREE))
     trials, ended = trainer.trials, []

@@ -2,13 +2,13 @@
 
 import math
 
-import pytest
 import torch
+from for_each import for_each
 
 from torchrl_loco.training.reppo import ValueBins
 
 
-@pytest.mark.parametrize("low", [0.0, -150.0])
+@for_each("low", [0.0, -150.0])
 def test_bins_keep_a_return(low):
     bins = ValueBins(low, 150.0, 151)
     returns = torch.tensor([5.0, 17.3, 99.99, 140.0, low + 5.0])

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from compare import assert_same
+from for_each import for_each
 from hook_tasks import Unsteady
 from small_runs import SMALL, made, networks, small_walker, trained
 
@@ -12,7 +13,7 @@ from torchrl_loco.training import Trainer, preset, train
 from torchrl_loco.training.environments import Environments, make_for
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+@for_each("algorithm", ["ppo", "reppo"])
 def test_a_run_begins_with_the_weights_of_another_or_of_a_policy(algorithm, tmp_path):
     with small_walker():
         first = trained(tmp_path / "first", algorithm)
