@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from for_each import for_each
 from torch import nn
 
 import torchrl_loco
@@ -48,7 +49,7 @@ OF_ROBOT = {
 FORMATS = [("policy.onnx", read_onnx), ("policy.pt2", read_program)]
 
 
-@pytest.mark.parametrize(("name", "read"), FORMATS)
+@for_each(("name", "read"), FORMATS)
 def test_exported_policies_do_the_same(name, read, tmp_path):
     """For any batch; with observations that are clipped; and they say what a robot's program has to know."""
     if name.endswith("onnx"):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from for_each import for_each
 from torchrl.envs import CatFrames, Compose, ToTensorImage
 from torchrl.envs.utils import check_env_specs
 
@@ -69,7 +70,7 @@ def seen_by_rays(m, data, camera):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("camera", ["track", "trackcom", "held", "fixed", "at_body", "at_com"])
+@for_each("camera", ["track", "trackcom", "held", "fixed", "at_body", "at_com"])
 def test_depth_and_geoms_are_those_of_rays_of_c_mujoco(camera, device):
     """Of all shapes and all kinds of cameras; what is transparent or in a hidden group is not seen."""
     m, device = shapes(), wp.get_device(device)
@@ -163,7 +164,7 @@ def test_transforms_of_torchrl_stack_and_turn_them():
     assert torch.equal(batch["pixels"][:, 2, 3:], batch["pixels"][:, 3, :6])
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("options", "match"),
     [
         ({"pixels_only": True}, "pixels_only needs from_pixels=True"),

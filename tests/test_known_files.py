@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from for_each import for_each
 
 from torchrl_loco import known_files, registry
 from torchrl_loco.known_files import UnnamedFileError
@@ -74,10 +75,13 @@ def test_a_file_runs_once_the_user_has_named_it(file, log, monkeypatch):
     assert len(log.read_text()) == 3
 
 
-@pytest.mark.parametrize("change", ["nothing", "task", "beside", "new", "bytecode", "link"])
+@for_each("change", ["task", "beside", "new", "bytecode", "link", "nothing"])
 def test_a_copy_in_a_run_folder_runs_if_all_of_it_is_known(change, file, log, monkeypatch):
+    file.write_text(TASK)
+    file.with_name("beside.py").write_text(BESIDE.format(log=str(log)))
+    forget(monkeypatch)
     registry.resolve(f"{file}:Task", by_user=True)
-    kept = file.parent / "run" / known_files.KEPT
+    kept = file.parent / f"run-{change}" / known_files.KEPT
     kept.mkdir(parents=True)
     (kept.parent / "config.json").write_text("{}")
     for each in (file, file.with_name("beside.py")):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from cases import MODELS
+from for_each import for_each
 from oracle import reference_model
 
 import torchrl_loco
@@ -44,7 +45,7 @@ def assert_figures_are_dm_controls(model, body):
         np.testing.assert_allclose(getattr(model.opt, option), value, err_msg=option)
 
 
-@pytest.mark.parametrize("body", MODELS)
+@for_each("body", MODELS)
 def test_figures_names_and_scene(body):
     model = models.load(MODELS[body])
     assert_figures_are_dm_controls(model, body)

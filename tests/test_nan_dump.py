@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from cases import COARSE
+from for_each import for_each
 
 import torchrl_loco
 from torchrl_loco import NonFiniteWarning, cli, nan_dump, storage
@@ -46,10 +47,6 @@ def too_fast(state, action):
     state["qvel"][BAD, 4] = 3e9
 
 
-@pytest.mark.parametrize(
-    ("device", "engine"),
-    [("cpu", "compiled"), ("cpu", "mujoco_warp"), pytest.param("cuda", "compiled", marks=pytest.mark.gpu)],
-)
 def test_the_file_holds_what_the_step_began_with(device, engine, file, actions):
     for spoil in (bad_action, too_fast):
         env = made(file, device, engine=engine, iterations=3)
@@ -186,13 +183,14 @@ def test_warp_repeats_what_happened_and_c_mujoco_agrees_on_an_ordinary_step(file
     assert np.abs(warp[-1] - warp[0]).max() > 1e-3
 
 
-@pytest.mark.parametrize(("spoil", "said"), [(bad_action, "entry 2 is nan"), (too_fast, "C MuJoCo: not finite after")])
+@for_each(("spoil", "said"), [(bad_action, "entry 2 is nan"), (too_fast, "C MuJoCo: not finite after")])
 def test_command(file, actions, capsys, spoil, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     env = made(file)
     drive(env, actions, spoil)
     with pytest.warns(NonFiniteWarning):
         env.close()
+    capsys.readouterr()
     with pytest.raises(SystemExit):
         cli.main(["inspect", str(file), "--device", "cuda:9"])
     assert capsys.readouterr().out == ""  # refused before the first line
@@ -201,6 +199,7 @@ def test_command(file, actions, capsys, spoil, said, tmp_path, monkeypatch):
     assert f"world {BAD} of {WORLDS} on cpu, episode 1, after 3 steps" in out
     assert said in out
     assert [path.name for path in tmp_path.iterdir()] == [file.name]  # C MuJoCo would leave a log
+    file.unlink()
 
 
 def test_a_state_written_from_outside_is_recognised(file):

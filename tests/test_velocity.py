@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from contact_forces import net_forces
+from for_each import for_each
 from oracle import DATA, reference_model
 from torchrl.envs.utils import check_env_specs
 
@@ -24,7 +25,6 @@ ROBOTS = {
     "g1": velocity.G1Velocity,
     "h1": velocity.H1Velocity,
 }
-ENGINES = [*((name, "compiled") for name in ROBOTS), ("go1", "mujoco_warp")]
 JOINTS = {"go1": 12, "go2": 12, "g1": 29, "h1": 19}
 FEET = {"go1": 4, "go2": 4, "g1": 2, "h1": 2}
 WORLDS = 16
@@ -43,7 +43,7 @@ USED = {2: 1, 3: 2, 6: 3}
 """Numbers of the size of spheres, capsules and boxes."""
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@for_each("name", ROBOTS)
 def test_a_robot_has_an_id(name):
     assert registry.env_class(f"{name}_velocity") is ROBOTS[name]
     assert registry.task_name(ROBOTS[name]) == f"{name}_velocity"
@@ -56,7 +56,7 @@ def colliding(contype, conaffinity):
     return np.flatnonzero(np.array(contype) | np.array(conaffinity))
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@for_each("name", ROBOTS)
 def test_model_has_the_figures_of_the_robot(name):
     m, expected = models.load(ROBOTS[name].model), reference_model(name)
     ours = colliding(m.geom_contype, m.geom_conaffinity)
@@ -88,12 +88,12 @@ def test_model_has_the_figures_of_the_robot(name):
     assert m.nmesh == 0
 
 
-@pytest.mark.parametrize(("name", "engine"), ENGINES)
-def test_a_control_step_ends_where_c_mujoco_does(name, engine):
+@for_each("name", ROBOTS)
+def test_a_control_step_ends_where_c_mujoco_does(name):
     cls, steps = ROBOTS[name], np.load(DATA / f"{name}_steps.npz")
     m = models.load(cls.model)
     m.opt.tolerance = 1e-12
-    config = dataclasses.replace(cls.config, iterations=200, ls_iterations=100, engine=engine)
+    config = dataclasses.replace(cls.config, iterations=200, ls_iterations=100, engine="compiled")
     sim = Simulation(m, config, len(steps["qpos"]), torch.device("cpu"))
     sim.compile(sim.step)  # in parallel, and not beside another worker
     for ours, theirs in {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart", "ctrl": "ctrl"}.items():
@@ -156,7 +156,7 @@ def wrapped(angle):
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
-@pytest.mark.parametrize("name", ["go1", *(pytest.param(name, marks=pytest.mark.slow) for name in ("go2", "g1", "h1"))])
+@for_each("name", ["go1", "g1"])
 def test_random_steps_stay_finite_and_have_the_shapes_of_the_specs(robot, name, caplog):
     env, joints, feet = robot(name), JOINTS[name], FEET[name]
     td = env.rollout(50, break_when_any_done=False)
@@ -242,7 +242,7 @@ def expected_terms(m, name, row):
     return {key: 0.02 * value for key, value in terms.items()}
 
 
-@pytest.mark.parametrize("name", EXPECTED)
+@for_each("name", EXPECTED)
 def test_reward_is_the_sum_of_its_terms_by_formula(robot, name):
     env, joints, feet, seen = robot(name), JOINTS[name], FEET[name], set()
     env.rollout(12, break_when_any_done=False)
@@ -299,7 +299,7 @@ def test_a_hard_contact_of_the_robot_with_itself_costs_each_physics_step(robot):
     assert {0, 4} < set(expected)
 
 
-@pytest.mark.parametrize(("tilt", "ends"), [(65, False), (75, True)])
+@for_each(("tilt", "ends"), [(65, False), (75, True)])
 def test_an_episode_ends_when_the_trunk_is_tilted_by_70_degrees(robot, tilt, ends):
     env = robot("go1")
     env.reset()
@@ -310,15 +310,14 @@ def test_an_episode_ends_when_the_trunk_is_tilted_by_70_degrees(robot, tilt, end
 
 
 def test_actions_are_targets_around_home(robot):
-    for name, scale in {"go1": 0.25 * 35.55 / 35.7643, "go2": 0.3}.items():
-        env = robot(name)
-        env.reset()
-        action = torch.zeros(env.action_spec.shape)
-        action[:, 2] = 2.0
-        stepped(env, with_memory(env.get_state(), delay=0.0), action)
-        target = torch.tensor(env.mj_model.key("home").qpos[7:], dtype=torch.float32).repeat(WORLDS, 1)
-        target[:, 2] += 2.0 * scale
-        torch.testing.assert_close(env.sim.ctrl, target)
+    env, scale = robot("go1"), 0.25 * 35.55 / 35.7643
+    env.reset()
+    action = torch.zeros(env.action_spec.shape)
+    action[:, 2] = 2.0
+    stepped(env, with_memory(env.get_state(), delay=0.0), action)
+    target = torch.tensor(env.mj_model.key("home").qpos[7:], dtype=torch.float32).repeat(WORLDS, 1)
+    target[:, 2] += 2.0 * scale
+    torch.testing.assert_close(env.sim.ctrl, target)
 
 
 # Commands.
@@ -364,7 +363,7 @@ def test_commands_are_drawn_anew_when_they_are_due(many):
     assert after["memory", "until_command"].min() >= 3.0
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("trained", "low", "high"),
     [
         (119_000, (-1, -1, -0.5), (1, 1, 0.5)),
@@ -447,10 +446,7 @@ def test_episodes_start_near_home_above_the_ground(many):
     assert (state["memory", "last_action"] == 0).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "low", "high"),
-    [("go1", 0.3, 1.5), ("g1", 0.3, 1.2), pytest.param("h1", 0.3, 1.2, marks=pytest.mark.slow)],
-)
+@for_each("name, low, high", [("go1", 0.3, 1.5), ("g1", 0.3, 1.2)])
 def test_worlds_differ_in_friction_and_mass(robot, name, low, high):
     env = robot(name)
     env.reset()  # before, all have the numbers of the model
@@ -599,7 +595,7 @@ SIDES = ("left", "right")
 
 @pytest.mark.slow
 @pytest.mark.skipif("MUJOCO_MENAGERIE" not in os.environ, reason="MUJOCO_MENAGERIE names no checkout of Menagerie")
-@pytest.mark.parametrize(
+@for_each(
     ("scene", "contacts", "base", "trunk", "feet"),
     [
         ("unitree_go2/scene_mjx.xml", "all", "base", "base", LEGS),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from for_each import for_each
 from torch import nn
 
 import torchrl_loco
@@ -70,7 +71,7 @@ def test_a_file_is_deployed_without_this_package(standing):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pushes", [0, 6])
+@for_each("pushes", [0, 6])
 def test_robots_do_the_same_in_both_engines(standing, capsys, tmp_path, pushes):
     out = tmp_path / "out.json"
     options = ("--episodes", 8, "--seconds", 3, "--pushes", pushes, "--device", "cpu", "--out", out)

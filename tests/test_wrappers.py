@@ -9,6 +9,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+from for_each import for_each
 from torchrl.envs import CatTensors, SerialEnv
 
 import torchrl_loco
@@ -95,7 +96,7 @@ def test_a_missing_library_is_named(monkeypatch):
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("library", CLASSES)
+@for_each("library", CLASSES)
 def test_what_is_wrapped(library):
     pytest.importorskip(library)
     cls = getattr(wrappers, CLASSES[library])
@@ -391,7 +392,7 @@ def test_rsl_rl_may_pass_actions_out_of_bounds(rsl_rl):
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("make_env", [make, make_with_groups])
+@for_each("make_env", [make, make_with_groups])
 def test_rsl_rl_sets_episode_lengths(rsl_rl, make_env):
     env = wrappers.RslRlVecEnv(make_env())
     env.episode_length_buf = torch.tensor([0, 1, 3, 4])
@@ -430,7 +431,7 @@ def test_rsl_rl_trains_and_bootstraps_from_the_final_observation(rsl_rl, tmp_pat
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("make_env", [make, make_with_groups])
+@for_each("make_env", [make, make_with_groups])
 def test_stable_baselines3(stable_baselines3, steps, make_env):
     env = wrappers.StableBaselines3VecEnv(make_env(stagger=True))
     assert isinstance(env, stable_baselines3.common.vec_env.VecEnv)
@@ -457,7 +458,7 @@ def test_stable_baselines3(stable_baselines3, steps, make_env):
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize(("make_env", "policy"), [(make, "MlpPolicy"), (make_with_groups, "MultiInputPolicy")])
+@for_each(("make_env", "policy"), [(make, "MlpPolicy"), (make_with_groups, "MultiInputPolicy")])
 def test_stable_baselines3_seeds_and_trains(stable_baselines3, make_env, policy):
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecMonitor
