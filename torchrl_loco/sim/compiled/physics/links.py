@@ -70,6 +70,16 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return result
 
 
+def moved_by(m: mujoco.MjModel) -> list[int]:
+    """Returns for each body a bit for each degree of freedom that moves it."""
+    found = [0]
+    for body in range(1, m.nbody):
+        first = m.body_dofadr[body]
+        own = sum(1 << dof for dof in range(first, first + m.body_dofnum[body]))
+        found.append(found[m.body_parentid[body]] | own)
+    return found
+
+
 def moving_bodies(m: mujoco.MjModel) -> list[int]:
     """Returns the bodies that have joints, each the first body of a link."""
     return [b for b in range(1, m.nbody) if m.body_dofnum[b]]

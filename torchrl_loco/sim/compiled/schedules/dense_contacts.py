@@ -22,6 +22,7 @@ from torchrl_loco.sim.compiled.ir.symbols import (
 )
 from torchrl_loco.sim.compiled.physics.constraints import Softness, Table, Variables
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, Dynamics
+from torchrl_loco.sim.compiled.physics.links import moved_by
 from torchrl_loco.sim.compiled.physics.pyramid import FRICTIONLESS, FULL
 from torchrl_loco.sim.compiled.physics.sensors import TouchSensors
 from torchrl_loco.sim.compiled.schedules.ground_contacts import GroundContacts
@@ -122,8 +123,9 @@ class DenseContacts:
             table.integers(title, [self.geoms.index(pair.geoms[i]) for pair in self.pairs])
             for i, title in enumerate(("first", "second"))
         ]
+        moved = moved_by(m)
         masks = [
-            table.integers(title, [self._moved_by(int(m.geom_bodyid[pair.geoms[i]])) for pair in self.pairs])
+            table.integers(title, [moved[m.geom_bodyid[pair.geoms[i]]] for pair in self.pairs])
             for i, title in enumerate(("first_dofs", "second_dofs"))
         ]
         radii = [
@@ -227,14 +229,6 @@ class DenseContacts:
                 self._store(violated, jacobians, weight * share, residual, softness.damping, variables)
                 if self._with_frames:
                     violated(f"contact_corner[k] = {len(self.ground.corners) + len(self.pairs)};  // no geoms")
-
-    def _moved_by(self, body: int) -> int:
-        """Returns the degrees of freedom that move a body, as bits."""
-        m, mask = self.tree.m, 0
-        while body:
-            mask |= sum(1 << d for d in self.tree.dofs(body))
-            body = m.body_parentid[body]
-        return mask
 
     def project(self, block: Block) -> None:
         """Sets how the residuals change along the search direction."""

@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -35,7 +35,7 @@ from torchrl_loco.sim.compiled.physics.constraints import Softness, both_sides
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, HINGE, SLIDE
 from torchrl_loco.sim.compiled.physics.equalities import CONNECT, JOINT, TENDON, WELD, Equality, Weld, active
 from torchrl_loco.sim.compiled.physics.lengths import OF_TENDON
-from torchrl_loco.sim.compiled.physics.links import Mass, matrix, moving_bodies, places
+from torchrl_loco.sim.compiled.physics.links import Mass, matrix, moved_by, moving_bodies, places
 from torchrl_loco.sim.compiled.physics.sensors import (
     ACCELEROMETER,
     ANGULAR_MOMENTUM,
@@ -104,6 +104,7 @@ class Description:
     Attributes:
         pairs: of geoms that may touch, in the order in which lanes look at them: planes first, in both parts those with
             friction, and in all parts by their function.
+        moved: for each body, a bit for each degree of freedom that moves it.
     """
 
     def __init__(self, m: mujoco.MjModel) -> None:
@@ -115,7 +116,7 @@ class Description:
         self.roots = sorted({int(m.body_rootid[b]) for b in self.moving})
         self.members = [[b for b in range(1, m.nbody) if self.places[b].link == i] for i in range(len(self.moving))]
         self.masses = [Mass.join(m, self.places, bodies) for bodies in self.members]
-        self.ancestors = [sum(1 << int(j) for j in self.dofs_to_root(d)) for d in range(m.nv)]
+        self.moved = moved_by(m)
         self.ground = Ground.of(m)
         self.pairs = self._sorted_pairs(pairs(m))
         self.functions = [f for f in FUNCTIONS if f in {kind(m, p).function for p in self.pairs}]
@@ -160,12 +161,6 @@ class Description:
         if self.limbs and any(map(self.limbs.crosses, coupled)):
             self.limbs = None
         self.layout = self._layout()
-
-    def dofs_to_root(self, dof: int) -> Iterator[int]:
-        """Yields a degree of freedom and those that move it, up to the world."""
-        while dof >= 0:
-            yield dof
-            dof = self.m.dof_parentid[dof]
 
     def is_ground(self, pair: Pair) -> bool:
         """Returns whether a geom of a pair is a plane of the world, or looked up."""
@@ -329,25 +324,14 @@ class Description:
         """Returns the radius of a sphere or capsule, and that of the bounding sphere of a solid."""
         return float(self.m.geom_rbound[g] if self.m.geom_type[g] in SOLID else self.m.geom_size[g, 0])
 
-    def dofs_of_body(self, body: int) -> int:
-        """Returns a bit for each degree of freedom that moves a body."""
-        link = self.places[body].link
-        if link < 0:
-            return 0
-        body = self.moving[link]
-        return self.ancestors[self.m.body_dofadr[body] + self.m.body_dofnum[body] - 1]
-
-    def dofs_of_geom(self, g: int) -> int:
-        """Returns a bit for each degree of freedom that moves a geom."""
-        return self.dofs_of_body(self.m.geom_bodyid[g])
-
     def dofs_of_weld(self, weld: Weld) -> int:
         """Returns a bit for each degree of freedom that moves one of its bodies."""
-        return self.dofs_of_body(weld.bodies[0]) | self.dofs_of_body(weld.bodies[1])
+        return self.moved[weld.bodies[0]] | self.moved[weld.bodies[1]]
 
     def apart(self, pair: Pair) -> int:
         """Returns a bit for each degree of freedom that moves one geom of a pair alone."""
-        return self.dofs_of_geom(pair.geoms[0]) ^ self.dofs_of_geom(pair.geoms[1])
+        first, second = self.m.geom_bodyid[list(pair.geoms)]
+        return self.moved[first] ^ self.moved[second]
 
     def softness(self, solref: Sequence[float], solimp: Sequence[float]) -> list[float]:
         """Returns the members of struct Softness."""

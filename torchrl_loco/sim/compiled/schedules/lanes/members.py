@@ -187,8 +187,8 @@ def _add_forces(tables: Tables, d: Description) -> None:
     tables.floats("spring", m.qpos_spring)
     tables.floats("damping", damping)
     tables.floats("armature", m.dof_armature)
-    above = [list(d.dofs_to_root(parent)) for parent in m.dof_parentid]
-    entries = [64 * dof + j for dof, ancestors in enumerate(above) for j in ancestors]
+    moved = [d.moved[body] for body in m.dof_bodyid]
+    entries = [64 * dof + j for dof in range(m.nv) for j in reversed(range(dof)) if moved[dof] >> j & 1]
     tables.size(MASS_ENTRIES=len(entries))
     tables.integers("mass_entry", entries, "unsigned")
     lengths = [Length.of_actuator(m, i) for i in d.acting]
@@ -265,7 +265,7 @@ def _add_welds(tables: Tables, d: Description, mask: str) -> None:
         tables.integers(f"weld_{title}_link", [place.link for _, place in at])
         tables.structs("Vec", f"weld_{title}_point", [place.point(weld.points[end]) for weld, place in at])
         tables.structs("Mat", f"weld_{title}_turn", [matrix(turn).ravel() for turn in turns])
-        tables.integers(f"weld_{title}_dofs", [d.dofs_of_body(weld.bodies[end]) for weld, _ in at], mask)
+        tables.integers(f"weld_{title}_dofs", [d.moved[weld.bodies[end]] for weld in welds], mask)
 
 
 def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
@@ -292,8 +292,8 @@ def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
     index = {g: i for i, g in enumerate(d.geoms)}
     tables.integers("first_geom", [index.get(p.geoms[0], 0) for p in found])
     tables.integers("second_geom", [index.get(p.geoms[1], 0) for p in found])
-    tables.integers("first_dofs", [d.dofs_of_geom(p.geoms[0]) for p in found], mask)
-    tables.integers("second_dofs", [d.dofs_of_geom(p.geoms[1]) for p in found], mask)
+    for i, title in enumerate(("first", "second")):
+        tables.integers(f"{title}_dofs", [d.moved[m.geom_bodyid[p.geoms[i]]] for p in found], mask)
     apart = [d.apart(pair) for pair in found]
     of_balls = [-1] * len(d.limited_balls)  # all of them
     of_equalities = [dofs_of(equality) for equality in d.equalities]
