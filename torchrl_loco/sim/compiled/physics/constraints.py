@@ -34,7 +34,7 @@ from torchrl_loco.sim.compiled.ir.symbols import (
     scalar,
     select,
 )
-from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE, MINVAL
+from torchrl_loco.sim.compiled.physics.dynamics import HINGE, MINVAL, SLIDE
 
 MINIMP, MAXIMP = 1e-4, 0.9999
 """MuJoCo's mjMINIMP and mjMAXIMP."""
@@ -197,6 +197,11 @@ class Table:
         return f"{self.prefix}_{title}[{self.index}]"
 
 
+def limited(m: mujoco.MjModel, *kinds: int) -> list[int]:
+    """Returns the joints of some kinds that have limits."""
+    return [j for j in range(m.njnt) if m.jnt_limited[j] and m.jnt_type[j] in kinds]
+
+
 def both_sides(m: mujoco.MjModel, joint: int) -> bool:
     """Returns whether a joint can be within the margin of both its limits, each of which is a row then."""
     low, high = m.jnt_range[joint]
@@ -214,7 +219,7 @@ class JointLimits:
 
     def __init__(self, m: mujoco.MjModel) -> None:
         self.m = m
-        joints = [j for j in range(m.njnt) if m.jnt_limited[j] and m.jnt_type[j] not in (FREE, BALL)]
+        joints = limited(m, SLIDE, HINGE)
         self.rows = [(j, sign) for j in joints for sign in ((1, -1) if both_sides(m, j) else (None,))]
         self.count = len(self.rows)
         self.arrays = {f"limit_{field}": self.count for field in ("D", "x", "v", "sign")}
@@ -268,8 +273,16 @@ class JointLimits:
 class DryFriction:
     """Friction loss of degrees of freedom: a force of constant size against the motion.
 
+    A row at distance zero, so that its weight and damping are constant.
+
     Args:
         m: the model.
+
+    Attributes:
+        dofs: the degrees of freedom.
+        softness: of each row.
+        weight: D of each.
+        bound: size of the residual beyond which the force of each is constant.
     """
 
     def __init__(self, m: mujoco.MjModel) -> None:

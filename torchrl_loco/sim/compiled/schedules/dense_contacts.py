@@ -20,7 +20,7 @@ from torchrl_loco.sim.compiled.ir.symbols import (
     total,
     vec,
 )
-from torchrl_loco.sim.compiled.physics.constraints import Softness, Table, Variables
+from torchrl_loco.sim.compiled.physics.constraints import Softness, Table, Variables, limited
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, Dynamics
 from torchrl_loco.sim.compiled.physics.links import moved_by
 from torchrl_loco.sim.compiled.physics.pyramid import FRICTIONLESS, FULL
@@ -72,7 +72,7 @@ class DenseContacts:
         m, self.tree, self.ground, self.touch, self._with_frames = tree.m, tree, ground, touch, with_frames
         planes = {corner.pair for corner in ground.corners}
         self.pairs = [pair for pair in found if pair not in planes]
-        self.balls = [j for j in range(m.njnt) if m.jnt_limited[j] and m.jnt_type[j] == BALL]
+        self.balls = limited(m, BALL)
         self.geoms = sorted({geom for pair in self.pairs for geom in pair.geoms})
         self.count = min(2 * len(self.pairs), MAX_DENSE) + len(self.balls)
         self.pyramid = FULL if any(pair.condim > 1 for pair in self.pairs) else FRICTIONLESS

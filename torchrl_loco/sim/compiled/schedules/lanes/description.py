@@ -29,9 +29,9 @@ from torchrl_loco.sim.compiled.collision.pairs import (
     stand_ins,
 )
 from torchrl_loco.sim.compiled.ir import symbols
-from torchrl_loco.sim.compiled.ir.parameters import nominal, present, varies
+from torchrl_loco.sim.compiled.ir.parameters import nominal, present
 from torchrl_loco.sim.compiled.physics.actuators import Actuator, acting
-from torchrl_loco.sim.compiled.physics.constraints import Softness, both_sides
+from torchrl_loco.sim.compiled.physics.constraints import DryFriction, Softness, both_sides, limited
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, HINGE, SLIDE
 from torchrl_loco.sim.compiled.physics.equalities import CONNECT, JOINT, TENDON, WELD, Equality, Weld, active
 from torchrl_loco.sim.compiled.physics.lengths import OF_TENDON
@@ -132,12 +132,10 @@ class Description:
         vertices = sum(len(mesh.vertices) for mesh in self.meshes.values())
         if vertices > MOST_VERTICES:
             raise ValueError(f"meshes with {vertices} vertices, more than {MOST_VERTICES}")
-        limited = [j for j in range(m.njnt) if m.jnt_limited[j]]
-        self.limited = [j for j in limited if m.jnt_type[j] in (SLIDE, HINGE)]
+        self.limited = limited(m, SLIDE, HINGE)
         self.limit_sides = 2 if any(both_sides(m, j) for j in self.limited) else 1
-        self.limited_balls = [j for j in limited if m.jnt_type[j] == BALL]
-        losses = m.dof_frictionloss
-        self.losses = [d for d in range(m.nv) if varies(losses[d]) or losses[d] > 0]
+        self.limited_balls = limited(m, BALL)
+        self.friction = DryFriction(m)
         sensors = [(int(m.sensor_type[i]), int(m.sensor_objid[i]), int(m.sensor_adr[i])) for i in range(m.nsensor)]
         self.subtrees = [s for s in sensors if s[0] == SUBTREE_VELOCITY]
         self.momenta = [s for s in sensors if s[0] == ANGULAR_MOMENTUM]
@@ -281,7 +279,7 @@ class Description:
             geoms=len(self.geoms),
             trees=len(self.roots),
             limits=self.limit_sides * len(self.limited),
-            friction_losses=len(self.losses),
+            friction_losses=self.friction.count,
             touch=len(self.touch),
             candidates=max(1, sum(not self.is_ground(p) for p in self.pairs)),
             near_ground=NEAR_GROUND if self.ground.fields or self.ground.boxes is not None else 0,

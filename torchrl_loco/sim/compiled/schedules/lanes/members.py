@@ -450,15 +450,12 @@ def _add_limits(tables: Tables, d: Description) -> None:
     tables.floats("limit_inverse_inertia", m.dof_invweight0)
     soft = [d.softness(m.jnt_solref[j], m.jnt_solimp[j]) for j in some if j is not None]
     tables.structs("Softness", "limit_softness", soft)
-    # Dry friction: a row at distance zero, so that its weight and damping are constant.
-    friction = [d.softness(m.dof_solref[dof], m.dof_solimp[dof]) for dof in d.losses]
-    damping, impedance = [s[1] for s in friction], np.array([s[2] for s in friction])
-    weight = 1 / np.maximum(MINVAL, m.dof_invweight0[d.losses] * (1 - impedance) / impedance)
-    tables.integers("friction_row", [d.losses.index(dof) if dof in d.losses else -1 for dof in range(m.nv)])
-    tables.integers("friction_dof", d.losses)
-    tables.floats("friction_damping", damping)
-    tables.floats("friction_weight", weight)
-    tables.floats("friction_bound", m.dof_frictionloss[d.losses] / weight)
+    dofs = d.friction.dofs
+    tables.integers("friction_row", [dofs.index(dof) if dof in dofs else -1 for dof in range(m.nv)])
+    tables.integers("friction_dof", dofs)
+    tables.floats("friction_damping", [softness.damping for softness in d.friction.softness])
+    tables.floats("friction_weight", d.friction.weight)
+    tables.floats("friction_bound", d.friction.bound)
 
 
 def _add_outputs(tables: Tables, d: Description) -> None:
