@@ -7,8 +7,8 @@ import numpy as np
 
 from torchrl_loco.sim.compiled.collision.kinds import CAPSULE, PLANE
 from torchrl_loco.sim.compiled.collision.pairs import Pair
-from torchrl_loco.sim.compiled.ir.symbols import array, dot, select, sqrt
-from torchrl_loco.sim.compiled.physics.dynamics import Poses, constant_matrix
+from torchrl_loco.sim.compiled.ir.symbols import Scalar, array, dot, select, sqrt
+from torchrl_loco.sim.compiled.physics.dynamics import Dynamics, Poses, constant_matrix
 
 LEAST_ALIGNED = 1e-6
 """Sine of the angle to a plane's normal below which the direction of a capsule along the plane is rounding."""
@@ -20,21 +20,36 @@ class Corner:
 
     Attributes:
         pair: the geoms and their parameters.
-        end: 0 for a sphere, 1 and -1 for the ends of a capsule.
+        body: that of the sphere or capsule.
+        distance: from the plane (m).
+        point: of the contact, from the center of mass of the body's tree, ``(3,)`` (m).
+        normal: that of the plane, ``(3,)``.
+        tangent: the first tangent times the friction coefficient, ``(3,)``.
     """
 
     pair: Pair
-    end: int
+    body: int
+    distance: Scalar
+    point: np.ndarray
+    normal: np.ndarray
+    tangent: np.ndarray
 
 
-def corners(m: mujoco.MjModel, found: list[Pair]) -> list[Corner]:
-    """Returns what may touch a plane, in the order of the pairs."""
-    result = []
+def corners(tree: Dynamics, found: list[Pair]) -> list[Corner]:
+    """Returns what may touch a plane, in the order of the pairs; of a capsule, the end of its axis comes first."""
+    m, result = tree.m, []
     for pair in found:
         plane, geom = pair.geoms
-        if m.geom_type[plane] == PLANE:
-            ends = (1, -1) if m.geom_type[geom] == CAPSULE else (0,)
-            result += [Corner(pair, end) for end in ends]
+        if m.geom_type[plane] != PLANE:
+            continue
+        body, (radius, half, _) = int(m.geom_bodyid[geom]), m.geom_size[geom]
+        (position, normal), (center, axis) = (geom_pose(m, tree.poses, g) for g in pair.geoms)
+        is_capsule = m.geom_type[geom] == CAPSULE
+        tangent = frame(normal, axis if is_capsule else None) * pair.friction
+        for tip in (center + axis * half, center + axis * -half) if is_capsule else (center,):
+            distance = dot(normal, tip - position) - radius
+            point = tip - tree.com[body] - normal * (radius + 0.5 * distance)
+            result.append(Corner(pair, body, distance, point, normal, tangent))
     return result
 
 

@@ -6,7 +6,7 @@ J acts on one body, so that ``J' D J`` is a stiffness of that body.
 import numpy as np
 
 from torchrl_loco.sim.compiled.collision.pairs import Pair, contact_weight, least_regularisation
-from torchrl_loco.sim.compiled.collision.planes import Corner, corners, frame, geom_pose
+from torchrl_loco.sim.compiled.collision.planes import Corner, corners
 from torchrl_loco.sim.compiled.ir.parameters import is_of_model
 from torchrl_loco.sim.compiled.ir.symbols import (
     Block,
@@ -44,21 +44,17 @@ class GroundContacts:
 
     def __init__(self, tree: Dynamics, found: list[Pair], touch: TouchSensors, *, with_frames: bool = False) -> None:
         m, self.tree, self.touch = tree.m, tree, touch
-        self.corners = corners(m, found)
+        self.corners = corners(tree, found)
         self.count = len(self.corners)
-        self.bodies = sorted({self.body(corner) for corner in self.corners})
+        self.bodies = sorted({corner.body for corner in self.corners})
         twists = tree.twists(names("search", m.nv))
         self.live = [i for i in range(6) if any(scalar(twists[b][i]).constant != 0 for b in self.bodies)]
         self._weights = [contact_weight(m, corner.pair) for corner in self.corners]
         self._weights_differ = len(set(map(scalar, self._weights))) > 1
-        self._frames = [self._frame(corner) for corner in self.corners]
-        self._lever = self._varying("lever", [self._point(corner) for corner in self.corners])
-        self.directions = [
-            self._varying(title, [frames[i] for frames in self._frames])
-            for i, title in enumerate(("normal", "tangent"))
-        ]
-        normal, tangent = self.directions
-        self.directions.append(cross(normal, tangent))
+        self._lever = self._varying("lever", [corner.point for corner in self.corners])
+        normal = self._varying("normal", [corner.normal for corner in self.corners])
+        tangent = self._varying("tangent", [corner.tangent for corner in self.corners])
+        self.directions = [normal, tangent, cross(normal, tangent)]
         if all(corner.pair.condim == 1 for corner in self.corners):
             self.pyramid = FRICTIONLESS
         elif self._velocity(self._stored_twist())[2].constant == 0:
@@ -72,38 +68,6 @@ class GroundContacts:
         self.fields = ["int body", *(f"float {title}" for title in self._stored)] if self.corners else []
         n = len(self.live)
         self.link = {"twist": n, "gradient": n, "stiffness": n * (n + 1) // 2}
-
-    def body(self, corner: Corner) -> int:
-        """Returns the body of a corner."""
-        return int(self.tree.m.geom_bodyid[corner.pair.geoms[1]])
-
-    def _plane(self, corner: Corner) -> tuple[np.ndarray, np.ndarray]:
-        """Returns a point and the normal of the plane of a corner, ``(3,)`` each."""
-        m, plane = self.tree.m, corner.pair.geoms[0]
-        position, axis = geom_pose(m, self.tree.poses, plane)
-        return position, axis
-
-    def _end(self, corner: Corner) -> np.ndarray:
-        """Returns the center of the sphere at a corner, ``(3,)`` (m)."""
-        m, geom = self.tree.m, corner.pair.geoms[1]
-        center, axis = geom_pose(m, self.tree.poses, geom)
-        return center + axis * (corner.end * m.geom_size[geom, 1]) if corner.end else center
-
-    def _distance(self, corner: Corner) -> Scalar:
-        position, normal = self._plane(corner)
-        return dot(normal, self._end(corner) - position) - self.tree.m.geom_size[corner.pair.geoms[1], 0]
-
-    def _point(self, corner: Corner) -> np.ndarray:
-        """Returns the contact point from the center of mass of the body's tree, ``(3,)`` (m)."""
-        depth = self.tree.m.geom_size[corner.pair.geoms[1], 0] + 0.5 * self._distance(corner)
-        return self._end(corner) - self.tree.com[self.body(corner)] - self._plane(corner)[1] * depth
-
-    def _frame(self, corner: Corner) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the normal, and the first tangent times the friction coefficient, ``(3,)`` each."""
-        pair = corner.pair
-        normal = self._plane(corner)[1]
-        axis = geom_pose(self.tree.m, self.tree.poses, pair.geoms[1])[1] if corner.end else None
-        return normal, frame(normal, axis) * pair.friction
 
     def _varying(self, title: str, vectors: list[np.ndarray]) -> np.ndarray:
         """Returns a vector of contact ``k``: numbers of the model where all contacts agree, else what is stored."""
@@ -130,15 +94,15 @@ class GroundContacts:
     def create(self, block: Block, variables: Variables) -> None:
         """Finds the contacts, and sets weights and residuals."""
         block("int ground = 0;")
-        for i, (corner, (normal, tangent)) in enumerate(zip(self.corners, self._frames, strict=True)):
-            position = self._distance(corner) - corner.pair.margin
+        for i, corner in enumerate(self.corners):
+            position = corner.distance - corner.pair.margin
             with block.scope(f"if ({block.value(position)} < 0.0f)") as touching:
                 touching("const int k = ground++;")
-                touching(f"contact_corner[k] = {i}; contact[k].body = {self.bodies.index(self.body(corner))};")
+                touching(f"contact_corner[k] = {i}; contact[k].body = {self.bodies.index(corner.body)};")
                 touching.set("contact[k].x0", position)
                 if self._weights_differ:
                     touching.set("contact[k].D", scalar(self._weights[i]))
-                for title, vector in (("lever", self._point(corner)), ("normal", normal), ("tangent", tangent)):
+                for title, vector in (("lever", corner.point), ("normal", corner.normal), ("tangent", corner.tangent)):
                     for component in range(3):
                         if f"{title}{component}" in self._stored:
                             touching.set(f"contact[k].{title}{component}", vector[component])
@@ -177,8 +141,8 @@ class GroundContacts:
             block("contact_zones[k] = 0;")
         for s in range(len(self.touch)):
             if (first | second) >> s & 1:
-                point, normal = self._point(corner) + self.tree.com[bodies[1]], self._plane(corner)[1]
-                self.touch.mark(block, s, point, normal if first >> s & 1 else -normal)
+                away = corner.normal if first >> s & 1 else -corner.normal
+                self.touch.mark(block, s, corner.point + self.tree.com[corner.body], away)
 
     def _store_twists(self, block: Block, velocity: list[Scalar]) -> None:
         """Stores the twists of the bodies for velocities of the joints."""
