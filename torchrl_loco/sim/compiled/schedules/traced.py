@@ -38,16 +38,7 @@ def source(
     contact_geoms: Sequence[int] = (),
     contact_rows: int = 1,
 ) -> str:
-    """Returns the C++ of a control step of one world, the body of a function of its arrays.
-
-    Args:
-        m: the model, or a ``VariedModel``.
-        substeps: physics steps; 0 evaluates the state without stepping.
-        with_cvel: whether the velocities of the bodies are written.
-        with_subtree_com: whether the centers of mass of the trees are written.
-        contact_geoms: geoms whose contact forces are written.
-        contact_rows: how many rows of them: one for the last substep, or one for each.
-    """
+    """Returns the C++ of a control step of one world, by the arguments of :func:`.step.source`."""
     world = Block()
     world("if (!live) return;")
     if isinstance(m, VariedModel):

@@ -71,15 +71,7 @@ def source(
     contact_geoms: Sequence[int] = (),
     contact_rows: int = 1,
 ) -> str:
-    """Returns the C++ of a control step of one world, the body of a function of its arrays.
-
-    Args:
-        m: the model, or a ``VariedModel``.
-        substeps: physics steps; 0 evaluates the state without stepping.
-        with_subtree_com: whether the centers of mass of the trees are written.
-        contact_geoms: geoms whose contact forces are written.
-        contact_rows: how many rows of them: one for the last substep, or one for each.
-    """
+    """Returns the C++ of a control step of one world, by the arguments of :func:`.step.source`."""
     d = Description(m)
     contacts: dict[str, Any] = {"contact_geoms": contact_geoms, "contact_rows": contact_rows}
     tables = members(d, substeps, with_subtree_com=with_subtree_com, **contacts)
