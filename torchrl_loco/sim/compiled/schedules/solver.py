@@ -38,6 +38,7 @@ class NewtonSolver:
         contact_geoms: geoms whose contact forces are asked for.
 
     Attributes:
+        contacts: those with the ground and the dense ones, as far as there are any, and C++ of the first and the end.
         arrays: C++ arrays of floats, and how many each has.
         structs: C++ arrays of structs, how many each has, and their fields. What a loop over contacts reads of one is a
             load or two.
@@ -56,6 +57,8 @@ class NewtonSolver:
         self.by_slopes = near(m) == 0
         self.delicate = is_delicate(nominal(m))
         self.places = self.ground.count + self.dense.count
+        contacts = (self.ground, "0", "ground"), (self.dense, "ground", "contacts")
+        self.contacts = [(rows, first, end) for rows, first, end in contacts if rows.count]
         directions = max(len(rows.pyramid.directions) for rows in (self.ground, self.dense))
         rows_of_contact = [f"{field}{d}" for field in "xv" for d in range(directions)]
         self.structs = {
@@ -103,17 +106,14 @@ class NewtonSolver:
     def read_touch(self, block: Block) -> None:
         """Sets the touch sensors from the forces that were found."""
         block(f"for (int i = 0; i < {len(self.touch)}; ++i) touch[i] = 0.0f;")
-        if self.ground.count:
-            self.touch.add(block, "0", "ground", self.ground.pyramid.normal_force())
-        if self.dense.count:
-            self.touch.add(block, "ground", "contacts", self.dense.pyramid.normal_force())
+        for rows, first, end in self.contacts:
+            self.touch.add(block, first, end, rows.pyramid.normal_force())
 
     def read_contact_forces(self, block: Block, row: str | None = None) -> None:
         """Writes the forces of the contacts on the geoms that were asked for, into a row if there are several."""
         self.contact_forces.clear(block, row)
-        for rows, first, end in ((self.ground, "0", "ground"), (self.dense, "ground", "contacts")):
-            if rows.count:
-                self.contact_forces.add(block, (first, end), rows.pyramid.force(rows.directions), row)
+        for rows, first, end in self.contacts:
+            self.contact_forces.add(block, (first, end), rows.pyramid.force(rows.directions), row)
 
     def _set_direction(self, block: Block) -> None:
         """Sets ``search`` to -H^-1 gradient, and ``gradient_squared`` and ``decrement``."""
@@ -184,13 +184,9 @@ class NewtonSolver:
 
     def _each_row(self, body: str, *, ground: bool = True) -> str:
         """Returns C++ that runs ``body`` for each row, ``row``, with or without contacts with the ground."""
-        loops = [self.limits.loop(body)]
-        if self.ground.count and ground:
-            loops.append(self.ground.pyramid.loop("0", "ground", body))
-        if self.dense.count:
-            loops.append(self.dense.pyramid.loop("ground", "contacts", body))
-        loops.append(self.friction.loop(body))
-        return "\n".join(loops)
+        contacts = [each for each in self.contacts if ground or each[0] is not self.ground]
+        loops = [rows.pyramid.loop(first, end, body) for rows, first, end in contacts]
+        return "\n".join([self.limits.loop(body), *loops, self.friction.loop(body)])
 
     def _move(self, block: Block) -> None:
         """Moves along the direction, and returns whether a row changed sides; says what is gained if no search has."""
@@ -204,10 +200,8 @@ class NewtonSolver:
         block("bool changed = false;")
         block(self.limits.advance(gained))
         block(self.friction.advance(gained))
-        if self.ground.count:
-            block(self.ground.pyramid.advance("0", "ground", gained))
-        if self.dense.count:
-            block(self.dense.pyramid.advance("ground", "contacts", gained))
+        for rows, first, end in self.contacts:
+            block(rows.pyramid.advance(first, end, gained))
         if self.by_slopes:
             block("step.improvement = -change;")
         block("return changed;")
