@@ -34,11 +34,6 @@ class Pyramid:
         """Returns how much of the weight of a contact an edge gets."""
         return 1.0 if condim > 1 else 1.0 / sum(count for *_, count in self.edges)
 
-    def residual(self, edge: tuple[int, int, int], x: Sequence[Scalar]) -> Scalar:
-        """Returns the residual of an edge from those of the directions."""
-        sign, direction, _ = edge
-        return x[0] + sign * x[direction] if direction else x[0]
-
     def response(self, weight: Scalar, x: Sequence[Scalar]) -> tuple[list[Scalar], dict[tuple[int, int], Scalar]]:
         """Returns gradient and Hessian of the cost with respect to the directions.
 
@@ -49,7 +44,7 @@ class Pyramid:
         gradient = [scalar(0) for _ in self.directions]
         hessian = {(0, 0): scalar(0)}
         for sign, direction, count in self.edges:
-            residual = self.residual((sign, direction, count), x)
+            residual = x[0] + sign * x[direction] if direction else x[0]
             active = call("OneSided::curvature", residual, count * weight)
             force = active * residual
             gradient[0] = gradient[0] + force

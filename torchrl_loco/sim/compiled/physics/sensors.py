@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.collision.kinds import SHAPES, SPHERE
-from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, array, cross, name, scalar, total
+from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, array, cross, name, total
 from torchrl_loco.sim.compiled.physics.dynamics import Dynamics, Poses, constant_matrix
 
 SUBTREE_VELOCITY, ANGULAR_MOMENTUM, TOUCH, VELOCIMETER, GYRO, ACCELEROMETER, FORCE, TORQUE = (
@@ -109,10 +109,6 @@ class TouchSensors:
             for s in range(len(self)):
                 contact(f"if (contact_zones[k] & {1 << s}) touch[{s}] += force_normal;")
 
-    def outputs(self) -> dict[int, Scalar]:
-        """Returns the sums by their address in ``sensordata``."""
-        return {address: name(f"touch[{s}]") for s, address in enumerate(self.addresses)}
-
 
 class ContactForces:
     """Net forces of the contacts on some geoms, and whether they have any contact.
@@ -169,6 +165,6 @@ def read(m: mujoco.MjModel, tree: Dynamics, touch: TouchSensors) -> list[Scalar 
     for kind, body, first in zip(m.sensor_type, m.sensor_objid, m.sensor_adr, strict=True):
         if kind in of_subtrees:
             row[first : first + 3] = of_subtrees[kind](m, tree, int(body))
-    for address, force in touch.outputs().items():
-        row[address] = scalar(force)
+    for s, address in enumerate(touch.addresses):
+        row[address] = name(f"touch[{s}]")
     return row

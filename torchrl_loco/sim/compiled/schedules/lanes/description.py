@@ -206,10 +206,6 @@ class Description:
         if boxes is not None and (len(boxes.numbers) > MOST_BOXES or len(self.geoms) > MOST_ON_BOXES):
             raise ValueError(f"{len(boxes.numbers)} boxes of the world, more than {MOST_BOXES}, or too many that move")
 
-    def points(self, pair: Pair) -> int:
-        """Returns how many contacts a pair can have."""
-        return kind(self.m, pair).points
-
     def collide(self) -> str:
         """Returns the calls that find the contacts, those with friction if there is ``friction``, or those without."""
         calls, kinds = [], [(kind(self.m, pair).function, pair.condim != 1) for pair in self.pairs]
@@ -263,8 +259,8 @@ class Description:
             ValueError: a world does not fit the shared memory of a GPU.
         """
         m = self.m
-        frictional = sum(self.points(p) for p in self.pairs if p.condim != 1)
-        frictionless = sum(self.points(p) for p in self.pairs if p.condim == 1)
+        frictional = sum(kind(m, p).points for p in self.pairs if p.condim != 1)
+        frictionless = sum(kind(m, p).points for p in self.pairs if p.condim == 1)
         standing, standing_frictionless = self._standing() if self.pairs else (0, 0)
         frictionless = min(frictionless, max(MOST_FRICTIONLESS, standing_frictionless)) + self.lasting
         if not frictional and not frictionless:
