@@ -21,8 +21,13 @@ from torchrl_loco.sim.compiled.physics.sensors import TOUCH, TouchSensors
 from torchrl_loco.sim.compiled.schedules import shared
 from torchrl_loco.sim.compiled.schedules.solver import NewtonSolver
 
-INPUTS = {"qpos": "nq", "qvel": "nv", "qacc": "nv", "ctrl": "nu"}
-"""What a world reads, and how many numbers of it. ``qacc`` starts as the warm start."""
+INPUTS = {
+    "qpos": ("nq", "qpos_out"),
+    "qvel": ("nv", "qvel_out"),
+    "qacc": ("nv", "qacc_warmstart_out"),
+    "ctrl": ("nu", "ctrl_in"),
+}
+"""What a world reads, how many numbers of it, and from which array of all worlds."""
 
 MOST_SHARED = 24 * 1024
 """Bytes of shared memory of a warp up to which it holds links on a GPU: stores to local memory go on to the second
@@ -45,8 +50,8 @@ def source(
         world("// Numbers of the model.")
         for column in range(m.varied.count):
             world(f"const float {number(column).args[0]} = wp::index(numbers_out, world, {column});")
-    for title, size in INPUTS.items():
-        argument, count = _argument(title), getattr(m, size)
+    for title, (size, argument) in INPUTS.items():
+        count = getattr(m, size)
         world(f"float {title}[{max(count, 1)}];")
         world(f"for (int i = 0; i < {count}; ++i) {title}[i] = wp::index({argument}, world, i);")
     world("int overflow = 0;")
@@ -73,9 +78,9 @@ def source(
         world.lines += [f"  {line}" for line in "\n".join(step.lines).splitlines()]
         world("}")
     if substeps:
-        for title, size in INPUTS.items():
+        for title, (size, argument) in INPUTS.items():
             if title != "ctrl":
-                row = f"wp::index({_argument(title)}, world, i)"
+                row = f"wp::index({argument}, world, i)"
                 world(f"for (int i = 0; i < {getattr(m, size)}; ++i) {row} = {title}[i];")
         world(f"time_out.data[world] += {literal(substeps * m.opt.timestep)};")
         world("overflow_out.data[world] |= overflow;")
@@ -99,11 +104,6 @@ def _declare_links(world: Block, count: int, numbers: int) -> None:
         world(f"#else\n{local}\n#endif")
     else:
         world(local)
-
-
-def _argument(title: str) -> str:
-    """Returns the array of all worlds that an input is read from."""
-    return {"qacc": "qacc_warmstart_out", "ctrl": "ctrl_in"}.get(title, f"{title}_out")
 
 
 def _substep(
