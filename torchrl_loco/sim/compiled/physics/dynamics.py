@@ -10,6 +10,7 @@ parents before children.
 """
 
 import dataclasses
+import itertools
 
 import mujoco
 import numpy as np
@@ -157,12 +158,9 @@ class Dynamics:
 
     def keep(self, block: Block) -> None:
         """Computes inertias and motion subspaces in ``block``, so that inner blocks share them."""
-        for vector in [
-            *self.cdof,
-            *(part for inertia in self.inertia[1:] for part in (*inertia.rotational, inertia.first)),
-        ]:
-            for x in vector:
-                block.value(x)
+        inertias = [part for inertia in self.inertia[1:] for part in (*inertia.rotational, inertia.first)]
+        for x in itertools.chain(*self.cdof, *inertias):
+            block.value(x)
 
     def dofs(self, body: int) -> range:
         """Returns the degrees of freedom between a body and its parent."""
