@@ -9,7 +9,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled.collision.kinds import BOX, FIELD, KINDS, NOT_COMPILED, ON_BOXES, Kind
+from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, FIELD, KINDS, NOT_COMPILED, ON_BOXES, Kind
 from torchrl_loco.sim.compiled.ir.parameters import Number, largest, varies
 from torchrl_loco.sim.compiled.ir.symbols import Scalar, select
 from torchrl_loco.sim.compiled.physics.dynamics import MINVAL
@@ -113,6 +113,11 @@ def stand_ins(m: mujoco.MjModel) -> dict[int, int]:
         own = [getattr(m, f"geom_{name}")[geom].tolist() for name in (*ALIKE, *ALIKE_NUMBERS)]
         found[geom] = first.setdefault(repr([own, geom if geom in named else -1]), geom)
     return found
+
+
+def half_length(m: mujoco.MjModel, geom: int) -> float:
+    """Returns the half length of a capsule, 0 for any other geom."""
+    return float(m.geom_size[geom, 1]) if m.geom_type[geom] == CAPSULE else 0.0
 
 
 def is_elliptic(m: mujoco.MjModel) -> bool:

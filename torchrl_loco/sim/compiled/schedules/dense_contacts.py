@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from torchrl_loco.sim.compiled.collision.kinds import CAPSULE
-from torchrl_loco.sim.compiled.collision.pairs import Pair, contact_weight, least_regularisation
+from torchrl_loco.sim.compiled.collision.pairs import Pair, contact_weight, half_length, least_regularisation
 from torchrl_loco.sim.compiled.collision.planes import geom_pose
 from torchrl_loco.sim.compiled.ir.symbols import (
     Block,
@@ -104,7 +103,7 @@ class DenseContacts:
     def _find(self, block: Block, variables: Variables) -> None:
         m, tree, nv = self.tree.m, self.tree, self.tree.m.nv
         origin = tree.com[next(b for b in range(1, m.nbody) if m.body_weldid[b])]
-        half = {g: float(m.geom_size[g, 1]) if m.geom_type[g] == CAPSULE else 0.0 for g in self.geoms}
+        half = {g: half_length(m, g) for g in self.geoms}
         poses = {g: geom_pose(m, tree.poses, g) for g in self.geoms}
         for i, g in enumerate(self.geoms):
             center, axis = poses[g]

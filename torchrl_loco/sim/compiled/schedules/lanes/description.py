@@ -12,7 +12,6 @@ import numpy as np
 from torchrl_loco.sim.compiled.collision.ground import Ground
 from torchrl_loco.sim.compiled.collision.kinds import (
     BOX,
-    CAPSULE,
     FUNCTIONS,
     GROUND_FUNCTIONS,
     MESH,
@@ -22,6 +21,7 @@ from torchrl_loco.sim.compiled.collision.kinds import (
 from torchrl_loco.sim.compiled.collision.meshes import Mesh
 from torchrl_loco.sim.compiled.collision.pairs import (
     Pair,
+    half_length,
     is_elliptic,
     kind,
     looked_up,
@@ -197,7 +197,7 @@ class Description:
             ValueError: it cannot.
         """
         moving = [g for g in self.geoms if self.m.body_weldid[self.m.geom_bodyid[g]]]
-        most = max((2 * (self.radius(g) + self.half_length(g)) for g in moving), default=0.0)
+        most = max((2 * (self.radius(g) + half_length(self.m, g)) for g in moving), default=0.0)
         for field in self.ground.fields:
             prisms = 2 * (most / field.cell[0] + 2) * (most / field.cell[1] + 2)
             if prisms > MOST_PRISMS:
@@ -309,10 +309,6 @@ class Description:
         """Returns the link of a geom, and its center and z axis in the frame of the link."""
         place = self.places[self.m.geom_bodyid[g]]
         return place.link, place.point(self.m.geom_pos[g]), matrix(place.turn(self.m.geom_quat[g]))[:, 2]
-
-    def half_length(self, g: int) -> float:
-        """Returns the half length of a capsule, 0 for any other geom."""
-        return float(self.m.geom_size[g, 1]) if self.m.geom_type[g] == CAPSULE else 0.0
 
     def radius(self, g: int) -> float:
         """Returns the radius of a sphere or capsule, and that of the bounding sphere of a solid."""

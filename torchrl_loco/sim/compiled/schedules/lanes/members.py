@@ -13,6 +13,7 @@ from torchrl_loco.sim.compiled.collision.kinds import MESH, ON_BOXES, POINT_BITS
 from torchrl_loco.sim.compiled.collision.pairs import (
     Pair,
     contact_weight,
+    half_length,
     least_regularisation,
 )
 from torchrl_loco.sim.compiled.collision.planes import LEAST_ALIGNED
@@ -264,14 +265,14 @@ def _add_welds(tables: Tables, d: Description, mask: str) -> None:
         turns = [place.turn(unturned if weld.turns is None else weld.turns[end]) for weld, place in at]
         tables.integers(f"weld_{title}_link", [place.link for _, place in at])
         tables.structs("Vec", f"weld_{title}_point", [place.point(weld.points[end]) for weld, place in at])
-        tables.structs("Mat", f"weld_{title}_turn", [matrix(turn).ravel() for turn in turns])
+        tables.structs("Mat", f"weld_{title}_turn", [matrix(turn) for turn in turns])
         tables.integers(f"weld_{title}_dofs", [d.moved[weld.bodies[end]] for weld in welds], mask)
 
 
 def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
     m, found = d.m, d.pairs
     geoms = [d.geom_frame(g) for g in d.geoms]
-    half = [d.half_length(g) for g in d.geoms]
+    half = [half_length(m, g) for g in d.geoms]
     tables.integers("geom_link", [link for link, _, _ in geoms])
     tables.structs("Vec", "geom_position", [center for _, center, _ in geoms])
     tables.structs("Vec", "geom_half_axis", [axis * h for (_, _, axis), h in zip(geoms, half, strict=True)])
@@ -283,7 +284,7 @@ def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
         tables.integers("geom_shape", [SHAPES.index(m.geom_type[g]) for g in d.geoms])
         tables.structs("Vec", "geom_size", m.geom_size[d.geoms])
         turns = [d.places[m.geom_bodyid[g]].turn(m.geom_quat[g]) for g in d.geoms]
-        tables.structs("Mat", "geom_orientation", [matrix(turn).ravel() for turn in turns])
+        tables.structs("Mat", "geom_orientation", [matrix(turn) for turn in turns])
         solid = np.isin(m.geom_type[d.geoms], SOLID)
         tables.size(SOLIDS_TURNED=any(abs(turn[0]) < 1 for turn in itertools.compress(turns, solid)))
     if d.meshes:
@@ -304,9 +305,9 @@ def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
     frames = [d.geom_frame(p.geoms[0]) for p in planes]
     tables.structs("Vec", "plane_normal", [normal for _, _, normal in frames])
     tables.floats("plane_offset", [normal @ center for _, center, normal in frames])
-    half = [d.half_length(p.geoms[1]) for p in planes]
+    half = [half_length(m, p.geoms[1]) for p in planes]
     tables.floats("inverse_half_length", [1 / h if h else 0.0 for h in half])
-    reach = [sum(d.radius(g) + d.half_length(g) for g in p.geoms) + p.margin for p in others]
+    reach = [sum(d.radius(g) + half_length(m, g) for g in p.geoms) + p.margin for p in others]
     _add_near_pairs(tables, d, [(index[a], index[b]) for a, b in (p.geoms for p in others)], reach)
     _add_friction(tables, d)
     # The limits of ball joints follow the pairs, then the equalities, then the rows of welds and connections.
@@ -414,7 +415,7 @@ def _add_ground(tables: Tables, d: Description) -> None:
         return
     tables.size(FIELDS=len(fields))
     tables.structs("Vec", "field_corner", [field.corner for field in fields])
-    tables.structs("Mat", "field_orientation", [field.orientation.ravel() for field in fields])
+    tables.structs("Mat", "field_orientation", [field.orientation for field in fields])
     tables.floats("cell_width", [field.cell[0] for field in fields])
     tables.floats("cell_height", [field.cell[1] for field in fields])
     tables.floats("field_columns", [field.heights.shape[1] - 1 for field in fields])
@@ -462,7 +463,7 @@ def _add_outputs(tables: Tables, d: Description) -> None:
     m = d.m
     tables.integers("body_link", [p.link for p in d.places])
     tables.structs("Vec", "body_position", [p.position for p in d.places])
-    tables.structs("Mat", "body_orientation", [matrix(p.quaternion).ravel() for p in d.places])
+    tables.structs("Mat", "body_orientation", [matrix(p.quaternion) for p in d.places])
     parts = [
         [(i, x.center, x.mass / m.body_subtreemass[body]) for i, x in d.parts_below(body)] for _, body, _ in d.subtrees
     ]
@@ -523,7 +524,7 @@ def _add_frames(tables: Tables, d: Description, name: str, sites: list[int]) -> 
     tables.integers(f"{name}_link", [place.link for _, place in at])
     tables.structs("Vec", f"{name}_position", [place.point(m.site_pos[site]) for site, place in at])
     turns = [matrix(place.turn(m.site_quat[site])) for site, place in at]
-    tables.structs("Mat", f"{name}_orientation", [turn.ravel() for turn in turns])
+    tables.structs("Mat", f"{name}_orientation", turns)
 
 
 def _add_touch(tables: Tables, d: Description) -> None:
