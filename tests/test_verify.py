@@ -73,7 +73,7 @@ def test_a_file_is_deployed_without_this_package(standing):
 @pytest.mark.slow
 @for_each("pushes", [0, 6])
 def test_robots_do_the_same_in_both_engines(standing, capsys, tmp_path, pushes):
-    out = tmp_path / "out.json"
+    out = tmp_path / f"{pushes}.json"
     options = ("--episodes", 8, "--seconds", 3, "--pushes", pushes, "--device", "cpu", "--out", out)
     status, said = command(capsys, standing, *options)
     figures = json.loads(out.read_text())
