@@ -76,11 +76,12 @@ static T shuffle_at(int line, T x, int from) {
 #define __reduce_or_sync(mask, x) any_at(line, x)
 #define __shfl_sync(mask, x, from) shuffle_at(line, x, from)
 #define __shfl_xor_sync(mask, x, bits) shuffle_at(line, x, lane ^ (bits))
+#define __shfl_up_sync(mask, x, by) shuffle_at(line, x, lane >= (by) ? lane - (by) : lane)
 static const struct { unsigned x; } threadIdx = {0};  // of a block with one world, where only x / 32 counts
 
 template <class T> struct Array { T* data; int shape[2]; };
 extern "C" {
-Array<float> ctrl_in, numbers_out, qpos_out, qvel_out, qacc_warmstart_out, time_out, sensordata_out;
+Array<float> ctrl_in, terrain_in, numbers_out, qpos_out, qvel_out, qacc_warmstart_out, time_out, sensordata_out;
 Array<float[3]> xpos_out, subtree_com_out, contact_force_out;
 Array<float[6]> cvel_out;
 Array<float[9]> xmat_out;

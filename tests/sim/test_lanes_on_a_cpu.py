@@ -20,7 +20,7 @@ from torchrl_loco.sim.compiled.engine import LATER
 
 COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 WORLDS, MOTION = 16, 100
-WAITING = r"(INLINE \w+ (?:sync|ballot|any_of_block|read|agreed|sum|largest)\()(.*)\) const"
+WAITING = r"(INLINE \w+ (?:sync|ballot|any_of_block|read|agreed|sum|sum_below|largest)\()(.*)\) const"
 PTX = {
     r'asm\("div\..*': "x = a / b;",
     r'asm\("rcp\..*': "x = 1.0f / a;",
@@ -60,6 +60,7 @@ def built(text, folder):
         text, count = re.subn(ptx, same, text)
         assert count == 1
     text = re.sub(WAITING, lambda m: f"{m[1]}{m[2]}{', ' if m[2] else ''}int line = __builtin_LINE()) const", text)
+    folder.mkdir()  # a library that is loaded is not loaded again from the same file
     (folder / "step.inc").write_text(text)
     source, library = pathlib.Path(__file__).with_name("lanes_on_a_cpu.cpp"), folder / "step.so"
     subprocess.run([COMPILER, "-std=c++17", "-w", "-fPIC", "-shared", f"-I{folder}", "-o", library, source], check=True)
@@ -86,7 +87,8 @@ def with_lanes(sim, folder):
     asked |= {"contact_geoms": engine._contact_geoms, "contact_rows": engine._contact_rows}
     text = step.source(engine._mj_model, engine._substeps, **asked)
     outputs = {name: array.numpy() for name, array in outputs.items() if array is not None and array.size}
-    before = {"ctrl_in": engine.data.ctrl.numpy(), "numbers_out": engine._rows.numpy()}
+    before = {"ctrl_in": engine.data.ctrl.numpy(), "terrain_in": engine._terrain.numpy()}
+    before["numbers_out"] = engine._rows.numpy()
     before |= {f"{name}_out": array.copy() for name, array in outputs.items()}
     return built(text, folder), text, before, outputs
 
@@ -100,7 +102,7 @@ def test_the_lanes_of_a_warp_agree_with_one_lane(task, actions, tmp_path):
     state = env.reset()
     for action in actions(env, MOTION):
         state = env.step_and_maybe_reset(state.set("action", action))[1]
-    library, text, before, outputs = with_lanes(env.sim, tmp_path)
+    library, text, before, outputs = with_lanes(env.sim, tmp_path / task)
     env.sim.step()  # into outputs
     after = stepped(library, text, before, last_first=False)
     for name, array in stepped(library, text, before, last_first=True).items():
@@ -130,6 +132,6 @@ def test_stiff_contacts_of_coupled_hinges(monkeypatch, tmp_path):
             getattr(sim, name)[world] = torch.from_numpy(getattr(data, name))
         mujoco.mj_step(model, data)
         expected.append(data.qvel.copy())
-    library, text, before, _ = with_lanes(sim, tmp_path)
+    library, text, before, _ = with_lanes(sim, tmp_path / "hinges")
     found = stepped(library, text, before, last_first=False)["qvel_out"]
     assert np.abs(found - expected).max() < 5e-4
