@@ -19,6 +19,7 @@ SHAPES = """
 <mujoco>
   <asset>
     <hfield name="field" nrow="9" ncol="12" size="2 1.5 0.4 0.1"/>
+    <hfield name="small" nrow="4" ncol="5" size="0.5 0.4 0.5 0.1"/>
     <mesh name="wedge" vertex="0 0 0  0.4 0 0  0 0.4 0  0 0 0.5"/>
   </asset>
   <worldbody>
@@ -39,6 +40,7 @@ SHAPES = """
       <camera name="trackcom" mode="trackcom" pos="1.5 0.4 1" xyaxes="-0.2 1 0 -0.4 0 1"/>
       <camera name="held" pos="0.1 -1.2 0.4" xyaxes="1 0.1 0 0 0.5 1" fovy="70"/>
     </body>
+    <body pos="-1.3 -0.9 0.2" euler="0 0 20"><geom type="hfield" hfield="small"/></body>
     <body name="target" pos="0.2 0.1 0.7"><geom type="sphere" size="0.01"/></body>
     <camera name="fixed" pos="2 2 1.5" xyaxes="-1 1 0 -0.4 -0.4 1"/>
     <camera name="at_body" pos="-1.5 -1 1.2" mode="targetbody" target="target"/>
@@ -257,6 +259,8 @@ def test_hooks_cast_rays():
     [
         (lambda s: s.depth("left", 8, 6), KeyError, "no camera 'left'.*egocentric"),
         (lambda s: s.ray("paw", [[0, 0, 1]]), KeyError, "no site 'paw'.*FR"),
+        (lambda s: s.depth(".*e.*", 8, 6), ValueError, "name one camera: .* matches 2"),
+        (lambda s: s.ray("[FR][RL]", [[0, 0, 1]]), ValueError, "name one site: .* matches 4"),
         (lambda s: s.ray("FR", [0, 0, 1]), ValueError, "directions must be rows of 3"),
     ],
 )

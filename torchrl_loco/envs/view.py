@@ -370,10 +370,7 @@ class View:
             raise ValueError(f"grid must be points ahead and to the left, (points, 2), got {where.shape}")
         if not np.isfinite(where).all():
             raise ValueError("grid must be finite numbers (m)")
-        ids, _ = self._catalog.ids("body", _one("body", body))
-        if len(ids) > 1:
-            raise ValueError(f"a scan is around one body, {body!r} names {len(ids)}")
-        scan = self._scanned(Asked(ids[0], tuple(map(tuple, where.tolist()))), (len(where),))
+        scan = self._scanned(Asked(self._id("body", body), tuple(map(tuple, where.tolist()))), (len(where),))
         return scan if math.isnan(miss) else torch.where(scan.isnan(), miss, scan)
 
     def depth(self, camera: str, width: int, height: int, far: float = 10.0) -> torch.Tensor:
@@ -390,11 +387,12 @@ class View:
 
         Raises:
             KeyError: the model has no such camera.
-            ValueError: a number is not positive, or the camera's perspective is not told by ``fovy`` alone.
+            ValueError: several cameras match, a number is not positive, or ``fovy`` alone does not tell the camera's
+                perspective.
         """
-        ids, _ = self._catalog.ids("camera", _one("camera", camera))
+        which = self._id("camera", camera)
         size = check_int("height", height), check_int("width", width)
-        return self._scanned(Looked(ids[0], size[1], size[0], check_float("far", far, POSITIVE)), size)
+        return self._scanned(Looked(which, size[1], size[0], check_float("far", far, POSITIVE)), size)
 
     def ray(self, site: str, directions: Any, far: float = 10.0) -> torch.Tensor:
         """Returns how far from a site lies what rays meet, shapes of all kinds and meshes among it.
@@ -409,15 +407,28 @@ class View:
 
         Raises:
             KeyError: the model has no such site.
-            ValueError: ``far`` is not positive, or the directions have another shape, or one is no direction.
+            ValueError: several sites match, ``far`` is not positive, or the directions have another shape, or one is
+                no direction.
         """
-        ids, _ = self._catalog.ids("site", _one("site", site))
+        which = self._id("site", site)
         rows = np.array(directions, dtype=float)
         if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all() or not rows.any(1).all():
             raise ValueError(f"directions must be rows of 3 finite numbers that are not all 0, (rays, 3), got {rows!r}")
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-        asked = Cast(ids[0], tuple(map(tuple, rows.tolist())), check_float("far", far, POSITIVE))
+        asked = Cast(which, tuple(map(tuple, rows.tolist())), check_float("far", far, POSITIVE))
         return self._scanned(asked, (len(rows),))
+
+    def _id(self, kind: str, name: str) -> int:
+        """Returns the id of the one element that a name or a regular expression matches.
+
+        Raises:
+            KeyError: it matches none.
+            ValueError: it matches several.
+        """
+        ids, _ = self._catalog.ids(kind, _one(kind, name))
+        if len(ids) > 1:
+            raise ValueError(f"name one {kind}: {name!r} matches {len(ids)}")
+        return ids[0]
 
     def _scanned(self, asked: Asked | Looked | Cast, shape: tuple[int, ...]) -> torch.Tensor:
         """Returns the array of a scan, depths or rays, of a shape in each world: at the first call, numbers like them.

@@ -4,7 +4,7 @@ import mujoco
 import warp as wp
 
 from torchrl_loco.eyes.scene import Mounts, Shapes, shapes_of, to_the_horizon
-from torchrl_loco.eyes.shapes import CAPSULE, CYLINDER, FIELD, PLANE
+from torchrl_loco.eyes.shapes import CAPSULE, CYLINDER, PLANE
 from torchrl_loco.sim import EXCLUSIVE
 
 WHOLE = wp.constant(wp.float32(1.0e6))
@@ -121,7 +121,7 @@ def place(
         found = wp.vec4(
             wp.min(one[0], other[0]), wp.min(one[1], other[1]), wp.max(one[2], other[2]), wp.max(one[3], other[3])
         )
-    elif kind != PLANE and kind != FIELD and shapes.geom[k] >= 0:
+    elif kind != PLANE and shapes.geom[k] >= 0:
         found = bounds(at, shapes.radius[k])
     bounds_out[world, k] = found
 

@@ -8,9 +8,11 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from torchrl_loco.eyes.shapes import BOX, FIELD, MESH, PLANE
+from torchrl_loco.eyes.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, FIELD, MESH, PLANE, SPHERE
 from torchrl_loco.sim import fill
 
+KINDS = (PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)
+"""Types of geoms that are seen."""
 GROUPS = 3
 """Groups of geoms that are seen, from 0 on, as in MuJoCo's viewer."""
 FULL_SHINE = 128.0
@@ -147,13 +149,14 @@ def shapes_of(m: mujoco.MjModel, device: wp.Device) -> tuple[Shapes, list[wp.Mes
     of_ground = [g for g in seen if m.geom_bodyid[g] == 0 and m.geom_type[g] in (BOX, FIELD)]
     alone = [g for g in seen if g not in set(of_ground)]
     kinds = [int(m.geom_type[g]) for g in alone]
-    meshes: dict[int, wp.Mesh] = {}
+    meshes: dict[tuple[int, int], wp.Mesh] = {}
+    ids = []
     for g, kind in zip(alone, kinds, strict=True):
-        if kind == MESH and (data := int(m.geom_dataid[g])) not in meshes:
-            first, points = m.mesh_vertadr[data], m.mesh_vertnum[data]
-            faces = m.mesh_face[m.mesh_faceadr[data] :][: m.mesh_facenum[data]]
-            meshes[data] = mesh(m.mesh_vert[first : first + points], faces, device)
-    ids = [meshes[int(m.geom_dataid[g])].id if k == MESH else 0 for g, k in zip(alone, kinds, strict=True)]
+        key = kind, int(m.geom_dataid[g])
+        if kind in (MESH, FIELD) and key not in meshes:
+            meshes[key] = mesh(*(of_mesh if kind == MESH else of_field)(m, key[1]), device)
+        ids.append(meshes[key].id if key in meshes else 0)
+    kinds = [MESH if kind == FIELD else kind for kind in kinds]
     mats = np.zeros((len(alone), 9))
     for row, g in zip(mats, alone, strict=True):
         mujoco.mju_quat2Mat(row, m.geom_quat[g])
@@ -194,6 +197,12 @@ def triangles(m: mujoco.MjModel, geoms: list[int]) -> tuple[np.ndarray, np.ndarr
         owner.append(np.full(len(of_own), g))
         count += len(own)
     return np.concatenate(points), np.concatenate(faces), np.concatenate(owner)
+
+
+def of_mesh(m: mujoco.MjModel, which: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns points and triangles of a mesh."""
+    points = m.mesh_vert[m.mesh_vertadr[which] :][: m.mesh_vertnum[which]]
+    return points, m.mesh_face[m.mesh_faceadr[which] :][: m.mesh_facenum[which]]
 
 
 def of_field(m: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
@@ -248,7 +257,12 @@ def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
             texture[g], repeat[g] = flat.index(used), np.where(whole, times / np.where(whole, 2 * size, 1), 0.5 * times)
             offset[g] = np.where(ends.all(), repeat[g] * size, -0.5)
     sees_through = [m.geom(g).name or str(g) for g in range(m.ngeom) if HIDDEN < color_of(m, g)[3] < 1.0]
-    for what, names in (("textures but those of the ground", left_out), ("transparency", sees_through)):
+    unknown = [m.geom(g).name or str(g) for g in range(m.ngeom) if m.geom_type[g] not in KINDS]
+    for what, names in (
+        ("textures but those of the ground", left_out),
+        ("transparency", sees_through),
+        ("shapes of such a type", unknown),
+    ):
         if names:
             logging.getLogger("torchrl_loco").info("cameras do not see %s: geoms %s", what, ", ".join(names[:8]))
     levels, texels, sky = textures(m, flat)
