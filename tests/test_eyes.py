@@ -149,9 +149,10 @@ def test_pixels_are_entries_that_hold_what_they_held(device):
     assert not torch.equal(ended["pixels"], td["pixels"])
     restored = env.reset(env.get_state(), set_state=True)
     assert torch.equal(restored["pixels"], td["pixels"])
-    alone = loco.make("walker_walk", 1, device, 0, **options)
+    alone = loco.make("walker_walk", 1, device, 0, reward_terms=True, **options)
     other = alone.reset()
-    assert set(other.keys()) == {"pixels", "depth", "done", "terminated", "truncated"}
+    assert set(other.keys()) == {"pixels", "depth", "reward_terms", "done", "terminated", "truncated"}
+    check_env_specs(alone)
     assert torch.equal(other["pixels"][0], kept[0])
     assert other["depth"].max() == 8.0
 
@@ -171,6 +172,7 @@ def test_transforms_of_torchrl_stack_and_turn_them():
     [
         ({"pixels_only": True}, "pixels_only needs from_pixels=True"),
         ({"camera": "side"}, "camera needs from_pixels=True"),
+        ({"from_pixels": True, "observation_terms": True}, "observation_terms .* pixels_only=False"),
         ({"from_pixels": True, "camera": "left"}, "unknown camera .left.: choose one of side"),
         ({"from_pixels": True, "camera": 7}, "camera"),
         ({"from_pixels": True, "size": 84}, "size must be the width and height"),
@@ -210,6 +212,15 @@ def test_hooks_see_depth():
         ours = plain.step(plain.reset(state, set_state=True).set("action", action))["next"]
     assert td["eye"].max() == 4.0
     assert td["eye"].min() < 1.0
+
+
+def test_a_group_must_not_have_the_name_of_pixels():
+    class Named(Sees):
+        def observation(self, s):
+            return {**super().observation(s), "depth": s.depth("egocentric", 8, 6)}
+
+    with pytest.raises(ValueError, match="'depth' is what a camera sees"):
+        Named(2, "cpu", seed=0, depth=4.0, pixels_only=False)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -82,7 +82,8 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         play: whether the worlds are for looking at a policy, not for training: commands can be set with
             :meth:`set_command`, ``randomize=None`` varies nothing, and tasks leave out noise and pushes.
         from_pixels: whether to return what a camera sees as ``"pixels"``, uint8 ``(num_envs, height, width, 3)``.
-        pixels_only: whether the other observations are left out; ``None`` leaves them out where there are pixels.
+        pixels_only: whether the groups of the observation are left out; ``None`` leaves them out where there are
+            pixels. Terms of the reward and metrics that are asked for stay.
         camera: name or number of a camera of the model; ``None`` takes the first.
         size: width and height of the pixels; ``None`` is 84 by 84.
         depth: greatest depth (m); if it is not 0, ``"depth"`` ``(num_envs, height, width)`` tells how far along the
@@ -166,6 +167,8 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         self.check_model(mj_model)
         seen = {"from_pixels": from_pixels, "pixels_only": pixels_only, "camera": camera, "size": size, "depth": depth}
         pixels = Pixels.checked(mj_model, seen, worlds, device)
+        if apart and pixels and pixels.only:
+            raise ValueError("observation_terms are of the observation, which pixels leave out: pass pixels_only=False")
         variation = Variation(varys, mj_model, device) if varys else None
 
         super().__init__(device=device, batch_size=[] if num_envs is None else [worlds])
@@ -251,9 +254,13 @@ class LocoEnv(Task, WorldAccess, QuickResets):
     def _make_specs(self) -> None:
         batch, device = self.batch_size, self.device
         as_float: dict[str, Any] = {"device": device, "dtype": torch.float32}
-        observation: dict[str, Any] = {
-            name: Unbounded((*batch, *shape), **as_float) for name, shape in self.groups.items()
-        }
+        groups = {} if self.pixels and self.pixels.only else self.groups
+        observation: dict[str, Any] = {name: Unbounded((*batch, *shape), **as_float) for name, shape in groups.items()}
+        if self.pixels:
+            seen = self.pixels.specs(batch, device)
+            if taken := sorted(groups.keys() & seen.keys()):
+                raise ValueError(f"{taken[0]!r} is what a camera sees: give the group of the observation another name")
+            observation |= seen
 
         def numbers(sizes: Mapping[str, int]) -> Composite:
             entries = {name: Unbounded((*batch, size), **as_float) for name, size in sizes.items()}
@@ -266,9 +273,6 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         if self._apart:
             apart = {group: numbers(sizes) for group, sizes in self._apart.items()}
             observation["observation_terms"] = Composite(apart, shape=batch, device=device)
-        if self.pixels:
-            seen = self.pixels.specs(batch, device)
-            observation = seen if self.pixels.only else {**observation, **seen}
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.observation_spec = Composite(observation, shape=batch, device=device)
         bounded, actions = self.action_range == BOUNDED, (*batch, self.mj_model.nu)
@@ -339,8 +343,11 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         *groups, reward, terms, metrics, flags = outputs.parts(outputs.memory.clone())
         done, terminated, truncated = flags.view(3, *batch, 1).unbind()
         entries = {"done": done, "terminated": terminated, "truncated": truncated}
-        for (name, shape), group in zip(self.groups.items(), groups, strict=True):
-            entries[name] = group.view(*batch, *shape)
+        if self.pixels:
+            entries |= self.pixels.entries(self.world.eye, batch)
+        if not (self.pixels and self.pixels.only):
+            for (name, shape), group in zip(self.groups.items(), groups, strict=True):
+                entries[name] = group.view(*batch, *shape)
         if with_reward:
             entries["reward"] = reward.view(*batch, 1)
         result = TensorDict._new_unsafe(entries, batch_size=batch, device=self.device)  # they need no checks
@@ -359,10 +366,6 @@ class LocoEnv(Task, WorldAccess, QuickResets):
                 group: dict(zip(sizes, newest[group].split([*sizes.values()], -1), strict=True))
                 for group, sizes in self._apart.items()
             }
-        if self.pixels:
-            if self.pixels.only:
-                result = result.select(*self.done_keys, *["reward"] * with_reward)
-            result.update(self.pixels.entries(self.world.eye, batch))
         return result
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:

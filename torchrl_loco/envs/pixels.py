@@ -15,6 +15,8 @@ from torchrl_loco.sim.simulation import check_memory
 
 SIZE = (84, 84)
 """Width and height of pixels, those of dm_control's benchmarks from pixels."""
+KEYS = {"rgb": "pixels", "depth": "depth"}
+"""Keys of what is drawn."""
 COPIES = 3
 """How often pixels lie in memory: where they are drawn, in what a step returns, and in what the next begins with."""
 DEPTHS = Interval(0, float("inf"))
@@ -29,7 +31,7 @@ class Pixels:
         width, height: of the pixels.
         kinds: what is drawn, of :data:`torchrl_loco.eyes.tracer.KINDS`.
         far: greatest depth (m).
-        only: whether the other observations are left out.
+        only: whether the groups of the observation are left out.
     """
 
     camera: int
@@ -66,7 +68,7 @@ class Pixels:
         if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
             raise ValueError(f"size must be the width and height of pixels, such as {SIZE}, got {size!r}")
         width, height = check_int("width", size[0]), check_int("height", size[1])
-        kinds = (*("rgb",) * with_rgb, *("depth",) * bool(far))
+        kinds = tuple(kind for kind, wanted in (("rgb", with_rgb), ("depth", far > 0)) if wanted)
         only = True if given["pixels_only"] is None else check_bool("pixels_only", given["pixels_only"])
         check_memory(COPIES * bytes_of(num_envs, width, height, kinds), num_envs, device)
         return cls(m.camera(0 if camera is None else camera).id, width, height, kinds, far, only)
@@ -74,19 +76,17 @@ class Pixels:
     def eye(self, sim: Simulation) -> Eye:
         """Returns what draws them."""
         size = self.width, self.height, sim.num_envs, self.kinds
-        return Eye(sim.mj_model, sim.device, self.camera, *size, far=self.far or 1.0)
+        return Eye(sim.mj_model, sim.device, self.camera, *size, far=self.far)
 
     def specs(self, batch: torch.Size, device: torch.device) -> dict[str, Bounded]:
         """Returns the specs of the entries by key."""
         size = self.height, self.width
         rgb = Bounded(0, 255, (*batch, *size, 3), dtype=torch.uint8, device=device)
         depth = Bounded(0.0, self.far, (*batch, *size), dtype=torch.float32, device=device)
-        return {
-            key: spec for kind, key, spec in (("rgb", "pixels", rgb), ("depth", "depth", depth)) if kind in self.kinds
-        }
+        return {KEYS[kind]: {"rgb": rgb, "depth": depth}[kind] for kind in self.kinds}
 
     def entries(self, eye: Eye | None, batch: torch.Size) -> dict[str, torch.Tensor]:
         """Returns copies of what is drawn, by key."""
         assert eye is not None
-        drawn = {"pixels": eye.rgb, "depth": eye.depth}
-        return {key: image.clone().view(*batch, *image.shape[1:]) for key, image in drawn.items() if len(image)}
+        drawn = {kind: getattr(eye, kind) for kind in self.kinds}
+        return {KEYS[kind]: image.clone().view(*batch, *image.shape[1:]) for kind, image in drawn.items()}
