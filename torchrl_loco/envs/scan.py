@@ -11,7 +11,7 @@ import warp as wp
 from torchrl_loco.envs.heights import Ground
 from torchrl_loco.eyes.rays import Rays
 from torchrl_loco.eyes.tracer import Eye
-from torchrl_loco.sim import Buffer, fill
+from torchrl_loco.sim import Buffer, array, fill
 from torchrl_loco.sim.compiled.collision.ground import NOTHING
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ NONE = wp.constant(wp.float32(NOTHING))
 
 
 @dataclasses.dataclass(frozen=True)
-class Asked:
+class ScanRequest:
     """A scan that hooks have asked for.
 
     Attributes:
@@ -36,7 +36,7 @@ class Asked:
 
 
 @dataclasses.dataclass(frozen=True)
-class Looked:
+class DepthRequest:
     """What a camera sees, for which hooks have asked.
 
     Attributes:
@@ -52,7 +52,7 @@ class Looked:
 
 
 @dataclasses.dataclass(frozen=True)
-class Cast:
+class RayRequest:
     """Rays from a site, for which hooks have asked.
 
     Attributes:
@@ -120,7 +120,6 @@ def scan(
     ground: Tables,
     body: int,
     points: wp.array[wp.vec2],
-    masked: bool,
     mask: wp.array[bool],
     xpos: wp.array2d[wp.vec3],
     xmat: wp.array2d[wp.mat33],
@@ -128,7 +127,7 @@ def scan(
     heights_out: wp.array2d[float],
 ):
     world, point = wp.tid()
-    if masked and not mask[world]:
+    if mask and not mask[world]:
         return
     place, mat, grid = xpos[world, body], xmat[world, body], points[point]
     x, y = mat[0, 0], mat[1, 0]
@@ -155,10 +154,14 @@ class Scans:
     """
 
     def __init__(
-        self, sim: "Simulation", asked: dict[str, Asked | Looked | Cast], ground: Ground | None, mask: wp.array
+        self,
+        sim: "Simulation",
+        asked: dict[str, ScanRequest | DepthRequest | RayRequest],
+        ground: Ground | None,
+        mask: wp.array,
     ) -> None:
-        self._eyes = {name: eye_of(sim, one) for name, one in asked.items() if not isinstance(one, Asked)}
-        self._asked = {name: one for name, one in asked.items() if isinstance(one, Asked)}
+        self._eyes = {name: eye_of(sim, one) for name, one in asked.items() if not isinstance(one, ScanRequest)}
+        self._asked = {name: one for name, one in asked.items() if isinstance(one, ScanRequest)}
         self._sim, self._mask = sim, mask
         self._ground = tables(ground, sim.device) if asked and ground is not None else None
         kept = {name: np.array(one.points, dtype=np.float32) for name, one in self._asked.items()}
@@ -170,26 +173,26 @@ class Scans:
 
     def all(self) -> None:
         """Launches them, in all worlds."""
-        self._launch(False)
+        self._launch(None)
 
     def begun(self) -> None:
         """Launches them, in the worlds in which episodes begin."""
-        self._launch(True)
+        self._launch(self._mask)
 
-    def _launch(self, masked: bool) -> None:
+    def _launch(self, mask: wp.array | None) -> None:
         data = self._sim.data
         for name, one in self._asked.items():
-            inputs = [self._ground, one.body, self._points[name], masked, self._mask, data.xpos, data.xmat]
+            inputs = [self._ground, one.body, self._points[name], mask, data.xpos, data.xmat]
             out = self._out[name].warp
             wp.launch(scan, dim=out.shape, inputs=inputs, outputs=[out], device=self._sim.device)
         for eye in self._eyes.values():
-            eye.launch(data.xpos, data.xmat, self._mask if masked else None)
+            eye.launch(data.xpos, data.xmat, mask)
 
 
-def eye_of(sim: "Simulation", asked: Looked | Cast) -> Eye | Rays:
+def eye_of(sim: "Simulation", asked: DepthRequest | RayRequest) -> Eye | Rays:
     """Returns what sees for hooks."""
     m, n = sim.mj_model, sim.num_envs
-    if isinstance(asked, Looked):
+    if isinstance(asked, DepthRequest):
         return Eye(m, sim.device, asked.camera, asked.width, asked.height, n, ("depth",), far=asked.far)
     mat = np.zeros(9)
     mujoco.mju_quat2Mat(mat, m.site_quat[asked.site])
@@ -199,12 +202,6 @@ def eye_of(sim: "Simulation", asked: Looked | Cast) -> Eye | Rays:
 
 def tables(ground: Ground, device: wp.Device) -> Tables:
     """Returns the ground as tables on a device."""
-
-    def array(rows: object, dtype: type, width: int = 1) -> wp.array:
-        kind = np.int32 if dtype in (int, wp.vec3i) else np.float32
-        values = np.array(rows, dtype=kind).reshape(-1, width) if width > 1 else np.array(rows, dtype=kind)
-        return wp.array(values, dtype=dtype, device=device)
-
     shapes = [field.heights.shape for field in ground.fields]
     starts = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
     heights = [field.heights.ravel() + field.corner[2] for field in ground.fields]
@@ -212,19 +209,19 @@ def tables(ground: Ground, device: wp.Device) -> Tables:
     return fill(
         Tables,
         plane=ground.plane,
-        corners=array([field.corner for field in ground.fields], wp.vec3, 3),
-        lengths=array([field.cell for field in ground.fields], wp.vec2, 2),
+        corners=array([field.corner for field in ground.fields], wp.vec3, device),
+        lengths=array([field.cell for field in ground.fields], wp.vec2, device),
         counts=array(
             [(columns - 1, rows - 1, start) for (rows, columns), start in zip(shapes, starts, strict=False)],
             wp.vec3i,
-            3,
+            device,
         ),
-        heights=array(np.concatenate(heights) if heights else [], float),
+        heights=array(np.concatenate(heights) if heights else [], float, device),
         grid=wp.vec3(*grid.corner, grid.cell) if grid else wp.vec3(),
         columns=grid.shape[0] if grid else 0,
         rows=grid.shape[1] if grid else 0,
-        first=array(grid.first if grid else [], int),
-        named=array(grid.named if grid else [], int),
-        places=array(boxes[:, :4], wp.vec4, 4),
-        tops=array(boxes[:, 4], float),
+        first=array(grid.first if grid else [], int, device),
+        named=array(grid.named if grid else [], int, device),
+        places=array(boxes[:, :4], wp.vec4, device),
+        tops=array(boxes[:, 4], float, device),
     )

@@ -12,7 +12,7 @@ import torch
 from torchrl_loco.checks import POSITIVE, check_float, check_int
 from torchrl_loco.envs import draws, heights, sensors
 from torchrl_loco.envs.names import Elements, Names
-from torchrl_loco.envs.scan import Asked, Cast, Looked
+from torchrl_loco.envs.scan import DepthRequest, RayRequest, ScanRequest
 from torchrl_loco.envs.tables import Entry, Table
 from torchrl_loco.envs.variation import Variation, constant_of
 from torchrl_loco.sim import models
@@ -73,7 +73,7 @@ class Catalog(Elements):
         self.arrays: set[str] = set()
         self.sensors: set[int] = set()
         self.contact_geoms: list[int] = []
-        self.scans: dict[str, Asked | Looked | Cast] = {}
+        self.scans: dict[str, ScanRequest | DepthRequest | RayRequest] = {}
         self.scanning: dict[str, set[str]] = {}
         self.complete = False
         self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}
@@ -370,7 +370,7 @@ class View:
             raise ValueError(f"grid must be points ahead and to the left, (points, 2), got {where.shape}")
         if not np.isfinite(where).all():
             raise ValueError("grid must be finite numbers (m)")
-        scan = self._scanned(Asked(self._id("body", body), tuple(map(tuple, where.tolist()))), (len(where),))
+        scan = self._scanned(ScanRequest(self._id("body", body), tuple(map(tuple, where.tolist()))), (len(where),))
         return scan if math.isnan(miss) else torch.where(scan.isnan(), miss, scan)
 
     def depth(self, camera: str, width: int, height: int, far: float = 10.0) -> torch.Tensor:
@@ -392,7 +392,7 @@ class View:
         """
         which = self._id("camera", camera)
         size = check_int("height", height), check_int("width", width)
-        return self._scanned(Looked(which, size[1], size[0], check_float("far", far, POSITIVE)), size)
+        return self._scanned(DepthRequest(which, size[1], size[0], check_float("far", far, POSITIVE)), size)
 
     def ray(self, site: str, directions: Any, far: float = 10.0) -> torch.Tensor:
         """Returns how far from a site lies what rays meet, shapes of all kinds and meshes among it.
@@ -415,7 +415,7 @@ class View:
         if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all() or not rows.any(1).all():
             raise ValueError(f"directions must be rows of 3 finite numbers that are not all 0, (rays, 3), got {rows!r}")
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-        asked = Cast(which, tuple(map(tuple, rows.tolist())), check_float("far", far, POSITIVE))
+        asked = RayRequest(which, tuple(map(tuple, rows.tolist())), check_float("far", far, POSITIVE))
         return self._scanned(asked, (len(rows),))
 
     def _id(self, kind: str, name: str) -> int:
@@ -430,7 +430,7 @@ class View:
             raise ValueError(f"name one {kind}: {name!r} matches {len(ids)}")
         return ids[0]
 
-    def _scanned(self, asked: Asked | Looked | Cast, shape: tuple[int, ...]) -> torch.Tensor:
+    def _scanned(self, asked: ScanRequest | DepthRequest | RayRequest, shape: tuple[int, ...]) -> torch.Tensor:
         """Returns the array of a scan, depths or rays, of a shape in each world: at the first call, numbers like them.
 
         Raises:
@@ -441,7 +441,7 @@ class View:
         if not self._catalog.complete:
             scans[name] = asked
             self._catalog.scanning.setdefault(self._hook, set()).add(name)
-            if isinstance(asked, Asked):
+            if isinstance(asked, ScanRequest):
                 heights.of_catalog(self._catalog)  # which may refuse
             return self.qpos[:, :1].view(-1, *[1] * len(shape)).expand(-1, *shape).clone()
         if name not in self._catalog.scanning.get(self._hook, ()):

@@ -3,7 +3,7 @@
 import mujoco
 import warp as wp
 
-from torchrl_loco.eyes.scene import Mounts, Shapes, shapes_of, to_the_horizon
+from torchrl_loco.eyes.scene import AT_BODY, AT_COM, OF_COM, TRACKS, Mounts, Shapes, shapes_of
 from torchrl_loco.eyes.shapes import CAPSULE, CYLINDER, PLANE
 from torchrl_loco.sim import EXCLUSIVE
 
@@ -11,10 +11,6 @@ WHOLE = wp.constant(wp.float32(1.0e6))
 """Bound of a picture on the plane in front of the camera."""
 NEAR = wp.constant(wp.float32(1.0e-4))
 """Depth from which a sphere is wholly in front of the camera (m)."""
-TRACKS = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK))
-OF_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
-AT_BODY = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY))
-AT_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM))
 
 
 @wp.func
@@ -142,28 +138,26 @@ class Placed:
         lights: where they are, and against what they shine, in the camera's frame.
         placed: origin and axes of the camera in the frame of each shape.
         bounds: from where to where each can be in the picture.
-        everywhere: the mask of all worlds.
     """
 
     def __init__(self, m: mujoco.MjModel, device: wp.Device, mounts: Mounts, worlds: int) -> None:
         self._mounts, self._device = mounts, device
         with EXCLUSIVE, wp.ScopedDevice(device):
-            self.shapes, self._meshes = shapes_of(to_the_horizon(m), device)
+            self.shapes, self._meshes = shapes_of(m, device)
             self.has_meshes = bool(self._meshes)
             size = worlds, self.shapes.kind.shape[0]
             self._pos, self.camera = wp.empty(worlds, dtype=wp.vec3), wp.empty(worlds, dtype=wp.mat33)
             self.lights = [wp.empty((worlds, mounts.mode.shape[0] - 1), dtype=wp.vec3) for _ in range(2)]
             self.placed = [wp.empty(size, dtype=kind) for kind in (wp.vec3, wp.mat33)]
             self.bounds = wp.empty(size, dtype=wp.vec4)
-            self.everywhere = wp.empty(0, dtype=bool)
 
-    def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array) -> None:
+    def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array | None) -> None:
         """Launches what places them, on Warp's current stream.
 
         Args:
             xpos: positions of the bodies (m), ``(worlds or more, nbody)``.
             xmat: their orientations.
-            mask: the worlds.
+            mask: the worlds; ``None`` is all.
         """
         here, camera = [mask, xpos, xmat], [self._pos, self.camera]
         for kernel, dim, inputs, outputs in (

@@ -5,9 +5,9 @@ import numpy as np
 import warp as wp
 
 from torchrl_loco.eyes.placing import Placed
-from torchrl_loco.eyes.scene import Shapes, array, mounts_at
+from torchrl_loco.eyes.scene import Shapes, mounts_at, to_the_horizon
 from torchrl_loco.eyes.shapes import MESH, to_mesh, to_shape
-from torchrl_loco.sim import EXCLUSIVE, Buffer
+from torchrl_loco.sim import EXCLUSIVE, Buffer, array
 
 
 @wp.kernel(enable_backward=False)
@@ -65,7 +65,7 @@ class Rays:
     ) -> None:
         one = np.zeros(1)
         mounts = mounts_at(m, device, one, one + body, one - 1, pos[None], mat[None])
-        self._placed, self._device, self._far = Placed(m, device, mounts, worlds), device, far
+        self._placed, self._device, self._far = Placed(to_the_horizon(m), device, mounts, worlds), device, far
         with EXCLUSIVE, wp.ScopedDevice(device):
             self._directions = array(directions, wp.vec3, device)
             self._out = Buffer((worlds, len(directions)), float, device)
@@ -80,7 +80,6 @@ class Rays:
             mask: the worlds; ``None`` is all.
         """
         placed, out = self._placed, self._out.warp
-        mask = placed.everywhere if mask is None else mask
         placed.launch(xpos, xmat, mask)
         inputs = [placed.shapes, mask, self._directions, self._far, *placed.placed]
         wp.launch(cast, out.shape, inputs, [out], device=self._device)

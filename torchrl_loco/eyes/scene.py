@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from torchrl_loco.eyes.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, FIELD, MESH, PLANE, SPHERE
-from torchrl_loco.sim import fill
+from torchrl_loco.sim import array, fill
 
 KINDS = (PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)
 """Types of geoms that are seen."""
@@ -19,6 +19,11 @@ FULL_SHINE = 128.0
 """Exponent of a highlight where a material's shininess is 1."""
 HIDDEN = 1e-3
 """Opacity up to which a geom is not seen."""
+TRACKS = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK))
+OF_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
+AT_BODY = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY))
+AT_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM))
+"""Modes of cameras and lights."""
 EDGES = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 """Corners of a box, and of its sides, seen from outside."""
@@ -101,7 +106,7 @@ def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device) -> Mounts:
     mujoco.mju_quat2Mat(frames[0], m.cam_quat[camera])
     fixed = [frames[0].reshape(3, 3), *(facing(m.light_dir[light]) for light in lights)]
     whole = [m.cam_mat0[camera].reshape(3, 3), *(facing(m.light_dir0[light]) for light in lights)]
-    tracks, of_com = mode == 1, mode == 2
+    tracks, of_com = mode == TRACKS, mode == OF_COM
     pos = np.where(tracks[:, None], of(m.cam_pos0, m.light_pos0), of(m.cam_pos, m.light_pos))
     pos = np.where(of_com[:, None], of(m.cam_poscom0, m.light_poscom0), pos)
     mat = np.where((tracks | of_com)[:, None, None], np.array(whole), np.array(fixed))
@@ -321,12 +326,3 @@ def textures(m: mujoco.MjModel, flat: list[int]) -> tuple[np.ndarray, np.ndarray
     sky = image(skies[0])
     sky = np.tile(sky, (1 if len(sky) > sky.shape[1] else 6, 1, 1))  # one side stands for all
     return table, np.concatenate([*texels, sky.reshape(-1, 3)]), (count, sky.shape[1])
-
-
-def array(values: np.ndarray, kind: Any, device: wp.Device) -> wp.array:
-    """Returns numbers as an array of Warp's, of vectors or matrices too."""
-    shape = getattr(kind, "_shape_", ())
-    scalar = {int: np.int32, float: np.float32, bool: np.bool_, wp.uint64: np.uint64, wp.vec3i: np.int32}
-    values = np.asarray(values).astype(scalar.get(kind, np.float32))
-    outer = values.shape[: values.ndim - len(shape)] if values.size else (0,) * max(values.ndim - len(shape), 1)
-    return wp.array(np.ascontiguousarray(values.reshape(*outer, *shape)), dtype=kind, device=device)

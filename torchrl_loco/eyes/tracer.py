@@ -276,11 +276,11 @@ class Eye:
         far: float = 1.0e10,
         along_ray: bool = False,
     ) -> None:
-        which = m.camera(camera).id
+        m, which = to_the_horizon(m), m.camera(camera).id
         self._device, half = device, math.tan(math.radians(m.cam_fovy[which] / 2.0))
         with EXCLUSIVE, wp.ScopedDevice(device):
             self._placed = Placed(m, device, mounts_of(m, which, device), worlds)
-            self._looks, self._view = looks_of(to_the_horizon(m), device), View()
+            self._looks, self._view = looks_of(m, device), View()
             self._view.half, self._view.far = wp.vec2(half * width / height, half), far
             self._view.width, self._view.height = width, height
             self._view.samples, self._view.along_ray = samples, along_ray
@@ -301,7 +301,6 @@ class Eye:
             mask: the worlds that look; ``None`` is all.
         """
         placed, out = self._placed, [one.warp for one in self._out]
-        mask = placed.everywhere if mask is None else mask
         placed.launch(xpos, xmat, mask)
         size = next(one.shape for one in out if one.size)
         where = [mask, placed.camera, *placed.lights, *placed.placed, placed.bounds]

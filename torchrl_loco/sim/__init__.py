@@ -4,6 +4,7 @@ import warp as wp
 
 from torchrl_loco.sim.buffer import Buffer as Buffer
 from torchrl_loco.sim.buffer import PackedBuffers as PackedBuffers
+from torchrl_loco.sim.buffer import array as array
 from torchrl_loco.sim.graph import EXCLUSIVE as EXCLUSIVE
 from torchrl_loco.sim.graph import Direct as Direct
 from torchrl_loco.sim.graph import Graph as Graph
