@@ -129,6 +129,33 @@ def test_light_falls_off_and_casts_shadows():
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_the_last_pictures_of_an_episode_are_stacked(device):
+    """A state holds them; one without begins with what is seen then."""
+    options = {"from_pixels": True, "pixels_only": False, "size": (24, 16), "episode_length": 4, "frame_stack": 3}
+    env = loco.make("walker_walk", 3, device, 0, **options)
+    check_env_specs(env)
+    env.set_seed(0)
+    td, generator = env.reset(), torch.Generator().manual_seed(0)
+    actions = (torch.rand(4, 3, 6, generator=generator) * 2 - 1).to(env.device)
+    assert torch.equal(td["pixels"][..., :3], td["pixels"][..., 6:])
+    pictures = [td["pixels"][..., 6:]] * 3
+    for action in actions[:3]:
+        before, td = env.step_and_maybe_reset(td.set("action", action))
+        pictures = [*pictures[1:], before["next", "pixels"][..., 6:]]
+        assert torch.equal(before["next", "pixels"], torch.cat(pictures, dim=-1))
+    state = env.get_state()
+    last, begun = env.step_and_maybe_reset(td.clone().set("action", actions[3]))
+    assert last["next", "done"].all()
+    assert torch.equal(begun["pixels"][..., :3], begun["pixels"][..., 6:])
+    restored = env.reset(state.clone(), set_state=True)
+    assert torch.equal(restored["pixels"], td["pixels"])
+    again, _ = env.step_and_maybe_reset(restored.set("action", actions[3]))
+    assert torch.equal(again["next", "pixels"], last["next", "pixels"])
+    bare = env.reset(loco.State(state.exclude("pictures").to_dict(), batch_size=[3]), set_state=True)
+    assert torch.equal(bare["pixels"], td["pixels"][..., 6:].repeat(1, 1, 1, 3))
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_pixels_are_entries_that_hold_what_they_held(device):
     """With the true last frame of an episode; they are the same alone and among others."""
     options = {"from_pixels": True, "depth": 8.0, "size": (24, 16), "camera": "side", "episode_length": 3}

@@ -182,5 +182,14 @@ def sim_config(
 
 
 def arguments_of(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the fields of :class:`SimConfig` and the options of its task that a policy's information names."""
-    return {name: value for name, value in info.get("sim", {}).items() if value is not None} | info.get("options", {})
+    """Returns the arguments of its environment that a policy's information names: simulation, options, pixels."""
+    sim = {name: value for name, value in info.get("sim", {}).items() if value is not None}
+    return sim | info.get("options", {}) | pixels_of(info)
+
+
+def pixels_of(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the arguments of an environment whose pixels the settings of a training ask for, none without."""
+    if not settings.get("from_pixels"):
+        return {}
+    chosen = {name: settings[name] for name in ("size", "frame_stack")}
+    return {"from_pixels": True, "pixels_only": False, "camera": settings["camera"] or None, **chosen}

@@ -38,12 +38,13 @@ def export_policy(policy: Policy, path: Path) -> float:
     """Writes a policy, with its normalisation of observations, as a file that needs none of this package.
 
     What is written takes ``observation``, float32 of shape ``(batch, n)`` for any batch, and gives ``action``, float32
-    of shape ``(batch, m)``, in [-1, 1] unless the task's actions are unbounded. Before the file is written, it is
-    compared with the policy, on the CPU and on random observations that reach beyond those of the training. Information
-    travels with it: task, protocol, sizes, bounds of an action, the time between two control steps (s), for how many of
-    them an action is held, and all of ``policy.info``; as ``metadata_props`` in ONNX, in the extra file
-    ``metadata.json`` with torch.export. So do the terms of the observation where it has names, how actions become
-    controls, and what is known of the robot: :func:`torchrl_loco.export.of_robot`.
+    of shape ``(batch, m)``, in [-1, 1] unless the task's actions are unbounded. Of a policy that sees, ``observation``
+    is pixels, uint8 of shape ``(batch, height, width, channels)``. Before the file is written, it is compared with the
+    policy, on the CPU and on random observations that reach beyond those of the training. Information travels with it:
+    task, protocol, sizes, bounds of an action, the time between two control steps (s), for how many of them an action
+    is held, and all of ``policy.info``; as ``metadata_props`` in ONNX, in the extra file ``metadata.json`` with
+    torch.export. So do the terms of the observation where it has names, how actions become controls, and what is known
+    of the robot: :func:`torchrl_loco.export.of_robot`.
 
     Of a task that follows a reference the file takes ``time_step`` too, int64 ``(batch,)``, a frame of it, and gives
     rows of the tables of :meth:`torchrl_loco.LocoEnv.reference` beside the action.
@@ -224,7 +225,7 @@ def of_robot(policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
     env = cls(
         1, "cpu", 0, policy.info["protocol"], **{**arguments_of(policy.info), "engine": "mujoco"}, compile_hooks=False
     )  # tells the terms
-    terms, cases, reference = env.observation_layout["observation"], env.cases(), dict(env.reference())
+    terms, cases, reference = env.observation_layout.get(policy.in_keys[0], {}), env.cases(), dict(env.reference())
     env.close()
     scaled = {"action_offset": (0.5 * (low + high)).tolist(), "action_scale": (0.5 * (high - low)).tolist()}
     facts = {

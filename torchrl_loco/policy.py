@@ -13,6 +13,7 @@ from torch import nn
 from torchrl_loco import storage
 from torchrl_loco.checks import check_choice, check_device
 from torchrl_loco.config import PROTOCOLS
+from torchrl_loco.encoder import PixelEncoder
 from torchrl_loco.registry import canonical_id
 
 SHIPPED = Path(__file__).parent / "policies"
@@ -81,15 +82,20 @@ class ObservationNorm(nn.Module):
 
 
 @torch.no_grad()
-def moments(observation: torch.Tensor) -> tuple[int, torch.Tensor, torch.Tensor]:
-    """Returns the number of observations of shape ``(..., size)``, their mean and variance, each ``(size,)``."""
-    batch = observation.flatten(0, -2)
+def moments(observation: torch.Tensor, first: int = -1) -> tuple[int, torch.Tensor, torch.Tensor]:
+    """Returns the number of observations of shape ``(..., size)``, their mean and variance, each ``(size,)``.
+
+    They begin at the dimension ``first``, if they have several.
+    """
+    batch = observation.flatten(0, first - 1)
     var, mean = torch.var_mean(batch, dim=0, correction=0)
     return len(batch), mean, var
 
 
 class Policy(TensorDictModule):
     """A deterministic policy: reads ``observation``, shape ``(..., n)``, and writes ``action``, shape ``(..., m)``.
+
+    One whose network begins with a :class:`~torchrl_loco.encoder.PixelEncoder` reads ``pixels`` instead.
 
     Args:
         network: an :class:`~torchrl_loco.policy.ObservationNorm`, then linear layers, layer norms and activations; the
@@ -98,7 +104,8 @@ class Policy(TensorDictModule):
     """
 
     def __init__(self, network: nn.Sequential, info: dict[str, Any]) -> None:
-        super().__init__(network, in_keys=["observation"], out_keys=["action"])
+        reads = "pixels" if isinstance(network[0], PixelEncoder) else "observation"
+        super().__init__(network, in_keys=[reads], out_keys=["action"])
         self.info = info
 
     @property
@@ -171,6 +178,7 @@ def _in_8_bits(name: str, weight: torch.Tensor) -> dict[str, torch.Tensor]:
 
 KINDS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
     "observation_norm": (ObservationNorm, ("limit",)),
+    "pixel_encoder": (PixelEncoder, ("shape", "channels", "features")),
     "linear": (nn.Linear, ()),
     "layer_norm": (nn.LayerNorm, ("eps",)),
     "silu": (nn.SiLU, ()),
@@ -223,13 +231,17 @@ def copied(layer: nn.Module) -> nn.Module:
 def random_observations(network: Any, count: int, spread: float) -> torch.Tensor:
     """Returns observations ``(count, n)`` on the CPU, always the same, ``spread`` times as spread as in the training.
 
+    Of a network that reads pixels they are noise, uint8 ``(count, height, width, channels)``.
+
     Raises:
-        TypeError: the network does not begin by normalising observations.
+        TypeError: the network begins with neither a norm of observations nor an encoder of pixels.
     """
-    norm = network[0]
+    norm, generator = network[0], torch.Generator().manual_seed(0)
+    if isinstance(norm, PixelEncoder):
+        return torch.randint(0, 256, (count, *norm.shape), dtype=torch.uint8, generator=generator)
     if not isinstance(norm, ObservationNorm):
         raise TypeError(f"a policy must begin with an ObservationNorm, this one begins with {type(norm).__name__}")
-    noise = torch.randn(count, len(norm.mean), generator=torch.Generator().manual_seed(0))
+    noise = torch.randn(count, len(norm.mean), generator=generator)
     return norm.mean.cpu() + spread * noise * (norm.var.cpu() + 1e-6).sqrt()
 
 

@@ -56,6 +56,7 @@ class Exported:
 
     Attributes:
         facts: what the file says, by name: see :func:`torchrl_loco.export.of_robot`.
+        reads: the entry of an environment that it reads.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -80,6 +81,7 @@ class Exported:
             raise ValueError(f"{path} does not say its task: it must be a file that torchrl-loco export wrote")
         if task is not None:
             self.facts["task"] = task
+        self.reads = "pixels" if self.facts.get("info", {}).get("from_pixels") else "observation"
 
     def act(self, observation: "torch.Tensor") -> "torch.Tensor":
         """Returns the actions ``(n, nu)`` for observations ``(n, size)``, on their device."""
@@ -234,7 +236,7 @@ def _worlds(
         **more,
     )
     for name, size, own in (
-        ("observation", facts["observation_size"], env.observation_spec["observation"].shape[-1]),
+        ("observation", facts["observation_size"], env.observation_spec[exported.reads].shape[-1]),
         ("action", facts["action_size"], env.mj_model.nu),
     ):
         if size != own:
@@ -355,7 +357,7 @@ def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str)
     sums: dict[str, list[torch.Tensor]] = {}
     for t in trange(steps, desc=label, leave=False, disable=None):  # no bar in logs
         if t % hold == 0:
-            action = exported.act(td["observation"])
+            action = exported.act(td[exported.reads])
         late = torch.cat([action.unsqueeze(0), late[:-1]])
         after = env.step(td.set("action", late.gather(0, behind.view(1, n, 1).expand(1, n, late.shape[2]))[0]))["next"]
         counts["return"] += after["reward"].squeeze(-1) * alive

@@ -22,7 +22,13 @@ def walk(env, td, moves):
 
 def assert_same(one, other):
     assert set(one.keys()) == set(other.keys())
-    assert set(State.KEYS) - set(one.keys()) <= {"act", "memory", "shared", "model"}  # of bodies that have none
+    assert set(State.KEYS) - set(one.keys()) <= {
+        "act",
+        "memory",
+        "shared",
+        "model",
+        "pictures",
+    }  # of bodies that have none
     assert (one == other).all()
 
 
@@ -141,11 +147,11 @@ def test_a_restored_state_is_not_returned(shared):
     state = env.get_state()
     td = env.reset(state, set_state=True)
     assert not set(State.KEYS) & set(td.keys())
-    assert set(state.keys()) == set(State.KEYS) - {"act", "memory", "shared", "model"}
+    assert set(state.keys()) == set(State.KEYS) - {"act", "memory", "shared", "model", "pictures"}
     assert env.reset(State(state.to_dict(), batch_size=[4]), set_state=True).device == env.device
     td = torchrl_loco.TransformedEnv(env, InitTracker()).reset(state, set_state=True)
     assert not set(State.KEYS) & set(td.keys())
-    assert set(state.keys()) == set(State.KEYS) - {"act", "memory", "shared", "model"}
+    assert set(state.keys()) == set(State.KEYS) - {"act", "memory", "shared", "model", "pictures"}
     assert TransformedEnv(env, InitTracker()).reset(state, set_state=True) is state  # TorchRL's own
 
 

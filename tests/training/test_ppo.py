@@ -166,7 +166,8 @@ def test_gradients_are_those_of_clip_ppo_loss(bounded):
     if bounded:
         action = td["before_tanh"]
         log_prob = log_prob + (1.0 - action.tanh().square()).log().sum(-1)
-    data = TensorDict({**ppo._normalised(td), **targets, "action": action, "log_prob": log_prob}, batch_size=[128])
+    rows = {key: ppo._read(td, key) for key in ppo.norms}
+    data = TensorDict({**rows, **targets, "action": action, "log_prob": log_prob}, batch_size=[128])
     ppo.optimizer.clipped_step = lambda norm: torch.zeros(())
     torch.manual_seed(1)
     metrics = dict(zip(ppo.metric_names, ppo.gradient_step(data), strict=True))
@@ -377,9 +378,8 @@ def test_a_critic_may_be_any_module():
 
     ppo = PPO(config, WALKER, network)
     seen = torch.randn(20, 24)
-    value = ppo._value(
-        ppo._normalised(TensorDict({"observation": seen}, [20]))["observation"], ppo.optimizer.wide(torch.float32)
-    )
+    rows = ppo._read(TensorDict({"observation": seen}, [20]), "observation")
+    value = ppo._value(rows, ppo.optimizer.wide(torch.float32))
     torch.testing.assert_close(value, ppo.critic.module(seen))
     assert all(by > 0.0 for by in one_update(ppo).values())
 

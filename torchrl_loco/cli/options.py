@@ -91,11 +91,13 @@ def task_options(args: list[str]) -> Any:
     preset_options = argparse.ArgumentParser("torchrl-loco train", usage, add_help=False, allow_abbrev=False)
     for flag in ("--device", "--algorithm"):
         preset_options.add_argument(flag)
+    preset_options.add_argument("--from_pixels", "--from-pixels", action="store_true")
     chosen, args[:] = preset_options.parse_known_args(args)
     if len(args) > 1 and not args[1].startswith("-"):
+        pixels: dict[str, Any] = {"from_pixels": True} if chosen.from_pixels else {}
         with user_errors():
             task = task_name(args[1], by_user=True)
-            config = _options(preset(task, chosen.device, chosen.algorithm))
+            config = _options(preset(task, chosen.device, chosen.algorithm, **pixels))
             _check_names(args[2:], config)
             note = tuning_note(config)
             words = about[task] if task in list_envs() else (resolve(task).__doc__ or "").strip().partition("\n")[0]

@@ -86,6 +86,8 @@ class LocoEnv(Task, WorldAccess, QuickResets):
             pixels. Terms of the reward and metrics that are asked for stay.
         camera: name or number of a camera of the model; ``None`` takes the first.
         size: width and height of the pixels; ``None`` is 84 by 84.
+        frame_stack: how many of the last pictures ``"pixels"`` holds, one after the other along its last dimension, the
+            newest last; ``None`` is 1. An episode begins with copies of its first.
         depth: greatest depth (m); if it is not 0, ``"depth"`` ``(num_envs, height, width)`` tells how far along the
             camera's axis lies what it sees (m).
         config: fields of :class:`torchrl_loco.SimConfig` to override, and the task's own :attr:`options`.
@@ -134,6 +136,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         pixels_only: bool | None = None,
         camera: str | int | None = None,
         size: tuple[int, int] | None = None,
+        frame_stack: int | None = None,
         depth: float = 0.0,
         **config: Any,
     ) -> None:
@@ -166,6 +169,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         mj_model = models.load(self.model, folder_of(type(self)), None, sim_settings.solids_on_terrain)
         self.check_model(mj_model)
         seen = {"from_pixels": from_pixels, "pixels_only": pixels_only, "camera": camera, "size": size, "depth": depth}
+        seen["frame_stack"] = frame_stack
         pixels = Pixels.checked(mj_model, seen, worlds, device)
         if apart and pixels and pixels.only:
             raise ValueError("observation_terms are of the observation, which pixels leave out: pass pixels_only=False")
@@ -344,7 +348,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         done, terminated, truncated = flags.view(3, *batch, 1).unbind()
         entries = {"done": done, "terminated": terminated, "truncated": truncated}
         if self.pixels:
-            entries |= self.pixels.entries(self.world.eye, batch)
+            entries |= self.pixels.entries(self.world.seen, batch)
         if not (self.pixels and self.pixels.only):
             for (name, shape), group in zip(self.groups.items(), groups, strict=True):
                 entries[name] = group.view(*batch, *shape)

@@ -31,6 +31,7 @@ class Pixels:
         width, height: of the pixels.
         kinds: what is drawn, of :data:`torchrl_loco.eyes.tracer.KINDS`.
         far: greatest depth (m).
+        stack: how many of the last pictures in colour an entry holds, the newest last.
         only: whether the groups of the observation are left out.
     """
 
@@ -39,6 +40,7 @@ class Pixels:
     height: int
     kinds: tuple[str, ...]
     far: float
+    stack: int
     only: bool
 
     @classmethod
@@ -54,7 +56,7 @@ class Pixels:
         """
         with_rgb, far = check_bool("from_pixels", given["from_pixels"]), check_float("depth", given["depth"], DEPTHS)
         if not with_rgb and not far:
-            if extra := [name for name in ("pixels_only", "camera", "size") if given[name] is not None]:
+            if extra := [name for name in ("pixels_only", "camera", "size", "frame_stack") if given[name] is not None]:
                 raise ValueError(f"{extra[0]} needs from_pixels=True, or the greatest depth to be seen (m) as depth")
             return None
         names, camera = [m.camera(i).name for i in range(m.ncam)], given["camera"]
@@ -70,23 +72,71 @@ class Pixels:
         width, height = check_int("width", size[0]), check_int("height", size[1])
         kinds = tuple(kind for kind, wanted in (("rgb", with_rgb), ("depth", far > 0)) if wanted)
         only = True if given["pixels_only"] is None else check_bool("pixels_only", given["pixels_only"])
-        check_memory(COPIES * bytes_of(num_envs, width, height, kinds), num_envs, device)
-        return cls(m.camera(0 if camera is None else camera).id, width, height, kinds, far, only)
+        stack = 1 if given["frame_stack"] is None else check_int("frame_stack", given["frame_stack"])
+        check_memory(COPIES * stack * bytes_of(num_envs, width, height, kinds), num_envs, device)
+        return cls(m.camera(0 if camera is None else camera).id, width, height, kinds, far, stack, only)
 
-    def eye(self, sim: Simulation) -> Eye:
-        """Returns what draws them."""
+    def settings(self, m: mujoco.MjModel) -> dict[str, Any]:
+        """Returns the settings of a training in which the same is seen, none without colours.
+
+        Raises:
+            ValueError: the camera has no name.
+        """
+        if "rgb" not in self.kinds:
+            return {}
+        if not (name := m.camera(self.camera).name) and self.camera:
+            raise ValueError(f"camera {self.camera} needs a name to train with")
+        return {"camera": name, "size": (self.width, self.height), "frame_stack": self.stack}
+
+    def seen(self, sim: Simulation) -> "Seen":
+        """Returns what draws them, and keeps them."""
         size = self.width, self.height, sim.num_envs, self.kinds
-        return Eye(sim.mj_model, sim.device, self.camera, *size, far=self.far)
+        return Seen(Eye(sim.mj_model, sim.device, self.camera, *size, far=self.far), self.stack)
 
     def specs(self, batch: torch.Size, device: torch.device) -> dict[str, Bounded]:
         """Returns the specs of the entries by key."""
         size = self.height, self.width
-        rgb = Bounded(0, 255, (*batch, *size, 3), dtype=torch.uint8, device=device)
+        rgb = Bounded(0, 255, (*batch, *size, 3 * self.stack), dtype=torch.uint8, device=device)
         depth = Bounded(0.0, self.far, (*batch, *size), dtype=torch.float32, device=device)
         return {KEYS[kind]: {"rgb": rgb, "depth": depth}[kind] for kind in self.kinds}
 
-    def entries(self, eye: Eye | None, batch: torch.Size) -> dict[str, torch.Tensor]:
+    def entries(self, seen: "Seen | None", batch: torch.Size) -> dict[str, torch.Tensor]:
         """Returns copies of what is drawn, by key."""
-        assert eye is not None
-        drawn = {kind: getattr(eye, kind) for kind in self.kinds}
-        return {KEYS[kind]: image.clone().view(*batch, *image.shape[1:]) for kind, image in drawn.items()}
+        assert seen is not None
+        return {
+            KEYS[kind]: image.clone().view(*batch, *image.shape[1:])
+            for kind, image in (("rgb", seen.stack), ("depth", seen.eye.depth))
+            if kind in self.kinds
+        }
+
+
+class Seen:
+    """What is drawn in all worlds, with the pictures before.
+
+    Attributes:
+        eye: what draws.
+        count: how many pictures are kept.
+        stack: the last pictures, uint8 ``(worlds, height, width, 3 * count)``, the newest last; after a reset all are
+            the first one.
+    """
+
+    def __init__(self, eye: Eye, count: int) -> None:
+        self.eye, self.count = eye, count
+        self.stack = eye.rgb if count == 1 else eye.rgb.repeat(1, 1, 1, count)
+
+    def append(self) -> None:
+        """Adds what was drawn of all worlds."""
+        if self.count > 1:
+            self.stack.copy_(torch.cat([self.stack[..., 3:], self.eye.rgb], dim=-1))
+
+    def begin(self, mask: torch.Tensor, kept: bool = False) -> None:
+        """Begins anew in the worlds of a mask ``(worlds,)``, with what was drawn of them.
+
+        Args:
+            mask: the worlds.
+            kept: whether pictures stay where there are any: those of a state that was restored.
+        """
+        if self.count > 1:
+            anew = mask.bool() & (self.stack == 0).flatten(1).all(dim=1) if kept else mask.bool()
+            first = self.eye.rgb.repeat(1, 1, 1, self.count)
+            self.stack.copy_(torch.where(anew.view(-1, 1, 1, 1), first, self.stack))

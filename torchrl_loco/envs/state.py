@@ -21,6 +21,7 @@ class State(TensorDict):
     ``act``             ``(N, na)``  activations of the actuators, if the model has any
     ``memory``          nested       entries of the task's memory by name, if it has any
     ``shared``          nested       what worlds share, by name, the same in each row, if the task has any
+    ``pictures``        ``(N, ...)`` the last pixels, where ``frame_stack`` keeps several
     ``model``           nested       by field, ``(N, numbers that vary)``, if ``randomize`` names any
     ``elapsed_steps``   ``(N,)``     control steps since the world's reset
     ``episode``         ``(N,)``     episodes begun: index of the next random stream
@@ -35,7 +36,7 @@ class State(TensorDict):
     """
 
     PHYSICS = ("qpos", "qvel", "qacc_warmstart", "act")
-    KEYS = (*PHYSICS, "memory", "shared", "model", "elapsed_steps", "episode")
+    KEYS = (*PHYSICS, "memory", "shared", "model", "pictures", "elapsed_steps", "episode")
 
     def branch(self, world: int, num_envs: int | None = None) -> "State":
         """Returns a state in which every world is a copy of one, to try different futures from the same moment.

@@ -90,7 +90,7 @@ class World:
         terminated: whether the episode ended by the task's hook, or because the world is not finite, ``(nworld,)``.
         truncated: whether the episode reached the time limit, or the task's hook cut it off, ``(nworld,)``.
         seed: seed of all random streams, ``(1,)``.
-        eye: what draws pixels, if the environment returns any.
+        seen: the pixels, if the environment returns any.
         health: counts what went wrong in the physics.
         kinds: by hook of the task in torch, how it runs: see ``Part.kind`` in ``part.py``.
         fixed: attributes of the task that were read when this was made, and never again.
@@ -138,7 +138,7 @@ class World:
             self._seed_of_hooks = torch.zeros(1, dtype=torch.long, device=task.device)
             self._stagger = Buffer(1, bool, device)
             self.mask.warp.fill_(True)
-            self.eye = task.pixels.eye(self.sim) if task.pixels else None
+            self.seen = task.pixels.seen(self.sim) if task.pixels else None
 
             self.health = Health(self.sim, task.on_overflow)
             self._monitors: list[Monitor] = [self.health]
@@ -184,6 +184,23 @@ class World:
         self._settle()  # poses and sensors; fused observation
         self._observe_begun()  # observation()
         self._look_begun()  # pixels
+
+    # Pixels.
+
+    def _look(self) -> None:
+        if self.seen:
+            self._draw()
+            self.seen.append()
+
+    def _look_begun(self) -> None:
+        if self.seen:
+            self._draw_begun()
+            self.seen.begin(self.mask.torch)
+
+    def _look_restored(self) -> None:
+        if self.seen:
+            self._draw_begun()
+            self.seen.begin(self.mask.torch, kept=True)
 
     # What each world does besides the physics, in Warp.
 
@@ -262,13 +279,13 @@ class World:
     def _launch_move(self) -> None:
         self.sim.forward(self._moved.warp, after=self._fused, contacts=False)  # which belong to the step
 
-    def _launch_look(self) -> None:
-        assert self.eye is not None
-        self.eye.launch(self.sim.data.xpos, self.sim.data.xmat)
+    def _launch_draw(self) -> None:
+        assert self.seen is not None
+        self.seen.eye.launch(self.sim.data.xpos, self.sim.data.xmat)
 
-    def _launch_look_begun(self) -> None:
-        assert self.eye is not None
-        self.eye.launch(self.sim.data.xpos, self.sim.data.xmat, self.mask.warp)
+    def _launch_draw_begun(self) -> None:
+        assert self.seen is not None
+        self.seen.eye.launch(self.sim.data.xpos, self.sim.data.xmat, self.mask.warp)
 
     def _launch_refresh(self) -> None:
         self.sim.forward(self.mask.warp, after=[*self._fused, *self._check_finite])
@@ -316,7 +333,7 @@ class World:
         launches += [self._launch_rest] if own or variation else []
         launches += [self._launch_conclude] if own else []
         launches += [self._scans.all, self._scans.begun] if self._scans.arrays else []
-        launches += [self._launch_look, self._launch_look_begun] if self.eye else []
+        launches += [self._launch_draw, self._launch_draw_begun] if self.seen else []
         sim.compile(*launches, *([self._launch_move] if hooks.moves else []))
         for each in kernels:
             each.record(sim)
@@ -330,10 +347,10 @@ class World:
         self._rest = self._record(self._launch_rest) if own or variation else _nothing
         self._conclude = self._record(self._launch_conclude) if own else _nothing
         self._move = self._keeping_what_was(self._record(self._launch_move)) if hooks.moves else _nothing
-        self._look = self._record(self._launch_look) if self.eye else _nothing
-        self._look_begun = self._record(self._launch_look_begun) if self.eye else _nothing
-        self._run_step = self._as_graph("_take_step", several=bool(own or self.eye))
-        self._run_reset = self._as_graph("_begin_masked", several=bool(own or self.eye) or variation is not None)
+        if self.seen:
+            self._draw, self._draw_begun = map(self._record, (self._launch_draw, self._launch_draw_begun))
+        self._run_step = self._as_graph("_take_step", several=bool(own or self.seen))
+        self._run_reset = self._as_graph("_begin_masked", several=bool(own or self.seen) or variation is not None)
 
     def _scan_first(self, scanning: Collection[str]) -> None:
         """Lets parts whose hooks read scans or depths make them first; in resets, those of the masked worlds."""
@@ -472,6 +489,8 @@ class World:
         if self._variation is not None:
             columns = self._variation.columns
             physics |= {("model", name): sim.numbers[:, which] for name, which in columns.items()}
+        if self.seen and self.seen.count > 1:
+            physics["pictures"] = self.seen.stack
         return {**physics, "elapsed_steps": self.elapsed_steps.torch, "episode": self.episode.torch}
 
     def refresh(self, mask: torch.Tensor) -> None:
@@ -487,7 +506,7 @@ class World:
         else:
             self._refresh_graph.replay()
         self._observe_restored()
-        self._look_begun()
+        self._look_restored()
 
     @functools.cached_property
     def _refresh_graph(self) -> Graph | Direct:

@@ -31,23 +31,40 @@ TOLERANCE = 1e-4
 class Spaces:
     """The sizes of what actor and critic read, and of an action.
 
-    The actor reads ``observation``. The critic reads ``privileged`` where an environment has it, else the same as the
-    actor.
+    The actor reads ``pixels`` where an environment has them, else ``observation``. The critic reads ``privileged``
+    where an environment has it, else ``observation``; pixels only where there is neither, or if it is told to.
     """
 
     observation: int
-    """Length of an observation."""
+    """Length of an observation; 0 if there is none."""
     action: int
     """Length of an action."""
     privileged: int | None = None
     """Length of what the critic alone reads; ``None`` where it reads the observation."""
     bounded: bool = True
     """Whether actions are bounded by [-1, 1]; else they are any numbers."""
+    pixels: tuple[int, ...] | None = None
+    """Height, width and channels of what the actor sees."""
+    critic_sees: bool = False
+    """Whether the critic reads pixels too."""
+
+    @property
+    def actor_key(self) -> str:
+        """The entry that the actor reads."""
+        return "observation" if self.pixels is None else "pixels"
 
     @property
     def critic_key(self) -> str:
         """The entry that the critic reads."""
+        if self.critic_sees:
+            return "pixels"
         return "observation" if self.privileged is None else "privileged"
+
+    @property
+    def rows(self) -> dict[str, int]:
+        """Lengths of the rows of numbers that are read, by entry."""
+        sizes = {"observation": self.observation, "privileged": self.privileged or 0}
+        return {key: sizes[key] for key in dict.fromkeys((self.actor_key, self.critic_key)) if key in sizes}
 
     @property
     def critic(self) -> int:
@@ -55,11 +72,16 @@ class Spaces:
         return self.observation if self.privileged is None else self.privileged
 
     @classmethod
-    def of(cls, env: EnvBase) -> "Spaces":
+    def of(cls, env: EnvBase, critic_sees: bool = False) -> "Spaces":
         """Returns those of an environment, of any batch size.
 
+        Args:
+            env: the environment.
+            critic_sees: whether the critic is to read pixels too.
+
         Raises:
-            ValueError: it has no flat observation, or its actions are neither bounded by [-1, 1] nor unbounded.
+            ValueError: it has neither a flat observation nor pixels, or its actions are neither bounded by [-1, 1] nor
+                unbounded.
         """
         spec = env.observation_spec
         sizes = {}
@@ -73,14 +95,18 @@ class Spaces:
                     "flatten it, for example with torchrl.envs.FlattenObservation"
                 )
             sizes[key] = shape[0]
-        if "observation" not in sizes:
+        pixels = tuple(spec["pixels"].shape[len(env.batch_size) :]) if "pixels" in spec.keys() else None  # noqa: SIM118
+        if "observation" not in sizes and pixels is None:
             raise ValueError(f"the environment must have an 'observation' to train on, it has {', '.join(spec.keys())}")
         low, high = env.action_spec.space.low, env.action_spec.space.high
         largest = torch.finfo(low.dtype).max  # which TorchRL has for infinity
         bounded = not ((low <= -largest).all() and (high >= largest).all())
         if bounded and not ((low == -1.0).all() and (high == 1.0).all()):
             raise ValueError("actions must be bounded by [-1, 1], or by nothing: set action_range in the class")
-        return cls(sizes["observation"], env.action_spec.shape[-1], sizes.get("privileged"), bounded)
+        sees = pixels is not None and (critic_sees or not sizes)
+        return cls(
+            sizes.get("observation", 0), env.action_spec.shape[-1], sizes.get("privileged"), bounded, pixels, sees
+        )
 
 
 class SquashedNormal(TransformedDistribution):
@@ -145,8 +171,8 @@ def make_actor(
 ) -> ProbabilisticActor:
     """Returns a Gaussian actor around a network that gives means and standard deviations, under tanh if it is bounded.
 
-    It reads ``observation`` and writes ``loc``, ``scale``, ``action`` and, if asked to, ``action_log_prob``. Actions
-    that the environment does not bound have ``bound``, if there is one.
+    It reads ``observation`` or ``pixels``, and writes ``loc``, ``scale``, ``action`` and, if asked to,
+    ``action_log_prob``. Actions that the environment does not bound have ``bound``, if there is one.
     """
     shape = (spaces.action,)
     if spaces.bounded:
@@ -155,7 +181,7 @@ def make_actor(
     # Checks of arguments would wait for the device.
     settings = {"validate_args": False} if bound is None else {"bound": bound}
     return ProbabilisticActor(
-        TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
+        TensorDictModule(network, in_keys=[spaces.actor_key], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         spec=spec,
         distribution_class=IndependentNormal if bound is None else SquashedNormal,

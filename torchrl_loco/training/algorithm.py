@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
+from torchrl_loco.encoder import PixelEncoder, shifted
 from torchrl_loco.policy import ObservationNorm, Policy, layers_of, moments
 from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed
@@ -132,12 +133,24 @@ class Algorithm(ABC):
             order = torch.randperm(len(data), generator=self.generator, device=self.device)
             self._order.copy_(order[: len(self._order)])
             self._epoch()
-        # After the update: the losses need the normalisation used while collecting.
-        for key, norm in self.norms.items():
-            count, mean, var = distributed.merged_moments(*moments(batch[key]))
-            norm.merge(count, mean, var + config.norm_eps**2)
+        self.learn_moments(batch)  # after the update: the losses need the normalisation used while collecting
         steps = config.epochs * (len(self._order) // config.minibatch_size)
         return torch.cat([self._totals / steps, of_batch])
+
+    def learn_moments(self, batch: TensorDictBase) -> None:
+        """Updates the normalisation of what networks read with a batch, and the mean picture with its first step."""
+        for key, norm in self.norms.items():
+            count, mean, var = distributed.merged_moments(*moments(batch[key]))
+            norm.merge(count, mean, var + self.config.norm_eps**2)
+        if self.spaces.pixels:
+            count, mean, _ = distributed.merged_moments(*moments(batch["pixels"][:, 0].float(), -3))
+            for encoder in (part for part in self.networks.modules() if isinstance(part, PixelEncoder)):
+                encoder.merge(count, mean)
+
+    def observed(self, minibatch: TensorDictBase) -> torch.Tensor:
+        """Returns what the actor reads of steps; pictures are moved at random if the settings ask for that."""
+        observation, most = minibatch[self.spaces.actor_key], self.config.random_shift
+        return shifted(observation, most) if self.spaces.pixels and most else observation
 
     def schedule(self, progress: float) -> None:
         """Sets the learning rate for a batch after ``progress`` of the policy's training, in [0, 1]."""

@@ -22,7 +22,7 @@ from torchrl_loco.checks import (
     check_int,
     check_packages,
 )
-from torchrl_loco.config import PROTOCOLS, SimConfig
+from torchrl_loco.config import PROTOCOLS, SimConfig, pixels_of
 from torchrl_loco.registry import is_place, resolve, task_name
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ INTERVALS = {
     "max_value": ANY,
     "episode_length": COUNT,
     "norm_eps": NOT_NEGATIVE,
+    "random_shift": COUNT,
 }
 """Intervals of the fields that are not simply positive."""
 
@@ -93,6 +94,8 @@ class TrainingConfig:
     """What differs from the defaults, by kind of device."""
     of_others: ClassVar[Settings] = {"action_repeat": 1, "episode_length": 0}
     """What differs for tasks other than those of dm_control's runners, which have episodes of their own."""
+    of_pixels: ClassVar[dict[str, Settings]] = {"cpu": {}, "cuda": {}}
+    """What differs where the actor sees pixels, by kind of device."""
 
     task: str
     """The task, an id or the file or module of a class and its name, with a colon between."""
@@ -113,6 +116,18 @@ class TrainingConfig:
     """Settings of the task's own, such as the motion that it tracks."""
     randomize: bool = True
     """Whether numbers of the model vary as the task says."""
+    from_pixels: bool = False
+    """Whether the actor sees the pixels of a camera instead of the observation."""
+    camera: str = ""
+    """Name of the camera; the model's first without one."""
+    size: tuple[int, int] = (84, 84)
+    """Width and height of the pixels."""
+    frame_stack: int = 3
+    """How many pictures the actor sees at once."""
+    random_shift: int = 0
+    """Pixels by which pictures are moved at random in gradient steps, at most and either way."""
+    critic_from_pixels: bool = False
+    """Whether the critic sees pixels too, instead of the observation of the task."""
 
     num_envs: int = 64
     """Worlds stepped together."""
@@ -179,6 +194,7 @@ class TrainingConfig:
         object.__setattr__(self, "device", str(self.device))
         object.__setattr__(self, "out", Path(self.out))
         object.__setattr__(self, "hidden", tuple(self.hidden))
+        object.__setattr__(self, "size", tuple(self.size))
         if not isinstance(self.sim, Sim):
             if not isinstance(self.sim, Mapping):
                 raise TypeError(f"sim must be a dict of fields of torchrl_loco.SimConfig, got {self.sim!r}")
@@ -187,6 +203,10 @@ class TrainingConfig:
             object.__setattr__(self, "sim", Sim(**chosen))
         object.__setattr__(self, "options", Options(self.options))
         object.__setattr__(self, "init", str(Path(self.init).expanduser().resolve()) if self.init else "")
+        if not self.from_pixels:
+            of_pixels = ("camera", "random_shift", "critic_from_pixels")
+            if needless := [each for each in of_pixels if getattr(self, each)]:
+                raise ValueError(f"{needless[0]} needs from_pixels=True")
         # Whether the machine has the device is checked when the run starts.
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
             raise ValueError(f"no device {self.device!r}: choose one of cpu, cuda, cuda:0, ...")
@@ -225,7 +245,8 @@ class TrainingConfig:
     def of_env(self) -> dict[str, Any]:
         """Arguments of the environments of the run, beside task, worlds, device, seed and protocol."""
         sim = {name: value for name, value in dataclasses.asdict(self.sim).items() if value is not None}
-        return {**sim, **self.options, **({} if self.randomize else {"randomize": ()})}
+        pixels = pixels_of(dataclasses.asdict(self))
+        return {**sim, **self.options, **pixels, **({} if self.randomize else {"randomize": ()})}
 
     @property
     def frames_per_batch(self) -> int:
@@ -332,6 +353,10 @@ class REPPOConfig(TrainingConfig):
         },
     }
     of_others: ClassVar[Settings] = {**TrainingConfig.of_others, "num_bins": 301}
+    of_pixels: ClassVar[dict[str, Settings]] = {
+        "cpu": {},
+        "cuda": {"num_envs": 4096, "minibatch_size": 4096, "bf16": True},
+    }
 
     compile: bool = True
     """Whether torch.compile makes kernels of losses and acting policy on CUDA; the first start on a machine takes 20 s
@@ -467,6 +492,7 @@ def preset(
     if overrides.get("options"):
         overrides["options"] = resolve(task).checked_options(overrides["options"])
     settings = {**kind.presets[device.type], **({} if is_runner(task) else kind.of_others), **own.get(algorithm, {})}
+    settings |= kind.of_pixels[device.type] if overrides.get("from_pixels") else {}
     if not is_runner(task) and kind is REPPOConfig:  # returns of either sign
         settings.setdefault("min_value", -settings.get("max_value", REPPOConfig.max_value))
     return kind(task, **{"device": str(device), **settings, **overrides})

@@ -13,7 +13,7 @@ from typing import Any
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
-from torchrl_loco.config import arguments_of
+from torchrl_loco.config import arguments_of, pixels_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv
@@ -172,6 +172,7 @@ class Environments:
                 *place, **{**config.of_env, "world_offset": 0, "metrics": True, "reward_terms": terms, **settings}
             )
         own = {**dataclasses.asdict(base.config), "randomize": base.randomize, **base.options_given}
+        own |= pixels_of(dataclasses.asdict(config))
         del own["naconmax"]  # which is for the number of its worlds
         if settings.get("play"):
             del own["episode_length"]

@@ -15,6 +15,7 @@ from torch.func import functional_call
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, ValueOperator
 
+from torchrl_loco.encoder import PixelEncoder
 from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of
@@ -50,20 +51,25 @@ class PPO(Algorithm):
                 return network_of(network, inputs, outputs)
             return MLP(inputs, outputs, num_cells=list(config.hidden), activation_class=nn.SiLU)
 
-        self.norms = {"observation": ObservationNorm(spaces.observation)}
-        mean: Any = make(spaces.observation, spaces.action)
+        def after_first(key: str, outputs: int) -> tuple[nn.Module, Any]:
+            """Returns what makes features of an entry, a norm or an encoder, and a network of these."""
+            if key in self.norms:
+                return self.norms[key], make(spaces.rows[key], outputs)
+            assert spaces.pixels is not None
+            encoder = PixelEncoder(spaces.pixels)
+            return encoder, make(encoder.features, outputs)
+
+        self.norms = {key: ObservationNorm(size) for key, size in spaces.rows.items()}
+        first, mean = after_first(spaces.actor_key, spaces.action)
         if network is None:
             nn.init.orthogonal_(mean[-1].weight, gain=0.01)  # the first actions are near zero, whatever is observed
         self._scale = AddStateIndependentNormalScale(spaces.action, init_value=math.log(config.init_std))
-        whole = nn.Sequential(self.norms["observation"], mean, self._scale)
-        self.actor = make_actor(spaces, config.device, whole, log_prob=True)
-        if spaces.privileged is not None:
-            self.norms["privileged"] = ObservationNorm(spaces.privileged)
-        value = make(spaces.critic, 1)
-        whole = nn.Sequential(self.norms[spaces.critic_key], value)
+        self.actor = make_actor(spaces, config.device, nn.Sequential(first, mean, self._scale), log_prob=True)
+        of_critic, value = after_first(spaces.critic_key, 1)
+        whole = nn.Sequential(of_critic, value)
         self.critic = ValueOperator(whole, in_keys=[spaces.critic_key]).to(config.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic})
-        self._mean, self._value = Rows(mean, spaces.observation), Rows(value, spaces.critic)
+        self._mean, self._value = Rows(mean, first), Rows(value, of_critic)
         self._dtype = torch.bfloat16 if config.bf16 and self.device.type == "cuda" else torch.float32
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = self.make_optimizer("actor and critic", parameters)
@@ -73,9 +79,9 @@ class PPO(Algorithm):
         self._kl_bounds = torch.tensor([0.0, 0.5 * config.target_kl, 2.0 * config.target_kl], device=self.device)
         self._lr_factors = torch.tensor([1.0, 1.5, 1.0, 1 / 1.5], device=self.device)
 
-    def _normalised(self, td: TensorDictBase) -> dict[str, torch.Tensor]:
-        """Returns normalised observations, with zeros up to the length of the rows of weights."""
-        return {key: normalised(td[key], norm, self._dtype, ALIGNED) for key, norm in self.norms.items()}
+    def _read(self, td: TensorDictBase, key: str) -> torch.Tensor:
+        """Returns pixels as they are; other entries normalised, with zeros up to the length of the rows of weights."""
+        return normalised(td[key], self.norms[key], self._dtype, ALIGNED) if key in self.norms else td[key]
 
     def _std(self) -> torch.Tensor:
         """Returns the standard deviations of actions, the same in all states, shape ``(nu,)``."""
@@ -88,8 +94,8 @@ class PPO(Algorithm):
     @torch.no_grad()
     def act(self, td: TensorDictBase) -> TensorDictBase:
         """Returns ``td`` with actions and their log-probabilities; with what they were before tanh, if bounded."""
-        rows = normalised(td["observation"], self.norms["observation"], self._dtype, ALIGNED)
-        rows = rows.view(-1, rows.shape[-1])
+        rows = self._read(td, self.spaces.actor_key)
+        rows = rows.reshape(-1, *rows.shape[td.ndim :])
         explores = exploration_type() in (ExplorationType.RANDOM, None)
         noise = (torch.randn if explores else torch.zeros)(len(rows), self.spaces.action, device=self.device)
         mean = self._mean(rows, self.optimizer.wide(self._dtype))
@@ -100,9 +106,9 @@ class PPO(Algorithm):
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns what the loss reads, of shape ``(num_envs, num_steps)``, with advantages and value targets."""
-        key, after = self.spaces.critic_key, batch["next"]
-        now, weights = self._normalised(batch), self.optimizer.wide(self._dtype)
-        value, later = (self._value(rows[key], weights).float() for rows in (now, self._normalised(after)))
+        key, after, weights = self.spaces.critic_key, batch["next"], self.optimizer.wide(self._dtype)
+        now = {name: self._read(batch, name) for name in dict.fromkeys((self.spaces.actor_key, key))}
+        value, later = (self._values(rows, weights) for rows in (now[key], self._read(after, key)))
         advantage, target = self._estimates(value, later, after)
         action, log_prob = batch["action"], batch["action_log_prob"]
         if self.spaces.bounded:  # densities before tanh, whose slope cancels in a ratio
@@ -110,6 +116,13 @@ class PPO(Algorithm):
             log_prob = log_prob + log_slope(action).sum(-1)
         read = {"action": action, "log_prob": log_prob, "advantage": advantage, "value_target": target}
         return TensorDict({**now, **read}, batch.batch_size)
+
+    def _values(self, rows: torch.Tensor, weights: Mapping[nn.Parameter, torch.Tensor]) -> torch.Tensor:
+        """Returns what the critic expects of a batch, ``(num_envs, num_steps, 1)``."""
+        if not self.spaces.critic_sees:
+            return self._value(rows, weights).float()
+        # Step by step: a whole batch would fill the memory with what convolutions give.
+        return torch.stack([self._value(step, weights).float() for step in rows.unbind(1)], dim=1)
 
     def _estimates(
         self, value: torch.Tensor, later: torch.Tensor, after: TensorDictBase
@@ -133,7 +146,7 @@ class PPO(Algorithm):
         config, weights = self.config, self.optimizer.wide(self._dtype)
         with self._beside():  # as are the slopes of what is computed there
             value = self._value(minibatch[self.spaces.critic_key], weights)
-        outputs = self._mean(minibatch["observation"], weights), self._std(), value
+        outputs = self._mean(self.observed(minibatch), weights), self._std(), value
         self._join()
         bounds = config.clip_epsilon, config.entropy_coeff, self.spaces.bounded
         *slopes, metrics = clipped_loss(*outputs, minibatch, *bounds)
@@ -396,11 +409,14 @@ class Rows:
 
     Args:
         network: layers one after the other; any other, as a critic may be, computes as a whole.
-        inputs: how many numbers of a row it reads.
+        first: what gives the network its rows: a norm, which has been applied, or an encoder of pixels, which is part
+            of the function then.
     """
 
-    def __init__(self, network: nn.Module, inputs: int) -> None:
-        self._inputs, self._layers = inputs, [network]
+    def __init__(self, network: nn.Module, first: nn.Module) -> None:
+        self._encoder = first if isinstance(first, PixelEncoder) else None
+        self._inputs = inputs = self._encoder.features if self._encoder else len(first.mean)  # type: ignore[arg-type]
+        self._layers = [network]
         with contextlib.suppress(TypeError):
             layers = layers_of(network)
             rows = torch.linspace(-1.0, 1.0, 4 * inputs, device=next(network.parameters()).device).view(4, inputs)
@@ -410,8 +426,11 @@ class Rows:
 
     def __call__(self, rows: torch.Tensor, weights: Mapping[nn.Parameter, torch.Tensor]) -> torch.Tensor:
         """Returns what it gives, ``(..., outputs)``, with ``weights`` for its own, whose rows may be longer as well."""
+        if self._encoder:
+            own = {name: weights[part][..., : part.shape[-1]] for name, part in self._encoder.named_parameters()}
+            rows = functional_call(self._encoder, own, (rows,)).to(next(iter(own.values())).dtype)
         for index, layer in enumerate(self._layers):
-            reads_long = index == 0 and isinstance(layer, nn.Linear)
+            reads_long = index == 0 and isinstance(layer, nn.Linear) and not self._encoder
             if index == 0 and not reads_long:
                 rows = rows[..., : self._inputs].clone()  # an activation may write in place
             own = {

@@ -17,6 +17,7 @@ from torch import nn
 from torch.nn.functional import cross_entropy, mse_loss
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
+from torchrl_loco.encoder import PixelEncoder
 from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of
@@ -47,23 +48,25 @@ class REPPO(Algorithm):
     def __init__(self, config: REPPOConfig, spaces: Spaces, network: Network | None = None) -> None:
         super().__init__(config, spaces, network)
         self.action_bound = 1.0 if spaces.bounded else config.action_bound
-        self.norms, outputs = {"observation": ObservationNorm(spaces.observation)}, 2 * spaces.action
+        self.norms = {key: ObservationNorm(size).to(config.device) for key, size in spaces.rows.items()}
+        encoder = PixelEncoder(spaces.pixels) if spaces.pixels else None
+        sight = PixelEncoder(spaces.pixels) if spaces.pixels and spaces.critic_sees else None
+        inputs, outputs = encoder.features if encoder else spaces.observation, 2 * spaces.action
         if network is None:
             head = nn.Linear(config.hidden[-1], outputs)
-            layers = [*normed_layers(spaces.observation, config.hidden), head]
+            layers = [*normed_layers(inputs, config.hidden), head]
         else:
-            layers = layers_of(network_of(network, spaces.observation, outputs))
-        whole = nn.Sequential(self.norms["observation"], *layers, NormalParamExtractor("exp"))
+            layers = layers_of(network_of(network, inputs, outputs))
+        whole = nn.Sequential(encoder or self.norms["observation"], *layers, NormalParamExtractor("exp"))
         self.actor = make_actor(spaces, config.device, whole, log_prob=False, bound=config.action_bound)
-        if spaces.privileged is not None:
-            self.norms["privileged"] = ObservationNorm(spaces.privileged).to(config.device)
         bins = ValueBins(config.min_value, config.max_value, config.num_bins)
-        self.critic = DistributionalQ((spaces.critic, spaces.action), config.hidden, bins).to(config.device)
-        self.distribution = self.actor[0].module[1:]  # from normalised observations to means and standard deviations
+        self.critic = DistributionalQ((spaces.critic, spaces.action), config.hidden, bins, sight).to(config.device)
+        # From pixels or normalised observations to means and standard deviations.
+        self.distribution = self.actor[0].module if encoder else self.actor[0].module[1:]
         self.dual = DualVariables(config).to(self.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "dual": self.dual})
-        if spaces.privileged is not None:  # the critic's networks read what is normalised already
-            self.networks["privileged_norm"] = self.norms["privileged"]
+        for key in self.norms.keys() - {spaces.actor_key}:  # the critic's networks read what is normalised already
+            self.networks[f"{key}_norm"] = self.norms[key]
         self.critic_optimizer = self.make_optimizer("critic", self.critic.parameters())
         # The gradient of a dual variable's logarithm shrinks with the variable: an eps of 1e-5 would keep it small.
         groups = [{"params": list(self.actor.parameters())}, {"params": list(self.dual.parameters()), "eps": 1e-8}]
@@ -75,6 +78,11 @@ class REPPO(Algorithm):
     def acting(self) -> nn.Module:
         """Returns the actor as a policy for collectors, compiled on CUDA if the settings ask for that."""
         return Acting(self.actor, self._fused(self.actor))
+
+    def _read(self, td: TensorDictBase) -> dict[str, torch.Tensor]:
+        """Returns what networks read of a batch, by entry: rows of numbers normalised, pixels as they are."""
+        rows = {key: norm(td[key]) for key, norm in self.norms.items()}
+        return rows | ({"pixels": td["pixels"]} if self.spaces.pixels else {})
 
     def _fused(self, function: Callable[..., Any], bf16: bool = False) -> Callable[..., Any]:
         """Returns a function of tensors as kernels of torch.compile on CUDA, if the settings ask for that.
@@ -102,10 +110,15 @@ class REPPO(Algorithm):
         the true terminal observation is bootstrapped; termination ends the return.
         """
         config, after = self.config, batch["next"]
-        now, later = ({key: norm(td[key]) for key, norm in self.norms.items()} for td in (batch, after))
+        now, later = self._read(batch), self._read(after)
         noise = torch.randn_like(batch["action"])
-        observed = later["observation"], later[self.spaces.critic_key]
-        log_prob, value, features = self._compiled_values(*observed, noise)
+        observed = later[self.spaces.actor_key], later[self.spaces.critic_key]
+        if self.spaces.pixels:  # step by step: a whole batch would fill the memory with what convolutions give
+            steps = zip(*(each.unbind(1) for each in (*observed, noise)), strict=True)
+            parts = [self._compiled_values(*step) for step in steps]
+            log_prob, value, features = (torch.stack(part, dim=1) for part in zip(*parts, strict=True))
+        else:
+            log_prob, value, features = self._compiled_values(*observed, noise)
         alive = ~after["terminated"]
         reward = after["reward"] * config.reward_scale
         reward = reward - config.gamma * self.dual.temperature * log_prob.unsqueeze(-1) * alive
@@ -185,11 +198,11 @@ class REPPO(Algorithm):
             Its metrics.
         """
         config, temperature, kl_weight = self.config, self.dual.temperature, self.dual.kl_weight
-        names = "observation", self.spaces.critic_key, "loc", "scale"
-        noise = torch.randn_like(minibatch["loc"])
+        names = self.spaces.critic_key, "loc", "scale"
+        noise, observation = torch.randn_like(minibatch["loc"]), self.observed(minibatch)
         with frozen(self.critic):
             loss, entropy, divergence, exceeded = self._compiled_actor_losses(
-                *(minibatch[name] for name in names), noise, temperature.detach(), kl_weight.detach()
+                observation, *(minibatch[name] for name in names), noise, temperature.detach(), kl_weight.detach()
             )
         # The dual variables rise while their constraint is violated: too little entropy, too much divergence.
         excess_entropy = entropy - config.target_entropy * noise.shape[-1]
@@ -333,19 +346,22 @@ class ValueBins(nn.Module):
 class DistributionalQ(nn.Module):
     """Critic Q(s, a) whose output is a distribution over returns, with a second head that predicts its next features.
 
-    It reads normalised observations.
+    It reads normalised observations, or pixels.
 
     Args:
         sizes: length of what it observes and of an action.
         hidden: widths of the encoder's layers; the heads have one hidden layer of the last width.
         bins: the bins of the distribution.
+        sight: what makes features of pixels, if it reads those.
     """
 
-    def __init__(self, sizes: tuple[int, int], hidden: tuple[int, ...], bins: ValueBins) -> None:
+    def __init__(
+        self, sizes: tuple[int, int], hidden: tuple[int, ...], bins: ValueBins, sight: PixelEncoder | None = None
+    ) -> None:
         super().__init__()
-        self.bins = bins
-        width = hidden[-1]
-        self.encoder = nn.Sequential(*normed_layers(sum(sizes), hidden), nn.Linear(width, width))
+        self.bins, self.sight = bins, sight
+        observed, width = sight.features if sight else sizes[0], hidden[-1]
+        self.encoder = nn.Sequential(*normed_layers(observed + sizes[1], hidden), nn.Linear(width, width))
         last = nn.Linear(width, len(bins.centers))
         with torch.no_grad():  # the initial prediction is a return of zero
             last.bias.add_(40.0 * bins.encode(torch.zeros(())))
@@ -356,13 +372,17 @@ class DistributionalQ(nn.Module):
 
     def forward(self, observation: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns logits of shape ``(..., count)`` and the predicted next features of shape ``(..., hidden[-1])``."""
-        features = self.encoder(torch.cat([observation, action], dim=-1))
+        features = self._features(observation, action)
         return self.value_head(features), self.predictor(features)
 
     def value_and_features(self, observation: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the mean return, shape ``(...)``, and the features, shape ``(..., hidden[-1])``."""
-        features = self.encoder(torch.cat([observation, action], dim=-1))
+        features = self._features(observation, action)
         return self.bins.decode(self.value_head(features)), features
+
+    def _features(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        seen = self.sight(observation) if self.sight else observation
+        return self.encoder(torch.cat([seen, action], dim=-1))
 
 
 def normed_layers(inputs: int, hidden: tuple[int, ...]) -> list[nn.Module]:

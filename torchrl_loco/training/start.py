@@ -117,6 +117,8 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
     if twice := [name for name in ("options", *base.options) if name in settings]:
         raise ValueError(f"{', '.join(twice)}: options are those of the environment, leave them out")
     own |= {"options": base.options_given} if base.options_given else {}
+    if pixels := base.pixels and base.pixels.settings(base.mj_model):
+        own |= {"from_pixels": True, **pixels}
     for name, value in own.items():
         if name in settings and str(settings[name]) != str(value):
             raise ValueError(f"{name} is that of the environment, {value!r}: leave it out, got {settings[name]!r}")

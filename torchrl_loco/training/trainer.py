@@ -16,6 +16,7 @@ from tqdm.auto import tqdm
 from torchrl_loco.checks import check_device
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.policy import Policy
+from torchrl_loco.sim.simulation import check_memory
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Spaces, deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, begin_from, settings_for_small_networks, start_compiler
@@ -31,6 +32,8 @@ from torchrl_loco.training.reppo import REPPO
 from torchrl_loco.training.run_folder import RunFolder
 from torchrl_loco.training.trials import Trials
 
+COPIES = 8
+"""How often the pixels of a batch lie in memory: before and after a step, collected, stacked, packed and shuffled."""
 ALGORITHMS: dict[str, type[Algorithm]] = {cls.config_type.algorithm: cls for cls in (PPO, REPPO)}
 
 
@@ -106,7 +109,11 @@ class Trainer:
         dump = run.nan_dump if first else run.nan_dump.with_stem(f"nan_dump_rank{rank}")
         self.env = self.environments.training(dump)
         make_algorithm = given.algorithm or ALGORITHMS[config.algorithm]
-        self.algorithm = make_algorithm(config, Spaces.of(self.env), given.network)
+        spaces = Spaces.of(self.env, config.critic_from_pixels)
+        if spaces.pixels:
+            needed = COPIES * config.frames_per_batch * math.prod(spaces.pixels)
+            check_memory(needed, config.num_envs, torch.device(config.device))
+        self.algorithm = make_algorithm(config, spaces, given.network)
         deterministic_policy(self.algorithm.actor, config, {})  # raises an error where it could not be saved
         self._base, _ = unwrapped(self.env)
         length, from_start = self.environments.full_length, not self._base.stagger

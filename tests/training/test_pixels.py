@@ -1,0 +1,89 @@
+"""Training from pixels: the encoder, actors that see, and critics that see or read states."""
+
+import pytest
+import torch
+from torch.nn.functional import pad
+
+import torchrl_loco as loco
+from torchrl_loco import training
+from torchrl_loco.encoder import PixelEncoder, shifted
+from torchrl_loco.export import export_policy
+from torchrl_loco.training import preset
+from torchrl_loco.training.environments import make_for
+from torchrl_loco.training.run_folder import RunFolder
+from torchrl_loco.training.trainer import Trainer
+
+SMALL = {"num_envs": 4, "num_steps": 4, "minibatch_size": 8, "total_frames": 64, "action_repeat": 1, "hidden": (16,)}
+SMALL |= {"video_seconds": 0, "eval_episodes": 2, "logger": "csv", "size": (24, 20), "camera": "back", "epochs": 2}
+
+
+def test_the_encoder_sees_what_differs_from_the_mean_picture():
+    torch.manual_seed(0)
+    encoder = PixelEncoder((20, 24, 6))
+    pictures = torch.randint(0, 256, (5, 3, 20, 24, 6), dtype=torch.uint8)
+    encoder.merge(10, pictures[:2].float().mean((0, 1)))
+    encoder.merge(5, pictures[2].float().mean(0))
+    torch.testing.assert_close(
+        encoder.mean, (pictures[:2].float().sum((0, 1)) * 10 / 6 + pictures[2].sum(0) * 5 / 3) / 15
+    )
+    features = encoder(pictures)
+    assert features.shape == (5, 3, 50)
+    rows = (pictures.flatten(0, 1).float() - encoder.mean).movedim(-1, 1) / 255
+    plain = encoder.head(encoder.others(encoder.first(rows)).flatten(1)).view(5, 3, 50)
+    torch.testing.assert_close(features, plain, rtol=1e-4, atol=1e-5)
+    with pytest.raises(ValueError, match="at least 15 x 15, got 24 x 14"):
+        PixelEncoder((14, 24, 3))
+
+
+def test_shifted_pictures_repeat_their_edges():
+    pictures = torch.randint(0, 256, (6, 9, 11, 2), dtype=torch.uint8)
+    torch.manual_seed(1)
+    moved = shifted(pictures, 2)
+    wide = pad(pictures.movedim(-1, 1).float(), (2, 2, 2, 2), mode="replicate").movedim(1, -1).byte()
+    crops = {(i, j): wide[:, i : i + 9, j : j + 11] for i in range(5) for j in range(5)}
+    found = [next(at for at, crop in crops.items() if torch.equal(crop[k], moved[k])) for k in range(6)]
+    assert len(set(found)) > 2
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+@pytest.mark.parametrize("critic_sees", [False, True])
+def test_actors_that_see(algorithm, critic_sees, tmp_path):
+    """They learn, the run is resumed exactly, and its policy acts and is exported as the actor."""
+    settings = {**SMALL, "from_pixels": True, "critic_from_pixels": critic_sees, "random_shift": 2}
+    run = RunFolder.create(preset("walker_walk", "cpu", algorithm, out=tmp_path, **settings))
+    first = Trainer(run)
+    before = {name: value.clone() for name, value in first.algorithm.networks.state_dict().items()}
+    first.iterate()
+    after = first.algorithm.networks.state_dict()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert sum("first.weight" in name for name in changed) == 1 + critic_sees  # a first convolution each
+    means = [value for name, value in after.items() if name.endswith("0.mean") and value.ndim == 3]
+    assert all((mean != 127.5).any() for mean in means)
+    first.save()
+    first.iterate()
+    again = Trainer(run, resume=True)
+    again.iterate()
+    for name, value in first.algorithm.networks.state_dict().items():
+        assert torch.equal(value, again.algorithm.networks.state_dict()[name]), name
+    again.train()
+    policy = run.load_policy()
+    assert policy.in_keys == ["pixels"]
+    td = make_for(policy, 3, "cpu", 0).rollout(3, policy)
+    assert td["pixels"].shape == (3, 3, 20, 24, 9)
+    assert td["action"].abs().max() <= 1.0
+    assert export_policy(policy, tmp_path / "policy.pt2") < 1e-5
+
+
+def test_an_environment_that_sees_is_trained_in(tmp_path):
+    """With its own camera and size; without states for the critic, that sees too."""
+    env = loco.make("walker_walk", 4, "cpu", 0, from_pixels=True, size=(20, 16), frame_stack=2, camera="back")
+    few = {name: value for name, value in SMALL.items() if name not in ("size", "camera", "num_envs")}
+    run = training.train(env, algorithm="reppo", out=tmp_path, **few)
+    config = run.load_config()
+    assert (config.from_pixels, config.camera, config.size, config.frame_stack) == (True, "back", (20, 16), 2)
+    assert run.load_policy().module[0].shape == (16, 20, 6)
+
+
+def test_settings_that_need_pixels():
+    with pytest.raises(ValueError, match="random_shift needs from_pixels=True"):
+        preset("walker_walk", "cpu", "reppo", random_shift=4)
