@@ -1,5 +1,6 @@
 """Patches of ground on a grid, and the model that lies under a robot."""
 
+import copy
 import dataclasses
 import inspect
 from collections.abc import Mapping
@@ -12,7 +13,10 @@ from torchrl_loco.checks import POSITIVE, check_float, check_int
 from torchrl_loco.config import read_mjcf
 from torchrl_loco.terrain.kinds import DEEP, Kind, Patch
 
-CONTACT = ("contype", "conaffinity", "condim", "priority", "friction", "solref", "solimp", "solmix", "margin", "gap")
+OF_PLANE = (
+    *("contype", "conaffinity", "condim", "priority", "friction", "solref", "solimp", "solmix", "margin", "gap"),
+    *("material", "rgba", "group"),
+)
 """What the ground has of the plane that it replaces."""
 CLEAR = 0.8
 """Half a side of the square about the middle of a patch over which a robot may begin (m)."""
@@ -191,27 +195,20 @@ class Terrain:
         if plane is None or plane.type != mujoco.mjtGeom.mjGEOM_PLANE:
             planes = [geom.name for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
             raise ValueError(f"there is no plane {floor!r} to replace: choose one of {', '.join(map(repr, planes))}")
-        like = {name: np.copy(getattr(plane, name)) for name in CONTACT}
-        like |= {"material": plane.material, "rgba": np.copy(plane.rgba), "group": plane.group}
-        like = {name: value.item() if getattr(value, "ndim", 1) == 0 else value for name, value in like.items()}
+        like = {name: copy.copy(getattr(plane, name)) for name in OF_PLANE}
         spec.delete(plane)
-        low = float(self.heights.min())
-        extent = max(float(self.heights.max()) - low, LEAST)
+        low, extent = float(self.heights.min()), max(float(np.ptp(self.heights)), LEAST)
         field = spec.add_hfield(name="terrain", nrow=self.heights.shape[0], ncol=self.heights.shape[1])
         field.size = [*self.half, extent, DEEP]
         field.userdata = ((self.heights - low) / extent).astype(np.float32).ravel().tolist()
-        kinds = mujoco.mjtGeom
-        world = spec.worldbody
+        kinds, world = mujoco.mjtGeom, spec.worldbody
         world.add_geom(name="terrain", type=kinds.mjGEOM_HFIELD, hfieldname="terrain", pos=[0, 0, low], **like)
         for k, box in enumerate(self.boxes):
             world.add_geom(name=f"terrain_{k}", type=kinds.mjGEOM_BOX, pos=box[:3], size=box[3:], **like)
         return spec
 
     def picture(self, path: Path | str) -> None:
-        """Writes a picture of the ground from above, with the kinds and where robots begin.
-
-        Args:
-            path: an image file.
+        """Writes a picture of the ground from above into an image file, with the kinds and where robots begin.
 
         Raises:
             ImportError: matplotlib is missing.

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from numpy.random import Generator
 
 DEEP = 1.0
 """How far boxes reach below what lies deepest in a patch (m)."""
@@ -24,11 +25,14 @@ class Patch:
     boxes: np.ndarray | None = None
 
 
-Kind = Callable[[float, np.random.Generator, float, float], Patch]
+Kind = Callable[[float, Generator, float, float], Patch]
 """Makes a patch from a difficulty, a generator, the length of a side and the distance of two points (m)."""
 
+Bounds = tuple[float, float]
+"""A figure in the easiest patch, and in the hardest."""
 
-def between(bounds: tuple[float, float], difficulty: float) -> float:
+
+def between(bounds: Bounds, difficulty: float) -> float:
     """Returns the number that lies between two as far as the difficulty says."""
     return bounds[0] + (bounds[1] - bounds[0]) * difficulty
 
@@ -45,14 +49,7 @@ def from_edge(size: float, cell: float) -> np.ndarray:
 
 
 def ring(outer: float, width: float, top: float, bottom: float) -> list[list[float]]:
-    """Returns four boxes that lie around a square.
-
-    Args:
-        outer: half a side, outside (m).
-        width: of the ring (m).
-        top: its height (m).
-        bottom: where it begins (m).
-    """
+    """Returns four boxes of a width, from bottom to top, within the edges of a square of half side ``outer`` (m)."""
     middle, half, z = outer - width / 2, width / 2, [(top + bottom) / 2, (top - bottom) / 2]
     long = [[0.0, sign * middle, z[0], outer, half, z[1]] for sign in (-1, 1)]
     return long + [[sign * middle, 0.0, z[0], half, outer - width, z[1]] for sign in (-1, 1)]
@@ -63,108 +60,62 @@ def block(half: float, top: float, bottom: float) -> list[list[float]]:
     return [[0.0, 0.0, (top + bottom) / 2, half, half, (top - bottom) / 2]]
 
 
-# Kinds. Each begins with what all of them take.
+# Kinds. All begin with the same four arguments, which not each needs; what follows are its figures.
 
 
-def flat(difficulty: float, rng: np.random.Generator, size: float, cell: float) -> Patch:
+def flat(difficulty: float, rng: Generator, size: float, cell: float) -> Patch:
     """Returns level ground."""
     return Patch(heights=np.zeros((len(points(size, cell)),) * 2))
 
 
 def slope(
     difficulty: float,
-    rng: np.random.Generator,
+    rng: Generator,
     size: float,
     cell: float,
-    gradient: tuple[float, float] = (0.0, 0.6),
+    gradient: Bounds = (0.0, 0.6),
     platform: float = 2.0,
     down: bool = False,
 ) -> Patch:
-    """Returns a pyramid, or a pit, with a level middle.
+    """Returns a pyramid with a level middle, or a pit with ``down``.
 
-    Args:
-        difficulty: from the least gradient to the greatest.
-        rng: not used.
-        size: a side (m).
-        cell: distance of two points (m).
-        gradient: the least and the greatest, rise over run.
-        platform: a side of the middle (m).
-        down: whether it goes down to the middle.
+    ``gradient`` is rise over run, ``platform`` a side of the middle (m).
     """
     steep = between(gradient, difficulty) * (-1 if down else 1)
-    heights = steep * np.minimum(from_edge(size, cell), size / 2 - platform / 2)
-    return Patch(heights=heights)
+    return Patch(heights=steep * np.minimum(from_edge(size, cell), size / 2 - platform / 2))
 
 
 def rough(
-    difficulty: float,
-    rng: np.random.Generator,
-    size: float,
-    cell: float,
-    height: tuple[float, float] = (0.02, 0.1),
-    step: float = 0.01,
+    difficulty: float, rng: Generator, size: float, cell: float, height: Bounds = (0.02, 0.1), step: float = 0.01
 ) -> Patch:
-    """Returns points of random heights.
-
-    Args:
-        difficulty: from the least height to the greatest.
-        rng: draws the heights.
-        size: a side (m).
-        cell: distance of two points (m).
-        height: the largest, in the easiest patch and in the hardest (m).
-        step: of which heights are multiples (m).
-    """
+    """Returns points of random heights: multiples of ``step`` (m), the largest of ``height`` (m)."""
     most = max(1, round(between(height, difficulty) / step))
-    heights = step * rng.integers(0, most + 1, (len(points(size, cell)),) * 2)
-    return Patch(heights=heights)
+    return Patch(heights=step * rng.integers(0, most + 1, (len(points(size, cell)),) * 2))
 
 
 def wave(
-    difficulty: float,
-    rng: np.random.Generator,
-    size: float,
-    cell: float,
-    amplitude: tuple[float, float] = (0.0, 0.1),
-    waves: float = 4.0,
+    difficulty: float, rng: Generator, size: float, cell: float, amplitude: Bounds = (0.0, 0.1), waves: float = 4.0
 ) -> Patch:
-    """Returns waves along both axes, from their middle height.
-
-    Args:
-        difficulty: from the least amplitude to the greatest.
-        rng: not used.
-        size: a side (m).
-        cell: distance of two points (m).
-        amplitude: of the waves along one axis (m).
-        waves: along a side.
-    """
+    """Returns as many ``waves`` along each side, from their middle height; ``amplitude`` (m) is that along one axis."""
     phase = 2 * math.pi * waves * points(size, cell) / size
-    heights = between(amplitude, difficulty) * (np.sin(phase)[None] + np.sin(phase)[:, None])
-    return Patch(heights=heights)
+    return Patch(heights=between(amplitude, difficulty) * (np.sin(phase)[None] + np.sin(phase)[:, None]))
 
 
 def stairs(
     difficulty: float,
-    rng: np.random.Generator,
+    rng: Generator,
     size: float,
     cell: float,
-    height: tuple[float, float] = (0.02, 0.18),
+    height: Bounds = (0.02, 0.18),
     width: float = 0.3,
     platform: float = 3.0,
     frame: float = 1.0,
     down: bool = False,
 ) -> Patch:
-    """Returns square rings of steps up to a platform, or down.
+    """Returns square rings of steps up to a platform, or down to it.
 
-    Args:
-        difficulty: from the least height to the greatest.
-        rng: not used.
-        size: a side (m).
-        cell: not used.
-        height: of a step (m).
-        width: of a step (m).
-        platform: the least length of its side (m).
-        frame: width of the level ground around (m).
-        down: whether they go down.
+    Steps have a ``height`` and a ``width`` (m), the platform has a side of ``platform`` (m) at least, the level ground
+    around a width of ``frame`` (m).
     """
     rise, steps = between(height, difficulty), int((size / 2 - frame - platform / 2) / width)
     sign, bottom = (-1 if down else 1), -(steps + 1) * rise - DEEP
@@ -177,25 +128,18 @@ def stairs(
 
 def obstacles(
     difficulty: float,
-    rng: np.random.Generator,
+    rng: Generator,
     size: float,
     cell: float,
-    height: tuple[float, float] = (0.03, 0.2),
+    height: Bounds = (0.03, 0.2),
     count: int = 40,
     length: tuple[float, float] = (0.3, 1.0),
     platform: float = 2.0,
 ) -> Patch:
-    """Returns boxes that are strewn over level ground, but for its middle.
+    """Returns boxes that are strewn over level ground, but for a square of side ``platform`` (m) in its middle.
 
-    Args:
-        difficulty: from the least height to the greatest.
-        rng: draws places, lengths and heights.
-        size: a side (m).
-        cell: distance of two points (m).
-        height: the largest of a box; each has between half of it and all (m).
-        count: boxes that are thrown; those that reach the middle or the edge are left out.
-        length: of their sides (m).
-        platform: a side of the middle (m).
+    Of ``count`` boxes that are thrown, those that reach the middle or the edge are left out. Each is between half of
+    ``height`` (m) and all of it high; ``length`` has the least and the greatest of its sides (m).
     """
     top = between(height, difficulty) * rng.uniform(0.5, 1.0, count)
     half = rng.uniform(*length, (count, 2)) / 2
@@ -207,27 +151,19 @@ def obstacles(
 
 def stepping_stones(
     difficulty: float,
-    rng: np.random.Generator,
+    rng: Generator,
     size: float,
     cell: float,
-    stone: tuple[float, float] = (0.8, 0.3),
-    gap: tuple[float, float] = (0.05, 0.3),
-    height: tuple[float, float] = (0.0, 0.1),
+    stone: Bounds = (0.8, 0.3),
+    gap: Bounds = (0.05, 0.3),
+    height: Bounds = (0.0, 0.1),
     platform: float = 2.0,
     depth: float = 1.0,
 ) -> Patch:
-    """Returns stones in a pit, around a platform.
+    """Returns stones in a pit, around a platform: large ones close together to small ones apart.
 
-    Args:
-        difficulty: from large stones close together to small ones apart.
-        rng: draws the heights of the stones.
-        size: a side (m).
-        cell: not used.
-        stone: length of their sides (m).
-        gap: between two (m).
-        height: by which they differ from the border's, either way (m).
-        platform: a side of it (m).
-        depth: of the pit (m).
+    Stones have a side of ``stone`` (m), are ``gap`` (m) apart, and differ by up to ``height`` (m) from the border's,
+    either way. ``platform`` is a side of the platform, ``depth`` that of the pit (m).
     """
     side, apart, uneven = (between(bounds, difficulty) for bounds in (stone, gap, height))
     bottom = -depth - DEEP
@@ -244,47 +180,23 @@ def stepping_stones(
 
 def gap(
     difficulty: float,
-    rng: np.random.Generator,
+    rng: Generator,
     size: float,
     cell: float,
-    width: tuple[float, float] = (0.05, 0.6),
+    width: Bounds = (0.05, 0.6),
     platform: float = 2.0,
     depth: float = 1.0,
 ) -> Patch:
-    """Returns a platform with a gap around it.
-
-    Args:
-        difficulty: from the narrowest gap to the widest.
-        rng: not used.
-        size: a side (m).
-        cell: not used.
-        width: of the gap (m).
-        platform: a side of it (m).
-        depth: of the gap (m).
-    """
+    """Returns a platform, of side ``platform`` (m), with a gap of a ``width`` and a ``depth`` (m) around it."""
     far, bottom = platform / 2 + between(width, difficulty), -depth - DEEP
     boxes = ring(size / 2, size / 2 - far, 0.0, bottom) + block(platform / 2, 0.0, bottom)
     return Patch(boxes=np.array(boxes + block(far, -depth, bottom)))
 
 
 def pit(
-    difficulty: float,
-    rng: np.random.Generator,
-    size: float,
-    cell: float,
-    depth: tuple[float, float] = (0.05, 0.5),
-    platform: float = 3.0,
+    difficulty: float, rng: Generator, size: float, cell: float, depth: Bounds = (0.05, 0.5), platform: float = 3.0
 ) -> Patch:
-    """Returns a pit with upright walls.
-
-    Args:
-        difficulty: from the shallowest to the deepest.
-        rng: not used.
-        size: a side (m).
-        cell: not used.
-        depth: of the pit (m).
-        platform: a side of its floor (m).
-    """
+    """Returns a pit of a ``depth`` (m) with upright walls; ``platform`` is a side of its floor (m)."""
     deep = between(depth, difficulty)
     boxes = ring(size / 2, size / 2 - platform / 2, 0.0, -deep - DEEP) + block(platform / 2, -deep, -deep - DEEP)
     return Patch(boxes=np.array(boxes))
