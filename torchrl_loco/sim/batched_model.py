@@ -48,15 +48,10 @@ def add_up_masses(
 
 
 class BatchedModel:
-    """Gives the fields that vary a row for each world, and copies the numbers of the worlds into them.
-
-    Args:
-        model: the model on the device, whose fields are replaced.
-        varied: which numbers differ from world to world.
-        numbers: rows of them, ``(nworld, varied.count)``.
+    """Gives the fields that vary a row for each world, and copies the numbers ``(nworld, varied.count)`` into them.
 
     Attributes:
-        model: the model.
+        model: the model on the device, whose fields are replaced.
     """
 
     def __init__(self, model: "mjw.Model", varied: Varied, numbers: wp.array) -> None:
@@ -79,14 +74,13 @@ class BatchedModel:
 
     def update(self, mask: wp.array) -> None:
         """Copies the numbers of the worlds in ``mask`` ``(nworld,)``; ``body_subtreemass`` follows the masses."""
-        count, device = self._numbers.shape[0], self._numbers.device
+        m, count, device = self.model, self._numbers.shape[0], self._numbers.device
         for name, places in self._places.items():
             inputs = [mask, self._numbers, self._varied.columns[name].start, places]
             wp.launch(write_field, (count, places.size), inputs=inputs, outputs=[self._flat[name]], device=device)
         if "body_mass" in self._places:
-            model = self.model
-            inputs = [model.body_parentid, model.body_mass, mask]
-            wp.launch(add_up_masses, count, inputs=inputs, outputs=[model.body_subtreemass], device=device)
+            inputs = [m.body_parentid, m.body_mass, mask]
+            wp.launch(add_up_masses, count, inputs=inputs, outputs=[m.body_subtreemass], device=device)
 
 
 def nominal_numbers(varied: Varied | None, num_envs: int, device: wp.Device) -> wp.array:

@@ -11,11 +11,6 @@ import warp as wp
 class Buffer:
     """An array of zeros on a device, as Warp and as torch see it. Its address never changes, so graphs can record it.
 
-    Args:
-        shape: its shape.
-        dtype: its Warp type.
-        device: where it lives.
-
     Attributes:
         warp: what kernels read and write.
         torch: a view of the same memory. It always holds the current values: clone what you want to keep.
@@ -34,12 +29,7 @@ class Buffer:
 
 
 class PackedBuffers:
-    """Arrays of float32 and flags in one piece of memory, which can be copied at once.
-
-    Args:
-        floats: number of floats of each array.
-        flags: number of flags.
-        device: where it lives.
+    """Arrays of so many float32 each, and as many flags, in one piece of memory, which can be copied at once.
 
     Attributes:
         memory: all of it, as bytes.
@@ -58,7 +48,14 @@ class PackedBuffers:
 def array(values: Any, kind: Any, device: wp.Device) -> wp.array:
     """Returns numbers as an array of Warp's, of vectors or matrices too."""
     shape = getattr(kind, "_shape_", ())
-    scalar = {int: np.int32, float: np.float32, bool: np.bool_, wp.uint64: np.uint64, wp.vec3i: np.int32}
+    scalar = {
+        int: np.int32,
+        float: np.float32,
+        bool: np.bool_,
+        wp.uint64: np.uint64,
+        wp.vec2i: np.int32,
+        wp.vec3i: np.int32,
+    }
     values = np.asarray(values).astype(scalar.get(kind, np.float32))
     outer = values.shape[: values.ndim - len(shape)] if values.size else (0,) * max(values.ndim - len(shape), 1)
     return wp.array(np.ascontiguousarray(values.reshape(*outer, *shape)), dtype=kind, device=device)

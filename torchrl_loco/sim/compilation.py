@@ -25,11 +25,7 @@ def compile_kernels(launches: Iterable[Callable[[], None]], device: wp.Device) -
 
     Warp compiles a module when one of its kernels is first launched, one module after another. Once the modules are
     known they can be compiled on all cores, and the progress bar knows how many are left. A module that another process
-    is compiling is waited for.
-
-    Args:
-        launches: functions that make the launches. Whatever else they do takes effect.
-        device: the Warp device.
+    is compiling is waited for. Whatever else ``launches`` do takes effect.
     """
     with wp.ScopedDevice(device), _collecting() as variants:
         for launch in launches:
@@ -98,12 +94,10 @@ def _collecting() -> Iterator[dict[tuple[wp.Module, int], None]]:
 
     replaced: list[tuple[Any, str, Callable[..., Any]]] = [(wp.Module, "load", load), (wp, "capture_if", both)]
     replaced += [(wp, "capture_while", once), (wp, "get_suggested_block_size", block_size)]
-    with _COLLECTING:  # one at a time: two would restore each other's functions
-        originals = [getattr(owner, name) for owner, name, _ in replaced]
-        try:
-            for (owner, name, new), original in zip(replaced, originals, strict=True):
-                setattr(owner, name, here(new, original))
-            yield variants
-        finally:
-            for (owner, name, _), original in zip(replaced, originals, strict=True):
-                setattr(owner, name, original)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_COLLECTING)  # one at a time: two would restore each other's functions
+        for owner, name, new in replaced:
+            original = getattr(owner, name)
+            stack.callback(setattr, owner, name, original)
+            setattr(owner, name, here(new, original))
+        yield variants

@@ -72,14 +72,8 @@ def read_sums(
 class ContactForces:
     """Adds up the forces of the contacts on some geoms, the same to the bit for any order of the contacts.
 
-    Args:
-        m: the model.
-        geoms: the geoms.
-        data: the data whose contacts are added up.
-        rows: of how many substeps the sums are kept.
-
     Attributes:
-        rows: as above.
+        rows: of how many substeps the sums are kept.
         force: net force of the contacts on each geom, in the world's frame (N), ``(nworld, rows * len(geoms))`` vec3,
             substep by substep.
         in_contact: whether it has any, ``(nworld, rows * len(geoms))`` bool.
@@ -101,11 +95,7 @@ class ContactForces:
     def update(self, model: "mjw.Model", data: "mjw.Data", mask: wp.array, row: int | None = None) -> None:
         """Adds up the contacts of the last physics step in the worlds where ``mask`` ``(nworld,)`` is set.
 
-        Args:
-            model: the model.
-            data: its data.
-            mask: the worlds.
-            row: where the sums are kept; ``None`` writes them into every row.
+        The sums are kept in a row; ``None`` writes them into every row.
         """
         device, contact = data.qpos.device, data.contact
         mjw.contact_force(model, data, self._contacts, True, self._of_contact)  # in the world's frame
@@ -114,9 +104,8 @@ class ContactForces:
             array.zero_()
         inputs = [data.nacon, contact.geom, contact.efc_address, contact.worldid, self._index, self._of_contact]
         wp.launch(add_contacts, dim=data.naconmax, inputs=inputs, outputs=sums, device=device)
-        bounds = (0, self.rows) if row is None else (row, row + 1)
-        outputs = [self.force, self.in_contact]
-        wp.launch(read_sums, dim=shape, inputs=[mask, *bounds, *sums], outputs=outputs, device=device)
+        inputs = [mask, *((0, self.rows) if row is None else (row, row + 1)), *sums]
+        wp.launch(read_sums, dim=shape, inputs=inputs, outputs=[self.force, self.in_contact], device=device)
 
 
 def contact_forces_bytes(m: mujoco.MjModel, geoms: int, num_envs: int, naconmax: int, rows: int = 1) -> int:

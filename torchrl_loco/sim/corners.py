@@ -14,6 +14,7 @@ DIAGONALS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 
 LIKE = ("condim", "friction", "solref", "solimp", "solmix", "priority", "margin", "gap")
 """What a sphere has of its solid."""
 BITS = 31
+"""Bits of a mask of contacts, but for its sign."""
 TYPE = mujoco.mjtGeom
 FIELD, ELLIPSOID, CYLINDER, BOX, MESH = (
     int(getattr(TYPE, f"mjGEOM_{kind}")) for kind in ("HFIELD", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
@@ -23,10 +24,7 @@ FIELD, ELLIPSOID, CYLINDER, BOX, MESH = (
 def stand_on_corners(spec: mujoco.MjSpec) -> list[str]:
     """Gives solids that may touch a height field of the world spheres in their place, for its fields and boxes.
 
-    What moves they touch as before; and where there is no field, everything.
-
-    Args:
-        spec: the model, which is changed.
+    What moves they touch as before; and where there is no field, everything. The model is changed.
 
     Returns:
         The names of the solids, or their numbers.
@@ -64,11 +62,11 @@ def stand_on_corners(spec: mujoco.MjSpec) -> list[str]:
                 geom.conaffinity |= accepted
                 continue
             names.append(geom.name or str(g))
-            for k, (place, radius) in enumerate(spheres(m, g)):
+            copied = {field: getattr(geom, field) for field in LIKE}
+            copied |= {"type": TYPE.mjGEOM_SPHERE, "contype": 0, "conaffinity": accepted, "mass": 0.0, "group": 3}
+            for k, (center, radius) in enumerate(spheres(m, g)):
                 name = f"{geom.name}_corner_{k}" if geom.name else ""
-                own = {"type": TYPE.mjGEOM_SPHERE, "pos": place, "size": [radius, 0, 0], "mass": 0.0, "group": 3}
-                copied = {field: getattr(geom, field) for field in LIKE}
-                geom.parent.add_geom(name=name, contype=0, conaffinity=accepted, **own, **copied)
+                geom.parent.add_geom(name=name, pos=center, size=[radius, 0, 0], **copied)
     return names
 
 

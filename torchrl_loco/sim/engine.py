@@ -50,12 +50,9 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def step(self, around: Around = ALONE) -> None:
-        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state.
+        """Advances every world by one control step under ``ctrl``, with what it does around the physics.
 
-        Forces, contacts and the sensors of forces are those of the last substep.
-
-        Args:
-            around: what each world does before and after the physics.
+        Poses and sensors belong to the new state; forces, contacts and the sensors of forces to the last substep.
         """
 
     @abc.abstractmethod

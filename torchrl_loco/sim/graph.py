@@ -187,9 +187,6 @@ class ScratchPool:
 
     The memory of mujoco_warp's deterministic kernels belongs to the recording. Warp requests it on a stream that is not
     being recorded; such requests go to the allocator that was active before.
-
-    Args:
-        device: a CUDA device.
     """
 
     def __init__(self, device: wp.Device) -> None:

@@ -9,16 +9,13 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.config import read_mjcf
-from torchrl_loco.sim.corners import stand_on_corners
+from torchrl_loco.sim.corners import BITS, stand_on_corners
 
 FOLDERS = ("assetdir", "meshdir", "texturedir")
 """Attributes of MJCF's compiler that name folders of files."""
 
 NEVER = -1e10
 """Margin (m) of an explicit pair of geoms that does not touch: nothing is so deep."""
-
-BITS = 31
-"""Bits of a mask of contacts, but for its sign."""
 
 VELOCITY_SENSORS = {
     int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
@@ -108,9 +105,7 @@ def _path(source: Path | str, folder: Path | None) -> Path:
 def files(source: Path | str | mujoco.MjSpec, folder: Path | None = None) -> list[Path]:
     """Returns the files of a model, what it includes and its meshes among them; none for MJCF text and specs.
 
-    Args:
-        source: as :func:`load` takes it.
-        folder: as there.
+    Arguments are those of :func:`load`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -123,9 +118,9 @@ def files(source: Path | str | mujoco.MjSpec, folder: Path | None = None) -> lis
         with contextlib.suppress(ElementTree.ParseError):
             for node in ElementTree.parse(file).iter():
                 places += [path.parent / node.attrib[name] for name in FOLDERS if name in node.attrib]
-                of = [value for name, value in node.items() if name.startswith("file")]
-                names += of
-                included = [(path.parent / name).resolve() for name in of if node.tag == "include"]
+                mentioned = [value for name, value in node.items() if name.startswith("file")]
+                names += mentioned
+                included = [(path.parent / name).resolve() for name in mentioned if node.tag == "include"]
                 found += [each for each in included if each.is_file() and each not in found]
     others = [file for name in names for place in places if (file := (place / name).resolve()).is_file()]
     return list(dict.fromkeys([*found, *others]))
@@ -142,12 +137,7 @@ def home_pose(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def control(mj_model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
-    """Returns the controls of actions in [-1, 1], which are scaled to the range of each actuator.
-
-    Args:
-        mj_model: the model.
-        action: ``(..., nu)``, clipped beyond.
-    """
+    """Returns the controls of actions ``(..., nu)``, which are clipped to [-1, 1] and scaled to actuators' ranges."""
     low, high = mj_model.actuator_ctrlrange.T
     return 0.5 * (low + high) + 0.5 * (high - low) * np.clip(action, -1.0, 1.0)
 
@@ -167,17 +157,17 @@ def touch_ground_only(mj_model: mujoco.MjModel) -> None:
     if len(kinds) > BITS:
         raise ValueError(f"contacts='ground' can do {BITS} kinds of contype and conaffinity of fixed geoms at most")
     for g in range(m.ngeom):
-        own = int(m.geom_contype[g]), int(m.geom_conaffinity[g])
+        masks = int(m.geom_contype[g]), int(m.geom_conaffinity[g])
         if fixed[g]:
-            bit = 1 << kinds.index(own) if own in kinds else 0
+            bit = 1 << kinds.index(masks) if masks in kinds else 0
             m.geom_contype[g], m.geom_conaffinity[g] = bit, 0
         else:
-            touched = (k for k, other in enumerate(kinds) if own[0] & other[1] or own[1] & other[0])
+            touched = (k for k, other in enumerate(kinds) if masks[0] & other[1] or masks[1] & other[0])
             m.geom_contype[g], m.geom_conaffinity[g] = 0, sum(1 << k for k in touched)
     for body in range(m.nbody):
-        own = m.geom_bodyid == body
-        m.body_contype[body] = np.bitwise_or.reduce(m.geom_contype[own])
-        m.body_conaffinity[body] = np.bitwise_or.reduce(m.geom_conaffinity[own])
+        geoms = m.geom_bodyid == body
+        m.body_contype[body] = np.bitwise_or.reduce(m.geom_contype[geoms])
+        m.body_conaffinity[body] = np.bitwise_or.reduce(m.geom_conaffinity[geoms])
     moving = ~fixed[m.pair_geom1] & ~fixed[m.pair_geom2]
     m.pair_margin[moving] = NEVER
 

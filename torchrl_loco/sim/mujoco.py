@@ -38,17 +38,12 @@ class Data:
     """The state of all worlds in float32, as the other engines have it, and what follows from it.
 
     Arrays are those of MuJoCo-Warp's ``mjData``. Those that were read as attributes once are kept up to date.
-
-    Args:
-        m: the model.
-        num_envs: number of worlds.
     """
 
     def __init__(self, m: mujoco.MjModel, num_envs: int) -> None:
-        with wp.ScopedDevice("cpu"):
-            arrays = mjw.make_data(m, nworld=num_envs, naconmax=1, njmax=1)
         self._arrays: dict[str, wp.array] = {}
-        self._all = arrays
+        with wp.ScopedDevice("cpu"):
+            self._all = mjw.make_data(m, nworld=num_envs, naconmax=1, njmax=1)
 
     def __getattr__(self, name: str) -> wp.array:
         """Returns an array, which follows from then on.
@@ -74,12 +69,7 @@ class Data:
 
 
 class World:
-    """A world of C MuJoCo: its ``mjData``, and NumPy's views of what is copied to and from it at every step.
-
-    Args:
-        m: the model.
-        state: names of what makes up its state.
-    """
+    """A world of C MuJoCo: its ``mjData``, and NumPy's views of what is copied to and from it at every step."""
 
     def __init__(self, m: mujoco.MjModel, state: Collection[str]) -> None:
         self.model, self.data = m, mujoco.MjData(m)
@@ -111,11 +101,10 @@ class MujocoEngine(Engine):
         varied: Varied | None = None,
         contact_rows: int = 1,
     ) -> None:
-        m = mj_model
+        self._nominal = m = mj_model
         self._varied, self._substeps, self._rows = varied, config.substeps, contact_rows
         self.model, self.data = Model(m, device), Data(m, num_envs)
         self._kernels = WorldKernels()
-        self._nominal = m
         self._passive = _without_actuation(m)
         home: Any = mujoco.MjData(m)
         names = [name for name in STATE if np.size(getattr(home, name))]
@@ -158,7 +147,9 @@ class MujocoEngine(Engine):
     def step(self, around: Around = ALONE) -> None:
         self._kernels.launch([*around.first, *around.before], self._all)
         shown, substeps, rows = self.data.shown(), self._substeps, self._rows
-        changed = {name: _differ(rows, self._written[name]) for name, rows in self._state.items()}
+        changed = {
+            name: (rows != self._written[name]).reshape(len(rows), -1).any(1) for name, rows in self._state.items()
+        }  # worlds, by what of their state
         anything = np.any(list(changed.values()), axis=0)
 
         def advance(i: int) -> None:
@@ -217,16 +208,15 @@ class MujocoEngine(Engine):
     def _each(self, worlds: np.ndarray, work: Callable[[int], None]) -> None:
         """Does something in worlds, a share of them in each thread; MuJoCo computes without Python's lock."""
 
-        def some(share: np.ndarray) -> None:
+        def work_through(share: np.ndarray) -> None:
             for world in share.tolist():
                 work(world)
 
         threads = min(len(worlds), os.cpu_count() or 1)
         if threads < 2:
-            some(worlds)
-            return
-        for done in [self._threads.submit(some, share) for share in np.array_split(worlds, threads)]:
-            done.result()
+            work_through(worlds)
+        else:
+            list(self._threads.map(work_through, np.array_split(worlds, threads)))  # which waits, and raises errors
 
     def _load(self, i: int, names: Collection[str]) -> None:
         """Writes parts of a world's state into its ``mjData``."""
@@ -258,15 +248,12 @@ class MujocoEngine(Engine):
     def _flag(self, i: int, *, limited: bool) -> None:
         """Flags what the substeps of a world have dropped or not finished."""
         world = self._worlds[i]
-        d, bits = world.data, int(Overflow.ITERATIONS) if limited else 0
-        if world.warned.any():
-            bits |= sum(int(flag) for kind, flag in FULL.items() if world.warned[kind])
-        if bits:
-            self._overflow[i] |= bits
-        if (rows := d.maxuse_efc) > self._most[0][i]:
-            self._most[0][i] = rows
-        if (contacts := d.maxuse_con) > self._most[1][0]:
-            self._most[1][0] = contacts
+        bits = int(Overflow.ITERATIONS) if limited else 0
+        bits |= sum(int(flag) for kind, flag in FULL.items() if world.warned[kind])
+        self._overflow[i] |= bits
+        constraints, contacts = self._most
+        constraints[i] = max(constraints[i], world.data.maxuse_efc)
+        contacts[0] = max(contacts[0], world.data.maxuse_con)
 
     def _add_up_forces(self, i: int, row: int) -> None:
         """Adds up the forces of a world's contacts on each geom that was asked for, in the world's frame (N)."""
@@ -307,11 +294,6 @@ def _without_actuation(m: mujoco.MjModel) -> mujoco.MjModel:
     passive = copy.copy(m)
     passive.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     return passive
-
-
-def _differ(rows: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Returns in which worlds numbers differ from those of before, ``(nworld,)``."""
-    return (rows != before).reshape(len(rows), -1).any(1)
 
 
 def data_bytes(m: mujoco.MjModel, num_envs: int) -> int:

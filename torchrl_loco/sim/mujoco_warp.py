@@ -124,13 +124,6 @@ def with_margin(needed: int) -> int:
     return math.ceil(needed * MARGIN)
 
 
-def _instead(m: mujoco.MjModel) -> str:
-    """Returns what to write in an MJCF for what MuJoCo-Warp does not have."""
-    if m.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
-        return ' Write <option solver="Newton"/>, or leave solver out'
-    return ""
-
-
 class MujocoWarpEngine(Engine):
     """Steps all worlds with MuJoCo-Warp.
 
@@ -155,7 +148,9 @@ class MujocoWarpEngine(Engine):
             try:
                 self.model = mjw.put_model(mj_model)
             except NotImplementedError as error:
-                raise ValueError(f"MuJoCo-Warp cannot step this model: {error}{_instead(mj_model)}") from error
+                is_pgs = mj_model.opt.solver == mujoco.mjtSolver.mjSOL_PGS
+                instead = ' Write <option solver="Newton"/>, or leave solver out' if is_pgs else ""
+                raise ValueError(f"MuJoCo-Warp cannot step this model: {error}{instead}") from error
             self.data = mjw.make_data(
                 with_every_row(mj_model, varied), nworld=num_envs, naconmax=config.naconmax, njmax=config.njmax
             )
@@ -292,13 +287,8 @@ class MujocoWarpEngine(Engine):
     def _evaluate_forces(self, mask: wp.array, sensordata: wp.array, overflow: wp.array, *, contacts: bool) -> None:
         """Evaluates all sensors, those of forces without control, where ``mask`` ``(nworld,)`` is set.
 
-        That takes the first half of a physics step of all worlds.
-
-        Args:
-            mask: the worlds.
-            sensordata: room for the sensors of the others.
-            overflow: room for the overflow of all.
-            contacts: whether contact forces are found.
+        That takes the first half of a physics step of all worlds. ``sensordata`` and ``overflow`` are room for what the
+        other worlds, and all worlds, have of them.
         """
         model, data = self.model, self.data
         wp.copy(sensordata, data.sensordata)
@@ -322,15 +312,8 @@ def data_bytes(
 ) -> int:
     """Returns the memory that ``mjData`` of so many worlds takes (bytes), without allocating it.
 
-    Its size is linear in the number of worlds and in ``naconmax``; three small instances give the coefficients.
-
-    Args:
-        mj_model: the model.
-        config: settings of the simulation.
-        num_envs: number of worlds.
-        contact_geoms: number of geoms whose contact forces are asked for.
-        varied: which numbers of the model differ from world to world; their memory is counted too.
-        contact_rows: of how many substeps contact forces are kept.
+    Its size is linear in the number of worlds and in ``naconmax``; three small instances give the coefficients. The
+    forces of so many geoms, and numbers that differ from world to world, are counted too.
     """
     with_rows = with_every_row(mj_model, varied)
 

@@ -108,9 +108,7 @@ def follow_rows(
 class RowOrder:
     """Sorts the constraint rows of every world by type, then by joint or pair of geoms.
 
-    Args:
-        model: the model.
-        data: the data whose rows :meth:`apply` moves, between ``mujoco_warp.step1`` and ``step2``.
+    :meth:`apply` moves the rows of ``data``, between ``mujoco_warp.step1`` and ``step2``.
 
     Raises:
         ValueError: the model has something else whose order varies.

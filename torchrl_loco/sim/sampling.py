@@ -1,10 +1,11 @@
 """What a world draws at its reset: a random stream of its own, a state of a table, or a pose free of contact."""
 
-from typing import Any
-
 import mujoco
 import numpy as np
 import warp as wp
+
+from torchrl_loco.sim.buffer import array
+from torchrl_loco.sim.world_func import fill
 
 MAX_TRIES = 64
 """Poses drawn before one in contact is kept. Three of four humanoid poses are free, so this does not happen."""
@@ -263,61 +264,49 @@ def draw_orientation_above_floor(world: int, args: RootAboveFloor, stream: wp.ui
 
 
 def make_outline(mj_model: mujoco.MjModel, device: wp.Device) -> Outline:
-    """Gathers the :class:`Outline` of a model in its default pose.
+    """Returns the outline of a model of one tree on a free joint, in its default pose and the frame of the root.
 
-    Args:
-        mj_model: a model of one tree on a free joint, above a floor, which is geom 0.
-        device: where the arrays live.
-
-    Returns:
-        The outline, in the frame of the root.
+    Geom 0 is the floor below it.
 
     Raises:
         ValueError: the model has another kind of geom.
     """
-    m, data = mj_model, mujoco.MjData(mj_model)
+    m, data, kinds = mj_model, mujoco.MjData(mj_model), mujoco.mjtGeom
     mujoco.mj_kinematics(m, data)
-    root, count = data.xmat[1].reshape(3, 3), m.ngeom - 1
-    center = (data.geom_xpos[1:] - data.xpos[1]) @ root
-    radius, segment, axes = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
-    for i in range(count):
-        kind, size = mujoco.mjtGeom(int(m.geom_type[i + 1])), m.geom_size[i + 1]
-        frame = root.T @ data.geom_xmat[i + 1].reshape(3, 3)
-        if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
-            radius[i] = size[0]
-        elif kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-            axes[i] = frame * size
-        elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-            axes[i] = frame * (size[0], size[0], 0.0)
-        else:
-            raise ValueError("an outline consists of spheres, capsules, cylinders and ellipsoids")
-        if kind in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER):
-            segment[i] = frame[:, 2] * size[1]
-    outline = Outline()
-    outline.center = wp.array(center, dtype=wp.vec3, device=device)
-    outline.radius = wp.array(radius, dtype=float, device=device)
-    outline.segment = wp.array(segment, dtype=wp.vec3, device=device)
-    outline.axes = wp.array(axes, dtype=wp.mat33, device=device)
-    return outline
+    root, size = data.xmat[1].reshape(3, 3), m.geom_size[1:]
+    sphere, capsule, cylinder, ellipsoid = (
+        (m.geom_type[1:] == kind)[:, None]
+        for kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER, kinds.mjGEOM_ELLIPSOID)
+    )
+    if not (sphere | capsule | cylinder | ellipsoid).all():
+        raise ValueError("an outline consists of spheres, capsules, cylinders and ellipsoids")
+    frames = root.T @ data.geom_xmat[1:].reshape(-1, 3, 3)
+    disks = size[:, [0, 0, 0]] * (cylinder * (1.0, 1.0, 0.0))
+    return fill(
+        Outline,
+        center=array((data.geom_xpos[1:] - data.xpos[1]) @ root, wp.vec3, device),
+        radius=array(size[:, 0] * (sphere | capsule)[:, 0], float, device),
+        segment=array(frames[:, :, 2] * size[:, 1:2] * (capsule | cylinder), wp.vec3, device),
+        axes=array(frames * (size * ellipsoid + disks)[:, None], wp.mat33, device),
+    )
 
 
 def make_skeleton(mj_model: mujoco.MjModel, pairs: np.ndarray, device: wp.Device) -> Skeleton:
-    """Gathers the :class:`Skeleton` of a model.
+    """Returns the skeleton of a model of free joints, hinges, capsules and spheres on a floor at z = 0.
 
     Args:
-        mj_model: a model of free joints, hinges, capsules and spheres on a floor at z = 0, which is geom 0.
+        mj_model: the model, whose geom 0 is the floor.
         pairs: geoms that may touch, lower id first, shape ``(npair, 2)``.
         device: where the arrays live.
-
-    Returns:
-        The skeleton.
 
     Raises:
         ValueError: the model has another kind of joint or geom.
     """
     m, joint, geom = mj_model, mujoco.mjtJoint, mujoco.mjtGeom
-    capsule, sphere = m.geom_type[1:] == geom.mjGEOM_CAPSULE, m.geom_type[1:] == geom.mjGEOM_SPHERE
-    if m.geom_type[0] != geom.mjGEOM_PLANE or not np.all(capsule | sphere):
+    if (
+        m.geom_type[0] != geom.mjGEOM_PLANE
+        or not np.isin(m.geom_type[1:], (geom.mjGEOM_CAPSULE, geom.mjGEOM_SPHERE)).all()
+    ):
         raise ValueError("contact-free poses need a floor as geom 0 and only capsules and spheres after it")
     if not np.isin(m.jnt_type, (joint.mjJNT_FREE, joint.mjJNT_HINGE)).all():
         raise ValueError("contact-free poses need a model of free joints and hinges only")
@@ -326,23 +315,20 @@ def make_skeleton(mj_model: mujoco.MjModel, pairs: np.ndarray, device: wp.Device
     geom_axis = np.zeros((m.ngeom, 3))
     for i in range(m.ngeom):
         mujoco.mju_rotVecQuat(geom_axis[i], np.array([0.0, 0.0, half_length[i]]), m.geom_quat[i])
-
-    def array(values: Any, dtype: Any) -> wp.array:
-        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-    skeleton = Skeleton()
-    skeleton.body_parent = array(m.body_parentid, int)
-    skeleton.body_joint = array(np.stack([m.body_jntadr, m.body_jntnum], axis=1), wp.vec2i)
-    skeleton.body_pos = array(m.body_pos, wp.vec3)
-    skeleton.body_quat = array(m.body_quat[:, [1, 2, 3, 0]], wp.quat)
-    skeleton.joint_qpos = array(m.jnt_qposadr, int)
-    skeleton.joint_free = array(m.jnt_type == joint.mjJNT_FREE, bool)
-    skeleton.joint_pos = array(m.jnt_pos, wp.vec3)
-    skeleton.joint_axis = array(m.jnt_axis, wp.vec3)
-    skeleton.joint_range = array(m.jnt_range, wp.vec2)
-    skeleton.geom_body = array(m.geom_bodyid, int)
-    skeleton.geom_pos = array(m.geom_pos, wp.vec3)
-    skeleton.geom_axis = array(geom_axis, wp.vec3)
-    skeleton.geom_radius = array(m.geom_size[:, 0], float)
-    skeleton.pair = array(pairs, wp.vec2i)
-    return skeleton
+    return fill(
+        Skeleton,
+        body_parent=array(m.body_parentid, int, device),
+        body_joint=array(np.stack([m.body_jntadr, m.body_jntnum], axis=1), wp.vec2i, device),
+        body_pos=array(m.body_pos, wp.vec3, device),
+        body_quat=array(m.body_quat[:, [1, 2, 3, 0]], wp.quat, device),
+        joint_qpos=array(m.jnt_qposadr, int, device),
+        joint_free=array(m.jnt_type == joint.mjJNT_FREE, bool, device),
+        joint_pos=array(m.jnt_pos, wp.vec3, device),
+        joint_axis=array(m.jnt_axis, wp.vec3, device),
+        joint_range=array(m.jnt_range, wp.vec2, device),
+        geom_body=array(m.geom_bodyid, int, device),
+        geom_pos=array(m.geom_pos, wp.vec3, device),
+        geom_axis=array(geom_axis, wp.vec3, device),
+        geom_radius=array(m.geom_size[:, 0], float, device),
+        pair=array(pairs, wp.vec2i, device),
+    )

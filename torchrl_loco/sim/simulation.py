@@ -165,9 +165,8 @@ class Simulation:
         self.xmat = wp.to_torch(self.data.xmat)
         self.time = wp.to_torch(self.data.time)
         self.overflow = wp.to_torch(self.data.overflow)
-        self.numbers = torch.empty((num_envs, 0), device=device)
-        if differing is not None:
-            self.numbers = wp.to_torch(self.engine.numbers)
+        no_numbers = torch.empty((num_envs, 0), device=device)
+        self.numbers = no_numbers if differing is None else wp.to_torch(self.engine.numbers)
         self.contact_force_history = torch.empty((num_envs, rows, 0, 3), device=device)
         self.in_contact_history = torch.empty((num_envs, rows, 0), dtype=torch.bool, device=device)
         if geoms:
@@ -190,10 +189,9 @@ class Simulation:
         return wp.to_torch(self.engine.subtree_com())
 
     def step(self, around: Around = ALONE) -> None:
-        """Advances every world by one control step under ``ctrl``; poses and sensors belong to the new state.
+        """Advances every world by one control step under ``ctrl``, with what it does around the physics.
 
-        Args:
-            around: what each world does before and after the physics.
+        Poses and sensors belong to the new state.
 
         Raises:
             TypeError: it is something else.
@@ -222,11 +220,9 @@ class Simulation:
         self.engine.forward(mask, [rest, *before], after, at_rest=at_rest)
 
     def rest(self, mask: wp.array, then: Sequence[WorldFunc]) -> None:
-        """Puts worlds at rest in the default pose, without updating their poses and sensors.
+        """Puts worlds of a mask, bool ``(nworld,)``, at rest in the default pose, without updating poses and sensors.
 
-        Args:
-            mask: the worlds, bool ``(nworld,)``.
-            then: what each of them does after that.
+        After that each of them does what ``then`` says.
         """
         self._kernels.launch([WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0)), *then], mask)
 
@@ -261,18 +257,13 @@ class Simulation:
                 data = self.data
             else:
                 if worlds not in self._mujoco_data:
-                    self._mujoco_data[worlds] = mjw.make_data(
-                        with_every_row(self.mj_model, self.varied),
-                        nworld=worlds,
-                        naconmax=self.config.naconmax,
-                        njmax=self.config.njmax,
-                    )
+                    m, room = with_every_row(self.mj_model, self.varied), self.config
+                    self._mujoco_data[worlds] = mjw.make_data(m, worlds, naconmax=room.naconmax, njmax=room.njmax)
                 data = self._mujoco_data[worlds]
-                more = [
-                    *(("mocap_pos", "mocap_quat") if self.mj_model.nmocap else ()),
-                    *(["act"] if self.mj_model.na else []),
-                ]
-                for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time", *more):
+                names = ["qpos", "qvel", "qacc_warmstart", "ctrl", "time"]
+                names += ["mocap_pos", "mocap_quat"] if self.mj_model.nmocap else []
+                names += ["act"] if self.mj_model.na else []
+                for name in names:
                     wp.copy(getattr(data, name), getattr(self.data, name)[:worlds])
                 model = self._model_of_each_world()
                 mjw.kinematics(model, data)
@@ -373,11 +364,6 @@ def check_geoms(mj_model: mujoco.MjModel, geoms: Sequence[int]) -> tuple[int, ..
 
 def choose_engine(mj_model: mujoco.MjModel, config: SimConfig, varied: Varied | None = None) -> tuple[str, str]:
     """Returns the name of the engine that steps a model, and why.
-
-    Args:
-        mj_model: the model.
-        config: settings of the simulation.
-        varied: which numbers of the model differ from world to world.
 
     Raises:
         ValueError: ``config.engine`` is "compiled", and the model needs something that it does not have.

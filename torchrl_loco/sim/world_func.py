@@ -92,9 +92,6 @@ ALONE = Around()
 class Chain:
     """Functions of a world as one, which calls them in their order.
 
-    Args:
-        funcs: the functions.
-
     Attributes:
         func: the function that calls them.
         struct: the ``wp.struct`` that it takes.
