@@ -116,10 +116,8 @@ class Motion:
             table = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.empty((0, 0))
         except ValueError:
             widths = sorted({line.count(",") + 1 for line in lines})
-            wrong = next((k for k, line in enumerate(lines) if not _is_row(line)), None)
-            what = f"rows of {widths[0]} to {widths[-1]} numbers"
-            if wrong is not None:
-                what = f"{lines[wrong][:60]!r} in row {wrong}"
+            wrong = [f"{line[:60]!r} in row {k}" for k, line in enumerate(lines) if not _is_row(line)]
+            what = wrong[0] if wrong else f"rows of {widths[0]} to {widths[-1]} numbers"
             raise ValueError(f"{self.path} must have rows of as many numbers, it has {what}") from None
         if table.shape[1] < 8:
             raise ValueError(
@@ -138,23 +136,19 @@ class Motion:
             raise ValueError(f"{self.path} lacks {', '.join(missing)}: it has {', '.join(tables) or 'nothing'}")
         rate, joints, pos, quat = (tables[key] for key in ("fps", "joint_pos", "body_pos_w", "body_quat_w"))
         frames, bodies = len(joints) if joints.ndim else 0, pos.shape[1] if pos.ndim == 3 else 0
-        fits = (
-            rate.size == 1,
-            joints.ndim == 2,
-            bodies > 0,
-            *(each.dtype.kind in "fiu" for each in (rate, joints, pos, quat)),
-        )
-        if not all(fits) or pos.shape != (frames, bodies, 3) or quat.shape != (frames, bodies, 4):
+        fits = rate.size == 1 and joints.ndim == 2 and bodies > 0
+        fits = fits and pos.shape == (frames, bodies, 3) and quat.shape == (frames, bodies, 4)
+        if not fits or any(each.dtype.kind not in "fiu" for each in (rate, joints, pos, quat)):
             raise ValueError(
                 f"{self.path} must have fps, a number; joint_pos (frames, joints), body_pos_w (frames, bodies, 3) and "
                 f"body_quat_w (frames, bodies, 4), they are {rate.shape}, {joints.shape}, {pos.shape}, {quat.shape}"
             )
-        own = check_float(f"fps of {self.path}", float(rate.ravel()[0]))
-        if fps is not None and not math.isclose(fps, own, rel_tol=1e-3):
-            raise ValueError(f"{self.path} has {own:g} frames per second, not {fps:g}")
+        stated = check_float(f"fps of {self.path}", float(rate.ravel()[0]))
+        if fps is not None and not math.isclose(fps, stated, rel_tol=1e-3):
+            raise ValueError(f"{self.path} has {stated:g} frames per second, not {fps:g}")
         self._joints = [str(name) for name in np.ravel(tables.get("joint_names", ()))]
         self._bodies = pos, [str(name) for name in np.ravel(tables.get("body_names", ()))]
-        return own, np.concatenate([pos[:, 0], quat[:, 0], joints], axis=1).astype(float)
+        return stated, np.concatenate([pos[:, 0], quat[:, 0], joints], axis=1).astype(float)
 
     def _check(self) -> None:
         """Checks all that needs no model.
@@ -242,21 +236,19 @@ class Motion:
         if self._bodies is None:
             return []
         there, names = self._bodies
-        own = _bodies_of(m)
-        names = names or (own if there.shape[1] == len(own) else [])
-        both = [name for name in names if name in own]
+        bodies = _bodies_of(m)
+        names = names or (bodies if there.shape[1] == len(bodies) else [])
+        both = [name for name in names if name in bodies]
         if not both or len(names) != there.shape[1]:
             return [f"its {there.shape[1]} bodies have no names, so the order of the joints could not be checked"]
         every = self._stride
-        pos, _ = poses(m, q[::every])
-        here = pos[:, [m.body(name).id for name in both]]
+        here = poses(m, q[::every])[0][:, [m.body(name).id for name in both]]
         apart = np.linalg.norm(here - there[::every, [names.index(name) for name in both]], axis=2)
         if apart.max() > BODY_ERROR:
             frame, body = np.unravel_index(apart.argmax(), apart.shape)
-            at = every * frame
             raise ValueError(
-                f"{self.path}: {both[body]} lies {apart.max():.2f} m from where the joints put it in frame {at}: "
-                f"joints or bodies are in another order than the robot's, {', '.join(_joints_of(m))}"
+                f"{self.path}: {both[body]} lies {apart.max():.2f} m from where the joints put it in frame "
+                f"{every * frame}: joints or bodies are in another order than the robot's, {', '.join(_joints_of(m))}"
             )
         return []
 
@@ -395,36 +387,36 @@ class Frames:
             parts.append((q, qvel, pos, mat, lin, ang))
         lengths = np.array([len(part[0]) for part in parts])
         last = lengths.cumsum() - 1
-        joined = (np.concatenate(each) for each in zip(*parts, strict=True))
-        names = ("qpos", "qvel", "pos", "mat", "lin", "ang")
-        tables: dict[str, Any] = {
-            name: np.ascontiguousarray(table, dtype=np.float32) for name, table in zip(names, joined, strict=True)
-        }
-        weights = np.array([motion.weight for motion in motions])
-        of_clips = tuple(motion.name for motion in motions), last - lengths + 1, last, weights
+        joined = (np.ascontiguousarray(np.concatenate(each), np.float32) for each in zip(*parts, strict=True))
+        tables: Any = dict(zip(("qpos", "qvel", "pos", "mat", "lin", "ang"), joined, strict=True))
+        names, weights = tuple(motion.name for motion in motions), np.array([motion.weight for motion in motions])
         if said:
             name, notes = next(iter(said.items()))
             more = f", and more of {len(said) - 1} others" if len(said) > 1 else ""
             words = f"{name}: {'; '.join(notes)}{more}"
             logging.getLogger("torchrl_loco").warning("motion %s: see torchrl-loco motion", words)
-        return cls(*of_clips, **tables, said=said)
+        return cls(names, last - lengths + 1, last, weights, **tables, said=said)
 
 
 def save(path: Path, qpos: np.ndarray, fps: float, m: mujoco.MjModel) -> None:
     """Writes poses ``(frames, nq)`` as an npz as mjlab's, with the names of joints and bodies."""
-    pos, mat = poses(m, qpos)
-    quat = quat_of(mat.reshape(-1, 3, 3)).reshape(*mat.shape[:2], 4)
-    tables = {
-        **{"joint_pos": qpos[:, 7:], "joint_vel": _rate(qpos[:, 7:], 1.0 / fps)},
-        **{"body_pos_w": pos[:, 1:], "body_quat_w": quat[:, 1:]},
-        **{"body_lin_vel_w": _rate(pos[:, 1:], 1.0 / fps), "body_ang_vel_w": _turn_rate(mat[:, 1:], 1.0 / fps)},
-    }
+    pos, mat = (table[:, 1:] for table in poses(m, qpos))
+    joints, dt = qpos[:, 7:], 1.0 / fps
+    tables: Any = mjlabs_tables(joints, _rate(joints, dt), pos, mat, _rate(pos, dt), _turn_rate(mat, dt))
+    tables |= {"joint_names": _joints_of(m), "body_names": _bodies_of(m)}
     content = io.BytesIO()
-    names = {"joint_names": _joints_of(m), "body_names": _bodies_of(m)}
-    written: dict[str, Any] = {"fps": np.array([fps]), **{name: np.array(words) for name, words in names.items()}}
-    written |= {name: table.astype(np.float32) for name, table in tables.items()}
-    np.savez_compressed(content, **written)
+    np.savez_compressed(content, fps=np.array([fps]), **tables)
     replace_file(path, content.getvalue())
+
+
+def mjlabs_tables(
+    joints: np.ndarray, rates: np.ndarray, pos: np.ndarray, mat: np.ndarray, lin: np.ndarray, ang: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Returns joints, and positions, orientations and velocities of bodies, by mjlab's names, float32."""
+    quat = quat_of(mat.reshape(-1, 3, 3)).reshape(*mat.shape[:2], 4)
+    tables = {"joint_pos": joints, "joint_vel": rates, "body_pos_w": pos, "body_quat_w": quat}
+    tables |= {"body_lin_vel_w": lin, "body_ang_vel_w": ang}
+    return {name: table.astype(np.float32) for name, table in tables.items()}
 
 
 def poses(m: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -448,9 +440,9 @@ def lowest_points(m: mujoco.MjModel, pos: np.ndarray, mat: np.ndarray) -> np.nda
         body, kind, size = m.geom_bodyid[geom], kinds(int(m.geom_type[geom])), m.geom_size[geom]
         if not body or not (m.geom_contype[geom] or m.geom_conaffinity[geom]):
             continue
-        own = np.empty(9)
-        mujoco.mju_quat2Mat(own, m.geom_quat[geom])
-        axes = mat[:, body, 2] @ own.reshape(3, 3)  # heights of the geom's axes, (frames, 3)
+        turn = np.empty(9)
+        mujoco.mju_quat2Mat(turn, m.geom_quat[geom])
+        axes = mat[:, body, 2] @ turn.reshape(3, 3)  # heights of the geom's axes, (frames, 3)
         half: Any
         if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE):
             half = size[0] + (np.abs(axes[:, 2]) * size[1] if kind == kinds.mjGEOM_CAPSULE else 0.0)
@@ -469,9 +461,9 @@ def lowest_points(m: mujoco.MjModel, pos: np.ndarray, mat: np.ndarray) -> np.nda
 def resampled(qpos: np.ndarray, fps: float, dt: float) -> np.ndarray:
     """Returns poses at multiples of ``dt`` (s), between frames along the shortest turn of the base."""
     last = (len(qpos) - 1) / fps
-    at = np.arange(math.floor(last / dt + 1e-6) + 1) * dt * fps
-    before = np.minimum(at.astype(int), len(qpos) - 2)
-    share = (at - before)[:, None]
+    frames = np.arange(math.floor(last / dt + 1e-6) + 1) * dt * fps
+    before = np.minimum(frames.astype(int), len(qpos) - 2)
+    share = (frames - before)[:, None]
     one, other = qpos[before], qpos[before + 1]
     found = (1.0 - share) * one + share * other
     found[:, 3:7] = _turned(one[:, 3:7], share * _rotation(one[:, 3:7], other[:, 3:7]))
