@@ -6,6 +6,11 @@ from typing import Any
 
 from torchrl_loco.checks import COUNT, FRACTION, NOT_NEGATIVE, SEED, check_fields, check_float, check_int
 
+PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
+"""Greatest change of a floating base's velocity by a push (m/s, rad/s), as mjlab 1.6 has it."""
+PUSH_EVERY = (1.0, 3.0)
+"""Least and greatest time between two pushes (s)."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Conditions:

@@ -96,9 +96,8 @@ def diagnose(body: str = "walker") -> Iterator[Finding]:
                 continue
             right = deviation < TOLERANCE  # false for NaN
             verdict = f"{'ok' if right else 'WRONG'}: differs from C MuJoCo by {deviation:.1e} (limit {TOLERANCE:.0e})"
-            yield Finding(
-                f"{body} on {device}", f"{verdict}, made in {seconds:.1f} s; engine {engine}", problem=not right
-            )
+            words = f"{verdict}, made in {seconds:.1f} s; engine {engine}"
+            yield Finding(f"{body} on {device}", words, problem=not right)
 
 
 def _gib(size: float) -> str:
@@ -122,12 +121,6 @@ def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) 
     """Measures the ``njmax`` and ``naconmax`` that a task needs under MuJoCo-Warp, with limits far above the need.
 
     Actions are random, the same in every call. Other actions, a trained policy's for one, may need more.
-
-    Args:
-        task: id of the environment.
-        num_envs: number of worlds.
-        device: where to measure; ``None`` takes CUDA if there is any.
-        steps: control steps.
 
     Returns:
         For each setting the most that was needed and the advised value.

@@ -49,11 +49,8 @@ def remember(path: Path) -> None:
     try:
         to = store()
         to.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        descriptor = os.open(to, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
-        try:
-            os.write(descriptor, b"".join(os.fsencode(f"{line}\n") for line in new))  # at once: others append too
-        finally:
-            os.close(descriptor)
+        with open(to, "ab", buffering=0, opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+            file.write(b"".join(os.fsencode(f"{line}\n") for line in new))  # at once: others append too
     except (OSError, RuntimeError) as error:
         warnings.warn(f"other processes will not know that {path} is yours: {error}", stacklevel=2)
 

@@ -109,12 +109,13 @@ def _classes() -> dict[str, type[LocoEnv]]:
     return classes
 
 
-def controls(dump: NanDump) -> torch.Tensor:
-    """Returns the controls that the action of a dump became, ``(nu,)``; a task's memory is zero for that."""
+def model_and_controls(dump: NanDump) -> tuple[mujoco.MjModel, torch.Tensor]:
+    """Returns the world's model, and the controls that the action became, ``(nu,)``; memory is zero for that."""
     env = dump.make_env("cpu")
     env.reset(dump.state, set_state=True)
+    model = env.mujoco_model()
     env.step(TensorDict({"action": dump.tensors["action"][None]}, batch_size=[1]))
-    return env.sim.ctrl[0].clone()
+    return model, env.sim.ctrl[0].clone()
 
 
 def warp_trace(dump: NanDump, device: torch.device | str | None = None) -> np.ndarray:
@@ -123,7 +124,7 @@ def warp_trace(dump: NanDump, device: torch.device | str | None = None) -> np.nd
     env = dump.make_env(device, ctrl_dt=config.sim_dt)  # one substep per step, to see them all
     sim, physics = env.sim, env.sim.capture(env.sim.step)  # without what the task does around it
     env.reset(dump.state.to(env.device), set_state=True)
-    sim.ctrl.copy_(controls(dump))
+    sim.ctrl.copy_(model_and_controls(dump)[1])
     trace = []
     for substep in range(config.substeps + 1):
         if substep:
@@ -138,15 +139,13 @@ def mujoco_trace(dump: NanDump) -> np.ndarray:
     C MuJoCo resets a world that is not finite; from there on the trace is NaN.
     """
     config = SimConfig(**dump.settings["config"])
-    env = dump.make_env("cpu")
-    env.reset(dump.state, set_state=True)
-    model = env.mujoco_model()
+    model, controls = model_and_controls(dump)
     set_options(model, config)
     data = mujoco.MjData(model)
     for name, value in dump.physics.items():
         getattr(data, name)[:] = value.numpy()
     trace = [np.concatenate([data.qpos, data.qvel])]
-    data.ctrl[:] = controls(dump)
+    data.ctrl[:] = controls
     mujoco.set_mju_user_warning(lambda message: None)  # else it prints, and writes a log into the working directory
     try:
         for _ in range(config.substeps):
@@ -177,7 +176,7 @@ def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterato
     bad["action"] = ~dump.tensors["action"].isfinite()  # finite ones are clipped
     wrong = [name for name in bad if bad[name].any()]
     for name in wrong:
-        entries = ", ".join(f"{i} is {dump.tensors[name][i]}" for i in torch.nonzero(bad[name]).flatten().tolist())
+        entries = ", ".join(f"{i} is {dump.tensors[name][i]}" for i in bad[name].nonzero().flatten().tolist())
         yield f"{name} is not finite before the step: entry {entries}"
     if "action" in wrong:
         yield "an action that is not finite terminates its world, which is stepped with zeros instead"

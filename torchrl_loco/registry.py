@@ -161,15 +161,14 @@ def env_class(id: str) -> "type[LocoEnv]":
 
     origin = f"environment {name!r} of {entry.distribution} ({entry.target})"
     try:
-        cls = functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
+        cls: Any = functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
     except Exception as error:  # a plug-in's module may raise anything
         raise ImportError(f"{origin} cannot be loaded: {type(error).__name__}: {error}") from error
     try:
-        environment = _check_environment(cls)
-        environment.check_class()
+        _check_environment(cls).check_class()
     except (TypeError, ValueError) as error:
         raise ImportError(f"{origin}: {error}") from error
-    return environment
+    return cls
 
 
 def summary(id: str) -> str:
@@ -277,11 +276,10 @@ def _no_class(module: ModuleType, source: str, name: str) -> str:
     if source in MAIN or "<locals>" in name:
         return f"{source}:{name} is of another process, of a notebook or a function: move the class into a file"
     kinds = {key: cls for key, cls in vars(module).items() if isinstance(cls, type) and issubclass(cls, LocoEnv)}
-    own = [key for key, cls in kinds.items() if cls.__module__ == module.__name__]
-    what = f"{source} has no class {name!r}{suggestion(name, own)}" if name else f"{source!r} names no class"
-    return f"{what}: " + (
-        f"choose one of {', '.join(own)}" if own else "it defines no subclass of torchrl_loco.LocoEnv"
-    )
+    names = [key for key, cls in kinds.items() if cls.__module__ == module.__name__]
+    what = f"{source} has no class {name!r}{suggestion(name, names)}" if name else f"{source!r} names no class"
+    choice = f"choose one of {', '.join(names)}" if names else "it defines no subclass of torchrl_loco.LocoEnv"
+    return f"{what}: {choice}"
 
 
 def _loaded(source: str) -> ModuleType | None:

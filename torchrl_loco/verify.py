@@ -6,7 +6,7 @@ Both are the policy's own task, with ``engine="mujoco"`` and as it was trained: 
 import contextlib
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,18 +14,13 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.checks import check_bool, check_packages
-from torchrl_loco.conditions import DEFAULT, Conditions
+from torchrl_loco.conditions import DEFAULT, PUSH, PUSH_EVERY, Conditions
 from torchrl_loco.config import arguments_of
 
 if TYPE_CHECKING:
     import torch
 
     from torchrl_loco.envs import LocoEnv
-
-PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
-"""Greatest change of a floating base's velocity by a push (m/s, rad/s), as mjlab 1.6 has it."""
-PUSH_EVERY = (1.0, 3.0)
-"""Least and greatest time between two pushes (s)."""
 
 ENGINES = ("C MuJoCo", "training simulator")
 UNDISTURBED = Conditions(delay=(0, 0), noise=0.0, pushes=0.0)
@@ -48,11 +43,7 @@ class Report:
 
 
 class Exported:
-    """A policy in an ONNX file that :func:`torchrl_loco.export_policy` wrote.
-
-    Args:
-        path: the file.
-        task: the name of its task, as the user says; ``None`` for what the file says.
+    """A policy in an ONNX file that :func:`torchrl_loco.export_policy` wrote, of the task that the user or it names.
 
     Attributes:
         facts: what the file says, by name: see :func:`torchrl_loco.export.of_robot`.
@@ -140,8 +131,7 @@ def verify(
     engines = ENGINES[:1] if alone else ENGINES
     cases = _by_case(cls, exported, conditions, engines, device)
     if cases:  # each is played
-        least = len(cases[ENGINES[0]])
-        conditions = dataclasses.replace(conditions, episodes=max(conditions.episodes, least))
+        conditions = dataclasses.replace(conditions, episodes=max(conditions.episodes, len(cases[ENGINES[0]])))
     outcomes, env = dict[str, Outcome](), None
     for name in engines:
         env = _worlds(cls, exported, conditions, name, device)
@@ -151,10 +141,7 @@ def verify(
         outcomes[name] = play(exported, env, conditions, name)
     assert env is not None
     seconds = outcomes[ENGINES[0]].steps_of_episode * env.config.ctrl_dt
-    report = _report(exported, cls, conditions, outcomes, seconds, cases)
-    return dataclasses.replace(
-        report, lines=[*_case_lines(cases), *report.lines], figures={**report.figures, "cases": cases}
-    )
+    return _report(exported, cls, conditions, outcomes, seconds, cases)
 
 
 def _by_case(
@@ -182,14 +169,8 @@ def _by_case(
         steps = np.minimum(list(cases.values()), played.steps_of_episode)
         earned = np.sum([played.sums[name][0] for name in cls.perfect], axis=0)
         shares = earned / (sum(cls.perfect.values()) * env.config.ctrl_dt * steps)
-        found[engine] = {
-            name: {
-                "return": float(shares[k]),
-                "failed": bool(played.fell[k]),
-                "lasted": float(played.steps[k] / steps[k]),
-            }
-            for k, name in enumerate(cases)
-        }
+        figures = {"return": shares.tolist(), "failed": played.fell.tolist(), "lasted": (played.steps / steps).tolist()}
+        found[engine] = {name: {key: values[k] for key, values in figures.items()} for k, name in enumerate(cases)}
     return found
 
 
@@ -197,18 +178,17 @@ def _case_lines(cases: dict[str, dict[str, dict[str, Any]]]) -> list[str]:
     """Returns how each case was played by itself, the worst in C MuJoCo first."""
     if not cases:
         return []
-    there, width = cases[ENGINES[0]], max(len(name) for name in cases[ENGINES[0]])
-    lines = [f"{'each once, undisturbed; return of 1 is perfect':<{width}}{''.join(f'{name:>22}' for name in cases)}"]
+    there = cases[ENGINES[0]]
+    rows: list[tuple[str, list[str]]] = [("each once, undisturbed; return of 1 is perfect", list(cases))]
     for name in sorted(there, key=lambda name: there[name]["return"]):
-        words = []
-        for played in cases.values():
-            row = played[name]
-            words.append(f"{row['return']:.3f}" + (f", failed at {row['lasted']:.0%}" if row["failed"] else ""))
-        lines.append(f"{name:<{width}}{''.join(f'{word:>22}' for word in words)}")
-    means = {engine: np.mean([row["return"] for row in played.values()]) for engine, played in cases.items()}
-    failed = {engine: sum(row["failed"] for row in played.values()) for engine, played in cases.items()}
-    words = [f"{means[engine]:.4f}, {failed[engine]} failed" for engine in cases]
-    return [*lines, f"{f'{len(there)} in all':<{width}}{''.join(f'{word:>22}' for word in words)}"]
+        found = [played[name] for played in cases.values()]
+        ends = [f", failed at {row['lasted']:.0%}" if row["failed"] else "" for row in found]
+        rows.append((name, [f"{row['return']:.3f}{end}" for row, end in zip(found, ends, strict=True)]))
+    of_all = [list(played.values()) for played in cases.values()]
+    means = [np.mean([row["return"] for row in played]) for played in of_all]
+    failed = [sum(row["failed"] for row in played) for played in of_all]
+    words = [f"{mean:.4f}, {count} failed" for mean, count in zip(means, failed, strict=True)]
+    return _table([*rows, (f"{len(there)} in all", words)], max(map(len, there)), 22)
 
 
 def _worlds(
@@ -221,12 +201,11 @@ def _worlds(
     """
     from torchrl_loco.envs.vary import Vary
 
-    facts = exported.facts
-    settings = arguments_of(facts.get("info", {}))
+    facts, settings = exported.facts, arguments_of(exported.facts.get("info", {}))
     if conditions.friction is not None:
         ground = cls.model.geom("terrain") if isinstance(cls.model, mujoco.MjSpec) else None
-        of = None if ground is None else r"(?!terrain(_\d+)?$).*"  # numbers of many boxes cannot vary
-        settings["randomize"] = [Vary("geom_friction", *conditions.friction, of=of, how="set", once=True)]
+        geoms = None if ground is None else r"(?!terrain(_\d+)?$).*"  # numbers of many boxes cannot vary
+        settings["randomize"] = [Vary("geom_friction", *conditions.friction, of=geoms, how="set", once=True)]
     if engine == ENGINES[0]:
         device, settings["engine"] = "cpu", "mujoco"
     env = cls(
@@ -235,12 +214,12 @@ def _worlds(
         **settings,
         **more,
     )
-    for name, size, own in (
+    for name, size, asked in (
         ("observation", facts["observation_size"], env.observation_spec[exported.reads].shape[-1]),
         ("action", facts["action_size"], env.mj_model.nu),
     ):
-        if size != own:
-            raise ValueError(f"the policy has {size} numbers of the {name}, {facts['task']} has {own}")
+        if size != asked:
+            raise ValueError(f"the policy has {size} numbers of the {name}, {facts['task']} has {asked}")
     return env
 
 
@@ -314,16 +293,7 @@ class Outcome:
 
 
 def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str) -> Outcome:
-    """Plays the policy in worlds of its task, a world for each episode.
-
-    Args:
-        exported: the policy.
-        env: the worlds.
-        conditions: what they are played in.
-        label: of the progress bar.
-
-    Returns:
-        How it did.
+    """Returns how the policy does in worlds of its task, a world for each episode, beside a progress bar with a label.
 
     Raises:
         ValueError: nothing floats that could be pushed.
@@ -345,12 +315,10 @@ def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str)
     env.set_seed(conditions.seed)  # from the first episode on, in both engines
     set_stage(env, exported.facts.get("info", {}))
     td = env.reset()
-    own_delay = (
-        "delay" in env.world.memory and env.world.memory["delay"].ndim == 1
-    )  # the task's own hooks hold its actions back
-    if own_delay:
-        env.world.memory["delay"].copy_(torch.from_numpy(delay))
-    behind = torch.from_numpy(np.zeros(n, dtype=int) if own_delay else delay).to(env.device)
+    behind = torch.from_numpy(delay).to(env.device)
+    if "delay" in env.world.memory and env.world.memory["delay"].ndim == 1:  # the task's hooks hold its actions back
+        env.world.memory["delay"].copy_(behind)
+        behind = torch.zeros_like(behind)
     late = torch.zeros(most + 1, n, env.mj_model.nu, device=env.device)
     alive = torch.ones(n, dtype=torch.bool, device=env.device)
     counts = {name: torch.zeros(n, device=env.device, dtype=torch.float64) for name in ("return", "steps", "fell")}
@@ -460,24 +428,27 @@ def _report(
         kept = cls.holds.get("kept", 0.9)
     if kept is not None and here is not None:
         trained = here["return"]
-        if conditions == dataclasses.replace(
-            Conditions().of(cls.holds), episodes=conditions.episodes, seed=conditions.seed
-        ):
+        asked = DEFAULT.of(cls.holds)
+        if conditions == dataclasses.replace(asked, episodes=conditions.episodes, seed=conditions.seed):
             trained = max(trained, exported.facts.get("info", {}).get("mean", trained))  # when its training ended
         least = trained - (1.0 - kept) * abs(trained)
         bounds.append((there["return"] >= least, f"return {there['return']:.1f}, at least {least:.1f} is asked for"))
     holds = all(met for met, _ in bounds)
     words = "; ".join(text for met, text in bounds if met == holds)
-    task, n = exported.facts["task"], there["episodes"]
+    task, n, metrics = exported.facts["task"], there["episodes"], outcomes[ENGINES[0]].metrics
     episodes = "1 episode, since all begin alike," if n == 1 < DEFAULT.episodes else f"{n} episodes"
-    lines = [f"{task} in C MuJoCo {mujoco.__version__}, {episodes} of {seconds:g} s, {_describe(conditions)}"]
     by_case = {} if cls.perfect else {engine: played.by_case() for engine, played in outcomes.items()}
-    lines += _lines_by_case(by_case.get(ENGINES[0], {}), outcomes[ENGINES[0]].metrics)
-    lines += [*_lines(table, outcomes[ENGINES[0]].metrics), f"{'holds' if holds else 'DOES NOT HOLD'}: {words}"]
+    lines = [
+        *_case_lines(cases),
+        f"{task} in C MuJoCo {mujoco.__version__}, {episodes} of {seconds:g} s, {_describe(conditions)}",
+        *_lines_by_case(by_case.get(ENGINES[0], {}), metrics),
+        *_lines(table, metrics),
+        f"{'holds' if holds else 'DOES NOT HOLD'}: {words}",
+    ]
     about = {"task": task, "protocol": exported.facts["protocol"], "mujoco": mujoco.__version__}
     figures = {"holds": holds, **about, "conditions": dataclasses.asdict(conditions), "outcomes": table}
     figures |= {"by_case": by_case} if any(by_case.values()) else {}
-    return Report(holds, lines, figures)
+    return Report(holds, lines, {**figures, "cases": cases})
 
 
 def _describe(conditions: Conditions) -> str:
@@ -493,25 +464,28 @@ def _lines_by_case(found: dict[str, dict[str, Any]], metrics: tuple[str, ...]) -
     """Returns how each case was played in C MuJoCo, the one with the most falls first."""
     if not found:
         return []
-    width = max(len(name) for name in found)
-    lines = [f"{'':<{width}}{'falls':>12}{''.join(f'{name:>16}' for name in metrics)}"]
+    width = max(map(len, found))
+    rows = [(f"{'':<{width}}{'falls':>12}", list(metrics))]
     for name, row in sorted(found.items(), key=lambda pair: -pair[1]["falls"] / pair[1]["episodes"]):
-        words = f"{row['falls']} of {row['episodes']}"
-        lines.append(f"{name:<{width}}{words:>12}{''.join(f'{_rounded(row[metric]):>16}' for metric in metrics)}")
-    return lines
+        falls = f"{row['falls']} of {row['episodes']}"
+        rows.append((f"{name:<{width}}{falls:>12}", [_rounded(row[metric]) for metric in metrics]))
+    return _table(rows, 0, 16)
 
 
 def _lines(table: dict[str, dict[str, dict[str, Any]]], metrics: tuple[str, ...]) -> list[str]:
     """Returns the figures, a line for each and a column for each engine: of a kind of episodes, falls and metrics."""
-    lines = [f"{'':<34}{''.join(f'{engine:>22}' for engine in table)}"]
-    few = ["falls", *(metrics or ["return"])]
+    rows, few = [("", list(table))], ["falls", *(metrics or ["return"])]
     for kind, row in table[ENGINES[0]].items():
         for name in few if kind != "all" else [name for name in row if name != "episodes"]:
             values = [figures[kind][name] for figures in table.values()]
             words = [f"{value} of {row['episodes']}" if name == "falls" else _rounded(value) for value in values]
-            title = name if kind == "all" else f"{kind}, {name}"
-            lines.append(f"{title:<34}{''.join(f'{word:>22}' for word in words)}")
-    return lines
+            rows.append((name if kind == "all" else f"{kind}, {name}", words))
+    return _table(rows, 34, 22)
+
+
+def _table(rows: Iterable[tuple[str, Iterable[str]]], width: int, column: int) -> list[str]:
+    """Returns lines of titles, of a width at least, and of words in columns of a width."""
+    return [f"{title:<{width}}{''.join(f'{word:>{column}}' for word in words)}" for title, words in rows]
 
 
 def _rounded(value: float | None) -> str:
