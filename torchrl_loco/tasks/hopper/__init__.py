@@ -160,14 +160,4 @@ class HopperHop(Hopper):
 
     target_speed = HOP_SPEED
     term_names = ("standing", "hopping")
-    presets = {
-        "reppo": {
-            "total_frames": 160_000_000,
-            "lr": 1e-3,
-            "minibatch_size": 4096,
-            "min_temperature": 1e-9,
-            "action_repeat": 2,  # as in HopperStand
-            "reward_scale": 0.5,
-            "episode_length": 100,
-        }
-    }
+    presets = {"reppo": {**HopperStand.presets["reppo"], "total_frames": 160_000_000}}

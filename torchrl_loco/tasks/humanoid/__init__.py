@@ -196,18 +196,7 @@ class HumanoidWalk(Humanoid):
     """
 
     target_speed = WALK_SPEED
-    presets = {
-        "reppo": {
-            "total_frames": 100_000_000,
-            "min_temperature": 1e-9,
-            "init_kl_weight": 0.02,  # as in HumanoidStand
-            "min_kl_weight": 0.02,
-            "episode_length": 100,
-            "gamma": 0.98,
-            "max_value": 75.0,
-            "bf16": True,
-        }
-    }
+    presets = {"reppo": {**HumanoidStand.presets["reppo"], "total_frames": 100_000_000, "bf16": True}}
 
 
 class HumanoidRun(Humanoid):

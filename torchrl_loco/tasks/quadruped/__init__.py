@@ -175,4 +175,4 @@ class QuadrupedRun(Quadruped):
     """
 
     target_speed = RUN_SPEED
-    presets = {"reppo": {"total_frames": 50_000_000, "lr": 1e-3, "minibatch_size": 4096, "min_temperature": 1e-9}}
+    presets = {"reppo": {**QuadrupedWalk.presets["reppo"], "total_frames": 50_000_000}}

@@ -49,15 +49,7 @@ AROUND = ((0.4, 0.0), (-0.4, 0.0), (0.0, 0.25), (0.0, -0.25))
 
 
 def hill(difficulty: float, rng: np.random.Generator, size: float, cell: float, down: bool = False) -> Patch:
-    """Returns a hill with a level top, or a hollow, that is as steep as 45 degrees in the middle of its sides.
-
-    Args:
-        difficulty: of the steepness.
-        rng: not used.
-        size: a side (m).
-        cell: distance of two points (m).
-        down: whether it is a hollow.
-    """
+    """Returns a hill with a level top, or a hollow, that is as steep as 45 degrees in the middle of its sides."""
     reach = size / 2 - 0.2  # around it the ground is level
     along = np.clip(1.0 - np.abs(points(size, cell)) / reach, 0.0, None)
     heights = reach * difficulty * np.minimum(along[:, None] * along[None], (1.0 - 1.0 / reach) ** 2)
@@ -134,12 +126,12 @@ class Rough(Velocity):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Lays the ground under the robot, whose feet decide on friction, as they do on the floor."""
         super().__init_subclass__(**kwargs)
-        own, above = vars(cls), [base for base in cls.__mro__[1:] if "model" in vars(base)]
+        given, above = vars(cls), [base for base in cls.__mro__[1:] if "model" in vars(base)]
         is_laid = any(issubclass(base, Rough) for base in above)
-        if is_laid and own.keys().isdisjoint(("ground", "robot", "model", "feet")):
+        if is_laid and given.keys().isdisjoint(("ground", "robot", "model", "feet")):
             return
-        if "model" in own or not hasattr(cls, "robot"):
-            if "model" not in own and not above:
+        if "model" in given or not hasattr(cls, "robot"):
+            if "model" not in given and not above:
                 return  # what several robots share
             cls.robot = cls.model
         spec = cls.ground.under(models.specification(cls.robot, velocity.FOLDER))
@@ -270,17 +262,10 @@ class Rough(Velocity):
         if not self.play:
             return rows
         other = (s.patch != s.began_patch).any(-1)
-        begun = {
-            **self.begin(s),
-            **{
-                name: torch.zeros_like(getattr(s, name))
-                for name in ("distance", "commanded_displacement", "commanded_distance")
-            },
-        }
-        held = {**{name: getattr(s, name) for name in begun}, **rows}
-        anew = either(other, begun, {name: held[name] for name in begun})
-        at_rest = torch.where(other.unsqueeze(-1), 0.0, s.qvel)
-        return {**rows, **anew, "qvel": at_rest}
+        ways = ("distance", "commanded_displacement", "commanded_distance")
+        begun = {**self.begin(s), **{name: torch.zeros_like(getattr(s, name)) for name in ways}}
+        anew = either(other, begun, {**{name: getattr(s, name) for name in begun}, **rows})
+        return {**rows, **anew, "qvel": torch.where(other.unsqueeze(-1), 0.0, s.qvel)}
 
     def observation(self, s: "View") -> dict[str, dict[str, torch.Tensor]]:
         """Returns that on flat ground, and the heights around the robot."""
@@ -322,9 +307,9 @@ class Rough(Velocity):
         """Returns the level and column that are set, or at first those of the world's own case."""
         rows, kinds = self.ground.rows, len(s.columns_of)
         case, turn = s.env_index % (rows * kinds), torch.div(s.env_index, rows * kinds, rounding_mode="floor")
-        own_row = rows - 1 - torch.div(case, kinds, rounding_mode="floor")
-        own = torch.stack([(case % kinds).float(), own_row / max(rows - 1, 1)], dim=-1)
-        patch = torch.where((s.level == 0).unsqueeze(-1), own, s.patch)
+        row_of_case = rows - 1 - torch.div(case, kinds, rounding_mode="floor")
+        of_case = torch.stack([(case % kinds).float(), row_of_case / max(rows - 1, 1)], dim=-1)
+        patch = torch.where((s.level == 0).unsqueeze(-1), of_case, s.patch)
         kind = patch[:, 0].round().clamp(0, kinds - 1).int()
         row = (patch[:, 1].clamp(0.0, 1.0) * (rows - 1)).round().int()
         column = s.first_column[kind] + turn % s.columns_of[kind]

@@ -12,24 +12,8 @@ import torch
 
 from torchrl_loco import motion as motions
 from torchrl_loco.checks import Interval, check_int
-from torchrl_loco.envs.base import LocoEnv
-from torchrl_loco.tasks.velocity import FOLDER as ROBOTS
-from torchrl_loco.tasks.velocity import (
-    PUSH_EVERY,
-    G1Velocity,
-    H1Velocity,
-    actuated,
-    beyond_limits,
-    com,
-    either,
-    hard_contacts,
-    limits,
-    pushed,
-    reach,
-    sliding,
-    squares,
-    targets,
-)
+from torchrl_loco.conditions import PUSH_EVERY
+from torchrl_loco.tasks.velocity import G1Velocity, H1Velocity, Robot, either, hard_contacts, pushed, squares
 
 if TYPE_CHECKING:
     from torchrl_loco.envs.view import View
@@ -90,7 +74,7 @@ def memory(joints: int) -> dict[str, Any]:
     }
 
 
-class Tracking(LocoEnv):
+class Tracking(Robot):
     """What robots that follow motions share; a robot sets the attributes without a value.
 
     The motions are ``motion``, as :func:`torchrl_loco.motion.read` takes them, in the time of control steps.
@@ -109,8 +93,8 @@ class Tracking(LocoEnv):
 
     Reward:
         ``FOLLOWED``: of the anchor in the world, and of all bodies, whose reference is moved and turned about the
-        vertical to the robot's anchor; and ``PENALTIES``, both times the control step. A step is compared with the
-        frame that the policy has seen.
+        vertical to the robot's anchor; and ``PENALTIES``, both times the control step. Without :attr:`own_geoms` there
+        is no ``self_collision``. A step is compared with the frame that the policy has seen.
 
     Start:
         The pose and velocities of a frame of the reference, up to ``NEAR``, ``TILT``, ``BEND`` and a push
@@ -132,7 +116,6 @@ class Tracking(LocoEnv):
     }
     config = G1Velocity.config
     episode_length = 500
-    action_range = (-math.inf, math.inf)
     perfect = {name: weight for name, (weight, _) in FOLLOWED.items()}
     shared = {
         **{"visits": (PIECES, torch.int64), "failures": (PIECES, torch.int64)},  # of all time, and of all ranks
@@ -140,12 +123,7 @@ class Tracking(LocoEnv):
     }
     summed_over_ranks = ("visits", "failures")
     presets = {
-        "ppo": {
-            **G1Velocity.presets["ppo"],
-            "total_frames": 300_000_000,
-            "entropy_coeff": 0.005,
-            "eval_episodes": 256,
-        },
+        "ppo": {**G1Velocity.presets["ppo"], "total_frames": 300_000_000, "entropy_coeff": 0.005, "eval_episodes": 256}
     }
     noise = NOISE
     command_ranges = {"phase": {"phase": (0.0, 1.0)}}  # and the clip, where there are several
@@ -157,8 +135,6 @@ class Tracking(LocoEnv):
     frames: motions.Frames
     """The motions as tables."""
 
-    base: ClassVar[str]
-    """Body that floats."""
     anchor: ClassVar[str]
     """Body about which the reference is moved and turned."""
     bodies: ClassVar[Sequence[str]]
@@ -167,10 +143,6 @@ class Tracking(LocoEnv):
     """Hands and feet."""
     motion_folder: ClassVar[Path]
     """Motions of the package for this robot."""
-    action_scale: ClassVar[float | None] = None
-    """Change of a joint's target by an action of 1 (rad); ``None`` is a quarter of what needs the greatest torque."""
-    own_geoms: ClassVar[str] = ""
-    """Regular expression of the geoms of which ``self_collision`` counts the contacts; empty leaves the term out."""
     estimates: ClassVar[bool] = True
     """Whether the policy sees where the anchor is and how fast the base moves, which a robot must estimate."""
 
@@ -221,10 +193,7 @@ class Tracking(LocoEnv):
         if not length:
             raise ValueError(f"there are {clips} motions: at most {PIECES - 1} can be practised together")
         counts = [max(1, math.floor((last - first) / length)) for first, last in zip(f.first, f.last, strict=True)]
-        edges = [
-            np.linspace(first, last, count + 1).astype(int)
-            for first, last, count in zip(f.first, f.last, counts, strict=True)
-        ]
+        edges = [np.linspace(*clip).astype(int) for clip in zip(f.first, f.last, np.add(counts, 1), strict=True)]
         begins, ends = (np.concatenate([edge[part] for edge in edges]) for part in (np.s_[:-1], np.s_[1:]))
         piece_of = np.searchsorted(begins, np.arange(len(f.qpos)), side="right") - 1
         is_last, self.pieces = np.isin(ends, f.last), len(begins)
@@ -250,11 +219,10 @@ class Tracking(LocoEnv):
         Raises:
             FileNotFoundError: a file is not there.
         """
-        own = "motion" not in self.options_given
-        places, fps = (self.motion_folder, OWN_RATE) if own else (self.motion, self.fps)
-        key = type(self), json.dumps([] if own else places), fps, self.config.ctrl_dt
+        paths, fps = (self.motion, self.fps) if "motion" in self.options_given else ([], OWN_RATE)
+        key = type(self), json.dumps(paths), fps, self.config.ctrl_dt
         try:
-            named = motions.named(places, fps)
+            named = motions.named(paths or self.motion_folder, fps)
             stamp = [Path(one["path"]).stat().st_mtime_ns for one in named if isinstance(one, dict)]
         except FileNotFoundError:
             if key not in _tables:
@@ -265,15 +233,6 @@ class Tracking(LocoEnv):
             read = motions.read(named)
             _tables[key] = stamp, motions.Frames.of(read, self.mj_model, self.bodies, self.config.ctrl_dt)
         return _tables[key][1]
-
-    @property
-    def joints(self) -> list[str]:
-        """Names of the joints, in the order of the actuators."""
-        return actuated(self.mj_model)
-
-    def home(self, s: "View") -> torch.Tensor:
-        """Returns the home pose of the joints, ``(num_envs, joints)`` (rad)."""
-        return s.home[:, 7:]
 
     # What is compared.
 
@@ -308,13 +267,9 @@ class Tracking(LocoEnv):
     def facts(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
         """Returns how actions become targets of the joints, and which bodies are followed about which."""
         tracking = {"base": cls.base, "anchor": cls.anchor, "bodies": list(cls.bodies)}
-        return {**targets(cls, m), "tracking": tracking}
+        return {**super().facts(m, info), "tracking": tracking}
 
     # The hooks, in the order in which they are called.
-
-    def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
-        """Returns the targets of the joints (rad): the home pose and a multiple of the action."""
-        return self.home(s) + reach(s, self.action_scale) * action
 
     def reward(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the terms of the reward."""
@@ -328,7 +283,7 @@ class Tracking(LocoEnv):
             "body_turn_rates": (s.ang[s.frame] - s.angvel(self.bodies)).square().sum(-1).mean(-1),
         }
         terms = {name: weight * torch.exp(-squared[name] / error**2) for name, (weight, error) in FOLLOWED.items()}
-        penalties = {"action_rate": squares(s.action - s.last_action), "joint_limits": beyond_limits(self, s)}
+        penalties = {"action_rate": squares(s.action - s.last_action), "joint_limits": self.beyond_limits(s)}
         if self.own_geoms:
             penalties["self_collision"] = hard_contacts(s, self.own_geoms)
         terms |= {name: PENALTIES[name] * value for name, value in penalties.items()}
@@ -409,8 +364,8 @@ class Tracking(LocoEnv):
         frame = torch.minimum(s.frame + steps, s.last[s.frame])
         base, rates, mat = s.root[frame], s.root_rates[frame], s.mat[frame, self.bodies.index(self.base)]
         linear = (mat.mT @ rates[:, :3].unsqueeze(-1)).squeeze(-1)
-        own = torch.cat([base[:, 2:3], -mat[:, 2], linear, rates[:, 3:]], dim=-1)
-        return {"joints": s.joints[frame], "rates": s.rates[frame], "base": own}
+        floating = torch.cat([base[:, 2:3], -mat[:, 2], linear, rates[:, 3:]], dim=-1)
+        return {"joints": s.joints[frame], "rates": s.rates[frame], "base": floating}
 
     def begin(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the pose and velocities of a frame of the reference; in training something near it, and a push."""
@@ -426,7 +381,7 @@ class Tracking(LocoEnv):
         place = root[:, :3] + s.uniform(-1.0, 1.0, 3) * torch.tensor(NEAR, device=s.device)
         half = 0.5 * s.uniform(-1.0, 1.0, 3) * torch.tensor(TILT, device=s.device)
         small = torch.cat([(1.0 - squares(half)).sqrt().unsqueeze(-1), half], dim=-1)
-        low, high = limits(self, s)
+        low, high = self.limits(s)
         push = s.uniform(-1.0, 1.0, 6) * torch.tensor(PUSH, device=s.device)
         return {
             "frame": frame,
@@ -469,12 +424,8 @@ class Tracking(LocoEnv):
     def reference(self) -> dict[str, torch.Tensor]:
         """Returns the reference at each frame, by mjlab's names: joints, and the bodies that follow."""
         f = self.frames
-        tables = {
-            **{"joint_pos": f.qpos[:, 7:], "joint_vel": f.qvel[:, 6:], "body_pos_w": f.pos},
-            "body_quat_w": motions.quat_of(f.mat.reshape(-1, 3, 3)).reshape(*f.mat.shape[:2], 4),
-            **{"body_lin_vel_w": f.lin, "body_ang_vel_w": f.ang},
-        }
-        return {name: torch.tensor(table, dtype=torch.float32) for name, table in tables.items()}
+        tables = motions.mjlabs_tables(f.qpos[:, 7:], f.qvel[:, 6:], f.pos, f.mat, f.lin, f.ang)
+        return {name: torch.from_numpy(table) for name, table in tables.items()}
 
     def ghost(self) -> torch.Tensor:
         """Returns the poses of the reference, ``(num_envs, nq)``."""
@@ -533,7 +484,7 @@ class G1Tracking(Tracking):
     """A Unitree G1, a humanoid of 29 joints and 33 kg, follows motions."""
 
     body = "g1"
-    model = ROBOTS / "g1.xml"
+    model = G1Velocity.model
     memory = memory(joints=29)
     base, anchor = "pelvis", "torso_link"
     ends = both("ankle_roll_link", "wrist_yaw_link")
@@ -544,7 +495,7 @@ class G1Tracking(Tracking):
     ]
     own_geoms = G1Velocity.own_geoms
     motion_folder = FOLDER / "g1"
-    randomize = [sliding(r".*_foot\d_collision"), com("torso_link")]
+    randomize = G1Velocity.randomize
 
 
 class G1TrackingNoEstimation(G1Tracking):
@@ -558,7 +509,7 @@ class H1Tracking(Tracking):
     """A Unitree H1, a humanoid of 19 joints and 51 kg, follows motions."""
 
     body = "h1"
-    model = ROBOTS / "h1.xml"
+    model = H1Velocity.model
     config = H1Velocity.config
     memory = memory(joints=19)
     base, anchor = "pelvis", "torso_link"
@@ -570,4 +521,4 @@ class H1Tracking(Tracking):
     ]
     action_scale = H1Velocity.action_scale
     motion_folder = FOLDER / "h1"
-    randomize = [sliding(r"floor|.*_foot\d"), com("torso_link")]
+    randomize = H1Velocity.randomize

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from torchrl_loco.checks import NOT_NEGATIVE, Interval, check_float, check_int
+from torchrl_loco.conditions import PUSH, PUSH_EVERY
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.vary import Vary
@@ -38,10 +39,6 @@ SETTLING = 1.5
 """Time after a new command for which its errors do not count (s)."""
 BIAS = 0.015
 """Greatest error of a joint's encoder in an episode (rad)."""
-PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
-"""Greatest change of the base's velocity by a push (m/s, rad/s), where :attr:`Velocity.push_scale` is 1."""
-PUSH_EVERY = (1.0, 3.0)
-"""Least and greatest time between pushes (s)."""
 MAX_DELAY = 3
 """Greatest delay that a robot may set (control steps): memory has the actions up to it."""
 START_HEIGHT = (0.01, 0.05)
@@ -95,7 +92,60 @@ def soft(geoms: str) -> list[Vary]:
     return [Vary("geom_friction", *bounds, component=k, **settings) for k, bounds in ranges.items()]
 
 
-class Velocity(LocoEnv):
+class Robot(LocoEnv):
+    """What robots share whose base floats, and whose actions are changes of their joints' targets from home, scaled.
+
+    Actuators are servos of joints.
+    """
+
+    action_range = (-math.inf, math.inf)
+
+    base: ClassVar[str]
+    """Body that floats."""
+    action_scale: ClassVar[float | None] = None
+    """Change of a joint's target by an action of 1 (rad); ``None`` is a quarter of what needs the greatest torque."""
+    own_geoms: ClassVar[str] = ""
+    """Regular expression of the geoms of which ``self_collision`` counts the contacts."""
+
+    @property
+    def joints(self) -> list[str]:
+        """Names of the actuated joints, in the order of the actuators."""
+        return actuated(self.mj_model)
+
+    @classmethod
+    def facts(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns how actions become targets of the joints (rad): ``action_offset + action_scale * action``."""
+        home = models.home_pose(m)[[int(m.joint(name).qposadr[0]) for name in actuated(m)]].tolist()
+        scale = np.full(m.nu, cls.action_scale or 0.0)
+        if cls.action_scale is None:
+            scale = 0.25 * m.actuator_forcerange[:, 1] / m.actuator_gainprm[:, 0]
+        return {"action_offset": home, "action_scale": scale.tolist()}
+
+    def home(self, s: "View") -> torch.Tensor:
+        """Returns the joint positions of the home pose (rad), ``(num_envs, joints)``."""
+        return s.home[:, [int(self.mj_model.joint(name).qposadr[0]) for name in self.joints]]
+
+    def limits(self, s: "View") -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the least and greatest positions of the joints (rad), each ``(num_envs, joints)``."""
+        low, high = s.model("jnt_range")[:, [self.mj_model.joint(name).id for name in self.joints]].unbind(-1)
+        return low, high
+
+    def beyond_limits(self, s: "View") -> torch.Tensor:
+        """Returns how far the joints are beyond 0.9 of their ranges (rad), summed, ``(num_envs,)``."""
+        low, high = self.limits(s)
+        beyond = (s.joint_qpos(self.joints) - 0.5 * (low + high)).abs() - 0.45 * (high - low)
+        return beyond.clamp(min=0.0).sum(-1)
+
+    def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
+        """Returns the targets of the joints (rad): the home pose and a multiple of the action."""
+        if self.action_scale is not None:
+            return self.home(s) + self.action_scale * action
+        return (
+            self.home(s) + 0.25 * s.model("actuator_forcerange")[..., 1] / s.model("actuator_gainprm")[..., 0] * action
+        )
+
+
+class Velocity(Robot):
     """What robots that follow a velocity command share; a robot sets the attributes without a value.
 
     The command is a velocity forward and to the left (m/s) and a yaw rate (rad/s), drawn anew every 3 to 8 s. The base
@@ -128,7 +178,6 @@ class Velocity(LocoEnv):
 
     config = SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=10, ls_iterations=20)
     episode_length = 1000
-    action_range = (-math.inf, math.inf)
     command_ranges = {"command": commands.first(CURRICULUM)}  # presets end before they widen
     presets = {
         "ppo": {
@@ -170,8 +219,6 @@ class Velocity(LocoEnv):
         "joint_velocities": 1.5,  # rad/s
     }
 
-    base: ClassVar[str]
-    """Body that floats."""
     trunk: ClassVar[str]
     """Body that is to stay upright."""
     feet: ClassVar[Mapping[str, str]]
@@ -182,8 +229,6 @@ class Velocity(LocoEnv):
     """The same while it walks."""
     run: ClassVar[Mapping[str, float]]
     """The same while it runs."""
-    action_scale: ClassVar[float | None] = None
-    """Change of a joint's target by an action of 1 (rad); ``None`` is a quarter of what needs the greatest torque."""
     weights: ClassVar[Mapping[str, float]] = WEIGHTS
     """Weights of the reward's terms; that of ``angular_momentum`` needs a sensor ``subtreeangmom`` of this name."""
     curriculum: ClassVar[dict[int, commands.Ranges]] = CURRICULUM
@@ -194,8 +239,6 @@ class Velocity(LocoEnv):
     """Greatest delay of an action in training (control steps), at most 3; ``verify`` delays by up to 2."""
     push_scale: ClassVar[float] = 1.0
     """Strength of the pushes in training, as a multiple of those of ``verify``."""
-    own_geoms: ClassVar[str] = ""
-    """Regular expression of the geoms of which ``self_collision`` counts the contacts."""
 
     @classmethod
     def check_class(cls) -> None:
@@ -247,15 +290,6 @@ class Velocity(LocoEnv):
 
     # What hooks share.
 
-    @property
-    def joints(self) -> list[str]:
-        """Names of the actuated joints, in the order of the actuators."""
-        return actuated(self.mj_model)
-
-    def home(self, s: "View") -> torch.Tensor:
-        """Returns the joint positions of the home pose (rad), ``(num_envs, joints)``."""
-        return s.home[:, [int(self.mj_model.joint(name).qposadr[0]) for name in self.joints]]
-
     def stray(self, s: "View", table: Mapping[str, float]) -> torch.Tensor:
         """Returns how far each joint may stray by a table of the class (rad), ``(joints,)``."""
         return torch.tensor([find(table, name) for name in self.joints], device=s.device)
@@ -292,7 +326,7 @@ class Velocity(LocoEnv):
         """Returns how actions become targets of the joints, and what commands the policy follows."""
         low, high = commands.reached(cls.curriculum, steps_of_training(info))
         velocity = {"base": cls.base, "trunk": cls.trunk, "command_low": low, "command_high": high}
-        return {**targets(cls, m), "velocity": velocity}
+        return {**super().facts(m, info), "velocity": velocity}
 
     @classmethod
     def stage_of(cls, info: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -313,7 +347,7 @@ class Velocity(LocoEnv):
         late, arrived = s.delay.unsqueeze(-1), action
         for steps, earlier in enumerate([s.last_action, *s.earlier_actions.unbind(1)], start=1):
             arrived = torch.where(late < steps, arrived, earlier)
-        return self.home(s) + reach(s, self.action_scale) * arrived
+        return super().control(s, arrived)
 
     def update(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the greatest height of each foot since it left the ground."""
@@ -342,7 +376,7 @@ class Velocity(LocoEnv):
             "track_angular": torch.exp(-((command - angular)[:, 2].square() + squares(angular[:, :2])) / 0.5),
             "upright": torch.exp(-squares(s.projected_gravity(self.trunk)[:, :2]) / 0.2),
             "pose": torch.exp(-(stray / spread).square().mean(-1)),
-            "joint_limits": beyond_limits(self, s),
+            "joint_limits": self.beyond_limits(s),
             "action_rate": squares(s.action - s.last_action),
             "foot_clearance": moves * ((heights - self.step_height).abs() * slides.sqrt()).sum(-1),
             "foot_swing_height": moves * (landed * (s.peak / self.step_height - 1.0).square()).sum(-1),
@@ -376,22 +410,14 @@ class Velocity(LocoEnv):
         goes_on |= {"until_command": s.until_command - s.dt, "command_age": s.command_age + s.dt}
         rows = either(due, commands.draw(s, self.curriculum), goes_on)
         return {
-            **self.commanded(s, rows, torch.atan2(forward[:, 1], forward[:, 0])),
-            **({} if self.play else self.pushed(s)),
+            **commands.turned(s, rows, torch.atan2(forward[:, 1], forward[:, 0]), self.curriculum),
+            **({} if self.play else pushed(s, PUSH, self.push_scale)),
             "trained": s.trained + 1.0,
             "last_action": s.action,
             "earlier_actions": torch.cat([s.last_action.unsqueeze(1), s.earlier_actions[:, :-1]], dim=1),
             "air_time": torch.where(touching, 0.0, s.air_time + s.dt),
             "peak": torch.where(touching, 0.0, s.peak),
         }
-
-    def commanded(self, s: "View", rows: dict[str, torch.Tensor], yaw: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Returns the rows of a command for robots that look toward ``yaw`` (rad)."""
-        return commands.turned(rows, yaw, *commands.limits(s, self.curriculum))
-
-    def pushed(self, s: "View") -> dict[str, torch.Tensor]:
-        """Returns velocities, which a push changes every 1 to 3 s, and the time until the next."""
-        return pushed(s, PUSH, self.push_scale)
 
     def observation(self, s: "View") -> dict[str, dict[str, torch.Tensor]]:
         """Returns what the policy sees, and for the critic the same without noise and the feet."""
@@ -412,7 +438,7 @@ class Velocity(LocoEnv):
         height = s.home[:, 2:3] + s.uniform(*START_HEIGHT, 1)
         turn = torch.stack([(0.5 * yaw).cos(), zero, zero, (0.5 * yaw).sin()], dim=-1)
         return {
-            **self.commanded(s, commands.draw(s, self.curriculum), yaw),
+            **commands.turned(s, commands.draw(s, self.curriculum), yaw, self.curriculum),
             "qpos": torch.cat([place, height, turn, s.home[:, 7:]], dim=-1),
             "until_push": s.uniform(*PUSH_EVERY),
             "bias": s.uniform(-BIAS, BIAS, len(self.joints)),
@@ -424,15 +450,6 @@ class Velocity(LocoEnv):
 def steps_of_training(info: Mapping[str, Any]) -> int:
     """Returns after how many control steps of each world a policy was saved."""
     return int(info.get("frames", 0)) // int(info.get("num_envs", 1))
-
-
-def targets(cls: Any, m: mujoco.MjModel) -> dict[str, list[float]]:
-    """Returns how actions become targets of the joints (rad): ``action_offset + action_scale * action``."""
-    home = models.home_pose(m)[[int(m.joint(name).qposadr[0]) for name in actuated(m)]].tolist()
-    scale = np.full(m.nu, cls.action_scale or 0.0)
-    if cls.action_scale is None:
-        scale = 0.25 * m.actuator_forcerange[:, 1] / m.actuator_gainprm[:, 0]
-    return {"action_offset": home, "action_scale": scale.tolist()}
 
 
 def actuated(m: mujoco.MjModel) -> list[str]:
@@ -458,26 +475,6 @@ def either(
     return {name: torch.where(mask.view(-1, *[1] * (row.ndim - 1)), row, old[name]) for name, row in new.items()}
 
 
-def reach(s: "View", scale: float | None) -> float | torch.Tensor:
-    """Returns how far an action of 1 moves the target of a joint (rad); by default a quarter of the greatest torque."""
-    if scale is not None:
-        return scale
-    return 0.25 * s.model("actuator_forcerange")[..., 1] / s.model("actuator_gainprm")[..., 0]
-
-
-def limits(task: Any, s: "View") -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the least and greatest positions of a task's joints (rad), each ``(num_envs, joints)``."""
-    low, high = s.model("jnt_range")[:, [task.mj_model.joint(name).id for name in task.joints]].unbind(-1)
-    return low, high
-
-
-def beyond_limits(task: Any, s: "View") -> torch.Tensor:
-    """Returns how far a task's joints are beyond 0.9 of their ranges (rad), summed, ``(num_envs,)``."""
-    low, high = limits(task, s)
-    beyond = (s.joint_qpos(task.joints) - 0.5 * (low + high)).abs() - 0.45 * (high - low)
-    return beyond.clamp(min=0.0).sum(-1)
-
-
 def hard_contacts(s: "View", geoms: str) -> torch.Tensor:
     """Returns in how many physics steps one of some geoms had a hard contact, ``(num_envs,)``."""
     hard = s.contact_force([geoms], history=True).norm(dim=-1) > HARD_CONTACT
@@ -485,7 +482,7 @@ def hard_contacts(s: "View", geoms: str) -> torch.Tensor:
 
 
 def pushed(s: "View", greatest: Sequence[float], scale: float = 1.0) -> dict[str, torch.Tensor]:
-    """Returns velocities, which a push changes every 1 to 3 s, and the time until the next."""
+    """Returns velocities, which a push changes every 1 to 3 s, and ``until_push``, the time until the next (s)."""
     push = s.until_push <= 0.0
     change = scale * s.uniform(-1.0, 1.0, 6) * torch.tensor(greatest, device=s.device)
     base = s.qvel[:, :6] + torch.where(push.unsqueeze(-1), change, 0.0)

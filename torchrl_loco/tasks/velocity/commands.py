@@ -9,7 +9,10 @@ if TYPE_CHECKING:
     from torchrl_loco.envs.view import View
 
 Ranges = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-"""Least and greatest velocity forward, to the left (m/s), and yaw rate (rad/s)."""
+"""Least and greatest velocity forward, to the left (m/s), and yaw rate (rad/s).
+
+A curriculum has them by the control step of training from which they hold, in rising order.
+"""
 
 STAND, TURN, AHEAD = 0.1, 0.3, 0.2
 """Shares of the commands that stand still, hold a heading, and go straight ahead."""
@@ -36,12 +39,7 @@ drawn (s); control steps of training, over all episodes of the world."""
 
 
 def limits(s: "View", curriculum: dict[int, Ranges]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns least and greatest command of each world, ``(num_envs, 3)``.
-
-    Args:
-        s: the worlds, whose memory has ``trained``.
-        curriculum: ranges by the control step of training from which they hold, in rising order.
-    """
+    """Returns least and greatest command of each world, ``(num_envs, 3)``, by what its memory has of ``trained``."""
     stages = list(curriculum.items())
     low, high = (
         torch.tensor(bounds, device=s.device).expand(s.num_envs, 3) for bounds in zip(*stages[0][1], strict=True)
@@ -82,16 +80,13 @@ def draw(s: "View", curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
 
 
 def turned(
-    rows: dict[str, torch.Tensor], yaw: torch.Tensor, low: torch.Tensor, high: torch.Tensor
+    s: "View", rows: dict[str, torch.Tensor], yaw: torch.Tensor, curriculum: dict[int, Ranges]
 ) -> dict[str, torch.Tensor]:
-    """Returns the rows of a command, whose yaw rate turns the worlds that hold a heading toward it.
+    """Returns rows of :func:`draw` for worlds that look toward ``yaw`` (rad), ``(num_envs,)``.
 
-    Args:
-        rows: those of :func:`draw`.
-        yaw: where each world looks (rad), ``(num_envs,)``.
-        low: least command, ``(num_envs, 3)``.
-        high: greatest command, ``(num_envs, 3)``.
+    The yaw rate turns those that hold a heading toward it.
     """
+    low, high = limits(s, curriculum)
     error = rows["heading"] - yaw
     rate = STIFFNESS * torch.atan2(error.sin(), error.cos())  # the shorter way
     rate = torch.minimum(torch.maximum(rate, low[:, 2]), high[:, 2])

@@ -20,6 +20,17 @@ WALK_SPEED = 1.0
 RUN_SPEED = 8.0
 """Horizontal speed that counts as running (m/s)."""
 
+SHORT_EPISODES = {
+    "lr": 1e-3,
+    "minibatch_size": 4096,
+    "min_temperature": 1e-9,  # none: it trains well without a lower bound
+    # Most of the return is lost while the body gets up, which is much of a short episode.
+    "episode_length": 100,
+    "gamma": 0.98,
+    "max_value": 75.0,
+}
+"""Settings of the training that standing and walking share."""
+
 BODIES = wp.constant(7)
 Rows = wp.types.matrix(shape=(7, 3), dtype=wp.float32)
 """First rows of the bodies' orientations."""
@@ -134,19 +145,7 @@ class WalkerStand(Walker):
         dm_control ``suite/walker.py``.
     """
 
-    presets = {
-        "reppo": {
-            "total_frames": 34_000_000,
-            "lr": 1e-3,
-            "minibatch_size": 4096,
-            "epochs": 2,
-            "min_temperature": 1e-9,  # none: it trains well without a lower bound
-            # Most of the return is lost while the body gets up, which is much of a short episode.
-            "episode_length": 100,
-            "gamma": 0.98,
-            "max_value": 75.0,
-        }
-    }
+    presets = {"reppo": {**SHORT_EPISODES, "total_frames": 34_000_000, "epochs": 2}}
 
 
 class WalkerWalk(Walker):
@@ -163,19 +162,7 @@ class WalkerWalk(Walker):
 
     target_speed = WALK_SPEED
     term_names = ("stand", "move")
-    presets = {
-        "reppo": {
-            "total_frames": 19_000_000,
-            "eval_interval": 2_000_000,
-            "lr": 1e-3,
-            "minibatch_size": 4096,
-            "min_temperature": 1e-9,
-            "episode_length": 100,  # as in WalkerStand
-            "gamma": 0.98,
-            "max_value": 75.0,
-            "bf16": True,
-        }
-    }
+    presets = {"reppo": {**SHORT_EPISODES, "total_frames": 19_000_000, "eval_interval": 2_000_000, "bf16": True}}
 
 
 class WalkerRun(Walker):
