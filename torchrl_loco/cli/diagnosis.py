@@ -55,11 +55,7 @@ def diagnose(
 
 
 def inspect(
-    what: tyro.conf.Positional[str],
-    /,
-    task: OtherTask = None,
-    device: str | None = None,
-    terrain: Path | None = None,
+    what: tyro.conf.Positional[str], /, task: OtherTask = None, device: str | None = None, terrain: Path | None = None
 ) -> None:
     """Inspect a NaN dump: step its world again, substep by substep, in Warp and in C MuJoCo. Or the ground of a task.
 
@@ -90,10 +86,7 @@ def inspect(
 
 
 def warm(
-    tasks: tyro.conf.Positional[tuple[str, ...]],
-    /,
-    algorithm: str | None = None,
-    device: str | None = None,
+    tasks: tyro.conf.Positional[tuple[str, ...]], /, algorithm: str | None = None, device: str | None = None
 ) -> None:
     """Compile ahead what trainings of tasks need, for images and CI: two iterations of each, which leave no run.
 

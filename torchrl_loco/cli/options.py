@@ -3,7 +3,7 @@
 import argparse
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
@@ -21,41 +21,21 @@ VALUES = tyro.constructors.ConstructorRegistry()
 
 @VALUES.primitive_rule
 def _integers_and_optionals(info: tyro.constructors.PrimitiveTypeInfo) -> Any:
-    """Parses integers as people write them, and optional values without the word None."""
+    """Parses integers as people write them, and optional values, pairs of numbers too, without the word None."""
     kinds = get_args(info.type) if info.type_origin in (Union, UnionType) else (info.type,)
     named = [kind for kind in kinds if kind is not NoneType]
     if named != [int] and (len(named) != 1 or len(kinds) == 1):
         return None
-    if get_origin(named[0]) is tuple:
-        return _pair(get_args(named[0])[0])
-    if named == [bool]:
-        return tyro.constructors.PrimitiveConstructorSpec(
-            nargs=1,
-            metavar="{True,False}",
-            instance_from_str=lambda words: {"true": True, "false": False}[words[0].lower()],
-            is_instance=lambda value: isinstance(value, tuple(kinds)),
-            str_from_instance=lambda value: [str(value)],
-            choices=("True", "False"),
-        )
-    parse: Callable[[str], Any] = _integer if named == [int] else named[0]
+    is_pair = get_origin(named[0]) is tuple
+    kind: Any = get_args(named[0])[0] if is_pair else named[0]
+    parse: Any = {int: _integer, bool: lambda word: {"true": True, "false": False}[word.lower()]}.get(kind, kind)
     return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=named[0].__name__.upper(),
-        instance_from_str=lambda words: parse(words[0]),
-        is_instance=lambda value: isinstance(value, tuple(kinds)),
-        str_from_instance=lambda value: [str(value)],
-    )
-
-
-def _pair(kind: type) -> tyro.constructors.PrimitiveConstructorSpec:
-    """Parses two numbers."""
-    parse: Callable[[str], Any] = _integer if kind is int else kind
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=2,
-        metavar=f"{kind.__name__.upper()} {kind.__name__.upper()}",
-        instance_from_str=lambda words: tuple(map(parse, words)),
-        is_instance=lambda value: value is None or isinstance(value, tuple),
-        str_from_instance=lambda value: ["None"] if value is None else [str(each) for each in value],
+        nargs=2 if is_pair else 1,
+        metavar="{True,False}" if kind is bool else " ".join([kind.__name__.upper()] * (2 if is_pair else 1)),
+        instance_from_str=lambda words: tuple(map(parse, words)) if is_pair else parse(words[0]),
+        is_instance=lambda value: isinstance(value, (tuple, NoneType) if is_pair else tuple(kinds)),
+        str_from_instance=lambda value: [str(each) for each in (value if isinstance(value, tuple) else [value])],
+        choices=("True", "False") if kind is bool else None,
     )
 
 
@@ -148,8 +128,8 @@ def _of_task(task: str) -> Mapping[str, tuple[Any, str]]:
     from torchrl_loco import tasks
     from torchrl_loco.registry import resolve
 
-    own = tasks.found().get(task)
-    return {} if own is not None and not own.has_options else resolve(task).options
+    found = tasks.found().get(task)
+    return {} if found is not None and not found.has_options else resolve(task).options
 
 
 def _annotated(value: Any, words: str) -> Any:
@@ -185,12 +165,8 @@ def settings(options: Any) -> tuple["training.TrainingConfig", tuple[int, ...], 
     """Returns the settings, the seeds and the number of GPUs of what :func:`_options` returned."""
     (kind,) = type(options).__bases__
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(kind)}
-    given = {
-        name: getattr(options, name)
-        for name, (value, _) in _of_task(options.task).items()
-        if getattr(options, name) != value
-    }
-    if given:
+    asked = {name: (getattr(options, name), value) for name, (value, _) in _of_task(options.task).items()}
+    if given := {name: value for name, (value, default) in asked.items() if value != default}:
         from torchrl_loco.registry import resolve
 
         values["options"] = resolve(options.task).checked_options(given)

@@ -61,8 +61,8 @@ class Which(Motions):
         Its task is the one that is named: ``task``, or ``run_or_task`` if ``policy`` says where the policy is.
         """
         policy, beside = self._load(run_or_task, device)
-        if self.motion or self.fps:
-            policy.info["options"] = {**policy.info.get("options", {}), **self.given(policy.info["task"])}
+        if given := self.given(policy.info["task"]):
+            policy.info["options"] = {**policy.info.get("options", {}), **given}
         return policy, beside
 
     def _load(self, run_or_task: str, device: str | None) -> tuple["torchrl_loco.Policy", Path]:
@@ -241,12 +241,7 @@ class Browser:
 BrowserOptions = Annotated[Browser, tyro.conf.arg(name="")]
 
 
-def record(
-    run_or_task: RunOrTask,
-    /,
-    which: WhichOptions = Which(),
-    video: VideoOptions = Video(),
-) -> None:
+def record(run_or_task: RunOrTask, /, which: WhichOptions = Which(), video: VideoOptions = Video()) -> None:
     """Record a video of a trained policy.
 
     Args:
@@ -300,15 +295,15 @@ def play(
 
         if viewer == "auto":
             viewer = _default_viewer(browser, video)
-        info, shown = played.info, ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
-        print(info["task"], *(f"{key} {info[key]}" for key in shown if key in info), sep=", ")
+        info, about = played.info, ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
+        print(info["task"], *(f"{key} {info[key]}" for key in about if key in info), sep=", ")
         if "mean" in info:
             print(training.describe(info))
         if viewer == "window":
             training.view(played, video.env(played), info["action_repeat"])
         elif viewer == "browser":
-            of = {"reward_terms": True, "play": True}
-            browser.show(make_for(played, browser.num_envs, video.device, video.seed, **of), played)
+            shown = make_for(played, browser.num_envs, video.device, video.seed, reward_terms=True, play=True)
+            browser.show(shown, played)
         else:
             video.make(played, _video_file(played, beside))
 

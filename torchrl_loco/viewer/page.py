@@ -4,6 +4,7 @@ import contextlib
 import functools
 import http
 import io
+import itertools
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -15,12 +16,11 @@ import websockets.asyncio.server
 from mjviser import ViserMujocoScene
 from viser import uplot
 
+from torchrl_loco.config import CONVERGED
 from torchrl_loco.motion import poses
 from torchrl_loco.viewer.player import Player
 from torchrl_loco.viewer.settings import is_foreign
 
-SOLVER = {"iterations": 100, "ls_iterations": 50}
-"""With which C MuJoCo finds the forces that arrows show: it converges, whatever the worlds' own settings are."""
 SPACING = 1.5
 """Distance between worlds, by the size of the model."""
 ELEVATION, AZIMUTH = np.deg2rad(20.0), np.deg2rad(120.0)
@@ -76,14 +76,9 @@ class _Server(viser.ViserServer):
 
 
 class Page:
-    """The page of some worlds.
+    """The page of some worlds, under a title; the next free port serves it if its own is taken.
 
-    Args:
-        player: the worlds.
-        host: address that the server listens on.
-        port: its port; the next free one if it is taken.
-        title: what stands above the controls.
-        act: takes what a click asks for, a function to be called by whoever steps the worlds.
+    ``act`` takes what a click asks for, a function to be called by whoever steps the worlds.
 
     Attributes:
         world: index of the chosen world.
@@ -102,8 +97,8 @@ class Page:
         self.server.gui.main_panel.dock_right()
         has_ghost = player.env.ghost() is not None
         self._model = player.env.model_with_ghost if has_ghost else player.env.mujoco_model()
-        for name, value in SOLVER.items():
-            setattr(self._model.opt, name, value)
+        for name in ("iterations", "ls_iterations"):  # for the forces that arrows show, whatever the worlds' own are
+            setattr(self._model.opt, name, CONVERGED[name])
         self.scene = ViserMujocoScene(self.server, self._model, player.env.num_envs)
         side = int(np.ceil(np.sqrt(player.env.num_envs)))
         self._spacing = SPACING * self._model.stat.extent
@@ -123,11 +118,6 @@ class Page:
         for entry, ranges in player.env.command_ranges.items() if player.env.play else ():
             self._make_command(entry, ranges)
         self._make_curves()
-
-    @property
-    def port(self) -> int:
-        """The port that the server listens on."""
-        return self.server.get_port()
 
     @property
     def watched(self) -> bool:
@@ -226,21 +216,15 @@ class Page:
         """Shows the present state of all worlds; the chosen one stands in its own place, the others beside it."""
         sim, chosen = self._player.env.sim, self.world
         shift = self._places - self._places[chosen]
-        of_forces = {}
-        if self.forces.value:
-            of_forces = {name: getattr(sim, name).cpu().numpy() for name in ("qpos", "qvel", "ctrl")}
+        names = ("qpos", "qvel", "ctrl") if self.forces.value else ()
+        of_forces = {name: getattr(sim, name).cpu().numpy() for name in names}
         pos, mat = sim.xpos.cpu().numpy(), sim.xmat.cpu().numpy().copy()
         if (ghost := self._player.env.ghost()) is not None:
             qpos = torch.cat([sim.qpos, ghost], dim=-1).cpu().numpy()
             pos, mat = (each.astype(np.float32) for each in poses(self._model, qpos))
             if of_forces:
                 of_forces |= {"qpos": qpos, "qvel": np.pad(of_forces["qvel"], ((0, 0), (0, sim.qvel.shape[1])))}
-        self.scene.update_from_arrays(
-            pos + shift[:, None].astype(np.float32),
-            mat,
-            env_idx=chosen,
-            **of_forces,
-        )
+        self.scene.update_from_arrays(pos + shift[:, None].astype(np.float32), mat, env_idx=chosen, **of_forces)
 
     def show_curves(self) -> None:
         """Shows curves and command of the chosen world."""
@@ -267,7 +251,6 @@ def _in_range(slider: Any) -> bool:
 
 def _plot(names: tuple[str, ...]) -> tuple[tuple[np.ndarray, ...], tuple[uplot.Series, ...]]:
     """Returns data, as yet none, and lines of a plot over time."""
-    lines = [
-        uplot.Series(label=name, stroke=COLORS[k % len(COLORS)], width=1.5, show=True) for k, name in enumerate(names)
-    ]
+    colors = zip(names, itertools.cycle(COLORS), strict=False)
+    lines = [uplot.Series(label=name, stroke=color, width=1.5, show=True) for name, color in colors]
     return tuple(np.zeros(1) for _ in range(1 + len(names))), (uplot.Series(label="time (s)"), *lines)

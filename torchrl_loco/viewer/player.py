@@ -14,13 +14,10 @@ HISTORY = 20.0
 class Player:
     """Worlds under a policy, without exploration: worlds whose episode ends begin the next.
 
-    Args:
-        env: the worlds.
-        policy: reads ``observation`` and writes ``action``; ``None`` leaves them at the start until there is one.
-        action_repeat: control steps for which an action is held; ``None`` takes that of ``policy.info``, else 1.
+    Arguments are those of :class:`torchrl_loco.viewer.viewer.Viewer`.
 
     Attributes:
-        policy: what acts from the next step on; another one may be set.
+        policy: what acts from the next step on; another one may be set. ``None`` leaves the worlds at the start.
         steps: control steps taken.
     """
 
@@ -81,10 +78,6 @@ class Player:
 
     def curves(self, world: int, points: int = 250) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the last 20 s of a world, thinned to about so many points.
-
-        Args:
-            world: index of the world.
-            points: how many points, about.
 
         Returns:
             Times since the start (s), ``(n,)``; the return of the episode so far, of this world and on average over

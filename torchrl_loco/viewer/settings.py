@@ -49,12 +49,8 @@ def is_foreign(host: str, named: str | None, origin: str | None) -> bool:
     """Returns whether a request comes from a page of another site, which must neither see nor steer the worlds.
 
     A page's own requests name one host in both headers. Where this machine alone is served, that must be its own name:
-    another site may have its name lead here.
-
-    Args:
-        host: address that the server listens on.
-        named: header ``Host``.
-        origin: header ``Origin``; programs that are no browser send none.
+    another site may have its name lead here. ``host`` is what the server listens on, ``named`` the header ``Host``;
+    programs that are no browser send no ``origin``.
     """
     if origin is not None and urlsplit(origin).netloc.lower() != (named or "").lower():
         return True

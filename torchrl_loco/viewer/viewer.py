@@ -84,7 +84,7 @@ class Viewer:
     @property
     def url(self) -> str:
         """Address of the page on this machine."""
-        return url_of(self._host, self.page.port)
+        return url_of(self._host, self.page.server.get_port())
 
     # Playing.
 

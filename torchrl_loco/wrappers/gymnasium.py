@@ -13,17 +13,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_loco.checks import check_choice
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.wrappers.common import (
-    check_render_mode,
-    groups_of,
-    made,
-    observations,
-    pictures,
-    render_metadata,
-    rows_as_objects,
-    step_worlds,
-    to_numpy,
-)
+from torchrl_loco.wrappers import common
 from torchrl_loco.wrappers.spaces import box, observation_space
 
 ARRAYS = ("numpy", "torch")
@@ -61,14 +51,14 @@ class GymnasiumEnv(Env):
         height: int = 240,
         **settings: Any,
     ) -> None:
-        self.render_mode = check_render_mode(render_mode)
+        self.render_mode = common.check_render_mode(render_mode)
         self._picture = (camera, width, height)
-        self.env = made(env, None, settings)
+        self.env = common.made(env, None, settings)
         if self.env.batch_size[0] != 1:
             raise ValueError(f"the environment has {self.env.batch_size[0]} worlds: take GymnasiumVectorEnv")
-        self.metadata = render_metadata(self.env)
+        self.metadata = common.render_metadata(self.env)
         self.observation_space, self.action_space = observation_space(self.env), box(self.env.action_spec)
-        self._groups = groups_of(self.env)
+        self._groups = common.groups_of(self.env)
         self._td: TensorDictBase | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -88,10 +78,7 @@ class GymnasiumEnv(Env):
         return self._observation(self._td), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Steps the world.
-
-        Args:
-            action: array or tensor.
+        """Steps the world under an action, an array or a tensor.
 
         Returns:
             Observation, reward, whether the episode terminated or was truncated, and the infos, which have
@@ -112,12 +99,12 @@ class GymnasiumEnv(Env):
         return self._observation(after), float(after["reward"]), terminated, truncated, infos
 
     def _observation(self, td: TensorDictBase) -> Any:
-        seen = to_numpy(observations(td, self._groups))
+        seen = common.to_numpy(common.observations(td, self._groups))
         return {name: rows[0] for name, rows in seen.items()} if isinstance(seen, dict) else seen[0]
 
     def render(self) -> Any:
         """Returns the current picture, uint8 ``(height, width, 3)``, or ``None`` without a render mode."""
-        return None if self.render_mode is None else pictures(self.env, self._picture)[0]
+        return None if self.render_mode is None else common.pictures(self.env, self._picture)[0]
 
     def close(self) -> None:
         """Frees the memory of the world."""
@@ -173,16 +160,16 @@ class GymnasiumVectorEnv(VectorEnv):
         **settings: Any,
     ) -> None:
         self._torch = check_choice("arrays", arrays, ARRAYS) == "torch"
-        self.render_mode = check_render_mode(render_mode)
+        self.render_mode = common.check_render_mode(render_mode)
         self._picture = (camera, width, height)
-        self.env = made(env, num_envs, settings)
+        self.env = common.made(env, num_envs, settings)
         self.num_envs = self.env.batch_size[0]
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, **render_metadata(self.env)}
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, **common.render_metadata(self.env)}
         self.single_observation_space = observation_space(self.env)
         self.single_action_space = box(self.env.action_spec)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._groups = groups_of(self.env)
+        self._groups = common.groups_of(self.env)
         self._td: TensorDictBase | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -204,13 +191,10 @@ class GymnasiumVectorEnv(VectorEnv):
         else:
             rows = torch.as_tensor(mask, device=self.env.device).unsqueeze(-1)
             self._td = self.env.reset(self._td.copy().set("_reset", rows))
-        return self._convert(observations(self._td, self._groups)), {}
+        return self._convert(common.observations(self._td, self._groups)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Steps all worlds and resets those that are done.
-
-        Args:
-            actions: array or tensor, ``(num_envs, ...)``.
+        """Steps all worlds under actions, an array or a tensor ``(num_envs, ...)``, and resets those that are done.
 
         Returns:
             The observations after the resets; rewards, terminations and truncations of the step, ``(num_envs,)`` each;
@@ -221,20 +205,20 @@ class GymnasiumVectorEnv(VectorEnv):
         """
         if self._td is None:
             raise ResetNeeded("reset() must be called before step()")
-        after, self._td = step_worlds(self.env, self._td, actions)
+        after, self._td = common.step_worlds(self.env, self._td, actions)
         rewards, terminations, truncations, done = (
             self._convert(after[key].squeeze(-1)) for key in ("reward", "terminated", "truncated", "done")
         )
         infos = {}
         if self._torch or done.any():
-            last = self._convert(observations(after, self._groups))
-            infos = {"final_obs": last if self._torch else rows_as_objects(last, done), "_final_obs": done}
+            last = self._convert(common.observations(after, self._groups))
+            infos = {"final_obs": last if self._torch else common.rows_as_objects(last, done), "_final_obs": done}
         if "reward_terms" in after:
             infos["reward_terms"] = {k: self._convert(x.squeeze(-1)) for k, x in after["reward_terms"].items()}
-        return self._convert(observations(self._td, self._groups)), rewards, terminations, truncations, infos
+        return self._convert(common.observations(self._td, self._groups)), rewards, terminations, truncations, infos
 
     def _convert(self, data: Any) -> Any:
-        return data if self._torch else to_numpy(data)
+        return data if self._torch else common.to_numpy(data)
 
     def render(self) -> tuple[np.ndarray, ...]:
         """Returns the current picture of each world, uint8 ``(height, width, 3)``; worlds that were done are new.
@@ -244,7 +228,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """
         if self.render_mode is None:
             raise ValueError('nothing can be rendered: make the environment with render_mode="rgb_array"')
-        return tuple(pictures(self.env, self._picture))
+        return tuple(common.pictures(self.env, self._picture))
 
     def close_extras(self, **_: Any) -> None:
         """Frees the memory of the worlds."""

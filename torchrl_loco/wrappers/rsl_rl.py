@@ -70,10 +70,9 @@ class RslRlVecEnv(VecEnv):
         return TensorDict(groups, batch_size=td.batch_size, device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Steps all worlds and resets those that are done.
+        """Steps all worlds under actions ``(num_envs, num_actions)``, and resets those that are done.
 
-        Args:
-            actions: ``(num_envs, num_actions)``. RSL-RL's Gaussian has no bounds; the task clips them to its own.
+        RSL-RL's Gaussian has no bounds; the task clips actions to its own.
 
         Returns:
             The observations after the resets; rewards and dones of the step, ``(num_envs,)`` each; and the extras.

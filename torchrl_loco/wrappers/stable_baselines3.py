@@ -7,17 +7,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torchrl.envs import EnvBase
 
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.wrappers.common import (
-    check_render_mode,
-    groups_of,
-    made,
-    observations,
-    pictures,
-    render_metadata,
-    rows_as_objects,
-    step_worlds,
-    to_numpy,
-)
+from torchrl_loco.wrappers import common
 from torchrl_loco.wrappers.spaces import box, observation_space
 
 
@@ -62,13 +52,13 @@ class StableBaselines3VecEnv(VecEnv):
         height: int = 240,
         **settings: Any,
     ) -> None:
-        self.render_mode = check_render_mode(render_mode)
+        self.render_mode = common.check_render_mode(render_mode)
         self._picture = (camera, width, height)
-        self.env = made(env, num_envs, settings)
+        self.env = common.made(env, num_envs, settings)
         self.num_envs = self.env.batch_size[0]
         super().__init__(self.num_envs, observation_space(self.env), box(self.env.action_spec))
-        self.metadata = render_metadata(self.env)
-        self._groups = groups_of(self.env)
+        self.metadata = common.render_metadata(self.env)
+        self._groups = common.groups_of(self.env)
 
     def reset(self) -> Any:
         """Returns the first observations of all worlds, under the seed that ``seed()`` was given before, if any."""
@@ -76,7 +66,7 @@ class StableBaselines3VecEnv(VecEnv):
             self.env.set_seed(self._seeds[0])
         self._seeds = [None] * self.num_envs
         self._td = self.env.reset()
-        return to_numpy(observations(self._td, self._groups))
+        return common.to_numpy(common.observations(self._td, self._groups))
 
     def step_async(self, actions: np.ndarray) -> None:
         """Takes the actions, ``(num_envs, ...)``; ``step_wait`` steps."""
@@ -89,18 +79,20 @@ class StableBaselines3VecEnv(VecEnv):
             The observations after the resets; rewards and dones of the step, ``(num_envs,)`` each; and the infos of
             each world.
         """
-        after, self._td = step_worlds(self.env, self._td, self._actions)
-        rewards, dones, terminated = (to_numpy(after[key].squeeze(-1)) for key in ("reward", "done", "terminated"))
+        after, self._td = common.step_worlds(self.env, self._td, self._actions)
+        rewards, dones, terminated = (
+            common.to_numpy(after[key].squeeze(-1)) for key in ("reward", "done", "terminated")
+        )
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if dones.any():
-            last = rows_as_objects(to_numpy(observations(after, self._groups)), dones)
+            last = common.rows_as_objects(common.to_numpy(common.observations(after, self._groups)), dones)
             for world in dones.nonzero()[0]:
                 infos[world] = {"terminal_observation": last[world], "TimeLimit.truncated": not terminated[world]}
-        return to_numpy(observations(self._td, self._groups)), rewards, dones, infos
+        return common.to_numpy(common.observations(self._td, self._groups)), rewards, dones, infos
 
     def get_images(self) -> list[np.ndarray]:
         """Returns the current picture of each world, uint8 ``(height, width, 3)``, which ``render()`` joins."""
-        return list(pictures(self.env, self._picture))
+        return list(common.pictures(self.env, self._picture))
 
     def close(self) -> None:
         """Frees the memory of the worlds."""
