@@ -2,6 +2,7 @@
 
 A task is a class in whose name is that of its folder: ``WalkerWalk`` in ``walker`` has the id ``walker_walk``,
 ``Go1Velocity`` in ``velocity`` the id ``go1_velocity``.
+What those of robots share is in ``robots``.
 """
 
 import ast

@@ -15,18 +15,8 @@ import torch
 from torchrl_loco import terrain
 from torchrl_loco.sim import models
 from torchrl_loco.tasks import velocity
-from torchrl_loco.tasks.velocity import (
-    WEIGHTS,
-    G1Velocity,
-    Go1Velocity,
-    Go2Velocity,
-    H1Velocity,
-    Velocity,
-    com,
-    either,
-    hard_contacts,
-    sliding,
-)
+from torchrl_loco.tasks.robots import com, either, hard_contacts, sliding, squares
+from torchrl_loco.tasks.velocity import WEIGHTS, G1Velocity, Go1Velocity, Go2Velocity, H1Velocity, Velocity
 from torchrl_loco.terrain.kinds import Patch, points
 
 if TYPE_CHECKING:
@@ -232,7 +222,7 @@ class Rough(Velocity):
         terms = super().terms(s)
         if self.leans:
             tilt = s.to_body(self.trunk, self.normal(s))[:, :2]
-            terms["upright"] = torch.exp(-velocity.squares(tilt) / 0.2)
+            terms["upright"] = torch.exp(-squares(tilt) / 0.2)
         if self.scrapes:
             terms["scrapes"] = torch.stack([hard_contacts(s, geoms) for geoms in self.scrapes]).sum(0)
         return terms

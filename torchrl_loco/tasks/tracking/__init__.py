@@ -13,7 +13,8 @@ import torch
 from torchrl_loco import motion as motions
 from torchrl_loco.checks import Interval, check_int
 from torchrl_loco.conditions import PUSH_EVERY
-from torchrl_loco.tasks.velocity import G1Velocity, H1Velocity, Robot, either, hard_contacts, pushed, squares
+from torchrl_loco.tasks.robots import Robot, either, hard_contacts, pushed, squares
+from torchrl_loco.tasks.velocity import G1Velocity, H1Velocity
 
 if TYPE_CHECKING:
     from torchrl_loco.envs.view import View

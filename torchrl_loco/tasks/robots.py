@@ -1,0 +1,122 @@
+"""What tasks of robots share, whether they follow commands or motions."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import mujoco
+import numpy as np
+import torch
+
+from torchrl_loco.conditions import PUSH_EVERY
+from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.envs.vary import Vary
+from torchrl_loco.sim import models
+
+if TYPE_CHECKING:
+    from torchrl_loco.envs.view import View
+
+HARD_CONTACT = 10.0
+"""Force from which a contact of the robot with itself counts (N)."""
+
+
+class Robot(LocoEnv):
+    """What robots share whose base floats, and whose actions are changes of their joints' targets from home, scaled.
+
+    Actuators are servos of joints.
+    """
+
+    action_range = (-math.inf, math.inf)
+
+    base: ClassVar[str]
+    """Body that floats."""
+    action_scale: ClassVar[float | None] = None
+    """Change of a joint's target by an action of 1 (rad); ``None`` is a quarter of what needs the greatest torque."""
+    own_geoms: ClassVar[str] = ""
+    """Regular expression of the geoms of which ``self_collision`` counts the contacts."""
+
+    @property
+    def joints(self) -> list[str]:
+        """Names of the actuated joints, in the order of the actuators."""
+        return actuated(self.mj_model)
+
+    @classmethod
+    def facts(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns how actions become targets of the joints (rad): ``action_offset + action_scale * action``."""
+        home = models.home_pose(m)[[int(m.joint(name).qposadr[0]) for name in actuated(m)]].tolist()
+        scale = np.full(m.nu, cls.action_scale or 0.0)
+        if cls.action_scale is None:
+            scale = 0.25 * m.actuator_forcerange[:, 1] / m.actuator_gainprm[:, 0]
+        return {"action_offset": home, "action_scale": scale.tolist()}
+
+    def home(self, s: "View") -> torch.Tensor:
+        """Returns the joint positions of the home pose (rad), ``(num_envs, joints)``."""
+        return s.home[:, [int(self.mj_model.joint(name).qposadr[0]) for name in self.joints]]
+
+    def limits(self, s: "View") -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the least and greatest positions of the joints (rad), each ``(num_envs, joints)``."""
+        low, high = s.model("jnt_range")[:, [self.mj_model.joint(name).id for name in self.joints]].unbind(-1)
+        return low, high
+
+    def beyond_limits(self, s: "View") -> torch.Tensor:
+        """Returns how far the joints are beyond 0.9 of their ranges (rad), summed, ``(num_envs,)``."""
+        low, high = self.limits(s)
+        beyond = (s.joint_qpos(self.joints) - 0.5 * (low + high)).abs() - 0.45 * (high - low)
+        return beyond.clamp(min=0.0).sum(-1)
+
+    def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
+        """Returns the targets of the joints (rad): the home pose and a multiple of the action."""
+        if self.action_scale is not None:
+            return self.home(s) + self.action_scale * action
+        return (
+            self.home(s) + 0.25 * s.model("actuator_forcerange")[..., 1] / s.model("actuator_gainprm")[..., 0] * action
+        )
+
+
+def actuated(m: mujoco.MjModel) -> list[str]:
+    """Returns the names of a model's actuated joints, in the order of the actuators."""
+    return [m.joint(int(joint)).name for joint in m.actuator_trnid[:, 0]]
+
+
+def com(trunk: str) -> Vary:
+    """Returns how the center of mass of a trunk differs from world to world (m)."""
+    return Vary("body_ipos", (-0.025, -0.025, -0.03), (0.025, 0.025, 0.03), of=trunk, how="add", once=True)
+
+
+def sliding(geoms: str, low: float = 0.3, high: float = 1.2) -> Vary:
+    """Returns how the sliding friction of geoms, alike for all of them, differs from world to world."""
+    return Vary("geom_friction", low, high, of=geoms, how="set", once=True)
+
+
+def soft(geoms: str) -> list[Vary]:
+    """Returns how torsional and rolling friction of round feet (m) differ from world to world."""
+    ranges = {1: (1e-4, 2e-2), 2: (1e-5, 5e-3)}
+    settings: dict[str, Any] = {"of": geoms, "how": "set", "log": True, "once": True}
+    return [Vary("geom_friction", *bounds, component=k, **settings) for k, bounds in ranges.items()]
+
+
+def squares(values: torch.Tensor) -> torch.Tensor:
+    """Returns the sum of the squares of each row, ``(num_envs,)``."""
+    return values.square().sum(-1)
+
+
+def either(
+    mask: torch.Tensor, new: Mapping[str, torch.Tensor], old: Mapping[str, torch.Tensor]
+) -> dict[str, torch.Tensor]:
+    """Returns rows by name: the new ones in the worlds of a mask ``(num_envs,)``, else the old ones."""
+    return {name: torch.where(mask.view(-1, *[1] * (row.ndim - 1)), row, old[name]) for name, row in new.items()}
+
+
+def hard_contacts(s: "View", geoms: str) -> torch.Tensor:
+    """Returns in how many physics steps one of some geoms had a hard contact, ``(num_envs,)``."""
+    hard = s.contact_force([geoms], history=True).norm(dim=-1) > HARD_CONTACT
+    return hard.any(-1).float().sum(-1)
+
+
+def pushed(s: "View", greatest: Sequence[float], scale: float = 1.0) -> dict[str, torch.Tensor]:
+    """Returns velocities, which a push changes every 1 to 3 s, and ``until_push``, the time until the next (s)."""
+    push = s.until_push <= 0.0
+    change = scale * s.uniform(-1.0, 1.0, 6) * torch.tensor(greatest, device=s.device)
+    base = s.qvel[:, :6] + torch.where(push.unsqueeze(-1), change, 0.0)
+    until_push = torch.where(push, s.uniform(*PUSH_EVERY), s.until_push - s.dt)
+    return {"qvel": torch.cat([base, s.qvel[:, 6:]], dim=-1), "until_push": until_push}
