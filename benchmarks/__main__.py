@@ -32,7 +32,6 @@ small = [256] if DEVICE == "cpu" else [8192]
 add("throughput", "from the bare simulator to a collector", small if DEVICE == "cpu" else [512, 2048, 8192, 32768])
 add("engines", "the compiled engine beside MuJoCo-Warp", small if DEVICE == "cpu" else [2048, 8192, 32768, 131072])
 commands.choices["engines"].add_argument("--base-up-to", type=int, default=131072, help="most worlds of MuJoCo-Warp")
-add("startup", "time from process start to the first step, and memory per world", small)
 add("peers", "other simulators compared with ours, in processes of their own", small)
 add("fidelity", "deviation from C MuJoCo in double precision", [256])
 commands.choices["fidelity"].add_argument("--picture", type=Path, help="file for a plot")
@@ -88,6 +87,16 @@ numbers.add_argument(
 numbers.add_argument("--worlds", type=int, nargs="+", default=[8192, 32768])
 numbers.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 numbers.add_argument("--out", type=Path, help="file for the results as JSON")
+begin = commands.add_parser("startup", help="a training's start by phase, with empty and with filled kernel caches")
+begin.add_argument(
+    "--tasks", nargs="+", choices=list_envs(), default=["walker_walk", "go1_velocity", "g1_velocity", "g1_tracking"]
+)
+begin.add_argument("--iterations", type=int, default=4, help="of each training")
+begin.add_argument("--repeats", type=int, default=1, help="trainings with filled caches")
+begin.add_argument("--settings", nargs="+", default=[], metavar="NAME=VALUE", help="further ones of train")
+begin.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
+begin.add_argument("--out", type=Path, help="file for the results as JSON")
+begin.add_argument("--picture", type=Path, help="file for a plot")
 spread = commands.add_parser("scaling", help="several GPUs beside one, with the same worlds on each")
 spread.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_walk"])
 spread.add_argument("--gpus", type=int, nargs="+", default=[1, 2], help="numbers of GPUs, or of processes on the CPU")
@@ -124,9 +133,11 @@ elif args.command == "pixels":
 
     rows = pixels(args.bodies, args.worlds, args.sizes, args.device)
 elif args.command == "startup":
-    from benchmarks.startup import COLUMNS, startup
+    from benchmarks.startup import COLUMNS, plot_startup, startup
 
-    rows = startup(args.bodies, args.worlds, str(args.device))
+    rows = startup(args.tasks, args.device, args.iterations, args.repeats, args.settings)
+    if args.picture:
+        plot_startup(rows, args.picture)
 elif args.command == "peers":
     from benchmarks.peers import COLUMNS, peers
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from hook_tasks import FollowVelocity
 
-from benchmarks import cases, coverage, fidelity, plot, robots, rollouts, scaling, soak, suite, timing
+from benchmarks import cases, coverage, fidelity, plot, robots, rollouts, scaling, soak, startup, suite, timing
 from benchmarks.cases import until_interrupted
 from benchmarks.peers import mjlab_policy
 from benchmarks.processes import MeasurementError, run_json
@@ -116,6 +116,20 @@ def test_soak_compares_the_counters_with_what_happened(monkeypatch):
     monkeypatch.setattr(soak.LocoEnv, "health", lambda env: {"total": {"non_finite": torch.tensor(3)}})
     with pytest.raises(AssertionError):
         soak.soak(["walker"], 32, 40 * 32, torch.device("cpu"))
+
+
+@pytest.mark.slow
+def test_all_seconds_of_a_start_are_in_a_phase(tmp_path):
+    settings = ["num_envs=4", "num_steps=8", "minibatch_size=16", "eval_episodes=2"]
+    empty, filled = startup.startup(["walker_walk"], torch.device("cpu"), 2, 1, settings)
+    for row in empty, filled:
+        assert sum(row[phase] for phase in startup.PHASES) == pytest.approx(row["total"], abs=0.01)
+        before = ("imports", "worlds", "text", "kernels", "networks", "rollout 1", "update 1")
+        assert all(row[phase] > 0.0 for phase in (*before, "iterations", "evaluation", "pictures", "end"))
+        assert sum(row[phase] for phase in before) < row["iteration 1"] < row["total"]
+    assert filled["kernels"] < 0.5 * empty["kernels"]
+    startup.plot_startup([empty, filled], tmp_path / "startup.png")
+    assert (tmp_path / "startup.png").exists()
 
 
 @pytest.mark.slow
