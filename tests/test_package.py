@@ -90,14 +90,16 @@ main(["train", "walker_stand", "--device=cpu", "--out", sys.argv[1]])
 
 @pytest.mark.slow
 def test_torchs_compiler_is_imported_when_somebody_compiles(tmp_path):
-    """Not by a training with PPO; and what tensordict and TorchRL asked of it at their import is done then."""
+    """Not by a training with PPO or by hooks; what tensordict and TorchRL asked of it at their import is done then."""
     code = """
 import sys
+import hook_tasks
 import quickly
 from torchrl_loco import training
 sizes = {"num_envs": 4, "num_steps": 8, "minibatch_size": 16, "epochs": 1, "hidden": (8,), "total_frames": 256}
 settings = {**sizes, "eval_episodes": 2, "video_seconds": 0.0, "logger": ("csv",)}
 training.train("walker_stand", device="cpu", out=sys.argv[1], algorithm="ppo", episode_length=40, **settings)
+hook_tasks.FollowVelocity(4, "cpu", 0)
 assert "torch._dynamo" not in sys.modules
 import torch, tensordict.base
 from torchrl.modules.distributions import utils

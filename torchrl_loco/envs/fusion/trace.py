@@ -47,6 +47,11 @@ class _Tracer(TorchDispatchMode):
         self._kept = list(arrays.values())  # arrays and constants: no other tensor gets their ids meanwhile
         self._nodes = {id(array): self.graph.placeholder(f"arg{i}") for i, array in enumerate(self._kept)}
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Returns no: torch 2.13 would import its compiler, which takes a second, to keep it away from this method."""
+        return False
+
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         if func is aten.lift_fresh.default:  # of torch.tensor(...): each run needs a copy
