@@ -59,8 +59,10 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
     relative to each other. Of geoms of the ground that are alike, one stands for all.
     """
     like = stand_ins(m)
-    weld = m.body_weldid[m.geom_bodyid]
-    parent_weld = m.body_weldid[m.body_parentid[weld]]
+    # As lists: there are thousands of candidates, and a number of an array takes ten times as long.
+    of_geoms = m.geom_bodyid, m.geom_contype, m.geom_conaffinity, m.body_weldid[m.geom_bodyid]
+    body, contype, conaffinity, weld = (array.tolist() for array in of_geoms)
+    parent_weld = m.body_weldid[m.body_parentid[weld]].tolist()
     filter_parent = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
     excluded = set(m.exclude_signature.tolist())
     explicit = [tuple(sorted((int(m.pair_geom1[i]), int(m.pair_geom2[i])))) for i in range(m.npair)]
@@ -73,8 +75,8 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
         for b in shown if weld[a] else moving:
             if b <= a or (a, b) in explicit:
                 continue
-            bodies = sorted((m.geom_bodyid[a], m.geom_bodyid[b]))
-            masked = not (m.geom_contype[a] & m.geom_conaffinity[b] or m.geom_contype[b] & m.geom_conaffinity[a])
+            bodies = sorted((body[a], body[b]))
+            masked = not (contype[a] & conaffinity[b] or contype[b] & conaffinity[a])
             related = weld[a] and weld[b] and (weld[a] == parent_weld[b] or weld[b] == parent_weld[a])
             if masked or weld[a] == weld[b] or (filter_parent and related):
                 continue

@@ -119,7 +119,8 @@ class Description:
         self.moved = moved_by(m)
         self.ground = Ground.of(m)
         self.pairs = self._sorted_pairs(pairs(m))
-        self.functions = [f for f in FUNCTIONS if f in {kind(m, p).function for p in self.pairs}]
+        used_functions = {kind(m, p).function for p in self.pairs}
+        self.functions = [f for f in FUNCTIONS if f in used_functions]
         self.condims = {p.condim for p in self.pairs} - {1}
         self.elliptic = bool(self.condims) and is_elliptic(m)
         self.some_lack_edges = len(self.condims) > 1 and not self.elliptic
