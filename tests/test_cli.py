@@ -6,7 +6,7 @@ import sys
 import pytest
 import tyro
 
-from torchrl_loco import __version__, cli
+from torchrl_loco import __version__, cli, garbage
 from torchrl_loco.cli.options import VALUES
 
 FRESH = """
@@ -139,3 +139,14 @@ def test_kernels_are_compiled_ahead_and_no_run_is_left(tmp_path, monkeypatch, ca
     with pytest.raises(SystemExit):
         cli.main(["warm"])
     assert "name the tasks" in capsys.readouterr().err
+
+
+def test_what_the_command_imports_is_left_out_of_collections(monkeypatch):
+    """In its own process, and where something was imported: else garbage of a training would stay."""
+    frozen = []
+    monkeypatch.setattr(garbage.gc, "freeze", lambda: frozen.append(len(sys.modules)))
+    for own_process, module in ((False, "first"), (True, "second"), (True, "second")):
+        monkeypatch.setattr(garbage.OWN_PROCESS, "is_set", lambda own=own_process: own)
+        with garbage.importing():
+            monkeypatch.setitem(sys.modules, module, sys)
+    assert len(frozen) == 1

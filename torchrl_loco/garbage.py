@@ -2,12 +2,30 @@
 
 import contextlib
 import gc
+import sys
 import threading
 from collections.abc import Iterator
 
 _LOCK = threading.RLock()
 _blocks, _was_enabled = 0, False
 """Blocks that threads are in, and whether garbage was collected before the first."""
+
+
+OWN_PROCESS = threading.Event()
+"""Set where the process is that of the command, to whose end everything stays that it imports."""
+
+
+@contextlib.contextmanager
+def importing() -> Iterator[None]:
+    """Is :func:`no_collection` for a block that imports; in a process of the command, later collections skip all of it.
+
+    Python would look three times at half a million objects, which takes a second.
+    """
+    known = len(sys.modules)
+    with no_collection():
+        yield
+        if OWN_PROCESS.is_set() and len(sys.modules) > known:  # else the garbage of a training might be kept
+            gc.freeze()
 
 
 @contextlib.contextmanager

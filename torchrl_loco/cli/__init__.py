@@ -20,13 +20,14 @@ from torchrl_loco.cli.errors import process_name, user_errors
 from torchrl_loco.cli.motions import motion
 from torchrl_loco.cli.options import VALUES, task_options
 from torchrl_loco.cli.policies import evaluate, export, play, record, verify, watch
-from torchrl_loco.garbage import no_collection
+from torchrl_loco.garbage import OWN_PROCESS, importing
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Runs the command line. Returns 0, or 130 when interrupted; exits with 2 for errors of the user."""
     if args is None:  # the process ends: collecting garbage among all that was imported would take seconds
         atexit.register(gc.freeze)
+        OWN_PROCESS.set()
     try:
         _run(sys.argv[1:] if args is None else list(args))
     except KeyboardInterrupt:
@@ -43,7 +44,7 @@ def _run(args: list[str]) -> None:
         print(torchrl_loco.__version__)
         return
     complete = list(args)
-    with no_collection():  # what is imported stays, and garbage collection takes a third of the time
+    with importing():  # garbage collection takes a third of the time
         options_type = task_options(args) if args[:1] == ["train"] else None
 
     def train(options: Annotated[options_type, tyro.conf.arg(name="")]) -> None:  # type: ignore[valid-type]

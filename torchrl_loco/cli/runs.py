@@ -11,7 +11,7 @@ from torchrl_loco.checks import SEED, check_int, check_run
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.motions import THOSE_OF_TRAINING, MotionOptions
 from torchrl_loco.cli.options import OtherTask, settings
-from torchrl_loco.garbage import no_collection
+from torchrl_loco.garbage import importing
 
 if TYPE_CHECKING:
     from torchrl_loco import training
@@ -130,7 +130,7 @@ def missing_processes(gpus: int | None, device: str) -> int:
 
 def _trained(what: "training.TrainingConfig | training.RunFolder", **changes: Any) -> str:
     """Trains to the last frame, and prints where the results are. Returns the folder of the run."""
-    with user_errors(), no_collection():
+    with user_errors(), importing():
         from torchrl_loco.training.start import Given, run_to_end
     run = run_to_end(what, Given(), user_errors, **changes)
     if os.environ.get("RANK", "0") == "0":
