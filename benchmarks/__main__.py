@@ -8,7 +8,8 @@ import torch
 
 from benchmarks.cases import CASES, INTERRUPTED, LEARNING, VARIANTS
 from benchmarks.results import save, show
-from benchmarks.tasks import TASKS
+from benchmarks.tables import PARTS
+from benchmarks.tasks import RUNNERS, TASKS
 from torchrl_loco import list_envs
 from torchrl_loco.policy import shipped_policies
 
@@ -22,7 +23,7 @@ def add(name: str, description: str, worlds: list[int]) -> argparse.ArgumentPars
     """Adds a command that measures."""
     command = commands.add_parser(name, help=description, description=description)
     command.add_argument("--worlds", type=int, nargs="+", default=worlds)
-    command.add_argument("--bodies", nargs="+", choices=list(TASKS), default=list(TASKS))
+    command.add_argument("--bodies", nargs="+", choices=list(TASKS), default=RUNNERS)
     command.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
     command.add_argument("--out", type=Path, help="file for the results as JSON")
     return command
@@ -30,9 +31,6 @@ def add(name: str, description: str, worlds: list[int]) -> argparse.ArgumentPars
 
 small = [256] if DEVICE == "cpu" else [8192]
 add("throughput", "from the bare simulator to a collector", small if DEVICE == "cpu" else [512, 2048, 8192, 32768])
-add("engines", "the compiled engine beside MuJoCo-Warp", small if DEVICE == "cpu" else [2048, 8192, 32768, 131072])
-commands.choices["engines"].add_argument("--base-up-to", type=int, default=131072, help="most worlds of MuJoCo-Warp")
-add("peers", "other simulators compared with ours, in processes of their own", small)
 add("fidelity", "deviation from C MuJoCo in double precision", [256])
 commands.choices["fidelity"].add_argument("--picture", type=Path, help="file for a plot")
 add("profile", "time of each kernel (CUDA)", small)
@@ -60,7 +58,16 @@ walk.add_argument("--episodes", type=int, default=256, help="in which a policy i
 walk.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 for name, further, default in (("throughput", {}, list(CASES)), ("profile", LEARNING, ["env_step_and_maybe_reset"])):
     commands.choices[name].add_argument("--cases", nargs="+", choices=[*CASES, *VARIANTS, *further], default=default)
-commands.choices["peers"].add_argument("--path", type=Path, help="folder that the peers' packages were installed in")
+every = commands.add_parser("tables", help="what the tables of speeds are made of: ours and other libraries")
+every.add_argument("folder", type=Path, help="has a file for each part; what is there is not measured again")
+every.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
+every.add_argument("--worlds", type=int, default=small[0])
+every.add_argument("--frames", type=int, default=40_000_000, help="of each of our trainings")
+every.add_argument("--settings", nargs="+", default=[], metavar="NAME=VALUE", help="further ones of train")
+every.add_argument("--path", type=Path, help="folder that the peers' packages were installed in")
+every.add_argument("--mjlab", type=Path, help="folder that mjlab and the packages it pins were installed in")
+every.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
+every.set_defaults(out=None)
 train = commands.add_parser("training", help="time to a return, compared with Brax's PPO on Playground")
 train.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_walk"])
 train.add_argument("--frames", type=int, default=10_000_000)
@@ -124,10 +131,11 @@ if args.command == "throughput":
 
     rows = throughput(args.bodies, args.worlds, args.cases, args.device)
     show(phases(rows), {"body": "", "worlds": "d", **dict.fromkeys(PHASES, ".3f")})
-elif args.command == "engines":
-    from benchmarks.engines import COLUMNS, engines
+elif args.command == "tables":
+    from benchmarks.tables import COLUMNS, tables
 
-    rows = engines(args.bodies, args.worlds, args.device, args.base_up_to)
+    options = {name: getattr(args, name) for name in ("device", "worlds", "frames", "settings", "path", "mjlab")}
+    rows = tables(args.folder, args.parts, **options)
 elif args.command == "pixels":
     from benchmarks.pixels import COLUMNS, pixels
 
@@ -138,10 +146,6 @@ elif args.command == "startup":
     rows = startup(args.tasks, args.device, args.iterations, args.repeats, args.settings)
     if args.picture:
         plot_startup(rows, args.picture)
-elif args.command == "peers":
-    from benchmarks.peers import COLUMNS, peers
-
-    rows = peers(args.bodies, args.worlds, args.device, args.path)
 elif args.command == "fidelity":
     from benchmarks.fidelity import COLUMNS, fidelity, plot_fidelity
 

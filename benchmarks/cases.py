@@ -59,7 +59,7 @@ def bare_default(body: str, n: int, device: torch.device, protocol: str = "playg
     config = sim_config(env_class(TASKS[body]).config, protocol, n, {"engine": "mujoco_warp"})
     sim = Simulation(models.load(env_class(TASKS[body]).model), config, n, device)
     sim.model.opt.graph_conditional, sim.model.opt.run_qacc_smooth = True, True
-    mask = wp.ones(n, dtype=bool, device=sim.device)
+    mask, draw = wp.ones(n, dtype=bool, device=sim.device), random_controls(sim)
     with wp.ScopedDevice(sim.device):
         sim.reset(mask)
         mjw.step(sim.model, sim.data)
@@ -69,7 +69,7 @@ def bare_default(body: str, n: int, device: torch.device, protocol: str = "playg
     wp.synchronize_device(sim.device)
 
     def step() -> None:
-        sim.ctrl.uniform_(-1.0, 1.0)
+        draw()
         wp.capture_launch(capture.graph, stream=current_stream(sim.device))
 
     return step
@@ -88,26 +88,37 @@ def bare_compiled(body: str, n: int, device: torch.device) -> Callable[[], None]
 def _bare(body: str, n: int, device: torch.device, engine: str) -> Callable[[], None]:
     config = sim_config(env_class(TASKS[body]).config, "playground", n, {"engine": engine})
     sim = Simulation(models.load(env_class(TASKS[body]).model), config, n, device)
-    mask = wp.ones(n, dtype=bool, device=sim.device)
+    mask, draw = wp.ones(n, dtype=bool, device=sim.device), random_controls(sim)
     graph = sim.capture(sim.step)
     sim.capture(lambda: sim.reset(mask)).replay()
 
     def step() -> None:
-        sim.ctrl.uniform_(-1.0, 1.0)
+        draw()
         graph.replay()
 
     return step
 
 
-def env_step(body: str, n: int, device: torch.device) -> Callable[[], None]:
-    """``env._step`` on random actions."""
-    env = torchrl_loco.make(TASKS[body], n, device, seed=0)
-    td = env.reset()
+def random_controls(sim: Simulation) -> Callable[[], None]:
+    """Returns what draws all controls anew: of servos, targets that are at most 0.5 rad from the home pose."""
+    m, middle, reach = sim.mj_model, torch.zeros(sim.mj_model.nu), 1.0
+    if m.actuator_biastype.any():
+        middle, reach = torch.tensor(models.home_pose(m)[m.jnt_qposadr[m.actuator_trnid[:, 0]]]).float(), 0.5
+    middle = middle.to(sim.ctrl.device)
 
-    def step() -> None:
-        env._step(td.set("action", torch.empty(env.action_spec.shape, device=device).uniform_(-1.0, 1.0)))
+    def draw() -> None:
+        sim.ctrl.uniform_(-reach, reach)
+        if reach < 1.0:
+            sim.ctrl.add_(middle)
 
-    return step
+    return draw
+
+
+def env_step(body: str, n: int, device: torch.device, **options: Any) -> Callable[[], None]:
+    """Physics, observation and reward on random actions, as graphs on CUDA, without TensorDicts and resets."""
+    env = torchrl_loco.make(TASKS[body], n, device, seed=0, stagger=True, **options)
+    env.reset()
+    return lambda: env.world.step(env.world.action.torch.uniform_(-1.0, 1.0))
 
 
 def env_step_and_maybe_reset(body: str, n: int, device: torch.device, **options: Any) -> Callable[[], None]:
@@ -122,13 +133,13 @@ def env_step_and_maybe_reset(body: str, n: int, device: torch.device, **options:
     return step
 
 
-def env_dm_control(body: str, n: int, device: torch.device) -> Callable[[], None]:
-    """The same under ``protocol="dm_control"``."""
-    return env_step_and_maybe_reset(body, n, device, protocol="dm_control")
+def env_step_dm_control(body: str, n: int, device: torch.device) -> Callable[[], None]:
+    """``env_step`` under ``protocol="dm_control"``."""
+    return env_step(body, n, device, protocol="dm_control")
 
 
 def env_deterministic(body: str, n: int, device: torch.device) -> Callable[[], None]:
-    """The same with ``deterministic=True`` under MuJoCo-Warp; the compiled engine is deterministic as it is."""
+    """``env_step_and_maybe_reset`` under MuJoCo-Warp with ``deterministic=True``, as the compiled engine always is."""
     return env_step_and_maybe_reset(body, n, device, engine="mujoco_warp", deterministic=True)
 
 
@@ -213,7 +224,7 @@ CASES = {
     )
 }
 """From the bare simulator to a collector."""
-VARIANTS = {case.__name__: case for case in (env_dm_control, env_deterministic)}
+VARIANTS = {case.__name__: case for case in (env_step_dm_control, env_deterministic)}
 """What settings cost."""
 LEARNING = {update.__name__: update}
 """What learning costs, of which only a profile is taken."""

@@ -7,8 +7,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.cases import until_interrupted
-from benchmarks.peers import environment_with
-from benchmarks.processes import MeasurementError, run_json
+from benchmarks.processes import MeasurementError, environment_with, run_json
 from benchmarks.results import Row
 from torchrl_loco import load_policy
 from torchrl_loco.export import export_policy

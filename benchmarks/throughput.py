@@ -1,15 +1,20 @@
 """Steps per second from the bare simulator to a collector, side by side on one device.
 
-Times are of one control step of all worlds. Ratios are to the bare loop with mujoco_warp's defaults.
+Times are of one control step of all worlds. Ratios are to the bare loop with mujoco_warp's defaults. As a process of
+its own (``python -m benchmarks.throughput DEVICE RUNS``, which are body, worlds and case each, as JSON) it compiles
+what it measures before it waits for its turn.
 """
 
+import gc
+import json
+import sys
 from collections.abc import Sequence
 
 import torch
 
-from benchmarks.cases import CASES, VARIANTS, until_interrupted, waiter
+from benchmarks.cases import BATCH_STEPS, CASES, VARIANTS, until_interrupted, waiter
 from benchmarks.results import Row
-from benchmarks.timing import milliseconds
+from benchmarks.timing import WARM_UP, milliseconds, my_turn
 
 COLUMNS = {"body": "", "worlds": "d", "case": "", "ms": ".3f", "ratio": ".3f", "million steps/s": ".3f"}
 PHASES = {
@@ -26,13 +31,19 @@ def throughput(bodies: Sequence[str], worlds: Sequence[int], cases: Sequence[str
     """Measures each case for each body and number of worlds; returns a row for each."""
     rows: list[Row] = []
     runs = [(body, n, case) for body in bodies for n in worlds for case in cases]
-    for body, n, case in until_interrupted(runs, "throughput"):
-        ms = milliseconds({**CASES, **VARIANTS}[case](body, n, device), waiter(device))
-        rows.append({"body": body, "worlds": n, "case": case, "ms": ms, "million steps/s": n / ms / 1e3})
+    rows += [measure(*run, device) for run in until_interrupted(runs, "throughput")]
     for row in rows:
         base = time_of(rows, row, "bare_default")
         row["ratio"] = row["ms"] / base if base else None
     return rows
+
+
+def measure(body: str, n: int, case: str, device: torch.device) -> Row:
+    """Measures a case; the more worlds, the less often."""
+    step = {**CASES, **VARIANTS}[case](body, n, device)
+    few = {"blocks": 3, "steps": BATCH_STEPS} if n > 20_000 else {}
+    ms = milliseconds(step, waiter(device), warm_up=WARM_UP, **few)
+    return {"body": body, "worlds": n, "case": case, "ms": ms, "million steps/s": n / ms / 1e3}
 
 
 def phases(rows: Sequence[Row]) -> list[Row]:
@@ -53,3 +64,19 @@ def time_of(rows: Sequence[Row], like: Row, case: str) -> float | None:
     """Returns the time of a case with the body and worlds of another row."""
     found = [r["ms"] for r in rows if (r["body"], r["worlds"], r["case"]) == (like["body"], like["worlds"], case)]
     return found[0] if found else None
+
+
+@torch.no_grad()
+def main(device: torch.device, runs: Sequence[tuple[str, int, str]]) -> None:
+    """Compiles, waits and prints a row for each run."""
+    for body, n, case in runs:
+        {**CASES, **VARIANTS}[case](body, n, device)()
+    gc.collect()  # many worlds of each body are held at once otherwise
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+    my_turn()
+    print(json.dumps({"rows": [measure(*run, device) for run in runs]}))
+
+
+if __name__ == "__main__":
+    main(torch.device(sys.argv[1]), json.loads(sys.argv[2]))

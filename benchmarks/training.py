@@ -9,8 +9,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.peers import environment_with
-from benchmarks.processes import MeasurementError, run_json
+from benchmarks.processes import MeasurementError, environment_with, run_json
 from benchmarks.results import Row
 from torchrl_loco.training import RunFolder
 

@@ -13,10 +13,10 @@ import pytest
 import torch
 from hook_tasks import FollowVelocity
 
-from benchmarks import cases, coverage, fidelity, plot, robots, rollouts, scaling, soak, startup, suite, timing
+from benchmarks import cases, coverage, fidelity, plot, robots, rollouts, scaling, soak, startup, suite, tables, timing
 from benchmarks.cases import until_interrupted
 from benchmarks.peers import mjlab_policy
-from benchmarks.processes import MeasurementError, run_json
+from benchmarks.processes import Job, MeasurementError, run_json
 from benchmarks.results import save, show
 from benchmarks.throughput import phases
 from torchrl_loco.policy import ObservationNorm, Policy
@@ -68,6 +68,36 @@ def test_a_failed_process_raises_its_error(tmp_path):
     assert run_json(["good"], environment) == {"ms": 2.5}
     with pytest.raises(MeasurementError, match="there_is_no_such_module"):
         run_json(["bad"], environment)
+
+
+WORKER = """
+import json, sys, time
+from benchmarks.timing import my_turn
+
+began = time.time()
+my_turn()
+turn = time.time()
+time.sleep(0.2)
+print(json.dumps({"span": [began, turn, time.time()]}))
+"""
+
+
+def test_jobs_measure_one_after_another_when_all_have_compiled_and_are_not_measured_again(tmp_path, monkeypatch):
+    (tmp_path / "worker.py").write_text(WORKER)
+    (tmp_path / "broken.py").write_text("import there_is_no_such_module")
+    jobs = [Job(name, [module], {"case": name}, tmp_path) for name, module in (("a", "worker"), ("b", "worker"))]
+    jobs.append(Job("c", ["broken"], {"case": "c"}, tmp_path))
+    monkeypatch.setattr(tables, "PARTS", {"steps": lambda wanted: jobs})
+    options = dict.fromkeys(("worlds", "frames", "settings", "path", "mjlab")) | {"device": torch.device("cpu")}
+    found = {row["job"]: row for row in tables.tables(tmp_path, ["steps"], **options)}
+    assert "there_is_no_such_module" in found["c"]["error"]
+    first, second = sorted((found[name]["span"] for name in "ab"), key=lambda span: span[1])
+    assert max(first[0], second[0]) < first[1] < first[2] <= second[1]
+    (tmp_path / "broken.py").write_text(WORKER)
+    again = {row["job"]: row for row in tables.tables(tmp_path, ["steps"], **options)}
+    assert "span" in again.pop("c")
+    assert again == {name: found[name] for name in "ab"}
+    assert len(json.loads((tmp_path / "steps.json").read_text())["rows"]) == 3
 
 
 def test_results_say_how_they_were_measured(tmp_path, capsys, monkeypatch):

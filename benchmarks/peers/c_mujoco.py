@@ -9,7 +9,7 @@ import numpy as np
 from mujoco import rollout
 
 from benchmarks.tasks import TASKS
-from benchmarks.timing import milliseconds
+from benchmarks.timing import milliseconds, my_turn
 from torchrl_loco.config import sim_config
 from torchrl_loco.registry import env_class
 from torchrl_loco.sim import models
@@ -38,6 +38,7 @@ def main(body: str, worlds: int, threads: int) -> None:
             states, _ = pool.rollout(model, data, state, control)
             state = states[:, -1]
 
+        my_turn()
         ms = milliseconds(step, lambda: None, blocks=5, steps=2) / CONTROL_STEPS
     print(json.dumps({"ms": ms, "threads": threads}))
 

@@ -63,7 +63,7 @@ import mjlab.tasks  # noqa: E402, F401  it registers the tasks
 import torch  # noqa: E402
 from mjlab.envs import ManagerBasedRlEnv  # noqa: E402
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper  # noqa: E402
-from mjlab.tasks.registry import load_env_cfg, load_rl_cfg  # noqa: E402
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls  # noqa: E402
 from mjlab.utils.torch import configure_torch_backends  # noqa: E402
 
 
@@ -76,7 +76,15 @@ class Curve:
 
     def __init__(self, runner: MjlabOnPolicyRunner, seconds: float, rows: list[list[float]]) -> None:
         self._logger, self._until, self.rows = runner.logger, seconds, rows
+        runner.logger.writer, runner.logger.log_dir = object(), ""  # without, it keeps no returns of episodes
+        runner.logger.init_logging_writer, runner.logger.log = lambda: None, self.note
+        runner.save = lambda *args: None
         self._start = time.perf_counter() - (rows[-1][0] if rows else 0.0)
+
+    def rate(self, frames: int) -> float | None:
+        """Returns frames per second without the first iterations, of which each has so many frames."""
+        times = [seconds for seconds, *_ in self.rows[5:]]
+        return frames * (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else None
 
     def note(self, **of_iteration: Any) -> None:
         """Notes an iteration.
@@ -92,6 +100,24 @@ class Curve:
             print(len(self.rows), *(f"{value:.2f}" for value in self.rows[-1]), flush=True)
         if seconds >= self._until:
             raise KeyboardInterrupt
+
+
+def made(task: str, worlds: int, device: str, motion: Path | None = None) -> tuple[MjlabOnPolicyRunner, Any]:
+    """Returns the runner of a task of mjlab, with its environment, and its settings of the training.
+
+    Raises:
+        ValueError: actions are clipped, which nothing here expects.
+    """
+    configure_torch_backends()
+    cfg, rl = load_env_cfg(task), load_rl_cfg(task)
+    cfg.scene.num_envs, rl.upload_model = worlds, False
+    cfg.seed = rl.seed
+    if motion is not None:
+        cfg.commands["motion"].motion_file = str(motion)
+    env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg=cfg, device=device), clip_actions=rl.clip_actions)
+    if rl.clip_actions is not None:
+        raise ValueError("actions are clipped, which the file cannot tell")
+    return (load_runner_cls(task) or MjlabOnPolicyRunner)(env, asdict(rl), None, device), rl
 
 
 def layout(env: ManagerBasedRlEnv) -> dict[str, Any]:
@@ -126,25 +152,15 @@ def layout(env: ManagerBasedRlEnv) -> dict[str, Any]:
 
 def train(robot: str, seconds: float, out: Path, worlds: int, device: str) -> None:
     """Trains a robot, or goes on, until so many seconds of training; writes the actor to ``out``."""
-    configure_torch_backends()
-    cfg, rl = load_env_cfg(TASKS[robot]), load_rl_cfg(TASKS[robot])
-    cfg.scene.num_envs, rl.upload_model = worlds, False
-    cfg.seed = rl.seed
     began = time.perf_counter()
-    env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg=cfg, device=device), clip_actions=rl.clip_actions)
-    if rl.clip_actions is not None:
-        raise ValueError("actions are clipped, which the file cannot tell")
-    facts = layout(env.unwrapped)
-    runner = MjlabOnPolicyRunner(env, asdict(rl), None, device)
+    runner, rl = made(TASKS[robot], worlds, device)
+    facts = layout(runner.env.unwrapped)
     checkpoint, rows = out.with_suffix(".pt"), []
     if checkpoint.exists():
         rows = runner.load(str(checkpoint))["rows"]
     print(f"worlds made in {time.perf_counter() - began:.0f} s, {len(rows)} iterations so far", flush=True)
 
-    curve = Curve(runner, seconds, rows)
-    runner.logger.writer, runner.logger.log_dir = object(), ""  # without, it keeps no returns of episodes
-    runner.logger.init_logging_writer, runner.logger.log = lambda: None, curve.note
-    save, runner.save = runner.save, lambda *args: None
+    save, curve = runner.save, Curve(runner, seconds, rows)
     if not rows or rows[-1][0] < seconds:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # a time limit loses nothing
         try:
@@ -153,14 +169,13 @@ def train(robot: str, seconds: float, out: Path, worlds: int, device: str) -> No
             save(str(checkpoint), {"rows": curve.rows})
 
     frames = worlds * rl.num_steps_per_env
-    rate = frames * (len(curve.rows) - 6) / (curve.rows[-1][0] - curve.rows[5][0]) if len(curve.rows) > 6 else None
     facts |= {
         "robot": robot,
         "worlds": worlds,
         "seed": rl.seed,
         "frames": frames * len(curve.rows),
         "seconds": curve.rows[-1][0],
-        "frames_per_second": rate,  # without the first iterations
+        "frames_per_second": curve.rate(frames),
         "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "CPU",
         "mujoco": mujoco.__version__,
     }
