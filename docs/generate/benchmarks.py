@@ -54,6 +54,12 @@ STEPS = (
     Measured("MuJoCo Playground 0.2, jitted step", PEERS, {"case": "playground"}, "ms"),
     Measured("TorchRL's `MujocoPlaygroundEnv`", PEERS, {"case": "playground_torchrl"}, "ms"),
 )
+LAST_STEPS, LAST_MJLAB = ("2026-11-28/h100-tables/steps.json",), ("2026-11-28/h100-tables/mjlab.json",)
+OF_ROBOTS = (
+    Measured("`env.step_and_maybe_reset`", LAST_STEPS, {"case": "env_step_and_maybe_reset"}, "ms"),
+    Measured("loop of `mujoco_warp.step` in a CUDA graph", LAST_STEPS, {"case": "bare_default"}, "ms"),
+)
+OF_MJLAB = Measured("`env.step`", LAST_MJLAB, {"case": "mjlab"}, "ms")
 WORLDS = (2048, 8192, 32768, 131072)
 BY_WORLDS = (
     Measured("our step (ms)", ENGINES, {"protocol": "playground"}, "with observation"),
@@ -107,7 +113,7 @@ def tables() -> dict[str, str]:
         "returns": returns() + sources([[f"{path}/results.csv" for path in runs.folders] for runs in RUNS.values()]),
         "tasks": tasks.overview(),
         "speed": speed(),
-        "speed-sources": sources([(TO_950, BRAX_TO_950, ROBOTS, MJLAB)]),
+        "speed-sources": sources([(TO_950, BRAX_TO_950, ROBOTS, MJLAB, *LAST_STEPS, *LAST_MJLAB)]),
         "variation": variation(),
         "fields": fields.fields(),
         "pairs": shapes.pairs(),
@@ -219,6 +225,10 @@ def speed() -> str:
     for body in BODIES[:2]:
         step = (_found(line, body=body, worlds=8192) for line in (ours, loop))
         rows.append((f"control step of 8192 {body}s (ms, H200)", *step, "", _found(playground, body=body, worlds=8192)))
+    for robot, task in (("Go1", "go1_velocity"), ("G1", "g1_velocity")):
+        step = (_found(line, worlds=8192, body=robot) for line in OF_ROBOTS)
+        peer = _found(OF_MJLAB, worlds=8192, task=task)
+        rows.append((f"control step of 8192 {robot}, with resets (ms, H100)", *step, peer, ""))
     folder, file = TO_950.rsplit("/", 1)
     run = [row for row in read(RESULTS / folder, file) if row["task"] == "walker_walk"]
     brax = [row for row in _json(BRAX_TO_950) if row["trainer"] != "ours"]

@@ -47,10 +47,12 @@ def test_shifted_pictures_repeat_their_edges():
 
 @pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
 @pytest.mark.parametrize("critic_sees", [False, True])
-def test_actors_that_see(algorithm, critic_sees, tmp_path):
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_actors_that_see(algorithm, critic_sees, device, tmp_path):
     """They learn, the run is resumed exactly, and its policy acts and is exported as the actor."""
     settings = {**SMALL, "from_pixels": True, "critic_from_pixels": critic_sees, "random_shift": 2}
-    run = RunFolder.create(preset("walker_walk", "cpu", algorithm, out=tmp_path, **settings))
+    settings |= {"compile": False} if algorithm == "reppo" else {}
+    run = RunFolder.create(preset("walker_walk", device, algorithm, out=tmp_path, **settings))
     first = Trainer(run)
     before = {name: value.clone() for name, value in first.algorithm.networks.state_dict().items()}
     first.iterate()
@@ -63,12 +65,12 @@ def test_actors_that_see(algorithm, critic_sees, tmp_path):
     first.iterate()
     again = Trainer(run, resume=True)
     again.iterate()
-    for name, value in first.algorithm.networks.state_dict().items():
-        assert torch.equal(value, again.algorithm.networks.state_dict()[name]), name
+    close = {"rtol": 0, "atol": 0} if device == "cpu" else {"rtol": 0.05, "atol": 2e-3}  # cuDNN adds in any order
+    torch.testing.assert_close(first.algorithm.networks.state_dict(), again.algorithm.networks.state_dict(), **close)
     again.train()
     policy = run.load_policy()
     assert policy.in_keys == ["pixels"]
-    td = make_for(policy, 3, "cpu", 0).rollout(3, policy)
+    td = make_for(policy, 3, device, 0).rollout(3, policy)
     assert td["pixels"].shape == (3, 3, 20, 24, 9)
     assert td["action"].abs().max() <= 1.0
     assert export_policy(policy, tmp_path / "policy.pt2") < 1e-5

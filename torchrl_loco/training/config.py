@@ -355,7 +355,7 @@ class REPPOConfig(TrainingConfig):
     of_others: ClassVar[Settings] = {**TrainingConfig.of_others, "num_bins": 301}
     of_pixels: ClassVar[dict[str, Settings]] = {
         "cpu": {},
-        "cuda": {"num_envs": 4096, "minibatch_size": 4096, "bf16": True},
+        "cuda": {"num_envs": 4096, "minibatch_size": 4096, "lr": 1e-3, "trials": 1, "bf16": True, "eval_episodes": 32},
     }
 
     compile: bool = True
