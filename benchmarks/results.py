@@ -47,9 +47,14 @@ def circumstances(device: torch.device) -> dict[str, Any]:
         "command": f"python -m benchmarks {shlex.join(words)}",
         "date": datetime.date.today().isoformat(),
         "revision": git.stdout.strip() if git.returncode == 0 else "unknown",
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name(),
+        "device": device_name(device),
         "versions": {name: metadata.version(name) for name in PACKAGES},
     }
+
+
+def device_name(device: torch.device) -> str:
+    """Returns what the GPU or the processor calls itself."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
 
 
 def cpu_name() -> str:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 
 from benchmarks.processes import Job, in_turn
-from benchmarks.results import Row, save
+from benchmarks.results import Row, device_name, save
 from benchmarks.tasks import MJLAB, RUNNERS, TASKS
 from torchrl_loco import motion
 from torchrl_loco.registry import env_class
@@ -120,7 +120,7 @@ def tables(folder: Path, parts: Sequence[str], **options: Any) -> list[Row]:
         parts: which of :data:`PARTS`.
         options: fields of :class:`Wanted`, but for ``work``.
     """
-    rows: list[Row] = []
+    rows, name = list[Row](), device_name(options["device"])  # a folder may be filled on several cards
     with tempfile.TemporaryDirectory() as work:
         wanted = Wanted(**options, work=Path(work))
         for part in parts:
@@ -130,7 +130,7 @@ def tables(folder: Path, parts: Sequence[str], **options: Any) -> list[Row]:
             missing = [job for job in PARTS[part](wanted) if job.name not in {row["job"] for row in found}]
 
             def done(job: Job, result: Row, found: list[Row] = found, file: Path = file) -> None:
-                found += [{"job": job.name, **job.about, **row} for row in result.get("rows", [result])]
+                found += [{"job": job.name, **job.about, **row, "device": name} for row in result.get("rows", [result])]
                 save(found, file, wanted.device)
                 print(f"{file.name}: {job.name} {result.get('error', 'measured')}", flush=True)
 

@@ -190,7 +190,6 @@ def test_robots_have_the_mean_and_the_worst_of_their_seeds_beside_mjlab(tmp_path
         write_metrics(tmp_path / f"run{seed}", metrics)
     made = robots.tables([tmp_path])
     assert "| Go1 | torchrl_loco, PPO | H100 | 3 | 4.1 (4) | 8.5 (9.0), 1 without |" in made["robots-training"]
-    assert "| Go1 | mjlab 1.6 | H100 | 1 | 0.107 | 151.0 |" in made["robots-training"]  # measured before
     assert "| Go1 | torchrl_loco, PPO | H100 | 3 | 1.0 (3.0) | 0.100 | 0.0 | 1.0 |" in made["robots-verified"]
 
 

@@ -14,6 +14,9 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 
 from benchmarks.published import PUBLISHED, read
+from benchmarks.tables import OF_RUNNERS, PARTS
+from benchmarks.tasks import RUNNERS
+from benchmarks.tasks import TASKS as TASKS_OF
 from benchmarks.variation import plot_variation
 from generate import address, bodies, fields, rewards, robots, shapes, tasks
 from generate.markdown import table
@@ -23,49 +26,51 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
 PICTURES = ROOT / "docs" / "_static"
 
-LOOP, DAY = "2026-11-22/h200-loop", "2026-11-23/h200"
-ENGINES = (f"{LOOP}/engines.json", f"{LOOP}/engines-others.json")
-COLLECTED = (f"{DAY}/throughput.json", f"{DAY}/throughput-many.json", f"{LOOP}/throughput-apart.json")
-PEERS = (f"{LOOP}/peers.json",)
+SPEED = "2026-11-28/tables"
+"""Folder of ``python -m benchmarks tables``, from which all speeds are."""
 SUITE = "2026-11-24/cpu/suite.json"
 VARIATION = "2026-11-25/h100-third/variation.json"
-TO_950 = "2026-11-23/h200-presets/time-to-return.csv"
-BRAX_TO_950 = "2026-11-21/h200/training/time-to-return.json"
-ROBOTS = f"{robots.RESULTS[-1].relative_to(RESULTS)}/results.json"
-MJLAB = str(robots.BEFORE.relative_to(RESULTS))
 
 
 class Measured(NamedTuple):
-    """A line of a table of speeds: what was measured, in which files, in which of their rows, under which key."""
+    """A line of a table of speeds: what was measured, and by which case."""
 
     label: str
-    files: Sequence[str]
-    rows: dict[str, Any]
-    key: str
+    case: str
 
 
-BODIES = ("walker", "humanoid", "cheetah", "hopper", "quadruped")
 STEPS = (
-    Measured("loop of `mujoco_warp.step` in a CUDA graph", ENGINES, {"protocol": "playground"}, "mujoco_warp"),
-    Measured("our step: physics, observation, reward", ENGINES, {"protocol": "playground"}, "with observation"),
-    Measured("the same under `dm_control`", ENGINES, {"protocol": "dm_control"}, "with observation"),
-    Measured("`RolloutCollector`, policy 2 x 256", COLLECTED, {"case": "rollout_collector"}, "ms"),
-    Measured("`env.step_and_maybe_reset`", PEERS, {"case": "env_step_and_maybe_reset"}, "ms"),
-    Measured("MuJoCo Playground 0.2, jitted step", PEERS, {"case": "playground"}, "ms"),
-    Measured("TorchRL's `MujocoPlaygroundEnv`", PEERS, {"case": "playground_torchrl"}, "ms"),
+    Measured("loop of `mujoco_warp.step` in a CUDA graph", "bare_default"),
+    Measured("our physics alone", "bare_compiled"),
+    Measured("our step: physics, observation, reward", "env_step"),
+    Measured("the same under `dm_control`", "env_step_dm_control"),
+    Measured("`env.step_and_maybe_reset`", "env_step_and_maybe_reset"),
+    Measured("`RolloutCollector`, policy 2 x 256", "rollout_collector"),
+    Measured("MuJoCo Playground 0.2, jitted step", "playground"),
+    Measured("TorchRL's `MujocoPlaygroundEnv`", "playground_torchrl"),
+    Measured("mjlab 1.6, `env.step`", "mjlab"),
 )
-LAST_STEPS, LAST_MJLAB = ("2026-11-28/h100-tables/steps.json",), ("2026-11-28/h100-tables/mjlab.json",)
-OF_ROBOTS = (
-    Measured("`env.step_and_maybe_reset`", LAST_STEPS, {"case": "env_step_and_maybe_reset"}, "ms"),
-    Measured("loop of `mujoco_warp.step` in a CUDA graph", LAST_STEPS, {"case": "bare_default"}, "ms"),
+COLLECTED = (
+    Measured("`env.step_and_maybe_reset`", "env_step_and_maybe_reset"),
+    Measured("TorchRL's `Collector`", "torchrl_collector"),
+    Measured("`RolloutCollector`", "rollout_collector"),
 )
-OF_MJLAB = Measured("`env.step`", LAST_MJLAB, {"case": "mjlab"}, "ms")
+OTHERS = ("bare_default", "playground", "playground_torchrl", "mjlab")
+"""Cases of other libraries."""
+BESIDE = {
+    "Go1": {"mjlab 1.6": "mjlab"},
+    "G1": {"mjlab 1.6": "mjlab"},
+    "humanoid": {"Playground 0.2": "playground", "`mujoco_warp`, physics alone": "bare_default"},
+    "walker": {"Playground 0.2": "playground", "`mujoco_warp`, physics alone": "bare_default"},
+}
+"""What a control step of a body is compared with first."""
 WORLDS = (2048, 8192, 32768, 131072)
-BY_WORLDS = (
-    Measured("our step (ms)", ENGINES, {"protocol": "playground"}, "with observation"),
-    Measured("times as long in the loop", ENGINES, {"protocol": "playground"}, "ratio"),
-    Measured("collected (million frames/s)", COLLECTED, {"case": "rollout_collector"}, "million steps/s"),
-)
+TRAINED = {
+    "go1_velocity": "a Go1 learns to follow velocity commands",
+    "g1_velocity": "a G1 learns the same",
+    "go1_rough": "a Go1 learns to walk over rough ground",
+    "g1_tracking": "a G1 learns to follow a motion",
+}
 
 
 class Runs(NamedTuple):
@@ -79,8 +84,8 @@ class Runs(NamedTuple):
 
 
 SEEDS = ("2026-11-23/h200-presets/campaign", "2026-11-23/h200-seeds/campaign")
-FIRST, ALONE, LAST = f"{DAY}/campaign", "2026-11-23/h200-alone/campaign", "2026-11-24/h200-alone/campaign"
-RUNNERS, RUN = "2026-11-22/h200-runners/campaign", "2026-11-24/h100/walker-run"
+FIRST, ALONE, LAST = "2026-11-23/h200/campaign", "2026-11-23/h200-alone/campaign", "2026-11-24/h200-alone/campaign"
+FURTHER, RUN = "2026-11-22/h200-runners/campaign", "2026-11-24/h100/walker-run"
 RUNS = {
     ("walker_stand", "playground"): Runs(SEEDS, (ALONE, "walker_stand", "playground", None)),
     ("walker_walk", "playground"): Runs(SEEDS, (SEEDS[1], "walker_walk", "playground", "4")),
@@ -88,11 +93,11 @@ RUNS = {
     ("humanoid_stand", "playground"): Runs(SEEDS, (FIRST, "humanoid_stand", "playground", None)),
     ("humanoid_walk", "playground"): Runs(SEEDS, (FIRST, "humanoid_walk", "playground", None)),
     ("humanoid_run", "playground"): Runs([FIRST, SEEDS[1]], (FIRST, "humanoid_run", "playground", None)),
-    ("cheetah_run", "playground"): Runs([RUNNERS]),
-    ("hopper_stand", "playground"): Runs([RUNNERS]),
-    ("hopper_hop", "playground"): Runs([RUNNERS]),
-    ("quadruped_walk", "playground"): Runs([RUNNERS]),
-    ("quadruped_run", "playground"): Runs([RUNNERS]),
+    ("cheetah_run", "playground"): Runs([FURTHER]),
+    ("hopper_stand", "playground"): Runs([FURTHER]),
+    ("hopper_hop", "playground"): Runs([FURTHER]),
+    ("quadruped_walk", "playground"): Runs([FURTHER]),
+    ("quadruped_run", "playground"): Runs([FURTHER]),
     ("walker_stand", "dm_control"): Runs(SEEDS, (ALONE, "walker_stand", "dm_control", None)),
     ("walker_walk", "dm_control"): Runs(SEEDS, (SEEDS[1], "walker_walk", "playground", "4")),
     ("walker_run", "dm_control"): Runs([RUN]),
@@ -108,12 +113,13 @@ TASKS = [task for task, protocol in RUNS if protocol == "playground"]
 def tables() -> dict[str, str]:
     """Returns the tables as Markdown, by the names that the comments in the pages give them."""
     return {
-        "steps": speeds(BODIES, STEPS) + sources(line.files for line in STEPS),
-        "worlds": by_worlds() + sources(line.files for line in BY_WORLDS),
+        "steps": of_bodies(STEPS, list(TASKS_OF)) + sources([[SPEED]]),
+        "worlds": by_worlds(),
+        "collected": of_bodies(COLLECTED, RUNNERS[:2]),
+        "speed": speed(),
+        "trained": trained(),
         "returns": returns() + sources([[f"{path}/results.csv" for path in runs.folders] for runs in RUNS.values()]),
         "tasks": tasks.overview(),
-        "speed": speed(),
-        "speed-sources": sources([(TO_950, BRAX_TO_950, ROBOTS, MJLAB, *LAST_STEPS, *LAST_MJLAB)]),
         "variation": variation(),
         "fields": fields.fields(),
         "pairs": shapes.pairs(),
@@ -155,31 +161,63 @@ def filled(text: str) -> str:
     return block.sub(lambda found: f"{found[1]}\n{made[found[2]]}\n{found[3]}", text)
 
 
-def speeds(bodies: Sequence[str], lines: Iterable[Measured]) -> str:
-    """Returns the milliseconds that a control step of 8192 worlds takes."""
-    return table(
-        ("", *bodies), [(line.label, *(_found(line, body=body, worlds=8192) for body in bodies)) for line in lines]
-    )
+@functools.cache
+def measured() -> dict[tuple[str, str, int], Row]:
+    """Returns what was measured of speeds, by task, case and worlds; each row names its GPU as ``device``.
+
+    Raises:
+        FileNotFoundError: a part was not.
+    """
+    files = [RESULTS / SPEED / f"{part}.json" for part in PARTS]
+    if missing := [file.stem for file in files if not file.exists()]:
+        command = f"python -m benchmarks tables benchmarks/results/{SPEED} --parts {' '.join(missing)}"
+        raise FileNotFoundError(f"speeds are not measured yet: {command}")
+    found = {}
+    for file in files:
+        for row in json.loads(file.read_text())["rows"]:
+            if "error" not in row:
+                found[row.get("task") or TASKS_OF[row["body"]], row["case"], row["worlds"]] = row
+    return found
+
+
+@functools.cache
+def card() -> str:
+    """Returns the name of the GPU on which most speeds were measured."""
+    devices = [row["device"] for row in measured().values()]
+    return max(dict.fromkeys(devices), key=devices.count)
+
+
+def _figure(task: str, case: str, worlds: int = 8192, key: str = "ms", unit: float = 1.0) -> str:
+    """Returns a figure to three digits, with its GPU if most others are of another; empty where there is none."""
+    if (row := measured().get((task, case, worlds))) is None:
+        return ""
+    elsewhere = "" if row["device"] == card() else f" ({_short(row['device'])})"
+    return f"{row[key] / unit:#.3g}".rstrip(".") + elsewhere
+
+
+def _short(device: str) -> str:
+    """Returns what a GPU is called for short."""
+    return next((word for word in device.split() if re.fullmatch(r"[A-Z]+\d+", word)), device)
+
+
+def of_bodies(lines: Iterable[Measured], bodies: Sequence[str]) -> str:
+    """Returns the milliseconds that a control step of 8192 worlds takes, for bodies of which ours was measured."""
+    shown = [body for body in bodies if _figure(TASKS_OF[body], "env_step")]
+    rows = [(line.label, *(_figure(TASKS_OF[body], line.case) for body in shown)) for line in lines]
+    return table((f"ms on one {_short(card())}", *shown), rows)
 
 
 def by_worlds() -> str:
     """Returns what is measured of walker and humanoid for several numbers of worlds."""
-    rows = [
-        (f"{body}, {line.label}", *(_found(line, body=body, worlds=worlds) for worlds in WORLDS))
-        for body in BODIES[:2]
-        for line in BY_WORLDS
-    ]
-    return table(("worlds", *WORLDS), rows)
-
-
-def _found(line: Measured, **where: Any) -> str:
-    """Returns a figure to three digits, empty if no file has it; the first file that does counts."""
-    wanted = line.rows | where
-    for file in line.files:
-        for row in json.loads((RESULTS / file).read_text())["rows"]:
-            if line.key in row and wanted.items() <= row.items():
-                return f"{row[line.key]:#.3g}".rstrip(".")
-    return ""
+    rows = []
+    for task, body in ((TASKS_OF[body], body) for body in RUNNERS[:2] if _figure(TASKS_OF[body], "env_step")):
+        speeds = measured()
+        times = [speeds[task, "bare_default", n]["ms"] / speeds[task, "env_step", n]["ms"] for n in WORLDS]
+        collected = [_figure(task, "rollout_collector", n, "million steps/s") for n in WORLDS]
+        rows.append((f"{body}, our step (ms)", *(_figure(task, "env_step", n) for n in WORLDS)))
+        rows.append((f"{body}, times as long in the loop", *(f"{value:#.3g}".rstrip(".") for value in times)))
+        rows.append((f"{body}, collected (million frames/s)", *collected))
+    return table((f"worlds on one {_short(card())}", *WORLDS), rows)
 
 
 def training(task: str) -> list[tuple[str, str]]:
@@ -219,33 +257,31 @@ def returns() -> str:
 
 
 def speed() -> str:
-    """Returns how fast the library is beside others: steps, time to a return, and training of a robot."""
-    loop, ours, playground = STEPS[0], STEPS[1], STEPS[5]
-    rows: list[tuple[str, ...]] = []
-    for body in BODIES[:2]:
-        step = (_found(line, body=body, worlds=8192) for line in (ours, loop))
-        rows.append((f"control step of 8192 {body}s (ms, H200)", *step, "", _found(playground, body=body, worlds=8192)))
-    for robot, task in (("Go1", "go1_velocity"), ("G1", "g1_velocity")):
-        step = (_found(line, worlds=8192, body=robot) for line in OF_ROBOTS)
-        peer = _found(OF_MJLAB, worlds=8192, task=task)
-        rows.append((f"control step of 8192 {robot}, with resets (ms, H100)", *step, peer, ""))
-    folder, file = TO_950.rsplit("/", 1)
-    run = [row for row in read(RESULTS / folder, file) if row["task"] == "walker_walk"]
-    brax = [row for row in _json(BRAX_TO_950) if row["trainer"] != "ours"]
-    seconds = [
-        f"{next(float(row[key]) for row in found if float(row['mean']) >= 950):.0f}"
-        for found, key in ((run, "wall"), (brax, "seconds"))
-    ]
-    rows.append(("walker walks, return 950, from the start of the process (s, H200)", seconds[0], "", "", seconds[1]))
-    ours_go1, mjlab = (
-        f"{_mean(seeds['go1_velocity', trainer, 'H100'], 'frames/s') / 1e6:.3g}"
-        for seeds, trainer in (
-            (robots.by_trainer(robots.rows_of()), "torchrl_loco, PPO"),
-            (robots.before(), "mjlab 1.6"),
-        )
-    )
-    rows.append(("training a Go1 to follow velocity commands (million frames/s, H100)", ours_go1, "", mjlab, ""))
-    return table(("", "torchrl_loco", "`mujoco_warp`", "mjlab 1.6", "Playground 0.2"), rows)
+    """Returns how fast the library is beside others, as far as it was measured: steps of rollouts, and training."""
+    rows = []
+    for body, others in BESIDE.items():
+        ours = _figure(TASKS_OF[body], "rollout_collector")
+        found = {name: _figure(TASKS_OF[body], case) for name, case in others.items()}
+        if ours and all(found.values()):
+            beside = ", ".join(f"{name}: {figure}" for name, figure in found.items())
+            rows.append((f"control step of 8192 {body}s (ms)", ours, beside))
+    rows += [(f"{words} (million frames/s)", ours, f"mjlab 1.6: {mjlab}") for words, ours, mjlab in _rates()[:3]]
+    return table((f"on one {_short(card())}", "torchrl_loco", "beside it"), rows)
+
+
+def trained() -> str:
+    """Returns frames per second of training beside mjlab's own."""
+    return table((f"million frames/s on one {_short(card())}", "torchrl_loco", "mjlab 1.6"), _rates())
+
+
+def _rates() -> list[tuple[str, str, str]]:
+    """Returns what is trained, and the million frames per second of ours and of mjlab's, of tasks with both."""
+    found = []
+    for task, words in TRAINED.items():
+        ours, mjlab = (_figure(task, case, key="frames/s", unit=1e6) for case in ("ours", "mjlab"))
+        if ours and mjlab:
+            found.append((words, ours, mjlab))
+    return found
 
 
 def variation() -> str:
@@ -294,18 +330,18 @@ def sources(files: Iterable[Iterable[str]]) -> str:
 
 
 def draw_steps(picture: Path) -> None:
-    """Draws the times of a control step of 8192 worlds, walker and humanoid, as bars."""
-    figure = Figure(figsize=(9, 3.4), layout="constrained")
-    for body, axes in zip(BODIES[:2], figure.subplots(1, 2, sharey=True), strict=True):
-        lines = [line for line in reversed(STEPS) if line.rows.get("protocol") != "dm_control"]
-        times = [float(_found(line, body=body, worlds=8192)) for line in lines]
-        others = ("loop", "MuJoCo Playground", "TorchRL's")
-        colors = ["#9aa7ad" if line.label.startswith(others) else "#f5a623" for line in lines]
-        axes.bar_label(
-            axes.barh([line.label.replace("`", "") for line in lines], times, color=colors), fmt="%g", padding=3
-        )
-        axes.set(title=f"8192 {body}s", xscale="log", xlabel="ms for a control step, one H200", xlim=(0.05, 300))
+    """Draws the times of a control step of 8192 worlds as bars, a panel for each of four bodies."""
+    figure = Figure(figsize=(9, 6.2), layout="constrained")
+    bodies = ("walker", "cheetah", "Go1", "G1")
+    for body, axes in zip(bodies, figure.subplots(2, 2, sharex=True, sharey="row").flat, strict=True):
+        rows = {line: measured().get((TASKS_OF[body], line.case, 8192)) for line in reversed(STEPS)}
+        shown = {line: row["ms"] for line, row in rows.items() if row and line.case not in OF_RUNNERS}
+        colors = ["#9aa7ad" if line.case in OTHERS else "#f5a623" for line in shown]
+        bars = axes.barh([line.label.replace("`", "") for line in shown], [*shown.values()], color=colors)
+        axes.bar_label(bars, fmt="%.3g", padding=3)
+        axes.set(title=f"8192 {body}s", xscale="log", xlim=(0.03, 300))
         axes.spines[["top", "right"]].set_visible(False)
+    figure.supxlabel(f"ms for a control step, one {_short(card())}")
     figure.savefig(picture, dpi=130)
 
 
@@ -344,6 +380,7 @@ PAGES = (
             "compiled-step.md",
             "robots.md",
             "api/model-numbers.md",
+            "guides/in-torchrl.md",
             "guides/your-own-task.md",
         )
     ),

@@ -1,7 +1,6 @@
 """What docs/robots.md says of the robots in numbers and curves, from folders of ``python -m benchmarks robots``."""
 
 import json
-import re
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -18,9 +17,7 @@ Row = dict[str, Any]
 ROOT = Path(__file__).parents[2]
 ALL = ROOT / "benchmarks" / "results"
 RESULTS = (ALL / "2026-11-26" / "h100-robots",)
-"""Trained by today's presets, and mjlab's policies."""
-BEFORE = ALL / "2026-11-24" / "h100" / "mjlab.txt"
-"""mjlab's own training, where the folder has none."""
+"""Trained by today's presets, and by mjlab."""
 CURVES = ROOT / "docs" / "_static" / "robots.png"
 MOVING = ROOT / "docs" / "_static" / "robots.webp"
 GPUS = {"H100": "#f5a623", "H200": "#c2571a"}
@@ -67,12 +64,9 @@ def tables(folders: Sequence[Path] = RESULTS) -> dict[str, str]:
     ours = by_trainer(found)
     episodes = " or ".join(sorted({f"{row['episodes']}" for row in found if "episodes" in row}))
     links = " and ".join(dict.fromkeys(_link(row["folder"] / "results.json") for row in found))
-    robots = {task for task, trainer, _ in ours if "mjlab" in trainer}
-    earlier = {key: rows for key, rows in before().items() if key[0] not in robots}
-    source = f", mjlab's from {_link(BEFORE)}"
     return {
         **of_page,
-        "robots-training": _table({**ours, **earlier}, TRAINING) + f"\nFrom {links}{source if earlier else ''}.\n",
+        "robots-training": _table(ours, TRAINING) + f"\nFrom {links}.\n",
         "robots-curves": "![Return against seconds of training, a line for each seed](_static/robots.png)\n",
         "robots-verified": _table(ours, VERIFIED)
         + f"\nFalls are episodes, of {episodes} of each policy; a third of them are on time. From {links}.\n",
@@ -123,16 +117,6 @@ def by_trainer(rows: Sequence[Row]) -> dict[Group, list[Row]]:
         return [*NAMES].index(task), "mjlab" in trainer, "REPPO" in trainer
 
     return {group: groups[group] for group in sorted(groups, key=place)}
-
-
-def before() -> dict[Group, list[Row]]:
-    """Returns what was measured of mjlab's own training earlier: rates, and when it had its reward."""
-    rates = re.findall(r"^(\w+) .* ([\d,]+) frames per second", BEFORE.read_text(), re.MULTILINE)
-    rows = {name: {"frames/s": float(rate.replace(",", ""))} for name, rate in rates}
-    column, value = MJLAB["go1_velocity"]
-    if reached := re.search(rf"{value} after (\d+) s", BEFORE.read_text()):
-        rows["Go1"] |= {"to mjlab's (s)": float(reached[1]), column: value}
-    return {(task, "mjlab 1.6", "H100"): [rows[name]] for task, name in NAMES.items() if name in rows}
 
 
 def _table(groups: dict[Group, list[Row]], columns: Sequence[Column]) -> str:
