@@ -129,6 +129,31 @@ def test_light_falls_off_and_casts_shadows():
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_a_camera_shows_what_is_there_now(device):
+    """The same as the entries of steps; geoms are seen where something is near."""
+    env = loco.make("walker_walk", 2, device, 0, from_pixels=True, depth=50.0, size=(24, 16), camera="back")
+    td = env.rollout(3)[:, -1]["next"]
+    seen = env.camera("back", 24, 16, ("rgb", "depth", "geoms"))
+    assert torch.equal(seen["rgb"], td["pixels"])
+    assert torch.equal(seen["depth"].clamp(max=50.0), td["depth"])
+    assert ((seen["geoms"] >= 0) == (seen["depth"] < 1e9)).all()
+    floor = env.mj_model.geom("floor").id
+    assert (seen["geoms"] == floor).any()
+    assert ((seen["geoms"] >= 0) & (seen["geoms"] != floor)).any()
+    kept = seen["rgb"].clone()
+    env.rollout(2)
+    env.camera("back", 24, 16)
+    assert torch.equal(seen["rgb"], kept)
+    single = loco.make("walker_walk", None, device, 0)
+    single.reset()
+    assert single.camera(width=8, height=6)["rgb"].shape == (6, 8, 3)
+    with pytest.raises(ValueError, match="'color': choose one of rgb, depth, geoms"):
+        env.camera(kinds=["color"])
+    with pytest.raises(ValueError, match="choose one of side, back, egocentric"):
+        env.camera("top")
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_the_last_pictures_of_an_episode_are_stacked(device):
     """A state holds them; one without begins with what is seen then."""
     options = {"from_pixels": True, "pixels_only": False, "size": (24, 16), "episode_length": 4, "frame_stack": 3}

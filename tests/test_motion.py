@@ -217,3 +217,23 @@ def test_the_command_prints_films_and_mends(tmp_path, capsys, rows):
     assert "WRONG" in (printed := capsys.readouterr()).out
     assert "pass fps" in printed.out
     assert "1 of 1 files hold no motion" in printed.err
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder", "capsule", "ellipsoid", "sphere"])
+def test_the_lowest_point_is_as_far_from_a_floor_as_c_mujoco_says(shape):
+    m = mujoco.MjModel.from_xml_string(f"""
+    <mujoco>
+      <worldbody>
+        <geom type="plane" size="0 0 1" pos="0 0 -5"/>
+        <body><freejoint/><geom type="{shape}" size="0.1 0.2 0.3" pos="0.1 0 0.2" euler="10 20 30"/></body>
+        <body pos="0 0 -1"><freejoint/><geom type="sphere" size="0.1"/></body>
+      </worldbody>
+    </mujoco>""")
+    data, rng = mujoco.MjData(m), np.random.default_rng(0)
+    data.qpos[:7] = rng.normal(size=7)
+    mujoco.mj_normalizeQuat(m, data.qpos)
+    mujoco.mj_kinematics(m, data)
+    poses = data.xpos[None], data.xmat.reshape(1, -1, 3, 3)
+    distance = mujoco.mj_geomDistance(m, data, 1, 0, 50.0, None)
+    assert motions.lowest_points(m, *poses, [1])[0] == pytest.approx(distance - 5.0)
+    assert motions.lowest_points(m, *poses)[0] == pytest.approx(min(distance - 5.0, data.xpos[2, 2] - 0.1))

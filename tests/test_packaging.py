@@ -87,7 +87,7 @@ def test_what_follows_from_an_address():
     links = re.findall(r"\]\(([^)]+)\)", text)
     assert all(link.startswith("https://") for link in links), links
     assert f"({public}/raw/v1.2.3/docs/_static/runners.webp)" in text
-    assert f"({public}/blob/v1.2.3/docs/benchmarks.md#" in text
+    assert f"({public}/blob/v1.2.3/docs/benchmarks.md)" in text
     assert urls(public)["Documentation"] == "https://someone.github.io/loco/"
     assert f"{public}/actions/workflows/test.yml/badge.svg" in address.badges(public)
     assert "colab.research.google.com/github/Someone/loco/blob/main/notebooks/planning.ipynb" in address.colab(public)

@@ -7,7 +7,7 @@ import logging
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -430,13 +430,15 @@ def poses(m: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pos, mat.reshape(len(qpos), m.nbody, 3, 3)
 
 
-def lowest_points(m: mujoco.MjModel, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
+def lowest_points(
+    m: mujoco.MjModel, pos: np.ndarray, mat: np.ndarray, geoms: Iterable[int] | None = None
+) -> np.ndarray:
     """Returns the height of the lowest point of what can touch the ground, in each frame (m), without meshes.
 
-    Positions (m) and orientations of bodies are those of :func:`poses`.
+    Positions (m) and orientations of bodies are those of :func:`poses`; ``geoms`` count, all of them for ``None``.
     """
     lowest, kinds = np.full(len(pos), np.inf), mujoco.mjtGeom
-    for geom in range(m.ngeom):
+    for geom in range(m.ngeom) if geoms is None else geoms:
         body, kind, size = m.geom_bodyid[geom], kinds(int(m.geom_type[geom])), m.geom_size[geom]
         if not body or not (m.geom_contype[geom] or m.geom_conaffinity[geom]):
             continue

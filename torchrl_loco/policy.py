@@ -209,7 +209,7 @@ def layers_of(network: nn.Module) -> list[nn.Module]:
         return [network]
     if isinstance(network, nn.Sequential):
         return [layer for part in network for layer in layers_of(part)]
-    kinds = ", ".join(kind.__name__ for kind, _ in KINDS.values() if kind is not ObservationNorm)
+    kinds = ", ".join(kind.__name__ for kind, _ in KINDS.values() if kind not in (ObservationNorm, PixelEncoder))
     raise TypeError(
         f"a policy cannot hold {type(network).__name__}, so what it computes could not be saved: build the network as "
         f"nn.Sequential of {kinds}"

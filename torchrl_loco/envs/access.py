@@ -17,13 +17,14 @@ from torchrl.envs import EnvBase
 from torchrl_loco.checks import ANY, Interval, check_choice, check_int
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.hooks import Hooks
+from torchrl_loco.envs.pixels import checked_camera
 from torchrl_loco.envs.state import State, write_state
 from torchrl_loco.envs.task import folder_of
 from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.vary import Vary
 from torchrl_loco.envs.world import World
 from torchrl_loco.eyes.pictures import LOOKS_WELL, OPACITY, Poses, with_ghost
-from torchrl_loco.eyes.tracer import Eye
+from torchrl_loco.eyes.tracer import KINDS, Eye
 from torchrl_loco.sim import Simulation, models
 
 STAGE_WORLDS = 64
@@ -167,6 +168,31 @@ class WorldAccess(EnvBase):
             both = self.world.renderer(Poses, self.model_with_ghost, camera, *size, worlds).render(poses)
             pixels = torch.lerp(pixels.float(), both.float(), OPACITY).round().to(torch.uint8)
         return pixels if self.batch_size else pixels[0]
+
+    def camera(
+        self, camera: str | int | None = None, width: int = 84, height: int = 84, kinds: Sequence[str] = ("rgb",)
+    ) -> dict[str, torch.Tensor]:
+        """Returns what a camera sees in all worlds now, as plain as ``from_pixels`` has it.
+
+        Args:
+            camera: name or number of a camera of the model; ``None`` takes the first.
+            width: pixels in a row.
+            height: rows.
+            kinds: what is told of each pixel, some of ``"rgb"``, ``"depth"`` and ``"geoms"``.
+
+        Returns:
+            By kind ``(num_envs, height, width)``: colours, uint8 with a last dimension of 3; depth along the camera's
+            axis (m), 1e10 where nothing is seen; numbers of the geoms that are seen, int32, -1 for none.
+
+        Raises:
+            ValueError: the model has no such camera, there is no such kind, or a size is not positive.
+            TypeError: a number is not an integer.
+        """
+        which, size = checked_camera(self.mj_model, camera), (check_int("width", width), check_int("height", height))
+        asked = tuple(check_choice("kind", kind, KINDS) for kind in ([kinds] if isinstance(kinds, str) else kinds))
+        eye = self.world.renderer(Eye, self.mj_model, which, *size, self.num_envs, asked)
+        eye.look(self.sim.data.xpos, self.sim.data.xmat)
+        return {kind: self._batched(getattr(eye, kind)) for kind in asked}
 
     @functools.cached_property
     def model_with_ghost(self) -> mujoco.MjModel:

@@ -59,13 +59,7 @@ class Pixels:
             if extra := [name for name in ("pixels_only", "camera", "size", "frame_stack") if given[name] is not None]:
                 raise ValueError(f"{extra[0]} needs from_pixels=True, or the greatest depth to be seen (m) as depth")
             return None
-        names, camera = [m.camera(i).name for i in range(m.ncam)], given["camera"]
-        if not m.ncam:
-            raise ValueError("pixels need a camera: the model has none")
-        if isinstance(camera, str):
-            check_choice("camera", camera, names)
-        elif camera is not None:
-            check_int("camera", camera, Interval(0, m.ncam))
+        camera = checked_camera(m, given["camera"])
         size = SIZE if given["size"] is None else given["size"]
         if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
             raise ValueError(f"size must be the width and height of pixels, such as {SIZE}, got {size!r}")
@@ -74,7 +68,7 @@ class Pixels:
         only = True if given["pixels_only"] is None else check_bool("pixels_only", given["pixels_only"])
         stack = 1 if given["frame_stack"] is None else check_int("frame_stack", given["frame_stack"])
         check_memory(COPIES * stack * bytes_of(num_envs, width, height, kinds), num_envs, device)
-        return cls(m.camera(0 if camera is None else camera).id, width, height, kinds, far, stack, only)
+        return cls(camera, width, height, kinds, far, stack, only)
 
     def settings(self, m: mujoco.MjModel) -> dict[str, Any]:
         """Returns the settings of a training in which the same is seen, none without colours.
@@ -108,6 +102,21 @@ class Pixels:
             for kind, image in (("rgb", seen.stack), ("depth", seen.eye.depth))
             if kind in self.kinds
         }
+
+
+def checked_camera(m: mujoco.MjModel, camera: str | int | None) -> int:
+    """Returns the number of a camera; of the first for ``None``.
+
+    Raises:
+        ValueError: the model has no such camera; the message names those that it has.
+        TypeError: ``camera`` has another type.
+    """
+    if not m.ncam:
+        raise ValueError("pixels need a camera: the model has none")
+    if isinstance(camera, str):
+        check_choice("camera", camera, [m.camera(i).name for i in range(m.ncam)])
+        return m.camera(camera).id
+    return 0 if camera is None else check_int("camera", camera, Interval(0, m.ncam))
 
 
 class Seen:

@@ -3,6 +3,7 @@
 import concurrent.futures
 import copy
 import os
+import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
@@ -124,6 +125,7 @@ class MujocoEngine(Engine):
         self.peak_constraints, self.peak_contacts = Buffer(num_envs, int, device), Buffer(1, int, device)
         self._forces, self._touches = self._force.numpy(), self._in_contact.numpy()
         self._most = self.peak_constraints.torch.numpy(), self.peak_contacts.torch.numpy()
+        self._of_all = threading.Lock()  # of what the threads of all worlds write
         self._threads = concurrent.futures.ThreadPoolExecutor(os.cpu_count(), "mujoco")
 
     @property
@@ -253,7 +255,8 @@ class MujocoEngine(Engine):
         self._overflow[i] |= bits
         constraints, contacts = self._most
         constraints[i] = max(constraints[i], world.data.maxuse_efc)
-        contacts[0] = max(contacts[0], world.data.maxuse_con)
+        with self._of_all:
+            contacts[0] = max(contacts[0], world.data.maxuse_con)
 
     def _add_up_forces(self, i: int, row: int) -> None:
         """Adds up the forces of a world's contacts on each geom that was asked for, in the world's frame (N)."""

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_loco import terrain
+from torchrl_loco import motion, terrain
 from torchrl_loco.sim import models
 from torchrl_loco.tasks import velocity
 from torchrl_loco.tasks.robots import com, either, hard_contacts, sliding, squares
@@ -145,8 +145,7 @@ class Rough(Velocity):
         data.qpos[:] = models.home_pose(m)
         mujoco.mj_kinematics(m, data)
         geoms = [g for g in range(m.ngeom) if any(re.fullmatch(feet, m.geom(g).name) for feet in self.feet.values())]
-        axis = np.abs(data.geom_xmat[geoms, 8]) * (m.geom_type[geoms] == int(mujoco.mjtGeom.mjGEOM_CAPSULE))
-        lowest = (data.geom_xpos[geoms, 2] - m.geom_size[geoms, 0] - axis * m.geom_size[geoms, 1]).min()
+        (lowest,) = motion.lowest_points(m, data.xpos[None], data.xmat.reshape(1, -1, 3, 3), geoms)
         return {
             "origins": self.ground.origins.reshape(-1, 3).astype(np.float32),
             "first_column": np.cumsum([0, *counts[:-1]]).astype(np.int32),
