@@ -128,10 +128,9 @@ def test_light_falls_off_and_casts_shadows():
     assert torch.equal(pixels[True][~dark], pixels[False][~dark])
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_camera_shows_what_is_there_now(device):
+def test_a_camera_shows_what_is_there_now():
     """The same as the entries of steps; geoms are seen where something is near."""
-    env = loco.make("walker_walk", 2, device, 0, from_pixels=True, depth=50.0, size=(24, 16), camera="back")
+    env = loco.make("walker_walk", 2, "cpu", 0, from_pixels=True, depth=50.0, size=(24, 16), camera="back")
     td = env.rollout(3)[:, -1]["next"]
     seen = env.camera("back", 24, 16, ("rgb", "depth", "geoms"))
     assert torch.equal(seen["rgb"], td["pixels"])
@@ -144,7 +143,7 @@ def test_a_camera_shows_what_is_there_now(device):
     env.rollout(2)
     env.camera("back", 24, 16)
     assert torch.equal(seen["rgb"], kept)
-    single = loco.make("walker_walk", None, device, 0)
+    single = loco.make("walker_walk", None, "cpu", 0)
     single.reset()
     assert single.camera(width=8, height=6)["rgb"].shape == (6, 8, 3)
     with pytest.raises(ValueError, match="'color': choose one of rgb, depth, geoms"):
@@ -317,8 +316,8 @@ def test_hooks_cast_rays():
     assert found[1, 0] == 3.0  # it points into the sky
 
 
-@pytest.mark.parametrize(
-    ("seen", "error", "match"),
+@for_each(
+    "seen, error, match",
     [
         (lambda s: s.depth("left", 8, 6), KeyError, "no camera 'left'.*egocentric"),
         (lambda s: s.ray("paw", [[0, 0, 1]]), KeyError, "no site 'paw'.*FR"),

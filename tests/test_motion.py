@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from for_each import for_each
 
 from torchrl_loco import Motion, cli
 from torchrl_loco import motion as motions
@@ -219,7 +220,7 @@ def test_the_command_prints_films_and_mends(tmp_path, capsys, rows):
     assert "1 of 1 files hold no motion" in printed.err
 
 
-@pytest.mark.parametrize("shape", ["box", "cylinder", "capsule", "ellipsoid", "sphere"])
+@for_each("shape", ["box", "cylinder", "capsule", "ellipsoid", "sphere"])
 def test_the_lowest_point_is_as_far_from_a_floor_as_c_mujoco_says(shape):
     m = mujoco.MjModel.from_xml_string(f"""
     <mujoco>

@@ -649,7 +649,7 @@ def test_wrong_tasks_are_refused():
             type("Wrong", (LocoEnv,), entries)(4, "cpu", seed=0, **options)
 
 
-@pytest.mark.parametrize("engine", ["compiled", "mujoco_warp", "mujoco"])
+@for_each("engine", ["compiled", "mujoco_warp", "mujoco"])
 def test_an_accelerometer_feels_what_holds_a_body(engine):
     task = type("Feels", (LocoEnv,), {**BASE, "reward": lambda self, s: s.sensor("unread")[:, 2]})
     env = task(2, "cpu", seed=0, engine=engine)

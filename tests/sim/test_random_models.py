@@ -29,7 +29,8 @@ KINDS = ("plane", "dense", "frictionless", "pyramid", "hinge limit", "slide limi
 """Kinds of constraints that a state can have."""
 KINDS_OF_LANES = (*KINDS, "cone", "turning")
 """The same with those that are not traced."""
-FORMS = {"traced": 31, "lanes": 0}
+FORMS = (31, 0)
+"""Most degrees of freedom of bodies that are traced: all of the random models, or none, which are lanes then."""
 """Both forms of the compiled step: most degrees of freedom that are traced."""
 ROLLING = """
 <mujoco>
@@ -302,8 +303,8 @@ def test_friction_that_is_not_traced(cone, varied):
     assert found["dense"] > 2
 
 
-@pytest.mark.parametrize("traced_dofs", FORMS.values(), ids=FORMS)
 @pytest.mark.parametrize("count", [pytest.param(3, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.ci)])
+@for_each("traced_dofs", FORMS)
 def test_a_step_agrees_with_c_mujoco(traced_dofs, count, monkeypatch):
     """Both forms of the compiled step, which one takes small bodies and the other large ones, step any model."""
     monkeypatch.setattr(step, "TRACED_DOFS", traced_dofs)
@@ -326,7 +327,7 @@ def test_a_step_agrees_with_c_mujoco(traced_dofs, count, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("traced_dofs", FORMS.values(), ids=FORMS)
+@for_each("traced_dofs", FORMS)
 def test_a_step_with_numbers_of_each_world_agrees_with_c_mujoco(traced_dofs, monkeypatch):
     monkeypatch.setattr(step, "TRACED_DOFS", traced_dofs)
     total, count = collections.Counter(), 2
@@ -346,7 +347,7 @@ def test_a_step_with_numbers_of_each_world_agrees_with_c_mujoco(traced_dofs, mon
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("vary", [False, True], ids=["alike", "varied"])
+@for_each("vary", [False, True])
 def test_a_step_by_implicitfast_agrees_with_c_mujoco(vary):
     total, count = collections.Counter(), 2
 

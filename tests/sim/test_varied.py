@@ -174,7 +174,7 @@ def test_each_world_steps_with_its_numbers(kind, device):
     np.testing.assert_allclose(sim.qpos.cpu(), plain.qpos.cpu(), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["mujoco_warp", "lanes"])
+@for_each("kind", ["mujoco_warp", "lanes"])
 def test_numbers_of_pairs_vary(kind):
     """Friction differs along the two tangents."""
     model, rng = mujoco.MjModel.from_xml_string(MARBLE), np.random.default_rng(0)
@@ -206,7 +206,7 @@ def test_a_world_does_not_depend_on_the_others(kind, device):
         assert torch.equal(some[:24], many[2976:])
 
 
-@pytest.mark.parametrize("kind", ["mujoco_warp", "lanes"])
+@for_each("kind", ["mujoco_warp", "lanes"])
 def test_a_mask_says_whose_numbers_count(kind):
     """And a world that is put at rest has its new numbers."""
     model, start, rng = mujoco.MjModel.from_xml_string(XML), start_of(XML), np.random.default_rng(0)

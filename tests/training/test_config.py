@@ -47,6 +47,7 @@ def test_wrong_settings():
             "(400) must be at least one batch of num_envs * num_steps * action_repeat (512), or trials must be 1",
         ),
         ({"trials": 5}, ValueError, "trials (5) * trial_fraction (0.2) must be less than 1"),
+        ({"random_shift": 4}, ValueError, "random_shift needs from_pixels=True"),
         ({"seed": -1}, ValueError, "seed must lie in [0, 2**32)"),
         ({"device": "tpu"}, ValueError, "choose one of cpu"),
         ({"task": "walker_stnd"}, ValueError, "did you mean 'walker_stand'"),
@@ -126,6 +127,7 @@ def test_presets_of_a_task(monkeypatch):
     assert preset(cls, "cpu", "reppo").lr == REPPOConfig.presets["cpu"]["lr"]
     first = type("First", (torchrl_loco.WalkerWalk,), {"presets": {"ppo": {}, **own}, "__doc__": "Walk."})
     assert [preset(task, "cuda:0").algorithm for task in (cls, first)] == ["reppo", "ppo"]
+    assert preset("walker_walk", "cuda:0", from_pixels=True).bf16
     walker = preset("walker_walk", "cuda:0")
     assert (walker.algorithm, walker.max_value, walker.min_value, walker.num_bins) == ("reppo", 75.0, 0.0, 151)
 

@@ -1,7 +1,10 @@
 """Training from pixels: the encoder, actors that see, and critics that see or read states."""
 
+import itertools
+
 import pytest
 import torch
+from for_each import for_each
 from torch.nn.functional import pad
 
 import torchrl_loco as loco
@@ -45,14 +48,14 @@ def test_shifted_pictures_repeat_their_edges():
     assert len(set(found)) > 2
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
-@pytest.mark.parametrize("critic_sees", [False, True])
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+@for_each("algorithm, critic_sees", list(itertools.product(("ppo", "reppo"), (False, True))))
 def test_actors_that_see(algorithm, critic_sees, device, tmp_path):
     """They learn, the run is resumed exactly, and its policy acts and is exported as the actor."""
     settings = {**SMALL, "from_pixels": True, "critic_from_pixels": critic_sees, "random_shift": 2}
     settings |= {"compile": False} if algorithm == "reppo" else {}
-    run = RunFolder.create(preset("walker_walk", device, algorithm, out=tmp_path, **settings))
+    out = tmp_path / f"{algorithm}-{critic_sees}"
+    run = RunFolder.create(preset("walker_walk", device, algorithm, out=out, **settings))
     first = Trainer(run)
     before = {name: value.clone() for name, value in first.algorithm.networks.state_dict().items()}
     first.iterate()
@@ -73,7 +76,7 @@ def test_actors_that_see(algorithm, critic_sees, device, tmp_path):
     td = make_for(policy, 3, device, 0).rollout(3, policy)
     assert td["pixels"].shape == (3, 3, 20, 24, 9)
     assert td["action"].abs().max() <= 1.0
-    assert export_policy(policy, tmp_path / "policy.pt2") < 1e-5
+    assert export_policy(policy, out / "policy.pt2") < 1e-5
 
 
 def test_an_environment_that_sees_is_trained_in(tmp_path):
@@ -84,8 +87,3 @@ def test_an_environment_that_sees_is_trained_in(tmp_path):
     config = run.load_config()
     assert (config.from_pixels, config.camera, config.size, config.frame_stack) == (True, "back", (20, 16), 2)
     assert run.load_policy().module[0].shape == (16, 20, 6)
-
-
-def test_settings_that_need_pixels():
-    with pytest.raises(ValueError, match="random_shift needs from_pixels=True"):
-        preset("walker_walk", "cpu", "reppo", random_shift=4)

@@ -75,14 +75,17 @@ def test_policy_of_a_run_is_its_actor(run):
     assert expected.std() > 1e-3
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "action_repeat", "trials"),
-    [
-        ("ppo", 4, 1),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("reppo", 1, 1), ("ppo", 4, 3))),
-    ],
-)
-def test_resumed_equals_uninterrupted(algorithm, action_repeat, trials, tmp_path, monkeypatch):
+def test_resumed_equals_uninterrupted(tmp_path, monkeypatch):
+    resume(tmp_path, monkeypatch, "ppo", action_repeat=4, trials=1)
+
+
+@pytest.mark.slow
+@for_each("algorithm, action_repeat, trials", [("reppo", 1, 1), ("ppo", 4, 3)])
+def test_others_resumed_equal_those_uninterrupted(algorithm, action_repeat, trials, tmp_path, monkeypatch):
+    resume(tmp_path / algorithm, monkeypatch, algorithm, action_repeat, trials)
+
+
+def resume(tmp_path, monkeypatch, algorithm, action_repeat, trials):
     """Stopped by Ctrl-C after two of five batches and resumed, a run ends bit for bit where one without a stop does."""
     settings = {"total_frames": 5 * 4 * 8 * action_repeat, "action_repeat": action_repeat, "episode_length": 23}
     settings |= {"trials": trials, "trial_fraction": 0.3}  # each a batch, so that it is stopped after the second
