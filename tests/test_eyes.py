@@ -173,6 +173,12 @@ def test_the_last_pictures_of_an_episode_are_stacked(device):
     assert torch.equal(begun["pixels"][..., :3], begun["pixels"][..., 6:])
     restored = env.reset(state.clone(), set_state=True)
     assert torch.equal(restored["pixels"], td["pixels"])
+    moved = state.clone()
+    moved["qpos"][:, 0] += 0.5
+    changed = env.reset(moved, set_state=True)["pixels"]
+    assert torch.equal(changed[..., :6], td["pixels"][..., :6])
+    assert not torch.equal(changed[..., 6:], td["pixels"][..., 6:])
+    restored = env.reset(state.clone(), set_state=True)
     again, _ = env.step_and_maybe_reset(restored.set("action", actions[3]))
     assert torch.equal(again["next", "pixels"], last["next", "pixels"])
     bare = env.reset(loco.State(state.exclude("pictures").to_dict(), batch_size=[3]), set_state=True)

@@ -10,7 +10,7 @@ import math
 import numbers
 import operator
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -213,6 +213,18 @@ def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> 
     if not os.access(path.parent, os.W_OK):
         raise ValueError(f"{name} {path} cannot be written: no permission in the folder {path.parent}")
     return path
+
+
+def checked_size(size: Any) -> tuple[int, int]:
+    """Returns the width and height of pixels.
+
+    Raises:
+        ValueError: they are not two, or not positive.
+        TypeError: they are no integers.
+    """
+    if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
+        raise ValueError(f"size must be the width and height of pixels, such as (84, 84), got {size!r}")
+    return check_int("width", size[0]), check_int("height", size[1])
 
 
 def check_run(path: Path) -> Path:

@@ -164,7 +164,9 @@ class RolloutCollector:
         """
         state: dict[str, Any] = {"transforms": state_of_transforms(self._env)}
         if self._carried is not None:
-            state |= {"carried": self._carried.clone().to_dict(), "env": self._base.get_state().to_dict()}
+            worlds = self._base.get_state()
+            again = ["pixels"] if "pictures" in worlds.keys() else []  # noqa: SIM118, the state holds them
+            state |= {"carried": self._carried.exclude(*again).clone().to_dict(), "env": worlds.to_dict()}
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -56,7 +56,16 @@ class PixelEncoder(nn.Module):
         self.mean.lerp_(mean, count / self.count)
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Returns features ``(..., features)`` of pixels, uint8 ``(..., height, width, channels)``."""
+        """Returns features ``(..., features)`` of pixels, uint8 ``(..., height, width, channels)``.
+
+        Raises:
+            ValueError: they have another shape or type.
+        """
+        if tuple(pixels.shape[-3:]) != self.shape or pixels.dtype != torch.uint8:
+            raise ValueError(
+                f"this policy sees uint8 pixels of shape {self.shape}, got {pixels.dtype} of shape "
+                f"{tuple(pixels.shape[-3:])}: pass the size and frame_stack that it was trained with"
+            )
         rows = (pixels.reshape(-1, *self.shape) - self.mean) / 255.0
         gap = -self.shape[-1] % ALIGNED
         rows, weight = pad(rows, (0, gap)), pad(self.first.weight, (0, 0, 0, 0, 0, gap))

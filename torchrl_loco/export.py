@@ -4,6 +4,7 @@ import copy
 import io
 import json
 import logging
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -73,7 +74,8 @@ def export_policy(policy: Policy, path: Path) -> float:
     facts = {
         "task": info["task"],
         "protocol": info["protocol"],
-        "observation_size": observations.shape[-1],
+        "observation_size": math.prod(observations.shape[1:]),
+        **({"observation_shape": list(observations.shape[1:])} if observations.ndim > 2 else {}),
         "action_size": expected.shape[-1],
         "action_low": -1.0 if policy.is_bounded else None,
         "action_high": 1.0 if policy.is_bounded else None,
@@ -230,7 +232,7 @@ def of_robot(policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
     scaled = {"action_offset": (0.5 * (low + high)).tolist(), "action_scale": (0.5 * (high - low)).tolist()}
     facts = {
         "observation": [{"term": name, "size": size} for name, size in terms.items()],
-        "history": cls.history.get("observation", 1),
+        "history": cls.history.get(policy.in_keys[0], 1),
         **({} if "control" in own_hooks(cls) else scaled),
         **_actuators(m),
         "home": models.home_pose(m).tolist(),

@@ -82,12 +82,9 @@ class ObservationNorm(nn.Module):
 
 
 @torch.no_grad()
-def moments(observation: torch.Tensor, first: int = -1) -> tuple[int, torch.Tensor, torch.Tensor]:
-    """Returns the number of observations of shape ``(..., size)``, their mean and variance, each ``(size,)``.
-
-    They begin at the dimension ``first``, if they have several.
-    """
-    batch = observation.flatten(0, first - 1)
+def moments(observation: torch.Tensor) -> tuple[int, torch.Tensor, torch.Tensor]:
+    """Returns the number of observations of shape ``(..., size)``, their mean and variance, each ``(size,)``."""
+    batch = observation.flatten(0, -2)
     var, mean = torch.var_mean(batch, dim=0, correction=0)
     return len(batch), mean, var
 
@@ -274,7 +271,8 @@ def _make_layer(description: str | list[Any], tensors: dict[str, torch.Tensor]) 
     if unknown := settings.keys() - set(known):
         raise ValueError(f"layer {name!r} has no setting {min(unknown)!r}")
     if kind not in (ObservationNorm, nn.Linear, nn.LayerNorm):
-        return kind(**settings)
+        with torch.random.fork_rng(devices=[]):  # an encoder draws weights, which are replaced
+            return kind(**settings)
     if not tensors:
         raise ValueError(f"layer {name!r} has no tensors")
     if kind is nn.Linear:

@@ -215,7 +215,7 @@ def _worlds(
         **more,
     )
     for name, size, asked in (
-        ("observation", facts["observation_size"], env.observation_spec[exported.reads].shape[-1]),
+        ("observation", facts["observation_size"], env.observation_spec[exported.reads].shape[1:].numel()),
         ("action", facts["action_size"], env.mj_model.nu),
     ):
         if size != asked:

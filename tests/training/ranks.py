@@ -83,6 +83,17 @@ def counted(out):
     return {name: int(values) for name, values in trainer._base.world.shared.items()}
 
 
+def seen(out):
+    """Returns the mean picture after a batch, the number of pictures, and the first ones of this rank."""
+    settings = {**SMALL, "from_pixels": True, "size": (20, 20), "hidden": (8,), "total_frames": 4 * BATCH}
+    path = RunFolder.create(preset("walker_walk", "cpu", "reppo", out=out, **settings)).path
+    trainer = Trainer(RunFolder(distributed.from_first(path if distributed.is_first() else None)))
+    batch = trainer.collector.rollout()
+    trainer.algorithm.update(batch, progress=0.0)
+    encoder = trainer.algorithm.distribution[0]
+    return {"mean": encoder.mean, "count": encoder.count.item(), "pictures": batch["pixels"][:, 0].clone()}
+
+
 def whole_and_resumed(out, algorithm):
     """Trains a run at once, and another that rank 1 is asked to end in its second update, after which it is resumed.
 
@@ -131,7 +142,7 @@ def of_ranks(out):
     """Returns all of the above."""
     with small_walker():
         runs = {algorithm: whole_and_resumed(out / algorithm, algorithm) for algorithm in ("ppo", "reppo")}
-        return {"messages": messages(), "counted": counted(out / "counts"), **runs}
+        return {"messages": messages(), "counted": counted(out / "counts"), "seen": seen(out / "seen"), **runs}
 
 
 def resumed_by_train(path, frames):

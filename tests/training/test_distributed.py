@@ -111,9 +111,13 @@ def test_messages(ranks):
     assert (first["gathered"], second["gathered"]) == ([0, 1], [])
 
 
-def test_what_worlds_share_is_added_up_where_the_task_says_so(ranks):
+def test_what_worlds_share_is_added_up_and_mean_pictures_are_of_all_ranks(ranks):
     steps = 2 * BATCH // SMALL["num_envs"] * SMALL["num_envs"]
     assert [of["counted"] for of in ranks] == [{"all_steps": 2 * steps, "own_steps": steps}] * 2
+    pictures = torch.cat([of["seen"]["pictures"] for of in ranks])  # of worlds of each
+    for of in ranks:
+        assert of["seen"]["count"] == len(pictures)
+        torch.testing.assert_close(of["seen"]["mean"], pictures.float().mean(0))
 
 
 def test_the_launcher_leaves_no_handlers_behind(ranks):

@@ -6,6 +6,7 @@ import pytest
 import torch
 from for_each import for_each
 from torch.nn.functional import pad
+from torchrl.envs import ToTensorImage
 
 import torchrl_loco as loco
 from torchrl_loco import training
@@ -36,6 +37,9 @@ def test_the_encoder_sees_what_differs_from_the_mean_picture():
     torch.testing.assert_close(features, plain, rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match="at least 15 x 15, got 24 x 14"):
         PixelEncoder((14, 24, 3))
+    for wrong in (pictures.view(15, 10, 48, 6), pictures[..., :3], pictures.float()):
+        with pytest.raises(ValueError, match=r"uint8 pixels of shape \(20, 24, 6\), got"):
+            encoder(wrong)
 
 
 def test_shifted_pictures_repeat_their_edges():
@@ -86,4 +90,10 @@ def test_an_environment_that_sees_is_trained_in(tmp_path):
     run = training.train(env, algorithm="reppo", out=tmp_path, **few)
     config = run.load_config()
     assert (config.from_pixels, config.camera, config.size, config.frame_stack) == (True, "back", (20, 16), 2)
+    assert config.critic_from_pixels
     assert run.load_policy().module[0].shape == (16, 20, 6)
+    other = loco.make("walker_walk", 4, "cpu", 0, from_pixels=True, size=(20, 16), frame_stack=2, camera="side")
+    with pytest.raises(ValueError, match="was begun with camera='back', the environment has 'side'"):
+        training.train(other, resume=run, total_frames=128)
+    with pytest.raises(ValueError, match=r"uint8 of shape .* frame_stack .* leave transforms of pixels out"):
+        training.train(loco.TransformedEnv(env, ToTensorImage()), algorithm="reppo", out=tmp_path, **few)

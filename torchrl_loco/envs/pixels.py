@@ -1,14 +1,14 @@
 """Pixels as entries of an environment: which camera, how large, and what they are in TorchRL's specs."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
 import torch
 from torchrl.data import Bounded
 
-from torchrl_loco.checks import Interval, check_bool, check_choice, check_float, check_int
+from torchrl_loco.checks import Interval, check_bool, check_choice, check_float, check_int, checked_size
 from torchrl_loco.eyes.tracer import Eye, bytes_of
 from torchrl_loco.sim import Simulation
 from torchrl_loco.sim.simulation import check_memory
@@ -60,14 +60,14 @@ class Pixels:
                 raise ValueError(f"{extra[0]} needs from_pixels=True, or the greatest depth to be seen (m) as depth")
             return None
         camera = checked_camera(m, given["camera"])
-        size = SIZE if given["size"] is None else given["size"]
-        if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
-            raise ValueError(f"size must be the width and height of pixels, such as {SIZE}, got {size!r}")
-        width, height = check_int("width", size[0]), check_int("height", size[1])
+        width, height = checked_size(SIZE if given["size"] is None else given["size"])
         kinds = tuple(kind for kind, wanted in (("rgb", with_rgb), ("depth", far > 0)) if wanted)
         only = True if given["pixels_only"] is None else check_bool("pixels_only", given["pixels_only"])
+        if given["frame_stack"] is not None and not with_rgb:
+            raise ValueError("frame_stack needs from_pixels=True: depth is not stacked")
         stack = 1 if given["frame_stack"] is None else check_int("frame_stack", given["frame_stack"])
-        check_memory(COPIES * stack * bytes_of(num_envs, width, height, kinds), num_envs, device)
+        of_kinds = [bytes_of(num_envs, width, height, (kind,)) * (stack if kind == "rgb" else 1) for kind in kinds]
+        check_memory(COPIES * sum(of_kinds), num_envs, device)
         return cls(camera, width, height, kinds, far, stack, only)
 
     def settings(self, m: mujoco.MjModel) -> dict[str, Any]:
@@ -80,7 +80,8 @@ class Pixels:
             return {}
         if not (name := m.camera(self.camera).name) and self.camera:
             raise ValueError(f"camera {self.camera} needs a name to train with")
-        return {"camera": name, "size": (self.width, self.height), "frame_stack": self.stack}
+        seen = {"camera": name, "size": (self.width, self.height), "frame_stack": self.stack}
+        return {**seen, **({"critic_from_pixels": True} if self.only else {})}
 
     def seen(self, sim: Simulation) -> "Seen":
         """Returns what draws them, and keeps them."""
@@ -143,9 +144,11 @@ class Seen:
 
         Args:
             mask: the worlds.
-            kept: whether pictures stay where there are any: those of a state that was restored.
+            kept: whether earlier pictures stay where there are any: those of a state that was restored.
         """
         if self.count > 1:
-            anew = mask.bool() & (self.stack == 0).flatten(1).all(dim=1) if kept else mask.bool()
-            first = self.eye.rgb.repeat(1, 1, 1, self.count)
-            self.stack.copy_(torch.where(anew.view(-1, 1, 1, 1), first, self.stack))
+            masked, begun = mask.bool().view(-1, 1, 1, 1), self.eye.rgb.repeat(1, 1, 1, self.count)
+            if kept:  # but the newest, as the state may have been changed
+                has = (self.stack != 0).flatten(1).any(dim=1).view(-1, 1, 1, 1)
+                begun = torch.where(has, torch.cat([self.stack[..., :-3], self.eye.rgb], dim=-1), begun)
+            self.stack.copy_(torch.where(masked, begun, self.stack))

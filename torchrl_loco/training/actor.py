@@ -95,7 +95,14 @@ class Spaces:
                     "flatten it, for example with torchrl.envs.FlattenObservation"
                 )
             sizes[key] = shape[0]
-        pixels = tuple(spec["pixels"].shape[len(env.batch_size) :]) if "pixels" in spec.keys() else None  # noqa: SIM118
+        pixels: tuple[int, ...] | None = None
+        if "pixels" in spec.keys():  # noqa: SIM118
+            pixels, dtype = tuple(spec["pixels"].shape[len(env.batch_size) :]), spec["pixels"].dtype
+            if dtype != torch.uint8 or len(pixels) != 3 or pixels[-1] % 3:
+                raise ValueError(
+                    "'pixels' to train on must be uint8 of shape (height, width, 3 * pictures), as frame_stack makes "
+                    f"them, but are {dtype} of shape {pixels}: leave transforms of pixels out"
+                )
         if "observation" not in sizes and pixels is None:
             raise ValueError(f"the environment must have an 'observation' to train on, it has {', '.join(spec.keys())}")
         low, high = env.action_spec.space.low, env.action_spec.space.high

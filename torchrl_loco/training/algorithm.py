@@ -143,9 +143,10 @@ class Algorithm(ABC):
             count, mean, var = distributed.merged_moments(*moments(batch[key]))
             norm.merge(count, mean, var + self.config.norm_eps**2)
         if self.spaces.pixels:
-            count, mean, _ = distributed.merged_moments(*moments(batch["pixels"][:, 0].float(), -3))
+            first = batch["pixels"][:, 0]
+            mean = distributed.mean_of_ranks(first.float().mean(0))
             for encoder in (part for part in self.networks.modules() if isinstance(part, PixelEncoder)):
-                encoder.merge(count, mean)
+                encoder.merge(len(first) * distributed.ranks(), mean)
 
     def observed(self, minibatch: TensorDictBase) -> torch.Tensor:
         """Returns what the actor reads of steps; pictures are moved at random if the settings ask for that."""

@@ -21,6 +21,7 @@ from torchrl_loco.checks import (
     check_fields,
     check_int,
     check_packages,
+    checked_size,
 )
 from torchrl_loco.config import PROTOCOLS, SimConfig, pixels_of
 from torchrl_loco.registry import is_place, resolve, task_name
@@ -194,7 +195,7 @@ class TrainingConfig:
         object.__setattr__(self, "device", str(self.device))
         object.__setattr__(self, "out", Path(self.out))
         object.__setattr__(self, "hidden", tuple(self.hidden))
-        object.__setattr__(self, "size", tuple(self.size))
+        object.__setattr__(self, "size", checked_size(self.size))
         if not isinstance(self.sim, Sim):
             if not isinstance(self.sim, Mapping):
                 raise TypeError(f"sim must be a dict of fields of torchrl_loco.SimConfig, got {self.sim!r}")
@@ -204,8 +205,8 @@ class TrainingConfig:
         object.__setattr__(self, "options", Options(self.options))
         object.__setattr__(self, "init", str(Path(self.init).expanduser().resolve()) if self.init else "")
         if not self.from_pixels:
-            of_pixels = ("camera", "random_shift", "critic_from_pixels")
-            if needless := [each for each in of_pixels if getattr(self, each)]:
+            of_pixels = ("camera", "size", "frame_stack", "random_shift", "critic_from_pixels")
+            if needless := [each for each in of_pixels if getattr(self, each) != getattr(TrainingConfig, each)]:
                 raise ValueError(f"{needless[0]} needs from_pixels=True")
         # Whether the machine has the device is checked when the run starts.
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
@@ -492,7 +493,7 @@ def preset(
     if overrides.get("options"):
         overrides["options"] = resolve(task).checked_options(overrides["options"])
     settings = {**kind.presets[device.type], **({} if is_runner(task) else kind.of_others), **own.get(algorithm, {})}
-    settings |= kind.of_pixels[device.type] if overrides.get("from_pixels") else {}
+    settings |= kind.of_pixels[device.type] if (settings | overrides).get("from_pixels") else {}
     if not is_runner(task) and kind is REPPOConfig:  # returns of either sign
         settings.setdefault("min_value", -settings.get("max_value", REPPOConfig.max_value))
     return kind(task, **{"device": str(device), **settings, **overrides})
@@ -515,6 +516,7 @@ def is_runner(task: "str | type[LocoEnv]") -> bool:
 
 def tuning_note(config: TrainingConfig) -> str:
     """Returns a note if ``config.task`` was not tuned on the CPU by its algorithm, else an empty string."""
-    if config.device != "cpu" or (config.algorithm == "ppo" and config.task in ("walker_stand", "walker_walk")):
+    tuned = config.algorithm == "ppo" and config.task in ("walker_stand", "walker_walk") and not config.from_pixels
+    if config.device != "cpu" or tuned:
         return ""
     return "On a CPU only walker_stand and walker_walk by ppo were tuned: other tasks need a GPU, or many more frames."

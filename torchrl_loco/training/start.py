@@ -78,7 +78,10 @@ def train(
         changes = settings | chosen
         if config is not None or changes.keys() - {"total_frames", "device"} or isinstance(algorithm, str):
             raise ValueError("a run that is resumed keeps its settings: pass no other than total_frames and device")
-        return run_to_end(_resumed(resume, cls), given, **changes)
+        run = _resumed(resume, cls)
+        if given.env is not None:
+            _check_same(run, given.env)
+        return run_to_end(run, given, **changes)
     if given.env is not None:
         chosen |= _settings_of(given.env, {**settings, **chosen})
     config = _config(cls, config, algorithm, {**settings, **chosen})
@@ -123,6 +126,19 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
         if name in settings and str(settings[name]) != str(value):
             raise ValueError(f"{name} is that of the environment, {value!r}: leave it out, got {settings[name]!r}")
     return {**own, "seed": settings.get("seed", base.seed), "action_repeat": settings.get("action_repeat", 1)}
+
+
+def _check_same(run: RunFolder, env: EnvBase) -> None:
+    """Checks that a run that is resumed goes on in an environment as that in which it was begun.
+
+    Raises:
+        ValueError: it has another protocol, other options, or sees other pixels.
+    """
+    stored = dataclasses.asdict(run.load_config())
+    found = {"options": {}, "from_pixels": False, **_settings_of(env, {})}
+    for name in ("protocol", "options", "from_pixels", "camera", "size", "frame_stack"):
+        if name in found and found[name] != stored[name]:
+            raise ValueError(f"{run.path} was begun with {name}={stored[name]!r}, the environment has {found[name]!r}")
 
 
 def _resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
