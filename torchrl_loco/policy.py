@@ -92,7 +92,7 @@ def moments(observation: torch.Tensor) -> tuple[int, torch.Tensor, torch.Tensor]
 class Policy(TensorDictModule):
     """A deterministic policy: reads ``observation``, shape ``(..., n)``, and writes ``action``, shape ``(..., m)``.
 
-    One whose network begins with a :class:`~torchrl_loco.encoder.PixelEncoder` reads ``pixels`` instead.
+    One whose network begins with a ``PixelEncoder`` reads ``pixels`` instead.
 
     Args:
         network: an :class:`~torchrl_loco.policy.ObservationNorm`, then linear layers, layer norms and activations; the

@@ -113,7 +113,7 @@ TASKS = [task for task, protocol in RUNS if protocol == "playground"]
 def tables() -> dict[str, str]:
     """Returns the tables as Markdown, by the names that the comments in the pages give them."""
     return {
-        "steps": of_bodies(STEPS, list(TASKS_OF)) + sources([[SPEED]]),
+        "steps": of_bodies(STEPS, list(TASKS_OF)) + sources([[f"{SPEED}/{part}.json" for part in PARTS]]),
         "worlds": by_worlds(),
         "collected": of_bodies(COLLECTED, RUNNERS[:2]),
         "speed": speed(),

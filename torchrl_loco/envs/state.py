@@ -21,7 +21,7 @@ class State(TensorDict):
     ``act``             ``(N, na)``  activations of the actuators, if the model has any
     ``memory``          nested       entries of the task's memory by name, if it has any
     ``shared``          nested       what worlds share, by name, the same in each row, if the task has any
-    ``pictures``        ``(N, ...)`` the last pixels, where ``frame_stack`` keeps several
+    ``pictures``        ``(N, *)``   the last pixels, where ``frame_stack`` keeps several
     ``model``           nested       by field, ``(N, numbers that vary)``, if ``randomize`` names any
     ``elapsed_steps``   ``(N,)``     control steps since the world's reset
     ``episode``         ``(N,)``     episodes begun: index of the next random stream
