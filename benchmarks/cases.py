@@ -170,7 +170,7 @@ def update(body: str, n: int, device: torch.device) -> Callable[[], None]:
     config = preset(TASKS[body], device, "reppo", num_envs=n, num_steps=1, epochs=1)
     env = torchrl_loco.make(TASKS[body], n, device, seed=0, stagger=True)
     learner = REPPO(config, Spaces.of(env))
-    batch = RolloutCollector(env, learner.actor, frames_per_batch=n).rollout().clone()
+    batch = RolloutCollector(env, learner.acting(), frames_per_batch=n).rollout().clone()
 
     def step() -> None:
         with settings_for_small_networks(), torch.enable_grad():

@@ -44,7 +44,7 @@ def measure(task: str, algorithm: str, device: str, settings: dict[str, Any]) ->
     with tempfile.TemporaryDirectory() as folder:
         env = Environments(config).training(Path(folder, "nan_dump"))
         learner = ALGORITHMS[algorithm](config, Spaces.of(env))
-        collector = RolloutCollector(env, learner.actor, frames_per_batch=config.frames_per_batch)
+        collector = RolloutCollector(env, learner.acting(), frames_per_batch=config.frames_per_batch)
 
         def iterate() -> None:
             learner.update(collector.rollout(), progress=0.0)

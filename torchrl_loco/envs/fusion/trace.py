@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 from torch._decomp import decomposition_table
-from torch.fx._lazy_graph_module import _LazyGraphModule
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchrl_loco.envs.fusion.rules import RULES
@@ -127,4 +126,4 @@ def trace(work: Callable[[dict[str, torch.Tensor]], None], arrays: dict[str, tor
         work(arrays)
     tracer.graph.output(None)
     tracer.graph.eliminate_dead_code()
-    return _LazyGraphModule(tracer.constants, tracer.graph)  # its code, of a tenth of a second, is seldom run
+    return torch.fx.GraphModule(tracer.constants, tracer.graph)
