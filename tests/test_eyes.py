@@ -12,6 +12,7 @@ from torchrl.envs.utils import check_env_specs
 import torchrl_loco as loco
 from torchrl_loco.eyes.rays import Rays
 from torchrl_loco.eyes.tracer import Eye
+from torchrl_loco.sim import simulation
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 WIDTH, HEIGHT = 40, 30
@@ -301,6 +302,28 @@ def test_rays_from_a_body_meet_what_those_of_c_mujoco_meet(device):
         met = mujoco.mj_ray(m, data, data.xpos[1] + body @ start, direction, groups, 1, -1, geom)
         assert distance == pytest.approx(50.0 if met < 0 else min(met, 50.0), rel=1e-4)
     assert (found < 50.0).mean() > 0.3
+
+
+@for_each(
+    "seen",
+    [
+        lambda s: s.depth("egocentric", 60, 60).flatten(1),
+        lambda s: torch.cat([s.ray(foot, [[0, 0, 1]]) for foot in ("FR", "FL", "RR", "RL")], dim=1),
+    ],
+)
+def test_what_hooks_see_must_fit(seen, monkeypatch):
+    """Also a few rays, before each of whose sites all shapes are placed."""
+
+    class Blind(loco.Go1Velocity):
+        noise = {}
+
+        def observation(self, s):
+            return seen(s)
+
+    monkeypatch.setattr(simulation, "free_memory", lambda device: 2 * 12_000)
+    loco.Go1Velocity(2, "cpu", seed=0)
+    with pytest.raises(MemoryError, match=r"num_envs=2 needs about .* GiB .* worlds fit"):
+        Blind(2, "cpu", seed=0)
 
 
 def test_hooks_cast_rays():

@@ -9,7 +9,8 @@ import torch
 from torchrl.data import Bounded
 
 from torchrl_loco.checks import Interval, check_bool, check_choice, check_float, check_int, checked_size
-from torchrl_loco.eyes.tracer import Eye, bytes_of
+from torchrl_loco.eyes.placing import bytes_placed
+from torchrl_loco.eyes.tracer import Eye
 from torchrl_loco.sim import Simulation
 from torchrl_loco.sim.simulation import check_memory
 
@@ -66,8 +67,8 @@ class Pixels:
         if given["frame_stack"] is not None and not with_rgb:
             raise ValueError("frame_stack needs from_pixels=True: depth is not stacked")
         stack = 1 if given["frame_stack"] is None else check_int("frame_stack", given["frame_stack"])
-        of_kinds = [bytes_of(num_envs, width, height, (kind,)) * (stack if kind == "rgb" else 1) for kind in kinds]
-        check_memory(COPIES * sum(of_kinds), num_envs, device)
+        of_pixel = sum({"rgb": 3 * stack, "depth": 4}[kind] for kind in kinds)
+        check_memory(num_envs * (COPIES * width * height * of_pixel + bytes_placed(m)), num_envs, device)
         return cls(camera, width, height, kinds, far, stack, only)
 
     def settings(self, m: mujoco.MjModel) -> dict[str, Any]:

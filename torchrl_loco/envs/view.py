@@ -15,12 +15,16 @@ from torchrl_loco.envs.names import Elements, Names
 from torchrl_loco.envs.scan import DepthRequest, RayRequest, ScanRequest
 from torchrl_loco.envs.tables import Entry, Table
 from torchrl_loco.envs.variation import Variation, constant_of
+from torchrl_loco.eyes.placing import bytes_placed
 from torchrl_loco.sim import models
+from torchrl_loco.sim.simulation import check_memory
 
 OF_A_STEP = frozenset({"action", "ctrl"})
 """What belongs to a step: an observation is also made after a reset, where there was none."""
 CONTACT_HISTORY = ("contact_force_history", "in_contact_history")
 """Arrays of contacts with a row for each substep."""
+COPIES_IN_HOOKS = 2
+"""How often what eyes see lies in memory: where it is found, and in what a hook makes of it."""
 
 
 class Catalog(Elements):
@@ -41,6 +45,7 @@ class Catalog(Elements):
         sensors: ids of the sensors that only an engine can evaluate.
         contact_geoms: ids of the geoms whose contacts were asked for, in the order of the engine's columns.
         scans: the scans of the ground, depths and rays that were asked for, by the name of their array.
+        bytes_scanned: memory that they take in a world.
         scanning: by hook, the names of those that it reads.
         sensor_address: where a sensor's numbers begin in ``sensordata``, by its id.
         constants: the task's tables by name.
@@ -74,6 +79,7 @@ class Catalog(Elements):
         self.sensors: set[int] = set()
         self.contact_geoms: list[int] = []
         self.scans: dict[str, ScanRequest | DepthRequest | RayRequest] = {}
+        self.bytes_scanned = 0
         self.scanning: dict[str, set[str]] = {}
         self.complete = False
         self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}
@@ -389,6 +395,7 @@ class View:
             KeyError: the model has no such camera.
             ValueError: several cameras match, a number is not positive, or ``fovy`` alone does not tell the camera's
                 perspective.
+            MemoryError: the device has no room for them.
         """
         which = self._id("camera", camera)
         size = check_int("height", height), check_int("width", width)
@@ -409,6 +416,7 @@ class View:
             KeyError: the model has no such site.
             ValueError: several sites match, ``far`` is not positive, or the directions have another shape, or one is
                 no direction.
+            MemoryError: the device has no room for them.
         """
         which = self._id("site", site)
         rows = np.array(directions, dtype=float)
@@ -439,7 +447,9 @@ class View:
         scans = self._catalog.scans
         name = next((name for name, other in scans.items() if other == asked), f"scan.{len(scans)}")
         if not self._catalog.complete:
-            scans[name] = asked
+            if name not in scans:
+                scans[name] = asked
+                self._make_room(math.prod(shape), eyes=not isinstance(asked, ScanRequest))
             self._catalog.scanning.setdefault(self._hook, set()).add(name)
             if isinstance(asked, ScanRequest):
                 heights.of_catalog(self._catalog)  # which may refuse
@@ -447,6 +457,16 @@ class View:
         if name not in self._catalog.scanning.get(self._hook, ()):
             raise ValueError(f"{self._hook}() did not ask for this scan when it was first called: it is not computed")
         return self._array(name)
+
+    def _make_room(self, count: int, *, eyes: bool) -> None:
+        """Checks that so many more numbers of each world fit into memory, with what eyes need to find them.
+
+        Raises:
+            MemoryError: they do not.
+        """
+        catalog = self._catalog
+        catalog.bytes_scanned += 4 * COPIES_IN_HOOKS * count + (bytes_placed(catalog.mj_model) if eyes else 0)
+        check_memory(catalog.num_envs * catalog.bytes_scanned, catalog.num_envs, catalog.device)
 
     def geom_xpos(self, geoms: Names) -> torch.Tensor:
         """Returns positions of the centers of geoms (m), shaped as :meth:`xpos`."""

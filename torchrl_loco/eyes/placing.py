@@ -3,7 +3,7 @@
 import mujoco
 import warp as wp
 
-from torchrl_loco.eyes.scene import AT_BODY, AT_COM, OF_COM, TRACKS, Mounts, Shapes, shapes_of
+from torchrl_loco.eyes.scene import AT_BODY, AT_COM, OF_COM, TRACKS, Mounts, Shapes, geoms_seen, shapes_of
 from torchrl_loco.eyes.shapes import CAPSULE, CYLINDER, PLANE
 from torchrl_loco.sim import EXCLUSIVE
 
@@ -120,6 +120,12 @@ def place(
     elif kind != PLANE and shapes.geom[k] >= 0:
         found = bounds(at, shapes.radius[k])
     bounds_out[world, k] = found
+
+
+def bytes_placed(m: mujoco.MjModel) -> int:
+    """Returns the memory that :class:`Placed` takes in a world (bytes), but for a few of the camera and lights."""
+    alone, of_ground = geoms_seen(m)
+    return (len(alone) + bool(of_ground)) * 4 * (3 + 9 + 4)
 
 
 class Placed:

@@ -148,11 +148,16 @@ def facing(direction: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def shapes_of(m: mujoco.MjModel, device: wp.Device) -> tuple[Shapes, list[wp.Mesh]]:
-    """Returns the shapes of a model that are seen, and the meshes among them, which must be kept."""
+def geoms_seen(m: mujoco.MjModel) -> tuple[list[int], list[int]]:
+    """Returns which geoms are seen: those that are shapes of their own, and those that are one shape, the ground."""
     seen = [g for g in range(m.ngeom) if m.geom_group[g] < GROUPS and color_of(m, g)[3] > HIDDEN]
     of_ground = [g for g in seen if m.geom_bodyid[g] == 0 and m.geom_type[g] in (BOX, FIELD)]
-    alone = [g for g in seen if g not in set(of_ground)]
+    return [g for g in seen if g not in set(of_ground)], of_ground
+
+
+def shapes_of(m: mujoco.MjModel, device: wp.Device) -> tuple[Shapes, list[wp.Mesh]]:
+    """Returns the shapes of a model that are seen, and the meshes among them, which must be kept."""
+    alone, of_ground = geoms_seen(m)
     kinds = [int(m.geom_type[g]) for g in alone]
     meshes: dict[tuple[int, int], wp.Mesh] = {}
     ids = []

@@ -311,8 +311,3 @@ class Eye:
         """Launches the kernels on torch's stream; arguments as of :meth:`launch`."""
         with EXCLUSIVE, wp.ScopedDevice(self._device), wp.ScopedStream(current_stream(self._device)):
             self.launch(xpos, xmat)
-
-
-def bytes_of(worlds: int, width: int, height: int, kinds: tuple[str, ...]) -> int:
-    """Returns the memory that the pixels of a camera take (bytes)."""
-    return worlds * width * height * sum({"rgb": 3, "depth": 4, "geoms": 4}[kind] for kind in kinds)
