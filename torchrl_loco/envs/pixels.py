@@ -18,7 +18,7 @@ SIZE = (84, 84)
 """Width and height of pixels, those of dm_control's benchmarks from pixels."""
 KEYS = {"rgb": "pixels", "depth": "depth"}
 """Keys of what is drawn."""
-COPIES = 3
+COPIES_IN_STEP = 3
 """How often pixels lie in memory: where they are drawn, in what a step returns, and in what the next begins with."""
 DEPTHS = Interval(0, float("inf"))
 
@@ -68,7 +68,7 @@ class Pixels:
             raise ValueError("frame_stack needs from_pixels=True: depth is not stacked")
         stack = 1 if given["frame_stack"] is None else check_int("frame_stack", given["frame_stack"])
         of_pixel = sum({"rgb": 3 * stack, "depth": 4}[kind] for kind in kinds)
-        check_memory(num_envs * (COPIES * width * height * of_pixel + bytes_placed(m)), num_envs, device)
+        check_memory(num_envs * (COPIES_IN_STEP * width * height * of_pixel + bytes_placed(m)), num_envs, device)
         return cls(camera, width, height, kinds, far, stack, only)
 
     def settings(self, m: mujoco.MjModel) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from torchrl_loco.training.reppo import REPPO
 from torchrl_loco.training.run_folder import RunFolder
 from torchrl_loco.training.trials import Trials
 
-COPIES = 8
+COPIES_IN_BATCH = 8
 """How often the pixels of a batch lie in memory: before and after a step, collected, stacked, packed and shuffled."""
 ALGORITHMS: dict[str, type[Algorithm]] = {cls.config_type.algorithm: cls for cls in (PPO, REPPO)}
 
@@ -111,7 +111,7 @@ class Trainer:
         make_algorithm = given.algorithm or ALGORITHMS[config.algorithm]
         spaces = Spaces.of(self.env, config.critic_from_pixels)
         if spaces.pixels:
-            needed = COPIES * config.frames_per_batch * math.prod(spaces.pixels)
+            needed = COPIES_IN_BATCH * config.frames_per_batch * math.prod(spaces.pixels)
             check_memory(needed, config.num_envs, torch.device(config.device))
         self.algorithm = make_algorithm(config, spaces, given.network)
         deterministic_policy(self.algorithm.actor, config, {})  # raises an error where it could not be saved
