@@ -122,3 +122,23 @@ def test_evaluations_are_behind_the_transforms_of_an_environment_that_was_handed
     assert env.transform.steps.tolist() == [3, 3, 3]
     assert env.base_env.base_env is base
     assert Environments(config, base).evaluation(2, seed=7).num_envs == 2
+
+
+class Named(torchrl_loco.WalkerStand):
+    """Has terms of the observation, with noise."""
+
+    noise = {"pose": 0.1}
+
+    def observation(self, s):
+        return {"observation": {"pose": s.qpos, "speed": s.qvel}}
+
+
+def test_evaluations_return_what_an_environment_returns_that_was_handed_in():
+    """All that its transforms may read, such as depth, with the same noise."""
+    seen = {"from_pixels": True, "depth": 5.0, "camera": "back", "size": (8, 6), "frame_stack": 2, "pixels_only": False}
+    for options in ({"depth": 5.0}, {**seen, "observation_terms": True, "noise_scale": 0.5, "compile_hooks": False}):
+        base = Named(3, "cpu", seed=5, metrics=True, **options)
+        other = Environments(PPOConfig(Named), base).evaluation(3, seed=7)
+        assert other.observation_spec == base.observation_spec
+        assert other.pixels == base.pixels
+        assert (other.noise_scale, other.compile_hooks) == (base.noise_scale, base.compile_hooks)

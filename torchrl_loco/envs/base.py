@@ -207,6 +207,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
                     f"{type(self).__name__} has noise or history, but a Warp function observes: "
                     'def observation(self, s): return {"observation": {"all": super().observation(s)}}'
                 )
+        self.observation_terms = apart
         self._apart = {group: sizes for group, sizes in self.observation_layout.items() if sizes and apart}
         if "observation" in self.groups:
             self.observation_size = math.prod(self.groups["observation"])

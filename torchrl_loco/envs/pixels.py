@@ -71,6 +71,13 @@ class Pixels:
         check_memory(num_envs * (COPIES_IN_STEP * width * height * of_pixel + bytes_placed(m)), num_envs, device)
         return cls(camera, width, height, kinds, far, stack, only)
 
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The arguments that ask for them."""
+        rgb, size = "rgb" in self.kinds, (self.width, self.height)
+        seen = {"from_pixels": rgb, "depth": self.far, "camera": self.camera, "size": size, "pixels_only": self.only}
+        return {**seen, "frame_stack": self.stack if rgb else None}
+
     def settings(self, m: mujoco.MjModel) -> dict[str, Any]:
         """Returns the settings of a training in which the same is seen, none without colours.
 

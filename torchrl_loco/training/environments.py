@@ -13,7 +13,7 @@ from typing import Any
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
-from torchrl_loco.config import arguments_of, pixels_of
+from torchrl_loco.config import arguments_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv
@@ -25,6 +25,8 @@ from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.config import TrainingConfig, is_runner
 from torchrl_loco.training.run_folder import RunFolder
 
+KEPT = ("play", "reward_terms", "observation_terms", "noise_scale", "compile_hooks", "on_overflow")
+"""Arguments of an environment that was handed in which its evaluations keep, besides those of physics and pixels."""
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -172,11 +174,11 @@ class Environments:
                 *place, **{**config.of_env, "world_offset": 0, "metrics": True, "reward_terms": terms, **settings}
             )
         own = {**dataclasses.asdict(base.config), "randomize": base.randomize, **base.options_given}
-        own |= pixels_of(dataclasses.asdict(config))
+        own |= {name: getattr(base, name) for name in KEPT} | (base.pixels.arguments if base.pixels else {})
         del own["naconmax"]  # which is for the number of its worlds
         if settings.get("play"):
-            del own["episode_length"]
-        own |= {"world_offset": 0, "play": base.play, "metrics": True, "reward_terms": base.reward_terms, **settings}
+            del own["episode_length"], own["noise_scale"]
+        own |= {"world_offset": 0, "metrics": True, **settings}
         return type(base)(worlds, base.device, seed, base.protocol, **own)
 
 
