@@ -6,7 +6,7 @@ import pytest
 import torch
 from for_each import for_each
 from torch.nn.functional import pad
-from torchrl.envs import ToTensorImage
+from torchrl.envs import ExcludeTransform, ToTensorImage
 
 import torchrl_loco as loco
 from torchrl_loco import training
@@ -95,5 +95,13 @@ def test_an_environment_that_sees_is_trained_in(tmp_path):
     other = loco.make("walker_walk", 4, "cpu", 0, from_pixels=True, size=(20, 16), frame_stack=2, camera="side")
     with pytest.raises(ValueError, match="was begun with camera='back', the environment has 'side'"):
         training.train(other, resume=run, total_frames=128)
+    blind = loco.TransformedEnv(
+        loco.make("walker_walk", 4, "cpu", 0, from_pixels=True, pixels_only=False), ExcludeTransform("pixels")
+    )
+    for name in ("from_pixels", "critic_from_pixels", "random_shift"):
+        with pytest.raises(ValueError, match=f"{name} needs an environment that returns 'pixels': .* leave transforms"):
+            training.train(blind, algorithm="reppo", out=tmp_path, **few, **{name: True})
+    run = training.train(blind, algorithm="reppo", out=tmp_path, **few)
+    assert not run.load_config().from_pixels
     with pytest.raises(ValueError, match=r"uint8 of shape .* frame_stack .* leave transforms of pixels out"):
         training.train(loco.TransformedEnv(env, ToTensorImage()), algorithm="reppo", out=tmp_path, **few)

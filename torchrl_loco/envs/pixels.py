@@ -79,13 +79,11 @@ class Pixels:
         return {**seen, "frame_stack": self.stack if rgb else None}
 
     def settings(self, m: mujoco.MjModel) -> dict[str, Any]:
-        """Returns the settings of a training in which the same is seen, none without colours.
+        """Returns the settings of a training in which the same is seen.
 
         Raises:
             ValueError: the camera has no name.
         """
-        if "rgb" not in self.kinds:
-            return {}
         if not (name := m.camera(self.camera).name) and self.camera:
             raise ValueError(f"camera {self.camera} needs a name to train with")
         seen = {"camera": name, "size": (self.width, self.height), "frame_stack": self.stack}

@@ -54,6 +54,8 @@ INTERVALS = {
     "random_shift": COUNT,
 }
 """Intervals of the fields that are not simply positive."""
+OF_PIXELS = ("camera", "size", "frame_stack", "random_shift", "critic_from_pixels")
+"""Settings that need ``from_pixels``."""
 
 
 Settings = dict[str, Any]
@@ -205,8 +207,7 @@ class TrainingConfig:
         object.__setattr__(self, "options", Options(self.options))
         object.__setattr__(self, "init", str(Path(self.init).expanduser().resolve()) if self.init else "")
         if not self.from_pixels:
-            of_pixels = ("camera", "size", "frame_stack", "random_shift", "critic_from_pixels")
-            if needless := [each for each in of_pixels if getattr(self, each) != getattr(TrainingConfig, each)]:
+            if needless := [each for each in OF_PIXELS if getattr(self, each) != getattr(TrainingConfig, each)]:
                 raise ValueError(f"{needless[0]} needs from_pixels=True")
         # Whether the machine has the device is checked when the run starts.
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):

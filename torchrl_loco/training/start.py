@@ -15,7 +15,7 @@ from torchrl_loco.registry import check_is_run, is_place, task_name
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
-from torchrl_loco.training.config import CONFIGS, TrainingConfig, check_setting, preset, tuning_note
+from torchrl_loco.training.config import CONFIGS, OF_PIXELS, TrainingConfig, check_setting, preset, tuning_note
 from torchrl_loco.training.environments import Given, unwrapped
 from torchrl_loco.training.run_folder import RunFolder
 from torchrl_loco.training.trainer import Trainer
@@ -120,8 +120,13 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
     if twice := [name for name in ("options", *base.options) if name in settings]:
         raise ValueError(f"{', '.join(twice)}: options are those of the environment, leave them out")
     own |= {"options": base.options_given} if base.options_given else {}
-    if pixels := base.pixels and base.pixels.settings(base.mj_model):
-        own |= {"from_pixels": True, **pixels}
+    seen = base.pixels if "pixels" in env.observation_spec.keys() else None  # noqa: SIM118, else no network sees them
+    if not seen and (needless := [name for name in ("from_pixels", *OF_PIXELS) if settings.get(name)]):
+        raise ValueError(
+            f"{needless[0]} needs an environment that returns 'pixels': make it with from_pixels=True, and leave "
+            "transforms out that take them away"
+        )
+    own |= {"from_pixels": True, **seen.settings(base.mj_model)} if seen else {"from_pixels": False}
     for name, value in own.items():
         if name in settings and str(settings[name]) != str(value):
             raise ValueError(f"{name} is that of the environment, {value!r}: leave it out, got {settings[name]!r}")
@@ -135,7 +140,7 @@ def _check_same(run: RunFolder, env: EnvBase) -> None:
         ValueError: it has another protocol, other options, or sees other pixels.
     """
     stored = dataclasses.asdict(run.load_config())
-    found = {"options": {}, "from_pixels": False, **_settings_of(env, {})}
+    found = {"options": {}, **_settings_of(env, {})}
     for name in ("protocol", "options", "from_pixels", "camera", "size", "frame_stack"):
         if name in found and found[name] != stored[name]:
             raise ValueError(f"{run.path} was begun with {name}={stored[name]!r}, the environment has {found[name]!r}")
