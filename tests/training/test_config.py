@@ -49,6 +49,7 @@ def test_wrong_settings():
         ({"trials": 5}, ValueError, "trials (5) * trial_fraction (0.2) must be less than 1"),
         ({"random_shift": 4}, ValueError, "random_shift needs from_pixels=True"),
         ({"size": (64, 64)}, ValueError, "size needs from_pixels=True"),
+        ({"from_pixels": True, "size": (64, 20), "random_shift": 20}, ValueError, "less than width and height of size"),
         ({"from_pixels": True, "size": 64}, ValueError, "size must be the width and height"),
         ({"seed": -1}, ValueError, "seed must lie in [0, 2**32)"),
         ({"device": "tpu"}, ValueError, "choose one of cpu"),

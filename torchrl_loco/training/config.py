@@ -209,6 +209,11 @@ class TrainingConfig:
         if not self.from_pixels:
             if needless := [each for each in OF_PIXELS if getattr(self, each) != getattr(TrainingConfig, each)]:
                 raise ValueError(f"{needless[0]} needs from_pixels=True")
+        elif self.random_shift >= min(self.size):
+            raise ValueError(
+                f"random_shift ({self.random_shift}) must be less than width and height of size ({self.size}): "
+                "pictures would be moved out of sight"
+            )
         # Whether the machine has the device is checked when the run starts.
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
             raise ValueError(f"no device {self.device!r}: choose one of cpu, cuda, cuda:0, ...")
