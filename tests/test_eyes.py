@@ -10,6 +10,7 @@ from torchrl.envs import CatFrames, Compose, ToTensorImage
 from torchrl.envs.utils import check_env_specs
 
 import torchrl_loco as loco
+from torchrl_loco.envs.pixels import checked_camera
 from torchrl_loco.eyes.rays import Rays
 from torchrl_loco.eyes.tracer import Eye
 from torchrl_loco.sim import simulation
@@ -149,6 +150,8 @@ def test_a_camera_shows_what_is_there_now():
     assert single.camera(width=8, height=6)["rgb"].shape == (6, 8, 3)
     with pytest.raises(ValueError, match="'color': choose one of rgb, depth, geoms"):
         env.camera(kinds=["color"])
+    with pytest.raises(ValueError, match="at least one of rgb, depth, geoms"):
+        env.camera(kinds=())
     with pytest.raises(ValueError, match="choose one of side, back, egocentric"):
         env.camera("top")
 
@@ -235,12 +238,19 @@ def test_transforms_of_torchrl_stack_and_turn_them():
         ({"from_pixels": True, "camera": 7}, "camera"),
         ({"from_pixels": True, "size": 84}, "size must be the width and height"),
         ({"from_pixels": True, "size": (0, 84)}, "width"),
-        ({"depth": -1.0}, "depth"),
+        ({"depth": -1.0}, r"depth, the greatest that is seen \(m\) or 0 for none, must lie in"),
     ],
 )
 def test_what_cannot_be_seen_is_refused(options, match):
     with pytest.raises(ValueError, match=match):
         loco.make("walker_walk", 2, "cpu", 0, **options)
+
+
+def test_a_camera_without_a_name_has_a_number():
+    m = mujoco.MjModel.from_xml_string("<mujoco><worldbody><camera/><camera name='b'/></worldbody></mujoco>")
+    assert checked_camera(m, None) == 0
+    with pytest.raises(ValueError, match=r"unknown camera '': choose one of b$"):
+        checked_camera(m, "")
 
 
 def test_pixels_that_do_not_fit_are_refused():

@@ -185,11 +185,14 @@ class WorldAccess(EnvBase):
             axis (m), 1e10 where nothing is seen; numbers of the geoms that are seen, int32, -1 for none.
 
         Raises:
-            ValueError: the model has no such camera, there is no such kind, or a size is not positive.
+            ValueError: the model has no such camera, there is no such kind or none is asked for, or a size is not
+                positive.
             TypeError: a number is not an integer.
         """
         which, size = checked_camera(self.mj_model, camera), (check_int("width", width), check_int("height", height))
         asked = tuple(check_choice("kind", kind, KINDS) for kind in ([kinds] if isinstance(kinds, str) else kinds))
+        if not asked:
+            raise ValueError(f"kinds must name at least one of {', '.join(KINDS)}, got {kinds!r}")
         eye = self.world.renderer(Eye, self.mj_model, which, *size, self.num_envs, asked)
         eye.look(self.sim.data.xpos, self.sim.data.xmat)
         return {kind: self._batched(getattr(eye, kind)) for kind in asked}

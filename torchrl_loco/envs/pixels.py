@@ -55,7 +55,8 @@ class Pixels:
             TypeError: an argument has the wrong type.
             MemoryError: the device has no room for the pixels.
         """
-        with_rgb, far = check_bool("from_pixels", given["from_pixels"]), check_float("depth", given["depth"], DEPTHS)
+        with_rgb = check_bool("from_pixels", given["from_pixels"])
+        far = check_float("depth, the greatest that is seen (m) or 0 for none,", given["depth"], DEPTHS)
         if not with_rgb and not far:
             if extra := [name for name in ("pixels_only", "camera", "size", "frame_stack") if given[name] is not None]:
                 raise ValueError(f"{extra[0]} needs from_pixels=True, or the greatest depth to be seen (m) as depth")
@@ -121,7 +122,7 @@ def checked_camera(m: mujoco.MjModel, camera: str | int | None) -> int:
     if not m.ncam:
         raise ValueError("pixels need a camera: the model has none")
     if isinstance(camera, str):
-        check_choice("camera", camera, [m.camera(i).name for i in range(m.ncam)])
+        check_choice("camera", camera, [name for i in range(m.ncam) if (name := m.camera(i).name)])
         return m.camera(camera).id
     return 0 if camera is None else check_int("camera", camera, Interval(0, m.ncam))
 
