@@ -83,16 +83,18 @@ def test_actors_that_see(algorithm, critic_sees, device, tmp_path):
     assert export_policy(policy, out / "policy.pt2") < 1e-5
 
 
-def test_an_environment_that_sees_is_trained_in(tmp_path):
-    """With its own camera and size; without states for the critic, that sees too."""
-    env = loco.make("walker_walk", 4, "cpu", 0, from_pixels=True, size=(20, 16), frame_stack=2, camera="back")
+def test_an_environment_that_sees_is_trained_in(tmp_path, caplog):
+    """With its own camera and size; without states for the critic, that sees too. Depth is for transforms to read."""
+    options = {"from_pixels": True, "size": (20, 16), "frame_stack": 2}
+    env = loco.make("walker_walk", 4, "cpu", 0, camera="back", depth=3.0, **options)
     few = {name: value for name, value in SMALL.items() if name not in ("size", "camera", "num_envs")}
     run = training.train(env, algorithm="reppo", out=tmp_path, **few)
     config = run.load_config()
     assert (config.from_pixels, config.camera, config.size, config.frame_stack) == (True, "back", (20, 16), 2)
     assert config.critic_from_pixels
     assert run.load_policy().module[0].shape == (16, 20, 6)
-    other = loco.make("walker_walk", 4, "cpu", 0, from_pixels=True, size=(20, 16), frame_stack=2, camera="side")
+    assert "networks do not read depth: join them to 'observation'" in caplog.text
+    other = loco.make("walker_walk", 4, "cpu", 0, camera="side", **options)
     with pytest.raises(ValueError, match="was begun with camera='back', the environment has 'side'"):
         training.train(other, resume=run, total_frames=128)
     blind = loco.TransformedEnv(

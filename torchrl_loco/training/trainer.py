@@ -116,6 +116,12 @@ class Trainer:
         self.algorithm = make_algorithm(config, spaces, given.network)
         deterministic_policy(self.algorithm.actor, config, {})  # raises an error where it could not be saved
         self._base, _ = unwrapped(self.env)
+        seen = {*self._base.groups, "depth"} & {*self.env.observation_spec.keys()}
+        unread = ", ".join(sorted(seen - {"observation", "privileged", "pixels"}))
+        if unread and first and not self.environments.transforms and given.algorithm is None:  # which may read them
+            logging.getLogger("torchrl_loco").warning(
+                "networks do not read %s: join them to 'observation', in the task or by transforms", unread
+            )
         length, from_start = self.environments.full_length, not self._base.stagger
         self.episodes = Episodes(config.num_envs, config.device, config.action_repeat, length, from_start)
         self._training_length = self._base.config.episode_length
