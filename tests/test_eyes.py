@@ -11,6 +11,7 @@ from torchrl.envs.utils import check_env_specs
 
 import torchrl_loco as loco
 from torchrl_loco.envs.pixels import checked_camera
+from torchrl_loco.eyes.placing import bytes_placed
 from torchrl_loco.eyes.rays import Rays
 from torchrl_loco.eyes.tracer import Eye
 from torchrl_loco.sim import simulation
@@ -80,6 +81,7 @@ def test_depth_and_geoms_are_those_of_rays_of_c_mujoco(camera, device):
     m, device = shapes(), wp.get_device(device)
     eye = Eye(m, device, camera, WIDTH, HEIGHT, 2, ("rgb", "depth", "geoms"), along_ray=True, far=1e3)
     eye.depth.fill_(torch.nan)
+    assert 2 * bytes_placed(m) == sum(each.capacity for each in (*eye._placed.placed, eye._placed.bounds))
     data, rng = mujoco.MjData(m), np.random.default_rng(1)
     poses = []
     for _ in range(2):
