@@ -11,7 +11,7 @@ import warp as wp
 from torchrl_loco.envs.heights import Ground
 from torchrl_loco.eyes.rays import Rays
 from torchrl_loco.eyes.tracer import Eye
-from torchrl_loco.sim import Buffer, array, fill
+from torchrl_loco.sim import Buffer, fill_from_numbers
 from torchrl_loco.sim.compiled.collision.ground import NOTHING
 
 if TYPE_CHECKING:
@@ -206,22 +206,19 @@ def tables(ground: Ground, device: wp.Device) -> Tables:
     starts = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
     heights = [field.heights.ravel() + field.corner[2] for field in ground.fields]
     grid, boxes = ground.grid, ground.boxes
-    return fill(
+    return fill_from_numbers(
         Tables,
+        device,
         plane=ground.plane,
-        corners=array([field.corner for field in ground.fields], wp.vec3, device),
-        lengths=array([field.cell for field in ground.fields], wp.vec2, device),
-        counts=array(
-            [(columns - 1, rows - 1, start) for (rows, columns), start in zip(shapes, starts, strict=False)],
-            wp.vec3i,
-            device,
-        ),
-        heights=array(np.concatenate(heights) if heights else [], float, device),
+        corners=[field.corner for field in ground.fields],
+        lengths=[field.cell for field in ground.fields],
+        counts=[(columns - 1, rows - 1, start) for (rows, columns), start in zip(shapes, starts, strict=False)],
+        heights=np.concatenate(heights) if heights else [],
         grid=wp.vec3(*grid.corner, grid.cell) if grid else wp.vec3(),
         columns=grid.shape[0] if grid else 0,
         rows=grid.shape[1] if grid else 0,
-        first=array(grid.first if grid else [], int, device),
-        named=array(grid.named if grid else [], int, device),
-        places=array(boxes[:, :4], wp.vec4, device),
-        tops=array(boxes[:, 4], float, device),
+        first=grid.first if grid else [],
+        named=grid.named if grid else [],
+        places=boxes[:, :4],
+        tops=boxes[:, 4],
     )

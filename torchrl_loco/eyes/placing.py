@@ -18,8 +18,8 @@ def center(mounts: Mounts, xpos: wp.array[wp.vec3], xmat: wp.array[wp.mat33], bo
     """Returns the center of mass of a subtree."""
     whole, found = float(0.0), wp.vec3()
     for b in range(body, body + mounts.subtree[body]):
-        whole += mounts.mass[b]
-        found += mounts.mass[b] * (xpos[b] + xmat[b] @ mounts.ipos[b])
+        whole += mounts.body_mass[b]
+        found += mounts.body_mass[b] * (xpos[b] + xmat[b] @ mounts.body_ipos[b])
     return wp.where(whole > 0.0, found / wp.max(whole, 1.0e-9), xpos[body])
 
 

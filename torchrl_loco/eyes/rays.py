@@ -7,7 +7,7 @@ import warp as wp
 from torchrl_loco.eyes.placing import Placed
 from torchrl_loco.eyes.scene import Shapes, mounts_at, to_the_horizon
 from torchrl_loco.eyes.shapes import MESH, to_mesh, to_shape
-from torchrl_loco.sim import EXCLUSIVE, Buffer, array
+from torchrl_loco.sim import EXCLUSIVE, Buffer
 
 
 @wp.kernel(enable_backward=False)
@@ -64,10 +64,10 @@ class Rays:
         far: float,
     ) -> None:
         one = np.zeros(1)
-        mounts = mounts_at(m, device, one, one + body, one - 1, pos[None], mat[None])
+        mounts = mounts_at(m, device, mode=one, body=one + body, target=one - 1, pos=pos[None], mat=mat[None])
         self._placed, self._device, self._far = Placed(to_the_horizon(m), device, mounts, worlds), device, far
         with EXCLUSIVE, wp.ScopedDevice(device):
-            self._directions = array(directions, wp.vec3, device)
+            self._directions = wp.array(directions, wp.vec3, device=device)
             self._out = Buffer((worlds, len(directions)), float, device)
         self.distance = self._out.torch
 

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from torchrl_loco.eyes.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, FIELD, MESH, PLANE, SPHERE
-from torchrl_loco.sim import array, fill
+from torchrl_loco.sim import fill_from_numbers
 
 KINDS = (PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)
 """Types of geoms that are seen."""
@@ -40,8 +40,8 @@ class Mounts:
     mat: wp.array[wp.mat33]
     # Of bodies: how many are in its subtree, its mass, and where its center of mass is.
     subtree: wp.array[int]
-    mass: wp.array[float]
-    ipos: wp.array[wp.vec3]
+    body_mass: wp.array[float]
+    body_ipos: wp.array[wp.vec3]
 
 
 @wp.struct
@@ -111,33 +111,15 @@ def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device) -> Mounts:
     pos = np.where(of_com[:, None], of(m.cam_poscom0, m.light_poscom0), pos)
     mat = np.where((tracks | of_com)[:, None, None], np.array(whole), np.array(fixed))
     bodies, targets = of(m.cam_bodyid, m.light_bodyid), of(m.cam_targetbodyid, m.light_targetbodyid)
-    return mounts_at(m, device, mode, bodies, targets, pos, mat)
+    return mounts_at(m, device, mode=mode, body=bodies, target=targets, pos=pos, mat=mat)
 
 
-def mounts_at(
-    m: mujoco.MjModel,
-    device: wp.Device,
-    mode: np.ndarray,
-    body: np.ndarray,
-    target: np.ndarray,
-    pos: np.ndarray,
-    mat: np.ndarray,
-) -> Mounts:
-    """Returns what holds what is at ``pos`` and ``mat``, as MuJoCo has it of cameras."""
+def mounts_at(m: mujoco.MjModel, device: wp.Device, **mounted: np.ndarray) -> Mounts:
+    """Returns what holds what is mounted, of which the fields of :class:`Mounts` are given up to ``mat``."""
     count = np.ones(m.nbody, dtype=np.int32)
     for b in range(m.nbody - 1, 0, -1):  # numbered along the tree: a subtree is a row of bodies
         count[m.body_parentid[b]] += count[b]
-    return fill(
-        Mounts,
-        mode=array(mode, int, device),
-        body=array(body, int, device),
-        target=array(target, int, device),
-        pos=array(pos, wp.vec3, device),
-        mat=array(mat, wp.mat33, device),
-        subtree=array(count, int, device),
-        mass=array(m.body_mass, float, device),
-        ipos=array(m.body_ipos, wp.vec3, device),
-    )
+    return fill_from_numbers(Mounts, device, m, **mounted, subtree=count)
 
 
 def facing(direction: np.ndarray) -> np.ndarray:
@@ -187,9 +169,7 @@ def shapes_of(m: mujoco.MjModel, device: wp.Device) -> tuple[Shapes, list[wp.Mes
         kept.append(mesh(points, faces, device))
         for name, value in zip(rows, (-1, MESH, 0, np.zeros(3), np.eye(3), np.ones(3), 0.0, kept[-1].id), strict=True):
             rows[name].append(value)
-    types = (int, int, int, wp.vec3, wp.mat33, wp.vec3, float, wp.uint64)
-    tables = {name: array(np.array(row), kind, device) for (name, row), kind in zip(rows.items(), types, strict=True)}
-    return fill(Shapes, **tables, owner=array(owner, int, device)), kept
+    return fill_from_numbers(Shapes, device, **rows, owner=owner), kept
 
 
 def triangles(m: mujoco.MjModel, geoms: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -233,7 +213,7 @@ def of_field(m: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
 
 def mesh(points: np.ndarray, faces: np.ndarray, device: wp.Device) -> wp.Mesh:
     """Returns triangles as what Warp traces rays through."""
-    return wp.Mesh(array(points, wp.vec3, device), array(faces.ravel(), int, device))
+    return wp.Mesh(wp.array(points, wp.vec3, device=device), wp.array(faces.ravel(), int, device=device))
 
 
 def color_of(m: mujoco.MjModel, geom: int) -> np.ndarray:
@@ -276,22 +256,23 @@ def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
         if names:
             logging.getLogger("torchrl_loco").info("cameras do not see %s: geoms %s", what, ", ".join(names[:8]))
     levels, texels, sky = textures(m, flat)
-    return fill(
+    return fill_from_numbers(
         Looks,
-        color=array(np.array([color_of(m, g)[:3] for g in range(m.ngeom)]), wp.vec3, device),
-        shine=array(shine, wp.vec3, device),
-        texture=array(texture, int, device),
-        repeat=array(repeat, wp.vec2, device),
-        offset=array(offset, wp.vec2, device),
-        light_kind=array(m.light_type[lights] == int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL), int, device),
-        shadow=array(m.light_castshadow[lights], bool, device),
-        diffuse=array(of_head(head, head.diffuse, m.light_diffuse[lights]), wp.vec3, device),
-        specular=array(of_head(head, head.specular, m.light_specular[lights]), wp.vec3, device),
-        attenuation=array(m.light_attenuation[lights], wp.vec3, device),
-        cone=array(np.column_stack([np.cos(np.deg2rad(m.light_cutoff)), m.light_exponent])[lights], wp.vec2, device),
+        device,
+        color=np.array([color_of(m, g)[:3] for g in range(m.ngeom)]),
+        shine=shine,
+        texture=texture,
+        repeat=repeat,
+        offset=offset,
+        light_kind=m.light_type[lights] == int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL),
+        shadow=m.light_castshadow[lights],
+        diffuse=of_head(head, head.diffuse, m.light_diffuse[lights]),
+        specular=of_head(head, head.specular, m.light_specular[lights]),
+        attenuation=m.light_attenuation[lights],
+        cone=np.column_stack([np.cos(np.deg2rad(m.light_cutoff)), m.light_exponent])[lights],
         ambient=wp.vec3(*map(float, ambient)),
-        levels=array(levels, wp.vec3i, device),
-        texels=array(texels, wp.vec3, device),
+        levels=levels,
+        texels=texels,
         sky=wp.vec2i(*sky),
     )
 

@@ -4,7 +4,6 @@ import warp as wp
 
 from torchrl_loco.sim.buffer import Buffer as Buffer
 from torchrl_loco.sim.buffer import PackedBuffers as PackedBuffers
-from torchrl_loco.sim.buffer import array as array
 from torchrl_loco.sim.graph import EXCLUSIVE as EXCLUSIVE
 from torchrl_loco.sim.graph import Direct as Direct
 from torchrl_loco.sim.graph import Graph as Graph
@@ -18,6 +17,7 @@ from torchrl_loco.sim.simulation import Simulation as Simulation
 from torchrl_loco.sim.world_func import Around as Around
 from torchrl_loco.sim.world_func import WorldFunc as WorldFunc
 from torchrl_loco.sim.world_func import fill as fill
+from torchrl_loco.sim.world_func import fill_from_numbers as fill_from_numbers
 from torchrl_loco.sim.world_func import holds as holds
 
 # At its default level Warp prints a line for each of a hundred kernels that it loads. Set another level to see them.

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 import warp as wp
 
@@ -43,19 +42,3 @@ class PackedBuffers:
         """Returns the arrays, then the flags, in :attr:`memory` or in a copy of it; all of one dimension."""
         floats = memory[: self._end].view(torch.float32).split(self._floats)
         return *floats, memory[self._end :].view(torch.bool)
-
-
-def array(values: Any, kind: Any, device: wp.Device) -> wp.array:
-    """Returns numbers as an array of Warp's, of vectors or matrices too."""
-    shape = getattr(kind, "_shape_", ())
-    scalar = {
-        int: np.int32,
-        float: np.float32,
-        bool: np.bool_,
-        wp.uint64: np.uint64,
-        wp.vec2i: np.int32,
-        wp.vec3i: np.int32,
-    }
-    values = np.asarray(values).astype(scalar.get(kind, np.float32))
-    outer = values.shape[: values.ndim - len(shape)] if values.size else (0,) * max(values.ndim - len(shape), 1)
-    return wp.array(np.ascontiguousarray(values.reshape(*outer, *shape)), dtype=kind, device=device)

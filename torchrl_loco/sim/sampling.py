@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from torchrl_loco.sim.buffer import array
-from torchrl_loco.sim.world_func import fill
+from torchrl_loco.sim.world_func import fill_from_numbers
 
 MAX_TRIES = 64
 """Poses drawn before one in contact is kept. Three of four humanoid poses are free, so this does not happen."""
@@ -97,32 +96,32 @@ class Skeleton:
     """What forward kinematics and the contact test of one world need of a model. Geom 0 is the floor, z = 0.
 
     Attributes:
-        body_parent: id of the parent body, ``(nbody,)``.
-        body_joint: first joint and number of joints, ``(nbody, 2)``.
+        body_parentid: id of the parent body, ``(nbody,)``.
+        body_jnt: first joint and number of joints, ``(nbody, 2)``.
         body_pos: offset from the parent (m), ``(nbody,)``.
         body_quat: rotation against the parent, ``(nbody,)``.
-        joint_qpos: start of the joint in qpos, ``(njnt,)``.
-        joint_free: whether it is a free joint, else a hinge, ``(njnt,)``.
-        joint_pos: anchor in the body's frame (m), ``(njnt,)``.
-        joint_axis: axis in the body's frame, ``(njnt,)``.
-        joint_range: lower and upper limit (rad), ``(njnt,)``.
-        geom_body: id of the geom's body, ``(ngeom,)``.
+        jnt_qposadr: start of the joint in qpos, ``(njnt,)``.
+        jnt_free: whether it is a free joint, else a hinge, ``(njnt,)``.
+        jnt_pos: anchor in the body's frame (m), ``(njnt,)``.
+        jnt_axis: axis in the body's frame, ``(njnt,)``.
+        jnt_range: lower and upper limit (rad), ``(njnt,)``.
+        geom_bodyid: id of the geom's body, ``(ngeom,)``.
         geom_pos: center in the body's frame (m), ``(ngeom,)``.
         geom_axis: from the center to the end of the capsule's segment (m), zero for a sphere, ``(ngeom,)``.
         geom_radius: radius (m), ``(ngeom,)``.
         pair: geoms that may touch, ``(npair,)``.
     """
 
-    body_parent: wp.array[int]
-    body_joint: wp.array[wp.vec2i]
+    body_parentid: wp.array[int]
+    body_jnt: wp.array[wp.vec2i]
     body_pos: wp.array[wp.vec3]
     body_quat: wp.array[wp.quat]
-    joint_qpos: wp.array[int]
-    joint_free: wp.array[bool]
-    joint_pos: wp.array[wp.vec3]
-    joint_axis: wp.array[wp.vec3]
-    joint_range: wp.array[wp.vec2]
-    geom_body: wp.array[int]
+    jnt_qposadr: wp.array[int]
+    jnt_free: wp.array[bool]
+    jnt_pos: wp.array[wp.vec3]
+    jnt_axis: wp.array[wp.vec3]
+    jnt_range: wp.array[wp.vec2]
+    geom_bodyid: wp.array[int]
     geom_pos: wp.array[wp.vec3]
     geom_axis: wp.array[wp.vec3]
     geom_radius: wp.array[float]
@@ -132,14 +131,14 @@ class Skeleton:
 @wp.func
 def draw_joints(skeleton: Skeleton, stream: wp.uint32, qpos: wp.array[float]) -> wp.uint32:
     """Draws the orientation of free joints and every hinge uniformly in its range; root positions stay."""
-    for joint in range(skeleton.joint_qpos.shape[0]):
-        address = skeleton.joint_qpos[joint]
-        if skeleton.joint_free[joint]:
+    for joint in range(skeleton.jnt_qposadr.shape[0]):
+        address = skeleton.jnt_qposadr[joint]
+        if skeleton.jnt_free[joint]:
             quat, stream = positive_quaternion(stream)
             for i in range(4):
                 qpos[address + 3 + i] = quat[i]
         else:
-            limits = skeleton.joint_range[joint]
+            limits = skeleton.jnt_range[joint]
             qpos[address] = wp.randf(stream, limits[0], limits[1])
     return stream
 
@@ -149,20 +148,20 @@ def pose_bodies(skeleton: Skeleton, qpos: wp.array[float], xpos: wp.array[wp.vec
     """Forward kinematics of one world; ``xquat`` is (x, y, z, w), Warp's order."""
     xpos[0] = wp.vec3(0.0)
     xquat[0] = wp.quat_identity()
-    for body in range(1, skeleton.body_parent.shape[0]):
-        parent = skeleton.body_parent[body]
+    for body in range(1, skeleton.body_parentid.shape[0]):
+        parent = skeleton.body_parentid[body]
         pos = xpos[parent] + wp.quat_rotate(xquat[parent], skeleton.body_pos[body])
         quat = xquat[parent] * skeleton.body_quat[body]
-        first = skeleton.body_joint[body][0]
-        for joint in range(first, first + skeleton.body_joint[body][1]):
-            q = skeleton.joint_qpos[joint]
-            if skeleton.joint_free[joint]:
+        first = skeleton.body_jnt[body][0]
+        for joint in range(first, first + skeleton.body_jnt[body][1]):
+            q = skeleton.jnt_qposadr[joint]
+            if skeleton.jnt_free[joint]:
                 pos = wp.vec3(qpos[q], qpos[q + 1], qpos[q + 2])
                 quat = wp.quat(qpos[q + 4], qpos[q + 5], qpos[q + 6], qpos[q + 3])
             else:
-                anchor = pos + wp.quat_rotate(quat, skeleton.joint_pos[joint])
-                quat = quat * wp.quat_from_axis_angle(skeleton.joint_axis[joint], qpos[q])
-                pos = anchor - wp.quat_rotate(quat, skeleton.joint_pos[joint])
+                anchor = pos + wp.quat_rotate(quat, skeleton.jnt_pos[joint])
+                quat = quat * wp.quat_from_axis_angle(skeleton.jnt_axis[joint], qpos[q])
+                pos = anchor - wp.quat_rotate(quat, skeleton.jnt_pos[joint])
         xpos[body] = pos
         xquat[body] = quat
 
@@ -173,14 +172,14 @@ def in_contact(skeleton: Skeleton, xpos: wp.array[wp.vec3], xquat: wp.array[wp.q
     for i in range(skeleton.pair.shape[0]):
         a = skeleton.pair[i][0]
         b = skeleton.pair[i][1]
-        body = skeleton.geom_body[b]
+        body = skeleton.geom_bodyid[b]
         q = xpos[body] + wp.quat_rotate(xquat[body], skeleton.geom_pos[b])
         v = wp.quat_rotate(xquat[body], skeleton.geom_axis[b])
         if a == 0:  # the floor
             if q[2] - wp.abs(v[2]) < skeleton.geom_radius[b]:
                 return True
         else:
-            body = skeleton.geom_body[a]
+            body = skeleton.geom_bodyid[a]
             p = xpos[body] + wp.quat_rotate(xquat[body], skeleton.geom_pos[a])
             u = wp.quat_rotate(xquat[body], skeleton.geom_axis[a])
             if segment_distance(p, u, q, v) < skeleton.geom_radius[a] + skeleton.geom_radius[b]:
@@ -282,12 +281,13 @@ def make_outline(mj_model: mujoco.MjModel, device: wp.Device) -> Outline:
         raise ValueError("an outline consists of spheres, capsules, cylinders and ellipsoids")
     frames = root.T @ data.geom_xmat[1:].reshape(-1, 3, 3)
     disks = size[:, [0, 0, 0]] * (cylinder * (1.0, 1.0, 0.0))
-    return fill(
+    return fill_from_numbers(
         Outline,
-        center=array((data.geom_xpos[1:] - data.xpos[1]) @ root, wp.vec3, device),
-        radius=array(size[:, 0] * (sphere | capsule)[:, 0], float, device),
-        segment=array(frames[:, :, 2] * size[:, 1:2] * (capsule | cylinder), wp.vec3, device),
-        axes=array(frames * (size * ellipsoid + disks)[:, None], wp.mat33, device),
+        device,
+        center=(data.geom_xpos[1:] - data.xpos[1]) @ root,
+        radius=size[:, 0] * (sphere | capsule)[:, 0],
+        segment=frames[:, :, 2] * size[:, 1:2] * (capsule | cylinder),
+        axes=frames * (size * ellipsoid + disks)[:, None],
     )
 
 
@@ -315,20 +315,14 @@ def make_skeleton(mj_model: mujoco.MjModel, pairs: np.ndarray, device: wp.Device
     geom_axis = np.zeros((m.ngeom, 3))
     for i in range(m.ngeom):
         mujoco.mju_rotVecQuat(geom_axis[i], np.array([0.0, 0.0, half_length[i]]), m.geom_quat[i])
-    return fill(
+    return fill_from_numbers(
         Skeleton,
-        body_parent=array(m.body_parentid, int, device),
-        body_joint=array(np.stack([m.body_jntadr, m.body_jntnum], axis=1), wp.vec2i, device),
-        body_pos=array(m.body_pos, wp.vec3, device),
-        body_quat=array(m.body_quat[:, [1, 2, 3, 0]], wp.quat, device),
-        joint_qpos=array(m.jnt_qposadr, int, device),
-        joint_free=array(m.jnt_type == joint.mjJNT_FREE, bool, device),
-        joint_pos=array(m.jnt_pos, wp.vec3, device),
-        joint_axis=array(m.jnt_axis, wp.vec3, device),
-        joint_range=array(m.jnt_range, wp.vec2, device),
-        geom_body=array(m.geom_bodyid, int, device),
-        geom_pos=array(m.geom_pos, wp.vec3, device),
-        geom_axis=array(geom_axis, wp.vec3, device),
-        geom_radius=array(m.geom_size[:, 0], float, device),
-        pair=array(pairs, wp.vec2i, device),
+        device,
+        m,
+        body_jnt=np.stack([m.body_jntadr, m.body_jntnum], axis=1),
+        body_quat=m.body_quat[:, [1, 2, 3, 0]],
+        jnt_free=m.jnt_type == joint.mjJNT_FREE,
+        geom_axis=geom_axis,
+        geom_radius=m.geom_size[:, 0],
+        pair=pairs,
     )

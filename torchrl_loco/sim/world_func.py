@@ -5,6 +5,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
 BLOCK_DIM = 64
@@ -54,6 +55,16 @@ def fill(struct: Any, source: Any = None, /, **fields: Any) -> Any:
     for name, value in given.items():
         setattr(instance, name, value)
     return instance
+
+
+def fill_from_numbers(struct: Any, device: wp.Device, source: Any = None, /, **fields: Any) -> Any:
+    """Returns what :func:`fill` does, where the numbers of an array are given instead of one on the device."""
+    for name, field in struct.vars.items():
+        values, kind = fields.get(name, getattr(source, name, None)), field.type
+        if hasattr(kind, "ndim") and values is not None:
+            values, like = np.asarray(values), {"dtype": kind.dtype, "device": device}
+            fields[name] = wp.array(values, **like) if values.size else wp.empty((0,) * kind.ndim, **like)
+    return fill(struct, source, **fields)
 
 
 def mujoco_warp_arrays() -> set[str]:
