@@ -13,6 +13,7 @@ import torchrl_loco
 from torchrl_loco.config import sim_config
 from torchrl_loco.sim import Simulation, compiled, models, mujoco_warp, simulation
 from torchrl_loco.sim.compiled import step
+from torchrl_loco.sim.engine import Setup
 from torchrl_loco.sim.graph import ScratchPool
 
 
@@ -38,15 +39,16 @@ def allocated(thing):
 def test_the_estimate_is_what_is_allocated(body, num_envs, overrides, geoms, rows):
     config = sim_config(CONFIGS[body], "playground", num_envs, overrides)
     model, device = models.load(MODELS[body]), wp.get_device("cpu")
-    engine = mujoco_warp.MujocoWarpEngine(model, config, num_envs, device, geoms, contact_rows=rows)
+    setup = Setup(model, config, num_envs, device, geoms, contact_rows=rows)
+    engine = mujoco_warp.MujocoWarpEngine(setup)
     needed = sum(allocated(engine.data).values())
     if geoms:
         arrays = [array for array in vars(engine.contact_forces).values() if isinstance(array, wp.array)]
         needed += sum(array.capacity for array in arrays)
-    assert mujoco_warp.data_bytes(model, config, num_envs, len(geoms), contact_rows=rows) == needed
-    data = compiled.CompiledEngine(model, config, num_envs, device, geoms, contact_rows=rows).data
+    assert mujoco_warp.data_bytes(setup) == needed
+    data = compiled.CompiledEngine(setup).data
     arrays = [array for array in vars(data).values() if isinstance(array, wp.array)]
-    assert compiled.data_bytes(model, num_envs, rows * len(geoms)) == sum(array.capacity for array in arrays)
+    assert compiled.data_bytes(setup) == sum(array.capacity for array in arrays)
 
 
 def test_scratch_memory_is_used_again():
@@ -81,7 +83,7 @@ def test_more_worlds_than_warp_can_address_are_refused():
 def test_as_many_as_fit_are_made(engine, monkeypatch):
     config = sim_config(CONFIGS["walker"], "playground", 8, {"engine": engine})
     model = models.load(MODELS["walker"])
-    needed = simulation.memory(engine, model, config, 8, torch.device("cpu"))
+    needed = simulation.memory(engine, Setup(model, config, 8, wp.get_device("cpu")))
     for free, fits in ((needed + 1, True), (needed / 2, False)):
         monkeypatch.setattr(simulation, "free_memory", lambda device, free=free: free)
         if fits:

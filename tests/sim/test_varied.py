@@ -15,6 +15,7 @@ from variation import all_varied, candidates, draw_rows
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import Simulation, compiled, mujoco_warp
 from torchrl_loco.sim.compiled import step, unsupported
+from torchrl_loco.sim.engine import Setup
 from torchrl_loco.sim.varied import FIELDS, Varied, field
 
 WORLDS, SUBSTEPS = 32, 3
@@ -319,14 +320,15 @@ def test_memory_counts_the_numbers(kind):
     model, device = mujoco.MjModel.from_xml_string(XML), wp.get_device("cpu")
     varied = all_varied(model)
     config = simulate(model, kind, 1).config
+    setup, plain = (Setup(model, config, 5, device, varied=v) for v in (varied, None))
     if kind == "mujoco_warp":
-        engine = mujoco_warp.MujocoWarpEngine(model, config, 5, device, (), varied)
+        engine = mujoco_warp.MujocoWarpEngine(setup)
         batched = {name for name in (*FIELDS, "body_subtreemass") if name != "pair_friction"}
         arrays = [engine.model.opt.gravity if name == "gravity" else getattr(engine.model, name) for name in batched]
         assert {array.shape[0] for array in arrays} == {5}
         taken = engine.numbers.capacity + sum(array.capacity for array in arrays)
-        bytes_ = [mujoco_warp.data_bytes(model, config, 5, 0, v) for v in (varied, None)]
+        bytes_ = [mujoco_warp.data_bytes(s) for s in (setup, plain)]
     else:
-        taken = compiled.CompiledEngine(model, config, 5, device, (), varied)._rows.capacity
-        bytes_ = [compiled.data_bytes(model, 5, 0, v) for v in (varied, None)]
+        taken = compiled.CompiledEngine(setup)._rows.capacity
+        bytes_ = [compiled.data_bytes(s) for s in (setup, plain)]
     assert bytes_[0] - bytes_[1] == taken

@@ -1,21 +1,44 @@
 """What advances the worlds of a simulation: the contract of the three engines."""
 
 import abc
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import mujoco
 import warp as wp
 
+from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.buffer import Buffer
-from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc
+from torchrl_loco.sim.varied import Varied
+from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, WorldKernels
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """What an engine is made of.
+
+    Attributes:
+        mj_model: a compiled model with the options of ``config``.
+        config: settings of the simulation.
+        num_envs: number of worlds.
+        device: where they live.
+        contact_geoms: ids of the geoms whose contact forces are computed.
+        varied: which numbers of the model differ from world to world.
+        contact_rows: of how many substeps contact forces are kept: of the last, or of all.
+    """
+
+    mj_model: mujoco.MjModel
+    config: SimConfig
+    num_envs: int
+    device: wp.Device
+    contact_geoms: tuple[int, ...] = ()
+    varied: Varied | None = None
+    contact_rows: int = 1
 
 
 class Engine(abc.ABC):
     """Steps all worlds of a model.
-
-    Engines are made of a compiled model with the options of ``config``, a ``config``, the number of worlds, their
-    device, the geoms whose contact forces are computed, which numbers of the model differ from world to world
-    (``varied``), and of how many substeps contact forces are kept: of the last, or of all.
 
     Attributes:
         model: the model on the device, with nominal numbers, to be read only.
@@ -32,9 +55,14 @@ class Engine(abc.ABC):
     model: Any
     data: Any
     numbers: wp.array
-    peak_constraints: Buffer
-    peak_contacts: Buffer
     coalesced = False
+
+    def __init__(self, setup: Setup) -> None:
+        self._substeps, self._device = setup.config.substeps, setup.device
+        self._all = wp.ones(setup.num_envs, dtype=bool, device=setup.device)
+        self._kernels = WorldKernels()
+        self.peak_constraints = Buffer(setup.num_envs, int, setup.device)
+        self.peak_contacts = Buffer(1, int, setup.device)
 
     @abc.abstractmethod
     def remedy(self, dropped: str, most: int) -> str:
@@ -44,9 +72,9 @@ class Engine(abc.ABC):
     def contact_arrays(self) -> tuple[wp.array, wp.array]:
         """Returns net contact forces vec3 and whether there is a contact, ``(nworld, contact_rows * geoms)`` each."""
 
-    @abc.abstractmethod
     def subtree_com(self) -> wp.array:
         """Returns ``data.subtree_com``, which from now on is up to date."""
+        return self.data.subtree_com
 
     @abc.abstractmethod
     def step(self, around: Around = ALONE) -> None:

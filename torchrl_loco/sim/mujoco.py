@@ -12,15 +12,12 @@ import numpy as np
 import warp as wp
 from typing_extensions import override
 
-from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.batched_model import nominal_numbers
-from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.compiled.engine import Model
-from torchrl_loco.sim.engine import Engine
+from torchrl_loco.sim.engine import Engine, Setup
 from torchrl_loco.sim.overflow import Overflow
-from torchrl_loco.sim.varied import Varied
-from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, WorldKernels
+from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc
 
 STATE = ("qpos", "qvel", "act", "qacc_warmstart", "time", "mocap_pos", "mocap_quat")
 """What hooks, states and resets may change between two steps; all else follows from it."""
@@ -92,25 +89,17 @@ class MujocoEngine(Engine):
     least MuJoCo's default limits, which many models lower for speed.
     """
 
-    def __init__(
-        self,
-        mj_model: mujoco.MjModel,
-        config: SimConfig,
-        num_envs: int,
-        device: wp.Device,
-        contact_geoms: Sequence[int] = (),
-        varied: Varied | None = None,
-        contact_rows: int = 1,
-    ) -> None:
-        self._nominal = m = mj_model
-        self._varied, self._substeps, self._rows = varied, config.substeps, contact_rows
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
+        self._nominal = m = setup.mj_model
+        self._varied, self._rows = setup.varied, setup.contact_rows
+        num_envs, device, contact_geoms = setup.num_envs, setup.device, setup.contact_geoms
         self.model, self.data = Model(m, device), Data(m, num_envs)
-        self._kernels = WorldKernels()
         self._passive = _without_actuation(m)
         home: Any = mujoco.MjData(m)
         names = [name for name in STATE if np.size(getattr(home, name))]
         self._worlds = [World(m, names) for _ in range(num_envs)]
-        self.numbers = nominal_numbers(varied, num_envs, device)
+        self.numbers = nominal_numbers(self._varied, num_envs, device)
         self._state = {name: getattr(self.data, name).numpy() for name in names}
         for name, rows in self._state.items():
             rows[:] = np.reshape(getattr(home, name), rows.shape[1:])
@@ -118,11 +107,9 @@ class MujocoEngine(Engine):
         self._ctrl, self._overflow = self.data.ctrl.numpy(), self.data.overflow.numpy()
         self._geoms, self._column = len(contact_geoms), np.full(m.ngeom + 1, -1)  # a part of a flex is geom -1
         self._column[list(contact_geoms)] = np.arange(self._geoms)
-        shape = num_envs, contact_rows * len(contact_geoms)
+        shape = num_envs, self._rows * len(contact_geoms)
         self._force = wp.zeros(shape, dtype=wp.vec3, device=device)
         self._in_contact = wp.zeros(shape, dtype=bool, device=device)
-        self._all = wp.ones(num_envs, dtype=bool, device=device)
-        self.peak_constraints, self.peak_contacts = Buffer(num_envs, int, device), Buffer(1, int, device)
         self._forces, self._touches = self._force.numpy(), self._in_contact.numpy()
         self._most = self.peak_constraints.torch.numpy(), self.peak_contacts.torch.numpy()
         self._of_all = threading.Lock()  # of what the threads of all worlds write
@@ -140,10 +127,6 @@ class MujocoEngine(Engine):
     @override
     def contact_arrays(self) -> tuple[wp.array, wp.array]:
         return self._force, self._in_contact
-
-    @override
-    def subtree_com(self) -> wp.array:
-        return self.data.subtree_com
 
     @override
     def step(self, around: Around = ALONE) -> None:
@@ -299,7 +282,7 @@ def _without_actuation(m: mujoco.MjModel) -> mujoco.MjModel:
     return passive
 
 
-def data_bytes(m: mujoco.MjModel, num_envs: int) -> int:
-    """Returns about how much memory so many worlds take (bytes): an ``mjData`` uses a small part of its arena."""
-    data: Any = mujoco.MjData(m)
-    return num_envs * (2 * int(data.nbuffer) + 65_536)
+def data_bytes(setup: Setup) -> int:
+    """Returns about how much memory the worlds take (bytes): an ``mjData`` uses a small part of its arena."""
+    data: Any = mujoco.MjData(setup.mj_model)
+    return setup.num_envs * (2 * int(data.nbuffer) + 65_536)

@@ -10,17 +10,14 @@ import mujoco
 import warp as wp
 from typing_extensions import override
 
-from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.batched_model import BatchedModel, batched_bytes, nominal_numbers, with_every_row
-from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.contact_forces import ContactForces, contact_forces_bytes
-from torchrl_loco.sim.engine import Engine
+from torchrl_loco.sim.engine import Engine, Setup
 from torchrl_loco.sim.graph import torch_is_recording
 from torchrl_loco.sim.models import FORCE_SENSORS
 from torchrl_loco.sim.row_order import RowOrder
-from torchrl_loco.sim.varied import Varied
-from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, WorldKernels, holds
+from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, holds
 
 UNROLLED_ITERATIONS = 10
 """Up to this many solver iterations, the recorded step contains all of them, without an early exit."""
@@ -132,18 +129,10 @@ class MujocoWarpEngine(Engine):
         with_subtree_com: whether ``data.subtree_com`` is up to date in a world at rest too.
     """
 
-    def __init__(
-        self,
-        mj_model: mujoco.MjModel,
-        config: SimConfig,
-        num_envs: int,
-        device: wp.Device,
-        contact_geoms: Sequence[int] = (),
-        varied: Varied | None = None,
-        contact_rows: int = 1,
-    ) -> None:
-        self._num_envs, self._device = num_envs, device
-        self._substeps = config.substeps
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
+        mj_model, config, varied, device = setup.mj_model, setup.config, setup.varied, setup.device
+        self._num_envs = num_envs = setup.num_envs
         with wp.ScopedDevice(device):
             try:
                 self.model = mjw.put_model(mj_model)
@@ -167,19 +156,15 @@ class MujocoWarpEngine(Engine):
         self.model.block_dim.update_gradient_cholesky = 32
         self.model.block_dim.update_gradient_JTDAJ_dense = 64
         self.contact_forces: ContactForces | None = None
-        if contact_geoms:
-            self.contact_forces = ContactForces(mj_model, contact_geoms, self.data, contact_rows)
+        if setup.contact_geoms:
+            self.contact_forces = ContactForces(mj_model, setup.contact_geoms, self.data, setup.contact_rows)
         self.with_subtree_com = False
         self._has_force_sensors = not FORCE_SENSORS.isdisjoint(mj_model.sensor_type)
         self._kept_sensors: tuple[wp.array, wp.array] | None = None
         if self._has_force_sensors or self.contact_forces is not None:
             self._kept_sensors = wp.clone(self.data.sensordata), wp.clone(self.data.overflow)
         self._row_order = RowOrder(self.model, self.data) if config.deterministic else None
-        self._all = wp.ones(num_envs, dtype=bool, device=device)
-        self._kernels = WorldKernels()
         self._any = wp.zeros(1, dtype=int, device=device)
-        self.peak_constraints = Buffer(num_envs, int, device)
-        self.peak_contacts = Buffer(1, int, device)
 
     @override
     def remedy(self, dropped: str, most: int) -> str:
@@ -302,29 +287,23 @@ class MujocoWarpEngine(Engine):
         self._launch(restore_others, [mask, sensordata, overflow], [data.sensordata, data.overflow])
 
 
-def data_bytes(
-    mj_model: mujoco.MjModel,
-    config: SimConfig,
-    num_envs: int,
-    contact_geoms: int = 0,
-    varied: Varied | None = None,
-    contact_rows: int = 1,
-) -> int:
-    """Returns the memory that ``mjData`` of so many worlds takes (bytes), without allocating it.
+def data_bytes(setup: Setup) -> int:
+    """Returns the memory that ``mjData`` takes (bytes), without allocating it.
 
     Its size is linear in the number of worlds and in ``naconmax``; three small instances give the coefficients. The
-    forces of so many geoms, and numbers that differ from world to world, are counted too.
+    forces of geoms, and numbers that differ from world to world, are counted too.
     """
-    with_rows = with_every_row(mj_model, varied)
+    mj_model, config, num_envs = setup.mj_model, setup.config, setup.num_envs
+    with_rows = with_every_row(mj_model, setup.varied)
 
     def size(worlds: int, contacts: int) -> int:
         with wp.ScopedDevice("cpu"):
             return _array_bytes(mjw.make_data(with_rows, nworld=worlds, naconmax=contacts, njmax=config.njmax))
 
     base = size(1, 1)
-    forces = contact_forces_bytes(mj_model, contact_geoms, num_envs, config.naconmax, contact_rows)
+    forces = contact_forces_bytes(mj_model, len(setup.contact_geoms), num_envs, config.naconmax, setup.contact_rows)
     data = base + (num_envs - 1) * (size(2, 1) - base) + (config.naconmax - 1) * (size(1, 2) - base)
-    return data + forces + batched_bytes(mj_model, varied, num_envs)
+    return data + forces + batched_bytes(mj_model, setup.varied, num_envs)
 
 
 def _array_bytes(thing: Any) -> int:

@@ -16,7 +16,7 @@ from torchrl_loco.sim import compiled, mjw, models, mujoco_warp
 from torchrl_loco.sim import mujoco as c_mujoco
 from torchrl_loco.sim.batched_model import BatchedModel, with_every_row
 from torchrl_loco.sim.compilation import compile_kernels
-from torchrl_loco.sim.engine import Engine
+from torchrl_loco.sim.engine import Engine, Setup
 from torchrl_loco.sim.graph import Direct, Graph, ScratchPool
 from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.warp_init import init_warp
@@ -32,7 +32,7 @@ DETERMINISTIC_SCRATCH = 11.0
 """The same with ``deterministic=True`` on CUDA (measured: 6 to 8 times the memory of a world)."""
 
 
-ENGINES: dict[str, Callable[..., Engine]] = {
+ENGINES: dict[str, Callable[[Setup], Engine]] = {
     "compiled": compiled.CompiledEngine,
     "mujoco_warp": mujoco_warp.MujocoWarpEngine,
     "mujoco": c_mujoco.MujocoEngine,
@@ -142,13 +142,13 @@ class Simulation:
             raise ValueError(f"engine='mujoco' is C MuJoCo, which computes on the CPU: pass device='cpu', got {device}")
         self.engine_choice = name, _ = choose_engine(mj_model, config, differing)
         rows = config.substeps if contact_history else 1
-        needed = memory(name, mj_model, config, num_envs, device, len(geoms), differing, rows)
-        check_memory(needed, num_envs, device)
         self.mj_model, self.config, self.varied = mj_model, config, varied
         self.num_envs = num_envs
         init_warp()
         self.device = wp.get_device(str(device))
-        self.engine = ENGINES[name](mj_model, config, num_envs, self.device, geoms, differing, rows)
+        setup = Setup(mj_model, config, num_envs, self.device, geoms, differing, rows)
+        check_memory(memory(name, setup), num_envs, device)
+        self.engine = ENGINES[name](setup)
         self.model, self.data = self.engine.model, self.engine.data
         self._mujoco_data: dict[int, mjw.Data] = {}
         self._batched: BatchedModel | None = None
@@ -382,23 +382,14 @@ def choose_engine(mj_model: mujoco.MjModel, config: SimConfig, varied: Varied | 
     return "mujoco_warp", f"engine 'compiled' does not have: {'; '.join(missing)}"
 
 
-def memory(
-    engine: str,
-    mj_model: mujoco.MjModel,
-    config: SimConfig,
-    num_envs: int,
-    device: torch.device,
-    contact_geoms: int = 0,
-    varied: Varied | None = None,
-    contact_rows: int = 1,
-) -> int:
+def memory(engine: str, setup: Setup) -> int:
     """Returns the memory that a simulation takes (bytes)."""
     if engine == "compiled":
-        return compiled.data_bytes(mj_model, num_envs, contact_geoms * contact_rows, varied)
+        return compiled.data_bytes(setup)
     if engine == "mujoco":
-        return c_mujoco.data_bytes(mj_model, num_envs)
-    scratch = DETERMINISTIC_SCRATCH if config.deterministic and device.type == "cuda" else SCRATCH
-    return int(scratch * mujoco_warp.data_bytes(mj_model, config, num_envs, contact_geoms, varied, contact_rows))
+        return c_mujoco.data_bytes(setup)
+    scratch = DETERMINISTIC_SCRATCH if setup.config.deterministic and setup.device.is_cuda else SCRATCH
+    return int(scratch * mujoco_warp.data_bytes(setup))
 
 
 def check_memory(needed: int, num_envs: int, device: torch.device) -> None:

@@ -11,9 +11,7 @@ import numpy as np
 import warp as wp
 from typing_extensions import override
 
-from torchrl_loco.config import SimConfig
 from torchrl_loco.sim import mjw
-from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.compiled.collision.ground import Ground
 from torchrl_loco.sim.compiled.collision.pairs import stand_ins
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel
@@ -26,9 +24,8 @@ from torchrl_loco.sim.compiled.step import (
     nominal_row,
     structure_of_arrays,
 )
-from torchrl_loco.sim.engine import Engine
-from torchrl_loco.sim.varied import Varied
-from torchrl_loco.sim.world_func import ALONE, Around, Chain, WorldFunc, WorldKernels
+from torchrl_loco.sim.engine import Engine, Setup
+from torchrl_loco.sim.world_func import ALONE, Around, Chain, WorldFunc
 
 ROWS = {
     "qpos": ("nq", wp.float32),
@@ -189,21 +186,18 @@ def _shape(m: mujoco.MjModel, nworld: int, name: str, contacts: int) -> tuple[in
             return nworld, getattr(m, size)
 
 
-def data_bytes(m: mujoco.MjModel, num_envs: int, contacts: int = 0, varied: Varied | None = None) -> int:
-    """Returns the memory that the state of so many worlds takes, without what is asked for later (bytes).
+def data_bytes(setup: Setup) -> int:
+    """Returns the memory that the state takes, without what is asked for later (bytes).
 
-    Args:
-        m: the model.
-        num_envs: number of worlds.
-        contacts: number of geoms whose contact forces are asked for, times that of the substeps that are kept.
-        varied: which numbers of the model differ from world to world; their memory is counted too.
+    Numbers that differ from world to world are counted too.
     """
+    m, num_envs, contacts = setup.mj_model, setup.num_envs, len(setup.contact_geoms) * setup.contact_rows
     rows = sum(
         math.prod(_shape(m, num_envs, name, contacts)) * wp.types.type_size_in_bytes(dtype)
         for name, (_, dtype) in ROWS.items()
         if name not in LATER
     )
-    return rows + (4 * num_envs * nominal_row(VariedModel(m, varied)).size if varied is not None else 0)
+    return rows + (0 if setup.varied is None else 4 * num_envs * nominal_row(VariedModel(m, setup.varied)).size)
 
 
 class Model(ReadOnly):
@@ -246,25 +240,17 @@ class CompiledEngine(Engine):
         ValueError: there are more worlds than Warp can address.
     """
 
-    def __init__(
-        self,
-        mj_model: mujoco.MjModel,
-        config: SimConfig,
-        num_envs: int,
-        device: wp.Device,
-        contact_geoms: Sequence[int] = (),
-        varied: Varied | None = None,
-        contact_rows: int = 1,
-    ) -> None:
-        self._mj_model = mj_model if varied is None else VariedModel(mj_model, varied)
-        self._substeps, self._device = config.substeps, device
-        self._contact_geoms, self._contact_rows = tuple(contact_geoms), contact_rows
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
+        mj_model, num_envs, device = setup.mj_model, setup.num_envs, setup.device
+        self._mj_model = mj_model if setup.varied is None else VariedModel(mj_model, setup.varied)
+        self._contact_geoms, self._contact_rows = setup.contact_geoms, setup.contact_rows
         check_worlds(mj_model, num_envs, device)
         _check_forces(mj_model, self._contact_geoms)
         self.model = Model(mj_model, device)
         self._launch_size = launch_size(self._mj_model, num_envs, device)
         by_world = structure_of_arrays(mj_model, device)
-        contacts = len(self._contact_geoms) * contact_rows
+        contacts = len(self._contact_geoms) * self._contact_rows
         self.data = Data(mj_model, num_envs, device, structure_of_arrays=by_world, contacts=contacts)
         self._rows = self.numbers = wp.zeros((num_envs, 0), dtype=float, device=device)
         if isinstance(self._mj_model, VariedModel):
@@ -274,11 +260,7 @@ class CompiledEngine(Engine):
             self.numbers = self._rows[:, : self._mj_model.varied.count]
         self._terrain = wp.array(Ground.of(mj_model).numbers(), dtype=wp.float32, device=device)
         self.coalesced = by_world and not self._launch_size.one_kernel
-        self._kernels: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
-        self._kernels_apart = WorldKernels()
-        self._all = wp.ones(num_envs, dtype=bool, device=device)
-        self.peak_constraints = Buffer(num_envs, int, device)
-        self.peak_contacts = Buffer(1, int, device)
+        self._steps: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
 
     @override
     def remedy(self, dropped: str, most: int) -> str:
@@ -289,20 +271,16 @@ class CompiledEngine(Engine):
         return self.data.contact_force, self.data.in_contact
 
     @override
-    def subtree_com(self) -> wp.array:
-        return self.data.subtree_com
-
-    @override
     def step(self, around: Around = ALONE) -> None:
         first, before, after, last = around
         if self._launch_size.one_kernel:
-            self._kernels_apart.launch(first, self._all)
+            self._kernels.launch(first, self._all)
             self._launch(self._substeps, self._all, before, after, self._contact_geoms)
-            self._kernels_apart.launch(last, self._all)
+            self._kernels.launch(last, self._all)
         else:
-            self._kernels_apart.launch([*first, *before], self._all)
+            self._kernels.launch([*first, *before], self._all)
             self._launch(self._substeps, self._all, (), (), self._contact_geoms)
-            self._kernels_apart.launch([*after, *last], self._all)
+            self._kernels.launch([*after, *last], self._all)
 
     @override
     def forward(
@@ -326,14 +304,14 @@ class CompiledEngine(Engine):
     ) -> None:
         outputs = self.data.outputs()
         key = substeps, contact_geoms, *(func for func, _ in before), None, *(func for func, _ in after)
-        if key not in self._kernels:
+        if key not in self._steps:
             asked: dict[str, Any] = {f"with_{name}": outputs[name] is not None for name in LATER}
             asked |= {"contact_geoms": contact_geoms, "contact_rows": self._contact_rows}
             text = kept_source(self._mj_model, substeps, **asked)
             start, end = Chain(before), Chain(after)
             funcs = start.func, start.struct, end.func, end.struct
-            self._kernels[key] = _kernel(text, *funcs, self._launch_size.registers), start, end
-        kernel, start, end = self._kernels[key]
+            self._steps[key] = _kernel(text, *funcs, self._launch_size.registers), start, end
+        kernel, start, end = self._steps[key]
         size = self._launch_size
         wp.launch(
             kernel,
