@@ -61,6 +61,23 @@ WEIGHTS = {
 }
 """Weights of the reward's terms by name."""
 
+HUMANOID = {
+    ".*hip_pitch.*": (0.3, 0.5),
+    ".*hip_(roll|yaw).*": (0.15, 0.2),
+    ".*knee.*": (0.35, 0.6),
+    ".*ankle_roll.*": (0.1, 0.15),
+    ".*ankle.*": (0.25, 0.35),
+    ".*waist_roll.*": (0.08, 0.08),
+    ".*waist_pitch.*": (0.1, 0.2),
+    ".*waist_yaw.*|torso": (0.2, 0.3),
+    ".*shoulder_pitch.*": (0.15, 0.5),
+    ".*shoulder_roll.*": (0.15, 0.2),
+    ".*shoulder_yaw.*": (0.1, 0.15),
+    ".*elbow.*": (0.15, 0.35),
+    ".*wrist.*": (0.3, 0.3),
+}
+"""How far the joints of a humanoid may stray from home while it walks, and while it runs (rad)."""
+
 
 def memory(joints: int, feet: int) -> dict[str, int | tuple[int, ...]]:
     """Returns what a robot with so many actuated joints and feet remembers."""
@@ -445,35 +462,8 @@ class G1Velocity(Velocity):
         },
     }
     stand = {".*": 0.05}
-    walk = {
-        ".*hip_pitch.*": 0.3,
-        ".*hip_(roll|yaw).*": 0.15,
-        ".*knee.*": 0.35,
-        ".*ankle_pitch.*": 0.25,
-        ".*ankle_roll.*": 0.1,
-        ".*waist_yaw.*": 0.2,
-        ".*waist_roll.*": 0.08,
-        ".*waist_pitch.*": 0.1,
-        ".*shoulder_(pitch|roll).*": 0.15,
-        ".*shoulder_yaw.*": 0.1,
-        ".*elbow.*": 0.15,
-        ".*wrist.*": 0.3,
-    }
-    run = {
-        ".*hip_pitch.*": 0.5,
-        ".*hip_(roll|yaw).*": 0.2,
-        ".*knee.*": 0.6,
-        ".*ankle_pitch.*": 0.35,
-        ".*ankle_roll.*": 0.15,
-        ".*waist_yaw.*": 0.3,
-        ".*waist_roll.*": 0.08,
-        ".*waist_pitch.*": 0.2,
-        ".*shoulder_pitch.*": 0.5,
-        ".*shoulder_roll.*": 0.2,
-        ".*shoulder_yaw.*": 0.15,
-        ".*elbow.*": 0.35,
-        ".*wrist.*": 0.3,
-    }
+    walk = {joints: walking for joints, (walking, _) in HUMANOID.items()}
+    run = {joints: running for joints, (_, running) in HUMANOID.items()}
     weights = {**WEIGHTS, "trunk_rotation": -0.05, "angular_momentum": -0.02, "self_collision": -1.0}
     randomize = [sliding(r".*_foot\d_collision"), com("torso_link")]
 
@@ -489,27 +479,6 @@ class H1Velocity(Velocity):
     feet = {side: rf"{side}\d" for side in ("left_foot", "right_foot")}
     action_scale = 0.25
     presets = {**Velocity.presets, "ppo": {**Velocity.presets["ppo"], "total_frames": 150_000_000}}
-    stand = {".*": 0.05}
-    walk = {
-        ".*hip_pitch": 0.3,
-        ".*hip_(roll|yaw)": 0.15,
-        ".*knee": 0.35,
-        ".*ankle": 0.25,
-        "torso": 0.2,
-        ".*shoulder_(pitch|roll)": 0.15,
-        ".*shoulder_yaw": 0.1,
-        ".*elbow": 0.15,
-    }
-    run = {
-        ".*hip_pitch": 0.5,
-        ".*hip_(roll|yaw)": 0.2,
-        ".*knee": 0.6,
-        ".*ankle": 0.35,
-        "torso": 0.3,
-        ".*shoulder_pitch": 0.5,
-        ".*shoulder_roll": 0.2,
-        ".*shoulder_yaw": 0.15,
-        ".*elbow": 0.35,
-    }
+    stand, walk, run = G1Velocity.stand, G1Velocity.walk, G1Velocity.run
     weights = {**WEIGHTS, "trunk_rotation": -0.05}
     randomize = [sliding(r"floor|.*_foot\d"), com("torso_link")]
