@@ -75,19 +75,6 @@ class Data:
         overflow: ``Overflow`` bits, ``(nworld,)``.
     """
 
-    qpos: wp.array
-    qvel: wp.array
-    act: wp.array
-    qacc_warmstart: wp.array
-    ctrl: wp.array
-    time: wp.array
-    xpos: wp.array
-    xmat: wp.array
-    contact_force: wp.array
-    in_contact: wp.array
-    sensordata: wp.array
-    overflow: wp.array
-
     def __init__(
         self,
         m: mujoco.MjModel,
@@ -313,17 +300,9 @@ class CompiledEngine(Engine):
             self._steps[key] = _kernel(text, *funcs, self._launch_size.registers), start, end
         kernel, start, end = self._steps[key]
         size = self._launch_size
-        wp.launch(
-            kernel,
-            dim=size.threads,
-            inputs=[
-                *(size.worlds_per_warp, size.lanes, mask, start.args(before), end.args(after), self._terrain),
-                self.data.ctrl,
-            ],
-            outputs=[self._rows, *outputs.values()],
-            device=self._device,
-            block_dim=size.block,
-        )
+        inputs = [size.worlds_per_warp, size.lanes, mask, start.args(before), end.args(after), self._terrain]
+        arrays = [self.data.ctrl, self._rows, *outputs.values()]
+        wp.launch(kernel, size.threads, inputs, arrays, device=self._device, block_dim=size.block)
 
 
 def _check_forces(m: mujoco.MjModel, contact_geoms: Sequence[int]) -> None:
