@@ -468,7 +468,9 @@ def resampled(qpos: np.ndarray, fps: float, dt: float) -> np.ndarray:
     share = (frames - before)[:, None]
     one, other = qpos[before], qpos[before + 1]
     found = (1.0 - share) * one + share * other
-    found[:, 3:7] = _turned(one[:, 3:7], share * _rotation(one[:, 3:7], other[:, 3:7]))
+    found[:, 3:7] = one[:, 3:7]
+    for row, turn in zip(found, share * _rotation(one[:, 3:7], other[:, 3:7]), strict=True):
+        mujoco.mju_quatIntegrate(row[3:7], turn, 1.0)
     return found
 
 
@@ -482,22 +484,10 @@ def quat_of(mat: np.ndarray) -> np.ndarray:
 
 def _rotation(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Returns rotation vectors (rad) ``(n, 3)``, in the frames of unit quaternions, that turn these to others."""
-    w = (one * other).sum(1)
-    v = one[:, :1] * other[:, 1:] - other[:, :1] * one[:, 1:] - np.cross(one[:, 1:], other[:, 1:])
-    v = np.where(w[:, None] < 0.0, -v, v)
-    size = np.linalg.norm(v, axis=1)
-    angle = 2.0 * np.arctan2(size, np.abs(w))
-    return v * np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0)[:, None]
-
-
-def _turned(quat: np.ndarray, by: np.ndarray) -> np.ndarray:
-    """Returns unit quaternions ``(n, 4)`` turned by rotation vectors (rad) ``(n, 3)`` of their frames."""
-    angle = np.linalg.norm(by, axis=1, keepdims=True)
-    v = by * 0.5 * np.sinc(0.5 * angle / np.pi)
-    w = np.cos(0.5 * angle)
-    real = quat[:, :1] * w - (quat[:, 1:] * v).sum(1, keepdims=True)
-    found = np.concatenate([real, quat[:, :1] * v + w * quat[:, 1:] + np.cross(quat[:, 1:], v)], axis=1)
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    found = np.empty((len(one), 3))
+    for row, begin, end in zip(found, one, other, strict=True):
+        mujoco.mju_subQuat(row, end, begin)
+    return found
 
 
 def _rate(values: np.ndarray, dt: float) -> np.ndarray:
