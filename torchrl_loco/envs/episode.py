@@ -102,11 +102,8 @@ def observer(
         size: length of an observation.
         coalesced: whether the threads of a warp take neighbouring worlds, and write observations together.
     """
-    write, struct = _observer(func, inputs._cls, size, coalesced)
-    return WorldFunc(write, fill(struct, inputs=inputs, outputs=outputs, non_finite=non_finite))
+    Inputs: Any = inputs._cls  # noqa: N806
 
-
-def _observer(observe: wp.Function, Inputs: Any, size: int, coalesced: bool) -> tuple[wp.Function, Any]:  # noqa: N803
     @wp.struct
     class Observer:
         inputs: Inputs
@@ -118,14 +115,14 @@ def _observer(observe: wp.Function, Inputs: Any, size: int, coalesced: bool) -> 
         out = args.outputs
         if wp.static(coalesced):
             observation = wp.zeros(shape=size, dtype=float)
-            out.reward[world] = observe(world, args.inputs, observation, out.terms[world])
+            out.reward[world] = func(world, args.inputs, observation, out.terms[world])
             write_rows(observation, out.observation[world])
             mark_non_finite(observation, world, args.non_finite)
         else:
-            out.reward[world] = observe(world, args.inputs, out.observation[world], out.terms[world])
+            out.reward[world] = func(world, args.inputs, out.observation[world], out.terms[world])
             mark_non_finite(out.observation[world], world, args.non_finite)
 
-    return write_observation, Observer
+    return WorldFunc(write_observation, fill(Observer, inputs=inputs, outputs=outputs, non_finite=non_finite))
 
 
 @wp.func
@@ -272,11 +269,8 @@ def begin_episode(world: int, args: EpisodeStart):
 
 def poser(func: wp.Function, inputs: Any, stream: wp.array) -> WorldFunc:
     """Returns what draws initial states from ``stream`` ``(nworld,)``, from what a body names in its ``pose_func``."""
-    draw, struct = _poser(func, inputs._cls)
-    return WorldFunc(draw, fill(struct, inputs=inputs, stream=stream))
+    Inputs: Any = inputs._cls  # noqa: N806
 
-
-def _poser(pose: wp.Function, Inputs: Any) -> tuple[wp.Function, Any]:  # noqa: N803
     @wp.struct
     class Poser:
         inputs: Inputs
@@ -284,6 +278,6 @@ def _poser(pose: wp.Function, Inputs: Any) -> tuple[wp.Function, Any]:  # noqa: 
 
     @wp.func
     def draw_pose(world: int, args: Poser):
-        pose(world, args.inputs, args.stream[world])
+        func(world, args.inputs, args.stream[world])
 
-    return draw_pose, Poser
+    return WorldFunc(draw_pose, fill(Poser, inputs=inputs, stream=stream))

@@ -192,15 +192,10 @@ class World:
             self._draw()
             self.seen.append()
 
-    def _look_begun(self) -> None:
+    def _look_begun(self, *, restored: bool = False) -> None:
         if self.seen:
             self._draw_begun()
-            self.seen.begin(self.mask.torch)
-
-    def _look_restored(self) -> None:
-        if self.seen:
-            self._draw_begun()
-            self.seen.begin(self.mask.torch, kept=True)
+            self.seen.begin(self.mask.torch, kept=restored)
 
     # What each world does besides the physics, in Warp.
 
@@ -506,7 +501,7 @@ class World:
         else:
             self._refresh_graph.replay()
         self._observe_restored()
-        self._look_restored()
+        self._look_begun(restored=True)
 
     @functools.cached_property
     def _refresh_graph(self) -> Graph | Direct:
