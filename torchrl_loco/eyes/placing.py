@@ -4,8 +4,8 @@ import mujoco
 import warp as wp
 
 from torchrl_loco.eyes.scene import AT_BODY, AT_COM, OF_COM, TRACKS, Mounts, Shapes, geoms_seen, shapes_of
-from torchrl_loco.eyes.shapes import CAPSULE, CYLINDER, PLANE
 from torchrl_loco.sim import EXCLUSIVE
+from torchrl_loco.sim.compiled.collision.kinds import CAPSULE, CYLINDER, PLANE
 
 WHOLE = wp.constant(wp.float32(1.0e6))
 """Bound of a picture on the plane in front of the camera."""

@@ -6,8 +6,9 @@ import warp as wp
 
 from torchrl_loco.eyes.placing import Placed
 from torchrl_loco.eyes.scene import Shapes, mounts_at, to_the_horizon
-from torchrl_loco.eyes.shapes import MESH, to_mesh, to_shape
+from torchrl_loco.eyes.shapes import to_mesh, to_shape
 from torchrl_loco.sim import EXCLUSIVE, Buffer
+from torchrl_loco.sim.compiled.collision.kinds import MESH
 
 
 @wp.kernel(enable_backward=False)

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from torchrl_loco.eyes.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, FIELD, MESH, PLANE, SPHERE
 from torchrl_loco.sim import fill_from_numbers
+from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, CYLINDER, ELLIPSOID, FIELD, MESH, PLANE, SPHERE
 
 KINDS = (PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)
 """Types of geoms that are seen."""

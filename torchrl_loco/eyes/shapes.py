@@ -3,17 +3,9 @@
 Directions need not have length 1: distances are in lengths of the direction.
 """
 
-import mujoco
 import warp as wp
 
-PLANE = wp.constant(int(mujoco.mjtGeom.mjGEOM_PLANE))
-FIELD = wp.constant(int(mujoco.mjtGeom.mjGEOM_HFIELD))
-SPHERE = wp.constant(int(mujoco.mjtGeom.mjGEOM_SPHERE))
-CAPSULE = wp.constant(int(mujoco.mjtGeom.mjGEOM_CAPSULE))
-ELLIPSOID = wp.constant(int(mujoco.mjtGeom.mjGEOM_ELLIPSOID))
-CYLINDER = wp.constant(int(mujoco.mjtGeom.mjGEOM_CYLINDER))
-BOX = wp.constant(int(mujoco.mjtGeom.mjGEOM_BOX))
-MESH = wp.constant(int(mujoco.mjtGeom.mjGEOM_MESH))
+from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, SPHERE
 
 MISS = wp.constant(wp.float32(1.0e10))
 """The distance of what is not met."""

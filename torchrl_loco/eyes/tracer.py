@@ -9,8 +9,9 @@ import warp as wp
 
 from torchrl_loco.eyes.placing import Placed
 from torchrl_loco.eyes.scene import Looks, Shapes, looks_of, mounts_of, to_the_horizon
-from torchrl_loco.eyes.shapes import MESH, MISS, PLANE, normal_of, to_mesh, to_shape
+from torchrl_loco.eyes.shapes import MISS, normal_of, to_mesh, to_shape
 from torchrl_loco.sim import EXCLUSIVE, Buffer, current_stream
+from torchrl_loco.sim.compiled.collision.kinds import MESH, PLANE
 
 KINDS = ("rgb", "depth", "geoms")
 """What a camera tells of each pixel."""
