@@ -98,14 +98,16 @@ class Monitor(ABC):
         if self._steps // INTERVAL > before // INTERVAL and not self._pending:
             self._request()
         if self._pending and (self._copied is None or self._copied.query()):  # on the CPU the copy is done at once
-            self._pending = False
-            self.report(self._host.tolist())
+            self._arrived()
 
     def check(self) -> None:
         """Requests the numbers, waits for the device, and reports."""
         self._request()
         if self._copied is not None:
             self._copied.synchronize()
+        self._arrived()
+
+    def _arrived(self) -> None:
         self._pending = False
         self.report(self._host.tolist())
 

@@ -16,21 +16,8 @@ import torch
 import torch._subclasses.schema_check_mode  # noqa: F401, which closing needs: an import while garbage is collected may fail
 import warp as wp
 
+from torchrl_loco.envs import episode
 from torchrl_loco.envs.body_funcs import check_pair, check_rows, of_package
-from torchrl_loco.envs.episode import (
-    Control,
-    EpisodeStart,
-    FiniteCheck,
-    Flags,
-    Outputs,
-    StepEnd,
-    apply_action,
-    begin_episode,
-    finish_step,
-    observer,
-    poser,
-    zero_non_finite,
-)
 from torchrl_loco.envs.hooks import PARTS, Hooks, reads_of
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
@@ -204,7 +191,7 @@ class World:
         flags = ("non_finite", "done", "terminated", "truncated", "ended", "cut_off", "mask")
         names = (*flags, "seed", "episode", "stream", "elapsed_steps")
         of_world = SimpleNamespace(**{name: getattr(self, name).warp for name in names}, overflow=data.overflow)
-        of_world.flags, of_world.episode_length = fill(Flags, of_world), task.config.episode_length
+        of_world.flags, of_world.episode_length = fill(episode.Flags, of_world), task.config.episode_length
         self._fused: list[WorldFunc] = []
         self._check_finite: list[WorldFunc] = []
         asked = task.hooks.catalog.arrays
@@ -214,18 +201,18 @@ class World:
             if not of_package(type(task)):  # the tests check those of the package
                 check_rows(func, inputs, n - 1, size, terms, device)
             coalesced = self.sim.engine.coalesced
-            self._fused = [observer(func, inputs, outputs, self.non_finite.warp, size, coalesced=coalesced)]
-            finite = fill(FiniteCheck, data, outputs=outputs, non_finite=self.non_finite.warp)
-            self._check_finite = [] if self._own else [WorldFunc(zero_non_finite, finite)]
+            self._fused = [episode.observer(func, inputs, outputs, self.non_finite.warp, size, coalesced=coalesced)]
+            finite = fill(episode.FiniteCheck, data, outputs=outputs, non_finite=self.non_finite.warp)
+            self._check_finite = [] if self._own else [WorldFunc(episode.zero_non_finite, finite)]
         counted = {"counter_bits": self.health.counter_bits, "counts": self.health.counts.warp}
-        self._finish = WorldFunc(finish_step, fill(StepEnd, of_world, **counted))
+        self._finish = WorldFunc(episode.finish_step, fill(episode.StepEnd, of_world, **counted))
         first = {"world_offset": task.world_offset or 0, "stagger": self._stagger.warp}
-        self._start = [WorldFunc(begin_episode, fill(EpisodeStart, of_world, **first))]
+        self._start = [WorldFunc(episode.begin_episode, fill(episode.EpisodeStart, of_world, **first))]
         self._starts_at_rest = True
         pose = task.pose_func(self) if "begin" not in self._own or "warp.begin" in asked else None
         if pose is not None:
             func, inputs = check_pair("pose_func", pose)
-            self._start.append(poser(func, inputs, self.stream.warp))
+            self._start.append(episode.poser(func, inputs, self.stream.warp))
             self._starts_at_rest = not holds(inputs, data.qvel)
 
     def _fused_outputs(self, task: "LocoEnv") -> tuple[Any, int, int]:
@@ -239,14 +226,14 @@ class World:
         if "reward" in self._own:
             reward, terms = Buffer(n, float, device), Buffer((n, len(cls.term_names)), float, device)
         self._kept_alive = observation, reward, terms
-        outputs = fill(Outputs, observation=observation.warp, reward=reward.warp, terms=terms.warp)
+        outputs = fill(episode.Outputs, observation=observation.warp, reward=reward.warp, terms=terms.warp)
         return outputs, observation.warp.shape[1], terms.warp.shape[1]
 
     def _launch_step(self, action: wp.array | None = None) -> None:
         """The physics of a step, under actions ``(nworld, nu)`` or those in the buffer; without hooks, all of it."""
         sim, action = self.sim, self.action.warp if action is None else action
         control = {"ctrlrange": sim.model.actuator_ctrlrange, "ctrl": sim.data.ctrl, "non_finite": self.non_finite.warp}
-        apply = [WorldFunc(apply_action, fill(Control, action=action, **control))]
+        apply = [WorldFunc(episode.apply_action, fill(episode.Control, action=action, **control))]
         around = Around(
             first=[func for monitor in self._monitors for func in monitor.first_of_step(action)],
             before=[] if "control" in self._own else apply,
