@@ -469,22 +469,21 @@ def test_a_text_is_kept_for_a_model_with_the_same_numbers_alone():
     model, same = (mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>") for _ in "ab")
     varied = step.VariedModel(model, Varied(model, {"body_mass": [1]}))
     other = step.VariedModel(model, Varied(model, {"dof_damping": [0]}))
-    options = {"with_cvel": False, "with_subtree_com": False, "contact_geoms": ()}
 
     def texts():
         return [
-            *(step.kept_source(m, 1, **options) for m in (model, varied, other)),
-            step.kept_source(model, 2, **options),
-            *(step.kept_source(model, 1, **{**options, name: True}) for name in ("with_cvel", "with_subtree_com")),
-            step.kept_source(model, 1, **{**options, "contact_geoms": (0,)}),
+            *(step.kept_source(m, 1) for m in (model, varied, other)),
+            step.kept_source(model, 2),
+            *(step.kept_source(model, 1, step.Asked(**{name: True})) for name in ("with_cvel", "with_subtree_com")),
+            step.kept_source(model, 1, step.Asked(contact_geoms=(0,))),
         ]
 
     first = texts()
     assert len(set(first)) == len(first)
     assert all(one is other for one, other in zip(texts(), first, strict=True))
-    assert step.kept_source(same, 1, **options) is first[0] == step.source(model, 1)
+    assert step.kept_source(same, 1) is first[0] == step.source(model, 1)
     same.dof_damping[0] = 1e-3
-    assert step.kept_source(same, 1, **options) == step.source(same, 1) != first[0]
+    assert step.kept_source(same, 1) == step.source(same, 1) != first[0]
 
 
 def test_settings_of_room_change_nothing():

@@ -83,9 +83,9 @@ def stepped(library, text, before, *, last_first):
 def with_lanes(sim, folder):
     """Returns the library of a simulation's step, its text, what it begins with, and where the simulation writes."""
     engine, outputs = sim.engine, sim.engine.data.outputs()
-    asked = {f"with_{name}": outputs[name] is not None for name in LATER}
-    asked |= {"contact_geoms": engine._contact_geoms, "contact_rows": engine._contact_rows}
-    text = step.source(engine._mj_model, engine._substeps, **asked)
+    with_cvel, with_com = (outputs[name] is not None for name in LATER)
+    asked = step.Asked(with_cvel, with_com, engine._contact_geoms, engine._contact_rows)
+    text = step.source(engine._mj_model, engine._substeps, asked)
     outputs = {name: array.numpy() for name, array in outputs.items() if array is not None and array.size}
     before = {"ctrl_in": engine.data.ctrl.numpy(), "terrain_in": engine._terrain.numpy()}
     before["numbers_out"] = engine._rows.numpy()

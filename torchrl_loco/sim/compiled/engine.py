@@ -16,6 +16,7 @@ from torchrl_loco.sim.compiled.collision.ground import Ground
 from torchrl_loco.sim.compiled.collision.pairs import stand_ins
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel
 from torchrl_loco.sim.compiled.read_only import ReadOnly, read_only
+from torchrl_loco.sim.compiled.schedules.shared import Asked
 from torchrl_loco.sim.compiled.step import (
     WARP,
     check_worlds,
@@ -292,9 +293,9 @@ class CompiledEngine(Engine):
         outputs = self.data.outputs()
         key = substeps, contact_geoms, *(func for func, _ in before), None, *(func for func, _ in after)
         if key not in self._steps:
-            asked: dict[str, Any] = {f"with_{name}": outputs[name] is not None for name in LATER}
-            asked |= {"contact_geoms": contact_geoms, "contact_rows": self._contact_rows}
-            text = kept_source(self._mj_model, substeps, **asked)
+            with_cvel, with_com = (outputs[name] is not None for name in LATER)
+            asked = Asked(with_cvel, with_com, contact_geoms, self._contact_rows)
+            text = kept_source(self._mj_model, substeps, asked)
             start, end = Chain(before), Chain(after)
             funcs = start.func, start.struct, end.func, end.struct
             self._steps[key] = _kernel(text, *funcs, self._launch_size.registers), start, end

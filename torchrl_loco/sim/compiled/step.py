@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import mujoco
@@ -13,6 +13,7 @@ from torchrl_loco.sim.compiled.collision.pairs import needs_lanes
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel, nominal
 from torchrl_loco.sim.compiled.physics.sensors import AT_SITES
 from torchrl_loco.sim.compiled.schedules import lanes, traced
+from torchrl_loco.sim.compiled.schedules.shared import NO_MORE, Asked
 
 TRACED_DOFS = 16
 """Most degrees of freedom of a body that is traced. A thread holds its state; for the humanoid that would be 12 KiB and
@@ -70,45 +71,23 @@ def check_worlds(m: mujoco.MjModel, num_envs: int, device: wp.Device) -> None:
         raise ValueError(f"num_envs={num_envs} is too large: Warp addresses {most} worlds with its 32 bits")
 
 
-def source(
-    m: mujoco.MjModel,
-    substeps: int,
-    *,
-    with_cvel: bool = False,
-    with_subtree_com: bool = False,
-    contact_geoms: Sequence[int] = (),
-    contact_rows: int = 1,
-) -> str:
+def source(m: mujoco.MjModel, substeps: int, asked: Asked = NO_MORE) -> str:
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 
     Args:
         m: the model, or a ``VariedModel``.
         substeps: physics steps; 0 evaluates the state without stepping.
-        with_cvel: whether the velocities of the bodies are written.
-        with_subtree_com: whether the centers of mass of the trees are written.
-        contact_geoms: geoms whose contact forces are written.
-        contact_rows: how many rows of them: one for the last substep, or one for each.
+        asked: what it writes beside the state.
     """
-    asked: dict[str, Any] = {
-        "with_subtree_com": with_subtree_com,
-        "contact_geoms": contact_geoms,
-        "contact_rows": contact_rows,
-    }
-    if not is_traced(m):  # lanes write cvel wherever there is an array for it
-        return lanes.source(m, substeps, **asked)
-    return traced.source(m, substeps, with_cvel=with_cvel, **asked)
+    return (traced if is_traced(m) else lanes).source(m, substeps, asked)
 
 
-def kept_source(m: mujoco.MjModel, substeps: int, **options: Any) -> str:
+def kept_source(m: mujoco.MjModel, substeps: int, asked: Asked = NO_MORE) -> str:
     """Returns :func:`source`, which is written once for environments of the same model: it takes up to half a second.
 
-    Args:
-        m: the model, or a ``VariedModel``.
-        substeps: physics steps.
-        options: those of :func:`source`, which can be hashed.
+    What is asked for must be hashable.
     """
-    key = is_traced(m), _fingerprint(m), substeps, *sorted(options.items())
-    return _kept(texts, key, lambda: source(m, substeps, **options))
+    return _kept(texts, (is_traced(m), _fingerprint(m), substeps, asked), lambda: source(m, substeps, asked))
 
 
 def _kept(kept: dict[tuple, Any], key: tuple, make: Callable[[], Any]) -> Any:

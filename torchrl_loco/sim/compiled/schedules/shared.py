@@ -1,6 +1,8 @@
 """The C++ that both schedules share: ``arithmetic.h``, ``laws.h``, ``newton.h`` and ``line_search.h``."""
 
 import pathlib
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from torchrl_loco.sim.overflow import Overflow
 
@@ -15,6 +17,25 @@ MUCH = 1.0
 LAWS = "".join((FOLDER / "physics" / f"{name}.h").read_text() + "\n" for name in ("arithmetic", "laws")) + FLAGS
 """Declarations, for the head of a function."""
 _LINE_SEARCH, _NEWTON = ((FOLDER / "schedules" / f"{name}.h").read_text() for name in ("line_search", "newton"))
+
+
+class Asked(NamedTuple):
+    """What a control step writes beside the state.
+
+    Attributes:
+        with_cvel: whether the velocities of the bodies are written; lanes do wherever there is an array for it.
+        with_subtree_com: whether the centers of mass of the trees are written.
+        contact_geoms: geoms whose contact forces are written.
+        contact_rows: how many rows of them: one for the last substep, or one for each.
+    """
+
+    with_cvel: bool = False
+    with_subtree_com: bool = False
+    contact_geoms: Sequence[int] = ()
+    contact_rows: int = 1
+
+
+NO_MORE = Asked()
 
 
 def line_search(scale: str, tolerance: str, near: str, iterations: str, by_slopes: str = "false") -> str:

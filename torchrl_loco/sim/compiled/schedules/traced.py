@@ -34,15 +34,7 @@ MOST_SHARED = 24 * 1024
 cache, and links are what most of them were for."""
 
 
-def source(
-    m: mujoco.MjModel,
-    substeps: int,
-    *,
-    with_cvel: bool = False,
-    with_subtree_com: bool = False,
-    contact_geoms: Sequence[int] = (),
-    contact_rows: int = 1,
-) -> str:
+def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked) -> str:
     """Returns the C++ of a control step of one world, by the arguments of :func:`.step.source`."""
     world = Block()
     world("if (!live) return;")
@@ -56,10 +48,10 @@ def source(
         world(f"for (int i = 0; i < {count}; ++i) {title}[i] = wp::index({argument}, world, i);")
     world("int overflow = 0;")
     world("const auto flag = [&](int bits) { overflow |= bits; };")
-    if substeps or TOUCH in m.sensor_type or contact_geoms:
+    if substeps or TOUCH in m.sensor_type or asked.contact_geoms:
         if not substeps:
             world("// Touch is a force: a step that is not taken finds it, without actuation.")
-        step, solver = _substep(m, substeps, contact_geoms, contact_rows)
+        step, solver = _substep(m, substeps, asked.contact_geoms, asked.contact_rows)
         for title, count in solver.arrays.items():
             if count and title != "qacc":
                 world(f"float {title}[{count}];")
@@ -84,7 +76,7 @@ def source(
                 world(f"for (int i = 0; i < {getattr(m, size)}; ++i) {row} = {title}[i];")
         world(f"time_out.data[world] += {literal(substeps * m.opt.timestep)};")
         world("overflow_out.data[world] |= overflow;")
-    _outputs(world, m, with_cvel, with_subtree_com)
+    _outputs(world, m, asked)
     return shared.LAWS + world.text() + "\n"
 
 
@@ -166,7 +158,7 @@ def _integrate(block: Block, m: mujoco.MjModel, tree: Dynamics) -> None:
             block.set(f"qpos[{q}]", h * qvel[d], "+=")
 
 
-def _outputs(world: Block, m: mujoco.MjModel, with_cvel: bool, with_subtree_com: bool) -> None:
+def _outputs(world: Block, m: mujoco.MjModel, asked: shared.Asked) -> None:
     """Appends what an observation reads: poses and velocities of the bodies, and sensors, of the present state.
 
     Constants are left out: they are in the arrays from the start.
@@ -177,9 +169,9 @@ def _outputs(world: Block, m: mujoco.MjModel, with_cvel: bool, with_subtree_com:
         "xmat": [orientation.flat for orientation in tree.poses.xmat],
         "sensordata": [[x] for x in sensors.read(m, tree, TouchSensors(m, tree.poses))],
     }
-    if with_cvel:
+    if asked.with_cvel:
         rows["cvel"] = tree.cvel
-    if with_subtree_com:
+    if asked.with_subtree_com:
         rows["subtree_com"] = [tree.com[b] if b and m.body_rootid[b] == b else () for b in range(m.nbody)]
     for title, row in rows.items():
         for i, element in enumerate(row):

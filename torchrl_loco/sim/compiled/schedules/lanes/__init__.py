@@ -8,8 +8,6 @@ needs it.
 """
 
 import pathlib
-from collections.abc import Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -63,23 +61,15 @@ NEWTON = shared.newton(
 )
 
 
-def source(
-    m: mujoco.MjModel,
-    substeps: int,
-    *,
-    with_subtree_com: bool = False,
-    contact_geoms: Sequence[int] = (),
-    contact_rows: int = 1,
-) -> str:
+def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked = shared.NO_MORE) -> str:
     """Returns the C++ of a control step of one world, by the arguments of :func:`.step.source`."""
     d = Description(m)
-    contacts: dict[str, Any] = {"contact_geoms": contact_geoms, "contact_rows": contact_rows}
-    tables = members(d, substeps, with_subtree_com=with_subtree_com, **contacts)
+    tables, count = members(d, substeps, asked), len(asked.contact_geoms)
     parts = {
-        "SUBTREE_COM": with_subtree_com,
+        "SUBTREE_COM": asked.with_subtree_com,
         "MOMENTA": len(d.momenta) > 0,
-        "CONTACT_GEOMS": len(contact_geoms) > 0,
-        "KEPT_CONTACTS": len(contact_geoms) > 0 or len(d.wrenches) > 0,
+        "CONTACT_GEOMS": count > 0,
+        "KEPT_CONTACTS": count > 0 or len(d.wrenches) > 0,
         "ELLIPTIC": d.elliptic,
         "TURNING": d.layout.directions > 3,
         "SOME_LACK_EDGES": d.some_lack_edges,
@@ -96,7 +86,7 @@ def source(
         "WRENCHES": len(d.wrenches) > 0,
         **{function.upper(): function in d.functions for function in FUNCTIONS},
     }
-    defined = [f"#define WITH_{part} {asked:d}" for part, asked in parts.items()]
+    defined = [f"#define WITH_{part} {needed:d}" for part, needed in parts.items()]
     text = "\n".join([*defined, HEADERS, *(f"#undef WITH_{part}" for part in parts), ""])
     text = tables.use(text.replace("//ACTUATOR", d.actuator().as_cpp()))
     for mark, value in {
@@ -117,4 +107,4 @@ def source(
 
 def nominal_row(m: VariedModel) -> np.ndarray:
     """Returns what the lanes read of the model itself: its numbers, then what follows from them."""
-    return members(Description(m), 0).row.nominal(m.varied)
+    return members(Description(m), 0, shared.NO_MORE).row.nominal(m.varied)

@@ -29,6 +29,7 @@ from torchrl_loco.sim.compiled.physics.links import matrix
 from torchrl_loco.sim.compiled.physics.sensors import GYRO, TORQUE, subtree
 from torchrl_loco.sim.compiled.schedules.lanes.description import LANES, Description, dofs_of, is_implicitfast
 from torchrl_loco.sim.compiled.schedules.lanes.layout import pad
+from torchrl_loco.sim.compiled.schedules.shared import Asked
 
 TRANSLATION, ROTATION = 0, 1
 """Kinds of a degree of freedom in ``world.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
@@ -40,14 +41,7 @@ MOST_ROUNDS = 4
 """Pairs of geoms whose bounding spheres a lane compares side by side, at most."""
 
 
-def members(
-    d: Description,
-    substeps: int,
-    *,
-    with_subtree_com: bool = False,
-    contact_geoms: Sequence[int] = (),
-    contact_rows: int = 1,
-) -> Tables:
+def members(d: Description, substeps: int, asked: Asked) -> Tables:
     """Returns structs ``Model`` and ``Varied``."""
     m, layout = d.m, d.layout
     tables = Tables(m.varied.count if isinstance(m, VariedModel) else 0)
@@ -86,11 +80,11 @@ def members(
     _add_geoms(tables, d, mask)
     _add_limits(tables, d)
     _add_outputs(tables, d)
-    if with_subtree_com:
+    if asked.with_subtree_com:
         tables.integers("root_body", d.roots)
-    tables.size(CONTACT_GEOMS=len(contact_geoms), HISTORY=contact_rows)
-    if contact_geoms:
-        _add_contact_geoms(tables, d, contact_geoms)
+    tables.size(CONTACT_GEOMS=len(asked.contact_geoms), HISTORY=asked.contact_rows)
+    if asked.contact_geoms:
+        _add_contact_geoms(tables, d, asked.contact_geoms)
     return tables
 
 
