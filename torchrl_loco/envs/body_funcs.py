@@ -49,13 +49,20 @@ def check_rows(func: wp.Function, inputs: Any, world: int, size: int, terms: int
             f"{func.key} must take the index of the world, the inputs, the row of the observation and that of the "
             f"terms, got the parameters {', '.join(func.input_types)}"
         )
-    kernel = _writer(func, inputs._cls)
+    Inputs: Any = inputs._cls  # noqa: N806
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def write_rows(
+        world: int, inputs: Inputs, observation: wp.array[float], terms: wp.array[float], reward: wp.array[float]
+    ):
+        reward[0] = func(world, inputs, observation, terms)
+
     rows = {"observation_size": size, "the number of term_names": terms}
     written = {name: np.zeros(length + 2 * AROUND, dtype=bool) for name, length in rows.items()}
     for before in (-1.5e30, 2.5e30):  # the function may write one of them
         memory = [wp.full(length + 2 * AROUND, before, dtype=float, device=device) for length in rows.values()]
         parts = [numbers[AROUND : numbers.size - AROUND] for numbers in memory]
-        wp.launch(kernel, 1, [world, inputs, *parts, wp.zeros(1, dtype=float, device=device)], device=device)
+        wp.launch(write_rows, 1, [world, inputs, *parts, wp.zeros(1, dtype=float, device=device)], device=device)
         for name, numbers in zip(rows, memory, strict=True):
             written[name] |= numbers.numpy() != np.float32(before)
     for name, length in rows.items():
@@ -69,16 +76,6 @@ def check_rows(func: wp.Function, inputs: Any, world: int, size: int, terms: int
 def _some(numbers: list[int]) -> str:
     """Returns the first few of some numbers, as text."""
     return ", ".join(map(str, numbers[:5])) + (", ..." if len(numbers) > 5 else "")
-
-
-def _writer(observe: wp.Function, Inputs: Any) -> wp.Kernel:  # noqa: N803
-    @wp.kernel(enable_backward=False, module="unique")
-    def write_rows(
-        world: int, inputs: Inputs, observation: wp.array[float], terms: wp.array[float], reward: wp.array[float]
-    ):
-        reward[0] = observe(world, inputs, observation, terms)
-
-    return write_rows
 
 
 def of_package(cls: type) -> bool:

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 import torch
 import warp as wp
@@ -13,6 +12,7 @@ from torchrl_loco.eyes.rays import Rays
 from torchrl_loco.eyes.tracer import Eye
 from torchrl_loco.sim import Buffer, fill_from_numbers
 from torchrl_loco.sim.compiled.collision.ground import NOTHING
+from torchrl_loco.sim.corners import axes_of
 
 if TYPE_CHECKING:
     from torchrl_loco.sim import Simulation
@@ -194,9 +194,7 @@ def eye_of(sim: "Simulation", asked: DepthRequest | RayRequest) -> Eye | Rays:
     m, n = sim.mj_model, sim.num_envs
     if isinstance(asked, DepthRequest):
         return Eye(m, sim.device, asked.camera, asked.width, asked.height, n, ("depth",), far=asked.far)
-    mat = np.zeros(9)
-    mujoco.mju_quat2Mat(mat, m.site_quat[asked.site])
-    place = int(m.site_bodyid[asked.site]), m.site_pos[asked.site], mat.reshape(3, 3)
+    place = int(m.site_bodyid[asked.site]), m.site_pos[asked.site], axes_of(m.site_quat[asked.site])
     return Rays(m, sim.device, *place, np.array(asked.directions), n, asked.far)
 
 

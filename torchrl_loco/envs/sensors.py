@@ -3,8 +3,9 @@
 from typing import Any
 
 import mujoco
-import numpy as np
 import torch
+
+from torchrl_loco.sim.corners import axes_of
 
 FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 Sensor, Object = mujoco.mjtSensor, mujoco.mjtObj
@@ -49,14 +50,8 @@ def _offset(s: Any, kind: str, ids: list[int]) -> tuple[list[int], torch.Tensor,
     else:
         bodies = [int(body) for body in getattr(m, f"{kind}_bodyid")[ids]]
         position, quaternion = getattr(m, f"{kind}_pos"), getattr(m, f"{kind}_quat")
-    axes = s._catalog.derived((kind, "axes", key), lambda: [_matrix(quaternion[i]) for i in ids])
+    axes = s._catalog.derived((kind, "axes", key), lambda: [axes_of(quaternion[i]) for i in ids])
     return bodies, s._catalog.derived((kind, "position", key), lambda: position[ids]), axes
-
-
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix.reshape(3, 3)
 
 
 def _lever(s: Any, kind: str, ids: list[int], one: bool) -> tuple[list[int], torch.Tensor]:

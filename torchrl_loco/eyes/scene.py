@@ -10,6 +10,7 @@ import warp as wp
 
 from torchrl_loco.sim import fill_from_numbers
 from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, CYLINDER, ELLIPSOID, FIELD, MESH, PLANE, SPHERE
+from torchrl_loco.sim.corners import axes_of
 
 KINDS = (PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)
 """Types of geoms that are seen."""
@@ -102,9 +103,7 @@ def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device) -> Mounts:
         return np.concatenate([cameras[[camera]], of_lights[lights]])
 
     mode = of(m.cam_mode, m.light_mode)
-    frames = [np.zeros(9)]
-    mujoco.mju_quat2Mat(frames[0], m.cam_quat[camera])
-    fixed = [frames[0].reshape(3, 3), *(facing(m.light_dir[light]) for light in lights)]
+    fixed = [axes_of(m.cam_quat[camera]), *(facing(m.light_dir[light]) for light in lights)]
     whole = [m.cam_mat0[camera].reshape(3, 3), *(facing(m.light_dir0[light]) for light in lights)]
     tracks, of_com = mode == TRACKS, mode == OF_COM
     pos = np.where(tracks[:, None], of(m.cam_pos0, m.light_pos0), of(m.cam_pos, m.light_pos))
@@ -149,16 +148,13 @@ def shapes_of(m: mujoco.MjModel, device: wp.Device) -> tuple[Shapes, list[wp.Mes
             meshes[key] = mesh(*(of_mesh if kind == MESH else of_field)(m, key[1]), device)
         ids.append(meshes[key].id if key in meshes else 0)
     kinds = [MESH if kind == FIELD else kind for kind in kinds]
-    mats = np.zeros((len(alone), 9))
-    for row, g in zip(mats, alone, strict=True):
-        mujoco.mju_quat2Mat(row, m.geom_quat[g])
     owner = np.zeros(0)
     rows = {
         "geom": [*alone],
         "kind": kinds,
         "body": [*m.geom_bodyid[alone]],
         "pos": [*m.geom_pos[alone]],
-        "mat": [*mats.reshape(-1, 3, 3)],
+        "mat": [axes_of(m.geom_quat[g]) for g in alone],
         "size": [*m.geom_size[alone]],
         "radius": [*m.geom_rbound[alone]],
         "mesh": ids,
@@ -176,13 +172,11 @@ def triangles(m: mujoco.MjModel, geoms: list[int]) -> tuple[np.ndarray, np.ndarr
     """Returns points and triangles of height fields and boxes of the world, and of each triangle its geom."""
     points, faces, owner, count = [], [], [], 0
     for g in geoms:
-        mat = np.zeros(9)
-        mujoco.mju_quat2Mat(mat, m.geom_quat[g])
         if m.geom_type[g] == BOX:
             own, of_own = EDGES * m.geom_size[g], np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
         else:
             own, of_own = of_field(m, int(m.geom_dataid[g]))
-        points.append(own @ mat.reshape(3, 3).T + m.geom_pos[g])
+        points.append(own @ axes_of(m.geom_quat[g]).T + m.geom_pos[g])
         faces.append(of_own + count)
         owner.append(np.full(len(of_own), g))
         count += len(own)

@@ -87,6 +87,12 @@ def spheres(m: mujoco.MjModel, geom: int) -> list[tuple[np.ndarray, float]]:
         places = [corner * max(0.0, 1.0 - radius / np.linalg.norm(corner)) for corner in np.unique(corners, axis=0)]
     else:
         places = list(DIAGONALS * (size - radius))
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, m.geom_quat[geom])
-    return [(m.geom_pos[geom] + turn.reshape(3, 3) @ place, radius) for place in places]
+    axes = axes_of(m.geom_quat[geom])
+    return [(m.geom_pos[geom] + axes @ place, radius) for place in places]
+
+
+def axes_of(quaternion: np.ndarray) -> np.ndarray:
+    """Returns the matrix ``(3, 3)`` of a rotation: the axes of a frame as columns."""
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, quaternion)
+    return axes.reshape(3, 3)

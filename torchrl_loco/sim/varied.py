@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from torchrl_loco.sim.corners import axes_of
+
 FIELDS = (
     *("geom_friction", "pair_friction", "body_mass", "body_inertia", "body_ipos"),
     *("dof_damping", "dof_armature", "dof_frictionloss", "jnt_stiffness"),
@@ -92,10 +94,9 @@ class Varied:
         for frames in (m.body_sameframe, m.geom_sameframe, m.site_sameframe):
             frames[:] = 0  # some were the same, which MuJoCo would go by
         for body in range(1, m.nbody):
-            axes, offset = np.zeros(9), self._mj_model.body_ipos[body] - m.body_ipos[body]
-            mujoco.mju_quat2Mat(axes, m.body_iquat[body])
+            offset = self._mj_model.body_ipos[body] - m.body_ipos[body]
             boxes = slice(m.body_bvhadr[body], m.body_bvhadr[body] + m.body_bvhnum[body])
-            m.bvh_aabb[boxes, :3] += offset @ axes.reshape(3, 3)
+            m.bvh_aabb[boxes, :3] += offset @ axes_of(m.body_iquat[body])
 
 
 def why_not(mj_model: mujoco.MjModel, name: str, element: int) -> str | None:

@@ -338,10 +338,6 @@ def _search(p: Program, table: Any, x: Any, *, out_int32: bool = False, right: b
     return p.cast(start, p._meta.dtype)
 
 
-def _bucketize(p: Program, x: Any, boundaries: Any, **options: Any) -> Value:
-    return _search(p, boundaries, x, **options)
-
-
 def _index(p: Program, x: Any, indices: Sequence[Any]) -> Value:
     some = [index for index in indices if index is not None]
     has_worlds = isinstance(x, Value) and x.world is not None
@@ -485,6 +481,7 @@ RULES: dict[str, Callable[..., Any]] = {
     **{"expand": _expand, "permute": _permute, "unsqueeze": _unsqueeze, "squeeze": _squeeze, "slice": _slice},
     **{"select": _select, "split": _split, "split_with_sizes": _split, "flip": _flip},
     **{"cat": _cat, "stack": _stack, "constant_pad_nd": _pad, "index_select": _index_select, "index": _index},
-    **{"index_put": _index_put, "gather": _gather, "searchsorted": _search, "bucketize": _bucketize},
+    **{"bucketize": lambda p, x, boundaries, **options: _search(p, boundaries, x, **options)},
+    **{"index_put": _index_put, "gather": _gather, "searchsorted": _search},
 }
 """Operators by name, without overload; what is missing is decomposed as torch does it for its compilers."""

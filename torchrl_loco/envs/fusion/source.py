@@ -110,7 +110,8 @@ class Source:
                 self._compute(target)
         values = ", ".join(self._names[node] for _, node in piece)
         self._lines.append(f"const float {row}[] = {{{values}}};")
-        self._lines.append(f"WRITE_ROW({row}, {_address(piece[0][0])}, {len(piece)}, {piece[0][0].place[2]})")
+        index, first, step = piece[0][0].place
+        self._lines.append(f"WRITE_ROW({row}, {_pointer(index, step)} + {first}, {len(piece)}, {step})")
 
     def _compute(self, node: Node) -> None:
         """Appends statements for a node and its parts, each once."""
@@ -188,11 +189,6 @@ def _pieces(targets: list[Node]) -> list[list[Node]]:
 
 def _pointer(index: int, step: int) -> str:
     return f"p{index}_{step}"
-
-
-def _address(node: Node) -> str:
-    index, first, step = node.place
-    return f"{_pointer(index, step)} + {first}"
 
 
 def _pointers(tensors: Sequence[torch.Tensor], places: set[tuple[int, int, int]]) -> list[str]:

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.ir.parameters import Number, present, varies
+from torchrl_loco.sim.corners import axes_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,10 +58,9 @@ class Mass:
 
 def matrix(quaternion: np.ndarray) -> np.ndarray:
     """Returns the matrix of a quaternion, exact zeros where rounding left something else."""
-    result = np.zeros(9)
-    mujoco.mju_quat2Mat(result, np.asarray(quaternion, float))
+    result = axes_of(np.asarray(quaternion, float))
     result[np.abs(result) < 1e-12] = 0
-    return result.reshape(3, 3)
+    return result
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
