@@ -5,9 +5,8 @@ things keep that gradient reliable: the critic is a distribution over returns, i
 actor minimises the KL divergence from the policy that collected the data wherever it exceeds a bound.
 """
 
-import contextlib
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -15,6 +14,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor
 from torch import nn
 from torch.nn.functional import cross_entropy, mse_loss
+from torchrl.objectives.utils import hold_out_net
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from torchrl_loco.encoder import PixelEncoder
@@ -200,7 +200,7 @@ class REPPO(Algorithm):
         config, temperature, kl_weight = self.config, self.dual.temperature, self.dual.kl_weight
         names = self.spaces.critic_key, "loc", "scale"
         noise, observation = torch.randn_like(minibatch["loc"]), self.observed(minibatch)
-        with frozen(self.critic):
+        with hold_out_net(self.critic):  # gradients pass through it, but not to its parameters
             loss, entropy, divergence, exceeded = self._compiled_actor_losses(
                 observation, *(minibatch[name] for name in names), noise, temperature.detach(), kl_weight.detach()
             )
@@ -234,19 +234,6 @@ class REPPO(Algorithm):
         exceeded = divergence >= self.config.kl_bound
         loss = torch.where(exceeded, kl_weight * divergence, temperature * log_prob - value).mean()
         return loss, -log_prob.detach().mean(), divergence.detach().mean(), exceeded.float().mean()
-
-
-@contextlib.contextmanager
-def frozen(module: nn.Module) -> Iterator[None]:
-    """Lets what is computed with a module pass gradients on to its inputs, but not to its parameters."""
-    trained = [parameter for parameter in module.parameters() if parameter.requires_grad]
-    for parameter in trained:
-        parameter.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for parameter in trained:
-            parameter.requires_grad_(True)
 
 
 class DualVariables(nn.Module):
