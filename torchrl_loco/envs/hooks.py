@@ -189,21 +189,11 @@ class Hooks:
             rows |= {"warp.observation": [0.0] * catalog.warp_outputs, "warp.reward": 0.0}
         arrays = {name: torch.as_tensor(row, dtype=torch.float32).to(device) for name, row in rows.items()}
         arrays = {name: row.repeat(n, *[1] * row.ndim) for name, row in arrays.items()}
-        kept: dict[str, Any] = {"device": device}
-        arrays |= {
-            f"memory.{name}": torch.zeros(n, *shape, dtype=kind, **kept)
-            for name, (shape, kind) in catalog.memory.items()
-        }
-        arrays |= {
-            f"shared.{name}": torch.zeros(shape, dtype=kind, **kept) for name, (shape, kind) in catalog.shared.items()
-        }
-        arrays |= {f"shared.{name}": start.clone() for name, start in catalog.starts.items()}
-        zeros = torch.zeros(n, dtype=torch.long, **kept)
-        arrays |= {
-            "seed": zeros[:1],
-            "world": torch.arange(n, **kept),
-            "ended": torch.zeros(n, dtype=torch.bool, **kept),
-        }
+        memory, shared = catalog.zeros()
+        arrays |= {f"memory.{name}": rows for name, rows in memory.items()}
+        arrays |= {f"shared.{name}": catalog.starts.get(name, values).clone() for name, values in shared.items()}
+        zeros = torch.zeros(n, dtype=torch.long, device=device)
+        arrays |= {"seed": zeros[:1], "world": torch.arange(n, device=device), "ended": zeros.bool()}
         return {**arrays, "episode": zeros, "elapsed_steps": zeros}
 
     def _probe(self, arrays: dict[str, torch.Tensor]) -> None:

@@ -90,6 +90,14 @@ class Catalog(Elements):
         self._tables: dict[Any, torch.Tensor] = {}
         self._places: dict[tuple[int, int], torch.Tensor] = {}
 
+    def zeros(self) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+        """Returns the entries of memory ``(num_envs, *shape)``, and of what worlds share, all of them zero."""
+        kept: dict[str, Any] = {"device": self.device}
+        memory = {
+            name: torch.zeros(self.num_envs, *shape, dtype=kind, **kept) for name, (shape, kind) in self.memory.items()
+        }
+        return memory, {name: torch.zeros(shape, dtype=kind, **kept) for name, (shape, kind) in self.shared.items()}
+
     def pick(self, values: torch.Tensor, ids: list[int], one: bool) -> torch.Tensor:
         """Returns the columns ``ids`` of an array ``(num_envs, count, ...)``, without their dimension for one."""
         if one:

@@ -108,14 +108,7 @@ class World:
             self.reward, self.terms = Buffer.around(reward), Buffer.around(terms.view(n, -1))
             self.metrics = metrics.view(n, -1)
             self.done, self.terminated, self.truncated = map(Buffer.around, flags.view(3, n))
-            self.memory = {
-                name: torch.zeros(n, *shape, dtype=dtype, device=task.device)
-                for name, (shape, dtype) in hooks.catalog.memory.items()
-            }
-            self.shared = {
-                name: torch.zeros(shape, dtype=dtype, device=task.device)
-                for name, (shape, dtype) in hooks.catalog.shared.items()
-            }
+            self.memory, self.shared = hooks.catalog.zeros()
             self.mask = Buffer(n, bool, device)
             self.stream = Buffer(n, wp.uint32, device)
             self.episode = Buffer(n, int, device)
