@@ -58,11 +58,6 @@ def groups_of(env: EnvBase) -> list[str]:
     return [key for key, spec in env.observation_spec.items() if not isinstance(spec, Composite)]
 
 
-def observations(td: TensorDictBase, groups: list[str]) -> Any:
-    """Returns the tensor of the policy, or a dictionary where there are further groups."""
-    return td["observation"] if groups == ["observation"] else {key: td[key] for key in groups}
-
-
 def to_numpy(data: Any) -> Any:
     """Returns a tensor, or those of a dictionary, as arrays on the host."""
     return {key: x.numpy(force=True) for key, x in data.items()} if isinstance(data, dict) else data.numpy(force=True)
@@ -76,20 +71,28 @@ def rows_as_objects(data: Any, mask: np.ndarray) -> np.ndarray:
     return rows
 
 
-def check_render_mode(mode: str | None) -> str | None:
-    """Returns a render mode, which may be ``None``.
+class Wrapped:
+    """What wrappers share that make pictures: the environment, its groups of observations and its camera."""
 
-    Raises:
-        ValueError: there is no such mode.
-    """
-    return None if mode is None else check_choice("render_mode", mode, RENDER_MODES)
+    def _wrap(
+        self, env: Any, num_envs: int | None, settings: dict[str, Any], mode: str | None, picture: tuple[str, int, int]
+    ) -> None:
+        self.render_mode = None if mode is None else check_choice("render_mode", mode, RENDER_MODES)
+        self.env, self._picture = made(env, num_envs, settings), picture
+        self._groups = groups_of(self.env)
 
+    def _render_metadata(self) -> dict[str, Any]:
+        """Returns what Gymnasium's metadata say of pictures."""
+        return {"render_modes": list(RENDER_MODES), "render_fps": round(1 / base_of(self.env).config.ctrl_dt)}
 
-def render_metadata(env: EnvBase) -> dict[str, Any]:
-    """Returns what Gymnasium's metadata say of pictures."""
-    return {"render_modes": list(RENDER_MODES), "render_fps": round(1 / base_of(env).config.ctrl_dt)}
+    def _seen(self, td: TensorDictBase) -> Any:
+        """Returns the tensor of the policy, or a dictionary where there are further groups."""
+        return td["observation"] if self._groups == ["observation"] else {key: td[key] for key in self._groups}
 
+    def _pictures(self) -> np.ndarray:
+        """Returns the current picture of each world, uint8 ``(num_envs, height, width, 3)``."""
+        return base_of(self.env).render(*self._picture).numpy(force=True)
 
-def pictures(env: EnvBase, picture: tuple[str, int, int]) -> np.ndarray:
-    """Returns the current picture of each world, uint8 ``(num_envs, height, width, 3)``."""
-    return base_of(env).render(*picture).numpy(force=True)
+    def close(self) -> None:
+        """Frees the memory of the worlds."""
+        self.env.close()

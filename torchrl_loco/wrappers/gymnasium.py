@@ -19,7 +19,7 @@ from torchrl_loco.wrappers.spaces import box, observation_space
 ARRAYS = ("numpy", "torch")
 
 
-class GymnasiumEnv(Env):
+class GymnasiumEnv(common.Wrapped, Env):
     """One world as Gymnasium's ``Env``, in NumPy arrays; ``reset()`` begins its next episode.
 
     For many worlds :class:`GymnasiumVectorEnv` is far quicker.
@@ -51,14 +51,11 @@ class GymnasiumEnv(Env):
         height: int = 240,
         **settings: Any,
     ) -> None:
-        self.render_mode = common.check_render_mode(render_mode)
-        self._picture = (camera, width, height)
-        self.env = common.made(env, None, settings)
+        self._wrap(env, None, settings, render_mode, (camera, width, height))
         if self.env.batch_size[0] != 1:
             raise ValueError(f"the environment has {self.env.batch_size[0]} worlds: take GymnasiumVectorEnv")
-        self.metadata = common.render_metadata(self.env)
+        self.metadata = self._render_metadata()
         self.observation_space, self.action_space = observation_space(self.env), box(self.env.action_spec)
-        self._groups = common.groups_of(self.env)
         self._td: TensorDictBase | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -99,19 +96,15 @@ class GymnasiumEnv(Env):
         return self._observation(after), float(after["reward"]), terminated, truncated, infos
 
     def _observation(self, td: TensorDictBase) -> Any:
-        seen = common.to_numpy(common.observations(td, self._groups))
+        seen = common.to_numpy(self._seen(td))
         return {name: rows[0] for name, rows in seen.items()} if isinstance(seen, dict) else seen[0]
 
     def render(self) -> Any:
         """Returns the current picture, uint8 ``(height, width, 3)``, or ``None`` without a render mode."""
-        return None if self.render_mode is None else common.pictures(self.env, self._picture)[0]
-
-    def close(self) -> None:
-        """Frees the memory of the world."""
-        self.env.close()
+        return None if self.render_mode is None else self._pictures()[0]
 
 
-class GymnasiumVectorEnv(VectorEnv):
+class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
     """An environment as Gymnasium's ``VectorEnv``, with its autoreset mode ``SAME_STEP``.
 
     Spaces, observations and actions are those of the task. A task with ``observation`` alone has a ``Box``; one with
@@ -160,16 +153,13 @@ class GymnasiumVectorEnv(VectorEnv):
         **settings: Any,
     ) -> None:
         self._torch = check_choice("arrays", arrays, ARRAYS) == "torch"
-        self.render_mode = common.check_render_mode(render_mode)
-        self._picture = (camera, width, height)
-        self.env = common.made(env, num_envs, settings)
+        self._wrap(env, num_envs, settings, render_mode, (camera, width, height))
         self.num_envs = self.env.batch_size[0]
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, **common.render_metadata(self.env)}
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, **self._render_metadata()}
         self.single_observation_space = observation_space(self.env)
         self.single_action_space = box(self.env.action_spec)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._groups = common.groups_of(self.env)
         self._td: TensorDictBase | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -191,7 +181,7 @@ class GymnasiumVectorEnv(VectorEnv):
         else:
             rows = torch.as_tensor(mask, device=self.env.device).unsqueeze(-1)
             self._td = self.env.reset(self._td.copy().set("_reset", rows))
-        return self._convert(common.observations(self._td, self._groups)), {}
+        return self._convert(self._seen(self._td)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Steps all worlds under actions, an array or a tensor ``(num_envs, ...)``, and resets those that are done.
@@ -211,11 +201,11 @@ class GymnasiumVectorEnv(VectorEnv):
         )
         infos = {}
         if self._torch or done.any():
-            last = self._convert(common.observations(after, self._groups))
+            last = self._convert(self._seen(after))
             infos = {"final_obs": last if self._torch else common.rows_as_objects(last, done), "_final_obs": done}
         if "reward_terms" in after:
             infos["reward_terms"] = {k: self._convert(x.squeeze(-1)) for k, x in after["reward_terms"].items()}
-        return self._convert(common.observations(self._td, self._groups)), rewards, terminations, truncations, infos
+        return self._convert(self._seen(self._td)), rewards, terminations, truncations, infos
 
     def _convert(self, data: Any) -> Any:
         return data if self._torch else common.to_numpy(data)
@@ -228,7 +218,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """
         if self.render_mode is None:
             raise ValueError('nothing can be rendered: make the environment with render_mode="rgb_array"')
-        return tuple(common.pictures(self.env, self._picture))
+        return tuple(self._pictures())
 
     def close_extras(self, **_: Any) -> None:
         """Frees the memory of the worlds."""

@@ -11,7 +11,7 @@ from torchrl_loco.wrappers import common
 from torchrl_loco.wrappers.spaces import box, observation_space
 
 
-class StableBaselines3VecEnv(VecEnv):
+class StableBaselines3VecEnv(common.Wrapped, VecEnv):
     """An environment as Stable-Baselines3's ``VecEnv``: all data is copied to the host, as NumPy arrays.
 
     A task with ``observation`` alone has a ``Box``; one with further groups, such as ``privileged``, has a ``Dict`` of
@@ -52,13 +52,10 @@ class StableBaselines3VecEnv(VecEnv):
         height: int = 240,
         **settings: Any,
     ) -> None:
-        self.render_mode = common.check_render_mode(render_mode)
-        self._picture = (camera, width, height)
-        self.env = common.made(env, num_envs, settings)
+        self._wrap(env, num_envs, settings, render_mode, (camera, width, height))
         self.num_envs = self.env.batch_size[0]
         super().__init__(self.num_envs, observation_space(self.env), box(self.env.action_spec))
-        self.metadata = common.render_metadata(self.env)
-        self._groups = common.groups_of(self.env)
+        self.metadata = self._render_metadata()
 
     def reset(self) -> Any:
         """Returns the first observations of all worlds, under the seed that ``seed()`` was given before, if any."""
@@ -66,7 +63,7 @@ class StableBaselines3VecEnv(VecEnv):
             self.env.set_seed(self._seeds[0])
         self._seeds = [None] * self.num_envs
         self._td = self.env.reset()
-        return common.to_numpy(common.observations(self._td, self._groups))
+        return common.to_numpy(self._seen(self._td))
 
     def step_async(self, actions: np.ndarray) -> None:
         """Takes the actions, ``(num_envs, ...)``; ``step_wait`` steps."""
@@ -85,18 +82,14 @@ class StableBaselines3VecEnv(VecEnv):
         )
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if dones.any():
-            last = common.rows_as_objects(common.to_numpy(common.observations(after, self._groups)), dones)
+            last = common.rows_as_objects(common.to_numpy(self._seen(after)), dones)
             for world in dones.nonzero()[0]:
                 infos[world] = {"terminal_observation": last[world], "TimeLimit.truncated": not terminated[world]}
-        return common.to_numpy(common.observations(self._td, self._groups)), rewards, dones, infos
+        return common.to_numpy(self._seen(self._td)), rewards, dones, infos
 
     def get_images(self) -> list[np.ndarray]:
         """Returns the current picture of each world, uint8 ``(height, width, 3)``, which ``render()`` joins."""
-        return list(common.pictures(self.env, self._picture))
-
-    def close(self) -> None:
-        """Frees the memory of the worlds."""
-        self.env.close()
+        return list(self._pictures())
 
     # The worlds are rows of tensors, no objects: an attribute belongs to all of them.
 
