@@ -10,6 +10,7 @@ from for_each import for_each
 
 from torchrl_loco.config import SimConfig, sim_config
 from torchrl_loco.sim import Simulation, models
+from torchrl_loco.sim.engine import Update
 
 CPU = torch.device("cpu")
 VIEWS = ("qpos", "qvel", "ctrl", "qacc_warmstart", "xpos", "xmat", "time", "overflow")
@@ -95,7 +96,7 @@ def test_forward_at_rest_is_forward_for_worlds_at_rest(body, engine):
         wp.to_torch(mask)[1:] = False
         sim.reset(mask)
         sim.qpos[0, -5:].uniform_(-1, 1, generator=generator)
-        sim.engine.forward(mask, at_rest=at_rest)
+        sim.engine.forward(mask, Update(at_rest=at_rest))
         states.append([wp.to_torch(x).clone() for x in arrays])
     for full, less in zip(*states, strict=True):
         torch.testing.assert_close(less, full, rtol=0, atol=0)

@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import warp as wp
@@ -35,6 +35,22 @@ class Setup:
     contact_geoms: tuple[int, ...] = ()
     varied: Varied | None = None
     contact_rows: int = 1
+
+
+class Update(NamedTuple):
+    """How poses and sensors of worlds are updated.
+
+    Attributes:
+        before: what each of them does first.
+        after: what it does at the end.
+        at_rest: whether they are at rest, which may cost less.
+        contacts: whether contact forces are found.
+    """
+
+    before: Sequence[WorldFunc] = ()
+    after: Sequence[WorldFunc] = ()
+    at_rest: bool = False
+    contacts: bool = True
 
 
 class Engine(abc.ABC):
@@ -84,23 +100,8 @@ class Engine(abc.ABC):
         """
 
     @abc.abstractmethod
-    def forward(
-        self,
-        mask: wp.array,
-        before: Sequence[WorldFunc] = (),
-        after: Sequence[WorldFunc] = (),
-        *,
-        at_rest: bool = False,
-        contacts: bool = True,
-    ) -> None:
+    def forward(self, mask: wp.array, update: Update) -> None:
         """Updates poses and sensors where ``mask`` ``(nworld,)`` is set, those of forces without control.
 
         Numbers of the model that were changed there count from now on.
-
-        Args:
-            mask: the worlds.
-            before: what each of them does first.
-            after: what it does at the end.
-            at_rest: whether they are at rest, which may cost less.
-            contacts: whether contact forces are found.
         """

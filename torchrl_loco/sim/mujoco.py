@@ -4,7 +4,7 @@ import concurrent.futures
 import copy
 import os
 import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import mujoco
@@ -15,9 +15,9 @@ from typing_extensions import override
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.batched_model import nominal_numbers
 from torchrl_loco.sim.compiled.engine import Model
-from torchrl_loco.sim.engine import Engine, Setup
+from torchrl_loco.sim.engine import Engine, Setup, Update
 from torchrl_loco.sim.overflow import Overflow
-from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc
+from torchrl_loco.sim.world_func import ALONE, Around
 
 STATE = ("qpos", "qvel", "act", "qacc_warmstart", "time", "mocap_pos", "mocap_quat")
 """What hooks, states and resets may change between two steps; all else follows from it."""
@@ -159,19 +159,11 @@ class MujocoEngine(Engine):
         self._kernels.launch([*around.after, *around.last], self._all)
 
     @override
-    def forward(
-        self,
-        mask: wp.array,
-        before: Sequence[WorldFunc] = (),
-        after: Sequence[WorldFunc] = (),
-        *,
-        at_rest: bool = False,
-        contacts: bool = True,
-    ) -> None:
-        self._kernels.launch(before, mask)
+    def forward(self, mask: wp.array, update: Update) -> None:
+        self._kernels.launch(update.before, mask)
         shown = self.data.shown()
 
-        def update(i: int) -> None:
+        def evaluate(i: int) -> None:
             world = self._worlds[i]
             if self._varied is not None:
                 world.model = self._varied.edited(self.numbers.numpy()[i], self._nominal)
@@ -180,15 +172,15 @@ class MujocoEngine(Engine):
             self._load(i, self._state)
             mujoco.mj_forward(self._passive if self._varied is None else _without_actuation(m), d)
             d.qacc_warmstart[:] = self._state["qacc_warmstart"][i]
-            if contacts and self._geoms:
+            if update.contacts and self._geoms:
                 for row in range(self._rows):
                     self._add_up_forces(i, row)
             self._write(i, shown)
 
         worlds = np.flatnonzero(mask.numpy())
-        self._each(worlds, update)
+        self._each(worlds, evaluate)
         self._keep_written(worlds)
-        self._kernels.launch(after, mask)
+        self._kernels.launch(update.after, mask)
 
     def _each(self, worlds: np.ndarray, work: Callable[[int], None]) -> None:
         """Does something in worlds, a share of them in each thread; MuJoCo computes without Python's lock."""

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -13,11 +13,11 @@ from typing_extensions import override
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.batched_model import BatchedModel, batched_bytes, nominal_numbers, with_every_row
 from torchrl_loco.sim.contact_forces import ContactForces, contact_forces_bytes
-from torchrl_loco.sim.engine import Engine, Setup
+from torchrl_loco.sim.engine import Engine, Setup, Update
 from torchrl_loco.sim.graph import torch_is_recording
 from torchrl_loco.sim.models import FORCE_SENSORS
 from torchrl_loco.sim.row_order import RowOrder
-from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, holds
+from torchrl_loco.sim.world_func import ALONE, Around, holds
 
 UNROLLED_ITERATIONS = 10
 """Up to this many solver iterations, the recorded step contains all of them, without an early exit."""
@@ -227,40 +227,32 @@ class MujocoWarpEngine(Engine):
             model.opt.disableflags, model.ncam, model.nlight = kept
 
     @override
-    def forward(
-        self,
-        mask: wp.array,
-        before: Sequence[WorldFunc] = (),
-        after: Sequence[WorldFunc] = (),
-        *,
-        at_rest: bool = False,
-        contacts: bool = True,
-    ) -> None:
+    def forward(self, mask: wp.array, update: Update) -> None:
         data = self.data
-        forces = self._kept_sensors if contacts or self._has_force_sensors else None
+        forces = self._kept_sensors if update.contacts or self._has_force_sensors else None
 
-        def update() -> None:
-            self._kernels.launch(before, mask)
+        def evaluate() -> None:
+            self._kernels.launch(update.before, mask)
             if self._batched is not None:
                 self._batched.update(mask)
             self._launch(clear_constraints, [mask], [data.efc.J, data.efc.D], LANES)
             if forces is not None:  # they act at rest too
-                self._evaluate_forces(mask, *forces, contacts=contacts)
-            elif at_rest:
+                self._evaluate_forces(mask, *forces, contacts=update.contacts)
+            elif update.at_rest:
                 self._launch(rest, [mask], [data.cvel, data.sensordata])
                 mjw.kinematics(self.model, self.data)
-                if self.with_subtree_com or any(holds(args, self.data.subtree_com) for _, args in after):
+                if self.with_subtree_com or any(holds(args, self.data.subtree_com) for _, args in update.after):
                     mjw.com_pos(self.model, self.data)
             else:
                 self._evaluate()
-            self._kernels.launch(after, mask)
+            self._kernels.launch(update.after, mask)
 
         if torch_is_recording(self._device):
-            update()
+            evaluate()
             return
         self._any.zero_()
         self._launch(any_world, [mask], [self._any])
-        wp.capture_if(self._any, update)
+        wp.capture_if(self._any, evaluate)
 
     def _evaluate(self) -> None:
         """Evaluates what an observation can read: poses and velocities of bodies, and velocity sensors."""

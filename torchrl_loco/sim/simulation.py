@@ -16,7 +16,7 @@ from torchrl_loco.sim import compiled, mjw, models, mujoco_warp
 from torchrl_loco.sim import mujoco as c_mujoco
 from torchrl_loco.sim.batched_model import BatchedModel, with_every_row
 from torchrl_loco.sim.compilation import compile_kernels
-from torchrl_loco.sim.engine import Engine, Setup
+from torchrl_loco.sim.engine import Engine, Setup, Update
 from torchrl_loco.sim.graph import Direct, Graph, ScratchPool
 from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.warp_init import init_warp
@@ -217,7 +217,7 @@ class Simulation:
             at_rest: whether they still are then; ``before`` may write ``qvel`` too if not.
         """
         rest = WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0))
-        self.engine.forward(mask, [rest, *before], after, at_rest=at_rest)
+        self.engine.forward(mask, Update([rest, *before], after, at_rest))
 
     def rest(self, mask: wp.array, then: Sequence[WorldFunc]) -> None:
         """Puts worlds of a mask, bool ``(nworld,)``, at rest in the default pose, without updating poses and sensors.
@@ -239,7 +239,7 @@ class Simulation:
             contacts: whether the forces of ``contact_geoms`` are found, too, which takes a part of a physics step;
                 else they stay as they are.
         """
-        self.engine.forward(mask, after=after, contacts=contacts)
+        self.engine.forward(mask, Update(after=after, contacts=contacts))
 
     def mujoco_data(self, *, contacts: bool = False, worlds: int | None = None) -> "mjw.Data":
         """Returns the present state as ``mjData`` of MuJoCo-Warp, with poses of geoms, sites and cameras.

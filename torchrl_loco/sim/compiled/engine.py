@@ -25,7 +25,7 @@ from torchrl_loco.sim.compiled.step import (
     nominal_row,
     structure_of_arrays,
 )
-from torchrl_loco.sim.engine import Engine, Setup
+from torchrl_loco.sim.engine import Engine, Setup, Update
 from torchrl_loco.sim.world_func import ALONE, Around, Chain, WorldFunc
 
 ROWS = {
@@ -271,16 +271,8 @@ class CompiledEngine(Engine):
             self._kernels.launch([*after, *last], self._all)
 
     @override
-    def forward(
-        self,
-        mask: wp.array,
-        before: Sequence[WorldFunc] = (),
-        after: Sequence[WorldFunc] = (),
-        *,
-        at_rest: bool = False,
-        contacts: bool = True,
-    ) -> None:
-        self._launch(0, mask, before, after, self._contact_geoms if contacts else ())
+    def forward(self, mask: wp.array, update: Update) -> None:
+        self._launch(0, mask, update.before, update.after, self._contact_geoms if update.contacts else ())
 
     def _launch(
         self,
