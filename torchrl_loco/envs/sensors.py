@@ -39,91 +39,70 @@ def angular_velocity(s: Any, bodies: list[int], one: bool) -> torch.Tensor:
     return s._catalog.pick(s._array("cvel"), bodies, one)[..., :3]
 
 
-# What is attached to a body: sites, geoms, its inertial frame.
+class Frames:
+    """Frames of bodies, or of what is attached to them: sites, geoms, centers of inertia.
 
+    Args:
+        s: the worlds.
+        kind: ``"body"``, ``"site"``, ``"geom"`` or ``"inertia"``.
+        ids: their ids; of centers of inertia, those of the bodies.
+        one: whether it is one that is named alone, which has no dimension of its own.
+    """
 
-def _offset(s: Any, kind: str, ids: list[int]) -> tuple[list[int], torch.Tensor, torch.Tensor]:
-    """Returns bodies of attached elements, and their positions ``(count, 3)`` and axes ``(count, 3, 3)`` there."""
-    m, key = s._catalog.mj_model, tuple(ids)
-    if kind == "inertia":
-        bodies, position, quaternion = list(ids), m.body_ipos, m.body_iquat
-    else:
-        bodies = [int(body) for body in getattr(m, f"{kind}_bodyid")[ids]]
-        position, quaternion = getattr(m, f"{kind}_pos"), getattr(m, f"{kind}_quat")
-    axes = s._catalog.derived((kind, "axes", key), lambda: [axes_of(quaternion[i]) for i in ids])
-    return bodies, s._catalog.derived((kind, "position", key), lambda: position[ids]), axes
+    def __init__(self, s: Any, kind: str, ids: list[int], one: bool) -> None:
+        self._s, self._kind, self._ids, self._one, m = s, kind, ids, one, s._catalog.mj_model
+        self._bodies = [int(b) for b in getattr(m, f"{kind}_bodyid")[ids]] if kind in ("site", "geom") else ids
 
+    def _pick(self, name: str) -> torch.Tensor:
+        """Returns an array of their bodies."""
+        return self._s._catalog.pick(self._s._array(name), self._bodies, self._one)
 
-def _lever(s: Any, kind: str, ids: list[int], one: bool) -> tuple[list[int], torch.Tensor]:
-    """Returns bodies, and vectors from their origins to what is attached, world frame (m)."""
-    bodies, position, _ = _offset(s, kind, ids)
-    xmat = s._catalog.pick(s._array("xmat"), bodies, one)
-    return bodies, (xmat * (position[0] if one else position).unsqueeze(-2)).sum(-1)
+    def _there(self, what: str) -> torch.Tensor:
+        """Returns where they are in the frames of their bodies, their ``"pos"`` or their axes by ``"quat"``."""
+        field = getattr(self._s._catalog.mj_model, f"{'body_i' if self._kind == 'inertia' else f'{self._kind}_'}{what}")
 
+        def numbers() -> Any:
+            return field[self._ids] if what == "pos" else [axes_of(field[i]) for i in self._ids]
 
-def attached_position(s: Any, kind: str, ids: list[int], one: bool) -> torch.Tensor:
-    """Returns positions of sites, geoms or centers of inertia (m), ``(num_envs, 3)`` or ``(num_envs, count, 3)``."""
-    bodies, lever = _lever(s, kind, ids, one)
-    return s._catalog.pick(s._array("xpos"), bodies, one) + lever
+        there = self._s._catalog.derived((self._kind, what, tuple(self._ids)), numbers)
+        return there[0] if self._one else there
 
+    def _lever(self) -> torch.Tensor:
+        """Returns vectors from the origins of their bodies to them, world frame (m)."""
+        return (self._pick("xmat") * self._there("pos").unsqueeze(-2)).sum(-1)
 
-def attached_orientation(s: Any, kind: str, ids: list[int], one: bool) -> torch.Tensor:
-    """Returns orientations of the same, ``(num_envs, 3, 3)`` or ``(num_envs, count, 3, 3)``."""
-    bodies, _, axes = _offset(s, kind, ids)
-    xmat = s._catalog.pick(s._array("xmat"), bodies, one)
-    return (xmat.unsqueeze(-1) * (axes[0] if one else axes).unsqueeze(-3)).sum(-2)
+    @property
+    def position(self) -> torch.Tensor:
+        """Positions (m), ``(num_envs, 3)`` or ``(num_envs, count, 3)``."""
+        return self._pick("xpos") if self._kind == "body" else self._pick("xpos") + self._lever()
 
+    @property
+    def axes(self) -> torch.Tensor:
+        """Orientations, ``(num_envs, 3, 3)`` or ``(num_envs, count, 3, 3)``."""
+        if self._kind == "body":
+            return self._pick("xmat")
+        return (self._pick("xmat").unsqueeze(-1) * self._there("quat").unsqueeze(-3)).sum(-2)
 
-def attached_velocity(s: Any, kind: str, ids: list[int], one: bool) -> torch.Tensor:
-    """Returns velocities of the same, world frame (m/s), shaped as their positions."""
-    bodies, lever = _lever(s, kind, ids, one)
-    return linear_velocity(s, bodies, one) + torch.linalg.cross(angular_velocity(s, bodies, one), lever)
+    @property
+    def velocity(self) -> torch.Tensor:
+        """Velocities, world frame (m/s), shaped as their positions."""
+        velocity = linear_velocity(self._s, self._bodies, self._one)
+        return velocity if self._kind == "body" else velocity + torch.linalg.cross(self.rotation, self._lever())
+
+    @property
+    def rotation(self) -> torch.Tensor:
+        """Angular velocities, world frame (rad/s), shaped as their positions."""
+        return angular_velocity(self._s, self._bodies, self._one)
 
 
 # Sensors.
 
-
-class Frame:
-    """What a sensor is attached to: pose and velocity of a body, site, geom or center of inertia; or of the world.
-
-    Args:
-        s: the worlds.
-        kind: MuJoCo's kind of object.
-        index: its id.
-    """
-
-    def __init__(self, s: Any, kind: int, index: int) -> None:
-        kinds = {Object.mjOBJ_SITE: "site", Object.mjOBJ_GEOM: "geom", Object.mjOBJ_BODY: "inertia"}
-        self.s, self.kind, self.index = s, {int(key): name for key, name in kinds.items()}.get(kind, ""), index
-        m = s._catalog.mj_model
-        self.body = int(getattr(m, f"{self.kind}_bodyid")[index]) if self.kind in ("site", "geom") else index
-
-    @property
-    def position(self) -> torch.Tensor:
-        """Position (m), ``(num_envs, 3)``."""
-        s = self.s
-        return attached_position(s, self.kind, [self.index], True) if self.kind else s._array("xpos")[:, self.index]
-
-    @property
-    def axes(self) -> torch.Tensor:
-        """Orientation, ``(num_envs, 3, 3)``."""
-        s = self.s
-        return attached_orientation(s, self.kind, [self.index], True) if self.kind else s._array("xmat")[:, self.index]
-
-    @property
-    def velocity(self) -> torch.Tensor:
-        """Velocity, world frame (m/s), ``(num_envs, 3)``."""
-        if not self.kind:
-            return linear_velocity(self.s, [self.index], True)
-        return attached_velocity(self.s, self.kind, [self.index], True)
-
-    @property
-    def rotation(self) -> torch.Tensor:
-        """Angular velocity, world frame (rad/s), ``(num_envs, 3)``."""
-        return angular_velocity(self.s, [self.body], True)
-
-
-FRAMES = {int(kind) for kind in (Object.mjOBJ_BODY, Object.mjOBJ_XBODY, Object.mjOBJ_SITE, Object.mjOBJ_GEOM)}
+FRAMES = {
+    int(Object.mjOBJ_BODY): "inertia",
+    int(Object.mjOBJ_XBODY): "body",
+    int(Object.mjOBJ_SITE): "site",
+    int(Object.mjOBJ_GEOM): "geom",
+}
 """Kinds of objects that a sensor can be attached to here."""
 
 AXES = {int(Sensor.mjSENS_FRAMEXAXIS): 0, int(Sensor.mjSENS_FRAMEYAXIS): 1, int(Sensor.mjSENS_FRAMEZAXIS): 2}
@@ -148,7 +127,7 @@ def _evaluate(s: Any, kind: int, sensor: int) -> torch.Tensor | None:
         return values[:, int(address[index])].unsqueeze(-1)
     if of not in FRAMES:
         return None
-    frame = Frame(s, of, index)
+    frame = Frames(s, FRAMES[of], [index], True)
     if kind == Sensor.mjSENS_GYRO:
         return into_frame(frame.axes, frame.rotation)
     if kind == Sensor.mjSENS_VELOCIMETER:
@@ -156,11 +135,11 @@ def _evaluate(s: Any, kind: int, sensor: int) -> torch.Tensor | None:
     reference = int(m.sensor_refid[sensor])
     if reference >= 0 and int(m.sensor_reftype[sensor]) not in FRAMES:
         return None
-    base = Frame(s, int(m.sensor_reftype[sensor]), reference) if reference >= 0 else None
+    base = Frames(s, FRAMES[int(m.sensor_reftype[sensor])], [reference], True) if reference >= 0 else None
     return _of_frames(kind, frame, base)
 
 
-def _of_frames(kind: int, frame: Frame, base: Frame | None) -> torch.Tensor | None:
+def _of_frames(kind: int, frame: Frames, base: Frames | None) -> torch.Tensor | None:
     def seen(vector: torch.Tensor) -> torch.Tensor:
         return vector if base is None else into_frame(base.axes, vector)
 

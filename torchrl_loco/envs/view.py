@@ -337,15 +337,15 @@ class View:
 
     def site_xpos(self, sites: Names) -> torch.Tensor:
         """Returns positions of sites (m), shaped as :meth:`xpos`."""
-        return sensors.attached_position(self, "site", *self._catalog.ids("site", sites))
+        return sensors.Frames(self, "site", *self._catalog.ids("site", sites)).position
 
     def site_xmat(self, sites: Names) -> torch.Tensor:
         """Returns orientations of sites, shaped as :meth:`xmat`."""
-        return sensors.attached_orientation(self, "site", *self._catalog.ids("site", sites))
+        return sensors.Frames(self, "site", *self._catalog.ids("site", sites)).axes
 
     def site_linvel(self, sites: Names) -> torch.Tensor:
         """Returns velocities of sites in the world's frame (m/s), shaped as :meth:`xpos`."""
-        return sensors.attached_velocity(self, "site", *self._catalog.ids("site", sites))
+        return sensors.Frames(self, "site", *self._catalog.ids("site", sites)).velocity
 
     def terrain_height(self, points: torch.Tensor) -> torch.Tensor:
         """Returns the height of the ground below points, as a ray from above finds it, ``(num_envs, ...)`` (m).
@@ -478,7 +478,7 @@ class View:
 
     def geom_xpos(self, geoms: Names) -> torch.Tensor:
         """Returns positions of the centers of geoms (m), shaped as :meth:`xpos`."""
-        return sensors.attached_position(self, "geom", *self._catalog.ids("geom", geoms))
+        return sensors.Frames(self, "geom", *self._catalog.ids("geom", geoms)).position
 
     def joint_qpos(self, joints: Names) -> torch.Tensor:
         """Returns positions of joints: ``(num_envs, count)`` for several hinges and slides (rad, m).
