@@ -59,18 +59,19 @@ def shapes():
 
 
 def seen_by_rays(m, data, camera):
-    """Returns distances along rays through the pixels, infinite where nothing is, and the geoms that they meet."""
+    """Returns depths along rays through the pixels, infinite where nothing is, and the geoms that they meet."""
     half = np.tan(np.deg2rad(m.cam_fovy[camera] / 2))
     x = half * WIDTH / HEIGHT * (2 * (np.arange(WIDTH) + 0.5) / WIDTH - 1)
     y = half * (1 - 2 * (np.arange(HEIGHT) + 0.5) / HEIGHT)
     rays = np.stack([*np.meshgrid(x, y), np.full((HEIGHT, WIDTH), -1.0)], -1)
-    rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ data.cam_xmat[camera].reshape(3, 3).T
+    lengths = np.linalg.norm(rays, axis=-1)
+    rays = rays / lengths[..., None] @ data.cam_xmat[camera].reshape(3, 3).T
     distances, geoms, geom = np.full((HEIGHT, WIDTH), np.inf), np.full((HEIGHT, WIDTH), -1), np.zeros(1, np.int32)
     groups = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)
     for at in np.ndindex(HEIGHT, WIDTH):
         distance = mujoco.mj_ray(m, data, data.cam_xpos[camera], rays[at], groups, 1, -1, geom)
         if distance >= 0:
-            distances[at], geoms[at] = distance, geom[0]
+            distances[at], geoms[at] = distance / lengths[at], geom[0]
     return distances, geoms
 
 
@@ -79,7 +80,7 @@ def seen_by_rays(m, data, camera):
 def test_depth_and_geoms_are_those_of_rays_of_c_mujoco(camera, device):
     """Of all shapes and all kinds of cameras; what is transparent or in a hidden group is not seen."""
     m, device = shapes(), wp.get_device(device)
-    eye = Eye(m, device, camera, WIDTH, HEIGHT, 2, ("rgb", "depth", "geoms"), along_ray=True, far=1e3)
+    eye = Eye(m, device, camera, WIDTH, HEIGHT, 2, ("rgb", "depth", "geoms"), far=1e3)
     eye.depth.fill_(torch.nan)
     assert 2 * bytes_placed(m) == sum(each.capacity for each in (*eye._placed.placed, eye._placed.bounds))
     data, rng = mujoco.MjData(m), np.random.default_rng(1)

@@ -27,7 +27,6 @@ class View:
     height: int
     samples: int
     far: float
-    along_ray: bool
 
 
 @wp.func
@@ -196,8 +195,7 @@ def tracer(rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool) -> 
                 if geom < 0:
                     geom = shapes.owner[owner]
             if wp.static(depth):
-                long = wp.where(view.along_ray, wp.length(d), 1.0)
-                depth_out[world, row, column] = wp.min(nearest * long, view.far)
+                depth_out[world, row, column] = wp.min(nearest, view.far)
             if wp.static(geoms):
                 geoms_out[world, row, column] = geom
             if wp.static(rgb):
@@ -252,7 +250,6 @@ class Eye:
         shadows: whether lights cast shadows.
         samples: rays along each side of a pixel, whose colors are averaged; depth and geoms are of the last.
         far: greatest depth (m).
-        along_ray: whether depth is along the ray instead of the camera's axis.
 
     Attributes:
         rgb: colors, uint8 ``(worlds, height, width, 3)``.
@@ -276,7 +273,6 @@ class Eye:
         shadows: bool = False,
         samples: int = 1,
         far: float = 1.0e10,
-        along_ray: bool = False,
     ) -> None:
         m, which = to_the_horizon(m), m.camera(camera).id
         self._device, half = device, math.tan(math.radians(m.cam_fovy[which] / 2.0))
@@ -284,8 +280,7 @@ class Eye:
             self._placed = Placed(m, device, mounts_of(m, which, device), worlds)
             self._looks, self._view = looks_of(m, device), View()
             self._view.half, self._view.far = wp.vec2(half * width / height, half), far
-            self._view.width, self._view.height = width, height
-            self._view.samples, self._view.along_ray = samples, along_ray
+            self._view.width, self._view.height, self._view.samples = width, height, samples
             self._trace = tracer(*(kind in kinds for kind in KINDS), shadows, self._placed.has_meshes)
 
             def pixels(kind: str, dtype: Any) -> Buffer:
