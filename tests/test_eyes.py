@@ -39,6 +39,7 @@ SHAPES = """
       <geom type="mesh" mesh="wedge" pos="-0.3 -0.5 0.1"/>
       <geom type="sphere" size="0.3" group="3"/>
       <geom type="sphere" size="0.3" rgba="1 1 1 0"/>
+      <site name="eye" pos="0.1 -0.9 0.4" quat="0.8 0.6 0 0"/>
       <camera name="track" mode="track" pos="0 -2 0.5" xyaxes="1 0 0 0 0.3 1"/>
       <camera name="trackcom" mode="trackcom" pos="1.5 0.4 1" xyaxes="-0.2 1 0 -0.4 0 1"/>
       <camera name="held" pos="0.1 -1.2 0.4" xyaxes="1 0.1 0 0 0.5 1" fovy="70"/>
@@ -297,22 +298,21 @@ def test_a_group_must_not_have_the_name_of_pixels():
 @pytest.mark.parametrize("device", DEVICES)
 def test_rays_from_a_body_meet_what_those_of_c_mujoco_meet(device):
     m, device, rng = shapes(), wp.get_device(device), np.random.default_rng(2)
-    directions, mat, start = rng.standard_normal((200, 3)), np.zeros(9), np.array([0.1, -0.9, 0.4])
+    directions, site = rng.standard_normal((200, 3)), m.site("eye")
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     data, geom = mujoco.MjData(m), np.zeros(1, np.int32)
     data.qpos[3:7] = [0.9, 0.2, -0.3, 0.1]
     mujoco.mj_normalizeQuat(m, data.qpos)
     mujoco.mj_forward(m, data)
-    mujoco.mju_quat2Mat(mat, np.array([0.8, 0.6, 0, 0]))
-    rays = Rays(m, device, 1, start, mat.reshape(3, 3), directions, 1, far=50.0)
-    body = data.xmat[1].reshape(3, 3)
+    rays = Rays(m, device, site.id, directions, 1, far=50.0)
+    start, axes = data.site("eye").xpos, data.site("eye").xmat.reshape(3, 3)
     rays.launch(
         wp.array(data.xpos[None], dtype=wp.vec3, device=device),
         wp.array(data.xmat.reshape(1, -1, 3, 3), dtype=wp.mat33, device=device),
     )
     found, groups = rays.distance[0].cpu().numpy(), np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)
-    for direction, distance in zip(directions @ mat.reshape(3, 3).T @ body.T, found, strict=True):
-        met = mujoco.mj_ray(m, data, data.xpos[1] + body @ start, direction, groups, 1, -1, geom)
+    for direction, distance in zip(directions @ axes.T, found, strict=True):
+        met = mujoco.mj_ray(m, data, start, direction, groups, 1, -1, geom)
         assert distance == pytest.approx(50.0 if met < 0 else min(met, 50.0), rel=1e-4)
     assert (found < 50.0).mean() > 0.3
 

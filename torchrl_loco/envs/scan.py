@@ -12,7 +12,6 @@ from torchrl_loco.eyes.rays import Rays
 from torchrl_loco.eyes.tracer import Eye
 from torchrl_loco.sim import Buffer, fill_from_numbers
 from torchrl_loco.sim.compiled.collision.ground import NOTHING
-from torchrl_loco.sim.corners import axes_of
 
 if TYPE_CHECKING:
     from torchrl_loco.sim import Simulation
@@ -194,8 +193,7 @@ def eye_of(sim: "Simulation", asked: DepthRequest | RayRequest) -> Eye | Rays:
     m, n = sim.mj_model, sim.num_envs
     if isinstance(asked, DepthRequest):
         return Eye(m, sim.device, asked.camera, asked.width, asked.height, n, ("depth",), far=asked.far)
-    place = int(m.site_bodyid[asked.site]), m.site_pos[asked.site], axes_of(m.site_quat[asked.site])
-    return Rays(m, sim.device, *place, np.array(asked.directions), n, asked.far)
+    return Rays(m, sim.device, asked.site, np.array(asked.directions), n, asked.far)
 
 
 def tables(ground: Ground, device: wp.Device) -> Tables:

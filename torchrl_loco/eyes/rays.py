@@ -1,4 +1,4 @@
-"""Rays from a place on a body: how far what they meet lies."""
+"""Rays from a site: how far what they meet lies."""
 
 import mujoco
 import numpy as np
@@ -9,6 +9,7 @@ from torchrl_loco.eyes.scene import Shapes, mounts_at, to_the_horizon
 from torchrl_loco.eyes.shapes import to_mesh, to_shape
 from torchrl_loco.sim import EXCLUSIVE, Buffer
 from torchrl_loco.sim.compiled.collision.kinds import MESH
+from torchrl_loco.sim.corners import axes_of
 
 
 @wp.kernel(enable_backward=False)
@@ -37,14 +38,12 @@ def cast(
 
 
 class Rays:
-    """Rays from a place on a body, in each of several worlds of a model.
+    """Rays from a site, in each of several worlds of a model.
 
     Args:
         m: the model.
         device: where.
-        body: the body.
-        pos: where they begin, in its frame (m).
-        mat: the frame of their directions in that of the body, ``(3, 3)``.
+        site: where they begin, and whose frame that of their directions is.
         directions: of length 1, ``(count, 3)``.
         worlds: how many worlds.
         far: greatest distance (m).
@@ -54,18 +53,10 @@ class Rays:
     """
 
     def __init__(
-        self,
-        m: mujoco.MjModel,
-        device: wp.Device,
-        body: int,
-        pos: np.ndarray,
-        mat: np.ndarray,
-        directions: np.ndarray,
-        worlds: int,
-        far: float,
+        self, m: mujoco.MjModel, device: wp.Device, site: int, directions: np.ndarray, worlds: int, far: float
     ) -> None:
-        one = np.zeros(1)
-        mounts = mounts_at(m, device, mode=one, body=one + body, target=one - 1, pos=pos[None], mat=mat[None])
+        place = {"body": m.site_bodyid[[site]], "pos": m.site_pos[[site]], "mat": axes_of(m.site_quat[site])[None]}
+        mounts = mounts_at(m, device, **place, mode=np.zeros(1), target=-np.ones(1))
         self._placed, self._device, self._far = Placed(to_the_horizon(m), device, mounts, worlds), device, far
         with EXCLUSIVE, wp.ScopedDevice(device):
             self._directions = wp.array(directions, wp.vec3, device=device)
