@@ -267,28 +267,17 @@ class NanGuard(Monitor):
 
     Args:
         path: the file; never overwritten.
-        sim: the simulation.
-        inputs: episodes and elapsed steps of all worlds, each ``(nworld,)``.
-        non_finite: flags of non-finite worlds, ``(nworld,)``.
-        seed: seed of the environment, ``(1,)``.
+        world: the :class:`.world.World`, of which no reference is kept.
         settings: further settings from which the environment can be made again.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        sim: Simulation,
-        inputs: tuple[Buffer, Buffer],
-        non_finite: Buffer,
-        seed: Buffer,
-        settings: dict[str, Any],
-    ) -> None:
-        self._path, self._sim, self._seed, self._settings = path, sim, seed, settings
-        data = sim.data
-        episode, elapsed_steps = (buffer.warp for buffer in inputs)
+    def __init__(self, path: Path, world: Any, settings: dict[str, Any]) -> None:
+        self._path, self._settings = path, settings
+        self._sim, self._seed = world.sim, world.seed
+        sim, data = self._sim, self._sim.data
         physics = {name: getattr(data, name) for name in State.PHYSICS}
-        numbers = {"numbers": wp.from_torch(sim.numbers)}
-        self._inputs = {"episode": episode, "elapsed_steps": elapsed_steps, **physics, **numbers}
+        clock = {"episode": world.episode.warp, "elapsed_steps": world.elapsed_steps.warp}
+        self._inputs = {**clock, **physics, "numbers": wp.from_torch(sim.numbers)}
         self._kept = {name: wp.zeros_like(array) for name, array in {"action": data.ctrl, **self._inputs}.items()}
         self._first = Buffer(1, int, sim.device)
         self._found = Buffer(1, bool, sim.device)
@@ -296,7 +285,7 @@ class NanGuard(Monitor):
         self._guarded = {
             "first": self._first.warp,
             "found": self._found.warp,
-            "non_finite": non_finite.warp,
+            "non_finite": world.non_finite.warp,
             "kept": kept,
         }
         super().__init__(1, self._first.torch.device)

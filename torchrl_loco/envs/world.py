@@ -123,9 +123,7 @@ class World:
             self.health = Health(self.sim, task.on_overflow)
             self._monitors: list[Monitor] = [self.health]
             if task.nan_dump is not None:
-                inputs = self.episode, self.elapsed_steps
-                guard = NanGuard(task.nan_dump, self.sim, inputs, self.non_finite, self.seed, task.settings())
-                self._monitors.append(guard)
+                self._monitors.append(NanGuard(task.nan_dump, self, task.settings()))
 
             with reads_of(task) as self.fixed:
                 self._make_funcs(task)
