@@ -101,10 +101,8 @@ class Hooks:
         self.own = own_hooks(type(env))
         if models.has_home(mj_model) and not draws_states(type(env)):
             self.own |= {"begin"}
-        bounded = env.action_range != (-float("inf"), float("inf"))
         self._substeps, (memory, shared) = env.config.substeps, declared(type(env))
-        settings = env.num_envs, env.device, memory, shared, env.config.ctrl_dt
-        self.catalog = Catalog(mj_model, *settings, bounded=bounded, variation=env.variation)
+        self.catalog = Catalog(env, mj_model, memory, shared)
         if type(env).observation_func is not Task.observation_func:
             self.catalog.warp_outputs = type(env).observation_size
         self.catalog.draws_states = draws_by_warp(type(env))

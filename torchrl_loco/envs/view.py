@@ -31,16 +31,15 @@ class Catalog(Elements):
     """What is the same at every step: the model's names, its numbers as tensors, and what hooks have asked for.
 
     Args:
-        mj_model: the model.
-        num_envs: number of worlds.
-        device: where the tensors live.
+        env: the environment, to which no reference is kept.
+        mj_model: its model.
         memory: each entry of the memory, by name.
         shared: each entry of what worlds share, by name.
+
+    Attributes:
         ctrl_dt: time of a control step (s).
         bounded: whether actions are clipped to [-1, 1].
         variation: which numbers of the model differ from world to world, if any do.
-
-    Attributes:
         arrays: names of the arrays that hooks have read.
         sensors: ids of the sensors that only an engine can evaluate.
         contact_geoms: ids of the geoms whose contacts were asked for, in the order of the engine's columns.
@@ -57,21 +56,14 @@ class Catalog(Elements):
     """
 
     def __init__(
-        self,
-        mj_model: mujoco.MjModel,
-        num_envs: int,
-        device: torch.device,
-        memory: Mapping[str, Entry],
-        shared: Mapping[str, Entry],
-        ctrl_dt: float,
-        *,
-        bounded: bool,
-        variation: Variation | None = None,
+        self, env: Any, mj_model: mujoco.MjModel, memory: Mapping[str, Entry], shared: Mapping[str, Entry]
     ) -> None:
         super().__init__(mj_model)
-        self.num_envs, self.device = num_envs, device
+        self.num_envs: int = env.num_envs
+        self.device: torch.device = env.device
+        self.variation: Variation | None = env.variation
         self.memory, self.shared, self.constants = dict(memory), dict(shared), dict[str, torch.Tensor]()
-        self.ctrl_dt, self.bounded, self.variation = ctrl_dt, bounded, variation
+        self.ctrl_dt, self.bounded = env.config.ctrl_dt, env.action_range != (-math.inf, math.inf)
         self.starts: dict[str, torch.Tensor] = {}
         self.warp_outputs: int | None = None
         self.draws_states = False
