@@ -4,10 +4,12 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.compiled.collision.ground import Ground
 from torchrl_loco.sim.compiled.engine import Chain, Data, _kernel
 from torchrl_loco.sim.compiled.schedules import lanes
 from torchrl_loco.sim.compiled.step import launch_size
+from torchrl_loco.sim.engine import Setup
 
 FIELDS = 8
 """Numbers of a contact: the pair, the distance less the margin, the point and the normal."""
@@ -42,7 +44,7 @@ def find_contacts(m: mujoco.MjModel, qpos: np.ndarray) -> list[list[tuple[tuple[
     text = head + text.replace("    jacobians();\n", DUMP)
     kernel = _kernel(text, before.func, before.struct, after.func, after.struct)
     count = len(qpos)
-    data = Data(m, count, wp.get_device("cpu"), structure_of_arrays=False)
+    data = Data(Setup(m, SimConfig.of(m), count, wp.get_device("cpu")))
     data.qpos.assign(qpos.astype(np.float32))
     found = wp.zeros((count, FIELDS * most), dtype=float, device="cpu")
     everywhere = wp.ones(count, dtype=bool, device="cpu")

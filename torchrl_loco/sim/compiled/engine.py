@@ -53,13 +53,6 @@ LATER = ("cvel", "subtree_com")
 class Data:
     """The state of all worlds, and what an observation reads. Names, shapes and units are those of ``mjData``.
 
-    Args:
-        m: the model.
-        nworld: number of worlds.
-        device: where they live.
-        structure_of_arrays: whether the world is the fastest index in memory.
-        contacts: number of geoms whose contact forces are asked for, times that of the substeps that are kept.
-
     Attributes:
         qpos: positions, ``(nworld, nq)``.
         qvel: velocities, ``(nworld, nv)``.
@@ -76,18 +69,11 @@ class Data:
         overflow: ``Overflow`` bits, ``(nworld,)``.
     """
 
-    def __init__(
-        self,
-        m: mujoco.MjModel,
-        nworld: int,
-        device: wp.Device,
-        *,
-        structure_of_arrays: bool,
-        contacts: int = 0,
-    ) -> None:
+    def __init__(self, setup: Setup) -> None:
+        m, by_world = setup.mj_model, structure_of_arrays(setup.mj_model, setup.device)
+
         def make(name: str) -> wp.array:
-            shape = _shape(m, nworld, name, contacts)
-            return _zeros(shape, ROWS[name][1], device, structure_of_arrays=structure_of_arrays)
+            return _zeros(_shape(setup, name), ROWS[name][1], setup.device, structure_of_arrays=by_world)
 
         self._make: Callable[[str], wp.array] | None = make
         self._later: dict[str, wp.array] = {}
@@ -164,14 +150,14 @@ def _fill_rows(array: wp.array, row: np.ndarray) -> None:
     array.assign(np.broadcast_to(row.reshape(shape[1:]), shape))
 
 
-def _shape(m: mujoco.MjModel, nworld: int, name: str, contacts: int) -> tuple[int, ...]:
+def _shape(setup: Setup, name: str) -> tuple[int, ...]:
     match ROWS[name][0]:
         case None:
-            return (nworld,)
+            return (setup.num_envs,)
         case "contacts":
-            return nworld, contacts
+            return setup.num_envs, len(setup.contact_geoms) * setup.contact_rows
         case size:
-            return nworld, getattr(m, size)
+            return setup.num_envs, getattr(setup.mj_model, size)
 
 
 def data_bytes(setup: Setup) -> int:
@@ -179,13 +165,14 @@ def data_bytes(setup: Setup) -> int:
 
     Numbers that differ from world to world are counted too.
     """
-    m, num_envs, contacts = setup.mj_model, setup.num_envs, len(setup.contact_geoms) * setup.contact_rows
     rows = sum(
-        math.prod(_shape(m, num_envs, name, contacts)) * wp.types.type_size_in_bytes(dtype)
+        math.prod(_shape(setup, name)) * wp.types.type_size_in_bytes(dtype)
         for name, (_, dtype) in ROWS.items()
         if name not in LATER
     )
-    return rows + (0 if setup.varied is None else 4 * num_envs * nominal_row(VariedModel(m, setup.varied)).size)
+    if setup.varied is None:
+        return rows
+    return rows + 4 * setup.num_envs * nominal_row(VariedModel(setup.mj_model, setup.varied)).size
 
 
 class Model(ReadOnly):
@@ -238,8 +225,7 @@ class CompiledEngine(Engine):
         self.model = Model(mj_model, device)
         self._launch_size = launch_size(self._mj_model, num_envs, device)
         by_world = structure_of_arrays(mj_model, device)
-        contacts = len(self._contact_geoms) * self._contact_rows
-        self.data = Data(mj_model, num_envs, device, structure_of_arrays=by_world, contacts=contacts)
+        self.data = Data(setup)
         self._rows = self.numbers = wp.zeros((num_envs, 0), dtype=float, device=device)
         if isinstance(self._mj_model, VariedModel):
             row = nominal_row(self._mj_model)
