@@ -42,7 +42,7 @@ def find_contacts(m: mujoco.MjModel, qpos: np.ndarray) -> list[list[tuple[tuple[
 
     before, after = Chain(()), Chain(())
     text = head + text.replace("    jacobians();\n", DUMP)
-    kernel = _kernel(text, before.func, before.struct, after.func, after.struct)
+    kernel = _kernel(text, before, after)
     count = len(qpos)
     data = Data(Setup(m, SimConfig.of(m), count, wp.get_device("cpu")))
     data.qpos.assign(qpos.astype(np.float32))

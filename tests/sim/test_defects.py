@@ -484,7 +484,7 @@ def test_a_body_builds_for_a_gpu(dofs, kind, varied, asked, arch, tmp_path, monk
     start, end = Chain(()), Chain(())
     text = step.source(VariedModel(model, all_varied(model)) if varied else model, 2, step.Asked(**asked))
     description = lanes.Description(model)
-    kernel = _kernel(text, start.func, start.struct, end.func, end.struct, description.registers())
+    kernel = _kernel(text, start, end, description.registers())
     kernel.module.options["optimization_level"] = 3  # as for users
     kernel.module.options["block_dim"] = 32 * description.worlds_per_block()
     (built,) = wp.compile_aot_module(

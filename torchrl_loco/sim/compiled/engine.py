@@ -275,8 +275,7 @@ class CompiledEngine(Engine):
             asked = Asked(with_cvel, with_com, contact_geoms, self._contact_rows)
             text = kept_source(self._mj_model, substeps, asked)
             start, end = Chain(before), Chain(after)
-            funcs = start.func, start.struct, end.func, end.struct
-            self._steps[key] = _kernel(text, *funcs, self._launch_size.registers), start, end
+            self._steps[key] = _kernel(text, start, end, self._launch_size.registers), start, end
         kernel, start, end = self._steps[key]
         size = self._launch_size
         inputs = [size.worlds_per_warp, size.lanes, mask, start.args(before), end.args(after), self._terrain]
@@ -300,24 +299,18 @@ def _check_forces(m: mujoco.MjModel, contact_geoms: Sequence[int]) -> None:
             )
 
 
-def _kernel(
-    text: str,
-    before: wp.Function,
-    Before: Any,  # noqa: N803
-    after: wp.Function,
-    After: Any,  # noqa: N803
-    registers: int | None = None,
-) -> wp.Kernel:
-    """Returns a kernel that calls ``before``, the C++ of a control step and ``after`` in each world.
+def _kernel(text: str, start: Chain, end: Chain, registers: int | None = None) -> wp.Kernel:
+    """Returns a kernel that calls functions, the C++ of a control step and further functions in each world.
 
     Args:
         text: the C++, of :func:`~torchrl_loco.sim.compiled.step.source`.
-        before: the function that is called first, of the world and of a ``Before``.
-        Before: a ``wp.struct``.
-        after: the function that is called last, of the world and of an ``After``.
-        After: a ``wp.struct``.
+        start: the functions that are called first.
+        end: those that are called last.
         registers: of a thread of a GPU, at most.
     """
+    before, after = start.func, end.func
+    Before: Any = start.struct  # noqa: N806
+    After: Any = end.struct  # noqa: N806
 
     @wp.func_native(text)
     def advance(
