@@ -467,15 +467,8 @@ class Hooks:
             for entry, (values, is_set) in self.commands.items()
         }
 
-    def observe_begun(self, a: Arrays) -> None:
+    def observe_begun(self, a: Arrays, *, restored: bool = False) -> None:
         """After a reset: writes the observation of the masked worlds, which is all of their history."""
-        self._observe_first(a, restored=False)
-
-    def observe_restored(self, a: Arrays) -> None:
-        """After a state was written: writes the observation of the masked worlds, with the state's history, if any."""
-        self._observe_first(a, restored=True)
-
-    def _observe_first(self, a: Arrays, *, restored: bool) -> None:
         groups = self._groups(a)
         for name, count in self.history.items():
             past = a[f"memory.{HISTORY.format(name)}"]
@@ -490,6 +483,10 @@ class Hooks:
         for name, values in groups.items():
             target, values = a[f"out.{name}"], values.masked_fill(_by_world(wrong, values), 0.0)
             target.copy_(torch.where(_by_world(a["mask"], target), values, target))
+
+    def observe_restored(self, a: Arrays) -> None:
+        """After a state was written: does what :meth:`observe_begun` does, with the state's history, if any."""
+        self.observe_begun(a, restored=True)
 
     def _lost(self, a: Arrays) -> Any:
         """Returns in which worlds an index out of range gave what looks like a number."""

@@ -28,18 +28,6 @@ from torchrl_loco.envs.fusion.trace import trace as trace
 from torchrl_loco.sim.world_func import BLOCK_DIM, fill
 
 
-def _kernel(text: str, Args: Any) -> wp.Kernel:  # noqa: N803
-    @wp.func_native(text)
-    def run(world: int, args: Args): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def fused_hooks(args: Args):
-        world = wp.tid()
-        run(world, args)
-
-    return fused_hooks
-
-
 def fuse(
     traced: torch.fx.GraphModule,
     arrays: dict[str, torch.Tensor],
@@ -72,12 +60,19 @@ def fuse(
                 raise
             source = (program := Program(*given, math.inf)).run(traced.graph, constants)
     names = [f"p{index}" for index in source.used]
-    struct = wp.struct(type("Pointers", (), {"__annotations__": dict.fromkeys(names, wp.uint64)}))
+    Pointers: Any = wp.struct(type("Pointers", (), {"__annotations__": dict.fromkeys(names, wp.uint64)}))  # noqa: N806
     tensors = [program.tensors[index] for index in source.used]
-    pointers = fill(struct, **{name: tensor.data_ptr() for name, tensor in zip(names, tensors, strict=True)})
-    kernel = _kernel(source.text, struct)
+    pointers = fill(Pointers, **{name: tensor.data_ptr() for name, tensor in zip(names, tensors, strict=True)})
+
+    @wp.func_native(source.text)
+    def run(world: int, args: Pointers): ...
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def fused_hooks(args: Pointers):
+        world = wp.tid()
+        run(world, args)
 
     def launch(kept: Any = tensors) -> None:
-        wp.launch(kernel, num_envs, [pointers], device=device, block_dim=BLOCK_DIM)
+        wp.launch(fused_hooks, num_envs, [pointers], device=device, block_dim=BLOCK_DIM)
 
     return launch
