@@ -482,7 +482,7 @@ def test_a_body_builds_for_a_gpu(dofs, kind, varied, asked, arch, tmp_path, monk
     model = bristly(dofs, **kind)
     assert unsupported(model) == []
     start, end = Chain(()), Chain(())
-    text = step.source(VariedModel(model, all_varied(model)) if varied else model, 2, step.Asked(**asked))
+    text = step.source(VariedModel(model, all_varied(model)) if varied else model, 2, **asked)
     description = lanes.Description(model)
     kernel = _kernel(text, start, end, description.registers())
     kernel.module.options["optimization_level"] = 3  # as for users

@@ -85,7 +85,7 @@ def with_lanes(sim, folder):
     engine, outputs = sim.engine, sim.engine.data.outputs()
     with_cvel, with_com = (outputs[name] is not None for name in LATER)
     asked = step.Asked(with_cvel, with_com, engine._contact_geoms, engine._contact_rows)
-    text = step.source(engine._mj_model, engine._substeps, asked)
+    text = step.source(engine._mj_model, engine._substeps, **asked._asdict())
     outputs = {name: array.numpy() for name, array in outputs.items() if array is not None and array.size}
     before = {"ctrl_in": engine.data.ctrl.numpy(), "terrain_in": engine._terrain.numpy()}
     before["numbers_out"] = engine._rows.numpy()

@@ -71,15 +71,15 @@ def check_worlds(m: mujoco.MjModel, num_envs: int, device: wp.Device) -> None:
         raise ValueError(f"num_envs={num_envs} is too large: Warp addresses {most} worlds with its 32 bits")
 
 
-def source(m: mujoco.MjModel, substeps: int, asked: Asked = NO_MORE) -> str:
+def source(m: mujoco.MjModel, substeps: int, **asked: Any) -> str:
     """Returns the C++ of a control step of one world, the body of a function of its arrays.
 
     Args:
         m: the model, or a ``VariedModel``.
         substeps: physics steps; 0 evaluates the state without stepping.
-        asked: what it writes beside the state.
+        asked: what it writes beside the state, as :class:`.shared.Asked` has it.
     """
-    return (traced if is_traced(m) else lanes).source(m, substeps, asked)
+    return (traced if is_traced(m) else lanes).source(m, substeps, Asked(**asked))
 
 
 def kept_source(m: mujoco.MjModel, substeps: int, asked: Asked = NO_MORE) -> str:
@@ -87,7 +87,8 @@ def kept_source(m: mujoco.MjModel, substeps: int, asked: Asked = NO_MORE) -> str
 
     What is asked for must be hashable.
     """
-    return _kept(texts, (is_traced(m), _fingerprint(m), substeps, asked), lambda: source(m, substeps, asked))
+    key = is_traced(m), _fingerprint(m), substeps, asked
+    return _kept(texts, key, lambda: source(m, substeps, **asked._asdict()))
 
 
 def _kept(kept: dict[tuple, Any], key: tuple, make: Callable[[], Any]) -> Any:
