@@ -94,6 +94,9 @@ class Hooks:
         ValueError: a hook returns something of the wrong shape, name or value.
     """
 
+    view: type[View] = View
+    """What hooks see."""
+
     @torch.inference_mode(False)  # writes of hooks are noticed by versions of tensors
     def __init__(self, env: Any, mj_model: mujoco.MjModel) -> None:
         self._env = weakref.ref(env)
@@ -140,7 +143,7 @@ class Hooks:
     ) -> Any:
         env = self._env()
         assert env is not None
-        view = View(self.catalog, arrays, hook, steps) if view is None else view
+        view = self.view(self.catalog, arrays, hook, steps) if view is None else view
         if self.catalog.complete:
             returned = getattr(env, hook)(view, *args)
             if view.lost:
@@ -299,7 +302,7 @@ class Hooks:
         Raises:
             ValueError: a group has a name that it cannot have.
         """
-        view = View(self.catalog, arrays, "observation", steps)
+        view = self.view(self.catalog, arrays, "observation", steps)
         groups = self._call("observation", arrays, steps=steps, view=view)
         if not isinstance(groups, Mapping):
             groups = {"observation": groups}
@@ -443,10 +446,10 @@ class Hooks:
             a[f"out.{name}"].copy_(values)
         outputs = [a[name] for name in a if name.startswith("out.")]
         memory = [a[f"memory.{name}"] for name, (_, kind) in self.catalog.memory.items() if kind.is_floating_point]
-        wrong = a["non_finite"] | _beyond(a["reward"], a["qpos"], a["qvel"], *memory, *outputs) | self._lost(a)
+        wrong = a["non_finite"] | beyond(a["reward"], a["qpos"], a["qvel"], *memory, *outputs) | self._lost(a)
         a["non_finite"].copy_(wrong)
         for values in (*outputs, a["reward"], a["terms"], *([a["metrics"]] if self.metric_names else [])):
-            values.masked_fill_(_by_world(wrong, values), 0.0)
+            values.masked_fill_(by_world(wrong, values), 0.0)
 
     def begin(self, a: Arrays) -> None:
         """At a reset, in the masked worlds, which are at rest: writes pose and memory."""
@@ -463,7 +466,7 @@ class Hooks:
     def _commanded(self, a: Arrays) -> dict[str, torch.Tensor]:
         """Returns the commands of all worlds, by entry of memory: those that are set, in the others what they drew."""
         return {
-            entry: torch.where(_by_world(is_set, values), values, a[f"memory.{entry}"])
+            entry: torch.where(by_world(is_set, values), values, a[f"memory.{entry}"])
             for entry, (values, is_set) in self.commands.items()
         }
 
@@ -475,14 +478,14 @@ class Hooks:
             values = groups[name].unsqueeze(1).expand(-1, count, -1)
             if restored:
                 has_past = past.isfinite().flatten(1).all(-1)
-                values = torch.where(_by_world(has_past, past), past, values)
-            past.copy_(torch.where(_by_world(a["mask"], past), values, past))
+                values = torch.where(by_world(has_past, past), past, values)
+            past.copy_(torch.where(by_world(a["mask"], past), values, past))
             groups[name] = values.flatten(1)
-        wrong = _beyond(a["qpos"], a["qvel"], *groups.values()) | self._lost(a)
+        wrong = beyond(a["qpos"], a["qvel"], *groups.values()) | self._lost(a)
         a["non_finite"].copy_(torch.where(a["mask"], a["non_finite"] | wrong, a["non_finite"]))
         for name, values in groups.items():
-            target, values = a[f"out.{name}"], values.masked_fill(_by_world(wrong, values), 0.0)
-            target.copy_(torch.where(_by_world(a["mask"], target), values, target))
+            target, values = a[f"out.{name}"], values.masked_fill(by_world(wrong, values), 0.0)
+            target.copy_(torch.where(by_world(a["mask"], target), values, target))
 
     def observe_restored(self, a: Arrays) -> None:
         """After a state was written: does what :meth:`observe_begun` does, with the state's history, if any."""
@@ -499,7 +502,7 @@ class Hooks:
             target = a[f"memory.{name}"] if name in self.catalog.memory else a[name]
             row = unit_quaternions(self.catalog.mj_model, row) if name == "qpos" else row
             new[name] = (
-                row.clone() if mask is None else torch.where(_by_world(mask, target), row.to(target.dtype), target)
+                row.clone() if mask is None else torch.where(by_world(mask, target), row.to(target.dtype), target)
             )
         for name, row in new.items():
             (a[f"memory.{name}"] if name in self.catalog.memory else a[name]).copy_(row)
@@ -517,13 +520,13 @@ NO_GROUPS = (
 """Names that a tensor of the observation cannot have: those of a step's other entries, and of a state."""
 
 
-def _beyond(*arrays: torch.Tensor) -> torch.Tensor:
+def beyond(*arrays: torch.Tensor) -> torch.Tensor:
     """Returns in which worlds a number of arrays ``(num_envs, ...)`` is not finite, or as good as that."""
     finite = [(values.flatten(1) if values.ndim > 1 else values.unsqueeze(1)).abs() < MAX_VALUE for values in arrays]
     return ~torch.stack([part.all(-1) for part in finite]).all(0)
 
 
-def _by_world(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+def by_world(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """Returns a mask of worlds in a shape that broadcasts with ``(num_envs, ...)``."""
     return mask.view(-1, *[1] * (values.ndim - 1))
 

@@ -167,6 +167,11 @@ def into_frame(xmat: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
     return (axes * vectors.unsqueeze(-1)).sum(-2)
 
 
+def out_of_frame(xmat: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """Returns vectors ``(num_envs, 3)`` in frames with the axes ``xmat`` ``(num_envs, 3, 3)`` in the world's."""
+    return (xmat * vectors.unsqueeze(-2)).sum(-1)
+
+
 def to_quaternion(axes: torch.Tensor) -> torch.Tensor:
     """Returns the quaternions (w, x, y, z), w >= 0, of orientations ``(num_envs, 3, 3)``.
 

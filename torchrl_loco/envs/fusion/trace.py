@@ -33,10 +33,13 @@ def _decomposed(func: Any) -> Callable[..., Any] | None:
     return new and (lambda target, *args, **kwargs: target.copy_(new(target, *args, **kwargs)))
 
 
-class _Tracer(TorchDispatchMode):
+class Tracer(TorchDispatchMode):
     """Notes each operator while it runs.
 
     A result bears its node as an attribute, which is dropped with it: all results together may not fit in memory.
+
+    Attributes:
+        arrays: what the graph takes, in this order.
     """
 
     def __init__(self, arrays: dict[str, torch.Tensor]) -> None:
@@ -44,7 +47,8 @@ class _Tracer(TorchDispatchMode):
         self.graph, self.constants = torch.fx.Graph(), torch.nn.Module()
         self._device = next(iter(arrays.values())).device
         self._known: set[torch.fx.Node] = set()  # whose numbers are the same in each run
-        self._kept = list(arrays.values())  # arrays and constants: no other tensor gets their ids meanwhile
+        self.arrays = list(arrays.values())
+        self._kept = list(self.arrays)  # arrays and constants: no other tensor gets their ids meanwhile
         self._nodes = {id(array): self.graph.placeholder(f"arg{i}") for i, array in enumerate(self._kept)}
 
     @classmethod
@@ -68,7 +72,7 @@ class _Tracer(TorchDispatchMode):
                 result = func(*args, **kwargs)
                 self._note(result, self._constant(result.to(self._device)))
                 return result
-        node = self.graph.call_function(func, *torch.fx.node.map_aggregate((args, kwargs), self._argument))
+        node = self.graph.call_function(func, *torch.fx.node.map_aggregate((args, kwargs), self.argument))
         operands = node.all_input_nodes
         if func is aten.lift_fresh_copy.default or (operands and self._known.issuperset(operands)):
             self._known.add(node)
@@ -84,7 +88,8 @@ class _Tracer(TorchDispatchMode):
         node = getattr(tensor, "_node", None)
         return node if node is not None and node.graph is self.graph else self._nodes.get(id(tensor))
 
-    def _argument(self, arg: Any) -> Any:
+    def argument(self, arg: Any) -> Any:
+        """Returns what stands for an argument of an operator in the graph, or for a result of it."""
         if not isinstance(arg, torch.Tensor):
             return arg
         if (node := self._noted(arg)) is not None:
@@ -121,7 +126,7 @@ def trace(work: Callable[[dict[str, torch.Tensor]], None], arrays: dict[str, tor
     Raises:
         RuntimeError: what it does depends on a number of an array.
     """
-    tracer = _Tracer(arrays)
+    tracer = Tracer(arrays)
     with tracer:
         work(arrays)
     tracer.graph.output(None)

@@ -13,6 +13,7 @@ import torch
 from torchrl_loco import motion as motions
 from torchrl_loco.checks import Interval, check_int
 from torchrl_loco.conditions import PUSH_EVERY
+from torchrl_loco.envs.rotations import product
 from torchrl_loco.tasks.robots import Robot, either, hard_contacts, pushed, squares
 from torchrl_loco.tasks.velocity import G1Velocity, H1Velocity
 
@@ -459,21 +460,6 @@ def angle(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     """Returns the angles (rad) between rotations ``(..., 3, 3)``, at most a little less than half a turn."""
     half = ((one - other).square().sum((-1, -2)) / 8.0).clamp(0.0, 0.9998).sqrt()
     return 2.0 * torch.asin(half)
-
-
-def product(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """Returns the products of quaternions (w, x, y, z), ``(num_envs, 4)``."""
-    aw, ax, ay, az = one.unbind(-1)
-    bw, bx, by, bz = other.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        dim=-1,
-    )
 
 
 def both(*links: str) -> list[str]:

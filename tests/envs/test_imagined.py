@@ -1,0 +1,251 @@
+"""What a task says of predicted states, and where bodies are there, against C MuJoCo and against the worlds."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from for_each import for_each
+
+import torchrl_loco as loco
+from torchrl_loco.envs.imagined import STATE, Imagined, showing_states
+from torchrl_loco.envs.kinematics import Kinematics
+from torchrl_loco.registry import resolve
+from torchrl_loco.sim import models
+
+JOINTS = """
+<mujoco>
+  <worldbody>
+    <body name="base" pos="0.1 -0.2 1" quat="0.9 0.1 0.3 -0.2">
+      <freejoint/><geom size="0.1"/>
+      <body pos="0.2 0 0.1" quat="0.7 0.7 0.1 0">
+        <joint type="ball" pos="0.05 0 -0.1"/><geom size="0.05" pos="0.1 0 0"/>
+        <body pos="0 0.3 0">
+          <joint type="slide" axis="1 1 0" ref="0.2"/><joint axis="0 1 1" pos="0 0.1 0" ref="0.3"/><joint axis="1 0 0"/>
+          <geom size="0.05"/>
+          <body pos="0.1 0.1 0.1"><geom size="0.02"/></body>
+        </body>
+      </body>
+    </body>
+    <body pos="1 0 0"><joint axis="0 0 1"/><geom size="0.1" pos="0.2 0 0"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def moving(model, seed):
+    """Returns data of a model somewhere, moving."""
+    rng, data = np.random.default_rng(seed), mujoco.MjData(model)
+    qpos = model.qpos0.copy()
+    mujoco.mj_integratePos(model, qpos, rng.normal(size=model.nv), 1.0)
+    data.qpos, data.qvel = qpos, rng.normal(size=model.nv)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def in_torch(data):
+    return tuple(torch.tensor(np.array(each), dtype=torch.float32).unsqueeze(0) for each in (data.qpos, data.qvel))
+
+
+@pytest.fixture(params=["joints", "humanoid"])
+def model(request):
+    return models.load(JOINTS if request.param == "joints" else resolve("humanoid_walk").model)
+
+
+def test_bodies_are_where_c_mujoco_has_them(model):
+    kinematics = Kinematics(model, torch.device("cpu"))
+    for seed in range(3):
+        data, velocity = moving(model, seed), np.zeros((model.nbody, 6))
+        for body in range(model.nbody):
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity[body], 0)
+        pos, mat, lin, ang = (each[0].numpy() for each in kinematics(*in_torch(data)))
+        np.testing.assert_allclose(pos, data.xpos, atol=2e-6)
+        np.testing.assert_allclose(mat.reshape(-1, 9), data.xmat, atol=2e-6)
+        np.testing.assert_allclose(np.hstack([ang, lin]), velocity, atol=1e-5)
+
+
+def test_gradients_of_bodies_are_those_of_differences(model):
+    kinematics = Kinematics(model, torch.device("cpu"))
+    inputs = [each.requires_grad_() for each in in_torch(moving(model, 0))]
+    torch.manual_seed(0)
+    weights = [torch.randn_like(each) for each in kinematics(*inputs)]
+
+    def weighed(qpos, qvel):
+        return sum((weight * each).sum() for weight, each in zip(weights, kinematics(qpos, qvel), strict=True))
+
+    weighed(*inputs).backward()
+    for _ in range(5):
+        directions = [torch.randn_like(each) for each in inputs]
+        slope = sum((each.grad * d).sum() for each, d in zip(inputs, directions, strict=True))
+        with torch.no_grad():
+            ahead, behind = (
+                weighed(*(each + by * d for each, d in zip(inputs, directions, strict=True))) for by in (1e-3, -1e-3)
+            )
+        torch.testing.assert_close(slope, (ahead - behind) / 2e-3, rtol=2e-3, atol=2e-2)
+
+
+BOX = """
+<mujoco>
+  <worldbody>
+    <body pos="0 0 1">
+      <freejoint/><geom type="box" size="0.2 0.2 0.1"/>
+      <body><joint name="axle" axis="0 0 1"/><geom type="box" size="0.2 0.05 0.05" pos="0.1 0 0"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor name="engine" joint="axle" ctrlrange="-3 2"/></actuator>
+</mujoco>
+"""
+
+
+class Rich(loco.LocoEnv):
+    """A task whose hooks read and write everything that can be imagined."""
+
+    body = "box"
+    model = BOX
+    config = loco.SimConfig(ctrl_dt=0.02, sim_dt=0.005, episode_length=1000)
+    action_range = (-float("inf"), float("inf"))
+    memory = {"last": 1, "count": torch.int32, "odd": torch.bool, "updates": (), "ends": ()}
+    constants = {"table": torch.arange(5.0)}
+    shared = {"total": ()}
+    randomize = [loco.Vary("body_mass", 0.5, 2.0)]
+
+    def control(self, s, action):
+        return 0.5 * action + s.last + 0.01 * s.count.unsqueeze(-1) % 3
+
+    def update(self, s):
+        return {"updates": s.updates + s.qvel[:, 6]}
+
+    def reward(self, s):
+        turned = torch.sin(s.joint_qpos("axle")) + s.model("body_mass")[:, 1] + s.ctrl[:, 0]
+        return {"turn": turned, "clock": torch.sin(6.0 * s.time) + s.env_index, "updates": s.updates}
+
+    def terminated(self, s):
+        return s.table[s.count % 8] > 2.5  # NaN beyond the table, which ends a world too
+
+    def truncated(self, s):
+        return s.time > 0.25
+
+    def events(self, s):
+        push = torch.where(s.count % 2 == 0, 0.5, 0.0).unsqueeze(-1)
+        rows = {"last": s.action, "count": s.count + 70_001, "odd": ~s.odd, "ends": s.ends + s.terminated}
+        return {**rows, "qvel": s.qvel + push}
+
+    def adapt(self, s):
+        return {"total": s.total + 1.0}
+
+    def observation(self, s):
+        rows = {
+            "joint": s.joint_qpos("axle").unsqueeze(-1),
+            "last": s.last,
+            "up": s.projected_gravity("world"),
+            "odd": s.odd.float(),
+        }
+        return {"observation": rows, "privileged": torch.stack([s.updates, s.ends, s.time], dim=-1)}
+
+
+def imagined_beside(env, td, action):
+    """Returns what is said of the step that an environment takes, and the step."""
+    after, m = env.step(td.set("action", action))["next"], env.mj_model
+    imagined = Imagined(env, env.num_envs)
+    state = td[STATE][:, : imagined.size]
+    found = after[STATE][:, -m.nq - m.nv - m.nu :]
+    qpos, qvel, ctrl = found.split([m.nq, m.nv, m.nu], dim=-1)
+    *before, rest = imagined.unpacked(state)
+    torch.testing.assert_close(imagined.control(*before, action, rest), ctrl)
+    over = torch.zeros(env.num_envs, dtype=torch.bool)
+    return imagined, imagined.judge(qpos, qvel, action, rest, state, over), after
+
+
+@pytest.mark.parametrize("task", [Rich, "g1_tracking", "g1_velocity"])
+def test_a_task_says_of_predicted_states_what_it_says_in_its_worlds(task):
+    """But for what it reads of contacts, as most of a velocity task's terms do."""
+    cls = task if isinstance(task, type) else resolve(task)
+    env = loco.make(showing_states(cls), num_envs=4, seed=3, reward_terms=True, noise_scale=0.0)
+    td, ended = env.reset(), False
+    torch.manual_seed(0)
+    for _ in range(4):
+        imagined, said, after = imagined_beside(env, td, 0.1 * torch.randn(4, env.mj_model.nu))
+        assert (said.terminated == after["terminated"][:, 0]).all()
+        assert (said.over == after["done"][:, 0]).all()
+        ended = ended or said.over.all()
+        if task == "g1_velocity":
+            td = after.select("observation", "privileged", STATE)
+            continue
+        of_contacts = after["reward_terms"].get("self_collision", torch.zeros(4, 1))
+        torch.testing.assert_close(said.reward, (after["reward"] - of_contacts)[:, 0], rtol=1e-4, atol=1e-5)
+        for group, rows in said.observations.items():
+            torch.testing.assert_close(rows, after[group], rtol=1e-5, atol=1e-5)
+        there, back = (imagined.unpacked(each[STATE][:, : imagined.size]) for each in (after, td))
+        for row, expected, start in zip(said.rest, there[2], back[2], strict=True):
+            torch.testing.assert_close(row[~said.over], expected[~said.over].to(row.dtype))
+            torch.testing.assert_close(row[said.over], start[said.over].to(row.dtype))
+        torch.testing.assert_close(said.qpos[said.over], back[0][said.over])
+        td = after.select("observation", "privileged", STATE)
+    assert ended == (task is Rich)
+    if ended:
+        start = torch.zeros(4, imagined.size)
+        gone = imagined.judge(said.qpos * float("nan"), said.qvel, torch.zeros(4, 1), said.rest, start, said.over)
+        assert gone.over.all() and not gone.reward.any() and not gone.observations["observation"].any()
+        assert not gone.qpos.any()
+
+
+def beside_g1(**settings):
+    env = loco.make(showing_states(resolve("g1_tracking")), num_envs=2, **settings)
+    state = env.reset()[STATE]
+    imagined = Imagined(env, 2)
+    qpos, qvel, rest = imagined.unpacked(state[:, : imagined.size])
+    over, action = torch.zeros(2, dtype=torch.bool), torch.zeros(2, env.mj_model.nu)
+    return qvel, lambda qvel: imagined.judge(qpos, qvel, action, rest, state[:, : imagined.size], over)
+
+
+def test_noise_is_drawn_anew():
+    qvel, judge = beside_g1()
+    first, second = (judge(qvel).observations for _ in range(2))
+    assert (first["privileged"] == second["privileged"]).all()
+    apart = (first["observation"] - second["observation"]).abs()
+    assert 0.8 < apart.max() <= 1.0  # rates have noise of up to 0.5, either way
+    assert (apart[:, :58] == 0.0).all()  # the reference has none
+
+
+def test_rewards_have_gradients():
+    qvel, judge = beside_g1()
+    direction = torch.randn_like(qvel)
+    judge(qvel.requires_grad_()).reward.sum().backward()
+    slope = (qvel.grad * direction).sum(-1)
+    with torch.no_grad():
+        ahead, behind = (judge(qvel + by * direction).reward for by in (1e-2, -1e-2))
+    torch.testing.assert_close(slope, (ahead - behind) / 2e-2, rtol=2e-2, atol=2e-4)
+
+
+class LeavesTorch(Rich):
+    """Its reward is computed in NumPy."""
+
+    def reward(self, s):
+        return torch.from_numpy(np.sin(s.qvel[:, 6].detach().numpy()))
+
+
+class Long(Rich):
+    """Its memory has long integers."""
+
+    memory = {**Rich.memory, "long": torch.int64}
+
+
+class Remembers(Rich):
+    """Its policy sees the past."""
+
+    history = {"observation": 3}
+
+
+@for_each(
+    ("task", "why"),
+    [
+        ("walker_walk", "its reward is a Warp function"),
+        ("go1_rough", "it scans the ground"),
+        (LeavesTorch, "leaves torch"),
+        (Long, "int32"),
+        (Remembers, "history"),
+    ],
+)
+def test_what_cannot_be_imagined_is_refused(task, why):
+    cls = task if isinstance(task, type) else resolve(task)
+    with pytest.raises(ValueError, match=why):
+        Imagined(loco.make(showing_states(cls), num_envs=2), 2)

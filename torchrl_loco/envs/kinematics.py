@@ -1,0 +1,217 @@
+"""Poses and velocities of bodies as functions of positions and velocities of joints, with gradients."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+
+from torchrl_loco.sim.graph import EXCLUSIVE, current_stream, joined_to_torch, torch_is_recording
+from torchrl_loco.sim.warp_init import init_warp
+
+FREE, SLIDE, HINGE = (
+    wp.constant(int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}"))) for kind in ("FREE", "SLIDE", "HINGE")
+)
+FIXED = wp.constant(-1)
+BLOCK = 32
+"""Worlds of a block of threads: few, so that a few thousand worlds keep all multiprocessors busy."""
+
+
+@wp.struct
+class Links:
+    """A model as a tree of links, each with at most one joint. The last link of a body has the number of the body."""
+
+    order: wp.array[int]
+    """The links, parents first; the first is the world."""
+    parent: wp.array[int]
+    kind: wp.array[int]
+    offset: wp.array[wp.vec3]
+    turn: wp.array[wp.mat33]
+    anchor: wp.array[wp.vec3]
+    axis: wp.array[wp.vec3]
+    q: wp.array[int]
+    v: wp.array[int]
+    rest: wp.array[float]
+
+
+COLUMNS: dict[str, Any] = {
+    "parent": int,
+    "kind": int,
+    "offset": wp.vec3,  # place in the parent (m)
+    "turn": wp.mat33,  # orientation in the parent, at rest
+    "anchor": wp.vec3,  # point about which the joint turns (m)
+    "axis": wp.vec3,
+    "q": int,  # where positions of the joint are
+    "v": int,  # where its velocities are
+    "rest": float,  # its position at rest
+}
+"""What is known of a link, and its type."""
+OUTPUTS = {(3,): wp.vec3, (3, 3): wp.mat33}
+"""Types of what is found of a link, by shape."""
+
+
+@wp.kernel(module="unique")
+def place_links(
+    links: Links,
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    pos: wp.array2d[wp.vec3],
+    mat: wp.array2d[wp.mat33],
+    lin: wp.array2d[wp.vec3],
+    ang: wp.array2d[wp.vec3],
+):
+    w = wp.tid()
+    mat[w, 0] = wp.identity(n=3, dtype=float)
+    for i in range(1, links.order.shape[0]):
+        k = links.order[i]
+        p = links.parent[k]
+        kind = links.kind[k]
+        q = links.q[k]
+        v = links.v[k]
+        if kind == FREE:
+            free = wp.quat_to_matrix(
+                wp.normalize(wp.quat(qpos[w, q + 4], qpos[w, q + 5], qpos[w, q + 6], qpos[w, q + 3]))
+            )
+            pos[w, k] = wp.vec3(qpos[w, q], qpos[w, q + 1], qpos[w, q + 2])
+            mat[w, k] = free
+            lin[w, k] = wp.vec3(qvel[w, v], qvel[w, v + 1], qvel[w, v + 2])
+            ang[w, k] = free * wp.vec3(qvel[w, v + 3], qvel[w, v + 4], qvel[w, v + 5])
+        else:
+            start = pos[w, p] + mat[w, p] * links.offset[k]
+            rest = mat[w, p] * links.turn[k]
+            carried = lin[w, p] + wp.cross(ang[w, p], start - pos[w, p])
+            if kind == FIXED:
+                pos[w, k] = start
+                mat[w, k] = rest
+                lin[w, k] = carried
+                ang[w, k] = ang[w, p]
+            elif kind == SLIDE:
+                along = rest * links.axis[k]
+                moved = (qpos[w, q] - links.rest[k]) * along
+                pos[w, k] = start + moved
+                mat[w, k] = rest
+                lin[w, k] = carried + wp.cross(ang[w, p], moved) + qvel[w, v] * along
+                ang[w, k] = ang[w, p]
+            else:
+                frame = wp.identity(n=3, dtype=float)
+                spin = wp.vec3()
+                if kind == HINGE:
+                    frame = rest * wp.quat_to_matrix(wp.quat_from_axis_angle(links.axis[k], qpos[w, q] - links.rest[k]))
+                    spin = qvel[w, v] * (rest * links.axis[k])
+                else:  # a ball
+                    frame = rest * wp.quat_to_matrix(
+                        wp.normalize(wp.quat(qpos[w, q + 1], qpos[w, q + 2], qpos[w, q + 3], qpos[w, q]))
+                    )
+                    spin = frame * wp.vec3(qvel[w, v], qvel[w, v + 1], qvel[w, v + 2])
+                lever = frame * links.anchor[k]
+                swung = rest * links.anchor[k] - lever
+                pos[w, k] = start + swung
+                mat[w, k] = frame
+                lin[w, k] = carried + wp.cross(ang[w, p], swung) - wp.cross(spin, lever)
+                ang[w, k] = ang[w, p] + spin
+
+
+def links_of(m: mujoco.MjModel) -> Iterator[tuple[int, int, dict[str, Any]]]:
+    """Yields the links of a model, parents first: their number, their body, and what :data:`COLUMNS` names."""
+    further = m.nbody
+    for body in range(m.nbody):
+        first, count, parent = int(m.body_jntadr[body]), int(m.body_jntnum[body]), int(m.body_parentid[body])
+        for at in range(max(count, 1)):
+            row: dict[str, Any] = {"parent": parent, "kind": -1}
+            row |= {"offset": np.zeros(3), "turn": np.eye(3), "anchor": np.zeros(3), "axis": np.zeros(3)}
+            row |= {"q": 0, "v": 0, "rest": 0.0}
+            if at == 0:
+                turn = np.zeros(9)
+                mujoco.mju_quat2Mat(turn, m.body_quat[body])
+                row |= {"offset": m.body_pos[body], "turn": turn.reshape(3, 3)}
+            if count:
+                joint, q = first + at, int(m.jnt_qposadr[first + at])
+                row |= {"kind": int(m.jnt_type[joint]), "anchor": m.jnt_pos[joint], "axis": m.jnt_axis[joint]}
+                row |= {"q": q, "v": int(m.jnt_dofadr[joint]), "rest": float(m.qpos0[q])}
+            is_last = at + 1 >= count
+            link, further = (body, further) if is_last else (further, further + 1)
+            yield link, body, row
+            parent = link
+
+
+class Kinematics:
+    """Where bodies are and how they move, as a differentiable function of positions and velocities.
+
+    Args:
+        m: the model.
+        device: where the tensors live.
+    """
+
+    def __init__(self, m: mujoco.MjModel, device: torch.device) -> None:
+        init_warp()
+        self._device, self._bodies = wp.device_from_torch(device), int(m.nbody)
+        links = list(links_of(m))
+        rows = {link: row for link, _, row in links}
+        self.count = len(rows)
+        self._links = Links()
+        self._links.order = wp.array([link for link, _, _ in links], dtype=int, device=self._device)
+        for name, kind in COLUMNS.items():
+            values = np.array([rows[link][name] for link in range(self.count)])
+            setattr(self._links, name, wp.array(values, dtype=kind, device=self._device))
+        self._root = torch.tensor(m.body_rootid, device=device).long()
+
+    def __call__(self, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Returns positions, orientations, linear and angular velocities of bodies, each ``(worlds, bodies, ...)``.
+
+        All are those of the bodies' origins, in the world's frame.
+        """
+        placed = _Placed.apply(self, qpos, qvel)
+        return placed if self.count == self._bodies else tuple(each[:, : self._bodies] for each in placed)
+
+    def named(self, bodies: Sequence[torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Returns these by MuJoCo's names: ``xpos``, ``xmat``, ``cvel`` and ``subtree_com``.
+
+        The points ``subtree_com``, of whose velocities ``cvel`` tells, are the origins of the bodies' trees here.
+        """
+        pos, mat, lin, ang = bodies
+        of_tree = lin + torch.linalg.cross(ang, pos.index_select(1, self._root) - pos)
+        return {"xpos": pos, "xmat": mat, "cvel": torch.cat([ang, of_tree], dim=-1), "subtree_com": pos}
+
+    def launch(self, tensors: Sequence[torch.Tensor], slopes: Sequence[torch.Tensor] = ()) -> None:
+        """Launches the kernel on torch's current stream; with ``slopes``, its adjoint, which adds to them.
+
+        Args:
+            tensors: qpos, qvel, and what is found of the links.
+            slopes: the gradients with regard to them.
+        """
+        device = self._device
+        arrays, gradients = ([_as_warp(each) for each in every] for every in (tensors, slopes))
+        adjoint: dict[str, Any] = {}
+        if slopes:
+            adjoint = {"adjoint": True, "adj_inputs": [Links(), *gradients[:2]], "adj_outputs": gradients[2:]}
+        recording = torch_is_recording(device)
+        with EXCLUSIVE, joined_to_torch(device) if recording else wp.ScopedStream(current_stream(device), False):
+            settings = {"device": device, "block_dim": BLOCK, **adjoint}
+            wp.launch(place_links, len(tensors[0]), [self._links, *arrays[:2]], arrays[2:], **settings)
+
+
+def _as_warp(tensor: torch.Tensor) -> wp.array:
+    return wp.from_torch(tensor.detach(), dtype=OUTPUTS.get(tuple(tensor.shape[2:]), wp.float32))
+
+
+class _Placed(torch.autograd.Function):
+    """What is found of the links of all worlds, from positions ``(worlds, nq)`` and velocities ``(worlds, nv)``."""
+
+    @staticmethod
+    def forward(ctx: Any, of: Kinematics, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        inputs = qpos.contiguous(), qvel.contiguous()
+        placed = tuple(qpos.new_zeros(len(qpos), of.count, *shape) for shape in ((3,), (3, 3), (3,), (3,)))
+        of.launch([*inputs, *placed])
+        ctx.save_for_backward(*inputs, *placed)
+        ctx.of = of
+        return placed
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        tensors = ctx.saved_tensors
+        found = [torch.zeros_like(each) for each in tensors[:2]]
+        own = [slope.clone(memory_format=torch.contiguous_format) for slope in slopes]  # the adjoint writes to them
+        ctx.of.launch(tensors, [*found, *own])
+        return None, *found
