@@ -3,6 +3,7 @@ from .actor import Spaces as Spaces
 from .algorithm import Algorithm as Algorithm
 from .config import PPOConfig as PPOConfig
 from .config import REPPOConfig as REPPOConfig
+from .config import SVGConfig as SVGConfig
 from .config import TrainingConfig as TrainingConfig
 from .config import preset as preset
 from .config import tuning_note as tuning_note
@@ -19,4 +20,5 @@ from .reppo import REPPO as REPPO
 from .run_folder import RunFolder as RunFolder
 from .start import begin as begin
 from .start import train as train
+from .svg import SVG as SVG
 from .trainer import Trainer as Trainer

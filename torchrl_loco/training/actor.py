@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -171,6 +171,15 @@ def network_of(make: Network, inputs: int, outputs: int) -> nn.Module:
     if shape != (2, outputs):
         raise ValueError(f"network({inputs}, {outputs}) must give {outputs} numbers for each row, but gave {shape[1:]}")
     return network
+
+
+def normed_layers(inputs: int, hidden: Iterable[int]) -> list[nn.Module]:
+    """Returns layers of the given widths, each with layer norm and SiLU."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), nn.LayerNorm(width), nn.SiLU()]
+        inputs = width
+    return layers
 
 
 def make_actor(

@@ -15,6 +15,7 @@ from torch import nn
 from torchrl.modules import ProbabilisticActor
 
 from torchrl_loco.encoder import PixelEncoder, shifted
+from torchrl_loco.envs import LocoEnv
 from torchrl_loco.policy import ObservationNorm, Policy, layers_of, moments
 from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed
@@ -93,6 +94,15 @@ class Algorithm(ABC):
         """Returns the actor as a policy for collectors."""
         return self.actor
 
+    @property
+    def actors(self) -> list[ProbabilisticActor]:
+        """All actors, which begin alike: by itself, one."""
+        return [self.actor]
+
+    def attach(self, env: LocoEnv) -> None:
+        """Takes what it needs of the environment in which it will train beyond its spaces: nothing, by itself."""
+        del env
+
     def make_optimizer(self, name: str, parameters: Iterable[Any]) -> FlatAdam:
         """Makes an optimizer of ``parameters`` or groups, whose learning rate recorded steps follow.
 
@@ -115,9 +125,7 @@ class Algorithm(ABC):
             len(batch_metric_names),)``.
         """
         config = self.config
-        for optimizer in self.optimizers.values():
-            if isinstance(optimizer, FlatAdam):
-                optimizer.adopt()
+        self.adopt()
         self.schedule(progress)
         with torch.no_grad():
             data = self.prepare(batch).reshape(-1)
@@ -136,6 +144,12 @@ class Algorithm(ABC):
         self.learn_moments(batch)  # after the update: the losses need the normalisation used while collecting
         steps = config.epochs * (len(self._order) // config.minibatch_size)
         return torch.cat([self._totals / steps, of_batch])
+
+    def adopt(self) -> None:
+        """Takes parameters back that were moved out of the vectors of their optimizers."""
+        for optimizer in self.optimizers.values():
+            if isinstance(optimizer, FlatAdam):
+                optimizer.adopt()
 
     def learn_moments(self, batch: TensorDictBase) -> None:
         """Updates the normalisation of what networks read with a batch, and the mean picture with its first step."""
@@ -323,9 +337,9 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
             raise ValueError(f"init: the networks of {source} do not fit this run: {error}") from error
         return
     policy = RunFolder(source).load_policy(device) if source.is_dir() else Policy.load(source, device)
-    mine = layers_of_actor(algorithm.actor)
-    for own, other in zip(mine, layers_of(policy.module), strict=False):
-        _copy(own, other, source, last=own is mine[-1])
+    for mine in map(layers_of_actor, algorithm.actors):
+        for own, other in zip(mine, layers_of(policy.module), strict=False):
+            _copy(own, other, source, last=own is mine[-1])
 
 
 def _copy(own: nn.Module, other: nn.Module, source: Path, *, last: bool) -> None:

@@ -52,6 +52,10 @@ INTERVALS = {
     "episode_length": COUNT,
     "norm_eps": NOT_NEGATIVE,
     "random_shift": COUNT,
+    "warmup": COUNT,
+    "horizon": Interval(2, 2**31),
+    "target_rate": Interval(0, 1, with_low=False, with_high=True),
+    "average_rate": Interval(0, 1, with_low=False, with_high=True),
 }
 """Intervals of the fields that are not simply positive."""
 OF_PIXELS = ("camera", "size", "frame_stack", "random_shift", "critic_from_pixels")
@@ -99,6 +103,10 @@ class TrainingConfig:
     """What differs for tasks other than those of dm_control's runners, which have episodes of their own."""
     of_pixels: ClassVar[dict[str, Settings]] = {"cpu": {}, "cuda": {}}
     """What differs where the actor sees pixels, by kind of device."""
+    widths: ClassVar[tuple[str, ...]] = ("hidden",)
+    """Names of the fields that are widths of layers."""
+    shows_states: ClassVar[bool] = False
+    """Whether the environment in which it trains must show its states."""
 
     task: str
     """The task, an id or the file or module of a class and its name, with a colon between."""
@@ -196,7 +204,8 @@ class TrainingConfig:
         object.__setattr__(self, "logger", tuple(dict.fromkeys(loggers)))
         object.__setattr__(self, "device", str(self.device))
         object.__setattr__(self, "out", Path(self.out))
-        object.__setattr__(self, "hidden", tuple(self.hidden))
+        for field in self.widths:
+            object.__setattr__(self, field, _checked_widths(field, getattr(self, field)))
         object.__setattr__(self, "size", checked_size(self.size))
         if not isinstance(self.sim, Sim):
             if not isinstance(self.sim, Mapping):
@@ -217,10 +226,6 @@ class TrainingConfig:
         # Whether the machine has the device is checked when the run starts.
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
             raise ValueError(f"no device {self.device!r}: choose one of cpu, cuda, cuda:0, ...")
-        if not self.hidden:
-            raise ValueError("hidden must name the width of at least one layer")
-        for width in self.hidden:
-            check_int("each width of hidden", width)
         if self.minibatch_size > self.frames_per_batch:
             raise ValueError(
                 f"minibatch_size ({self.minibatch_size}) must not exceed the batch of num_envs ({self.num_envs}) * "
@@ -405,6 +410,99 @@ class REPPOConfig(TrainingConfig):
             raise ValueError(f"min_value ({self.min_value:g}) must be below max_value ({self.max_value:g})")
 
 
+@dataclasses.dataclass(frozen=True)
+class SVGConfig(TrainingConfig):
+    """Settings of stochastic value gradients through a learned model.
+
+    ``epochs`` are rounds after each batch, in which model, actor and critic make a gradient step each;
+    ``minibatch_size`` is how many windows and imagined worlds one has.
+
+    Raises:
+        TypeError: a field has the wrong type.
+        ValueError: a field is out of range, or does not fit another; the message names what is valid.
+    """
+
+    algorithm: ClassVar[str] = "svg"
+    widths: ClassVar[tuple[str, ...]] = ("hidden", "model_hidden", "critic_hidden")
+    shows_states: ClassVar[bool] = True
+    presets: ClassVar[dict[str, Settings]] = {
+        "cpu": {
+            "num_envs": 128,
+            "num_steps": 16,
+            "action_repeat": 1,
+            "epochs": 4,
+            "model_hidden": (256, 256),
+        },
+        "cuda": {
+            "num_envs": 4096,
+            "num_steps": 16,
+            "total_frames": 60_000_000,
+            "action_repeat": 1,
+            "episode_length": 1000,
+            "epochs": 6,
+            "minibatch_size": 4096,
+            "lr": 5e-4,
+            "final_lr_fraction": 0.1,
+            "hidden": (1024, 512, 256),
+            "bf16": True,
+            "eval_episodes": 128,
+        },
+    }
+
+    reward_scale: float = 1.0
+    """Factor on the reward before returns are estimated."""
+    gamma: float = 0.97
+    """Discount of a step."""
+    compile: bool = True
+    """Whether torch.compile makes kernels of what is imagined on CUDA; the first start on a machine takes a minute
+    longer then."""
+    horizon: int = 16
+    """Steps that are imagined in a row, along which the actor's gradient flows."""
+    window: int = 16
+    """Steps that the model predicts in a row where it is fitted."""
+    replay: int = 8
+    """Batches that are remembered."""
+    warmup: int = 50
+    """Rounds at the start in which the actor stays, since what model and critic say at first would lead it astray."""
+    model_hidden: tuple[int, ...] = (1024, 1024, 1024)
+    """Widths of the model's layers."""
+    model_lr: float = 1e-3
+    """Learning rate of the model at the start; it falls as the other does."""
+    critic_hidden: tuple[int, ...] = (512, 512)
+    """Widths of the critic's layers."""
+    target_rate: float = 0.02
+    """Share by which the critic that returns are made with follows the one that learns, in a round."""
+    average_rate: float = 0.01
+    """Share by which the policy that is kept follows the one that learns, in a round."""
+    init_std: float = 0.3
+    """Standard deviation of an action, which stays; before tanh, if actions are bounded."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.window > self.replay * self.num_steps:
+            raise ValueError(
+                f"window ({self.window}) must not exceed the replay * num_steps = {self.replay * self.num_steps} steps "
+                f"that are remembered: pass replay={math.ceil(self.window / self.num_steps)} or more"
+            )
+        if self.trials > 1:
+            raise ValueError("trials must be 1: svg begins one policy")
+        if self.action_repeat > 1:
+            raise ValueError("action_repeat must be 1: svg imagines single control steps")
+
+
+def _checked_widths(name: str, widths: Any) -> tuple[int, ...]:
+    """Returns the widths of layers.
+
+    Raises:
+        TypeError: they are no integers.
+        ValueError: there are none, or one is not positive.
+    """
+    several = tuple(widths) if isinstance(widths, list | tuple) else (widths,)
+    if not several:
+        raise ValueError(f"{name} must name the width of at least one layer")
+    return tuple(check_int(f"each width of {name}", width) for width in several)
+
+
 def _stored_name(task: Any) -> str:
     """Returns the name of a task; of one that says where its class is, with the whole path of its file.
 
@@ -432,7 +530,7 @@ def check_loggers(names: Collection[str]) -> None:
             check_packages(f"the logger {name}", [name], "train" if name == "tensorboard" else name)
 
 
-CONFIGS: dict[str, type[TrainingConfig]] = {config.algorithm: config for config in (PPOConfig, REPPOConfig)}
+CONFIGS: dict[str, type[TrainingConfig]] = {config.algorithm: config for config in (PPOConfig, REPPOConfig, SVGConfig)}
 
 
 def config_from_json(values: dict[str, Any]) -> TrainingConfig:
@@ -468,8 +566,8 @@ def preset(
     Args:
         task: id of the environment, its class, or where that is: ``"path/to/file.py:Class"``.
         device: where to train; ``None`` takes CUDA if there is any.
-        algorithm: "ppo" or "reppo"; ``None`` takes PPO on a CPU, and on CUDA the first of the task's ``presets``, REPPO
-            if it has none.
+        algorithm: "ppo", "reppo" or "svg"; ``None`` takes PPO on a CPU, and on CUDA the first of the task's
+            ``presets``, REPPO if it has none.
         overrides: fields of the settings, and the task's own :attr:`torchrl_loco.LocoEnv.options`.
 
     Raises:

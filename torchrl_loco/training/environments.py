@@ -16,6 +16,7 @@ from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 from torchrl_loco.config import arguments_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
+from torchrl_loco.envs.imagined import showing_states
 from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
@@ -168,7 +169,10 @@ class Environments:
         """Returns worlds as the run's, by themselves those of an evaluation."""
         config, base = self._config, self._base
         if base is None:
-            place = resolve(config.task), worlds, config.device, seed, config.protocol
+            task = resolve(config.task)
+            if config.shows_states and settings.get("stagger"):  # evaluations do without
+                task = showing_states(task)
+            place = task, worlds, config.device, seed, config.protocol
             terms = not is_runner(config.task)
             return make(
                 *place, **{**config.of_env, "world_offset": 0, "metrics": True, "reward_terms": terms, **settings}

@@ -20,7 +20,7 @@ from torchrl.objectives.value.functional import td_lambda_return_estimate
 from torchrl_loco.encoder import PixelEncoder
 from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
-from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of
+from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of, normed_layers
 from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step, compiled
 from torchrl_loco.training.config import REPPOConfig
 
@@ -370,12 +370,3 @@ class DistributionalQ(nn.Module):
     def _features(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         seen = self.sight(observation) if self.sight else observation
         return self.encoder(torch.cat([seen, action], dim=-1))
-
-
-def normed_layers(inputs: int, hidden: tuple[int, ...]) -> list[nn.Module]:
-    """Returns layers of the given widths, each with layer norm and SiLU."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.LayerNorm(width), nn.SiLU()]
-        inputs = width
-    return layers

@@ -41,8 +41,9 @@ def train(
         network: a function of the numbers of inputs and outputs that returns a network, an ``nn.Sequential`` of the
             layers that a policy's file can hold. It makes the actor's, and PPO's critic with one output. What it
             returns is not initialised again. Observations are normalised before it.
-        algorithm: ``"ppo"``, ``"reppo"`` or a subclass of :class:`torchrl_loco.training.algorithm.Algorithm`; ``None``
-            takes that of ``config``, or the default of the device.
+        algorithm: ``"ppo"``, ``"reppo"``, ``"svg"`` or a subclass of
+            :class:`torchrl_loco.training.algorithm.Algorithm`; ``None`` takes that of ``config``, or the
+            default of the device.
         out: the folder in which the run's own folder is made.
         device: where to train; ``None`` takes CUDA if there is any, or the device of the run that is resumed.
         resume: a run that was stopped, to continue from its checkpoint with the same task, network and algorithm. The

@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 
 from torchrl_loco.checks import check_device
 from torchrl_loco.collector import RolloutCollector
+from torchrl_loco.envs.imagined import STATE
 from torchrl_loco.policy import Policy
 from torchrl_loco.sim.simulation import check_memory
 from torchrl_loco.training import distributed
@@ -30,11 +31,12 @@ from torchrl_loco.training.ppo import PPO
 from torchrl_loco.training.process import interruptible, lock, unlock
 from torchrl_loco.training.reppo import REPPO
 from torchrl_loco.training.run_folder import RunFolder
+from torchrl_loco.training.svg import SVG
 from torchrl_loco.training.trials import Trials
 
 COPIES_IN_BATCH = 8
 """How often the pixels of a batch lie in memory: before and after a step, collected, stacked, packed and shuffled."""
-ALGORITHMS: dict[str, type[Algorithm]] = {cls.config_type.algorithm: cls for cls in (PPO, REPPO)}
+ALGORITHMS: dict[str, type[Algorithm]] = {cls.config_type.algorithm: cls for cls in (PPO, REPPO, SVG)}
 
 
 class Trainer:
@@ -47,8 +49,8 @@ class Trainer:
     Args:
         run: the folder from which settings are read and into which everything is written.
         resume: whether to continue from the run's checkpoint. On the CPU, a run that was stopped and resumed equals one
-            that was not, bit for bit. With another number of ranks, parameters and counters continue, the worlds start
-            anew, and what that changes is printed.
+            that was not, bit for bit, but one of svg, which forgets its steps. With another number of ranks, parameters
+            and counters continue, the worlds start anew, and what that changes is printed.
         given: what is handed in as objects.
         total_frames: to how many frames a resumed run is trained; ``None`` leaves that as it was. As the device, it is
             stored in the folder once nothing is left to be refused.
@@ -117,12 +119,13 @@ class Trainer:
         deterministic_policy(self.algorithm.actor, config, {})  # raises an error where it could not be saved
         self._base, _ = unwrapped(self.env)
         seen = {*self._base.groups, "depth"} & {*self.env.observation_spec.keys()}
-        unread = ", ".join(sorted(seen - {"observation", "privileged", "pixels"}))
+        unread = ", ".join(sorted(seen - {"observation", "privileged", "pixels", STATE}))
         if unread and first and not self.environments.transforms and given.algorithm is None:  # which may read them
             logging.getLogger("torchrl_loco").warning(
                 "networks do not read %s: join them to 'observation', in the task or by transforms", unread
             )
         length, from_start = self.environments.full_length, not self._base.stagger
+        self.algorithm.attach(self._base)
         self.episodes = Episodes(config.num_envs, config.device, config.action_repeat, length, from_start)
         self._training_length = self._base.config.episode_length
         terms = self.env.observation_spec.get("reward_terms", None)

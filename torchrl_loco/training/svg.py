@@ -1,0 +1,340 @@
+"""Stochastic value gradients through a learned model (Heess et al., 2015; Amos et al., 2021).
+
+A network learns one control step of the robot from what happened last. From there, actor and critic learn in steps that
+are imagined: the model predicts states, and the task's own hooks say what is observed and earned there and what ends.
+So the actor ascends the gradient of the imagined return, as in SuperMimic (arXiv 2610.28480), which follows motions.
+"""
+
+import copy
+import logging
+import math
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NoReturn
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import AddStateIndependentNormalScale
+from torch import nn
+from torchrl.modules import MLP, ProbabilisticActor
+
+from torchrl_loco.envs import LocoEnv
+from torchrl_loco.envs.imagined import FOUND, Imagined
+from torchrl_loco.policy import ObservationNorm
+from torchrl_loco.sim import TorchGraph
+from torchrl_loco.training import distributed
+from torchrl_loco.training.actor import Network, Spaces, make_actor, network_of, normed_layers
+from torchrl_loco.training.algorithm import WARMUP, Algorithm, clip_and_step, compiled
+from torchrl_loco.training.config import SVGConfig
+from torchrl_loco.training.dynamics import Dynamics
+from torchrl_loco.training.muon import Muon
+from torchrl_loco.training.replay import Replay
+
+
+class SVG(Algorithm):
+    """After each batch, some rounds: the model is fitted to windows of what is remembered, actor and critic imagine.
+
+    The policy that is evaluated and kept is a moving average of the one that learns and collects.
+    """
+
+    config_type = SVGConfig
+    metric_names = (
+        "loss_model",
+        "error_first",
+        "error_last",
+        "grad_norm_model",
+        "imagined_return",
+        "imagined_length",
+        "value",
+        "loss_critic",
+        "grad_norm_actor",
+        "grad_norm_critic",
+        "lost_gradients",
+    )
+    config: SVGConfig
+
+    def __init__(self, config: SVGConfig, spaces: Spaces, network: Network | None = None) -> None:
+        super().__init__(config, spaces, network)
+        if spaces.pixels:
+            raise ValueError("svg imagines no pixels: train with algorithm='ppo' or 'reppo' from pixels")
+        self.norms = {key: ObservationNorm(size).to(self.device) for key, size in spaces.rows.items()}
+        if network is None:
+            self._mean: nn.Module = MLP(
+                spaces.observation, spaces.action, num_cells=config.hidden, activation_class=nn.SiLU
+            )
+            nn.init.orthogonal_(self._mean[-1].weight, gain=0.01)  # the first actions are near zero
+        else:
+            self._mean = network_of(network, spaces.observation, spaces.action)
+        self._average = copy.deepcopy(self._mean).requires_grad_(False)
+        scale = AddStateIndependentNormalScale(spaces.action, init_value=math.log(config.init_std))
+        scale.requires_grad_(False)
+        self._learner, self.actor = (
+            make_actor(spaces, self.device, nn.Sequential(self.norms["observation"], mean, scale), log_prob=False)
+            for mean in (self._mean, self._average)
+        )
+        *_, last = config.critic_hidden
+        value = nn.Sequential(*normed_layers(spaces.critic, config.critic_hidden), nn.Linear(last, 1))
+        self.critic = nn.Sequential(self.norms[spaces.critic_key], value.to(self.device))
+        self._target = copy.deepcopy(self.critic[1]).requires_grad_(False)
+        parts = {"actor": self.actor, "learner": self._learner, "critic": self.critic, "target": self._target}
+        self.networks, self._rounds = nn.ModuleDict(parts), 0
+        self._actor_optimizers = self._optimizers_of("actor", self._mean)
+        self._critic_optimizers = [self.make_optimizer("critic", value.parameters())]
+
+    def attach(self, env: LocoEnv) -> None:
+        """Makes the model of the robot of an environment, and what imagines its task.
+
+        Raises:
+            ValueError: the environment was handed in, or its task or robot cannot be imagined.
+        """
+        config, on_cuda = self.config, self.device.type == "cuda"
+        if FOUND not in env.hooks.catalog.memory:
+            raise ValueError("svg needs a task that shows its states: train with the task's id or class, not in an env")
+
+        def fused(function: Callable[..., Any], what: str = "") -> Callable[..., Any]:
+            def in_bf16(*args: Any) -> Any:
+                with torch.autocast("cuda", torch.bfloat16):
+                    return function(*args)
+
+            chosen = in_bf16 if config.bf16 and what else function  # hooks are none of networks
+            settings = {"options": {"force_shape_pad": True}}
+            return compiled(chosen, what or "a hook", **settings) if config.compile and on_cuda else chosen
+
+        def recorded(work: Callable[[], None]) -> Callable[[], None]:
+            return TorchGraph(work, self.device, warmup=WARMUP) if on_cuda else work
+
+        self._imagined = Imagined(env, config.minibatch_size, fused)
+        if (unknown := self._imagined.unknown) and distributed.is_first():
+            logging.getLogger("torchrl_loco").warning(
+                "svg imagines neither contacts nor sensors of forces: hooks read zeros there for %s", ", ".join(unknown)
+            )
+        m, sim = env.mj_model, env.config
+        self.model = Dynamics(m, sim.ctrl_dt, sim.substeps, config.model_hidden).to(self.device)
+        self.networks.add_module("model", self.model)
+        self._model_optimizers = self._optimizers_of("model", self.model.net)
+        sizes = {"state": self._imagined.size, "observation": self.spaces.observation}
+        self._replay = Replay(config, m, sizes, self.generator)
+        self._move, self._dream = fused(self._moved, "the model"), fused(self._dreamt, "the actor")
+        self._value, self._target_value = fused(self.critic, "the critic"), fused(self._valued, "the critic")
+        self._fit, self._improve = recorded(self.fit), recorded(self.improve)
+
+    def acting(self) -> nn.Module:
+        """Returns the actor that learns as a policy for collectors."""
+        return self._learner
+
+    @property
+    def actors(self) -> list[ProbabilisticActor]:
+        """The actor that is kept, and the one that learns."""
+        return [self.actor, self._learner]
+
+    def prepare(self, batch: TensorDictBase) -> NoReturn:
+        """Refuses: it remembers batches instead."""
+        raise NotImplementedError("svg learns from windows of several batches")
+
+    def gradient_step(self, minibatch: TensorDictBase) -> NoReturn:
+        """Refuses, likewise."""
+        raise NotImplementedError("svg learns from windows of several batches")
+
+    def update(self, batch: TensorDictBase, progress: float) -> torch.Tensor:
+        """Updates on what is remembered, a batch more, without synchronising with the device.
+
+        Args:
+            batch: experience of shape ``(num_envs, num_steps)``; each rank passes its own.
+            progress: fraction of the training that is done, in [0, 1], which sets the learning rates.
+
+        Returns:
+            The means of the metrics over all rounds, ``(len(metric_names),)``; zeros until a window is remembered.
+        """
+        self.adopt()
+        self.schedule(progress)
+        steps = self._replay.keep(batch)
+        self.learn_moments(batch)
+        self.model.learn_moments(*steps)
+        self._totals.zero_()
+        rounds = self.config.epochs if self._replay.has_window else 0
+        for _ in range(rounds):
+            self._replay.draw_window()
+            self._fit()
+            self._replay.draw_starts()
+            self._improve()
+        self._rounds += rounds
+        return self._totals / max(rounds, 1)
+
+    def schedule(self, progress: float) -> None:
+        """Sets the learning rates, as all do; that of the model is its own, and that of the actor 0 at the start."""
+        super().schedule(progress)
+        for optimizers, factor in (
+            (self._model_optimizers, self.config.model_lr / self.config.lr),
+            (self._actor_optimizers, float(self._rounds >= self.config.warmup)),
+        ):
+            for group in (group for optimizer in optimizers for group in optimizer.param_groups):
+                group["lr"].mul_(factor)
+
+    # The model.
+
+    def fit(self) -> None:
+        """Makes a gradient step of the model: it predicts a window of steps from the first state alone."""
+        first, controls, afters, events, valid = self._replay.window
+        qpos, qvel, _ = self._imagined.unpacked(first)
+        qpos, qvel = qpos.requires_grad_(), qvel.requires_grad_()  # as those of later steps, so that one kernel does
+        errors = []
+        for ctrl, after, event in zip(controls, afters, events, strict=True):
+            qpos, qvel, error = self._move(qpos, qvel, ctrl, after, event)
+            errors.append(error)
+        by_step = (torch.stack(errors) * valid).sum(1) / valid.sum(1).clamp(min=1.0)
+        loss = by_step.mean()
+        norm = self._descend(self._model_optimizers, loss)
+        self._add("loss_model", loss, by_step[0], by_step[-1], norm)
+
+    def _moved(
+        self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor, after: torch.Tensor, event: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Returns predicted positions and velocities with what events changed, and the error without."""
+        qpos, qvel = self.model(qpos, qvel, ctrl)
+        return qpos, qvel + event, self.model.errors(qpos, qvel, after)
+
+    # Actor and critic.
+
+    def improve(self) -> None:
+        """Makes a gradient step of actor and critic each, in steps that are imagined from remembered states on."""
+        config = self.config
+        rewards, ended, cut, seen = self._imagine()
+        values = self._target_value(seen.flatten(0, 1)).view_as(rewards)
+        returns = lambda_returns(rewards, values, ended, cut, config.gamma, config.lmbda)
+        over = (ended | cut)[:-1].float()
+        alive = torch.cat([torch.ones_like(rewards[:1]), (1.0 - over).cumprod(0)])  # before each step
+        norm_actor = self._descend(self._actor_optimizers, -returns[0].mean())
+        weight, aims = alive[1:], returns[1:].detach()
+        value = self._value(seen[:-1].detach().flatten(0, 1)).float().view_as(aims)
+        loss = ((value - aims).square() * weight).sum() / weight.sum().clamp(min=1.0)
+        norm_critic = self._descend(self._critic_optimizers, loss)
+        with torch.no_grad():
+            for mine, new, rate in (
+                (self._target, self.critic[1], config.target_rate),
+                (self._average, self._mean, config.average_rate),
+            ):
+                for old, latest in zip(mine.parameters(), new.parameters(), strict=True):
+                    old.lerp_(latest, rate)
+        length = alive.sum(0).mean()
+        self._add("imagined_return", returns[0].mean(), length, values.mean(), loss, norm_actor, norm_critic)
+
+    def _imagine(self) -> tuple[torch.Tensor, ...]:
+        """Returns rewards, whether episodes terminated and were cut off, and what the critic reads after each step.
+
+        Each is ``(horizon, n, ...)``; what comes after an end does not count.
+        """
+        config, imagined = self.config, self._imagined
+        rows, observation = self._replay.starts
+        qpos, qvel, rest = imagined.unpacked(rows)
+        observation = observation.clone()
+        for start in (qpos, qvel, observation, *rest):
+            start.requires_grad_(start.is_floating_point())  # as in later steps, so that one kernel does
+        steps, over = [], torch.zeros_like(rows[:, 0], dtype=torch.bool)
+        self.model.net.requires_grad_(False)
+        for noise in torch.randn(config.horizon, len(rows), self.spaces.action, device=self.device):
+            action, qpos, qvel = self._dream(observation, qpos, qvel, noise, *rest)
+            said = imagined.judge(qpos, qvel, action, rest, rows, over)
+            qpos, qvel, rest, over = said.qpos, said.qvel, said.rest, said.over
+            observation = said.observations["observation"]
+            of_critic = said.observations[self.spaces.critic_key]
+            steps.append((config.reward_scale * said.reward, said.terminated, said.truncated, of_critic))
+        self.model.net.requires_grad_(True)
+        return tuple(map(torch.stack, zip(*steps, strict=True)))
+
+    def _dreamt(
+        self,
+        observation: torch.Tensor,
+        qpos: torch.Tensor,
+        qvel: torch.Tensor,
+        noise: torch.Tensor,
+        *rest: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Returns the actions that standard normal noise makes, and the positions and velocities they lead to."""
+        action = self._mean(self.norms["observation"](observation)).float() + self.config.init_std * noise
+        action = action.tanh() if self.spaces.bounded else action
+        return action, *self.model(qpos, qvel, self._imagined.control(qpos, qvel, action, rest))
+
+    def _valued(self, rows: torch.Tensor) -> torch.Tensor:
+        """Returns the values that returns are made with, ``(n, 1)``."""
+        return self._target(self.critic[0](rows)).float()
+
+    # Optimizers.
+
+    def _optimizers_of(self, name: str, network: nn.Module) -> list[Any]:
+        """Returns those of a network: Muon for its matrices but the last, Adam for the rest."""
+        matrices: list[Any] = [part.weight for part in network.modules() if isinstance(part, nn.Linear)][:-1]
+        taken = set(map(id, matrices))
+        rest = self.make_optimizer(name, (each for each in network.parameters() if id(each) not in taken))
+        if not matrices:
+            return [rest]
+        self.optimizers[f"{name} matrices"] = Muon(matrices, torch.tensor(self.config.lr, device=self.device))
+        return [rest, self.optimizers[f"{name} matrices"]]
+
+    def _descend(self, optimizers: Iterable[Any], loss: torch.Tensor) -> torch.Tensor:
+        """Makes a step of each optimizer, of zeros if a number of the gradient is not finite, which is counted.
+
+        Returns:
+            The norm of all gradients before.
+        """
+        for optimizer in optimizers:
+            optimizer.zero_grad()
+        with torch.autograd.set_multithreading_enabled(False):  # Warp belongs to the thread that records
+            loss.backward()
+        groups = [group for optimizer in optimizers for group in optimizer.param_groups]
+        slopes = [part.grad for group in groups for part in group["params"] if part.grad is not None]
+        norm = torch.stack(torch._foreach_norm(slopes)).norm()
+        for slope in slopes:
+            slope.copy_(torch.where(norm.isfinite(), slope, 0.0))
+        for optimizer in optimizers:
+            clip_and_step(optimizer, self.config.max_grad_norm)
+        self._totals[-1] += ~norm.isfinite()
+        return norm.nan_to_num(0.0, 0.0, 0.0)
+
+    def _add(self, first: str, *values: torch.Tensor) -> None:
+        """Adds metrics to their totals, from the one that is named on."""
+        at = self.metric_names.index(first)
+        self._totals[at : at + len(values)] += torch.stack([value.detach() for value in values])
+
+    def note(self, metrics: Mapping[str, Sequence[float]]) -> str:
+        """Returns that gradients were lost, and why they may be, if some were."""
+        lost = max(metrics["lost_gradients"])
+        why = "a hook gives NaN, or has no slope where it is called, as sqrt at 0" if lost else ""
+        return why and f"{lost:.2f} of 3 gradients of a round were not finite and left out: {why}"
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that a continuation needs, but for the steps that are remembered."""
+        return {**super().state_dict(), "rounds": self._rounds}
+
+    def load_state_dict(self, state: dict[str, Any], draws: bool = True) -> None:
+        """Continues from a state, but for the steps that were remembered, which are as large as the worlds' memory."""
+        super().load_state_dict(state, draws)
+        self._rounds = state["rounds"]
+        if distributed.is_first():
+            print("svg remembers steps anew: the run differs from one that was not stopped", file=sys.stderr)
+
+    def release(self) -> None:
+        """Forgets what was recorded."""
+        for graph in (self._fit, self._improve):
+            if isinstance(graph, TorchGraph):
+                graph.release()
+
+
+def lambda_returns(
+    rewards: torch.Tensor, values: torch.Tensor, ended: torch.Tensor, cut: torch.Tensor, gamma: float, lmbda: float
+) -> torch.Tensor:
+    """Returns lambda-returns from each step on, ``(steps, n)`` as all arguments, through which gradients flow.
+
+    Args:
+        rewards: of steps.
+        values: of the states after them.
+        ended: whether the episode ended there, so that nothing follows.
+        cut: whether it was cut off, so that what follows is the value.
+        gamma: discount.
+        lmbda: share of the return in what follows, instead of the value.
+    """
+    follows, returns = values[-1], list[torch.Tensor]()
+    for t in range(len(rewards) - 1, -1, -1):
+        follows = torch.where(cut[t], values[t], follows)
+        returns.append(rewards[t] + torch.where(ended[t], 0.0, gamma * follows))
+        follows = torch.lerp(values[t - 1], returns[-1], lmbda)  # of the step before
+    return torch.stack(returns[::-1])
