@@ -184,7 +184,9 @@ def test_a_task_says_of_predicted_states_what_it_says_in_its_worlds(task):
     if ended:
         start = torch.zeros(4, imagined.size)
         gone = imagined.judge(said.qpos * float("nan"), said.qvel, torch.zeros(4, 1), said.rest, start, said.over)
-        assert gone.over.all() and not gone.reward.any() and not gone.observations["observation"].any()
+        assert gone.over.all()
+        assert not gone.reward.any()
+        assert not gone.observations["observation"].any()
         assert not gone.qpos.any()
 
 
