@@ -61,7 +61,7 @@ def test_settings_of_a_task_wait_for_torch_alone(tmp_path):
     said, exits, imported = in_fresh_process(*lines)
     assert exits == ["exit 0", "exit 2", "exit 2"], said
     assert imported[1] == "imported ['torch']"
-    assert "--algorithm, ppo or reppo (here ppo)" in said
+    assert "--algorithm, ppo or reppo or svg (here ppo)" in said
     assert "--task" not in said  # the preset is for no other
     assert "did you mean 'num_envs'?" in said
     assert not {"walker_run", "doctor"} & set(said.split())  # other tasks and commands have such an option too

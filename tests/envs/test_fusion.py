@@ -431,9 +431,13 @@ import hashlib, sys, torchrl_loco
 from torchrl_loco.envs import fusion
 from torchrl_loco.sim import Simulation
 
-plain = fusion._kernel
+plain = fusion.Program.run
+def told(*args):
+    source = plain(*args)
+    print(hashlib.sha256(source.text.encode()).hexdigest())
+    return source
 Simulation.compile = lambda *args: sys.exit()  # when all texts are written
-fusion._kernel = lambda text, *args: print(hashlib.sha256(text.encode()).hexdigest()) or plain(text, *args)
+fusion.Program.run = told
 torchrl_loco.make("go1_velocity", 2, "cpu", seed=0)
 """
 
