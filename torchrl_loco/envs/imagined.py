@@ -193,13 +193,9 @@ class Imagined:
 
     def _trace(self, states: torch.Tensor, action: torch.Tensor, compiled: Callable[[Any], Any] | None) -> None:
         """Makes modules of the hooks, of states like those in the home pose."""
-        home, none = (
-            self._hooks.catalog.home.expand(len(states), -1),
-            torch.zeros(len(states), device=states.device) > 0,
-        )
-        _, qvel, rest = self.unpacked(states)
-        at_home = [torch.cat([home, states[:, home.shape[1] :]], dim=-1), home.clone(), qvel]
-        start, qpos = at_home[:2]
+        home = self._hooks.catalog.home
+        start = torch.cat([home.expand(len(states), -1), states[:, len(home) :]], dim=-1)
+        qpos, qvel, rest = self.unpacked(start)
         try:
             self._control = self._checked(self._controlled, (qpos, qvel, action, *rest))
         except ValueError as error:
@@ -207,6 +203,7 @@ class Imagined:
         if WithUnits.drawn:
             self._refuse("its control draws random numbers")
         self._units = qpos.new_zeros(len(qpos), 0)
+        none = torch.zeros_like(qpos[:, 0], dtype=torch.bool)
         inputs = [qpos, qvel, *self.kinematics(qpos, qvel), action, self._units, start, none, *rest]
         with torch.no_grad():
             self._called(*inputs)  # which counts random numbers
@@ -220,13 +217,13 @@ class Imagined:
         Raises:
             ValueError: it does not.
         """
-        module = traced(function, inputs)
-        with torch.no_grad(), torch.random.fork_rng([]):
-            torch.manual_seed(0)
+        module, generator = traced(function, inputs), torch.Generator().manual_seed(0)
+        with torch.no_grad():
             others = [
-                each + 0.1 * torch.randn(each.shape).to(each.device) if each.is_floating_point() else each
+                each + 0.1 * torch.randn(each.shape, generator=generator).to(each.device) * each.is_floating_point()
                 for each in inputs
             ]
+            others = [other.to(each.dtype) for other, each in zip(others, inputs, strict=True)]
             for found, expected in zip(module(*others), function(*others), strict=True):
                 if not torch.allclose(found.float(), expected.float(), rtol=1e-3, atol=1e-4, equal_nan=True):
                     self._refuse("a hook leaves torch (numpy, item, tolist)")
