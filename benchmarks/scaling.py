@@ -12,7 +12,6 @@ import torch
 
 from benchmarks.processes import MeasurementError, run_json
 from benchmarks.results import Row
-from torchrl_loco.training.config import CONFIGS
 
 COLUMNS = {
     "task": "",
@@ -33,7 +32,7 @@ COLUMNS = {
 def scaling(
     tasks: Sequence[str], gpus: Sequence[int], device: torch.device, settings: Mapping[str, Any] | None = None
 ) -> list[Row]:
-    """Measures each task with both algorithms on so many GPUs, or in so many processes on the CPU.
+    """Measures each task with PPO and REPPO on so many GPUs, or in so many processes on the CPU.
 
     Args:
         tasks: ids of environments.
@@ -52,8 +51,8 @@ def scaling(
             except MeasurementError as error:
                 rows.append({"task": task, "gpus": count, "error": str(error)})
                 continue
-            for algorithm in CONFIGS:
-                row = {"task": task, "algorithm": algorithm, "gpus": count, **found[algorithm]}
+            for algorithm, measured in found.items():
+                row = {"task": task, "algorithm": algorithm, "gpus": count, **measured}
                 rows.append(row | compared(row, first.setdefault(algorithm, row)))
     return rows
 
