@@ -10,12 +10,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 from torchrl_loco import tasks
 from torchrl_loco.checks import (
-    ANY,
-    COUNT,
-    FRACTION,
-    NOT_NEGATIVE,
-    SEED,
-    Interval,
     check_choice,
     check_device,
     check_fields,
@@ -25,6 +19,7 @@ from torchrl_loco.checks import (
 )
 from torchrl_loco.config import PROTOCOLS, SimConfig, pixels_of
 from torchrl_loco.registry import is_place, resolve, task_name
+from torchrl_loco.training.intervals import INTERVALS
 
 if TYPE_CHECKING:
     import torch
@@ -32,32 +27,6 @@ if TYPE_CHECKING:
     from torchrl_loco.envs import LocoEnv
 
 LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow"]
-INTERVALS = {
-    "seed": SEED,
-    "eval_interval": COUNT,
-    "gamma": Interval(0, 1, with_low=False, with_high=True),
-    "lmbda": FRACTION,
-    "trial_fraction": Interval(0, 1, with_low=False),
-    "final_lr_fraction": FRACTION,
-    "video_seconds": NOT_NEGATIVE,
-    "checkpoint_seconds": NOT_NEGATIVE,
-    "clip_epsilon": Interval(0, 1, with_low=False, with_high=True),
-    "entropy_coeff": NOT_NEGATIVE,
-    "target_kl": NOT_NEGATIVE,
-    "target_entropy": ANY,
-    "aux_coeff": NOT_NEGATIVE,
-    "num_bins": Interval(2, 2**31),
-    "min_value": ANY,
-    "max_value": ANY,
-    "episode_length": COUNT,
-    "norm_eps": NOT_NEGATIVE,
-    "random_shift": COUNT,
-    "warmup": COUNT,
-    "horizon": Interval(2, 2**31),
-    "target_rate": Interval(0, 1, with_low=False, with_high=True),
-    "average_rate": Interval(0, 1, with_low=False, with_high=True),
-}
-"""Intervals of the fields that are not simply positive."""
 OF_PIXELS = ("camera", "size", "frame_stack", "random_shift", "critic_from_pixels")
 """Settings that need ``from_pixels``."""
 
