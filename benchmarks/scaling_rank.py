@@ -93,7 +93,7 @@ if __name__ == "__main__":
         results = {
             name: measure(task, name, device, settings)
             for name, config in CONFIGS.items()
-            if not config.shows_states  # which few tasks can be trained by
+            if not config.shows_states  # else it trains few tasks
         }
         if distributed.is_first():
             print(json.dumps(results))

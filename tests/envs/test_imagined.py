@@ -225,6 +225,20 @@ class LeavesTorch(Rich):
         return torch.from_numpy(np.sin(s.qvel[:, 6].detach().numpy()))
 
 
+class Drawing(Rich):
+    """Its controls are random."""
+
+    def control(self, s, action):
+        return action + s.uniform(-1.0, 1.0, 1)
+
+
+class Poses(Rich):
+    """Its controls depend on where a body is."""
+
+    def control(self, s, action):
+        return action + s.xpos(["world"])[:, 0, :1]
+
+
 class Long(Rich):
     """Its memory has long integers."""
 
@@ -243,6 +257,8 @@ class Remembers(Rich):
         ("walker_walk", "its reward is a Warp function"),
         ("go1_rough", "it scans the ground"),
         (LeavesTorch, "leaves torch"),
+        (Drawing, "its control draws random numbers"),
+        (Poses, "its control reads more than positions"),
         (Long, "int32"),
         (Remembers, "history"),
     ],

@@ -197,11 +197,13 @@ class Imagined:
         start = torch.cat([home.expand(len(states), -1), states[:, len(home) :]], dim=-1)
         qpos, qvel, rest = self.unpacked(start)
         try:
-            self._control = self._checked(self._controlled, (qpos, qvel, action, *rest))
+            with torch.no_grad():
+                self._controlled(qpos, qvel, action, *rest)
         except ValueError as error:
             self._refuse(f"its control reads more than positions, velocities, memory and numbers ({error})")
         if WithUnits.drawn:
             self._refuse("its control draws random numbers")
+        self._control = self._checked(self._controlled, (qpos, qvel, action, *rest))
         self._units = qpos.new_zeros(len(qpos), 0)
         none = torch.zeros_like(qpos[:, 0], dtype=torch.bool)
         inputs = [qpos, qvel, *self.kinematics(qpos, qvel), action, self._units, start, none, *rest]

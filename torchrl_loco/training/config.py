@@ -398,7 +398,6 @@ class SVGConfig(TrainingConfig):
         "cpu": {
             "num_envs": 128,
             "num_steps": 16,
-            "action_repeat": 1,
             "epochs": 4,
             "model_hidden": (256, 256),
         },
@@ -406,8 +405,6 @@ class SVGConfig(TrainingConfig):
             "num_envs": 4096,
             "num_steps": 16,
             "total_frames": 60_000_000,
-            "action_repeat": 1,
-            "episode_length": 1000,
             "epochs": 6,
             "minibatch_size": 4096,
             "lr": 5e-4,
@@ -418,6 +415,8 @@ class SVGConfig(TrainingConfig):
         },
     }
 
+    action_repeat: int = 1
+    """Frames for which an action is held; no more than one."""
     reward_scale: float = 1.0
     """Factor on the reward before returns are estimated."""
     gamma: float = 0.97
