@@ -46,9 +46,9 @@ def in_torch(data):
     return tuple(torch.tensor(np.array(each), dtype=torch.float32).unsqueeze(0) for each in (data.qpos, data.qvel))
 
 
-@pytest.fixture(params=["joints", "humanoid"])
+@pytest.fixture(params=["joints", "humanoid_walk", "go1_velocity"])
 def model(request):
-    return models.load(JOINTS if request.param == "joints" else resolve("humanoid_walk").model)
+    return models.load(JOINTS if request.param == "joints" else resolve(request.param).model)
 
 
 def test_bodies_are_where_c_mujoco_has_them(model):
@@ -73,6 +73,10 @@ def test_gradients_of_bodies_are_those_of_differences(model):
         return sum((weight * each).sum() for weight, each in zip(weights, kinematics(qpos, qvel), strict=True))
 
     weighed(*inputs).backward()
+    kept = [each.clone() for each in weights]
+    slopes = torch.autograd.grad(kinematics(*inputs), inputs, weights)  # which stay as they are
+    for found, each in zip((*slopes, *weights), (*(each.grad for each in inputs), *kept), strict=True):
+        torch.testing.assert_close(found, each)
     for _ in range(5):
         directions = [torch.randn_like(each) for each in inputs]
         slope = sum((each.grad * d).sum() for each, d in zip(inputs, directions, strict=True))

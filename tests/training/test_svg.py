@@ -197,6 +197,17 @@ def test_actor_and_critic_learn_from_returns_up_to_the_end_of_episodes(tmp_path,
         torch.testing.assert_close(now, 0.5 * (old + critic))
 
 
+def test_a_window_goes_on_with_what_events_changed(tmp_path):
+    """The error is that of the prediction itself."""
+    svg = svg_of(out=tmp_path)
+    first, controls, afters, _, _ = svg._replay.window
+    qpos, qvel, _ = svg._imagined.unpacked(first)
+    event = torch.randn_like(qvel)
+    calm, pushed = (svg._moved(qpos, qvel, controls[0], afters[0], by) for by in (torch.zeros_like(event), event))
+    for one, other in zip(pushed, (calm[0], calm[1] + event, calm[2]), strict=True):
+        torch.testing.assert_close(one, other)
+
+
 def test_gradients_that_are_not_finite_are_left_out_and_said(tmp_path):
     svg = svg_of(out=tmp_path)
     before = [each.clone() for each in svg._mean.parameters()]
