@@ -211,12 +211,13 @@ def test_a_window_goes_on_with_what_events_changed(tmp_path):
 def test_gradients_that_are_not_finite_are_left_out_and_said(tmp_path):
     svg = svg_of(out=tmp_path)
     before = [each.clone() for each in svg._mean.parameters()]
-    svg._totals.zero_()
-    svg._descend(svg._actor_optimizers, sum(each.sum() for each in svg._mean.parameters()) * float("nan"))
-    assert svg._totals[-1] == 1.0
+    whole = sum(each.sum() for each in svg._mean.parameters())
+    assert svg._descend(svg._actor_optimizers, whole * float("nan")) == (0.0, True)
     assert all(each.isfinite().all() for each in svg._mean.parameters()), before
-    assert "left out" in svg.note({"lost_gradients": [0.0, 0.5]})
-    assert not svg.note({"lost_gradients": [0.0]})
+    assert svg._descend(svg._actor_optimizers, whole)[1] == False  # noqa: E712, a tensor
+    none = {"lost_of_model": [0.0], "lost_of_actor": [0.0], "lost_of_critic": [0.0]}
+    assert "left out, 50% of the actor's" in svg.note({**none, "lost_of_actor": [0.0, 0.5]})
+    assert not svg.note(none)
 
 
 def test_a_policy_begins_both_actors(tmp_path):

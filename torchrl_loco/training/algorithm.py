@@ -62,6 +62,7 @@ class Algorithm(ABC):
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
         self._data: Packed | None = None
         on_cuda = self.device.type == "cuda"
+        self._stream = torch.cuda.Stream(self.device) if on_cuda else None
         self._epoch = TorchGraph(self._gradient_steps, self.device, warmup=WARMUP) if on_cuda else self._gradient_steps
 
     @abstractmethod
@@ -144,6 +145,21 @@ class Algorithm(ABC):
         self.learn_moments(batch)  # after the update: the losses need the normalisation used while collecting
         steps = config.epochs * (len(self._order) // config.minibatch_size)
         return torch.cat([self._totals / steps, of_batch])
+
+    @contextlib.contextmanager
+    def beside(self) -> Iterator[None]:
+        """Lets CUDA work on another stream, until :meth:`join`: small networks leave most of it idle."""
+        if self._stream is None:
+            yield
+        else:
+            self._stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(self._stream):
+                yield
+
+    def join(self) -> None:
+        """Waits for what was put on the other stream, without the host."""
+        if self._stream is not None:
+            torch.cuda.current_stream().wait_stream(self._stream)
 
     def adopt(self) -> None:
         """Takes parameters back that were moved out of the vectors of their optimizers."""

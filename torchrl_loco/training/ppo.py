@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -74,7 +74,6 @@ class PPO(Algorithm):
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = self.make_optimizer("actor and critic", parameters)
         self._written = ("action", "action_log_prob", *("before_tanh",) * spaces.bounded)
-        self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         # By which a gradient step multiplies the learning rate, between these divergences.
         self._kl_bounds = torch.tensor([0.0, 0.5 * config.target_kl, 2.0 * config.target_kl], device=self.device)
         self._lr_factors = torch.tensor([1.0, 1.5, 1.0, 1 / 1.5], device=self.device)
@@ -144,10 +143,10 @@ class PPO(Algorithm):
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
         """Returns the metrics, a scalar each, of a step down the clipped loss, the critic's and the entropy's."""
         config, weights = self.config, self.optimizer.wide(self._dtype)
-        with self._beside():  # as are the slopes of what is computed there
+        with self.beside():  # as are the slopes of what is computed there
             value = self._value(minibatch[self.spaces.critic_key], weights)
         outputs = self._mean(self.observed(minibatch), weights), self._std(), value
-        self._join()
+        self.join()
         bounds = config.clip_epsilon, config.entropy_coeff, self.spaces.bounded
         *slopes, metrics = clipped_loss(*outputs, minibatch, *bounds)
         self.optimizer.zero_grad()
@@ -155,20 +154,6 @@ class PPO(Algorithm):
         if config.target_kl:
             self._follow(metrics[self.metric_names.index("kl_approx")])
         return [*metrics, clip_and_step(self.optimizer, config.max_grad_norm)]
-
-    @contextlib.contextmanager
-    def _beside(self) -> Iterator[None]:
-        """Lets CUDA work on another stream, until :meth:`_join`: small networks leave most of it idle."""
-        if self._stream is None:
-            yield
-        else:
-            self._stream.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(self._stream):
-                yield
-
-    def _join(self) -> None:
-        if self._stream is not None:
-            torch.cuda.current_stream().wait_stream(self._stream)
 
     def schedule(self, progress: float) -> None:
         """Sets the learning rate, unless it follows the divergence."""

@@ -5,6 +5,7 @@ are imagined: the model predicts states, and the task's own hooks say what is ob
 So the actor ascends the gradient of the imagined return, as in SuperMimic (arXiv 2610.28480), which follows motions.
 """
 
+import contextlib
 import copy
 import logging
 import math
@@ -43,13 +44,15 @@ class SVG(Algorithm):
         "error_first",
         "error_last",
         "grad_norm_model",
+        "lost_of_model",
         "imagined_return",
         "imagined_length",
         "value",
         "loss_critic",
         "grad_norm_actor",
+        "lost_of_actor",
         "grad_norm_critic",
-        "lost_gradients",
+        "lost_of_critic",
     )
     config: SVGConfig
 
@@ -100,9 +103,6 @@ class SVG(Algorithm):
             settings = {"options": {"force_shape_pad": True}}
             return compiled(chosen, what or "a hook", **settings) if config.compile and on_cuda else chosen
 
-        def recorded(work: Callable[[], None]) -> Callable[[], None]:
-            return TorchGraph(work, self.device, warmup=WARMUP) if on_cuda else work
-
         self._imagined = Imagined(env, config.minibatch_size, fused)
         if (unknown := self._imagined.unknown) and distributed.is_first():
             logging.getLogger("torchrl_loco").warning(
@@ -111,12 +111,13 @@ class SVG(Algorithm):
         m, sim = env.mj_model, env.config
         self.model = Dynamics(m, sim.ctrl_dt, sim.substeps, config.model_hidden).to(self.device)
         self.networks.add_module("model", self.model)
+        self._known = copy.deepcopy(self.model).requires_grad_(False)
         self._model_optimizers = self._optimizers_of("model", self.model.net)
         sizes = {"state": self._imagined.size, "observation": self.spaces.observation}
         self._replay = Replay(config, m, sizes, self.generator)
         self._move, self._dream = fused(self._moved, "the model"), fused(self._dreamt, "the actor")
         self._value, self._target_value = fused(self.critic, "the critic"), fused(self._valued, "the critic")
-        self._fit, self._improve = recorded(self.fit), recorded(self.improve)
+        self._learn = TorchGraph(self._round, self.device, warmup=WARMUP) if on_cuda else self._round
 
     def acting(self) -> nn.Module:
         """Returns the actor that learns as a policy for collectors."""
@@ -154,11 +155,19 @@ class SVG(Algorithm):
         rounds = self.config.epochs if self._replay.has_window else 0
         for _ in range(rounds):
             self._replay.draw_window()
-            self._fit()
             self._replay.draw_starts()
-            self._improve()
+            self._learn()
         self._rounds += rounds
         return self._totals / max(rounds, 1)
+
+    def _round(self) -> None:
+        """Fits the model while actor and critic imagine by what it was."""
+        with torch.no_grad():
+            torch._foreach_copy_(list(self._known.state_dict().values()), list(self.model.state_dict().values()))
+        with self.beside() if distributed.ranks() == 1 else contextlib.nullcontext():  # ranks meet in one order
+            self.fit()
+        self.improve()
+        self.join()
 
     def schedule(self, progress: float) -> None:
         """Sets the learning rates, as all do; that of the model is its own, and that of the actor 0 at the start."""
@@ -183,8 +192,7 @@ class SVG(Algorithm):
             errors.append(error)
         by_step = (torch.stack(errors) * valid).sum(1) / valid.sum(1).clamp(min=1.0)
         loss = by_step.mean()
-        norm = self._descend(self._model_optimizers, loss)
-        self._add("loss_model", loss, by_step[0], by_step[-1], norm)
+        self._add("loss_model", loss, by_step[0], by_step[-1], *self._descend(self._model_optimizers, loss))
 
     def _moved(
         self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor, after: torch.Tensor, event: torch.Tensor
@@ -203,11 +211,11 @@ class SVG(Algorithm):
         returns = lambda_returns(rewards, values, ended, cut, config.gamma, config.lmbda)
         over = (ended | cut)[:-1].float()
         alive = torch.cat([torch.ones_like(rewards[:1]), (1.0 - over).cumprod(0)])  # before each step
-        norm_actor = self._descend(self._actor_optimizers, -returns[0].mean())
+        of_actor = self._descend(self._actor_optimizers, -returns[0].mean())
         weight, aims = alive[1:], returns[1:].detach()
         value = self._value(seen[:-1].detach().flatten(0, 1)).float().view_as(aims)
         loss = ((value - aims).square() * weight).sum() / weight.sum().clamp(min=1.0)
-        norm_critic = self._descend(self._critic_optimizers, loss)
+        of_critic = self._descend(self._critic_optimizers, loss)
         with torch.no_grad():
             for mine, new, rate in (
                 (self._target, self.critic[1], config.target_rate),
@@ -216,7 +224,7 @@ class SVG(Algorithm):
                 for old, latest in zip(mine.parameters(), new.parameters(), strict=True):
                     old.lerp_(latest, rate)
         length = alive.sum(0).mean()
-        self._add("imagined_return", returns[0].mean(), length, values.mean(), loss, norm_actor, norm_critic)
+        self._add("imagined_return", returns[0].mean(), length, values.mean(), loss, *of_actor, *of_critic)
 
     def _imagine(self) -> tuple[torch.Tensor, ...]:
         """Returns rewards, whether episodes terminated and were cut off, and what the critic reads after each step.
@@ -230,7 +238,6 @@ class SVG(Algorithm):
         for start in (qpos, qvel, observation, *rest):
             start.requires_grad_(start.is_floating_point())  # as in later steps, so that one kernel does
         steps, over = [], torch.zeros_like(rows[:, 0], dtype=torch.bool)
-        self.model.net.requires_grad_(False)
         for noise in torch.randn(config.horizon, len(rows), self.spaces.action, device=self.device):
             action, qpos, qvel = self._dream(observation, qpos, qvel, noise, *rest)
             said = imagined.judge(qpos, qvel, action, rest, rows, over)
@@ -238,7 +245,6 @@ class SVG(Algorithm):
             observation = said.observations["observation"]
             of_critic = said.observations[self.spaces.critic_key]
             steps.append((config.reward_scale * said.reward, said.terminated, said.truncated, of_critic))
-        self.model.net.requires_grad_(True)
         return tuple(map(torch.stack, zip(*steps, strict=True)))
 
     def _dreamt(
@@ -252,7 +258,7 @@ class SVG(Algorithm):
         """Returns the actions that standard normal noise makes, and the positions and velocities they lead to."""
         action = self._mean(self.norms["observation"](observation)).float() + self.config.init_std * noise
         action = action.tanh() if self.spaces.bounded else action
-        return action, *self.model(qpos, qvel, self._imagined.control(qpos, qvel, action, rest))
+        return action, *self._known(qpos, qvel, self._imagined.control(qpos, qvel, action, rest))
 
     def _valued(self, rows: torch.Tensor) -> torch.Tensor:
         """Returns the values that returns are made with, ``(n, 1)``."""
@@ -270,11 +276,11 @@ class SVG(Algorithm):
         self.optimizers[f"{name} matrices"] = Muon(matrices, torch.tensor(self.config.lr, device=self.device))
         return [rest, self.optimizers[f"{name} matrices"]]
 
-    def _descend(self, optimizers: Iterable[Any], loss: torch.Tensor) -> torch.Tensor:
-        """Makes a step of each optimizer, of zeros if a number of the gradient is not finite, which is counted.
+    def _descend(self, optimizers: Iterable[Any], loss: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Makes a step of each optimizer, of zeros if a number of the gradient is not finite.
 
         Returns:
-            The norm of all gradients before.
+            The norm of all gradients before, 0 if it is not finite, and whether it is not.
         """
         for optimizer in optimizers:
             optimizer.zero_grad()
@@ -287,19 +293,21 @@ class SVG(Algorithm):
             slope.copy_(torch.where(norm.isfinite(), slope, 0.0))
         for optimizer in optimizers:
             clip_and_step(optimizer, self.config.max_grad_norm)
-        self._totals[-1] += ~norm.isfinite()
-        return norm.nan_to_num(0.0, 0.0, 0.0)
+        return norm.nan_to_num(0.0, 0.0, 0.0), ~norm.isfinite()
 
     def _add(self, first: str, *values: torch.Tensor) -> None:
         """Adds metrics to their totals, from the one that is named on."""
         at = self.metric_names.index(first)
-        self._totals[at : at + len(values)] += torch.stack([value.detach() for value in values])
+        self._totals[at : at + len(values)] += torch.stack([value.detach().float() for value in values])
 
     def note(self, metrics: Mapping[str, Sequence[float]]) -> str:
         """Returns that gradients were lost, and why they may be, if some were."""
-        lost = max(metrics["lost_gradients"])
-        why = "a hook gives NaN, or has no slope where it is called, as sqrt at 0" if lost else ""
-        return why and f"{lost:.2f} of 3 gradients of a round were not finite and left out: {why}"
+        lost = {part: max(metrics[f"lost_of_{part}"]) for part in ("model", "actor", "critic")}
+        if not any(lost.values()):
+            return ""
+        shares = ", ".join(f"{share:.0%} of the {part}'s" for part, share in lost.items() if share)
+        why = "a hook gives NaN, or has no slope where it is called, as sqrt at 0"
+        return f"gradients that were not finite were left out, {shares}: {why}"
 
     def state_dict(self) -> dict[str, Any]:
         """Returns all that a continuation needs, but for the steps that are remembered."""
@@ -314,9 +322,8 @@ class SVG(Algorithm):
 
     def release(self) -> None:
         """Forgets what was recorded."""
-        for graph in (self._fit, self._improve):
-            if isinstance(graph, TorchGraph):
-                graph.release()
+        if isinstance(self._learn, TorchGraph):
+            self._learn.release()
 
 
 def lambda_returns(
