@@ -187,19 +187,18 @@ def test_what_is_seen():
     without = loco.make("g1_tracking_no_estimation", 2, "cpu", 0, play=True, engine="mujoco")
     sizes = whole.observation_layout["observation"]
     own = without.observation_layout["observation"]
-    assert sizes.keys() - own.keys() == {
-        *("anchor_position", "linear_velocity"),
-        *(f"{name}_{step}" for name in ("joints", "rates", "base") for step in (1, 400)),
-    }
+    assert sizes.keys() - own.keys() == {"anchor_position", "linear_velocity", "ahead"}
     assert {"anchor_position", "linear_velocity"} < without.observation_layout["privileged"].keys()
     td = whole.reset()
     terms = dict(zip(sizes, td["observation"].split(list(sizes.values()), dim=-1), strict=True))
     f = whole.frames
-    assert torch.allclose(terms["joints_1"], torch.tensor(f.qpos[f.first[:2] + 1, 7:]), atol=1e-6)
-    assert torch.allclose(
-        terms["joints_400"], torch.tensor(f.qpos[np.minimum(f.first + 400, f.last)[:2], 7:]), atol=1e-6
-    )
-    assert torch.allclose(terms["base_1"][:, 0], torch.tensor(f.qpos[f.first[:2] + 1, 2]), atol=1e-6)
+    frames = np.minimum(f.first[:2, None] + np.array([1, 400]), f.last[:2, None])
+    ahead = terms["ahead"].view(2, 2, 29 + 29 + 10)
+    assert torch.allclose(ahead[..., :29], torch.tensor(f.qpos[frames, 7:]), atol=1e-6)
+    assert torch.allclose(ahead[..., 29:58], torch.tensor(f.qvel[frames, 6:]), atol=1e-5)
+    assert torch.allclose(ahead[..., 58], torch.tensor(f.qpos[frames, 2]), atol=1e-6)
+    upright = torch.tensor(f.mat[frames, whole.bodies.index("pelvis")])[..., 2, :]
+    assert torch.allclose(ahead[..., 59:62], -upright, atol=1e-6)
 
 
 def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_path, short):

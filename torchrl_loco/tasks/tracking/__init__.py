@@ -353,21 +353,22 @@ class Tracking(Robot):
             "joint_velocities": s.joint_qvel(self.joints),
             "last_action": s.last_action,
         }
-        for step in self.future:
-            seen |= {f"{name}_{step}": values for name, values in self.ahead(s, step).items()}
+        if self.future:
+            seen["ahead"] = self.ahead(s).flatten(1)
         from_anchor = into.unsqueeze(1) @ (pos - pos[:, anchor].unsqueeze(1)).unsqueeze(-1)
         turned = (into.unsqueeze(1) @ mat)[..., :2]
         hidden = {"bodies": from_anchor.flatten(1), "orientations": turned.flatten(1)}
         measured = {name: values for name, values in seen.items() if self.estimates or name not in ESTIMATED}
         return {"observation": measured, "privileged": {**seen, **hidden}}
 
-    def ahead(self, s: "View", steps: int) -> dict[str, torch.Tensor]:
-        """Returns what the policy sees of the reference so many frames later, or of the last."""
-        frame = torch.minimum(s.frame + steps, s.last[s.frame])
+    def ahead(self, s: "View") -> torch.Tensor:
+        """Returns what the policy sees of the frames ahead, the last at the end, ``(num_envs, frames, size)``."""
+        steps = torch.tensor(self.future, dtype=torch.int32, device=s.device)
+        frame = torch.minimum(s.frame.unsqueeze(-1) + steps, s.last[s.frame].unsqueeze(-1))
         base, rates, mat = s.root[frame], s.root_rates[frame], s.mat[frame, self.bodies.index(self.base)]
-        linear = (mat.mT @ rates[:, :3].unsqueeze(-1)).squeeze(-1)
-        floating = torch.cat([base[:, 2:3], -mat[:, 2], linear, rates[:, 3:]], dim=-1)
-        return {"joints": s.joints[frame], "rates": s.rates[frame], "base": floating}
+        linear = (mat.mT @ rates[..., :3].unsqueeze(-1)).squeeze(-1)
+        floating = [base[..., 2:3], -mat[..., 2, :], linear, rates[..., 3:]]
+        return torch.cat([s.joints[frame], s.rates[frame], *floating], dim=-1)
 
     def begin(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the pose and velocities of a frame of the reference; in training something near it, and a push."""
