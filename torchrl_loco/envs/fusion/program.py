@@ -352,6 +352,8 @@ class Program:
         for node in graph.nodes:
             if node.op == "placeholder":
                 name, tensor = next(inputs)
+                if not node.users:  # most arrays in most parts
+                    continue
                 by_world = tensor.ndim > 0 and tensor.shape[0] == self._n and not name.startswith(GLOBAL)
                 huge = not by_world and tensor.numel() > MOST_NUMBERS  # can be looked up alone
                 found[node] = Huge(tensor) if huge else self.source(tensor, 0 if by_world else None)
@@ -427,11 +429,11 @@ class Program:
         """
         stores: list[tuple[Node, Node]] = []
         for _, value, before in self._sources.values():
-            for at in np.ndindex(*before.shape):
-                if value.array[at] is not before[at]:
+            for old, new in zip(before.flat, value.array.flat, strict=True):
+                if new is not old:
                     if value.world is None:
                         raise CannotFuse("a tensor that has no worlds is changed")
-                    stores.append((before[at], value.array[at]))
+                    stores.append((old, new))
         return Source(stores, self.tensors)
 
 
