@@ -1,5 +1,8 @@
 """Stochastic value gradients: the model, what is remembered, returns, Muon, and that it learns."""
 
+import copy
+import functools
+
 import pytest
 import torch
 from for_each import for_each
@@ -137,17 +140,32 @@ def test_windows_go_across_batches_and_no_further_than_episodes(what, behind):
     assert seen == {4.0, 5.0, 6.0, 7.0} | {100.0 + step for step in range(4, 12)}
 
 
-def svg_of(task=None, **settings):
-    """Returns an svg that has learned from a few batches, and can be asked for more."""
-    config = preset(task or "g1_tracking", "cpu", "svg", **{**FEW, "total_frames": 10_000, "warmup": 0, **settings})
-    trainer = Trainer(RunFolder.create(config))
-    for _ in range(3):
-        trainer.iterate()
-    return trainer.algorithm
+@pytest.fixture(scope="module")
+def made_once(tmp_path_factory):
+    """Returns a function that makes an svg, which has learned from a few batches, in the first test that needs it."""
+
+    @functools.cache
+    def get():
+        settings = {**FEW, "total_frames": 10_000, "warmup": 0, "horizon": 5, "target_rate": 0.5, "average_rate": 0.25}
+        config = preset("g1_tracking", "cpu", "svg", out=tmp_path_factory.mktemp("svg"), **settings)
+        trainer = Trainer(RunFolder.create(config))
+        for _ in range(3):
+            trainer.iterate()
+        return trainer.algorithm
+
+    return get
 
 
-def test_the_actor_ascends_the_gradient_of_the_imagined_return(tmp_path):
-    svg = svg_of(out=tmp_path, horizon=5)
+@pytest.fixture
+def svg(made_once):
+    """It can be asked for more, and gets its networks back after each test."""
+    svg = made_once()
+    kept = copy.deepcopy(svg.networks.state_dict())
+    yield svg
+    svg.load_networks(kept)
+
+
+def test_the_actor_ascends_the_gradient_of_the_imagined_return(svg):
     parameters = list(svg._mean.parameters())
 
     def imagined_return():
@@ -172,9 +190,8 @@ def test_the_actor_ascends_the_gradient_of_the_imagined_return(tmp_path):
         torch.testing.assert_close(slope, (reached[0] - reached[1]) / 2e-3, rtol=5e-2, atol=2e-3)
 
 
-def test_actor_and_critic_learn_from_returns_up_to_the_end_of_episodes(tmp_path, monkeypatch):
+def test_actor_and_critic_learn_from_returns_up_to_the_end_of_episodes(svg, monkeypatch):
     """Of two worlds one ends after its second step: what comes then counts for nobody."""
-    svg = svg_of(out=tmp_path, target_rate=0.5, average_rate=0.25)
     seen = torch.randn(4, 2, svg.spaces.critic)
     rewards, none = torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 1e6], [6.0, 1e6]]), torch.zeros(4, 2, dtype=torch.bool)
     ended = none.clone()
@@ -197,9 +214,8 @@ def test_actor_and_critic_learn_from_returns_up_to_the_end_of_episodes(tmp_path,
         torch.testing.assert_close(now, 0.5 * (old + critic))
 
 
-def test_a_window_goes_on_with_what_events_changed(tmp_path):
+def test_a_window_goes_on_with_what_events_changed(svg):
     """The error is that of the prediction itself."""
-    svg = svg_of(out=tmp_path)
     first, controls, afters, _, _ = svg._replay.window
     qpos, qvel, _ = svg._imagined.unpacked(first)
     event = torch.randn_like(qvel)
@@ -208,8 +224,7 @@ def test_a_window_goes_on_with_what_events_changed(tmp_path):
         torch.testing.assert_close(one, other)
 
 
-def test_gradients_that_are_not_finite_are_left_out_and_said(tmp_path):
-    svg = svg_of(out=tmp_path)
+def test_gradients_that_are_not_finite_are_left_out_and_said(svg):
     before = [each.clone() for each in svg._mean.parameters()]
     whole = sum(each.sum() for each in svg._mean.parameters())
     assert svg._descend(svg._actor_optimizers, whole * float("nan")) == (0.0, True)
@@ -220,14 +235,17 @@ def test_gradients_that_are_not_finite_are_left_out_and_said(tmp_path):
     assert not svg.note(none)
 
 
-def test_a_policy_begins_both_actors(tmp_path):
-    svg = svg_of(out=tmp_path)
+def test_a_policy_begins_both_actors(svg, tmp_path):
     policy = deterministic_policy(svg.actor, svg.config, {})
     policy.save(tmp_path / "policy.safetensors")
-    other = svg_of(out=tmp_path / "other", seed=1)
-    begin_from(other, tmp_path / "policy.safetensors", "cpu")
-    for mine in (other._mean, other._average):
-        for own, kept in zip(mine.parameters(), svg._average.parameters(), strict=True):
+    average = [each.clone() for each in svg._average.parameters()]
+    with torch.no_grad():
+        for mine in (svg._mean, svg._average):
+            for own in mine.parameters():
+                own.normal_()
+    begin_from(svg, tmp_path / "policy.safetensors", "cpu")
+    for mine in (svg._mean, svg._average):
+        for own, kept in zip(mine.parameters(), average, strict=True):
             torch.testing.assert_close(own.detach(), kept)
 
 
