@@ -1,8 +1,11 @@
 """Lets kernels be compiled without optimisation, which takes longer than they run in tests; but for what draws.
 
-Importing it is enough, also in a process that a test starts. It does nothing where there is a GPU.
+Importing it is enough, also in a process that a test starts, which may be ``python -m quickly MODULE ARGUMENTS``. It does
+nothing where there is a GPU.
 """
 
+import runpy
+import sys
 from pathlib import Path
 
 import torch
@@ -34,3 +37,7 @@ if not torch.cuda.is_available():
     wp._src.context.Runtime.get_clang_pch_dir = headers
     wp._src.codegen.cpu_linear_contiguous_specialization_candidate = lambda adj, block_dim: False  # a second body each
     wp.config.optimization_level = 0
+
+if __name__ == "__main__":
+    del sys.argv[0]
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)

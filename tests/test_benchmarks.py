@@ -149,8 +149,10 @@ def test_soak_compares_the_counters_with_what_happened(monkeypatch):
 
 
 @pytest.mark.slow
-def test_all_seconds_of_a_start_are_in_a_phase(tmp_path):
-    settings = ["num_envs=4", "num_steps=8", "minibatch_size=16", "eval_episodes=2"]
+def test_all_seconds_of_a_start_are_in_a_phase(tmp_path, monkeypatch):
+    settings = ["num_envs=4", "num_steps=8", "minibatch_size=16", "eval_episodes=2", "episode_length=40"]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    monkeypatch.setattr(startup, "run_json", lambda arguments, *rest: run_json(["quickly", *arguments], *rest))
     empty, filled = startup.startup(["walker_walk"], torch.device("cpu"), 2, 1, settings)
     for row in empty, filled:
         assert sum(row[phase] for phase in startup.PHASES) == pytest.approx(row["total"], abs=0.01)
