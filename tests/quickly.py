@@ -1,7 +1,7 @@
 """Lets kernels be compiled without optimisation, which takes longer than they run in tests; but for what draws.
 
-Importing it is enough, also in a process that a test starts, which may be ``python -m quickly MODULE ARGUMENTS``. It does
-nothing where there is a GPU.
+Importing it is enough, also in a process that a test starts, which may be ``python -m quickly MODULE ARGUMENTS``. It
+does nothing where there is a GPU.
 """
 
 import runpy

@@ -9,7 +9,7 @@ import warnings
 
 import pytest
 import torch
-from cases import COMPILED, PROTOCOLS
+from cases import COARSE, COMPILED, PROTOCOLS
 from for_each import for_each
 from mujoco_warp import OverflowType
 from tensordict import TensorDict
@@ -28,7 +28,9 @@ def reported_soon(monkeypatch):
 
 
 def made(device, engine="mujoco_warp", **options):
-    return torchrl_loco.make("humanoid_stand", WORLDS, device, seed=0, engine=engine, **options)
+    """Makes worlds, under MuJoCo-Warp with two physics steps in a control step: recording each takes long."""
+    coarse = COARSE if engine == "mujoco_warp" else {}
+    return torchrl_loco.make("humanoid_stand", WORLDS, device, seed=0, engine=engine, **{**coarse, **options})
 
 
 def fall(env, steps=35):
@@ -43,7 +45,7 @@ def fall(env, steps=35):
 
 
 def test_dropped_constraints_are_counted_in_their_world_and_contacts_in_all():
-    found = fall(made("cpu", njmax=5, on_overflow="ignore"))
+    found = fall(made("cpu", njmax=5, on_overflow="ignore", sim_dt=0.005))
     counts = found["worlds", "constraint_overflow"].tolist()
     assert counts[0] > 20
     assert counts[1:] == [0]
@@ -89,7 +91,7 @@ def test_each_bit_counts_once_and_in_its_world(engine):
 
 def test_peaks_hold_for_all_steps():
     """A lying capsule has two contacts in one pair, limbs that pass each other have none: both need room."""
-    env = made("cpu")
+    env = made("cpu", sim_dt=0.005)
     td, contacts, pairs, rows = env.reset(), [0], [0], [0]
     for _ in range(60):
         td = env.step(td.set("action", env.action_spec.zero()))["next"]

@@ -146,6 +146,10 @@ class Rich(loco.LocoEnv):
         return {"observation": rows, "privileged": torch.stack([s.updates, s.ends, s.time], dim=-1)}
 
 
+PLAIN = {"engine": "mujoco", "compile_hooks": False}
+"""What makes worlds without compiling: neither physics nor kernels of hooks are what is looked at."""
+
+
 def imagined_beside(env, td, action):
     """Returns what is said of the step that an environment takes, and the step."""
     after, m = env.step(td.set("action", action))["next"], env.mj_model
@@ -163,7 +167,7 @@ def imagined_beside(env, td, action):
 def test_a_task_says_of_predicted_states_what_it_says_in_its_worlds(task):
     """But for what it reads of contacts, as most of a velocity task's terms do."""
     cls = task if isinstance(task, type) else resolve(task)
-    env = loco.make(showing_states(cls), num_envs=4, seed=3, reward_terms=True, noise_scale=0.0)
+    env = loco.make(showing_states(cls), num_envs=4, seed=3, reward_terms=True, noise_scale=0.0, **PLAIN)
     td, ended = env.reset(), False
     torch.manual_seed(0)
     for _ in range(4):
@@ -194,8 +198,8 @@ def test_a_task_says_of_predicted_states_what_it_says_in_its_worlds(task):
         assert not gone.qpos.any()
 
 
-def beside_g1(**settings):
-    env = loco.make(showing_states(resolve("g1_tracking")), num_envs=2, **settings)
+def beside_g1():
+    env = loco.make(showing_states(resolve("g1_tracking")), num_envs=2, **PLAIN)
     state = env.reset()[STATE]
     imagined = Imagined(env, 2)
     qpos, qvel, rest = imagined.unpacked(state[:, : imagined.size])
@@ -270,4 +274,4 @@ class Remembers(Rich):
 def test_what_cannot_be_imagined_is_refused(task, why):
     cls = task if isinstance(task, type) else resolve(task)
     with pytest.raises(ValueError, match=why):
-        Imagined(loco.make(showing_states(cls), num_envs=2), 2)
+        Imagined(loco.make(showing_states(cls), num_envs=2, **PLAIN), 2)
