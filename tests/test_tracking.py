@@ -16,6 +16,8 @@ from torchrl_loco.tasks import tracking
 from torchrl_loco.tasks.tracking import FOLLOWED, PENALTIES, PIECES, G1Tracking, H1Tracking
 
 PUNCHES = H1Tracking.motion_folder / "punches.csv"
+PLAIN = {"engine": "mujoco", "compile_hooks": False}
+"""What makes worlds that are hardly stepped: nothing is compiled."""
 MANY = 500
 """Worlds of which shares are counted."""
 EXAMPLE = Path(__file__).parents[1] / "examples" / "follow_motion.py"
@@ -183,8 +185,8 @@ def test_starts_follow_failures(device):
 
 
 def test_what_is_seen():
-    whole = loco.make("g1_tracking", 2, "cpu", 0, play=True, future=(1, 400), engine="mujoco")
-    without = loco.make("g1_tracking_no_estimation", 2, "cpu", 0, play=True, engine="mujoco")
+    whole = loco.make("g1_tracking", 2, "cpu", 0, play=True, future=(1, 400), **PLAIN)
+    without = loco.make("g1_tracking_no_estimation", 2, "cpu", 0, play=True, **PLAIN)
     sizes = whole.observation_layout["observation"]
     own = without.observation_layout["observation"]
     assert sizes.keys() - own.keys() == {"anchor_position", "linear_velocity", "ahead"}
@@ -203,12 +205,12 @@ def test_what_is_seen():
 
 def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_path, short):
     given = Motion(short / "a.csv", fps=25, ground=True, weight=2.0)
-    one = loco.make("h1_tracking", 1, "cpu", 0, motion=given, engine="mujoco")
+    one = loco.make("h1_tracking", 1, "cpu", 0, motion=given, **PLAIN)
     assert list(one.cases()) == ["a"]
-    again = loco.make("h1_tracking", 1, "cpu", 0, engine="mujoco", **json.loads(json.dumps(one.options_given)))
+    again = loco.make("h1_tracking", 1, "cpu", 0, **PLAIN, **json.loads(json.dumps(one.options_given)))
     assert np.array_equal(again.frames.qpos, one.frames.qpos)
     assert again.frames.weights.tolist() == [2.0]
-    other = loco.make("h1_tracking", 1, "cpu", 0, motion=short, fps=25, engine="mujoco")
+    other = loco.make("h1_tracking", 1, "cpu", 0, motion=short, fps=25, **PLAIN)
     with pytest.raises(ValueError, match="cases"):  # its memory points into other tables
         other.load_state_dict(one.state_dict())
     with pytest.raises(FileNotFoundError, match="there is no motion"):
@@ -219,7 +221,7 @@ def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_p
         loco.make("h1_tracking", 1, "cpu", 0, motion=short)
     with pytest.raises(ValueError, match="unknown argument 'motions', did you mean 'motion'"):
         loco.make("h1_tracking", 1, "cpu", 0, motions=short)
-    assert loco.make("h1_tracking", 1, "cpu", 0, future=3, engine="mujoco").future == (3,)
+    assert loco.make("h1_tracking", 1, "cpu", 0, future=3, **PLAIN).future == (3,)
     for future in ((-1,), (0,), ("a",), 1.5):
         with pytest.raises(ValueError, match="future must be whole numbers"):
             loco.make("h1_tracking", 1, "cpu", 0, future=future)
@@ -270,7 +272,7 @@ def test_from_a_clip_to_a_file_that_plays_without_torch(tmp_path, short, capsys)
 
 def test_tables_of_the_package_are_those_of_its_models():
     for cls in (G1Tracking, H1Tracking):
-        env = loco.make(cls, 1, "cpu", 0, engine="mujoco")
+        env = loco.make(cls, 1, "cpu", 0, **PLAIN)
         assert env.bodies[0] == env.base
         assert len(env.cases()) == 3
         assert not env.frames.said
