@@ -28,7 +28,7 @@ def env():
 
 @pytest.fixture(scope="module")
 def played():
-    return Hills(16, "cpu", seed=0, play=True, on_overflow="ignore")
+    return Hills(16, "cpu", seed=0, play=True, on_overflow="ignore", engine="mujoco", compile_hooks=False)
 
 
 def still(env):

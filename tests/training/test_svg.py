@@ -56,6 +56,8 @@ class Spin(loco.LocoEnv):
         return {"observation": {"rates": s.qvel, "last_action": s.last_action}}
 
 
+PLAIN = {"engine": "mujoco", "compile_hooks": False}
+"""What makes worlds that are hardly stepped: nothing is compiled."""
 FEW = {
     **{"num_envs": 32, "num_steps": 8, "minibatch_size": 64, "epochs": 4, "horizon": 8, "window": 12, "warmup": 20},
     **{"hidden": (32,), "model_hidden": (32,), "critic_hidden": (32,), "average_rate": 0.1},
@@ -64,7 +66,7 @@ FEW = {
 
 
 def test_the_model_can_say_any_step_exactly():
-    env = loco.make("g1_velocity", num_envs=1, seed=2)
+    env = loco.make("g1_velocity", num_envs=1, seed=2, **PLAIN)
     env.rollout(5)
     before = env.sim.qpos.clone(), env.sim.qvel.clone()
     action = torch.randn(1, env.mj_model.nu)
@@ -82,7 +84,7 @@ def test_the_model_can_say_any_step_exactly():
 
 def test_only_robots_that_float_have_a_model():
     with pytest.raises(ValueError, match="base must float"):
-        Dynamics(loco.make("walker_walk", num_envs=1).mj_model, 0.02, 4, (8,))
+        Dynamics(loco.make("walker_walk", num_envs=1, **PLAIN).mj_model, 0.02, 4, (8,))
 
 
 def counted(first, end=(), leap=(), lost=()):
@@ -105,7 +107,7 @@ def counted(first, end=(), leap=(), lost=()):
 
 def remembered(**batches):
     """Returns what remembers two batches of three, from step 0, 4 and 8 on, and draws windows of 5 steps."""
-    m = loco.make(Spin, num_envs=1).mj_model
+    m = loco.make(Spin, num_envs=1, **PLAIN).mj_model
     config = preset("g1_tracking", "cpu", "svg", num_envs=3, num_steps=4, minibatch_size=12, window=5, replay=2)
     replay = Replay(config, m, {"state": 16, "observation": 1}, torch.Generator().manual_seed(0))
     replay.keep(counted(0))
