@@ -34,7 +34,8 @@ def short(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def h1(short):
-    return loco.make("h1_tracking", 6, "cpu", 0, play=True, motion=short, fps=25, metrics=True, reward_terms=True)
+    options = {"play": True, "motion": short, "fps": 25, "metrics": True, "reward_terms": True}
+    return loco.make("h1_tracking", 6, "cpu", 0, **options, **PLAIN)
 
 
 def rotation(mat):
