@@ -236,7 +236,7 @@ def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_p
 
 @pytest.mark.slow
 def test_from_a_clip_to_a_file_that_plays_without_torch(tmp_path, short, capsys):
-    settings = {"num_envs": 16, "num_steps": 8, "total_frames": 1024, "minibatch_size": 64, "eval_episodes": 4}
+    settings = {"num_envs": 16, "num_steps": 8, "total_frames": 256, "minibatch_size": 64, "eval_episodes": 2}
     arguments = [f"--{name}={value}" for name, value in {**settings, "video_seconds": 0}.items()]
     cli.main(["train", "h1_tracking", "--motion", str(short), "--fps", "25", *arguments, "--out", str(tmp_path)])
     (run,) = tmp_path.iterdir()
@@ -251,10 +251,10 @@ def test_from_a_clip_to_a_file_that_plays_without_torch(tmp_path, short, capsys)
     with pytest.raises(SystemExit):
         cli.main(["eval", str(run), "--episodes", "2"])
     with pytest.raises(SystemExit):  # its worlds are in the midst of other tables
-        cli.main(["resume", str(run), "--total_frames", "2048", "--motion", str(tmp_path / "a.csv"), "--fps", "25"])
+        cli.main(["resume", str(run), "--total_frames", "512", "--motion", str(tmp_path / "a.csv"), "--fps", "25"])
     assert "is a run of 2 cases, a, b, and not of 1, a" in capsys.readouterr().err
     there = ["--motion", str(tmp_path / "a.csv"), str(tmp_path / "b.csv"), "--fps", "25"]
-    cli.main(["resume", str(run), "--total_frames", "2048", *there])
+    cli.main(["resume", str(run), "--total_frames", "512", *there])
     header, *_ = (run / "metrics.csv").read_text().splitlines()
     assert "metric/body_error" in header
     cli.main(["verify", str(run), "--episodes", "1"])  # so short a motion is survived without having learned
