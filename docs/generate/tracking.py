@@ -36,26 +36,31 @@ def draw_svg(ppo: dict[str, list[dict[str, str]]], svg: dict[str, list[dict[str,
     """Draws how 59 motions are learned by svg and by PPO."""
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     episodes, returns = figure.subplots(1, 2)
-    of_svg = {name: rows for name, rows in svg.items() if name.startswith("seed")}
-    for color, label, some in (("tab:blue", "svg", of_svg), ("tab:orange", "PPO", ppo)):
+    of_preset, quick = (
+        {n: rows for n, rows in svg.items() if n.startswith(start)} for start in ("seed", "in a minute")
+    )
+    groups = ("tab:orange", "PPO", ppo), ("tab:blue", "svg", of_preset), ("tab:green", "svg in a minute", quick)
+    for color, label, some in groups:
         for name, rows in some.items():
             columns = ([float(row[key]) for row in rows] for key in ("seconds", "episode_length"))
             dashes = ":" if "anew" in name else "-"
             episodes.plot(*columns, dashes, color=color, lw=1.2, label=label + ", compiled anew" * (dashes == ":"))
     for name, rows in read(OF_SVG / "evaluations.csv").items():
         seconds, reached = ([float(row[key]) for row in rows] for key in ("seconds", "return"))
-        color, dashes = "tab:orange" if "PPO" in name else "tab:blue", ":" if "anew" in name else "-"
+        color = next(color for color, label, _ in reversed(groups) if name.startswith(label))
+        dashes = ":" if "anew" in name else "-"
         returns.plot(seconds, reached, "o" + dashes, color=color, ms=4, lw=1.2)
-        returns.annotate(
-            f"{rows[-1]['lost']} lost", (seconds[-1], reached[-1]), (4, -3), textcoords="offset points", size=7
-        )
+        returns.annotate(rows[-1]["lost"], (seconds[-1], reached[-1]), (5, -3), textcoords="offset points", size=7)
     episodes.set_ylabel("control steps of an episode, of 500")
-    returns.set_ylabel("return of all clips, of what is perfect")
+    returns.set_ylabel("return of all clips (number: clips lost)")
     for axis in (episodes, returns):
         axis.set_xlabel("seconds of training, with compiling")
-        axis.set_xlim(0, 200 if axis is episodes else 660)
+        axis.set_xlim(0 if axis is episodes else 40, 200 if axis is episodes else 800)
         axis.set_ylim(0.0, 500.0 if axis is episodes else 1.0)
         axis.grid(alpha=0.3)
+    returns.set_xscale("log")
+    returns.set_xticks([60, 120, 180, 600], ["60", "120", "180", "600"])
+    returns.minorticks_off()
     shown = dict(zip(*episodes.get_legend_handles_labels()[::-1], strict=True))
     episodes.legend(shown.values(), shown.keys(), fontsize=7)
     figure.savefig(PICTURE_OF_SVG, dpi=110)
