@@ -10,14 +10,7 @@ from torchrl_loco.sim.compiled.physics import equalities
 from torchrl_loco.sim.compiled.physics.actuators import BIASES, FILTERS, acting
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE
 from torchrl_loco.sim.compiled.physics.lengths import OF_JOINT, OF_TENDON
-from torchrl_loco.sim.compiled.physics.sensors import (
-    ANGULAR_MOMENTUM,
-    AT_SITES,
-    FORCE,
-    SUBTREE_VELOCITY,
-    TORQUE,
-    TOUCH,
-)
+from torchrl_loco.sim.compiled.physics.sensors import ANGULAR_MOMENTUM, AT_SITES, FORCE, SUBTREE_VELOCITY, TORQUE, TOUCH
 from torchrl_loco.sim.compiled.schedules import lanes
 from torchrl_loco.sim.compiled.step import is_traced
 from torchrl_loco.sim.varied import Varied

@@ -16,18 +16,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.ir.parameters import nominal, present, varies
-from torchrl_loco.sim.compiled.ir.symbols import (
-    Block,
-    Scalar,
-    array,
-    dot,
-    identity,
-    scalar,
-    sincos,
-    sqrt,
-    total,
-    zeros,
-)
+from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, array, dot, identity, scalar, sincos, sqrt, total, zeros
 from torchrl_loco.sim.compiled.physics.actuators import Actuator, acting
 from torchrl_loco.sim.compiled.physics.links import matrix
 from torchrl_loco.sim.compiled.physics.spatial import Inertia, cross_force, cross_motion, turning

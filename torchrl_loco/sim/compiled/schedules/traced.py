@@ -6,15 +6,7 @@ import mujoco
 
 from torchrl_loco.sim.compiled.collision.pairs import pairs
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel, number, present
-from torchrl_loco.sim.compiled.ir.symbols import (
-    Block,
-    Scalar,
-    cells,
-    literal,
-    names,
-    scalar,
-    zeros,
-)
+from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, cells, literal, names, scalar, zeros
 from torchrl_loco.sim.compiled.physics import sensors
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE, Dynamics
 from torchrl_loco.sim.compiled.physics.sensors import TOUCH, TouchSensors

@@ -22,34 +22,13 @@ from torchrl_loco.sim.compiled.schedules.lanes.description import is_implicitfas
 from torchrl_loco.sim.compiled.schedules.lanes.members import members
 
 FILES = (
-    "world",
-    "friction",
-    "group",
-    "kinematics",
-    "welds",
-    "dynamics",
-    "contacts",
-    "planes",
-    "segments",
-    "solids",
-    "boxes",
-    "box_pairs",
-    "fields",
-    "many_boxes",
-    "collide",
-    "rows",
-    "sides",
-    "eliminate",
-    "limbs",
-    "solve",
-    "outputs",
-    "site_sensors",
-    "step",
+    *("world", "friction", "group", "kinematics", "welds", "dynamics"),
+    *("contacts", "planes", "segments", "solids", "boxes", "box_pairs", "fields", "many_boxes", "collide"),
+    *("rows", "sides", "eliminate", "limbs", "solve", "outputs", "site_sensors", "step"),
 )
-"""The headers, in their order: from ``group`` on, each adds a struct that is built on the one before."""
-TEMPLATE = pathlib.Path(__file__).with_name("step.h")
-"""The last of them: a control step from the arrays of all worlds and back."""
-HEADERS = "\n".join(TEMPLATE.with_name(f"{name}.h").read_text() for name in FILES)
+"""The headers, in their order: from ``group`` on, each adds a struct that is built on the one before. The last one is a
+control step, from the arrays of all worlds and back."""
+HEADERS = "\n".join(pathlib.Path(__file__).with_name(f"{name}.h").read_text() for name in FILES)
 LINE_SEARCH = shared.line_search("Model::scale()", "Model::ls_tolerance()", "Model::ls_near()", "Model::LS_ITERATIONS")
 NEWTON = shared.newton(
     "Model::scale()",

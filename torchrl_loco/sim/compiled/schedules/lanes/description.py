@@ -10,24 +10,9 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.collision.ground import Ground
-from torchrl_loco.sim.compiled.collision.kinds import (
-    BOX,
-    FUNCTIONS,
-    GROUND_FUNCTIONS,
-    MESH,
-    PLANE,
-    SOLID,
-)
+from torchrl_loco.sim.compiled.collision.kinds import BOX, FUNCTIONS, GROUND_FUNCTIONS, MESH, PLANE, SOLID
 from torchrl_loco.sim.compiled.collision.meshes import Mesh
-from torchrl_loco.sim.compiled.collision.pairs import (
-    Pair,
-    half_length,
-    is_elliptic,
-    kind,
-    looked_up,
-    pairs,
-    stand_ins,
-)
+from torchrl_loco.sim.compiled.collision.pairs import Pair, half_length, is_elliptic, kind, looked_up, pairs, stand_ins
 from torchrl_loco.sim.compiled.ir import symbols
 from torchrl_loco.sim.compiled.ir.parameters import nominal, present
 from torchrl_loco.sim.compiled.physics.actuators import Actuator, acting

@@ -10,12 +10,7 @@ import numpy as np
 
 from torchrl_loco.sim.compiled.collision.ground import BOX_NUMBERS
 from torchrl_loco.sim.compiled.collision.kinds import MESH, ON_BOXES, POINT_BITS, SHAPES, SOLID
-from torchrl_loco.sim.compiled.collision.pairs import (
-    Pair,
-    contact_weight,
-    half_length,
-    least_regularisation,
-)
+from torchrl_loco.sim.compiled.collision.pairs import Pair, contact_weight, half_length, least_regularisation
 from torchrl_loco.sim.compiled.collision.planes import LEAST_ALIGNED
 from torchrl_loco.sim.compiled.ir import symbols
 from torchrl_loco.sim.compiled.ir.parameters import Number, VariedModel, nominal, present, varies
