@@ -6,7 +6,7 @@ import warp as wp
 
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.compiled.collision.ground import Ground
-from torchrl_loco.sim.compiled.engine import Chain, Data, _kernel
+from torchrl_loco.sim.compiled.engine import Chain, Data, _kernel, arrays_of
 from torchrl_loco.sim.compiled.schedules import lanes
 from torchrl_loco.sim.compiled.step import launch_size
 from torchrl_loco.sim.engine import Setup
@@ -50,8 +50,9 @@ def find_contacts(m: mujoco.MjModel, qpos: np.ndarray) -> list[list[tuple[tuple[
     everywhere = wp.ones(count, dtype=bool, device="cpu")
     size = launch_size(m, count, wp.get_device("cpu"))
     terrain = wp.array(Ground.of(m).numbers(), dtype=float, device="cpu")
-    inputs = [size.worlds_per_warp, size.lanes, everywhere, before.args(()), after.args(()), terrain, data.ctrl]
-    wp.launch(kernel, dim=size.threads, inputs=inputs, outputs=[found, *data.outputs().values()], device="cpu")
+    arrays = arrays_of(data, terrain, found)
+    inputs = [size.worlds_per_warp, size.lanes, everywhere, before.args(()), after.args(()), arrays]
+    wp.launch(kernel, dim=size.threads, inputs=inputs, device="cpu")
     result = []
     for rows in found.numpy().reshape(count, most, FIELDS):
         end = int(np.argmax(rows[:, 0] < 0))

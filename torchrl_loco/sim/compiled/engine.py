@@ -26,7 +26,7 @@ from torchrl_loco.sim.compiled.step import (
     structure_of_arrays,
 )
 from torchrl_loco.sim.engine import Engine, Setup, Update
-from torchrl_loco.sim.world_func import ALONE, Around, Chain, WorldFunc
+from torchrl_loco.sim.world_func import ALONE, Around, Chain, WorldFunc, fill
 
 ROWS = {
     "qpos": ("nq", wp.float32),
@@ -48,6 +48,17 @@ ROWS = {
 
 LATER = ("cvel", "subtree_com")
 """Arrays that are made, and computed, if they are asked for before the first step."""
+
+WORLD_ARRAYS = {
+    **{"terrain_in": wp.array(dtype=float), "ctrl_in": wp.array2d(dtype=float), "numbers_out": wp.array2d(dtype=float)},
+    **{
+        f"{name}_out": wp.array(dtype=dtype, ndim=1 if size is None else 2)
+        for name, (size, dtype) in ROWS.items()
+        if name != "ctrl"
+    },
+}
+"""What the C++ of a step reads and writes, by the names that it has there."""
+Arrays: Any = wp.struct(type("Arrays", (), {"__annotations__": WORLD_ARRAYS}))
 
 
 class Data:
@@ -185,10 +196,6 @@ class Model(ReadOnly):
 
     Only what environments read when they are made is copied here. Anything else makes the model of MuJoCo-Warp, which
     imports it and takes a second or two.
-
-    Args:
-        m: the model.
-        device: where it lives.
     """
 
     def __init__(self, m: mujoco.MjModel, device: wp.Device) -> None:
@@ -278,9 +285,15 @@ class CompiledEngine(Engine):
             self._steps[key] = _kernel(text, start, end, self._launch_size.registers), start, end
         kernel, start, end = self._steps[key]
         size = self._launch_size
-        inputs = [size.worlds_per_warp, size.lanes, mask, start.args(before), end.args(after), self._terrain]
-        arrays = [self.data.ctrl, self._rows, *outputs.values()]
-        wp.launch(kernel, size.threads, inputs, arrays, device=self._device, block_dim=size.block)
+        arrays = arrays_of(self.data, self._terrain, self._rows)
+        inputs = [size.worlds_per_warp, size.lanes, mask, start.args(before), end.args(after), arrays]
+        wp.launch(kernel, size.threads, inputs, device=self._device, block_dim=size.block)
+
+
+def arrays_of(data: Data, terrain: wp.array, numbers: wp.array) -> Any:
+    """Returns what a step reads and writes, as its kernel takes it."""
+    outputs = {f"{name}_out": array for name, array in data.outputs().items()}
+    return fill(Arrays, terrain_in=terrain, ctrl_in=data.ctrl, numbers_out=numbers, **outputs)
 
 
 def _check_forces(m: mujoco.MjModel, contact_geoms: Sequence[int]) -> None:
@@ -300,69 +313,23 @@ def _check_forces(m: mujoco.MjModel, contact_geoms: Sequence[int]) -> None:
 
 
 def _kernel(text: str, start: Chain, end: Chain, registers: int | None = None) -> wp.Kernel:
-    """Returns a kernel that calls functions, the C++ of a control step and further functions in each world.
-
-    Args:
-        text: the C++, of :func:`~torchrl_loco.sim.compiled.step.source`.
-        start: the functions that are called first.
-        end: those that are called last.
-        registers: of a thread of a GPU, at most.
-    """
+    """Returns a kernel that calls functions, the C++ of a control step and further functions in each world."""
     before, after = start.func, end.func
     Before: Any = start.struct  # noqa: N806
     After: Any = end.struct  # noqa: N806
+    named = "".join(f"const auto& {name} = arrays.{name};\n" for name in WORLD_ARRAYS)
 
-    @wp.func_native(text)
-    def advance(
-        world: int,
-        lane: int,
-        live: bool,
-        terrain_in: wp.array[float],
-        ctrl_in: wp.array2d[float],
-        numbers_out: wp.array2d[float],
-        qpos_out: wp.array2d[float],
-        qvel_out: wp.array2d[float],
-        act_out: wp.array2d[float],
-        qacc_warmstart_out: wp.array2d[float],
-        time_out: wp.array[float],
-        xpos_out: wp.array2d[wp.vec3],
-        xmat_out: wp.array2d[wp.mat33],
-        cvel_out: wp.array2d[wp.spatial_vector],
-        subtree_com_out: wp.array2d[wp.vec3],
-        contact_force_out: wp.array2d[wp.vec3],
-        in_contact_out: wp.array2d[bool],
-        sensordata_out: wp.array2d[float],
-        overflow_out: wp.array[int],
-    ): ...
+    @wp.func_native(named + text)
+    def advance(world: int, lane: int, live: bool, arrays: Arrays): ...
 
     @wp.kernel(enable_backward=False, module="unique", cuda_max_registers=registers)
     def compiled_step(
-        # In:
         worlds_per_warp: int,
         lanes: int,
         mask_in: wp.array[bool],
         before_args: Before,
         after_args: After,
-        # Model in:
-        terrain_in: wp.array[float],
-        # Data in:
-        ctrl_in: wp.array2d[float],
-        # Model out:
-        numbers_out: wp.array2d[float],
-        # Data out:
-        qpos_out: wp.array2d[float],
-        qvel_out: wp.array2d[float],
-        act_out: wp.array2d[float],
-        qacc_warmstart_out: wp.array2d[float],
-        time_out: wp.array[float],
-        xpos_out: wp.array2d[wp.vec3],
-        xmat_out: wp.array2d[wp.mat33],
-        cvel_out: wp.array2d[wp.spatial_vector],
-        subtree_com_out: wp.array2d[wp.vec3],
-        contact_force_out: wp.array2d[wp.vec3],
-        in_contact_out: wp.array2d[bool],
-        sensordata_out: wp.array2d[float],
-        overflow_out: wp.array[int],
+        arrays: Arrays,
     ):
         place = wp.tid() % WARP // lanes  # of the world in its warp
         lane = wp.tid() % lanes  # of the thread in its world
@@ -372,27 +339,7 @@ def _kernel(text: str, start: Chain, end: Chain, registers: int | None = None) -
             live = mask_in[world]
         if live and lane == 0:
             before(world, before_args)
-        advance(
-            world,
-            lane,
-            live,  # lanes of a block may wait for those that are not
-            terrain_in,
-            ctrl_in,
-            numbers_out,
-            qpos_out,
-            qvel_out,
-            act_out,
-            qacc_warmstart_out,
-            time_out,
-            xpos_out,
-            xmat_out,
-            cvel_out,
-            subtree_com_out,
-            contact_force_out,
-            in_contact_out,
-            sensordata_out,
-            overflow_out,
-        )
+        advance(world, lane, live, arrays)  # lanes of a block may wait for those that are not live
         if live and lane == 0:
             after(world, after_args)
 
