@@ -26,6 +26,8 @@ from torchrl_loco.envs.fusion.nodes import (
 )
 from torchrl_loco.envs.fusion.program import FILLERS, INFINITE, LONG, Program, Value, _shifted, offsets_of, shape_of
 
+aten = torch.ops.aten
+
 BEATS = {"max": "{0} > {1} || ({0} != {0} && {1} == {1})", "min": "{0} < {1} || ({0} != {0} && {1} == {1})"}
 REMAINDER = "{0} != 0 && ({0} < 0) != ({1} < 0) ? {0} + {1} : {0}"
 
@@ -54,6 +56,11 @@ TESTS = {
     **{"isnan": "{0} != {0}", "isfinite": "{0} - {0} == 0", "isinf": "{0} == {0} && {0} - {0} != 0"},
 }
 """Operators that are bool, on operands of a common type."""
+
+VIEWS = ("expand", "permute", "unsqueeze", "squeeze", "slice", "select", "split_with_sizes")
+"""Operators that look at a tensor in another way."""
+FAR = 2**32
+"""How many numbers, for torch, a world begins behind the one before: more than any tensor has of one."""
 
 FOLDS = {"sum": ADD, "prod": MUL, "amax": MOST, "amin": LEAST, "all": AND, "any": OR}
 """Reductions, from left to right."""
@@ -169,65 +176,37 @@ def _view(p: Program, x: Any, *args: Any, **kwargs: Any) -> Value:
     return x.with_array(array, world)
 
 
-def _expand(p: Program, x: Value, *args: Any, **kwargs: Any) -> Value:
-    shape, more = list(p._meta.shape), p._meta.ndim - x.array.ndim
-    world = _shifted(x.world, more)
-    if world is None and shape and shape[0] == p._n and (more or x.array.shape[0] == 1):
-        world = 0
+def _seen(op: Any, p: Program, x: Value, *args: Any, **kwargs: Any) -> Any:
+    """Returns the view, or views, that an operator of torch makes of a value: strides tell what has gone where.
+
+    Raises:
+        CannotFuse: it is of a part of the worlds, which differ.
+    """
+    array, step = x.array, x.array.itemsize
+    shape, steps = list(array.shape), [stride // step for stride in array.strides]
+    if x.world is not None:
+        shape[x.world], steps[x.world] = p._n * shape[x.world], FAR
+    seen = op(torch.empty_strided(shape, steps, dtype=torch.bool, device="meta"), *args, **kwargs)
+    return [_view_of(p, x, each) for each in seen] if isinstance(seen, tuple | list) else _view_of(p, x, seen)
+
+
+def _view_of(p: Program, x: Value, seen: torch.Tensor) -> Value:
+    shape, steps, size = list(seen.shape), list(seen.stride()), x.array.itemsize
+    start = int(seen.storage_offset()) % FAR
+    worlds = [d for d, step in enumerate(steps) if step == FAR]
+    world = worlds[-1] if worlds and shape[worlds[-1]] == p._n * x.array.shape[x.world] else None
     if world is not None:
-        shape[world] = 1 if x.world is None else x.array.shape[x.world]
-    return x.with_array(np.broadcast_to(x.array, shape), world)
+        shape[world], steps[world] = x.array.shape[x.world], x.array.strides[x.world] // size
+    elif x.world is not None and x.varies:
+        raise CannotFuse("{op} goes across worlds")
+    elif shape and shape[0] == p._n and steps[0] == 0:  # what all worlds are given
+        world, shape[0] = 0, 1
+    every = np.lib.stride_tricks.as_strided(x.array, (start + 1,), (size,))[start:]
+    strides = [size * (step % FAR) for step in steps]  # none from world to world where all have the same
+    return x.with_array(np.lib.stride_tricks.as_strided(every, shape, strides), world)
 
 
-def _permute(p: Program, x: Value, dims: Sequence[int]) -> Value:
-    dims = [dim % x.array.ndim for dim in dims]
-    return x.with_array(x.array.transpose(dims), None if x.world is None else dims.index(x.world))
-
-
-def _unsqueeze(p: Program, x: Value, dim: int) -> Value:
-    dim %= x.array.ndim + 1
-    return x.with_array(np.expand_dims(x.array, dim), _shifted(x.world, x.world is not None and dim <= x.world))
-
-
-def _squeeze(p: Program, x: Value, dim: int | Sequence[int] | None = None) -> Value:
-    dims = range(x.array.ndim) if dim is None else [dim] if isinstance(dim, int) else dim
-    gone = tuple({d % x.array.ndim for d in dims if x.array.shape[d] == 1} - {x.world}) if x.array.ndim else ()
-    world = _shifted(x.world, -sum(x.world is not None and d < x.world for d in gone))
-    return x.with_array(np.squeeze(x.array, gone), world)
-
-
-def _slice(
-    p: Program, x: Value, dim: int = 0, start: int | None = None, end: int | None = None, step: int = 1
-) -> Value:
-    if dim % x.array.ndim == x.world:
-        if (start or 0) == 0 and (end is None or end >= p._n * x.array.shape[dim]) and step == 1:
-            return x
-    x = _plain(p, x, dim)
-    (dim,) = x.rowwise([dim])
-    return x.with_array(x.array[(*[slice(None)] * dim, slice(start, end, step))], x.world)
-
-
-def _plain(p: Program, x: Value, dim: int) -> Value:
-    """Returns a value without worlds if it is the same in all, and if their dimension is ``dim``: a model's numbers."""
-    if x.world is None or dim % x.array.ndim != x.world or x.array.shape[x.world] != 1 or x.varies:
-        return x
-    shape = [p._n if d == x.world else size for d, size in enumerate(x.array.shape)]
-    return x.with_array(np.broadcast_to(x.array, shape), None)
-
-
-def _select(p: Program, x: Value, dim: int, index: int) -> Value:
-    x = _plain(p, x, dim)
-    (dim,) = x.rowwise([dim])
-    world = _shifted(x.world, -int(x.world is not None and dim < x.world))
-    return x.with_array(x.array[(*[slice(None)] * dim, index, ...)], world)
-
-
-def _split(p: Program, x: Value, size: int | Sequence[int], dim: int = 0) -> list[Value]:
-    (dim,) = x.rowwise([dim])
-    total = x.array.shape[dim]
-    sizes = [min(size, total - i) for i in range(0, total, size)] if isinstance(size, int) else list(size)
-    ends = np.cumsum(sizes).tolist()
-    return [_slice(p, x, dim, end - n, end) for n, end in zip(sizes, ends, strict=True)]
+_slice, _select, _unsqueeze = (functools.partial(_seen, op) for op in (aten.slice, aten.select, aten.unsqueeze))
 
 
 def _flip(p: Program, x: Value, dims: Sequence[int]) -> Value:
@@ -254,14 +233,6 @@ def _pad(p: Program, x: Value, pad: Sequence[int], value: Any = 0) -> Value:
 def _stack(p: Program, tensors: Sequence[Any], dim: int = 0) -> Any:
     values, world = p.aligned(*tensors)
     return _cat(p, [_unsqueeze(p, x.with_array(x.array, world), dim) for x in values], dim)
-
-
-def _index_select(p: Program, x: Any, dim: int, index: Any) -> Value:
-    if isinstance(index, Value) and not (isinstance(x, Value) and x.world is not None):
-        return _looked_up(p, x, [*[None] * (dim % len(shape_of(x))), index])
-    x = p.value(x)
-    (dim,) = x.rowwise([dim])
-    return x.with_array(np.take(x.array, p.numbers(index), axis=dim), x.world)
 
 
 def _pick(p: Program, columns: Sequence[Any], index: Value) -> Value:
@@ -309,33 +280,6 @@ def _looked_up(p: Program, x: Any, indices: Sequence[Any]) -> Value:
             made[(*at, *of)] = p.node(text, dtype, inside.array[at], address.array[at], place=(table, None, 0))
     start, count = dims[0] if dims == list(range(dims[0], dims[-1] + 1)) else 0, address.array.ndim
     return Value(np.moveaxis(made, range(count), range(start, start + count)), dtype, _shifted(world, start))
-
-
-def _search(p: Program, table: Any, x: Any, *, out_int32: bool = False, right: bool = False, **others: Any) -> Value:
-    """Returns how many numbers of a sorted row are less than (``right``: at most) each number.
-
-    Raises:
-        CannotFuse: it has other options, or the row is no row.
-    """
-    if any(value not in (None, "left") for name, value in others.items() if name != "side"):
-        raise CannotFuse("{op} has a sorter")
-    right = right or others.get("side") == "right"
-    shape = shape_of(table)
-    if len(shape) != 1:
-        raise CannotFuse("{op} searches in more than one row")
-    at, first, (step,), dtype = p.table(table)
-    x, start, end = p.cast(x, dtype), p.value(0), p.value(shape[0])
-    for _ in range(shape[0].bit_length()):  # as torch halves it, so that rows that are not sorted give the same
-        (start, end, x), world = p.aligned(start, end, x)
-        middle = f"p{at}_0[{first} + ({{0}} + {{1}}) / 2 * {step}]"
-        text = f"{{0}} < {{1}} && !({middle} {'>' if right else '>='} {{2}})"
-        nodes = np.frompyfunc(lambda *args, text=text: p.node(text, torch.bool, *args, place=(at, None, 0)), 3, 1)
-        less = Value(np.asarray(nodes(start.array, end.array, x.array), dtype=object), torch.bool, world)
-        half = p.apply("({0} + {1}) / 2", torch.int64, start, end)
-        more, kept = p.apply("{0} + 1", torch.int64, half), p.apply("{0} < {1}", torch.bool, start, end, of=torch.int64)
-        end = p.where(less, end, p.where(kept, half, end, torch.int64), torch.int64)
-        start = p.where(less, more, start, torch.int64)
-    return p.cast(start, p._meta.dtype)
 
 
 def _index(p: Program, x: Any, indices: Sequence[Any]) -> Value:
@@ -471,17 +415,14 @@ RULES: dict[str, Callable[..., Any]] = {
     **{name: functools.partial(_filler, None if name.startswith("full") else 0) for name in FILLERS},
     **{"add": functools.partial(_add, ADD), "sub": functools.partial(_add, SUB), "remainder": _remainder, "div": _div},
     **{"pow": _pow, "round": _round, "clamp": _clamp, "where": lambda p, *of: p.where(*of), "copy": _filled},
-    **{"masked_fill": lambda p, x, mask, new: p.where(mask, new, x)},
     **{"var": _var, "mean": _mean, "cumsum": _cumsum, "mm": _matmul, "bmm": _matmul},
     **{name: functools.partial(_extreme, name) for name in BEATS},
     **{f"arg{name}": functools.partial(_place, name) for name in BEATS},
     **dict.fromkeys(("_to_copy", "clone", "lift_fresh_copy", "copy_strided"), _copy),
     **{name: lambda p, x: x for name in ("alias", "detach", "detach_", "lift_fresh")},
     **dict.fromkeys(("view", "_unsafe_view"), _view),
-    **{"expand": _expand, "permute": _permute, "unsqueeze": _unsqueeze, "squeeze": _squeeze, "slice": _slice},
-    **{"select": _select, "split": _split, "split_with_sizes": _split, "flip": _flip},
-    **{"cat": _cat, "stack": _stack, "constant_pad_nd": _pad, "index_select": _index_select, "index": _index},
-    **{"bucketize": lambda p, x, boundaries, **options: _search(p, boundaries, x, **options)},
-    **{"index_put": _index_put, "gather": _gather, "searchsorted": _search},
+    **{name: functools.partial(_seen, getattr(aten, name)) for name in VIEWS},
+    **{"flip": _flip, "cat": _cat, "stack": _stack, "constant_pad_nd": _pad},
+    **{"index": _index, "index_put": _index_put, "gather": _gather},
 }
 """Operators by name, without overload; what is missing is decomposed as torch does it for its compilers."""

@@ -18,6 +18,15 @@ aten = torch.ops.aten
 COPIES = (aten._to_copy.default, aten.lift_fresh_copy.default)
 
 
+def _searchsorted(row: torch.Tensor, x: Any, *, out_int32: bool = False, right: bool = False, side: Any = None) -> Any:
+    """Returns what searchsorted does in one row, by the decomposition of bucketize: torch has none of its own."""
+    return decomposition_table[aten.bucketize.Tensor](x, row, out_int32=out_int32, right=right or side == "right")
+
+
+DECOMPOSED = {**decomposition_table, aten.searchsorted.Tensor: _searchsorted}
+"""Operators of which torch's compilers know what they consist of."""
+
+
 def _decomposed(func: Any) -> Callable[..., Any] | None:
     """Returns what does by other operators what one without a rule does, if torch has that for its compilers."""
     name, kept = func._schema.name.removeprefix("aten::"), {torch.Tag.nondeterministic_seeded, torch.Tag.inplace_view}
@@ -27,9 +36,9 @@ def _decomposed(func: Any) -> Callable[..., Any] | None:
     if func._can_decompose():
         return func.decompose
     if not in_place:
-        return decomposition_table.get(func)
+        return DECOMPOSED.get(func)
     functional: Any = getattr(getattr(aten, name[:-1], None), func._overloadname, None)
-    new = decomposition_table.get(functional)
+    new = DECOMPOSED.get(functional)
     return new and (lambda target, *args, **kwargs: target.copy_(new(target, *args, **kwargs)))
 
 
