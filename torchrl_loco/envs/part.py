@@ -14,7 +14,7 @@ import torchrl_loco
 from torchrl_loco.envs.fusion import fuse, trace
 from torchrl_loco.envs.hooks import Arrays
 from torchrl_loco.garbage import no_collection
-from torchrl_loco.sim import Recorded, Simulation
+from torchrl_loco.sim import Simulation
 
 COMPARED = 64
 """Worlds in which a trace or a kernel is compared with the hooks themselves."""
@@ -158,7 +158,7 @@ class Part:
             self._do_without_kernel(sim.device, error)
             return
         self._traced, self.kind = None, "kernel"
-        self._run = Recorded(self.launch, sim.capture(self.launch), sim.device)
+        self._run = sim.capture(self.launch)
 
     def _compile_by_torch(self, traced: torch.fx.GraphModule) -> None:
         try:

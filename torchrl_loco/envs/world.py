@@ -28,10 +28,8 @@ from torchrl_loco.sim import (
     EXCLUSIVE,
     Around,
     Buffer,
-    Direct,
     Graph,
     PackedBuffers,
-    Recorded,
     Simulation,
     TorchGraph,
     WorldFunc,
@@ -316,18 +314,18 @@ class World:
                 self.fixed |= names
         if self._scans.arrays:
             self._scan_first(hooks.catalog.scanning)
-        self._physics, self._settle = self._record(self._launch_step), self._record(self._launch_reset)
-        self._rest = self._record(self._launch_rest) if own or variation else _nothing
-        self._conclude = self._record(self._launch_conclude) if own else _nothing
-        self._move = self._keeping_what_was(self._record(self._launch_move)) if hooks.moves else _nothing
+        self._physics, self._settle = sim.capture(self._launch_step), sim.capture(self._launch_reset)
+        self._rest = sim.capture(self._launch_rest) if own or variation else _nothing
+        self._conclude = sim.capture(self._launch_conclude) if own else _nothing
+        self._move = self._keeping_what_was(sim.capture(self._launch_move)) if hooks.moves else _nothing
         if self.seen:
-            self._draw, self._draw_begun = map(self._record, (self._launch_draw, self._launch_draw_begun))
+            self._draw, self._draw_begun = map(sim.capture, (self._launch_draw, self._launch_draw_begun))
         self._run_step = self._as_graph("_take_step", several=bool(own or self.seen))
         self._run_reset = self._as_graph("_begin_masked", several=bool(own or self.seen) or variation is not None)
 
     def _scan_first(self, scanning: Collection[str]) -> None:
         """Lets parts whose hooks read scans or depths make them first; in resets, those of the masked worlds."""
-        scans = {False: self._record(self._scans.all), True: self._record(self._scans.begun)}
+        scans = {False: self.sim.capture(self._scans.all), True: self.sim.capture(self._scans.begun)}
         for name, hooks in PARTS.items():
             part = getattr(self, f"_{name}")
             if isinstance(part, Part) and not {*scanning}.isdisjoint(hooks):
@@ -365,9 +363,6 @@ class World:
         arrays |= {f"shared.{name}": values for name, values in self.shared.items()}
         arrays |= {f"out.{name}": group for name, group in self.groups.items()}
         return arrays | {f"memory.{name}": rows for name, rows in self.memory.items()}
-
-    def _record(self, launch: Callable[..., None]) -> Recorded:
-        return Recorded(launch, self.sim.capture(launch), self.sim.device)
 
     def _keeping_what_was(self, move: Callable[[], None]) -> Callable[[], None]:
         """Returns ``move`` such that what belongs to the step stays: a fused function's reward."""
@@ -428,9 +423,7 @@ class World:
     def reset(self, mask: torch.Tensor | None, stagger: bool) -> None:
         """Begins the next episode in the worlds of ``mask`` ``(nworld,)``, in all for ``None``.
 
-        Args:
-            mask: the worlds.
-            stagger: whether they begin with a random number of elapsed steps.
+        With ``stagger`` each begins with a random number of elapsed steps.
         """
         self._set_mask(mask)
         if stagger:
@@ -482,7 +475,7 @@ class World:
         self._look_begun(restored=True)
 
     @functools.cached_property
-    def _refresh_graph(self) -> Graph | Direct:
+    def _refresh_graph(self) -> Graph:
         """A recording of it: most environments never need one."""
         device = self.sim.device
         with torch.inference_mode(False), EXCLUSIVE, self.sim.qpos.device:

@@ -5,9 +5,7 @@ import warp as wp
 from torchrl_loco.sim.buffer import Buffer as Buffer
 from torchrl_loco.sim.buffer import PackedBuffers as PackedBuffers
 from torchrl_loco.sim.graph import EXCLUSIVE as EXCLUSIVE
-from torchrl_loco.sim.graph import Direct as Direct
 from torchrl_loco.sim.graph import Graph as Graph
-from torchrl_loco.sim.graph import Recorded as Recorded
 from torchrl_loco.sim.graph import TorchGraph as TorchGraph
 from torchrl_loco.sim.graph import current_stream as current_stream
 from torchrl_loco.sim.graph import joined_to_torch as joined_to_torch

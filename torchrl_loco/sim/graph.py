@@ -1,6 +1,7 @@
 """Work recorded once and replayed at every step: CUDA graphs on the GPU, Warp's recorder on the CPU."""
 
 import contextlib
+import inspect
 import os
 import threading
 import weakref
@@ -52,21 +53,32 @@ def joined_to_torch(device: wp.Device) -> Iterator[None]:
 
 
 class Graph:
-    """The Warp launches that ``launch`` makes, recorded at construction and run by :meth:`replay`.
+    """Warp launches as a call: a recording of them is replayed, or they join the CUDA graph that torch records.
 
-    Every array that the launches touch must live, at the same address, as long as the graph does. Scratch memory that
-    is allocated while recording comes from ``scratch`` on CUDA and is kept by the recording itself on the CPU.
+    Every array that the launches touch must live, at the same address, as long as this does. Scratch memory that is
+    allocated while recording comes from ``scratch`` on CUDA and is kept by the recording itself on the CPU.
 
     Args:
         launch: makes the launches. It is called twice: once for real, which compiles the kernels and lets mujoco_warp
-            allocate what it allocates lazily, and once to record. It must not read from the device.
+            allocate what it allocates lazily, and once to record. It must not read from the device. If it is a method,
+            its object is not kept alive.
         device: the Warp device.
         scratch: where scratch memory comes from; needed on CUDA.
+        anew: whether it is called at each replay instead: C MuJoCo's steps are none that Warp could record.
     """
 
-    def __init__(self, launch: Callable[[], None], device: wp.Device, scratch: "ScratchPool | None" = None) -> None:
-        self._device = device
-        self._scratch = scratch
+    def __init__(
+        self,
+        launch: Callable[..., None],
+        device: wp.Device,
+        scratch: "ScratchPool | None" = None,
+        *,
+        anew: bool = False,
+    ) -> None:
+        self._launch = weakref.WeakMethod(launch) if inspect.ismethod(launch) else lambda: launch
+        self._device, self._scratch, self._graph = device, scratch, None
+        if anew:
+            return
         allocator = wp.ScopedAllocator(device, scratch) if device.is_cuda else contextlib.nullcontext()
         with EXCLUSIVE, wp.ScopedDevice(device), allocator:
             launch()
@@ -74,55 +86,31 @@ class Graph:
                 launch()
         self._graph = capture.graph
 
-    def replay(self) -> None:
-        """Runs the recorded work on torch's current stream of the device, without waiting for it."""
-        with contextlib.nullcontext() if self._device.is_cuda else EXCLUSIVE:
-            wp.capture_launch(self._graph, stream=current_stream(self._device))
-
-
-class Direct:
-    """A launch that is made anew at each replay: C MuJoCo's steps are none that Warp could record.
-
-    Args:
-        launch: a method that makes it. Its object is not kept alive.
-    """
-
-    def __init__(self, launch: Callable[[], None]) -> None:
-        self._launch = weakref.WeakMethod(launch)
-
-    def replay(self) -> None:
-        """Makes the launch."""
-        launch = self._launch()
-        assert launch is not None
-        with EXCLUSIVE, wp.ScopedDevice("cpu"):
-            launch()
-
-
-class Recorded:
-    """Warp launches as a call: a recording of them is replayed, or they join the CUDA graph that torch records.
-
-    Args:
-        launch: a method that makes the launches and does not read from the device. Its object is not kept alive.
-        graph: a recording of it.
-        device: the Warp device.
-    """
-
-    def __init__(self, launch: Callable[..., None], graph: Graph | Direct, device: wp.Device) -> None:
-        self._launch, self._graph, self._device = weakref.WeakMethod(launch), graph, device
-
     def __call__(self, *args: Any) -> None:
         """Runs them on torch's current stream, without waiting for the device.
 
         Args:
-            args: of the method, where they join torch's recording; in a replay they are those of its recording.
+            args: of ``launch``, where it joins torch's recording; in a replay they are those of its recording.
         """
-        if torch_is_recording(self._device):
-            launch = self._launch()
-            assert launch is not None
-            with joined_to_torch(self._device):
-                launch(*args)
-        else:
-            self._graph.replay()
+        if not torch_is_recording(self._device):
+            self.replay()
+            return
+        with joined_to_torch(self._device):
+            self._launch_now(*args)
+
+    def replay(self) -> None:
+        """Runs the recorded work on torch's current stream of the device, without waiting for it."""
+        with contextlib.nullcontext() if self._device.is_cuda else EXCLUSIVE:
+            if self._graph is not None:
+                wp.capture_launch(self._graph, stream=current_stream(self._device))
+                return
+            with wp.ScopedDevice(self._device):
+                self._launch_now()
+
+    def _launch_now(self, *args: Any) -> None:
+        launch = self._launch()
+        assert launch is not None
+        launch(*args)
 
 
 class TorchGraph:

@@ -1,5 +1,6 @@
 """Many worlds of one model on one device, whichever engine steps them."""
 
+import functools
 import gc
 import logging
 import math
@@ -17,7 +18,7 @@ from torchrl_loco.sim import mujoco as c_mujoco
 from torchrl_loco.sim.batched_model import BatchedModel, with_every_row
 from torchrl_loco.sim.compilation import compile_kernels
 from torchrl_loco.sim.engine import Engine, Setup, Update
-from torchrl_loco.sim.graph import Direct, Graph, ScratchPool
+from torchrl_loco.sim.graph import Graph, ScratchPool
 from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.warp_init import init_warp
 from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, WorldKernels, copy_row, fill, zero_row
@@ -150,7 +151,6 @@ class Simulation:
         check_memory(memory(name, setup), num_envs, device)
         self.engine = ENGINES[name](setup)
         self.model, self.data = self.engine.model, self.engine.data
-        self._mujoco_data: dict[int, mjw.Data] = {}
         self._batched: BatchedModel | None = None
         self._every = wp.ones(num_envs, dtype=bool, device=self.device)
         self._kernels = WorldKernels()
@@ -216,15 +216,17 @@ class Simulation:
             after: what it does at the end.
             at_rest: whether they still are then; ``before`` may write ``qvel`` too if not.
         """
-        rest = WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0))
-        self.engine.forward(mask, Update([rest, *before], after, at_rest))
+        self.engine.forward(mask, Update([self._at_rest(), *before], after, at_rest))
 
     def rest(self, mask: wp.array, then: Sequence[WorldFunc]) -> None:
         """Puts worlds of a mask, bool ``(nworld,)``, at rest in the default pose, without updating poses and sensors.
 
         After that each of them does what ``then`` says.
         """
-        self._kernels.launch([WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0)), *then], mask)
+        self._kernels.launch([self._at_rest(), *then], mask)
+
+    def _at_rest(self) -> WorldFunc:
+        return WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0))
 
     def apart(self, funcs: Sequence[WorldFunc]) -> None:
         """Calls functions in every world, in a kernel of their own."""
@@ -241,7 +243,7 @@ class Simulation:
         """
         self.engine.forward(mask, Update(after=after, contacts=contacts))
 
-    def mujoco_data(self, *, contacts: bool = False, worlds: int | None = None) -> "mjw.Data":
+    def mujoco_data(self, *, contacts: bool = False) -> "mjw.Data":
         """Returns the present state as ``mjData`` of MuJoCo-Warp, with poses of geoms, sites and cameras.
 
         Under the engine ``compiled`` it is made at the first call, and takes the memory of the other engine: several
@@ -249,28 +251,26 @@ class Simulation:
 
         Args:
             contacts: whether contacts and constraints are found too; that takes a part of a physics step.
-            worlds: how many of the first worlds it has; ``None`` is all.
         """
-        worlds = self.num_envs if worlds is None else worlds
         with wp.ScopedDevice(self.device):  # not that on which the caller makes arrays
-            if isinstance(self.data, mjw.Data) and worlds == self.num_envs:
-                data = self.data
-            else:
-                if worlds not in self._mujoco_data:
-                    m, room = with_every_row(self.mj_model, self.varied), self.config
-                    self._mujoco_data[worlds] = mjw.make_data(m, worlds, naconmax=room.naconmax, njmax=room.njmax)
-                data = self._mujoco_data[worlds]
+            data, model = self.data, self._model_of_each_world()
+            if not isinstance(data, mjw.Data):
+                data = self._mujoco_data
                 names = ["qpos", "qvel", "qacc_warmstart", "ctrl", "time"]
                 names += ["mocap_pos", "mocap_quat"] if self.mj_model.nmocap else []
                 names += ["act"] if self.mj_model.na else []
                 for name in names:
-                    wp.copy(getattr(data, name), getattr(self.data, name)[:worlds])
-                model = self._model_of_each_world()
+                    wp.copy(getattr(data, name), getattr(self.data, name))
                 mjw.kinematics(model, data)
                 mjw.com_pos(model, data)
             if contacts:
-                mjw.fwd_position(self._model_of_each_world(), data)
+                mjw.fwd_position(model, data)
         return data
+
+    @functools.cached_property
+    def _mujoco_data(self) -> "mjw.Data":
+        m, room = with_every_row(self.mj_model, self.varied), self.config
+        return mjw.make_data(m, self.num_envs, naconmax=room.naconmax, njmax=room.njmax)
 
     def _model_of_each_world(self) -> "mjw.Model":
         """Returns MuJoCo-Warp's model with the present numbers of each world."""
@@ -286,11 +286,9 @@ class Simulation:
         """Compiles the kernels that ``launches`` would launch, in parallel and with a progress bar."""
         compile_kernels(launches, self.device)
 
-    def capture(self, launch: Callable[[], None]) -> Graph | Direct:
+    def capture(self, launch: Callable[..., None]) -> Graph:
         """Returns a recording of the launches that ``launch`` makes. It also runs them: reset before use."""
-        if isinstance(self.engine, c_mujoco.MujocoEngine):
-            return Direct(launch)
-        return Graph(launch, self.device, self._scratch)
+        return Graph(launch, self.device, self._scratch, anew=isinstance(self.engine, c_mujoco.MujocoEngine))
 
 
 def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
