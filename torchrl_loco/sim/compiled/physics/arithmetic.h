@@ -103,6 +103,12 @@ struct Vec {
   INLINE Vec cross(Vec b) const { return {y * b.z - z * b.y, z * b.x - x * b.z, x * b.y - y * b.x}; }
   INLINE float norm() const { return Math::root(dot(*this)); }
   INLINE float component(int i) const { return i == 0 ? x : i == 1 ? y : z; }
+  INLINE void write(float* to) const {
+    to[0] = x;
+    to[1] = y;
+    to[2] = z;
+  }
+  static INLINE Vec unit(int i) { return {i == 0 ? 1.0f : 0.0f, i == 1 ? 1.0f : 0.0f, i == 2 ? 1.0f : 0.0f}; }
 };
 
 struct Quat {  // of unit length, as MuJoCo orders it
@@ -118,6 +124,10 @@ struct Quat {  // of unit length, as MuJoCo orders it
   INLINE Vec rotate(Vec v) const {
     const Vec u = {x, y, z}, t = u.cross(v) * 2.0f;
     return v + t * w + u.cross(t);
+  }
+  INLINE void write(float* to) const {
+    to[0] = w;
+    Vec{x, y, z}.write(to + 1);
   }
   // That of a matrix, given by its rows: the largest of the four comes first, whose square is not small.
   static INLINE Quat from(Vec a, Vec b, Vec c) {

@@ -12,7 +12,6 @@ struct BoxPairContacts : BoxContacts {
     float distances[CORNERS];
   };
 
-  static INLINE Vec unit(int i) { return {i == 0 ? 1.0f : 0.0f, i == 1 ? 1.0f : 0.0f, i == 2 ? 1.0f : 0.0f}; }
   static INLINE Vec magnitude(Vec v) { return {fabsf(v.x), fabsf(v.y), fabsf(v.z)}; }
   static INLINE Vec signs(Vec v) {
     return {v.x < 0.0f ? -1.0f : 1.0f, v.y < 0.0f ? -1.0f : 1.0f, v.z < 0.0f ? -1.0f : 1.0f};
@@ -30,8 +29,8 @@ struct BoxPairContacts : BoxContacts {
   // The middle of the edge along an axis that is farthest in the direction n times `facing`; mirrored in an axis, or -1.
   static INLINE Vec edge_of(Vec size, Vec n, float facing, int along, int mirrored) {
     Vec middle = by_component(signs(n) * facing, size);
-    if (mirrored >= 0) middle = middle - unit(mirrored) * (2.0f * middle.component(mirrored));
-    return middle - unit(along) * middle.component(along);
+    if (mirrored >= 0) middle = middle - Vec::unit(mirrored) * (2.0f * middle.component(mirrored));
+    return middle - Vec::unit(along) * middle.component(along);
   }
 
   // The nearest points of two edges, along axis i of the first box and j of the second, on the side to which `normal`
@@ -53,7 +52,7 @@ struct BoxPairContacts : BoxContacts {
       float s = across >= MINVAL ? clamp(divide(ahead - cosine * behind, across), -reach, reach) : 0.0f;
       const float t = clamp(cosine * s - behind, -other_reach, other_reach);
       s = clamp(ahead + cosine * t, -reach, reach);
-      const Vec from = corner + unit(i) * s, to = start + along * t, gap = to - from;
+      const Vec from = corner + Vec::unit(i) * s, to = start + along * t, gap = to - from;
       if (!(gap.dot(gap) < nearest)) continue;
       nearest = gap.dot(gap);
       found.distances[0] = gap.dot(normal);
@@ -87,7 +86,7 @@ struct BoxPairContacts : BoxContacts {
   static INLINE void touch_face(Vec center, const Mat& turn, Vec size, Vec other, int axis, float margin,
                                 Touching& found) {
     const float side = center.component(axis) < 0.0f ? -1.0f : 1.0f;
-    const Vec towards = turn.transposed_times(unit(axis)), steep = magnitude(towards);
+    const Vec towards = turn.transposed_times(Vec::unit(axis)), steep = magnitude(towards);
     const int against = steep.y > steep.x ? (steep.z > steep.y ? 2 : 1) : steep.z > steep.x ? 2 : 0;
     const int u = next(against), v = next(u), x = next(axis), y = next(x);
     const Vec out = turn.column(against) *
@@ -103,7 +102,7 @@ struct BoxPairContacts : BoxContacts {
     ROLLED_FOR(int edge = 0; edge < 4 && count > 0; ++edge)
       count = cut(corners, count, edge > 1, edge & 1 ? -1.0f : 1.0f, edge > 1 ? height : width);
     const float same = 1e-10f * (width * width + height * height);
-    found.normal = unit(axis) * side;
+    found.normal = Vec::unit(axis) * side;
     ROLLED_FOR(int k = 0; k < count; ++k) {
       const Vec c = corners[k];
       bool is_new = c.z <= margin;
@@ -114,7 +113,7 @@ struct BoxPairContacts : BoxContacts {
       if (!is_new) continue;
       found.distances[found.count] = c.z;
       found.points[found.count++] =
-          unit(x) * c.x + unit(y) * c.y + unit(axis) * (side * (size.component(axis) + 0.5f * c.z));
+          Vec::unit(x) * c.x + Vec::unit(y) * c.y + Vec::unit(axis) * (side * (size.component(axis) + 0.5f * c.z));
     }
   }
 
@@ -129,9 +128,9 @@ struct BoxPairContacts : BoxContacts {
     ROLLED_FOR(int i = 0; i < 15; ++i) {
       const int k = i % 3, l = (i - 6) / 3;
       const bool is_edge = i >= 6;
-      Vec n = i < 3 ? unit(k) : turn.column(k);
+      Vec n = i < 3 ? Vec::unit(k) : turn.column(k);
       if (is_edge) {
-        n = unit(l).cross(n);
+        n = Vec::unit(l).cross(n);
         const float squared = n.dot(n);
         if (squared < 1e-7f) continue;  // parallel
         n = n * divide(1.0f, root(squared));
@@ -149,7 +148,7 @@ struct BoxPairContacts : BoxContacts {
       }
     }
     if (edges >= 0) {  // a face that is nearly as good has more contacts
-      const Vec of_face = face < 3 ? unit(face) : turn.column(face - 3);
+      const Vec of_face = face < 3 ? Vec::unit(face) : turn.column(face - 3);
       if (fabsf(normal.dot(of_face)) > 0.99f && gap < face_gap + 0.05f * fabsf(face_gap) + MINVAL) edges = -1;
     }
     if (edges >= 0) {

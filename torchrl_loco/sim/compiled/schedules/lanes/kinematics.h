@@ -152,7 +152,7 @@ struct Kinematics : Group {
       const Vec com = w.com[Model::tree(link)];
       Motion axis = w.axes[d];  // direction and anchor in the parent's frame
       if (kind == TRANSLATION) {
-        axis = {{0.0f, 0.0f, 0.0f}, {k == 0 ? 1.0f : 0.0f, k == 1 ? 1.0f : 0.0f, k == 2 ? 1.0f : 0.0f}};
+        axis = {{0.0f, 0.0f, 0.0f}, Vec::unit(k)};
       } else if (kind == ROTATION) {
         const Pose pose = w.pose[link];
         const Vec anchor = Model::HAS_BALL ? pose.position + pose.orientation * Model::dof_anchor(d) : pose.position;

@@ -98,7 +98,7 @@ struct Outputs : Solver {
     UNROLLED_FOR(int own = 0; own < OWN_GEOMS; ++own) {
       const int g = lane + LANES * own;
       if (g >= Model::CONTACT_GEOMS) break;
-      UNROLLED_FOR(int k = 0; k < 3; ++k) forces[3 * g + k] = total[own].component(k);
+      total[own].write(forces + 3 * g);
       touches[g] = touched[own];
     }
   }
@@ -110,12 +110,9 @@ struct Outputs : Solver {
     SHARED_LOOP(b, Model::BODIES) {
       const int link = Model::body_link(b);
       const Pose pose = pose_of(link);
-      const Vec position = pose.position + pose.orientation * Model::body_position(b);
+      (pose.position + pose.orientation * Model::body_position(b)).write(xpos + 3 * b);
       const Mat orientation = Model::body_orientation(b);
       const Motion velocity = velocity_of(link);
-      xpos[3 * b] = position.x;
-      xpos[3 * b + 1] = position.y;
-      xpos[3 * b + 2] = position.z;
       UNROLLED_FOR(int i = 0; i < 3; ++i) {
         const Vec column = pose.orientation * orientation.column(i);
         xmat[9 * b + i] = column.x;
@@ -131,8 +128,7 @@ struct Outputs : Solver {
 #if WITH_SUBTREE_COM
   // Centres of mass of the trees, in the rows of their roots.
   INLINE void write_centers(float* subtree_com) const {
-    SHARED_LOOP(t, Model::TREES)
-      UNROLLED_FOR(int k = 0; k < 3; ++k) subtree_com[3 * Model::root_body(t) + k] = w.com[t].component(k);
+    SHARED_LOOP(t, Model::TREES) w.com[t].write(subtree_com + 3 * Model::root_body(t));
   }
 
 #endif

@@ -13,11 +13,7 @@ struct SiteSensors : Outputs {
     return Model::frame_orientation(site).transposed_times(in_link);
   }
   INLINE void write(int site, Vec v, float* sensordata) const {
-    const Vec seen = in_frame(site, v);
-    float* const out = sensordata + Model::frame_address(site);
-    out[0] = seen.x;
-    out[1] = seen.y;
-    out[2] = seen.z;
+    in_frame(site, v).write(sensordata + Model::frame_address(site));
   }
 
   INLINE void write_velocities(float* sensordata) const {

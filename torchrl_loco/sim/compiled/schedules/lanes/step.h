@@ -19,11 +19,7 @@ struct Step : SiteSensors {
     SHARED_LOOP(i, Model::QUATERNIONS) {
       const int q = Model::quaternion_qpos(i), d = Model::quaternion_dof(i);
       const Vec rate = {w.qvel[d], w.qvel[d + 1], w.qvel[d + 2]};
-      const Quat next = Quat{w.qpos[q], w.qpos[q + 1], w.qpos[q + 2], w.qpos[q + 3]}.turned(rate, h);
-      w.qpos[q] = next.w;
-      w.qpos[q + 1] = next.x;
-      w.qpos[q + 2] = next.y;
-      w.qpos[q + 3] = next.z;
+      Quat{w.qpos[q], w.qpos[q + 1], w.qpos[q + 2], w.qpos[q + 3]}.turned(rate, h).write(w.qpos + q);
     }
     sync();
   }
@@ -152,14 +148,3 @@ if (live) {
   }
   step.sync();  // the first lane may read it
 }
-#undef INLINE
-#undef NOINLINE
-#undef ROLLED_FOR
-#undef UNROLLED_FOR
-#undef OWN_DOFS
-#undef OWN_LINKS
-#undef OWN_PLACES
-#undef CLOSED_CONTACTS
-#undef SHARED_LOOP
-#undef OWN_ROWS
-#undef LOCKSTEP

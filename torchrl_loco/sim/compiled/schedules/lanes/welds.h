@@ -32,7 +32,7 @@ struct Welds : Kinematics {
     if (Model::weld_axis(i) < 3) return {point, other, (point - other).component(axis)};
     const WeldFrames frames = weld_frames(weld);
     const Vec v = {frames.turn.x, frames.turn.y, frames.turn.z};
-    const Vec unit = {axis == 0 ? 1.0f : 0.0f, axis == 1 ? 1.0f : 0.0f, axis == 2 ? 1.0f : 0.0f};
+    const Vec unit = Vec::unit(axis);
     const float scale = Model::weld_scale(weld);
     const Vec turning = (unit * frames.turn.w + v.cross(unit)) * (0.5f * scale);
     return {point, frames.second.transposed_times(turning), scale * v.component(axis)};
