@@ -390,12 +390,7 @@ class WorldAccess(EnvBase):
 
 
 def set_stage(env: Any, info: Mapping[str, Any]) -> None:
-    """Lets episodes begin at the stage that a policy has reached, unless it is of another task, which a log line says.
-
-    Args:
-        env: the worlds.
-        info: the policy's information.
-    """
+    """Lets episodes begin at the stage that a policy has reached, unless it is of another task, which the log says."""
     try:
         env.set_stage(env.stage_of(info))
     except ValueError as error:

@@ -9,12 +9,7 @@ from torchrl_loco.sim.varied import field, why_not
 
 
 class Change:
-    """What a :class:`Vary` does to the numbers of a model.
-
-    Args:
-        vary: the Vary.
-        elements: the elements of the model.
-        label: what its random stream depends on.
+    """What a :class:`Vary` does to the numbers of a model. Its random stream depends on ``label``.
 
     Attributes:
         places: numbers that it changes, as fields and indices of their flattened arrays.

@@ -99,13 +99,7 @@ def of_catalog(catalog: Any) -> Ground:
 
 
 def below(catalog: Any, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-    """Returns the height of the ground below points (m), NaN where there is none.
-
-    Args:
-        catalog: that of the hooks.
-        x: of the points (m), ``(num_envs, ...)``.
-        y: likewise.
-    """
+    """Returns the height of the ground below points ``(num_envs, ...)`` (m), NaN where there is none."""
     ground = of_catalog(catalog)
     found = torch.full_like(x, ground.plane)
     for k, field in enumerate(ground.fields):

@@ -89,11 +89,7 @@ class Monitor(ABC):
         self.clear()
 
     def poll(self, steps: int = 1) -> None:
-        """Requests the numbers every :data:`INTERVAL` steps, and reports once they have arrived on the host.
-
-        Args:
-            steps: control steps since the last call.
-        """
+        """Requests the numbers every :data:`INTERVAL` of all ``steps``; reports once they have arrived on the host."""
         before, self._steps = self._steps, self._steps + steps
         if self._steps // INTERVAL > before // INTERVAL and not self._pending:
             self._request()

@@ -18,11 +18,7 @@ KINDS = {
 
 
 class Elements:
-    """The elements of a model by name.
-
-    Args:
-        mj_model: the model.
-    """
+    """The elements of a model by name."""
 
     def __init__(self, mj_model: mujoco.MjModel) -> None:
         self.mj_model = mj_model

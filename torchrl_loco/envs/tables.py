@@ -23,12 +23,7 @@ class Entry(NamedTuple):
 
 
 def entries(cls: type, attribute: str, taken: Collection[str]) -> dict[str, Entry]:
-    """Returns the entries that a class declares by name.
-
-    Args:
-        cls: the class.
-        attribute: ``"memory"`` or ``"shared"``.
-        taken: names that they cannot have.
+    """Returns the entries of ``memory`` or ``shared`` that a class declares by name; those ``taken`` they cannot have.
 
     Raises:
         TypeError: the attribute is no table of names and shapes or types.

@@ -362,9 +362,6 @@ class Task:
     def checked_options(cls, given: Mapping[str, Any]) -> dict[str, Any]:
         """Returns values of :attr:`options` that are given, as a run keeps them: as JSON can hold them.
 
-        Args:
-            given: values by name.
-
         Raises:
             ValueError: there is no such option.
         """
@@ -416,11 +413,7 @@ def declared(cls: type[Task]) -> tuple[dict[str, Entry], dict[str, Entry]]:
 
 
 def check_commands(cls: type[Task], memory: Mapping[str, Entry]) -> None:
-    """Checks the commands that a class declares.
-
-    Args:
-        cls: the class.
-        memory: the entries of its memory.
+    """Checks the commands that a class with this memory declares.
 
     Raises:
         ValueError: there is no such entry, it has another number of numbers, or a range is empty.

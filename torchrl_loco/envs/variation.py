@@ -27,12 +27,7 @@ MOST_BITS = 12
 
 
 class Variation(Varied):
-    """The numbers of a model that differ from world to world, and their draws.
-
-    Args:
-        varys: how, in this order.
-        mj_model: the model.
-        device: where the worlds live.
+    """The numbers of a model that differ from world to world, one Vary after another, and their draws.
 
     Raises:
         ValueError: a name is not in the model, nothing is left that varies, or a number could become impossible.

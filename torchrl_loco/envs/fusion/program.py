@@ -341,10 +341,6 @@ class Program:
     def run(self, graph: torch.fx.Graph, constants: Callable[[str], torch.Tensor]) -> Source:
         """Returns the C++ of a graph.
 
-        Args:
-            graph: the graph.
-            constants: returns a tensor of the graph by name.
-
         Raises:
             CannotFuse: it cannot be written so.
         """

@@ -43,10 +43,6 @@ Store = tuple[Node, Node]
 class Source:
     """C++ of stores.
 
-    Args:
-        stores: what is written where.
-        tensors: the tensors, by index.
-
     Attributes:
         text: the statements of one world, which find the tensors in ``args.p0``, ``args.p1``, ...
         used: indices of the tensors.

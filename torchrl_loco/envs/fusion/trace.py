@@ -126,11 +126,7 @@ class Tracer(TorchDispatchMode):
 
 
 def trace(work: Callable[[dict[str, torch.Tensor]], None], arrays: dict[str, torch.Tensor]) -> torch.fx.GraphModule:
-    """Returns what a function does to arrays, as a module that takes them one after another.
-
-    Args:
-        work: changes the arrays in place; it is called once.
-        arrays: tensors, by name.
+    """Returns what a function, called once, does to arrays in place: a module that takes them one after another.
 
     Raises:
         RuntimeError: what it does depends on a number of an array.

@@ -15,9 +15,6 @@ REMEDY = (
 class ReadOnly:
     """An object whose attributes can be read only, and so can the arrays and objects that they hold.
 
-    Args:
-        source: the object.
-
     Raises:
         AttributeError: an attribute is set.
     """

@@ -63,13 +63,9 @@ def geom_pose(m: mujoco.MjModel, poses: Poses, geom: int) -> tuple[np.ndarray, n
 def frame(normal: np.ndarray, axis: np.ndarray | None) -> np.ndarray:
     """Returns the first tangent of a contact with a plane, ``(3,)``; the second is normal x first.
 
-    C MuJoCo aligns the first with the axis of a capsule, unless that is normal to the plane. Tangents that are
-    exchanged or reversed give the same pyramid: where the axis of the capsule stays in one plane with the normal, one
-    constant direction serves for all cases.
-
-    Args:
-        normal: the plane's normal, constants.
-        axis: axis of the capsule; ``None`` for a sphere.
+    C MuJoCo aligns the first with the axis of a capsule, which a sphere has not, unless that is normal to the plane.
+    Tangents that are exchanged or reversed give the same pyramid: where the axis of the capsule stays in one plane with
+    the normal, one constant direction serves for all cases.
     """
     n = np.array([x.constant for x in normal])
     fallback = np.eye(3)[1] if -0.5 < n[1] < 0.5 else np.eye(3)[2]

@@ -19,10 +19,6 @@ Number = float | Scalar
 class VariedModel:
     """Stands in for an ``MjModel``: where numbers vary, its arrays hold scalars that read them for each world.
 
-    Args:
-        m: the model.
-        varied: which of its numbers vary.
-
     Attributes:
         nominal: the model.
         varied: which of its numbers vary.

@@ -347,11 +347,7 @@ class Block:
         self(f"const float {result} = {text};")
 
     def keep(self, x: Any) -> Any:
-        """Returns scalars as names of their present values, which inner blocks can use: cells may change, these not.
-
-        Args:
-            x: a scalar or an array of them; constants stay what they are.
-        """
+        """Returns scalars as names of their values now, which inner blocks can use: cells may change, these not."""
         if isinstance(x, np.ndarray):
             return np.array([self.keep(y) for y in x], dtype=object)
         x = scalar(x)

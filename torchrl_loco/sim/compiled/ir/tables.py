@@ -12,10 +12,7 @@ from torchrl_loco.sim.varied import Varied
 
 
 class Row:
-    """What the lanes read of a world's model: its numbers, then what follows from them.
-
-    Args:
-        numbers: how many numbers vary.
+    """What the lanes read of a world's model: its numbers that vary, then what follows from them.
 
     Attributes:
         derived: what follows, at the places from ``numbers`` on.
@@ -55,9 +52,6 @@ class Row:
 
 class Tables:
     """The members of struct ``Model``, and of ``Varied``, whose functions read the row of a world.
-
-    Args:
-        numbers: how many numbers of the model vary.
 
     Attributes:
         lines: the members of ``Model``.

@@ -162,13 +162,7 @@ def raised(x: Scalar, power: float | Scalar) -> Scalar:
 
 
 class Table:
-    """Numbers that differ between the rows of a loop, as constant C++ arrays; equal ones fold.
-
-    Args:
-        block: where the arrays are declared.
-        prefix: start of their names.
-        index: the C++ variable that names the row.
-    """
+    """Numbers that differ between the rows of a loop, of which C++ calls the present one ``index``; equal ones fold."""
 
     def __init__(self, block: Block, prefix: str, index: str) -> None:
         self.block, self.prefix, self.index = block, prefix, index
@@ -212,9 +206,6 @@ class JointLimits:
     """Limits of hinges and slides. Each has a place of its own, whose weight is zero while the joint is within them.
 
     Where a joint cannot be near both its limits, they share a place.
-
-    Args:
-        m: the model.
     """
 
     def __init__(self, m: mujoco.MjModel) -> None:
@@ -261,11 +252,7 @@ class JointLimits:
         return f"#pragma unroll\nfor (int i = 0; i < {self.count}; ++i) {{ {row} {body} }}"
 
     def advance(self, first: str) -> str:
-        """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides.
-
-        Args:
-            first: what is done with each row before.
-        """
+        """Returns C++ that does ``first``, moves residuals along the direction, and notes if a row changed sides."""
         moves = "changed |= row.weight > 0.0f && row.crosses(next); limit_x[i] = next;"
         return self.loop(f"{first}const float next = row.after(alpha); {moves}")
 
@@ -274,9 +261,6 @@ class DryFriction:
     """Friction loss of degrees of freedom: a force of constant size against the motion.
 
     A row at distance zero, so that its weight and damping are constant.
-
-    Args:
-        m: the model.
 
     Attributes:
         dofs: the degrees of freedom.
@@ -329,11 +313,7 @@ class DryFriction:
         )
 
     def advance(self, first: str) -> str:
-        """Returns C++ that moves the residuals along the search direction, and notes whether a row changed sides.
-
-        Args:
-            first: what is done with each row before.
-        """
+        """Returns C++ that does ``first``, moves residuals along the direction, and notes if a row changed sides."""
         moves = "changed |= row.crosses(next); friction_x[i] = next;"
         return self.loop(f"{first}const float next = row.after(alpha); {moves}")
 

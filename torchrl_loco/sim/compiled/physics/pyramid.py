@@ -35,12 +35,7 @@ class Pyramid:
         return 1.0 if condim > 1 else 1.0 / sum(count for *_, count in self.edges)
 
     def response(self, weight: Scalar, x: Sequence[Scalar]) -> tuple[list[Scalar], dict[tuple[int, int], Scalar]]:
-        """Returns gradient and Hessian of the cost with respect to the directions.
-
-        Args:
-            weight: of an edge.
-            x: residuals of the directions.
-        """
+        """Returns gradient and Hessian of the cost by the directions, from an edge's weight and their residuals."""
         gradient = [scalar(0) for _ in self.directions]
         hessian = {(0, 0): scalar(0)}
         for sign, direction, count in self.edges:
@@ -90,13 +85,7 @@ class Pyramid:
         return f"#pragma unroll 1\nfor (int k = {first}; k < {count}; ++k) {{\n{lines}}}"
 
     def advance(self, first: str, count: str, before: str) -> str:
-        """Returns C++ that moves the residuals along the search direction, and notes whether an edge changed sides.
-
-        Args:
-            first: the first contact.
-            count: one beyond the last.
-            before: what is done with each edge before.
-        """
+        """Returns C++ that moves the residuals along the direction, and notes if an edge changed sides."""
         edges = self.loop(first, count, f"{before}changed |= row.crosses(row.after(alpha));").removesuffix("}")
         moves = " ".join(f"contact[k].x{d} += alpha * contact[k].v{d};" for d in self.directions)
         return f"{edges}  {moves}\n}}"

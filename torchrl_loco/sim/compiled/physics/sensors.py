@@ -57,10 +57,6 @@ class TouchSensors:
     within the site every ray does.
 
     C++ variables: ``contact_zones``, the sensors that feel contact ``k``, one bit each, and ``touch``, the sums (N).
-
-    Args:
-        m: the model.
-        poses: where the bodies are.
     """
 
     def __init__(self, m: mujoco.MjModel, poses: Poses) -> None:
@@ -77,14 +73,7 @@ class TouchSensors:
         return sum(1 << s for s, site in enumerate(self.sites) if self.m.site_bodyid[site] == body)
 
     def mark(self, block: Block, sensor: int, point: np.ndarray, ray: np.ndarray) -> None:
-        """Notes whether a sensor feels contact ``k``.
-
-        Args:
-            block: where contact ``k`` is made.
-            sensor: index of the sensor.
-            point: the contact in the world's frame (m), ``(3,)``.
-            ray: the normal that points away from the sensor's body, ``(3,)``.
-        """
+        """Notes whether a sensor feels contact ``k``, at a point (m) along a ray from its body, in world axes."""
         m, site = self.m, self.sites[sensor]
         body = m.site_bodyid[site]
         axes = self.poses.xmat[body] @ constant_matrix(m.site_quat[site])
@@ -95,14 +84,7 @@ class TouchSensors:
         block(f"if (Interval::meets({SHAPES.index(m.site_type[site])}, {vectors})) contact_zones[k] |= {1 << sensor};")
 
     def add(self, block: Block, first: str, count: str, force: Scalar) -> None:
-        """Adds the normal forces of the contacts from ``first`` to ``count``.
-
-        Args:
-            block: a block after the solver.
-            first: C++ expression.
-            count: C++ expression.
-            force: normal force of contact ``k`` (N).
-        """
+        """Adds the normal ``force`` of each contact ``k`` from ``first`` to ``count``, after the solver."""
         with block.scope(f"for (int k = {first}; k < {count}; ++k)") as contact:
             contact("if (!contact_zones[k]) continue;")
             contact(f"const float force_normal = {contact.value(force)};")
@@ -139,14 +121,7 @@ class ContactForces:
             block(f"static const int force_{title}[{len(places)}] = {{{', '.join(map(str, places))}}};")
 
     def add(self, block: Block, bounds: tuple[str, str], force: np.ndarray, row: str | None = None) -> None:
-        """Adds contacts.
-
-        Args:
-            block: a block after the solver and :meth:`clear`.
-            bounds: C++ expressions of the first contact, and of the one behind the last.
-            force: force of contact ``k`` on its second geom, ``(3,)`` (N).
-            row: C++ expression of the row that they are written to, if there are several.
-        """
+        """Adds the ``force`` ``(3,)`` on its second geom of each contact ``k`` within bounds, after :meth:`clear`."""
         with block.scope(f"for (int k = {bounds[0]}; k < {bounds[1]}; ++k)") as contact:
             contact("const int first = force_first[contact_corner[k]], second = force_second[contact_corner[k]];")
             contact("if (first < 0 && second < 0) continue;")

@@ -45,14 +45,7 @@ class DenseContacts:
     """Contacts whose Jacobians are stored: between moving bodies, or with spheres and capsules of the world.
 
     A limit of a ball joint is one more, without friction. Pairs whose bounding spheres overlap are looked at one after
-    the other.
-
-    Args:
-        tree: the dynamics.
-        found: pairs of geoms that may touch.
-        ground: the contacts that come before these.
-        touch: the sensors that may feel them.
-        with_frames: whether their directions and pairs are stored too, which the solver does without.
+    the other. With ``with_frames`` directions and pairs are stored too, which the solver does without.
 
     Attributes:
         directions: of contact ``k``, if they are stored: the normal, and the two tangents times friction, ``(3,)``
@@ -196,13 +189,7 @@ class DenseContacts:
                 block.set(f"dense_J{i}[(k - ground) * {nv} + {d}]", jacobian[d])
 
     def _feel(self, block: Block, sensors: list[str], at: np.ndarray) -> None:
-        """Notes which touch sensors feel contact ``k``.
-
-        Args:
-            block: where the contact is made.
-            sensors: C++ expressions of the sensors of either body.
-            at: the contact in the world's frame (m), ``(3,)``.
-        """
+        """Notes which touch sensors of either body feel contact ``k``."""
         for s in range(len(self.touch)):
             first, second = (f"{body} >> {s} & 1" for body in sensors)
             with block.scope(f"if (({first}) | ({second}))") as near:
@@ -285,12 +272,7 @@ class DenseContacts:
         block("++modes;")
 
     def solve(self, block: Block, solve: Callable[[list[Scalar]], list[Scalar]]) -> None:
-        """Sets ``solution`` to H^-1 gradient, adding the modes one after the other (Sherman and Morrison).
-
-        Args:
-            block: where it is computed.
-            solve: returns (M + K)^-1 x, with the contacts of the ground in K.
-        """
+        """Sets ``solution`` to H^-1 gradient, adding modes one after the other (Sherman and Morrison) to ``solve``."""
         nv = self.tree.m.nv
         with block.scope("for (int e = 0; e <= modes; ++e)") as mode:
             mode("const bool last = e == modes;")

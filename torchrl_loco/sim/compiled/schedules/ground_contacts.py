@@ -30,11 +30,7 @@ from torchrl_loco.sim.compiled.physics.sensors import TouchSensors
 class GroundContacts:
     """Contacts of spheres and capsules with planes of the world. All have a place.
 
-    Args:
-        tree: the dynamics.
-        found: pairs of geoms that may touch.
-        touch: the sensors that may feel them.
-        with_frames: whether their directions are stored where they differ, even if the solver does without.
+    With ``with_frames`` their directions are stored where they differ, even if the solver does without.
 
     Attributes:
         directions: of contact ``k``: the normal, and the two tangents times friction, ``(3,)`` each.

@@ -32,11 +32,6 @@ class NewtonSolver:
     C++ variables: ``qacc`` (result), ``force`` (smooth force), ``search`` (direction), and their products with M,
     ``M_qacc`` and ``M_search``.
 
-    Args:
-        tree: the dynamics.
-        found: pairs of geoms that may touch.
-        contact_geoms: geoms whose contact forces are asked for.
-
     Attributes:
         contacts: those with the ground and the dense ones, as far as there are any, and C++ of the first and the end.
         arrays: C++ arrays of floats, and how many each has.
@@ -73,12 +68,7 @@ class NewtonSolver:
             self.contact_forces = ContactForces(contact_geoms, corners + [pair.geoms for pair in self.dense.pairs])
 
     def write(self, block: Block, variables: Variables) -> None:
-        """Appends constraints and solver to a block, after which ``qacc`` is the acceleration.
-
-        Args:
-            block: the block, in which ``force`` is set and ``qacc`` holds the start.
-            variables: symbols of qpos, qvel and qacc.
-        """
+        """Appends constraints and solver to a block, in which ``force`` is set, and ``qacc`` holds the start."""
         m, option = self.m, self.m.opt
         for rows in (self.limits, self.friction, self.ground, self.dense):
             rows.create(block, variables)

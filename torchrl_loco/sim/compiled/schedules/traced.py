@@ -73,13 +73,7 @@ def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked) -> str:
 
 
 def _declare_links(world: Block, count: int, numbers: int) -> None:
-    """Declares ``link``, and the ``place`` of this thread in it. On a GPU a block is a warp.
-
-    Args:
-        world: where.
-        count: links.
-        numbers: what a link keeps.
-    """
+    """Declares ``link``, so many of so many numbers, and the ``place`` of this thread. On a GPU a block is a warp."""
     size = 16 * -(-numbers // 4)  # bytes of a link
     local = f"Link link[{count}][1]; const int place = 0;"
     if 32 * size * count <= MOST_SHARED:  # an odd multiple of 16 bytes mostly: accesses of 16 bytes meet in no bank

@@ -83,9 +83,6 @@ def is_implicitfast(m: mujoco.MjModel) -> bool:
 class Description:
     """What lanes have to know about a model.
 
-    Args:
-        m: the model.
-
     Attributes:
         pairs: of geoms that may touch, in the order in which lanes look at them: planes first, in both parts those with
             friction, and in all parts by their function.
