@@ -45,22 +45,16 @@ def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked = shared.NO_MOR
     d = Description(m)
     tables, count = members(d, substeps, asked), len(asked.contact_geoms)
     parts = {
-        "SUBTREE_COM": asked.with_subtree_com,
-        "MOMENTA": len(d.momenta) > 0,
         "CONTACT_GEOMS": count > 0,
         "KEPT_CONTACTS": count > 0 or len(d.wrenches) > 0,
         "ELLIPTIC": d.elliptic,
-        "TURNING": d.layout.directions > 3,
-        "SOME_LACK_EDGES": d.some_lack_edges,
         "LIMBS": d.limbs is not None,
         "MESHES": bool(d.meshes),
         "SOLIDS": d.has_solids or d.ground.boxes is not None,
         "GROUND": d.layout.near_ground > 0,
         "TENDONS": d.pulls_tendons,
         "ACTIVATIONS": d.layout.activations > 0,
-        "EQUALITIES": len(d.equalities) > 0,
         "WELDS": len(d.welds) > 0,
-        "MOTION_SENSORS": len(d.motions) > 0,
         "ACCELEROMETERS": len(d.accelerometers) > 0,
         "WRENCHES": len(d.wrenches) > 0,
         **{function.upper(): function in d.functions for function in FUNCTIONS},

@@ -2,7 +2,6 @@
 struct Collision : ManyBoxContacts {
   using ManyBoxContacts::ManyBoxContacts;
 
-#if WITH_EQUALITIES
   // Equalities are rows that lie before the contacts without friction. The slope is that of the second length's polynomial.
   INLINE void hold_equalities() {
     ROLLED_FOR(int base = 0; base < Model::EQUALITIES; base += LANES) {
@@ -24,7 +23,6 @@ struct Collision : ManyBoxContacts {
     }
   }
 
-#endif
 #if WITH_WELDS
   INLINE void hold_welds() {
     ROLLED_FOR(int base = 0; base < Model::WELD_ROWS; base += LANES) {
@@ -82,9 +80,7 @@ struct Collision : ManyBoxContacts {
     // Those with friction, then those without, by one text.
     ROLLED_FOR(int kind = 0; kind < 2; ++kind) {
       const bool friction = kind == 0;
-#if WITH_EQUALITIES
       if (!friction) hold_equalities();
-#endif
 #if WITH_WELDS
       if (!friction) hold_welds();
 #endif

@@ -105,7 +105,6 @@ class Description:
         self.functions = [f for f in FUNCTIONS if f in used_functions]
         self.condims = {p.condim for p in self.pairs} - {1}
         self.elliptic = bool(self.condims) and is_elliptic(m)
-        self.some_lack_edges = len(self.condims) > 1 and not self.elliptic
         on_ground = looked_up(m) | (m.geom_type == PLANE)
         self.geoms = sorted({g for p in self.pairs for g in p.geoms if not on_ground[g]})
         self.has_solids = any(m.geom_type[g] in SOLID for g in self.geoms)

@@ -75,9 +75,8 @@ def members(d: Description, substeps: int, asked: Asked) -> Tables:
     _add_geoms(tables, d, mask)
     _add_limits(tables, d)
     _add_outputs(tables, d)
-    if asked.with_subtree_com:
-        tables.integers("root_body", d.roots)
-    tables.size(CONTACT_GEOMS=len(asked.contact_geoms), HISTORY=asked.contact_rows)
+    tables.integers("root_body", d.roots)
+    tables.size(CONTACT_GEOMS=len(asked.contact_geoms), HISTORY=asked.contact_rows, SUBTREE_COM=asked.with_subtree_com)
     if asked.contact_geoms:
         _add_contact_geoms(tables, d, asked.contact_geoms)
     return tables
@@ -230,8 +229,6 @@ def _add_equalities(tables: Tables, d: Description) -> None:
     found = d.equalities
     first = len(d.pairs) + len(d.limited_balls) + len(found)
     tables.size(EQUALITIES=len(found), FIRST_WELD=first, TWO_SIDED=len(found) + d.layout.weld_rows)
-    if not found:
-        return
     tables.integers("first_share", np.cumsum([0, *(len(e.shares) for e in found)]))
     shares = [share for e in found for share in e.shares]
     tables.integers("share_dof", [dof for dof, _ in shares])
@@ -370,12 +367,11 @@ def _add_friction(tables: Tables, d: Description) -> None:
         tables.floats("mu", slopes)
     tables.floats("friction", [ratio if d.elliptic else p.friction for p in found])
     tables.floats("friction_ratio", [p.friction_ratio for p in found])
-    if d.layout.directions > 3:
-        tables.floats("torsional", [p.torsional / mu for p, mu in zip(found, slopes, strict=True)])
-        tables.floats("rolling", [p.rolling / mu for p, mu in zip(found, slopes, strict=True)])
-        tables.floats("rolling_ratio", [p.rolling_ratio for p in found])
-    if d.some_lack_edges:
-        tables.integers("edges", [2 * (p.condim - 1) for p in found])
+    tables.floats("torsional", [p.torsional / mu for p, mu in zip(found, slopes, strict=True)])
+    tables.floats("rolling", [p.rolling / mu for p, mu in zip(found, slopes, strict=True)])
+    tables.floats("rolling_ratio", [p.rolling_ratio for p in found])
+    rows = d.layout.contact_rows  # a pyramid may have fewer edges; where none does, this folds
+    tables.integers("edges", [rows if d.elliptic or p.condim == 1 else 2 * (p.condim - 1) for p in found])
 
 
 def _add_meshes(tables: Tables, d: Description) -> None:

@@ -125,13 +125,11 @@ struct Outputs : Solver {
     }
   }
 
-#if WITH_SUBTREE_COM
   // Centres of mass of the trees, in the rows of their roots.
   INLINE void write_centers(float* subtree_com) const {
     SHARED_LOOP(t, Model::TREES) w.com[t].write(subtree_com + 3 * Model::root_body(t));
   }
 
-#endif
   // Momentum of a subtree over its mass.
   INLINE void write_subtree_velocities(float* sensordata) const {
     ROLLED_FOR(int s = 0; s < Model::SUBTREES; ++s) {
@@ -150,7 +148,6 @@ struct Outputs : Solver {
     }
   }
 
-#if WITH_MOMENTA
   // Angular momentum of a subtree about its centre of mass: that about the centre of its tree, less what its linear
   // momentum at its own centre has about that.
   INLINE void write_angular_momenta(float* sensordata) const {
@@ -176,5 +173,4 @@ struct Outputs : Solver {
       SHARED_LOOP(k, 3) sensordata[Model::momentum_address(s) + k] = found.component(k);
     }
   }
-#endif
 };

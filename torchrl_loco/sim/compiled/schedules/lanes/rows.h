@@ -61,11 +61,9 @@ struct Rows : Collision {
         tangent = w.tangents[i] * (own ? read(own_friction, i) : Model::friction(pair));
         other = second_tangent(c.normal, tangent, pair);
       }
-#if WITH_TURNING
-      const Vec twist = c.normal * Model::torsional(pair);
+      const Vec twist = c.normal * Model::torsional(pair);  // unless no contact resists turning
       const Vec roll = w.tangents[friction ? i : 0] * Model::rolling(pair);
       const Vec other_roll = c.normal.cross(roll) * Model::rolling_ratio(pair);
-#endif
       float* const row = w.jacobian + STRIDE * (friction ? DIRECTIONS * i : (DIRECTIONS - 1) * frictional + i);
       OWN_DOFS(slot, d) {
         if (d >= STRIDE) continue;
@@ -86,8 +84,7 @@ struct Rows : Collision {
           continue;
         }
 #endif
-#if WITH_EQUALITIES
-        if (c.pair() >= Model::PAIRS + Model::BALL_LIMITS) {
+        if (Model::EQUALITIES && c.pair() >= Model::PAIRS + Model::BALL_LIMITS) {
           const int equality = c.pair() - (Model::PAIRS + Model::BALL_LIMITS), end = Model::first_share(equality + 1);
           float total = 0.0f;
           ROLLED_FOR(int k = Model::first_share(equality); k < end; ++k) {
@@ -97,7 +94,6 @@ struct Rows : Collision {
           row[d] = total;
           continue;
         }
-#endif
         if (Model::BALL_LIMITS && !touches) {
           const int k = d - Model::ball_dof(c.pair() - Model::PAIRS);
           row[d] = k >= 0 && k < 3 ? c.normal.component(k) : 0.0f;
@@ -107,13 +103,12 @@ struct Rows : Collision {
         if (friction) {
           row[STRIDE + d] = velocity.dot(tangent);
           row[2 * STRIDE + d] = velocity.dot(other);
-#if WITH_TURNING
+          if (DIRECTIONS == 3) continue;
           const Vec angular = axes[slot].angular * sign;
           row[3 * STRIDE + d] = angular.dot(twist);
           if (DIRECTIONS == 4) continue;
           row[4 * STRIDE + d] = angular.dot(roll);
           row[5 * STRIDE + d] = angular.dot(other_roll);
-#endif
         }
       }
     }
@@ -138,13 +133,11 @@ struct Rows : Collision {
         continue;
       }
 #endif
-#if WITH_SOME_LACK_EDGES
       if (r < first_frictionless() && r % CONTACT_ROWS >= Model::edges(c.pair())) {  // so far open that it stays so
         w.weight[r] = 0.0f;
         w.x[r] = 1e15f;
         continue;
       }
-#endif
       float distance = c.distance;
 #if WITH_WELDS
       if (c.pair() >= Model::FIRST_WELD) {  // the impedance is that of all of its rows together

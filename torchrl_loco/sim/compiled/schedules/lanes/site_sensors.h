@@ -2,7 +2,6 @@
 struct SiteSensors : Outputs {
   using Outputs::Outputs;
 
-#if WITH_MOTION_SENSORS || WITH_ACCELEROMETERS || WITH_WRENCHES
   // Where a site is from the centre of mass of its tree, and a vector in its frame.
   INLINE Vec offset_of(int site) const {
     const int link = Model::frame_link(site);
@@ -22,7 +21,6 @@ struct SiteSensors : Outputs {
       write(s, Model::frame_turning(s) ? velocity.angular : velocity.at(offset_of(s)), sensordata);
     }
   }
-#endif
 
 #if WITH_WRENCHES
   // This lane's share of the force in the joint above a subtree, about the centre of mass of its tree: what accelerates its

@@ -125,16 +125,10 @@ if (live) {
   step.write_bodies(reinterpret_cast<float*>(row_of(xpos_out.data, Model::BODIES)),
                     reinterpret_cast<float*>(row_of(xmat_out.data, Model::BODIES)),
                     cvel_out.data ? reinterpret_cast<float*>(row_of(cvel_out.data, Model::BODIES)) : nullptr);
-#if WITH_SUBTREE_COM
-  step.write_centers(reinterpret_cast<float*>(row_of(subtree_com_out.data, Model::BODIES)));
-#endif
+  if (Model::SUBTREE_COM) step.write_centers(reinterpret_cast<float*>(row_of(subtree_com_out.data, Model::BODIES)));
   step.write_subtree_velocities(sensors);
-#if WITH_MOTION_SENSORS
-  step.write_velocities(sensors);
-#endif
-#if WITH_MOMENTA
+  if (Model::MOTION_SENSORS > 0) step.write_velocities(sensors);
   step.write_angular_momenta(sensors);
-#endif
   if (Model::SUBSTEPS > 0) {
     SHARED_LOOP(i, Model::POSITIONS) row_of(qpos_out.data, Model::POSITIONS)[i] = w.qpos[i];
 #if WITH_ACTIVATIONS
