@@ -115,14 +115,12 @@ def below(ground: Tables, x: float, y: float):
 
 @wp.kernel(enable_backward=False)
 def scan(
-    # In:
     ground: Tables,
     body: int,
     points: wp.array[wp.vec2],
     mask: wp.array[bool],
     xpos: wp.array2d[wp.vec3],
     xmat: wp.array2d[wp.mat33],
-    # Out:
     heights_out: wp.array2d[float],
 ):
     world, point = wp.tid()

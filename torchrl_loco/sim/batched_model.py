@@ -12,12 +12,10 @@ from torchrl_loco.sim.varied import Varied
 
 @wp.kernel(enable_backward=False)
 def write_field(
-    # In:
     mask_in: wp.array[bool],
     numbers_in: wp.array2d[float],
     first: int,
     places_in: wp.array[int],
-    # Model out:
     field_out: wp.array2d[float],
 ):
     world, i = wp.tid()
@@ -30,9 +28,7 @@ def add_up_masses(
     # Model:
     body_parentid: wp.array[int],
     body_mass: wp.array2d[float],
-    # In:
     mask_in: wp.array[bool],
-    # Model out:
     body_subtreemass_out: wp.array2d[float],
 ):
     world = wp.tid()

@@ -16,15 +16,12 @@ LARGEST = wp.constant(2.0**24)
 
 @wp.kernel(enable_backward=False)
 def add_contacts(
-    # Data in:
     nacon_in: wp.array[int],
     contact_geom_in: wp.array[wp.vec2i],
     contact_efc_address_in: wp.array2d[int],
     contact_worldid_in: wp.array[int],
-    # In:
     index_in: wp.array[int],
     force_in: wp.array[wp.spatial_vector],
-    # Out:
     sum_out: wp.array3d[wp.int64],
     touches_out: wp.array2d[bool],
 ):
@@ -47,13 +44,11 @@ def add_contacts(
 
 @wp.kernel(enable_backward=False)
 def read_sums(
-    # In:
     mask_in: wp.array[bool],
     first_row: int,
     end_row: int,
     sum_in: wp.array3d[wp.int64],
     touches_in: wp.array2d[bool],
-    # Out:
     force_out: wp.array2d[wp.vec3],
     in_contact_out: wp.array2d[bool],
 ):

@@ -28,9 +28,7 @@ LANES = wp.constant(32)
 
 @wp.kernel(enable_backward=False)
 def clear_constraints(
-    # In:
     mask_in: wp.array[bool],
-    # Data out:
     efc_J_out: wp.array3d[float],  # noqa: N803
     efc_D_out: wp.array2d[float],  # noqa: N803
 ):
@@ -46,13 +44,7 @@ def clear_constraints(
 
 
 @wp.kernel(enable_backward=False)
-def rest(
-    # In:
-    mask_in: wp.array[bool],
-    # Data out:
-    cvel_out: wp.array2d[wp.spatial_vector],
-    sensordata_out: wp.array2d[float],
-):
+def rest(mask_in: wp.array[bool], cvel_out: wp.array2d[wp.spatial_vector], sensordata_out: wp.array2d[float]):
     """Zeroes what is not evaluated in a world at rest."""
     world = wp.tid()
     if not mask_in[world]:
@@ -64,23 +56,16 @@ def rest(
 
 
 @wp.kernel(enable_backward=False)
-def any_world(
-    # In:
-    mask_in: wp.array[bool],
-    # Out:
-    any_out: wp.array[int],
-):
+def any_world(mask_in: wp.array[bool], any_out: wp.array[int]):
     if mask_in[wp.tid()]:
         any_out[0] = 1
 
 
 @wp.kernel(enable_backward=False)
 def restore_others(
-    # In:
     mask_in: wp.array[bool],
     sensordata_in: wp.array2d[float],
     overflow_in: wp.array[int],
-    # Data out:
     sensordata_out: wp.array2d[float],
     overflow_out: wp.array[int],
 ):
@@ -95,11 +80,9 @@ def restore_others(
 
 @wp.kernel(enable_backward=False)
 def record_peaks(
-    # Data in:
     nefc_in: wp.array[int],
     nacon_in: wp.array[int],
     ncollision_in: wp.array[int],
-    # Out:
     constraints_out: wp.array[int],
     contacts_out: wp.array[int],
 ):

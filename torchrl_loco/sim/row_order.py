@@ -37,12 +37,10 @@ def comes_before(a: wp.vec4i, b: wp.vec4i, otherwise: bool) -> bool:
 
 @wp.kernel(enable_backward=False)
 def rank_rows(
-    # Data in:
     nefc_in: wp.array[int],
     efc_type_in: wp.array2d[int],
     efc_id_in: wp.array2d[int],
     contact_geom_in: wp.array[wp.vec2i],
-    # Out:
     rank_out: wp.array2d[int],
 ):
     """Counts the rows that come before each row: its rank."""
@@ -60,14 +58,7 @@ def rank_rows(
 
 
 @wp.kernel(enable_backward=False)
-def move_rows(
-    # Data in:
-    nefc_in: wp.array[int],
-    # In:
-    rank_in: wp.array2d[int],
-    # Out:
-    rows_out: wp.array3d[Any],
-):
+def move_rows(nefc_in: wp.array[int], rank_in: wp.array2d[int], rows_out: wp.array3d[Any]):
     """Permutes a column of the rows in place: each cycle of the permutation starts at its lowest row."""
     world, column = wp.tid()
     for start in range(wp.min(nefc_in[world], rank_in.shape[1])):
@@ -88,12 +79,9 @@ def move_rows(
 
 @wp.kernel(enable_backward=False)
 def follow_rows(
-    # Data in:
     nacon_in: wp.array[int],
     contact_worldid_in: wp.array[int],
-    # In:
     rank_in: wp.array2d[int],
-    # Data out:
     contact_efc_address_out: wp.array2d[int],
 ):
     """Updates the row addresses of the contacts."""
