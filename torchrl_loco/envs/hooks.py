@@ -203,13 +203,7 @@ class Hooks:
             controls = self._call("control", arrays, args=(arrays["action"],))
             self._check("control", controls, (n, m.nu))
         memory, pose = self.catalog.memory, self._pose
-
-        def remember(rows: Mapping[str, torch.Tensor]) -> None:
-            arrays.update(
-                {f"memory.{name}": row.to(memory[name].dtype) for name, row in rows.items() if name in memory}
-            )
-
-        remember(self._rows("update", arrays, memory) if "update" in self.own else {})
+        self._remember(arrays, self._rows("update", arrays, memory))
         if "reward" in self.own:
             terms = self._call("reward", arrays, steps=1)
             if isinstance(terms, Mapping) and not (terms and all(isinstance(name, str) for name in terms)):
@@ -227,21 +221,16 @@ class Hooks:
             for name, number in numbers.items():
                 self._check("metrics", number, (n,), name)
             self.metric_names = tuple(numbers)
-        if "events" in self.own:
-            rows = self._rows("events", arrays, {**memory, **pose})
-            self.moves = bool(pose.keys() & rows.keys())
-            remember(rows)
-        if "adapt" in self.own:
-            self._adapted(arrays)
-        if "begin" in self.own:
-            rows = self._rows("begin", arrays, {**memory, **pose})
-            for name, row in rows.items():
-                if not row.isfinite().all():
-                    raise ValueError(f"{self._title}.begin returns {name} with numbers that are not finite")
-            self.carried = tuple(name for name in rows if name in memory and self._is_carried(name, arrays, rows[name]))
-        if "observation" in self.own:
-            groups = self._groups(arrays)
-            self.groups = {name: tuple(values.shape[1:]) for name, values in groups.items()}
+        rows = self._rows("events", arrays, {**memory, **pose})
+        self.moves = bool(pose.keys() & rows.keys())
+        self._remember(arrays, {name: row for name, row in rows.items() if name in memory})
+        self._adapted(arrays)
+        rows = self._rows("begin", arrays, {**memory, **pose})
+        for name, row in rows.items():
+            if not row.isfinite().all():
+                raise ValueError(f"{self._title}.begin returns {name} with numbers that are not finite")
+        self.carried = tuple(name for name in rows if name in memory and self._is_carried(name, arrays, rows[name]))
+        self.groups = {name: tuple(values.shape[1:]) for name, values in self._groups(arrays).items()}
         self._declare_noise_and_history()
 
     def _declare_noise_and_history(self) -> None:
@@ -297,11 +286,13 @@ class Hooks:
         return False
 
     def _groups(self, arrays: Arrays, steps: int = 0) -> dict[str, torch.Tensor]:
-        """Returns the present observation by group, its terms joined in their order, with noise.
+        """Returns the present observation by group, if a hook makes it: its terms joined in their order, with noise.
 
         Raises:
             ValueError: a group has a name that it cannot have.
         """
+        if "observation" not in self.own:
+            return {}
         view = self.view(self.catalog, arrays, "observation", steps)
         groups = self._call("observation", arrays, steps=steps, view=view)
         if not isinstance(groups, Mapping):
@@ -360,13 +351,13 @@ class Hooks:
     def _rows(
         self, hook: str, arrays: Arrays, known: Mapping[str, Entry], *, by_world: bool = True
     ) -> dict[str, torch.Tensor]:
-        """Returns the new rows that a hook returns, by name, each of full shape.
+        """Returns the new rows that a hook returns, if it is the task's own, by name, each of full shape.
 
         Raises:
             TypeError: it returns no rows by name, or one of another type.
             ValueError: a name is unknown, or a row has the wrong shape.
         """
-        rows = self._call(hook, arrays, steps=0 if hook == "begin" else 1)
+        rows = self._call(hook, arrays, steps=0 if hook == "begin" else 1) if hook in self.own else None
         if rows is None:
             return {}
         if not isinstance(rows, Mapping):
@@ -406,8 +397,7 @@ class Hooks:
 
     def judge(self, a: Arrays) -> None:
         """After the physics: writes memory, reward, terms, both flags of the end; what events change, and ``moved``."""
-        if "update" in self.own:
-            self._remember(a, self._rows("update", a, self.catalog.memory))
+        self._remember(a, self._rows("update", a, self.catalog.memory))
         if "reward" in self.own:
             terms = self._call("reward", a, steps=1)
             if isinstance(terms, Mapping):
@@ -420,12 +410,10 @@ class Hooks:
                 a[flag].copy_(self._call(hook, a, steps=1))
         if "metrics" in self.own:
             a["metrics"].copy_(torch.stack([value.float() for value in self._metrics(a).values()], dim=-1))
-        if "events" in self.own:
-            rows = self._rows("events", a, {**self.catalog.memory, **self._pose})
-            changed = [(rows[name] != a[name]).any(-1) for name in ("qpos", "qvel") if name in rows]
-            if changed:
-                a["moved"].copy_(torch.stack(changed).any(0))
-            self._remember(a, rows)
+        rows = self._rows("events", a, {**self.catalog.memory, **self._pose})
+        if changed := [(rows[name] != a[name]).any(-1) for name in self._pose if name in rows]:
+            a["moved"].copy_(torch.stack(changed).any(0))
+        self._remember(a, rows)
         self._remember(a, self._commanded(a))
 
     def adapt(self, a: Arrays) -> None:
@@ -436,7 +424,7 @@ class Hooks:
 
     def observe(self, a: Arrays) -> None:
         """At the end of a step: writes the observation, and marks and zeroes worlds that are not finite."""
-        groups = self._groups(a, steps=1) if "observation" in self.own else {}
+        groups = self._groups(a, steps=1)
         for name, values in groups.items():
             if name in self.history:
                 past = a[f"memory.{HISTORY.format(name)}"]
