@@ -11,7 +11,7 @@ from torchrl.data import Bounded
 from torchrl_loco.checks import Interval, check_bool, check_choice, check_float, check_int, checked_size
 from torchrl_loco.eyes.placing import bytes_placed
 from torchrl_loco.eyes.tracer import Eye
-from torchrl_loco.sim import Simulation
+from torchrl_loco.sim import Buffer, Simulation
 from torchrl_loco.sim.simulation import check_memory
 
 SIZE = (84, 84)
@@ -90,10 +90,10 @@ class Pixels:
         seen = {"camera": name, "size": (self.width, self.height), "frame_stack": self.stack}
         return {**seen, **({"critic_from_pixels": True} if self.only else {})}
 
-    def seen(self, sim: Simulation) -> "Seen":
-        """Returns what draws them, and keeps them."""
+    def seen(self, sim: Simulation, mask: Buffer) -> "Seen":
+        """Returns what draws them, and keeps them; ``mask`` tells in which worlds episodes begin."""
         size = self.width, self.height, sim.num_envs, self.kinds
-        return Seen(Eye(sim.mj_model, sim.device, self.camera, *size, far=self.far), self.stack)
+        return Seen(sim, mask, Eye(sim.mj_model, sim.device, self.camera, *size, far=self.far), self.stack)
 
     def specs(self, batch: torch.Size, device: torch.device) -> dict[str, Bounded]:
         """Returns the specs of the entries by key."""
@@ -137,24 +137,31 @@ class Seen:
             the first one.
     """
 
-    def __init__(self, eye: Eye, count: int) -> None:
-        self.eye, self.count = eye, count
+    def __init__(self, sim: Simulation, mask: Buffer, eye: Eye, count: int) -> None:
+        self._sim, self._mask, self.eye, self.count = sim, mask, eye, count
         self.stack = eye.rgb if count == 1 else eye.rgb.repeat(1, 1, 1, count)
+
+    def draw(self) -> None:
+        """Launches what draws all worlds."""
+        self.eye.launch(self._sim.data.xpos, self._sim.data.xmat)
+
+    def draw_begun(self) -> None:
+        """Launches what draws the worlds in which episodes begin."""
+        self.eye.launch(self._sim.data.xpos, self._sim.data.xmat, self._mask.warp)
 
     def append(self) -> None:
         """Adds what was drawn of all worlds."""
         if self.count > 1:
             self.stack.copy_(torch.cat([self.stack[..., 3:], self.eye.rgb], dim=-1))
 
-    def begin(self, mask: torch.Tensor, kept: bool = False) -> None:
-        """Begins anew in the worlds of a mask ``(worlds,)``, with what was drawn of them.
+    def begin(self, kept: bool = False) -> None:
+        """Begins anew in the worlds in which episodes begin, with what was drawn of them.
 
         Args:
-            mask: the worlds.
             kept: whether earlier pictures stay where there are any: those of a state that was restored.
         """
         if self.count > 1:
-            masked, begun = mask.bool().view(-1, 1, 1, 1), self.eye.rgb.repeat(1, 1, 1, self.count)
+            masked, begun = self._mask.torch.view(-1, 1, 1, 1), self.eye.rgb.repeat(1, 1, 1, self.count)
             if kept:  # but the newest, as the state may have been changed
                 has = (self.stack != 0).flatten(1).any(dim=1).view(-1, 1, 1, 1)
                 begun = torch.where(has, torch.cat([self.stack[..., :-3], self.eye.rgb], dim=-1), begun)

@@ -116,7 +116,7 @@ class World:
             self._seed_of_hooks = torch.zeros(1, dtype=torch.long, device=task.device)
             self._stagger = Buffer(1, bool, device)
             self.mask.warp.fill_(True)
-            self.seen = task.pixels.seen(self.sim) if task.pixels else None
+            self.seen = task.pixels.seen(self.sim, self.mask) if task.pixels else None
 
             self.health = Health(self.sim, task.on_overflow)
             self._monitors: list[Monitor] = [self.health]
@@ -171,7 +171,7 @@ class World:
     def _look_begun(self, *, restored: bool = False) -> None:
         if self.seen:
             self._draw_begun()
-            self.seen.begin(self.mask.torch, kept=restored)
+            self.seen.begin(kept=restored)
 
     # What each world does besides the physics, in Warp.
 
@@ -250,14 +250,6 @@ class World:
     def _launch_move(self) -> None:
         self.sim.forward(self._moved.warp, after=self._fused, contacts=False)  # which belong to the step
 
-    def _launch_draw(self) -> None:
-        assert self.seen is not None
-        self.seen.eye.launch(self.sim.data.xpos, self.sim.data.xmat)
-
-    def _launch_draw_begun(self) -> None:
-        assert self.seen is not None
-        self.seen.eye.launch(self.sim.data.xpos, self.sim.data.xmat, self.mask.warp)
-
     def _launch_refresh(self) -> None:
         self.sim.forward(self.mask.warp, after=[*self._fused, *self._check_finite])
 
@@ -304,7 +296,7 @@ class World:
         launches += [self._launch_rest] if own or variation else []
         launches += [self._launch_conclude] if own else []
         launches += [self._scans.all, self._scans.begun] if self._scans.arrays else []
-        launches += [self._launch_draw, self._launch_draw_begun] if self.seen else []
+        launches += [self.seen.draw, self.seen.draw_begun] if self.seen else []
         sim.compile(*launches, *([self._launch_move] if hooks.moves else []))
         for each in kernels:
             each.record(sim)
@@ -319,7 +311,7 @@ class World:
         self._conclude = sim.capture(self._launch_conclude) if own else _nothing
         self._move = self._keeping_what_was(sim.capture(self._launch_move)) if hooks.moves else _nothing
         if self.seen:
-            self._draw, self._draw_begun = map(sim.capture, (self._launch_draw, self._launch_draw_begun))
+            self._draw, self._draw_begun = map(sim.capture, (self.seen.draw, self.seen.draw_begun))
         self._run_step = self._as_graph("_take_step", several=bool(own or self.seen))
         self._run_reset = self._as_graph("_begin_masked", several=bool(own or self.seen) or variation is not None)
 
