@@ -29,15 +29,8 @@ def check_rows(func: wp.Function, inputs: Any, world: int, size: int, terms: int
     """Checks that a body's function writes the rows of observation and terms: every number, and none beyond.
 
     A write beyond a row would change the data of another world, or crash. The function runs twice for one world, with
-    rows in memory of their own. What it writes into its inputs stays.
-
-    Args:
-        func: the body's function.
-        inputs: its inputs.
-        world: the world; one with a high index tells the row of a world from the memory of all.
-        size: length of an observation.
-        terms: number of the terms.
-        device: where the inputs are.
+    rows in memory of their own: one with a high index tells the row of a world from the memory of all. What it writes
+    into its inputs stays.
 
     Raises:
         TypeError: the function has other parameters than it must.

@@ -94,13 +94,8 @@ def observer(
 ) -> WorldFunc:
     """Returns what writes observation, reward and terms, from what a body names in its ``observation_func``.
 
-    Args:
-        func: the body's function.
-        inputs: its inputs.
-        outputs: where they are written.
-        non_finite: is set where an observation is not finite, ``(nworld,)``.
-        size: length of an observation.
-        coalesced: whether the threads of a warp take neighbouring worlds, and write observations together.
+    It sets ``non_finite`` where an observation is not finite. If ``coalesced``, the threads of a warp take neighbouring
+    worlds, and write observations, which have this size, together.
     """
     Inputs: Any = inputs._cls  # noqa: N806
 

@@ -69,11 +69,7 @@ class Hooks:
     """The hooks of an environment's task that are plain torch.
 
     If there are any, they are called once when this is made, in worlds at rest in the home pose, which tells what they
-    return and what of the physics they ask for.
-
-    Args:
-        env: the environment. No reference to it is kept that would keep it alive.
-        mj_model: its model.
+    return and what of the physics they ask for. No reference that would keep the environment alive is kept.
 
     Attributes:
         own: names of the hooks.

@@ -49,12 +49,7 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
 
 
 class Monitor(ABC):
-    """Adds functions to each control step, reads a few of their numbers every 100 steps, and reports.
-
-    Args:
-        count: how many numbers :meth:`numbers` returns.
-        device: where they are.
-    """
+    """Adds functions to each control step, reads ``count`` of their numbers every 100 steps, and reports."""
 
     def __init__(self, count: int, device: torch.device) -> None:
         self._device = device
@@ -133,10 +128,6 @@ class Health(Monitor):
     """Counts, for each world, the control steps in which something went wrong in the physics.
 
     What ends a control step counts (:func:`torchrl_loco.envs.episode.finish_step`).
-
-    Args:
-        sim: the simulation.
-        on_overflow: what to do when something was dropped, one of :data:`ON_OVERFLOW`.
 
     Attributes:
         counter_bits: the bits of ``overflow`` that each counter but the last counts.
@@ -261,10 +252,7 @@ def find_first(world: int, args: Guarded):
 class NanGuard(Monitor):
     """Writes the state and action before the first step that made a world non-finite to a file, a NaN dump.
 
-    Args:
-        path: the file; never overwritten.
-        world: the :class:`.world.World`, of which no reference is kept.
-        settings: further settings from which the environment can be made again.
+    The file is never overwritten; no reference to the :class:`.world.World` is kept.
     """
 
     def __init__(self, path: Path, world: Any, settings: dict[str, Any]) -> None:

@@ -109,9 +109,7 @@ class Part:
     def _compare(self, run: Callable[[], None], what: str) -> None:
         """Compares what stands for the hooks with the hooks themselves, on numbers that it was not made with.
 
-        Args:
-            run: changes the arrays as the hooks would.
-            what: is said of it where it differs, with the name of the array.
+        ``what`` is said of it where it differs, with the name of the array.
 
         Raises:
             ValueError: they differ, or hooks take none of the numbers.

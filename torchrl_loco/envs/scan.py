@@ -137,13 +137,7 @@ def scan(
 
 
 class Scans:
-    """The scans, depths and rays that hooks ask for.
-
-    Args:
-        sim: the physics.
-        asked: all by the name of their array.
-        ground: what is below; ``None`` where there are no scans.
-        mask: the worlds in which episodes begin.
+    """The scans, depths and rays that hooks ask for, by name; ``mask`` tells in which worlds episodes begin.
 
     Attributes:
         arrays: of scans, heights of the body above the ground at each point (m), NaN where there is none, ``(nworld,

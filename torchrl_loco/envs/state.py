@@ -89,12 +89,7 @@ def write_state(
 ) -> None:
     """Writes a state into the worlds of a mask. Missing entries become zero, but episode, model and shared stay.
 
-    What worlds share is written where all of them are.
-
-    Args:
-        state: the state; a plain TensorDict with the same keys works too.
-        targets: the tensors of all worlds by key of :class:`State`, written in place.
-        mask: worlds that are written, ``(num_envs,)``.
+    What worlds share is written where all of them are. Targets are the tensors of all worlds by key of :class:`State`.
 
     Raises:
         ValueError: qpos or qvel is missing, a shape is wrong, or a value is not finite. Then nothing is written.

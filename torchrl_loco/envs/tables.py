@@ -60,13 +60,7 @@ def entries(cls: type, attribute: str, taken: Collection[str]) -> dict[str, Entr
 
 
 def constants(title: str, declared: Any, taken: Collection[str], device: torch.device) -> dict[str, torch.Tensor]:
-    """Returns the tables of a task on its device: floats in float32, small integers in int64.
-
-    Args:
-        title: the task's name, for messages.
-        declared: tensors, arrays or numbers by name.
-        taken: names that they cannot have.
-        device: where they live.
+    """Returns the tables of a task on its device, but for names that are taken: floats are float32, integers int64.
 
     Raises:
         TypeError: it is no dict, or a table is no array of numbers.
@@ -145,10 +139,7 @@ Note = Callable[[torch.Tensor, bool], None]
 def lookup(table: torch.Tensor, index: Any, note: Note) -> torch.Tensor:
     """Returns ``table[index]``, in which indices may be of each world: the first dimension of those is the world.
 
-    Args:
-        table: what worlds share.
-        index: as torch takes it.
-        note: is told of indices that are out of range.
+    ``note`` is told of indices that are out of range.
 
     Returns:
         What torch returns, NaN (or of integers the first) where an index is out of range.

@@ -30,11 +30,7 @@ COPIES_IN_HOOKS = 2
 class Catalog(Elements):
     """What is the same at every step: the model's names, its numbers as tensors, and what hooks have asked for.
 
-    Args:
-        env: the environment, to which no reference is kept.
-        mj_model: its model.
-        memory: each entry of the memory, by name.
-        shared: each entry of what worlds share, by name.
+    It keeps no reference to the environment.
 
     Attributes:
         ctrl_dt: time of a control step (s).

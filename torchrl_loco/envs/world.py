@@ -46,12 +46,9 @@ if TYPE_CHECKING:
 class World:
     """The worlds of an environment on their device: simulation, buffers, monitors and graphs.
 
-    It is made when the environment opens and dropped when it closes. Buffers hold one row per world and always show the
-    current values.
-
-    Args:
-        task: the environment. No reference to it is kept.
-        mj_model: the model that is stepped: the task's, without the sensors that nothing reads.
+    It is made when the environment opens and dropped when it closes. It keeps no reference to the task, and steps the
+    task's model without the sensors that nothing reads. Buffers hold one row per world and always show the current
+    values.
 
     Attributes:
         sim: the physics.

@@ -275,10 +275,7 @@ class Block:
     """C++ statements, and which expressions already have a name in their scope.
 
     What depends on a cell is computed again in every inner block and after every assignment, since the cell may have
-    changed; everything else is computed once.
-
-    Args:
-        outer: the block around it, whose names are visible.
+    changed; everything else is computed once. The names of the block around it are visible.
     """
 
     def __init__(self, outer: "Block | None" = None) -> None:
