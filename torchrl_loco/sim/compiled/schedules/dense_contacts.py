@@ -1,6 +1,7 @@
 """Contacts whose Jacobians are stored, and limits of ball joints, traced for one model."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -111,19 +112,16 @@ class DenseContacts:
             reach = sum(m.geom_size[g, 0] + half[g] for g in (a, b)) + max(pair.margin, 0.0)
             block(f"if ({block.value(dot(offset, offset))} < {literal(reach**2)}) candidate[candidates++] = {i};")
         table = Table(block, "pair", "pair")
-        geoms = [
-            table.integers(title, [self.geoms.index(pair.geoms[i]) for pair in self.pairs])
-            for i, title in enumerate(("first", "second"))
-        ]
+
+        def both(title: str, number: Callable[[int], Any], column: Callable[..., Any] = table.integers) -> list[Any]:
+            """Returns columns of a number of the first geom of each pair, and of the second."""
+            of = enumerate(("first", "second"))
+            return [column(f"{which}{title}", [number(pair.geoms[i]) for pair in self.pairs]) for i, which in of]
+
         moved = moved_by(m)
-        masks = [
-            table.integers(title, [moved[m.geom_bodyid[pair.geoms[i]]] for pair in self.pairs])
-            for i, title in enumerate(("first_dofs", "second_dofs"))
-        ]
-        radii = [
-            table.column(title, [float(m.geom_size[pair.geoms[i], 0]) for pair in self.pairs])
-            for i, title in enumerate(("first_radius", "second_radius"))
-        ]
+        geoms = both("", self.geoms.index)
+        masks = both("_dofs", lambda g: moved[m.geom_bodyid[g]])
+        radii = both("_radius", lambda g: float(m.geom_size[g, 0]), table.column)
         margin = table.column("margin", [pair.margin for pair in self.pairs])
         shares = [contact_weight(m, pair) for pair in self.pairs]
         weight = table.column("weight", shares)
@@ -131,10 +129,7 @@ class DenseContacts:
         share = table.column("share", [self.pyramid.share(pair.condim) for pair in self.pairs])
         friction = table.column("friction", [pair.friction for pair in self.pairs])
         softness = Softness.from_table(table, [Softness.make(m, pair.solref, pair.solimp) for pair in self.pairs])
-        touching = [
-            table.integers(title, [self.touch.of_body(m.geom_bodyid[pair.geoms[i]]) for pair in self.pairs])
-            for i, title in enumerate(("first_sensors", "second_sensors") if len(self.touch) else ())
-        ]
+        touching = both("_sensors", lambda g: self.touch.of_body(m.geom_bodyid[g])) if len(self.touch) else []
         with block.loop("c", "candidates") as candidate:
             candidate(f"const int pair = candidate[c], first = {geoms[0]}, second = {geoms[1]};")
             candidate(f"const int first_dofs = {masks[0]}, second_dofs = {masks[1]};")
