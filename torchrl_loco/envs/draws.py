@@ -44,13 +44,8 @@ def stream(
 
 
 def places(first: int, count: int, device: torch.device) -> torch.Tensor:
-    """Returns ``count`` places of a stream from ``first`` on, int64 ``(count,)``, for :func:`draw`."""
+    """Returns ``count`` places of a stream from ``first`` on, int64 ``(count,)``: draws are hashes of the sums."""
     return torch.arange(first + 1, first + 1 + count, device=device) * GOLDEN
-
-
-def draw(start: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
-    """Returns the numbers of each stream ``(num_envs, 1)`` at some places ``(count,)``, int64 ``(num_envs, count)``."""
-    return mix(start + at)
 
 
 def to_unit(bits: torch.Tensor) -> torch.Tensor:

@@ -87,20 +87,9 @@ def _grid(boxes: np.ndarray) -> tuple[Grid | None, np.ndarray]:
     return grid, cells
 
 
-def of_catalog(catalog: Any) -> Ground:
-    """Returns the ground of the model of hooks, made when it is first asked for.
-
-    Raises:
-        ValueError: as :meth:`Ground.of`.
-    """
-    if catalog.ground is None:
-        catalog.ground = Ground.of(catalog.mj_model)
-    return catalog.ground
-
-
 def below(catalog: Any, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     """Returns the height of the ground below points ``(num_envs, ...)`` (m), NaN where there is none."""
-    ground = of_catalog(catalog)
+    ground = catalog.ground
     found = torch.full_like(x, ground.plane)
     for k, field in enumerate(ground.fields):
         rows, columns = field.heights.shape[0] - 1, field.heights.shape[1] - 1

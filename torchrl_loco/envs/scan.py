@@ -14,6 +14,7 @@ from torchrl_loco.sim import Buffer, fill_from_numbers
 from torchrl_loco.sim.compiled.collision.ground import NOTHING
 
 if TYPE_CHECKING:
+    from torchrl_loco.envs.view import Catalog
     from torchrl_loco.sim import Simulation
 
 UPRIGHT = 0.1
@@ -144,17 +145,12 @@ class Scans:
             points)``; of cameras, depths (m), ``(nworld, height, width)``; of rays, distances (m), ``(nworld, rays)``.
     """
 
-    def __init__(
-        self,
-        sim: "Simulation",
-        asked: dict[str, ScanRequest | DepthRequest | RayRequest],
-        ground: Ground | None,
-        mask: wp.array,
-    ) -> None:
+    def __init__(self, sim: "Simulation", catalog: "Catalog", mask: wp.array) -> None:
+        asked = catalog.scans
         self._eyes = {name: eye_of(sim, one) for name, one in asked.items() if not isinstance(one, ScanRequest)}
         self._asked = {name: one for name, one in asked.items() if isinstance(one, ScanRequest)}
         self._sim, self._mask = sim, mask
-        self._ground = tables(ground, sim.device) if asked and ground is not None else None
+        self._ground = tables(catalog.ground, sim.device) if self._asked else None
         kept = {name: np.array(one.points, dtype=np.float32) for name, one in self._asked.items()}
         self._points = {name: wp.array(points, dtype=wp.vec2, device=sim.device) for name, points in kept.items()}
         self._out = {name: Buffer((sim.num_envs, len(points)), float, sim.device) for name, points in kept.items()}

@@ -202,7 +202,7 @@ class Variation(Varied):
             zero = torch.zeros_like(a["episode"])
             episode = zero if change.vary.once else a["episode"]
             stream = draws.stream(a["seed"], a["world"], episode, zero, f"vary {change.label}")
-            units.append(draws.to_unit(draws.draw(stream, at)))
+            units.append(draws.to_unit(draws.mix(stream + at)))
         a["numbers"].copy_(torch.where(a["mask"].unsqueeze(1), self._numbers(units), a["numbers"]))
 
     # What they may become.

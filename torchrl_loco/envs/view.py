@@ -1,6 +1,7 @@
 """What hooks see of all worlds: the view ``s``, by MuJoCo's names and by the names in the model."""
 
 import difflib
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -72,11 +73,15 @@ class Catalog(Elements):
         self.complete = False
         self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}
         self.home = self._tensor(models.home_pose(mj_model))
-        self.ground: heights.Ground | None = None
         self._index: dict[tuple[int, ...], torch.Tensor] = {}
         self._constants: dict[Any, torch.Tensor] = {}
         self._tables: dict[Any, torch.Tensor] = {}
         self._places: dict[tuple[int, int], torch.Tensor] = {}
+
+    @functools.cached_property
+    def ground(self) -> heights.Ground:
+        """What a ray from above can meet."""
+        return heights.Ground.of(self.mj_model)
 
     def zeros(self) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
         """Returns the entries of memory ``(num_envs, *shape)``, and of what worlds share, all of them zero."""
@@ -448,7 +453,7 @@ class View:
                 self._make_room(math.prod(shape), eyes=not isinstance(asked, ScanRequest))
             self._catalog.scanning.setdefault(self._hook, set()).add(name)
             if isinstance(asked, ScanRequest):
-                heights.of_catalog(self._catalog)  # which may refuse
+                _ = self._catalog.ground  # which may refuse
             return self.qpos[:, :1].view(-1, *[1] * len(shape)).expand(-1, *shape).clone()
         if name not in self._catalog.scanning.get(self._hook, ()):
             raise ValueError(f"{self._hook}() did not ask for this scan when it was first called: it is not computed")
@@ -571,7 +576,7 @@ class View:
                 a["seed"], a["world"], a["episode"], a["elapsed_steps"] + self._steps, self._hook
             )
         first, self._drawn = self._drawn, self._drawn + count
-        return draws.draw(self._stream, self._catalog.places(first, count))
+        return draws.mix(self._stream + self._catalog.places(first, count))
 
 
 def _one(kind: str, name: Any) -> str:
