@@ -5,12 +5,6 @@ import os
 import sys
 from collections.abc import Iterator
 
-EXTRA = {
-    **dict.fromkeys(("matplotlib", "tensorboard", "imageio", "av"), "train"),
-    **dict.fromkeys(("viser", "mjviser"), "viewer"),
-}
-"""The extras by the modules that they bring."""
-
 
 def process_name() -> str:
     """Returns what the lines of this process begin with."""
@@ -25,7 +19,4 @@ def user_errors(*kinds: type[Exception]) -> Iterator[None]:
         yield
     except kinds as error:
         print(f"{process_name()}: {error}", file=sys.stderr)
-        if isinstance(error, ModuleNotFoundError) and error.name in EXTRA:
-            extra = EXTRA[error.name]
-            print(f"install it with: pip install 'torchrl-loco[{extra}]', or pip install '.[{extra}]'", file=sys.stderr)
         raise SystemExit(2) from None

@@ -9,7 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from torchrl_loco.checks import POSITIVE, check_float, check_int
+from torchrl_loco.checks import POSITIVE, check_float, check_int, check_packages
 from torchrl_loco.config import read_mjcf
 from torchrl_loco.terrain.kinds import DEEP, Kind, Patch
 
@@ -213,6 +213,7 @@ class Terrain:
         Raises:
             ImportError: matplotlib is missing.
         """
+        check_packages("a picture", ["matplotlib"], "train")
         from matplotlib.figure import Figure
 
         x, y = self.half

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase, step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import trange
 
-from torchrl_loco.checks import SEED, check_int
+from torchrl_loco.checks import SEED, check_int, check_packages
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.eyes.scene import to_the_horizon
@@ -242,7 +242,8 @@ def record(
 
 def write_video(path: Path, frames: Iterable[torch.Tensor], frame_rate: int) -> None:
     """Writes frames, uint8 ``(height, width, 3)``, as a video file, whole or not at all, as :func:`record` does."""
-    import imageio.v3 as imageio  # of the extra "train"
+    check_packages("a video", ("imageio", "av"), "train")
+    import imageio.v3 as imageio
 
     content = io.BytesIO()
     with imageio.imopen(content, "w", plugin="pyav", extension=path.suffix) as video:
