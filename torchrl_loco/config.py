@@ -182,14 +182,13 @@ def sim_config(
 
 
 def arguments_of(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the arguments of its environment that a policy's information names: simulation, options, pixels."""
-    sim = {name: value for name, value in info.get("sim", {}).items() if value is not None}
-    return sim | info.get("options", {}) | pixels_of(info)
+    """Returns the arguments of an environment that settings of a training name, or a policy's information.
 
-
-def pixels_of(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the arguments of an environment whose pixels the settings of a training ask for, none without."""
-    if not settings.get("from_pixels"):
-        return {}
-    chosen = {name: settings[name] for name in ("size", "frame_stack")}
-    return {"from_pixels": True, "pixels_only": False, "camera": settings["camera"] or None, **chosen}
+    They are those of the simulation, options of the task, and pixels.
+    """
+    arguments = {name: value for name, value in info.get("sim", {}).items() if value is not None}
+    arguments |= info.get("options", {})
+    if info.get("from_pixels"):
+        arguments |= {"from_pixels": True, "pixels_only": False, "camera": info["camera"] or None}
+        arguments |= {name: info[name] for name in ("size", "frame_stack")}
+    return arguments

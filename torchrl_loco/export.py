@@ -66,10 +66,10 @@ def export_policy(policy: Policy, path: Path) -> float:
     path = check_output_file("path", path, tuple(SUFFIXES.values()))
     if path.suffix == ".onnx":
         check_packages("exporting as ONNX", ("onnx", "onnxscript", "onnxruntime"), "onnx")
-    original = _Network(policy)
-    observations = random_observations(original.layers, max(BATCH_SIZES), 4.0)  # some are clipped
-    expected = original(observations)
     of_task, reference = of_robot(policy)
+    original = _Network(policy, reference)
+    observations = random_observations(original.layers, max(BATCH_SIZES), 4.0)  # some are clipped
+    expected = original.layers(observations)
     info = policy.info
     facts = {
         "task": info["task"],
@@ -86,11 +86,10 @@ def export_policy(policy: Policy, path: Path) -> float:
         "info": info,
         **of_task,
     }
-    network = _WithReference(original, reference) if reference else original
-    content, play = (_as_onnx if path.suffix == ".onnx" else _as_program)(network, observations[:2], facts)
+    content, play = (_as_onnx if path.suffix == ".onnx" else _as_program)(original, observations[:2], facts)
     error = max(difference(play(observations[:size]), expected[:size]) for size in BATCH_SIZES)
     if not error <= TOLERANCE:  # true for NaN too
-        rounding = difference(copy.deepcopy(original).double()(observations.double()), expected)
+        rounding = difference(copy.deepcopy(original.layers).double()(observations.double()), expected)
         if not error <= (allowed := max(TOLERANCE, 2.0 * rounding)):
             raise RuntimeError(
                 f"the exported policy differs by {error:.1e} from the original, whose own rounding in float32 is "
@@ -101,45 +100,40 @@ def export_policy(policy: Policy, path: Path) -> float:
 
 
 class _Network(nn.Module):
-    """The network of a policy, copied to the CPU; gives its argument the name that exported policies have for it."""
+    """The network of a policy on the CPU, and the reference that it follows, tables ``(frames, ...)`` by name, if any.
 
-    def __init__(self, policy: Policy) -> None:
+    Its arguments have the names that exported policies have for them.
+    """
+
+    def __init__(self, policy: Policy, reference: Mapping[str, torch.Tensor]) -> None:
         super().__init__()
-        self.layers = copy.deepcopy(policy.module).cpu().requires_grad_(False).eval()
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Returns the actions, shape ``(batch, m)``, for observations of shape ``(batch, n)``."""
-        return self.layers(observation)
-
-
-class _WithReference(nn.Module):
-    """A network, and beside it the reference that it follows, tables ``(frames, ...)`` by name."""
-
-    def __init__(self, network: _Network, reference: Mapping[str, torch.Tensor]) -> None:
-        super().__init__()
-        self.network, self.names = network, tuple(reference)
+        self.layers, self.names = copy.deepcopy(policy.module).cpu().requires_grad_(False).eval(), tuple(reference)
         for name, table in reference.items():
             self.register_buffer(name, table)
 
-    def forward(self, observation: torch.Tensor, time_step: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns the actions, and of each table the rows of ``time_step`` ``(batch,)``, int64, within the table."""
+    def forward(self, observation: torch.Tensor, time_step: torch.Tensor | None = None) -> Any:
+        """Returns the actions ``(batch, m)`` for observations ``(batch, n)``.
+
+        With ``time_step``, int64 ``(batch,)``, a tuple of them and of these rows of each table, within the table.
+        """
+        actions = self.layers(observation)
+        if time_step is None:
+            return actions
         frame = time_step.clamp(0, len(getattr(self, self.names[0])) - 1)
-        return self.network(observation), *(getattr(self, name)[frame] for name in self.names)
+        return actions, *(getattr(self, name)[frame] for name in self.names)
 
 
-def _inputs(network: nn.Module, observations: torch.Tensor) -> dict[str, torch.Tensor]:
+def _inputs(network: _Network, observations: torch.Tensor) -> dict[str, torch.Tensor]:
     """Returns the inputs of a network by name; of a reference the first frame."""
-    inputs = {"observation": observations}
-    if isinstance(network, _WithReference):
-        inputs["time_step"] = torch.zeros(len(observations), dtype=torch.int64)
-    return inputs
+    of_reference = {"time_step": torch.zeros(len(observations), dtype=torch.int64)} if network.names else {}
+    return {"observation": observations, **of_reference}
 
 
 Exported = tuple[bytes, Callable[[torch.Tensor], torch.Tensor]]
 """A file's content, and what it computes when it is loaded."""
 
 
-def _as_program(network: nn.Module, example: torch.Tensor, facts: dict[str, Any]) -> Exported:
+def _as_program(network: _Network, example: torch.Tensor, facts: dict[str, Any]) -> Exported:
     inputs = _inputs(network, example)
     shapes = {name: {0: torch.export.Dim("batch")} for name in inputs}
     program = torch.export.export(network, tuple(inputs.values()), dynamic_shapes=shapes)
@@ -150,12 +144,12 @@ def _as_program(network: nn.Module, example: torch.Tensor, facts: dict[str, Any]
 
     def play(observations: torch.Tensor) -> torch.Tensor:
         found = loaded(*_inputs(network, observations).values())
-        return found if isinstance(found, torch.Tensor) else found[0]
+        return found[0] if network.names else found
 
     return content, play
 
 
-def _as_onnx(network: nn.Module, example: torch.Tensor, facts: dict[str, Any]) -> Exported:
+def _as_onnx(network: _Network, example: torch.Tensor, facts: dict[str, Any]) -> Exported:
     import onnxruntime
 
     inputs, log = _inputs(network, example), logging.getLogger("torch.onnx")
@@ -168,7 +162,7 @@ def _as_onnx(network: nn.Module, example: torch.Tensor, facts: dict[str, Any]) -
                 network,
                 tuple(inputs.values()),
                 input_names=list(inputs),
-                output_names=["action", *(network.names if isinstance(network, _WithReference) else ())],
+                output_names=["action", *network.names],
                 dynamic_shapes={name: {0: "batch"} for name in inputs},
                 dynamo=True,
                 verbose=False,

@@ -171,6 +171,11 @@ def env_class(id: str) -> "type[LocoEnv]":
     return cls
 
 
+def label(task: str) -> str:
+    """Returns the name of a task for people and file systems: its id, or the name of its class."""
+    return re.sub(r"[^\w.-]+", "-", task.rpartition(":")[2])
+
+
 def summary(id: str) -> str:
     """Returns what a task asks for, in a sentence; errors are those of :func:`env_class`."""
     id = canonical_id(id)

@@ -43,6 +43,6 @@ def test_means_are_over_the_last_hundred_episodes_in_whole_batches():
         episodes.take(40, 40.0 * value, 40.0)
         assert episodes.count == min(40 * (value + 1), 120) >= min(WINDOW, 40 * (value + 1))
         episodes.take(0, 0.0, 0.0)
-    assert episodes.mean_return == (7 + 8 + 9) / 3
+    assert episodes.metrics(0.0, 10) == {"return": (7 + 8 + 9) / 3, "episode_length": 1.0, "episodes": 120}
     episodes.take(1000, 5000.0, 1000.0)
-    assert (episodes.count, episodes.mean_return) == (1000, 5.0)
+    assert (episodes.count, episodes.metrics(0.0, 10)["return"]) == (1000, 5.0)

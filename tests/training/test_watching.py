@@ -50,3 +50,11 @@ def test_a_run_with_objects_of_its_own_has_no_other_policy_than_its_file(ppo_run
     os.utime(run.policy, ns=(2**62, 2**62))
     with pytest.raises(ValueError, match="behind ObservationNorm"):
         watched.newer()
+
+
+def test_the_worlds_have_the_settings_of_the_run(ppo_run, tmp_path):
+    run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
+    run.store_config(run.load_config(sim={"iterations": 7}, from_pixels=True, size=(32, 24)))
+    env = Watched(run, 1, "cpu", 0).env
+    assert env.config.iterations == 7
+    assert env.reset()["pixels"].shape == (1, 24, 32, 9)

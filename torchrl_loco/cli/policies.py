@@ -4,7 +4,6 @@ import dataclasses
 import ipaddress
 import json
 import os
-import re
 import sys
 import tempfile
 from collections.abc import Callable
@@ -30,6 +29,7 @@ from torchrl_loco.cli.motions import Motions
 from torchrl_loco.cli.options import OtherTask
 from torchrl_loco.conditions import DEFAULT, Conditions
 from torchrl_loco.known_files import place_of
+from torchrl_loco.registry import label, task_name
 from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_host, check_viewer
 
 CONTAINERS = (".mp4", ".mkv", ".mov")
@@ -71,7 +71,7 @@ class Which(Motions):
             raise ValueError(f"{run_or_task} names the task already: leave --task out")
         if self.policy is not None:
             policy, _ = _policy_at(self.policy, device, _task(run_or_task))
-            return policy, Path(_label(policy))
+            return policy, Path(label(policy.info["task"]))
         if Path(run_or_task).exists():
             return _policy_at(Path(run_or_task), device, None if self.task is None else _task(self.task))
         task = _task(run_or_task)
@@ -115,17 +115,10 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
 
 def _task(name: str) -> str:
     """Returns the name of a task, which stood where a file or a folder could be named too."""
-    from torchrl_loco.registry import task_name
-
     try:
         return task_name(name, by_user=True)
     except ValueError as error:
         raise ValueError(f"there is no run folder or policy file {name!r}, and {error}") from None
-
-
-def _label(policy: "torchrl_loco.Policy") -> str:
-    """Returns the name of a policy's task for files."""
-    return re.sub(r"[^\w.-]+", "-", policy.info["task"].rpartition(":")[2])
 
 
 def evaluate(
@@ -363,7 +356,7 @@ def watch(
 
 def _video_file(policy: "torchrl_loco.Policy", beside: Path) -> Path:
     """Returns the default file of a video: that of a run folder; elsewhere it is named after the task."""
-    return beside.with_name("video.mp4" if is_run(beside.parent) else f"{_label(policy)}.mp4")
+    return beside.with_name("video.mp4" if is_run(beside.parent) else f"{label(policy.info['task'])}.mp4")
 
 
 def export(

@@ -17,8 +17,8 @@ from torchrl_loco.checks import (
     check_packages,
     checked_size,
 )
-from torchrl_loco.config import PROTOCOLS, SimConfig, pixels_of
-from torchrl_loco.registry import is_place, resolve, task_name
+from torchrl_loco.config import PROTOCOLS, SimConfig, arguments_of
+from torchrl_loco.registry import is_place, label, resolve, task_name
 from torchrl_loco.training.intervals import INTERVALS
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ class TrainingConfig:
     @property
     def label(self) -> str:
         """The name of the task for people and file systems, its id or the name of its class."""
-        return re.sub(r"[^\w.-]+", "-", self.task.rpartition(":")[2])
+        return label(self.task)
 
     def to_json(self) -> dict[str, Any]:
         """Returns the settings as values that JSON can hold, from which ``config_from_json`` makes them again."""
@@ -225,9 +225,7 @@ class TrainingConfig:
     @property
     def of_env(self) -> dict[str, Any]:
         """Arguments of the environments of the run, beside task, worlds, device, seed and protocol."""
-        sim = {name: value for name, value in dataclasses.asdict(self.sim).items() if value is not None}
-        pixels = pixels_of(dataclasses.asdict(self))
-        return {**sim, **self.options, **pixels, **({} if self.randomize else {"randomize": ()})}
+        return arguments_of(dataclasses.asdict(self)) | ({} if self.randomize else {"randomize": ()})
 
     @property
     def frames_per_batch(self) -> int:

@@ -189,9 +189,7 @@ def average(tensors: Sequence[torch.Tensor]) -> None:
     """
     if ranks() == 1 or not tensors:
         return
-    bucket = torch.cat([tensor.flatten() for tensor in tensors])
-    _sum(bucket)
-    bucket /= ranks()
+    bucket = _reduced(torch.cat([tensor.flatten() for tensor in tensors])) / ranks()
     for tensor, part in zip(tensors, bucket.split([tensor.numel() for tensor in tensors]), strict=True):
         tensor.copy_(part.view_as(tensor))
 
@@ -221,18 +219,13 @@ def merged_moments(
 
 def mean_of_ranks(values: torch.Tensor) -> torch.Tensor:
     """Returns the mean over the ranks of ``values``, of any shape ``(...)``."""
-    if ranks() == 1:
-        return values
-    values = values.clone()
-    _sum(values)
-    return values / ranks()
+    return values if ranks() == 1 else _reduced(values.clone()) / ranks()
 
 
 def add_changes(values: torch.Tensor, before: torch.Tensor) -> None:
     """Writes into ``values`` and ``before``, of any shape and type, what was before plus the changes of all ranks."""
     if ranks() > 1:
-        change = (values - before).double()
-        _sum(change)
+        change = _reduced((values - before).double())
         values.copy_(before + change.to(values.dtype))
     before.copy_(values)
 
@@ -241,9 +234,7 @@ def extremes_of_ranks(least: torch.Tensor, largest: torch.Tensor) -> tuple[torch
     """Returns the least and the largest number of all ranks from those of each, which are scalars."""
     if ranks() == 1:
         return least, largest
-    both = torch.stack([-least, largest])
-    with _peers():
-        dist.all_reduce(both, dist.ReduceOp.MAX)
+    both = _reduced(torch.stack([-least, largest]), largest=True)
     return -both[0], both[1]
 
 
@@ -251,8 +242,7 @@ def any_rank(*flags: bool) -> list[bool]:
     """Returns for each flag whether it is set on some rank."""
     if ranks() == 1:
         return list(flags)
-    counts = torch.tensor(flags, dtype=torch.float32, device=_device())
-    _sum(counts)
+    counts = _reduced(torch.tensor(flags, dtype=torch.float32, device=_device()))
     return [count > 0 for count in counts.tolist()]
 
 
@@ -295,9 +285,11 @@ def wait_for_all() -> None:
             dist.barrier()
 
 
-def _sum(tensor: torch.Tensor) -> None:
+def _reduced(tensor: torch.Tensor, *, largest: bool = False) -> torch.Tensor:
+    """Returns a tensor, which now holds the sum over the ranks, or the largest of them."""
     with _peers():
-        dist.all_reduce(tensor)
+        dist.all_reduce(tensor, dist.ReduceOp.MAX if largest else dist.ReduceOp.SUM)
+    return tensor
 
 
 def _device() -> torch.device:

@@ -17,7 +17,7 @@ from torchrl_loco.config import arguments_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.imagined import showing_states
-from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv
+from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv, named_transforms
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
 from torchrl_loco.training import distributed
@@ -109,8 +109,7 @@ class Environments:
     @property
     def names_of_transforms(self) -> list[str]:
         """Names of the transforms' classes."""
-        parts = [list(part) if isinstance(part, Compose) else [part] for part in self.transforms]
-        return [type(one).__name__ for some in parts for one in some]
+        return [] if self._given is None else [type(one).__name__ for one in named_transforms(self._given).values()]
 
     def training(self, nan_dump: Path) -> EnvBase:
         """Returns the environment in which the run trains: actions are held for ``action_repeat`` frames.

@@ -80,15 +80,16 @@ class Episodes:
         """Number of the episodes that the means are over."""
         return round(sum(row[0] for row in self._window))
 
-    @property
-    def mean_return(self) -> float:
-        """Their mean return; there must be some."""
-        return sum(row[1] for row in self._window) / self.count
+    def metrics(self, mean_reward: float, time_limit: int) -> dict[str, float]:
+        """Returns the mean return and length (control steps) of the last episodes, and their number.
 
-    @property
-    def mean_length(self) -> float:
-        """Their mean length (control steps), in training; there must be some."""
-        return sum(row[2] for row in self._window) / self.count
+        Until one has ended that was seen from its start, they are what follows from the mean reward of a control step
+        if no episode ends before the time limit of the training (control steps), and their number is 0.
+        """
+        if not (count := self.count):
+            return {"return": round(mean_reward * self._full_length, 3), "episode_length": time_limit, "episodes": 0}
+        mean_return, mean_length = (sum(row[k] for row in self._window) / count for k in (1, 2))
+        return {"return": round(mean_return, 3), "episode_length": round(mean_length, 1), "episodes": count}
 
     def restart(self) -> None:
         """Forgets all episodes, also those that are running: another policy plays from here on."""

@@ -32,24 +32,26 @@ def _as_json(config: TrainingConfig) -> bytes:
     return f"{json.dumps(config.to_json(), indent=2)}\n".encode()
 
 
-def _read_table(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Returns the columns of a CSV file and its lines, without those that a crash or a full disk has cut.
+def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
+    """Returns the columns of a CSV file and its rows, without those that a crash or a full disk has cut.
 
     Raises:
-        ValueError: a line has more columns than the head.
+        ValueError: a row has more columns than the head.
     """
-    *whole, _ = path.read_text().split("\n") if path.exists() else [""]
-    columns, *lines = list(csv.reader(whole)) or [[]]
-    if longer := [line for line in lines if len(line) > len(columns)]:
-        raise ValueError(f"{path} has a line of {len(longer[0])} columns, but its head names {len(columns)}")
-    return columns, [line for line in lines if len(line) == len(columns)]
+    rows = csv.DictReader(path.read_text().split("\n")[:-1] if path.exists() else [])
+    columns, found = list(rows.fieldnames or ()), [dict[Any, Any](row) for row in rows]
+    if longer := [row for row in found if None in row]:
+        count = len(columns) + len(longer[0][None])
+        raise ValueError(f"{path} has a line of {count} columns, but its head names {len(columns)}")
+    return columns, [row for row in found if None not in row.values()]
 
 
-def _write_table(path: Path, columns: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
-    """Writes a CSV file as a whole; columns that a line lacks at its end are empty in it."""
+def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
+    """Writes a CSV file as a whole; columns that a row lacks are empty in it."""
     text = io.StringIO()
-    padded = [[*line, *[""] * (len(columns) - len(line))] for line in lines]
-    csv.writer(text, lineterminator="\n").writerows([columns, *padded])
+    table = csv.DictWriter(text, columns, lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
     storage.replace_file(path, text.getvalue().encode())
 
 
@@ -241,29 +243,26 @@ class RunFolder:
         """Removes the lines of metrics and evaluations after ``frames`` frames: a resumed run writes them again."""
         for name in ("metrics.csv", "evaluations.csv"):
             path = self.path / name
-            columns, lines = _read_table(path)
+            columns, rows = _read_table(path)
             if columns:
-                at = columns.index("frames")
-                _write_table(path, columns, [line for line in lines if float(line[at]) <= frames])
+                _write_table(path, columns, [row for row in rows if float(row["frames"]) <= frames])
             else:
                 path.unlink(missing_ok=True)  # the disk was full when its first line was written
 
     def _append(self, name: str, row: dict[str, Any]) -> None:
         path = self.path / name
-        with contextlib.ExitStack() as opened:
-            head = opened.enter_context(path.open(newline="")) if path.exists() else ()
-            columns = next(csv.reader(head), [])
-        if new := [key for key in row if key not in columns]:
-            columns, lines = _read_table(path)
-            columns = [*columns, *new]
-            _write_table(path, columns, lines)
-        with path.open("a", newline="") as file:
-            csv.DictWriter(file, columns, lineterminator="\n").writerow(row)
+        with path.open("a+", newline="") as file:
+            file.seek(0)
+            columns = next(csv.reader(file), [])
+            if row.keys() <= set(columns):
+                csv.DictWriter(file, columns, lineterminator="\n").writerow(row)
+                return
+        columns, rows = _read_table(path)
+        _write_table(path, [*dict.fromkeys([*columns, *row])], [*rows, row])
 
     def _read(self, name: str) -> list[dict[str, float]]:
-        path = self.path / name
-        columns, lines = _read_table(path)
-        return [{key: float(value or "nan") for key, value in zip(columns, line, strict=True)} for line in lines]
+        _, rows = _read_table(self.path / name)
+        return [{key: float(value or "nan") for key, value in row.items()} for row in rows]
 
     def save_checkpoint(self, entries: dict[str, Any], keep: int = 1) -> None:
         """Writes ``entries`` as the checkpoint; a crash while writing leaves the previous one.

@@ -127,7 +127,6 @@ class Trainer:
         length, from_start = self.environments.full_length, not self._base.stagger
         self.algorithm.attach(self._base)
         self.episodes = Episodes(config.num_envs, config.device, config.action_repeat, length, from_start)
-        self._training_length = self._base.config.episode_length
         terms = self.env.observation_spec.get("reward_terms", None)
         self._terms = () if terms is None else tuple(terms.keys())
         self._metrics = self._base.metric_names
@@ -224,23 +223,19 @@ class Trainer:
 
     def _say_once(self, row: dict[str, float]) -> None:
         """Prints what a user should know after a batch with these metrics, each thing once in a run."""
-        ended = f"{self._non_finite} episodes have ended because a state, an observation or a reward was not finite"
-        if (
-            self._non_finite
-            and "non_finite" not in self._said
-            and (lost := self._base.health()["total", "index_error"])
-        ):
-            ended += f"; {int(lost)} steps indexed constants or shared beyond their end"
-        notes = {
-            "non_finite": ended if self._non_finite else "",
-            "alike": f"the reward was {self._alike:g} in every step of every world: look at reward(self, s)"
-            if self._alike is not None
-            else "",
-            "ends_at_once": "every episode ended at its first step: look at terminated(self, s) and begin(self, s)"
-            if self._ends_at_once
-            else "",
-            "algorithm": self.algorithm.note({key: [row[key]] for key in row}),
-        }
+        notes = {}
+        if self._non_finite and "non_finite" not in self._said:
+            lost = int(self._base.health()["total", "index_error"])
+            beyond = f"; {lost} steps indexed constants or shared beyond their end" if lost else ""
+            what = "episodes have ended because a state, an observation or a reward was not finite"
+            notes["non_finite"] = f"{self._non_finite} {what}{beyond}"
+        if self._alike is not None:
+            notes["alike"] = f"the reward was {self._alike:g} in every step of every world: look at reward(self, s)"
+        if self._ends_at_once:
+            notes["ends_at_once"] = (
+                "every episode ended at its first step: look at terminated(self, s) and begin(self, s)"
+            )
+        notes["algorithm"] = self.algorithm.note({key: [row[key]] for key in row})
         for kind, note in notes.items():
             if note and kind not in self._said:
                 self._said.add(kind)
@@ -306,24 +301,11 @@ class Trainer:
             "frames": self.frames,
             "seconds": round(self.seconds, 3),
             "frames_per_second": round(self.frames_per_iteration / seconds, 1),
-            **self._of_episodes(mean_reward),
+            **self.episodes.metrics(mean_reward, self._base.config.episode_length),
             **{f"reward/{name}": round(mean, 6) for name, mean in zip(self._terms, of_terms, strict=True)},
             **{f"metric/{name}": round(mean, 6) for name, mean in zip(self._metrics, of_metrics, strict=True)},
             **{name: round(value, 6) for name, value in zip(names, means, strict=True)},
         }
-
-    def _of_episodes(self, mean_reward: float) -> dict[str, float]:
-        """Returns the mean return and length (control steps) of the last episodes, and their number.
-
-        Until one has ended that was seen from its start, they are what follows from the mean reward of the batch if no
-        episode ends before its time limit, and their number is 0.
-        """
-        if not self.episodes.count:
-            estimate = round(mean_reward * self.environments.full_length, 3)
-            return {"return": estimate, "episode_length": self._training_length, "episodes": 0}
-        episodes = self.episodes
-        means = round(episodes.mean_return, 3), round(episodes.mean_length, 1)
-        return {"return": means[0], "episode_length": means[1], "episodes": episodes.count}
 
     def _evaluation_is_due(self) -> bool:
         interval = self.config.eval_interval

@@ -24,9 +24,8 @@ class Watched:
     """
 
     def __init__(self, run: RunFolder, num_envs: int, device: str, seed: int) -> None:
-        self._run, self._config = run, run.load_config(device=device)
-        config = self._config
-        settings = {"world_offset": 0, "reward_terms": True, "play": True}
+        self._run, self._device, config = run, device, run.load_config(device=device)
+        settings = {**config.of_env, "world_offset": 0, "reward_terms": True, "play": True}
         self.env = make(resolve(run.task), num_envs, device, seed, config.protocol, **settings)
         self._files = [run.policy] if run.given else [run.policy, run.checkpoint]
         self._seen = 0
@@ -43,10 +42,10 @@ class Watched:
             return None
         self._seen = when
         if newest == self._run.policy:
-            policy = self._run.load_policy(self._config.device)
+            policy = self._run.load_policy(self._device)
             refuse_transforms(policy)
         else:
-            policy = last_policy(self._run, self._config.device)
+            policy = last_policy(self._run, self._device)
         set_stage(self.env, policy.info)
         return policy
 
