@@ -320,37 +320,32 @@ def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str)
         env.world.memory["delay"].copy_(behind)
         behind = torch.zeros_like(behind)
     late = torch.zeros(most + 1, n, env.mj_model.nu, device=env.device)
-    alive = torch.ones(n, dtype=torch.bool, device=env.device)
-    counts = {name: torch.zeros(n, device=env.device, dtype=torch.float64) for name in ("return", "steps", "fell")}
-    sums: dict[str, list[torch.Tensor]] = {}
+    alive, taken, figures = torch.ones(n, dtype=torch.bool, device=env.device), [], []
     for t in trange(steps, desc=label, leave=False, disable=None):  # no bar in logs
         if t % hold == 0:
             action = exported.act(td[exported.reads])
         late = torch.cat([action.unsqueeze(0), late[:-1]])
         after = env.step(td.set("action", late.gather(0, behind.view(1, n, 1).expand(1, n, late.shape[2]))[0]))["next"]
-        counts["return"] += after["reward"].squeeze(-1) * alive
-        counts["steps"] += alive
-        for group in ("reward_terms", "metrics"):
-            for name, values in after.get(group, {}).items():
-                value = values.squeeze(-1).double()
-                counted = alive & value.isfinite()
-                total = sums.setdefault(name, [torch.zeros_like(value), torch.zeros_like(value)])
-                total[0] += torch.where(counted, value, 0.0)
-                total[1] += counted
-        ended = after["terminated"].squeeze(-1)
-        counts["fell"] += ended & alive
-        alive &= ~after["done"].squeeze(-1)
+        taken.append(torch.stack([alive, after["terminated"].squeeze(-1), after["reward"].squeeze(-1)]).double())
+        told = {**after.get("reward_terms", {}), **after.get("metrics", {})}
+        figures.append({name: values.squeeze(-1).double() for name, values in told.items()})
+        alive = alive & ~after["done"].squeeze(-1)
         td = after.exclude("reward")
         if not alive.any():
             break
         if t in pushes:
             env.sim.qvel[:, :6] += torch.from_numpy(pushes[t]).float().to(env.device)  # poses stay
-    kept = {name: values.cpu().numpy() for name, values in counts.items()}
+    counts, fell, rewards = torch.stack(taken, dim=1).cpu().numpy()
+    sums = {}
+    for name in figures[0]:
+        values = torch.stack([step[name] for step in figures]).cpu().numpy()
+        counted = (counts > 0) & np.isfinite(values)
+        sums[name] = np.where(counted, values, 0.0).sum(0), counted.sum(0)
     return Outcome(
-        fell=kept["fell"] > 0,
-        steps=kept["steps"],
-        returns=kept["return"],
-        sums={name: (total[0].cpu().numpy(), total[1].cpu().numpy()) for name, total in sums.items()},
+        fell=(fell * counts).any(0),
+        steps=counts.sum(0),
+        returns=np.where(counts > 0, rewards, 0.0).sum(0),
+        sums=sums,
         delay=delay,
         is_fixed=is_fixed,
         steps_of_episode=steps,

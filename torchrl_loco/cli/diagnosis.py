@@ -12,6 +12,7 @@ import tyro
 from torchrl_loco.checks import check_device
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.options import OtherTask, summaries
+from torchrl_loco.registry import list_envs, resolve
 
 
 def list_tasks() -> None:
@@ -67,8 +68,6 @@ def inspect(
     """
     if terrain is not None:
         with user_errors():
-            from torchrl_loco.registry import list_envs, resolve
-
             cls = resolve(what, by_user=True)
             if not hasattr(cls, "ground"):
                 rough = ", ".join(name for name in list_envs() if name.endswith("_rough"))

@@ -9,6 +9,7 @@ import tyro
 
 from torchrl_loco.checks import check_choice, check_output_file, check_packages
 from torchrl_loco.cli.errors import user_errors
+from torchrl_loco.registry import resolve
 
 if TYPE_CHECKING:
     import mujoco
@@ -32,8 +33,6 @@ class Motions:
         Raises:
             ValueError: the task follows no motions.
         """
-        from torchrl_loco.registry import resolve
-
         if not (self.motion or self.fps):
             return {}
         given = {"motion": list(self.motion), "fps": self.fps} if self.motion else {"fps": self.fps}
@@ -81,7 +80,6 @@ def motion(
             raise ValueError("name a CSV or npz file, a folder or a glob")
         from torchrl_loco import motion as motions
         from torchrl_loco.envs.task import folder_of
-        from torchrl_loco.registry import resolve
         from torchrl_loco.sim import models
 
         cls = resolve(task, by_user=True)

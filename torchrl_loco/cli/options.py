@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
 import tyro
 
+from torchrl_loco import tasks
 from torchrl_loco.checks import check_choice
 from torchrl_loco.cli.errors import user_errors
+from torchrl_loco.registry import list_envs, resolve, summary, task_name
 
 if TYPE_CHECKING:
     from torchrl_loco import training
@@ -50,8 +52,6 @@ def _integer(word: str) -> int:
 
 def summaries() -> dict[str, str]:
     """Returns what each environment asks for, by id."""
-    from torchrl_loco.registry import list_envs, summary
-
     found = {}
     for name in list_envs():
         try:
@@ -63,7 +63,6 @@ def summaries() -> dict[str, str]:
 
 def task_options(args: list[str]) -> Any:
     """Returns the type of a task's settings; removes from ``args`` the options that choose the preset."""
-    from torchrl_loco.registry import list_envs, resolve, task_name
     from torchrl_loco.training.config import CONFIGS, TrainingConfig, preset, tuning_note
 
     about = summaries()
@@ -125,9 +124,6 @@ def _options(config: "training.TrainingConfig") -> "training.TrainingConfig":
 
 def _of_task(task: str) -> Mapping[str, tuple[Any, str]]:
     """Returns the options of a task, which is imported only if it has any."""
-    from torchrl_loco import tasks
-    from torchrl_loco.registry import resolve
-
     found = tasks.found().get(task)
     return {} if found is not None and not found.has_options else resolve(task).options
 
@@ -167,7 +163,5 @@ def settings(options: Any) -> tuple["training.TrainingConfig", tuple[int, ...], 
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(kind)}
     asked = {name: (getattr(options, name), value) for name, (value, _) in _of_task(options.task).items()}
     if given := {name: value for name, (value, default) in asked.items() if value != default}:
-        from torchrl_loco.registry import resolve
-
         values["options"] = resolve(options.task).checked_options(given)
     return kind(**values), options.seeds, options.gpus

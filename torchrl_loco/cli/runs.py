@@ -12,6 +12,7 @@ from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.motions import THOSE_OF_TRAINING, MotionOptions
 from torchrl_loco.cli.options import OtherTask, settings
 from torchrl_loco.garbage import importing
+from torchrl_loco.registry import task_name
 
 if TYPE_CHECKING:
     from torchrl_loco import training
@@ -63,7 +64,6 @@ def resume(
     with user_errors():
         check_run(run)
         from torchrl_loco import training
-        from torchrl_loco.registry import task_name
 
         folder = training.RunFolder(run, None if task is None else task_name(task, by_user=True))
         training.Given().check(folder)

@@ -7,7 +7,6 @@ import inspect
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
@@ -28,7 +27,6 @@ from torchrl_loco.training.run_folder import RunFolder
 
 KEPT = ("play", "reward_terms", "observation_terms", "noise_scale", "compile_hooks", "on_overflow")
 """Arguments of an environment that was handed in which its evaluations keep, besides those of physics and pixels."""
-NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,17 +92,23 @@ class Environments:
     """
 
     def __init__(self, config: TrainingConfig, given: EnvBase | None = None) -> None:
-        self._config, self._given = config, given
-        self._base: LocoEnv | None = None
-        self._evaluating: dict[int, LocoEnv] = {}
+        self._config, self._given, self._evaluating = config, given, dict[int, LocoEnv]()
         self.transforms: tuple[Transform, ...] = ()
         if given is None:
-            task = resolve(config.task)
-            self.full_length = task.config.episode_length if task.episode_length is None else task.episode_length
+            self._task: type[LocoEnv] = resolve(config.task)
+            self._protocol: str = config.protocol
+            self._arguments = {**config.of_env, "reward_terms": not is_runner(config.task)}
+            length = self._task.episode_length
+            self.full_length = self._task.config.episode_length if length is None else length
         else:
-            self._base, self.transforms = unwrapped(given)
-            _refuse_further_arguments(type(self._base))
-            self.full_length = self._base.config.episode_length
+            base, self.transforms = unwrapped(given)
+            self._task, self._protocol = type(base), base.protocol
+            _refuse_further_arguments(self._task)
+            self._arguments = {**dataclasses.asdict(base.config), "randomize": base.randomize, **base.options_given}
+            self._arguments |= {name: getattr(base, name) for name in KEPT}
+            self._arguments |= base.pixels.arguments if base.pixels else {}
+            del self._arguments["naconmax"]  # which is for the number of its worlds
+            self.full_length = base.config.episode_length
 
     @property
     def names_of_transforms(self) -> list[str]:
@@ -136,7 +140,7 @@ class Environments:
             env, (FrameSkipTransform if is_runner(config.task) else ActionRepeat)(config.action_repeat)
         )
 
-    def evaluation(self, episodes: int, seed: int, info: Mapping[str, Any] = NOTHING) -> EnvBase:
+    def evaluation(self, episodes: int, seed: int, info: Mapping[str, Any] | None = None) -> EnvBase:
         """Returns worlds in which a policy of the run can be played, each for an episode of the task's own length.
 
         They are made once for a number of episodes; then their random streams begin anew. They have the settings and
@@ -144,12 +148,12 @@ class Environments:
         whatever ``episodes`` is: some transforms keep a row for each. Episodes begin at the stage of the curriculum
         that the information of a policy tells.
         """
-        worlds = self._base.num_envs if self._base is not None and self.transforms else episodes
+        worlds = self._config.num_envs if self.transforms else episodes
         if worlds not in self._evaluating:
             self._evaluating[worlds] = self._made(worlds, seed)
         own = self._evaluating[worlds]
         own.set_seed(seed)
-        own.set_stage(own.stage_of(info))
+        own.set_stage(own.stage_of(info or {}))
         env: EnvBase = own
         for transform in self.transforms:
             env = TransformedEnv(env, copy.deepcopy(transform.clone()))  # that it learns in evaluations stays apart
@@ -166,23 +170,14 @@ class Environments:
 
     def _made(self, worlds: int, seed: int, **settings: Any) -> LocoEnv:
         """Returns worlds as the run's, by themselves those of an evaluation."""
-        config, base = self._config, self._base
-        if base is None:
-            task = resolve(config.task)
-            if config.shows_states and settings.get("stagger"):  # evaluations do without
-                task = showing_states(task)
-            place = task, worlds, config.device, seed, config.protocol
-            terms = not is_runner(config.task)
-            return make(
-                *place, **{**config.of_env, "world_offset": 0, "metrics": True, "reward_terms": terms, **settings}
-            )
-        own = {**dataclasses.asdict(base.config), "randomize": base.randomize, **base.options_given}
-        own |= {name: getattr(base, name) for name in KEPT} | (base.pixels.arguments if base.pixels else {})
-        del own["naconmax"]  # which is for the number of its worlds
+        config, own = self._config, {**self._arguments, "world_offset": 0, "metrics": True, **settings}
+        place = worlds, config.device, seed, self._protocol
+        if self._given is None:
+            shows_states = config.shows_states and settings.get("stagger")  # evaluations do without
+            return make(showing_states(self._task) if shows_states else self._task, *place, **own)
         if settings.get("play"):
             del own["episode_length"], own["noise_scale"]
-        own |= {"world_offset": 0, "metrics": True, **settings}
-        return type(base)(worlds, base.device, seed, base.protocol, **own)
+        return self._task(*place, **own)
 
 
 def _refuse_further_arguments(cls: type[LocoEnv]) -> None:

@@ -8,7 +8,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.wrappers import common
-from torchrl_loco.wrappers.spaces import box, observation_space
+from torchrl_loco.wrappers.gymnasium import box, observation_space
 
 
 class StableBaselines3VecEnv(common.Wrapped, VecEnv):
