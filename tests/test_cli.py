@@ -77,7 +77,7 @@ def test_ctrl_c_while_a_command_starts(monkeypatch, capsys):
     def interrupted(task, *rest):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchrl_loco.training.config.preset", interrupted)  # importing torch takes the longest in it
+    monkeypatch.setattr("torchrl_loco.cli.options.preset", interrupted)  # importing torch takes the longest in it
     assert cli.main(["train", "walker_walk"]) == 130
     assert capsys.readouterr().err == "torchrl-loco: interrupted\n"
 

@@ -381,9 +381,10 @@ class Frames:
             pos, mat = poses(m, q)
             base = mat[:, m.jnt_bodyid[0]]
             pos, mat = pos[:, ids], mat[:, ids]
-            lin, ang = _rate(pos, dt), _turn_rate(mat, dt)
+            lin, ang = np.gradient(pos, dt, axis=0), _turn_rate(mat, dt)
             of_base = np.einsum("fji,fj->fi", base, _turn_rate(base[:, None], dt)[:, 0])
-            qvel = np.concatenate([_rate(q[:, :3], dt), of_base, _rate(q[:, 7:], dt)], axis=1)
+            rates = np.gradient(q, dt, axis=0)
+            qvel = np.concatenate([rates[:, :3], of_base, rates[:, 7:]], axis=1)
             parts.append((q, qvel, pos, mat, lin, ang))
         lengths = np.array([len(part[0]) for part in parts])
         last = lengths.cumsum() - 1
@@ -402,7 +403,8 @@ def save(path: Path, qpos: np.ndarray, fps: float, m: mujoco.MjModel) -> None:
     """Writes poses ``(frames, nq)`` as an npz as mjlab's, with the names of joints and bodies."""
     pos, mat = (table[:, 1:] for table in poses(m, qpos))
     joints, dt = qpos[:, 7:], 1.0 / fps
-    tables: Any = mjlabs_tables(joints, _rate(joints, dt), pos, mat, _rate(pos, dt), _turn_rate(mat, dt))
+    rates = np.gradient(joints, dt, axis=0)
+    tables: Any = mjlabs_tables(joints, rates, pos, mat, np.gradient(pos, dt, axis=0), _turn_rate(mat, dt))
     tables |= {"joint_names": _joints_of(m), "body_names": _bodies_of(m)}
     content = io.BytesIO()
     np.savez_compressed(content, fps=np.array([fps]), **tables)
@@ -488,11 +490,6 @@ def _rotation(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     for row, begin, end in zip(found, one, other, strict=True):
         mujoco.mju_subQuat(row, end, begin)
     return found
-
-
-def _rate(values: np.ndarray, dt: float) -> np.ndarray:
-    """Returns central differences over time, one-sided at the ends."""
-    return np.gradient(values, dt, axis=0)
 
 
 def _turn_rate(mat: np.ndarray, dt: float) -> np.ndarray:

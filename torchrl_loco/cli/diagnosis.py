@@ -9,6 +9,7 @@ from pathlib import Path
 
 import tyro
 
+from torchrl_loco import training
 from torchrl_loco.checks import check_device
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.options import OtherTask, summaries
@@ -98,8 +99,6 @@ def warm(
         if not tasks:
             raise ValueError(f"name the tasks that are to be trained: {', '.join(summaries())}")
         check_device(device)
-        from torchrl_loco import training
-
         configs = [training.preset(task, device, algorithm) for task in tasks]
     for task, config in zip(tasks, configs, strict=True):
         short = dataclasses.replace(config, total_frames=2 * config.control_steps_per_batch, trials=1)

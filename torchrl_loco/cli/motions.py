@@ -136,8 +136,6 @@ def _film(m: "mujoco.MjModel", q: "np.ndarray", out: Path, camera: str) -> None:
     from torchrl_loco.training.evaluation import SIZE, write_video
 
     print(f"rendering {len(q)} frames; on a CPU this takes a while", file=sys.stderr)
-    device = wp.get_device("cuda" if torch.cuda.is_available() else "cpu")
-    renderer = Poses(m, device, camera, *SIZE, 1)
-    poses = torch.tensor(q, dtype=torch.float32, device=wp.device_to_torch(device))
-    shown = tqdm(poses, desc="video", leave=False, disable=None)
+    renderer = Poses(m, wp.get_device("cuda" if torch.cuda.is_available() else "cpu"), camera, *SIZE, 1)
+    shown = tqdm(torch.from_numpy(q), desc="video", leave=False, disable=None)
     write_video(out, (renderer.render(row[None])[0] for row in shown), FRAME_RATE)

@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 from collections.abc import Mapping
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
+from typing import Annotated, Any, Union, get_args, get_origin
 
 import tyro
 
@@ -13,9 +13,7 @@ from torchrl_loco import tasks
 from torchrl_loco.checks import check_choice
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.registry import list_envs, resolve, summary, task_name
-
-if TYPE_CHECKING:
-    from torchrl_loco import training
+from torchrl_loco.training.config import CONFIGS, Sim, TrainingConfig, preset, tuning_note
 
 VALUES = tyro.constructors.ConstructorRegistry()
 """How values are parsed, where the parser's own rules are inconvenient."""
@@ -63,8 +61,6 @@ def summaries() -> dict[str, str]:
 
 def task_options(args: list[str]) -> Any:
     """Returns the type of a task's settings; removes from ``args`` the options that choose the preset."""
-    from torchrl_loco.training.config import CONFIGS, TrainingConfig, preset, tuning_note
-
     about = summaries()
     usage = "%(prog)s TASK [--device DEVICE] [--algorithm ALGORITHM] [--SETTING VALUE ...]; all settings: --help"
     preset_options = argparse.ArgumentParser("torchrl-loco train", usage, add_help=False, allow_abbrev=False)
@@ -111,7 +107,7 @@ SEEDS = Annotated[
 ]
 
 
-def _options(config: "training.TrainingConfig") -> "training.TrainingConfig":
+def _options(config: TrainingConfig) -> TrainingConfig:
     """Returns the settings as options: with their task fixed, as a preset belongs to one, several seeds and GPUs."""
     hidden = tyro.conf.Suppress, tyro.conf.Fixed
     kind = type(config)
@@ -140,8 +136,6 @@ def _check_names(args: list[str], config: Any) -> None:
     Raises:
         ValueError: there is no such setting; the message names the nearest or all, or the algorithm that has it.
     """
-    from torchrl_loco.training.config import CONFIGS, Sim
-
     settings_of = {algorithm: {field.name for field in dataclasses.fields(kind)} for algorithm, kind in CONFIGS.items()}
     mine = {field.name for field in dataclasses.fields(config)} - {"task", "options"} | set(_of_task(config.task))
     for arg in args:
@@ -157,7 +151,7 @@ def _check_names(args: list[str], config: Any) -> None:
         check_choice("setting", name, sorted(mine | {"device", "algorithm"}))
 
 
-def settings(options: Any) -> tuple["training.TrainingConfig", tuple[int, ...], int | None]:
+def settings(options: Any) -> tuple[TrainingConfig, tuple[int, ...], int | None]:
     """Returns the settings, the seeds and the number of GPUs of what :func:`_options` returned."""
     (kind,) = type(options).__bases__
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(kind)}

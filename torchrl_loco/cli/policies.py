@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import tyro
 
 import torchrl_loco
+from torchrl_loco import training
 from torchrl_loco.checks import (
     SEED,
     Interval,
@@ -92,17 +93,14 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
     named, too. The user may say the name of its task; else it is what the file says.
     """
     if source.suffix == ".pt" and is_run(source.parent):
-        from torchrl_loco.training import RunFolder
         from torchrl_loco.training.watching import last_policy
 
-        return last_policy(RunFolder(source.parent, task), device, source), source
+        return last_policy(training.RunFolder(source.parent, task), device, source), source
     if not source.is_dir():
         policy = torchrl_loco.Policy.load(source, device)
         policy.info["task"] = task or place_of(policy.info["task"], source.parent)
         return policy, source
-    from torchrl_loco.training import RunFolder
-
-    run = RunFolder(source, task)
+    run = training.RunFolder(source, task)
     if run.policy.is_file() or run.given or not run.has_checkpoint:
         return run.load_policy(device), run.policy
     from torchrl_loco.training.watching import last_policy  # which needs what a training needs
@@ -140,8 +138,6 @@ def evaluate(
     """
     with user_errors():
         played, _ = which.load(run_or_task, device)
-        from torchrl_loco import training
-
         summary = training.evaluate_policy(played, episodes, seed)
     print(training.describe(summary))
 
@@ -174,10 +170,11 @@ class Video:
         """Checks that a video can be written."""
         check_packages("a video", ("imageio", "av"), "train")
 
-    def make(self, policy: "torchrl_loco.Policy", default: Path) -> None:
-        """Records the policy into ``out``, or into ``default`` or a numbered sibling of it, and prints the path."""
-        from torchrl_loco import storage, training
+    def make(self, policy: "torchrl_loco.Policy", beside: Path) -> None:
+        """Records the policy into ``out``, or a new file ``beside`` that of the policy, and prints the path."""
+        from torchrl_loco import storage
 
+        default = beside.with_name("video.mp4" if is_run(beside.parent) else f"{label(policy.info['task'])}.mp4")
         out = check_output_file("out", storage.unused_path(default)) if self.out is None else self.out
         print(f"recording {self.seconds:g} s; on a CPU this takes a while", file=sys.stderr)  # logs have no bar
         training.record(policy, self.env(policy), out, self.seconds, policy.info["action_repeat"], self.camera)
@@ -246,7 +243,7 @@ def record(run_or_task: RunOrTask, /, which: WhichOptions = Which(), video: Vide
         video.check()
         video.check_encoder()
         played, beside = which.load(run_or_task, video.device)
-        video.make(played, _video_file(played, beside))
+        video.make(played, beside)
 
 
 def play(
@@ -275,15 +272,11 @@ def play(
             viewer = "video"
         if viewer == "browser":
             browser.check()
-        if viewer == "window":
-            from torchrl_loco.training import has_display
-
-            if not has_display():
-                raise ValueError("there is no display for a window: pass --viewer browser or --viewer video")
+        if viewer == "window" and not training.has_display():
+            raise ValueError("there is no display for a window: pass --viewer browser or --viewer video")
         if viewer == "video":
             video.check_encoder()
         played, beside = which.load(run_or_task, video.device)
-        from torchrl_loco import training
         from torchrl_loco.training.environments import make_for
 
         if viewer == "auto":
@@ -298,13 +291,11 @@ def play(
             shown = make_for(played, browser.num_envs, video.device, video.seed, reward_terms=True, play=True)
             browser.show(shown, played)
         else:
-            video.make(played, _video_file(played, beside))
+            video.make(played, beside)
 
 
 def _default_viewer(browser: Browser, video: Video) -> Literal["window", "browser", "video"]:
     """Returns where a policy is shown: in a window if there is a display, else in the browser, if that is installed."""
-    from torchrl_loco import training
-
     if training.has_display():
         return "window"
     try:
@@ -346,17 +337,11 @@ def watch(
         os.nice(19)  # the lowest priority that there is, also of threads that are made from here on
         if hasattr(os, "SCHED_IDLE"):  # of Linux: a fifth of the share of nice 19
             os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-        from torchrl_loco import training
         from torchrl_loco.training.watching import Watched
 
         folder = training.RunFolder(run, None if task is None else _task(task))
         watched = Watched(folder, browser.num_envs, device, seed)
         browser.show(watched.env, watched.newer(), watched.newer, cpu_share)
-
-
-def _video_file(policy: "torchrl_loco.Policy", beside: Path) -> Path:
-    """Returns the default file of a video: that of a run folder; elsewhere it is named after the task."""
-    return beside.with_name("video.mp4" if is_run(beside.parent) else f"{label(policy.info['task'])}.mp4")
 
 
 def export(

@@ -3,19 +3,17 @@
 import dataclasses
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import tyro
 
+from torchrl_loco import training
 from torchrl_loco.checks import SEED, check_int, check_run
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.motions import THOSE_OF_TRAINING, MotionOptions
 from torchrl_loco.cli.options import OtherTask, settings
 from torchrl_loco.garbage import importing
 from torchrl_loco.registry import task_name
-
-if TYPE_CHECKING:
-    from torchrl_loco import training
 
 
 def train(options: Any, args: list[str]) -> None:
@@ -32,9 +30,7 @@ def train(options: Any, args: list[str]) -> None:
         _check_seeds(seeds, gpus)
         missing = missing_processes(gpus, config.device)
     if missing:
-        from torchrl_loco.training import distributed
-
-        distributed.launch(missing, args)
+        training.distributed.launch(missing, args)
         return
     runs = [_trained(dataclasses.replace(config, seed=seed)) for seed in seeds or (config.seed,)]
     if seeds:
@@ -63,8 +59,6 @@ def resume(
     """
     with user_errors():
         check_run(run)
-        from torchrl_loco import training
-
         folder = training.RunFolder(run, None if task is None else task_name(task, by_user=True))
         training.Given().check(folder)
         asked: dict[str, Any] = {"total_frames": total_frames, "device": device}
@@ -91,8 +85,6 @@ def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("lear
     with user_errors():
         for run in runs:
             check_run(run)  # before what takes seconds to import
-        from torchrl_loco import training
-
         training.plot_runs([training.RunFolder(run) for run in runs], out)
     print(out)
 

@@ -7,7 +7,8 @@ import torch
 import warp as wp
 
 from torchrl_loco.eyes.tracer import Eye
-from torchrl_loco.sim import EXCLUSIVE, current_stream, mjw
+from torchrl_loco.motion import poses
+from torchrl_loco.sim import EXCLUSIVE, current_stream
 
 LOOKS_WELL: dict[str, Any] = {"shadows": True, "samples": 2}
 """Settings of an :class:`~torchrl_loco.eyes.tracer.Eye` for pictures that people look at."""
@@ -50,16 +51,12 @@ class Poses:
     def __init__(
         self, mj_model: mujoco.MjModel, device: wp.Device, camera: str | int, width: int, height: int, worlds: int
     ) -> None:
-        self._device, self._eye = device, Eye(mj_model, device, camera, width, height, worlds, **LOOKS_WELL)
-        with EXCLUSIVE, wp.ScopedDevice(device):
-            self._model = mjw.put_model(mj_model)
-            self._data = mjw.make_data(mj_model, nworld=worlds, naconmax=1, njmax=1)
-        wp.synchronize_device(device)  # made on Warp's stream, used on torch's
+        self._model, self._device = mj_model, device
+        self._eye = Eye(mj_model, device, camera, width, height, worlds, **LOOKS_WELL)
 
     def render(self, qpos: torch.Tensor) -> torch.Tensor:
         """Returns poses ``(worlds, nq)`` as pixels, uint8 ``(worlds, height, width, 3)``, until the next call."""
         with EXCLUSIVE, wp.ScopedDevice(self._device), wp.ScopedStream(current_stream(self._device)):
-            wp.copy(self._data.qpos, wp.from_torch(qpos.float().contiguous()))
-            mjw.kinematics(self._model, self._data)
-            self._eye.launch(self._data.xpos, self._data.xmat)
+            pos, mat = poses(self._model, qpos.numpy(force=True))
+            self._eye.launch(wp.array(pos, wp.vec3), wp.array(mat, wp.mat33))
         return self._eye.rgb

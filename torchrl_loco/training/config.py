@@ -289,12 +289,7 @@ class PPOConfig(TrainingConfig):
 
 @dataclasses.dataclass(frozen=True)
 class REPPOConfig(TrainingConfig):
-    """Settings of relative entropy pathwise policy optimization.
-
-    Raises:
-        TypeError: a field has the wrong type.
-        ValueError: a field is out of range, or does not fit another; the message names what is valid.
-    """
+    """Settings of relative entropy pathwise policy optimization."""
 
     algorithm: ClassVar[str] = "reppo"
     presets: ClassVar[dict[str, Settings]] = {
@@ -383,10 +378,6 @@ class SVGConfig(TrainingConfig):
 
     ``epochs`` are rounds after each batch, in which model, actor and critic make a gradient step each;
     ``minibatch_size`` is how many windows and imagined worlds one has.
-
-    Raises:
-        TypeError: a field has the wrong type.
-        ValueError: a field is out of range, or does not fit another; the message names what is valid.
     """
 
     algorithm: ClassVar[str] = "svg"

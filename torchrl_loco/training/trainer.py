@@ -78,15 +78,12 @@ class Trainer:
     ) -> None:
         self.run = run
         changes = {"total_frames": total_frames, "device": device, "options": options}
-        taken = distributed.is_first() and lock(run.path)
-        if taken:
-            run.remove_parts()
-        try:
+        with contextlib.ExitStack() as undone:
+            if distributed.is_first() and lock(run.path):
+                undone.callback(unlock, run.path)
+                run.remove_parts()
             self._make(given or Given(), resume, {name: new for name, new in changes.items() if new is not None})
-        except BaseException:
-            if taken:
-                unlock(run.path)
-            raise
+            undone.pop_all()
 
     def _make(self, given: Given, resume: bool, changes: dict[str, Any]) -> None:
         run = self.run
@@ -129,7 +126,6 @@ class Trainer:
         self.episodes = Episodes(config.num_envs, config.device, config.action_repeat, length, from_start)
         terms = self.env.observation_spec.get("reward_terms", None)
         self._terms = () if terms is None else tuple(terms.keys())
-        self._metrics = self._base.metric_names
         self._source = source_of(run.task)
         self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
@@ -201,8 +197,9 @@ class Trainer:
                 bar.update(self.frames_per_iteration)
                 if first:
                     self._say_once(row)
-                trial_is_over = self.trials.is_over(self.frames)
-                if trial_is_over or self.frames >= self.last_frame or self._evaluation_is_due():
+                trial_is_over, of_trial = self.trials.is_over(self.frames), self.trials.own_frames(self.frames)
+                is_due = config.eval_interval and of_trial % config.eval_interval < self.frames_per_iteration
+                if trial_is_over or self.frames >= self.last_frame or is_due:
                     mean = None
                     if loggers is not None:
                         mean = self.evaluate()["mean"]
@@ -274,12 +271,14 @@ class Trainer:
         flags = (after[name].squeeze(-1) for name in ("done", "terminated"))
         ended = self.episodes.add(after["reward"].squeeze(-1), *flags)
         spread, ends = after["reward"].max() - after["reward"].min(), after["done"].float().mean()
-        terms = [after["reward_terms", name].mean() / config.action_repeat for name in self._terms]
+        of_env = {f"reward/{name}": after["reward_terms", name].mean() / config.action_repeat for name in self._terms}
+        of_env |= {f"metric/{name}": after["metrics", name].nanmean() for name in self._base.metric_names}
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
         non_finite = self._base.health()["total", "non_finite"]
-        terms += [after["metrics", name].nanmean() for name in self._metrics]
-        numbers = torch.cat([torch.stack([non_finite, spread, ends, reward, *terms]), ended, metrics])
-        non_finite, spread, ends, mean_reward, *means = distributed.mean_of_ranks(numbers).tolist()
+        numbers = torch.cat([ended, torch.stack([non_finite, spread, ends, reward, *of_env.values()]), metrics])
+        means = distributed.mean_of_ranks(numbers).tolist()
+        self.episodes.take(*(mean * distributed.ranks() for mean in means[:3]))
+        non_finite, spread, ends, mean_reward, *means = means[3:]
         before, self._non_finite = self._non_finite, round(non_finite * distributed.ranks())
         if ends == 1.0 and self._non_finite - before >= config.frames_per_batch * distributed.ranks():
             raise ValueError(
@@ -288,28 +287,19 @@ class Trainer:
             )
         self._alike = mean_reward if spread == 0.0 else None
         self._ends_at_once = ends == 1.0
-        of_terms = [means.pop(0) for _ in self._terms]
-        of_metrics = [means.pop(0) for _ in self._metrics]
-        self.episodes.take(*(means.pop(0) * distributed.ranks() for _ in ended))
         self.frames += self.frames_per_iteration
         self.iteration += 1
         seconds = time.perf_counter() - start
         self.seconds += seconds
-        names = (*algorithm.metric_names, *algorithm.batch_metric_names)
+        names = *of_env, *algorithm.metric_names, *algorithm.batch_metric_names
         return {
             "iteration": self.iteration,
             "frames": self.frames,
             "seconds": round(self.seconds, 3),
             "frames_per_second": round(self.frames_per_iteration / seconds, 1),
             **self.episodes.metrics(mean_reward, self._base.config.episode_length),
-            **{f"reward/{name}": round(mean, 6) for name, mean in zip(self._terms, of_terms, strict=True)},
-            **{f"metric/{name}": round(mean, 6) for name, mean in zip(self._metrics, of_metrics, strict=True)},
             **{name: round(value, 6) for name, value in zip(names, means, strict=True)},
         }
-
-    def _evaluation_is_due(self) -> bool:
-        interval = self.config.eval_interval
-        return interval > 0 and self.trials.own_frames(self.frames) % interval < self.frames_per_iteration
 
     def evaluate(self) -> dict[str, float]:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""

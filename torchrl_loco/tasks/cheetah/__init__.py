@@ -88,13 +88,12 @@ class CheetahRun(LocoEnv):
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""
         data = world.sim.data
-        inputs = fill(
+        return observe_cheetah, fill(
             CheetahInputs,
             data,
             torso_velocity=int(self.mj_model.sensor("torso_velocity").adr[0]),
             target_speed=self.target_speed,
         )
-        return observe_cheetah, inputs
 
     def initial_states(self) -> np.ndarray:
         """Returns states into which random poses have settled, ``(512, nq + nv)``.

@@ -86,7 +86,7 @@ class Hopper(LocoEnv):
         model, data = self.mj_model, world.sim.data
         torso, foot = model.body("torso").id, model.body("foot").id
         sensors = {name: int(model.sensor(name).adr[0]) for name in ("torso_velocity", "touch_toe", "touch_heel")}
-        inputs = fill(
+        return observe_hopper, fill(
             HopperInputs,
             data,
             torso=torso,
@@ -96,7 +96,6 @@ class Hopper(LocoEnv):
             target_speed=self.target_speed,
             **sensors,
         )
-        return observe_hopper, inputs
 
     def pose_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that draws pitch and hinges, and its inputs."""

@@ -117,7 +117,7 @@ class Humanoid(LocoEnv):
         """Returns the function that writes observation and reward, and its inputs."""
         model, data = self.mj_model, world.sim.data
         extremities = [model.body(name).id for name in EXTREMITIES]
-        inputs = fill(
+        return observe_humanoid, fill(
             HumanoidInputs,
             data,
             torso=model.body("torso").id,
@@ -126,7 +126,6 @@ class Humanoid(LocoEnv):
             torso_velocity=int(model.sensor("torso_velocity").adr[0]),
             target_speed=self.target_speed,
         )
-        return observe_humanoid, inputs
 
     def pose_func(self, world: World) -> tuple[wp.Function, Any] | None:
         """Returns the function that draws a pose free of contact under ``dm_control``, else the default pose."""

@@ -117,7 +117,7 @@ class Quadruped(LocoEnv):
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""
         model, data = self.mj_model, world.sim.data
-        inputs = fill(
+        return observe_quadruped, fill(
             QuadrupedInputs,
             data,
             torso=model.body("torso").id,
@@ -126,7 +126,6 @@ class Quadruped(LocoEnv):
             force_torque=int(model.sensor("force_toe_front_left").adr[0]),
             target_speed=self.target_speed,
         )
-        return observe_quadruped, inputs
 
     def pose_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that draws the orientation and raises the torso, and its inputs."""

@@ -101,7 +101,7 @@ class Walker(LocoEnv):
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""
         model, data = self.mj_model, world.sim.data
-        inputs = fill(
+        return observe_walker, fill(
             WalkerInputs,
             data,
             torso=model.body("torso").id,
@@ -109,7 +109,6 @@ class Walker(LocoEnv):
             target_speed=self.target_speed,
             observe_height=self.protocol == "dm_control",
         )
-        return observe_walker, inputs
 
     def pose_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that draws pitch and hinges, and its inputs."""
