@@ -8,19 +8,20 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
+import torch
+from tqdm.auto import trange
 
 from torchrl_loco.checks import check_bool, check_packages
 from torchrl_loco.conditions import DEFAULT, PUSH, PUSH_EVERY, Conditions
 from torchrl_loco.config import arguments_of
-
-if TYPE_CHECKING:
-    import torch
-
-    from torchrl_loco.envs import LocoEnv
+from torchrl_loco.envs import LocoEnv
+from torchrl_loco.envs.access import set_stage
+from torchrl_loco.envs.vary import Vary
+from torchrl_loco.registry import resolve
 
 ENGINES = ("C MuJoCo", "training simulator")
 UNDISTURBED = Conditions(delay=(0, 0), noise=0.0, pushes=0.0)
@@ -74,10 +75,8 @@ class Exported:
             self.facts["task"] = task
         self.reads = "pixels" if self.facts.get("info", {}).get("from_pixels") else "observation"
 
-    def act(self, observation: "torch.Tensor") -> "torch.Tensor":
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
         """Returns the actions ``(n, nu)`` for observations ``(n, size)``, on their device."""
-        import torch
-
         inputs = {"observation": observation.cpu().numpy()}
         if len(self._session.get_inputs()) > 1:  # the frame of a reference that it gives too
             inputs["time_step"] = np.zeros(len(observation), dtype=np.int64)
@@ -118,8 +117,6 @@ def verify(
     check_packages("verifying", ("onnxruntime",), "onnx")
     conditions.check()
     check_bool("alone", alone)
-    from torchrl_loco.registry import resolve
-
     exported = Exported(path, task)
     cls = resolve(exported.facts["task"])
     if options is not None and (given := options(exported.facts["task"])):
@@ -154,8 +151,6 @@ def _by_case(
         nothing after it has ended too soon; whether it has; and the share of its steps until then. Nothing where a task
         has no cases.
     """
-    from torchrl_loco.envs import LocoEnv
-
     found: dict[str, dict[str, dict[str, Any]]] = {}
     if cls.cases is LocoEnv.cases or not cls.perfect:
         return found
@@ -193,14 +188,12 @@ def _case_lines(cases: dict[str, dict[str, dict[str, Any]]]) -> list[str]:
 
 def _worlds(
     cls: Any, exported: Exported, conditions: Conditions, engine: str, device: str | None, **more: Any
-) -> "LocoEnv":
+) -> LocoEnv:
     """Returns worlds of a policy's task, a world for each episode.
 
     Raises:
         ValueError: the policy does not fit the task.
     """
-    from torchrl_loco.envs.vary import Vary
-
     facts, settings = exported.facts, arguments_of(exported.facts.get("info", {}))
     if conditions.friction is not None:
         ground = cls.model.geom("terrain") if isinstance(cls.model, mujoco.MjSpec) else None
@@ -223,7 +216,7 @@ def _worlds(
     return env
 
 
-def _begins_alike(env: "LocoEnv", conditions: Conditions) -> bool:
+def _begins_alike(env: LocoEnv, conditions: Conditions) -> bool:
     """Returns whether all episodes are the same one."""
     env.reset()
     same = all(bool((view == view[:1]).all()) for view in (env.sim.qpos, env.sim.qvel))
@@ -292,17 +285,12 @@ class Outcome:
         }
 
 
-def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str) -> Outcome:
+def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -> Outcome:
     """Returns how the policy does in worlds of its task, a world for each episode, beside a progress bar with a label.
 
     Raises:
         ValueError: nothing floats that could be pushed.
     """
-    import torch
-    from tqdm.auto import trange
-
-    from torchrl_loco.envs.access import set_stage
-
     n, steps, dt = env.num_envs, env.config.episode_length, env.config.ctrl_dt
     if conditions.seconds is not None:
         steps = min(steps, max(round(conditions.seconds / dt), 1))
@@ -354,7 +342,7 @@ def play(exported: Exported, env: "LocoEnv", conditions: Conditions, label: str)
     )
 
 
-def _pushes(env: "LocoEnv", generator: np.random.Generator, steps: int, scale: float) -> dict[int, np.ndarray]:
+def _pushes(env: LocoEnv, generator: np.random.Generator, steps: int, scale: float) -> dict[int, np.ndarray]:
     """Returns changes of the bases' velocities ``(n, 6)`` (m/s, rad/s), by the control step after which they come.
 
     Raises:
@@ -373,14 +361,12 @@ def _pushes(env: "LocoEnv", generator: np.random.Generator, steps: int, scale: f
     return found
 
 
-def _fix_commands(env: "LocoEnv", info: dict[str, Any]) -> np.ndarray:
+def _fix_commands(env: LocoEnv, info: dict[str, Any]) -> np.ndarray:
     """Lets the first half of the worlds have one command throughout, if the task says which.
 
     Returns:
         In which worlds, ``(n,)``.
     """
-    import torch
-
     n, fixed = env.num_envs, type(env).fixed_commands(info)
     is_fixed = np.arange(n) < (n // 2 if fixed else 0)
     for entry, rows in fixed.items():

@@ -3,19 +3,15 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
+import numpy as np
 import tyro
 
+import torchrl_loco
 from torchrl_loco.checks import check_choice, check_output_file, check_packages
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.registry import resolve
-
-if TYPE_CHECKING:
-    import mujoco
-    import numpy as np
-
-    from torchrl_loco.motion import Motion
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,11 +74,10 @@ def motion(
                 check_packages("a video", ("imageio", "av"), "train")
         if not files:
             raise ValueError("name a CSV or npz file, a folder or a glob")
-        from torchrl_loco import motion as motions
         from torchrl_loco.envs.task import folder_of
         from torchrl_loco.sim import models
 
-        cls = resolve(task, by_user=True)
+        motions, cls = torchrl_loco.motion, resolve(task, by_user=True)
         m = models.load(cls.model, folder_of(cls))
         check_choice("camera", camera, [m.camera(i).name for i in range(m.ncam)])
         named = motions.named(list(files), fps or 0.0)
@@ -114,19 +109,15 @@ def motion(
             print(out)
 
 
-def _row(motion: "Motion", q: "np.ndarray", m: "mujoco.MjModel") -> str:
-    """Returns figures of a motion."""
-    import numpy as np
-
-    from torchrl_loco.motion import lowest_points, poses
-
-    lowest = lowest_points(m, *poses(m, q)).min()
+def _row(motion: "torchrl_loco.Motion", q: np.ndarray, m: Any) -> str:
+    """Returns figures of a motion on a model."""
+    lowest = torchrl_loco.motion.lowest_points(m, *torchrl_loco.motion.poses(m, q)).min()
     speed = np.linalg.norm(np.diff(q[:, :3], axis=0), axis=1).max() * motion.fps
     rate = np.abs(np.diff(q[:, 7:], axis=0)).max() * motion.fps
     return f"{len(q):6d} {motion.fps:6g} {motion.seconds:8.2f} {lowest:11.3f} {speed:12.2f} {rate:15.1f}"
 
 
-def _film(m: "mujoco.MjModel", q: "np.ndarray", out: Path, camera: str) -> None:
+def _film(m: Any, q: np.ndarray, out: Path, camera: str) -> None:
     """Renders poses as a video, at its frame rate."""
     import torch
     import warp as wp

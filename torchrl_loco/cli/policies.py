@@ -93,9 +93,7 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
     named, too. The user may say the name of its task; else it is what the file says.
     """
     if source.suffix == ".pt" and is_run(source.parent):
-        from torchrl_loco.training.watching import last_policy
-
-        return last_policy(training.RunFolder(source.parent, task), device, source), source
+        return training.watching.last_policy(training.RunFolder(source.parent, task), device, source), source
     if not source.is_dir():
         policy = torchrl_loco.Policy.load(source, device)
         policy.info["task"] = task or place_of(policy.info["task"], source.parent)
@@ -103,9 +101,7 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
     run = training.RunFolder(source, task)
     if run.policy.is_file() or run.given or not run.has_checkpoint:
         return run.load_policy(device), run.policy
-    from torchrl_loco.training.watching import last_policy  # which needs what a training needs
-
-    policy = last_policy(run, device)
+    policy = training.watching.last_policy(run, device)
     after = f"after {policy.info['frames']:,} frames"
     print(f"{run.path}: no policy was evaluated yet, this is that of the last checkpoint, {after}", file=sys.stderr)
     return policy, run.policy
@@ -182,9 +178,7 @@ class Video:
 
     def env(self, policy: "torchrl_loco.Policy") -> "torchrl_loco.LocoEnv":
         """Returns one world of the policy's task."""
-        from torchrl_loco.training.environments import make_for
-
-        return make_for(policy, 1, self.device, self.seed, play=True)
+        return training.environments.make_for(policy, 1, self.device, self.seed, play=True)
 
 
 VideoOptions = Annotated[Video, tyro.conf.arg(name="")]
@@ -277,8 +271,6 @@ def play(
         if viewer == "video":
             video.check_encoder()
         played, beside = which.load(run_or_task, video.device)
-        from torchrl_loco.training.environments import make_for
-
         if viewer == "auto":
             viewer = _default_viewer(browser, video)
         info, about = played.info, ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
@@ -288,7 +280,8 @@ def play(
         if viewer == "window":
             training.view(played, video.env(played), info["action_repeat"])
         elif viewer == "browser":
-            shown = make_for(played, browser.num_envs, video.device, video.seed, reward_terms=True, play=True)
+            place = browser.num_envs, video.device, video.seed
+            shown = training.environments.make_for(played, *place, reward_terms=True, play=True)
             browser.show(shown, played)
         else:
             video.make(played, beside)
@@ -337,10 +330,8 @@ def watch(
         os.nice(19)  # the lowest priority that there is, also of threads that are made from here on
         if hasattr(os, "SCHED_IDLE"):  # of Linux: a fifth of the share of nice 19
             os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-        from torchrl_loco.training.watching import Watched
-
         folder = training.RunFolder(run, None if task is None else _task(task))
-        watched = Watched(folder, browser.num_envs, device, seed)
+        watched = training.watching.Watched(folder, browser.num_envs, device, seed)
         browser.show(watched.env, watched.newer(), watched.newer, cpu_share)
 
 
@@ -362,16 +353,16 @@ def export(
     with user_errors(ValueError, TypeError, OSError, ImportError, RuntimeError):
         written, beside = which.load(run_or_task, "cpu")
         from torchrl_loco import storage
-        from torchrl_loco.export import SUFFIXES, TOLERANCE, export_policy, why_not
 
-        suffix = SUFFIXES[format]
+        suffix = torchrl_loco.export.SUFFIXES[format]
         if out is not None:
             check_output_file("out", out, (suffix,))
         out = storage.unused_path(beside.with_suffix(suffix)) if out is None else out
-        error = export_policy(written, out)
-    if reason := why_not(written):
+        error = torchrl_loco.export_policy(written, out)
+    if reason := torchrl_loco.export.why_not(written):
         print(f"the file holds the network alone: {reason}")
-    print(f"largest difference from the policy, on random observations: {error:.1e} (at most {TOLERANCE:.0e})")
+    most = torchrl_loco.export.TOLERANCE
+    print(f"largest difference from the policy, on random observations: {error:.1e} (at most {most:.0e})")
     print(out)
 
 
@@ -408,11 +399,10 @@ def verify(
         conditions: what the policy must hold in.
     """
     with user_errors(), tempfile.TemporaryDirectory() as folder:
+        conditions.check()
         from torchrl_loco import storage
         from torchrl_loco import verify as verification
-        from torchrl_loco.export import export_policy, why_not
 
-        conditions.check()
         out = None if out is None else check_output_file("out", out, (".json",))
         path = Path(run_task_or_file) if which.policy is None else which.policy
         if path.suffix == ".onnx":
@@ -420,11 +410,11 @@ def verify(
             named = None if named is None else _task(named)
         else:
             exported, beside = which.load(run_task_or_file, "cpu")
-            if reason := why_not(exported):
+            if reason := torchrl_loco.export.why_not(exported):
                 raise ValueError(f"{run_task_or_file} cannot be verified: {reason}")
             path, named = Path(folder) / "policy.onnx", None
             with user_errors(RuntimeError):  # of the export alone
-                export_policy(exported, path)
+                torchrl_loco.export_policy(exported, path)
             if out is None and is_run(beside.parent):
                 out = storage.unused_path(beside.with_name("verify.json"))
         print(f"verifying: {conditions.episodes} episodes, which take minutes on a CPU", file=sys.stderr, flush=True)

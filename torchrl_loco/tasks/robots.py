@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -11,10 +11,8 @@ import torch
 from torchrl_loco.conditions import PUSH_EVERY
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.vary import Vary
+from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
-
-if TYPE_CHECKING:
-    from torchrl_loco.envs.view import View
 
 HARD_CONTACT = 10.0
 """Force from which a contact of the robot with itself counts (N)."""
@@ -49,22 +47,22 @@ class Robot(LocoEnv):
             scale = 0.25 * m.actuator_forcerange[:, 1] / m.actuator_gainprm[:, 0]
         return {"action_offset": home, "action_scale": scale.tolist()}
 
-    def home(self, s: "View") -> torch.Tensor:
+    def home(self, s: View) -> torch.Tensor:
         """Returns the joint positions of the home pose (rad), ``(num_envs, joints)``."""
         return s.home[:, [int(self.mj_model.joint(name).qposadr[0]) for name in self.joints]]
 
-    def limits(self, s: "View") -> tuple[torch.Tensor, torch.Tensor]:
+    def limits(self, s: View) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the least and greatest positions of the joints (rad), each ``(num_envs, joints)``."""
         low, high = s.model("jnt_range")[:, [self.mj_model.joint(name).id for name in self.joints]].unbind(-1)
         return low, high
 
-    def beyond_limits(self, s: "View") -> torch.Tensor:
+    def beyond_limits(self, s: View) -> torch.Tensor:
         """Returns how far the joints are beyond 0.9 of their ranges (rad), summed, ``(num_envs,)``."""
         low, high = self.limits(s)
         beyond = (s.joint_qpos(self.joints) - 0.5 * (low + high)).abs() - 0.45 * (high - low)
         return beyond.clamp(min=0.0).sum(-1)
 
-    def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
+    def control(self, s: View, action: torch.Tensor) -> torch.Tensor:
         """Returns the targets of the joints (rad): the home pose and a multiple of the action."""
         if self.action_scale is not None:
             return self.home(s) + self.action_scale * action
@@ -107,13 +105,13 @@ def either(
     return {name: torch.where(mask.view(-1, *[1] * (row.ndim - 1)), row, old[name]) for name, row in new.items()}
 
 
-def hard_contacts(s: "View", geoms: str) -> torch.Tensor:
+def hard_contacts(s: View, geoms: str) -> torch.Tensor:
     """Returns in how many physics steps one of some geoms had a hard contact, ``(num_envs,)``."""
     hard = s.contact_force([geoms], history=True).norm(dim=-1) > HARD_CONTACT
     return hard.any(-1).float().sum(-1)
 
 
-def pushed(s: "View", greatest: Sequence[float], scale: float = 1.0) -> dict[str, torch.Tensor]:
+def pushed(s: View, greatest: Sequence[float], scale: float = 1.0) -> dict[str, torch.Tensor]:
     """Returns velocities, which a push changes every 1 to 3 s, and ``until_push``, the time until the next (s)."""
     push = s.until_push <= 0.0
     change = scale * s.uniform(-1.0, 1.0, 6) * torch.tensor(greatest, device=s.device)

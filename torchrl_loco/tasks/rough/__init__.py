@@ -6,21 +6,19 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
 import torch
 
 from torchrl_loco import motion, terrain
+from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
 from torchrl_loco.tasks import velocity
 from torchrl_loco.tasks.robots import com, either, hard_contacts, sliding, squares
 from torchrl_loco.tasks.velocity import WEIGHTS, G1Velocity, Go1Velocity, Go2Velocity, H1Velocity, Velocity
 from torchrl_loco.terrain.kinds import Patch, points
-
-if TYPE_CHECKING:
-    from torchrl_loco.envs.view import View
 
 SCAN = tuple((round(0.1 * x, 1), round(0.1 * y, 1)) for y in range(-5, 6) for x in range(-8, 9))
 """Where the heights around a robot are seen, ahead of it and to its left (m)."""
@@ -176,24 +174,24 @@ class Rough(Velocity):
 
     # What hooks share.
 
-    def heights(self, s: "View") -> torch.Tensor:
+    def heights(self, s: View) -> torch.Tensor:
         """Returns the heights of the feet over the ground below them (m), ``(num_envs, feet)``."""
         sites = s.site_xpos(list(self.feet))
         return sites[..., 2] - s.terrain_height(sites).nan_to_num(0.0)
 
-    def has_left(self, s: "View") -> torch.Tensor:
+    def has_left(self, s: View) -> torch.Tensor:
         """Returns whether a robot has been farther from where it began than its patch reaches, ``(num_envs,)``."""
         return s.distance > self.ground.size / 2
 
-    def is_settled(self, s: "View") -> torch.Tensor:
+    def is_settled(self, s: View) -> torch.Tensor:
         """Returns whether a robot has left its patch, or its commands have led far enough to do so, ``(num_envs,)``."""
         return self.has_left(s) | (s.commanded_distance >= ACROSS)
 
-    def ahead(self, s: "View") -> torch.Tensor:
+    def ahead(self, s: View) -> torch.Tensor:
         """Returns the horizontal direction in which the base looks, ``(num_envs, 2)``."""
         return torch.nn.functional.normalize(s.xmat(self.base)[:, :2, 0], dim=-1)
 
-    def normal(self, s: "View") -> torch.Tensor:
+    def normal(self, s: View) -> torch.Tensor:
         """Returns the direction in which the ground around the base faces, ``(num_envs, 3)``."""
         around, ahead = torch.tensor(AROUND, device=s.device), self.ahead(s)
         place = s.xpos(self.base)[:, :2].unsqueeze(1)
@@ -206,7 +204,7 @@ class Rough(Velocity):
 
     # The hooks, in the order in which they are called.
 
-    def update(self, s: "View") -> dict[str, torch.Tensor]:
+    def update(self, s: View) -> dict[str, torch.Tensor]:
         """Returns also how far a robot has been from where it began, and how far by its commands."""
         commanded = s.commanded_displacement + s.dt * turned(s.command[:, :2], self.ahead(s))
         return {
@@ -216,7 +214,7 @@ class Rough(Velocity):
             "commanded_distance": torch.maximum(s.commanded_distance, commanded.norm(dim=-1)),
         }
 
-    def terms(self, s: "View") -> dict[str, torch.Tensor]:
+    def terms(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the terms on flat ground, the trunk being upright on the slope."""
         terms = super().terms(s)
         if self.leans:
@@ -226,13 +224,13 @@ class Rough(Velocity):
             terms["scrapes"] = torch.stack([hard_contacts(s, geoms) for geoms in self.scrapes]).sum(0)
         return terms
 
-    def truncated(self, s: "View") -> torch.Tensor:
+    def truncated(self, s: View) -> torch.Tensor:
         """Returns whether the ground ends, or the robot has left its patch; in play it may go on."""
         half = torch.tensor(self.ground.half, device=s.device) + (self.ground.border - EDGE)
         ends = (s.qpos[:, :2].abs() > half).any(-1)
         return ends if self.play else ends | self.has_left(s)
 
-    def metrics(self, s: "View") -> dict[str, torch.Tensor]:
+    def metrics(self, s: View) -> dict[str, torch.Tensor]:
         """Returns also the level and the best level, from 0 on, and the share of robots that leave their patch.
 
         A robot is asked once: when it falls, when it leaves, or when its commands have led 8 m away.
@@ -245,7 +243,7 @@ class Rough(Velocity):
             "crossed": torch.where(asked, self.has_left(s).float(), math.nan),
         }
 
-    def events(self, s: "View") -> dict[str, torch.Tensor]:
+    def events(self, s: View) -> dict[str, torch.Tensor]:
         """Returns also who fell and was asked; in play, what begins anew where kind or difficulty were set."""
         rows = {**super().events(s), "fell": s.terminated, "asked": self.is_settled(s)}
         if not self.play:
@@ -256,12 +254,12 @@ class Rough(Velocity):
         anew = either(other, begun, {**{name: getattr(s, name) for name in begun}, **rows})
         return {**rows, **anew, "qvel": torch.where(other.unsqueeze(-1), 0.0, s.qvel)}
 
-    def observation(self, s: "View") -> dict[str, dict[str, torch.Tensor]]:
+    def observation(self, s: View) -> dict[str, dict[str, torch.Tensor]]:
         """Returns that on flat ground, and the heights around the robot."""
         scan = SCALE * s.height_scan(self.base, SCAN, miss=MISS)
         return {group: {**terms, "scan": scan} for group, terms in super().observation(s).items()}
 
-    def begin(self, s: "View") -> dict[str, torch.Tensor]:
+    def begin(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the home pose over the middle of a patch, and a command."""
         start = super().begin(s)
         rows = self.chosen_level(s) if self.play else self.next_level(s)
@@ -275,7 +273,7 @@ class Rough(Velocity):
         pose = torch.cat([place, z + highest + s.sunk, start["qpos"][:, 3:]], dim=-1)
         return {**start, **rows, "qpos": pose, "origin": origin}
 
-    def next_level(self, s: "View") -> dict[str, torch.Tensor]:
+    def next_level(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the next level, the best, and the column, which stays."""
         rows, columns = self.ground.rows, self.ground.columns
         up = self.has_left(s)
@@ -292,7 +290,7 @@ class Rough(Velocity):
         column = (s.env_index + torch.div(s.env_index, rows, rounding_mode="floor")) % columns
         return {"level": level, "reached": torch.where(s.level == 0, level, reached), "column": column}
 
-    def chosen_level(self, s: "View") -> dict[str, torch.Tensor]:
+    def chosen_level(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the level and column that are set, or at first those of the world's own case."""
         rows, kinds = self.ground.rows, len(s.columns_of)
         case, turn = s.env_index % (rows * kinds), torch.div(s.env_index, rows * kinds, rounding_mode="floor")

@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -14,12 +14,10 @@ import torch
 from torchrl_loco.checks import NOT_NEGATIVE, Interval, check_float, check_int
 from torchrl_loco.conditions import PUSH, PUSH_EVERY
 from torchrl_loco.config import SimConfig
+from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
 from torchrl_loco.tasks.robots import Robot, actuated, com, either, hard_contacts, pushed, sliding, soft, squares
 from torchrl_loco.tasks.velocity import commands
-
-if TYPE_CHECKING:
-    from torchrl_loco.envs.view import View
 
 FOLDER = Path(__file__).parent
 LEGS = ("FR", "FL", "RR", "RL")
@@ -234,23 +232,23 @@ class Velocity(Robot):
 
     # What hooks share.
 
-    def stray(self, s: "View", table: Mapping[str, float]) -> torch.Tensor:
+    def stray(self, s: View, table: Mapping[str, float]) -> torch.Tensor:
         """Returns how far each joint may stray by a table of the class (rad), ``(joints,)``."""
         return torch.tensor([find(table, name) for name in self.joints], device=s.device)
 
-    def touching(self, s: "View") -> torch.Tensor:
+    def touching(self, s: View) -> torch.Tensor:
         """Returns whether each foot touches something, bool ``(num_envs, feet)``."""
         return torch.stack([s.in_contact([geoms]).any(-1) for geoms in self.feet.values()], dim=-1)
 
-    def forces(self, s: "View") -> torch.Tensor:
+    def forces(self, s: View) -> torch.Tensor:
         """Returns the contact force on each foot, world frame (N), ``(num_envs, feet, 3)``."""
         return torch.stack([s.contact_force([geoms]).sum(1) for geoms in self.feet.values()], dim=1)
 
-    def heights(self, s: "View") -> torch.Tensor:
+    def heights(self, s: View) -> torch.Tensor:
         """Returns the heights of the feet (m), ``(num_envs, feet)``."""
         return s.site_xpos(list(self.feet))[..., 2]
 
-    def seen(self, s: "View") -> dict[str, torch.Tensor]:
+    def seen(self, s: View) -> dict[str, torch.Tensor]:
         """Returns what a policy sees, without noise, by name, each ``(num_envs, n)``.
 
         Velocities and gravity are in the frame of the base (m/s, rad/s), joint positions relative to home (rad).
@@ -286,23 +284,23 @@ class Velocity(Robot):
 
     # The hooks, in the order in which they are called.
 
-    def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
+    def control(self, s: View, action: torch.Tensor) -> torch.Tensor:
         """Returns the targets of the joints (rad): the home pose and a multiple of the action that arrives."""
         late, arrived = s.delay.unsqueeze(-1), action
         for steps, earlier in enumerate([s.last_action, *s.earlier_actions.unbind(1)], start=1):
             arrived = torch.where(late < steps, arrived, earlier)
         return super().control(s, arrived)
 
-    def update(self, s: "View") -> dict[str, torch.Tensor]:
+    def update(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the greatest height of each foot since it left the ground."""
         peak = torch.maximum(s.peak, self.heights(s))
         return {"peak": torch.where(self.touching(s), s.peak, peak)}
 
-    def reward(self, s: "View") -> dict[str, torch.Tensor]:
+    def reward(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the terms of the reward: :meth:`terms` times their weights and the control step."""
         return {name: self.weights[name] * s.dt * term for name, term in self.terms(s).items()}
 
-    def terms(self, s: "View") -> dict[str, torch.Tensor]:
+    def terms(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the terms of the reward by name, each ``(num_envs,)``, before they are weighted."""
         seen = self.seen(s)
         linear, angular, stray, command = (
@@ -335,11 +333,11 @@ class Velocity(Robot):
             terms["self_collision"] = hard_contacts(s, self.own_geoms)
         return terms
 
-    def terminated(self, s: "View") -> torch.Tensor:
+    def terminated(self, s: View) -> torch.Tensor:
         """Returns whether the trunk is tilted by more than 70 degrees."""
         return s.projected_gravity(self.trunk)[:, 2] > -UPSIDE
 
-    def metrics(self, s: "View") -> dict[str, torch.Tensor]:
+    def metrics(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the errors of horizontal velocity (m/s) and yaw rate (rad/s), once a command has settled."""
         seen, settled = self.seen(s), s.command_age >= SETTLING
         linear = (s.command - seen["linear_velocity"])[:, :2].norm(dim=-1)
@@ -347,7 +345,7 @@ class Velocity(Robot):
         errors = {"linear_error": linear, "angular_error": angular}
         return {name: torch.where(settled, error, math.nan) for name, error in errors.items()}
 
-    def events(self, s: "View") -> dict[str, torch.Tensor]:
+    def events(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the command that holds next, the last action, how long feet are in the air, and pushes."""
         due, forward, touching = s.until_command <= 0.0, s.xmat(self.base)[:, :2, 0], self.touching(s)
         goes_on = {name: getattr(s, name) for name in ("command", "heading", "holds_heading")}
@@ -363,7 +361,7 @@ class Velocity(Robot):
             "peak": torch.where(touching, 0.0, s.peak),
         }
 
-    def observation(self, s: "View") -> dict[str, dict[str, torch.Tensor]]:
+    def observation(self, s: View) -> dict[str, dict[str, torch.Tensor]]:
         """Returns what the policy sees, and for the critic the same without noise and the feet."""
         seen, forces = self.seen(s), self.forces(s).flatten(1)
         hidden = {
@@ -375,7 +373,7 @@ class Velocity(Robot):
         }
         return {"observation": seen, "privileged": {**seen, **hidden}}
 
-    def begin(self, s: "View") -> dict[str, torch.Tensor]:
+    def begin(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the home pose, somewhere within half a meter and just above the ground, and a command."""
         yaw, zero = s.uniform(-math.pi, math.pi), torch.zeros_like(s.home[:, 0])
         place = s.home[:, :2] + s.uniform(-0.5, 0.5, 2)

@@ -1,12 +1,10 @@
 """Velocity commands: how they are drawn, and how they turn a robot toward a heading."""
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 
-if TYPE_CHECKING:
-    from torchrl_loco.envs.view import View
+from torchrl_loco.envs.view import View
 
 Ranges = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 """Least and greatest velocity forward, to the left (m/s), and yaw rate (rad/s).
@@ -38,7 +36,7 @@ ROWS: dict[str, int | tuple[int, ...]] = {
 drawn (s); control steps of training, over all episodes of the world."""
 
 
-def limits(s: "View", curriculum: dict[int, Ranges]) -> tuple[torch.Tensor, torch.Tensor]:
+def limits(s: View, curriculum: dict[int, Ranges]) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns least and greatest command of each world, ``(num_envs, 3)``, by what its memory has of ``trained``."""
     stages = list(curriculum.items())
     low, high = (
@@ -62,7 +60,7 @@ def first(curriculum: dict[int, Ranges]) -> dict[str, tuple[float, float]]:
     return dict(zip(NAMES, next(iter(curriculum.values())), strict=True))
 
 
-def draw(s: "View", curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
+def draw(s: View, curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
     """Returns rows of a new command: of command, heading, whether it is held, time until the next, and its age."""
     low, high = limits(s, curriculum)
     command, kind = low + (high - low) * s.uniform(0.0, 1.0, 3), s.uniform(0.0, 1.0, 3)
@@ -80,7 +78,7 @@ def draw(s: "View", curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
 
 
 def turned(
-    s: "View", rows: dict[str, torch.Tensor], yaw: torch.Tensor, curriculum: dict[int, Ranges]
+    s: View, rows: dict[str, torch.Tensor], yaw: torch.Tensor, curriculum: dict[int, Ranges]
 ) -> dict[str, torch.Tensor]:
     """Returns rows of :func:`draw` for worlds that look toward ``yaw`` (rad), ``(num_envs,)``.
 
