@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+import torchrl_loco
 from torchrl_loco import known_files, tasks
 from torchrl_loco.checks import check_choice, suggestion
 
@@ -121,9 +122,7 @@ def _first_line(cls: type) -> str:
 
 
 def _check_environment(cls: Any) -> "type[LocoEnv]":
-    from torchrl_loco.envs import LocoEnv
-
-    if not (isinstance(cls, type) and issubclass(cls, LocoEnv)):
+    if not (isinstance(cls, type) and issubclass(cls, torchrl_loco.LocoEnv)):
         raise TypeError(
             f"{cls!r} is no subclass of torchrl_loco.LocoEnv, as torchrl_loco.WalkerWalk is: pass the class"
         )
@@ -276,12 +275,10 @@ def _class_at(place: str, by_user: bool) -> "type[LocoEnv]":
 
 def _no_class(module: ModuleType, source: str, name: str) -> str:
     """Returns what is wrong with the name of a class that a module does not have."""
-    from torchrl_loco.envs import LocoEnv
-
     if source in MAIN or "<locals>" in name:
         return f"{source}:{name} is of another process, of a notebook or a function: move the class into a file"
-    kinds = {key: cls for key, cls in vars(module).items() if isinstance(cls, type) and issubclass(cls, LocoEnv)}
-    names = [key for key, cls in kinds.items() if cls.__module__ == module.__name__]
+    classes = [cls for cls in vars(module).values() if isinstance(cls, type) and cls.__module__ == module.__name__]
+    names = [cls.__name__ for cls in classes if issubclass(cls, torchrl_loco.LocoEnv)]
     what = f"{source} has no class {name!r}{suggestion(name, names)}" if name else f"{source!r} names no class"
     choice = f"choose one of {', '.join(names)}" if names else "it defines no subclass of torchrl_loco.LocoEnv"
     return f"{what}: {choice}"

@@ -7,10 +7,9 @@ What those of robots share is in ``robots``.
 
 import ast
 import functools
-import importlib
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 
 class Task(NamedTuple):
@@ -51,19 +50,3 @@ def found() -> dict[str, Task]:
                     summary = (ast.get_docstring(node) or "").partition("\n")[0]
                     tasks[id] = Task(f"{__name__}.{folder}", node.name, summary, has_options)
     return tasks
-
-
-def __getattr__(name: str) -> Any:
-    """Returns the class of a task, which is imported when it is asked for.
-
-    Raises:
-        AttributeError: there is no such task.
-    """
-    for task in found().values():
-        if task.name == name:
-            return getattr(importlib.import_module(task.module), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *(task.name for task in found().values())]
