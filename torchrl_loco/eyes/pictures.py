@@ -37,22 +37,10 @@ def with_ghost(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 class Poses:
-    """Renders poses of a model through one camera.
+    """Renders poses of a model through one camera. Arguments are those of :class:`Eye`: a world is a pose."""
 
-    Args:
-        mj_model: the model.
-        device: where.
-        camera: name or number of a camera of the model.
-        width: pixels in a row, at least 1.
-        height: rows, at least 1.
-        worlds: how many poses at a time.
-    """
-
-    def __init__(
-        self, mj_model: mujoco.MjModel, device: wp.Device, camera: str | int, width: int, height: int, worlds: int
-    ) -> None:
-        self._model, self._device = mj_model, device
-        self._eye = Eye(mj_model, device, camera, width, height, worlds, **LOOKS_WELL)
+    def __init__(self, m: mujoco.MjModel, device: wp.Device, *picture: Any) -> None:
+        self._model, self._device, self._eye = m, device, Eye(m, device, *picture, **LOOKS_WELL)
 
     def render(self, qpos: torch.Tensor) -> torch.Tensor:
         """Returns poses ``(worlds, nq)`` as pixels, uint8 ``(worlds, height, width, 3)``, until the next call."""

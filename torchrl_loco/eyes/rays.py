@@ -64,13 +64,7 @@ class Rays:
         self.distance = self._out.torch
 
     def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array | None = None) -> None:
-        """Launches the kernels, on Warp's current stream.
-
-        Args:
-            xpos: positions of the bodies (m), ``(worlds, nbody)``.
-            xmat: their orientations.
-            mask: the worlds; ``None`` is all.
-        """
+        """Launches the kernels, on Warp's current stream; arguments as of :meth:`Placed.launch`."""
         placed, out = self._placed, self._out.warp
         placed.launch(xpos, xmat, mask)
         inputs = [placed.shapes, mask, self._directions, self._far, *placed.placed]

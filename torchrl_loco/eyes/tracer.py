@@ -290,13 +290,7 @@ class Eye:
         self.rgb, self.depth, self.geoms = (one.torch for one in self._out)
 
     def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array | None = None) -> None:
-        """Launches the kernels, on Warp's current stream.
-
-        Args:
-            xpos: positions of the bodies (m), ``(worlds or more, nbody)``.
-            xmat: their orientations.
-            mask: the worlds that look; ``None`` is all.
-        """
+        """Launches the kernels, on Warp's current stream; arguments as of :meth:`Placed.launch`."""
         placed, out = self._placed, [one.warp for one in self._out]
         placed.launch(xpos, xmat, mask)
         size = next(one.shape for one in out if one.size)

@@ -198,17 +198,9 @@ def shipped_return(config: TrainingConfig) -> str:
 
 @torch.no_grad()
 def play(policy: PolicyFunc, env: EnvBase, action_repeat: int, frames: int, label: str) -> Iterator[TensorDictBase]:
-    """Yields the result of each frame from a reset on, without exploration.
+    """Yields what is under ``"next"`` of so many frames from a reset on, without exploration, beside a labelled bar.
 
-    Args:
-        policy: reads ``observation`` and writes ``action``.
-        env: where it plays.
-        action_repeat: frames for which an action is held.
-        frames: how many frames.
-        label: of the progress bar.
-
-    Yields:
-        What is under ``"next"`` of each step.
+    Further arguments are those of :func:`record`.
     """
     td = env.reset()
     for frame in trange(frames, desc=label, leave=False, disable=None):  # no bar in logs

@@ -109,7 +109,7 @@ class MLflow(MLFlowLogger):
     def __init__(self, folder: Path, id: str | None) -> None:
         import mlflow
 
-        self._name, self._id, self._begun = folder.name, id, False
+        self.mlflow, self._name, self._id, self._begun = mlflow, folder.name, id, False
         self.tracking_before = mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else None
         local = f"sqlite:///{folder.absolute() / 'mlflow.db'}"
         artifacts = None if self.tracking_before else (folder.absolute() / "mlflow").as_uri()
@@ -122,21 +122,17 @@ class MLflow(MLFlowLogger):
 
     def end(self, status: str) -> None:
         """Ends the run, if it has begun, and gives the process back the server that it had before."""
-        import mlflow
-
         try:
             if self._begun:  # else the active run, if there is one, is not ours
-                mlflow.end_run(status)
+                self.mlflow.end_run(status)
         finally:
-            mlflow.set_tracking_uri(self.tracking_before)  # which TorchRL has set for the whole process
+            self.mlflow.set_tracking_uri(self.tracking_before)  # which TorchRL has set for the whole process
 
     def _create_experiment(self) -> Any:
-        import mlflow
-
-        run = super()._create_experiment() if self._id is None else mlflow.start_run(run_id=self._id)
+        run = super()._create_experiment() if self._id is None else self.mlflow.start_run(run_id=self._id)
         self._begun = True
         if self._id is None:
-            mlflow.set_tag("mlflow.runName", self._name)
+            self.mlflow.set_tag("mlflow.runName", self._name)
         else:
             self.id = run.info.experiment_id
         return run
@@ -162,9 +158,7 @@ def _begin(logger: Logger, settings: dict[str, Any]) -> str | None:
         logger.log_hparams(settings)
         return logger.experiment.id
     if isinstance(logger, MLflow):
-        import mlflow
-
-        mlflow.log_params(settings)  # TorchRL's log_hparams needs omegaconf
+        logger.mlflow.log_params(settings)  # TorchRL's log_hparams needs omegaconf
         return logger.experiment.info.run_id
     return None
 
