@@ -42,12 +42,6 @@ def points(size: float, cell: float) -> np.ndarray:
     return np.linspace(-size / 2, size / 2, round(size / cell) + 1)
 
 
-def from_edge(size: float, cell: float) -> np.ndarray:
-    """Returns how far each point of a patch is from the nearest edge (m), ``(points, points)``."""
-    along = size / 2 - np.abs(points(size, cell))
-    return np.minimum(along[:, None], along[None])
-
-
 def ring(outer: float, width: float, top: float, bottom: float) -> list[list[float]]:
     """Returns four boxes of a width, from bottom to top, within the edges of a square of half side ``outer`` (m)."""
     middle, half, z = outer - width / 2, width / 2, [(top + bottom) / 2, (top - bottom) / 2]
@@ -81,8 +75,9 @@ def slope(
 
     ``gradient`` is rise over run, ``platform`` a side of the middle (m).
     """
+    from_edge = np.minimum(size / 2 - np.abs(points(size, cell)), size / 2 - platform / 2)
     steep = between(gradient, difficulty) * (-1 if down else 1)
-    return Patch(heights=steep * np.minimum(from_edge(size, cell), size / 2 - platform / 2))
+    return Patch(heights=steep * np.minimum(from_edge[:, None], from_edge[None]))
 
 
 def rough(
