@@ -46,5 +46,6 @@ class Poses:
         """Returns poses ``(worlds, nq)`` as pixels, uint8 ``(worlds, height, width, 3)``, until the next call."""
         with EXCLUSIVE, wp.ScopedDevice(self._device), wp.ScopedStream(current_stream(self._device)):
             pos, mat = poses(self._model, qpos.numpy(force=True))
-            self._eye.launch(wp.array(pos, wp.vec3), wp.array(mat, wp.mat33))
+            self._bodies = wp.array(pos, wp.vec3), wp.array(mat, wp.mat33)  # kept until they are drawn
+            self._eye.launch(*self._bodies)
         return self._eye.rgb
