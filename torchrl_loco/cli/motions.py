@@ -35,9 +35,7 @@ class Motions:
         return resolve(task).checked_options(given)  # the rate is not that of the training
 
 
-MotionOptions = Annotated[Motions, tyro.conf.arg(name="")]
 THOSE_OF_TRAINING = Motions()
-
 
 FRAME_RATE = 25
 """Frames per second of videos."""

@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 from collections.abc import Mapping
 from types import NoneType, UnionType
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 import tyro
 
@@ -87,6 +87,10 @@ def task_options(args: list[str]) -> Any:
         configs = {task: TrainingConfig(task) for task in about}
     return tyro.extras.subcommand_type_from_defaults(configs, about, prefix_names=False)
 
+
+T = TypeVar("T")
+Flat = Annotated[T, tyro.conf.arg(name="")]
+"""Options of a dataclass, whose names stand alone."""
 
 OtherTask = Annotated[
     str | None,

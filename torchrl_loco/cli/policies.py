@@ -27,7 +27,7 @@ from torchrl_loco.checks import (
 )
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.motions import Motions
-from torchrl_loco.cli.options import OtherTask
+from torchrl_loco.cli.options import Flat, OtherTask
 from torchrl_loco.conditions import DEFAULT, Conditions
 from torchrl_loco.known_files import place_of
 from torchrl_loco.registry import label, task_name
@@ -83,9 +83,6 @@ class Which(Motions):
         return torchrl_loco.load_policy(task, device, self.protocol), Path(task)
 
 
-WhichOptions = Annotated[Which, tyro.conf.arg(name="")]
-
-
 def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["torchrl_loco.Policy", Path]:
     """Returns the policy of a run folder or a file, and the path of its file.
 
@@ -120,7 +117,7 @@ def evaluate(
     /,
     episodes: int | None = None,
     seed: int | None = None,
-    which: WhichOptions = Which(),
+    which: Flat[Which] = Which(),
     device: str | None = None,
 ) -> None:
     """Evaluate a trained policy over full episodes, without exploration.
@@ -181,9 +178,6 @@ class Video:
         return training.environments.make_for(policy, 1, self.device, self.seed, play=True)
 
 
-VideoOptions = Annotated[Video, tyro.conf.arg(name="")]
-
-
 @dataclasses.dataclass(frozen=True)
 class Browser:
     """Options of the page in the browser."""
@@ -222,10 +216,7 @@ class Browser:
             viewer.run()
 
 
-BrowserOptions = Annotated[Browser, tyro.conf.arg(name="")]
-
-
-def record(run_or_task: RunOrTask, /, which: WhichOptions = Which(), video: VideoOptions = Video()) -> None:
+def record(run_or_task: RunOrTask, /, which: Flat[Which] = Which(), video: Flat[Video] = Video()) -> None:
     """Record a video of a trained policy.
 
     Args:
@@ -247,9 +238,9 @@ def play(
         Literal["auto", "window", "browser", "video"],
         tyro.conf.arg(help="where it is shown; auto is a window if there is a display, else the browser."),
     ] = "auto",
-    which: WhichOptions = Which(),
-    browser: BrowserOptions = Browser(),
-    video: VideoOptions = Video(),
+    which: Flat[Which] = Which(),
+    browser: Flat[Browser] = Browser(),
+    video: Flat[Video] = Video(),
 ) -> None:
     """Show a trained policy: in a window, in the browser or as a video.
 
@@ -307,7 +298,7 @@ def watch(
     seed: int = 0,
     cpu_share: float = 0.02,
     task: OtherTask = None,
-    browser: BrowserOptions = Browser(),
+    browser: Flat[Browser] = Browser(),
 ) -> None:
     """Show a running training in the browser: its newest policy, swapped in as it appears.
 
@@ -340,7 +331,7 @@ def export(
     /,
     format: Literal["onnx", "torch"] = "onnx",
     out: Path | None = None,
-    which: WhichOptions = Which(),
+    which: Flat[Which] = Which(),
 ) -> None:
     """Write a policy as a file for programs without this package, and compare it with the policy.
 
@@ -366,9 +357,6 @@ def export(
     print(out)
 
 
-ConditionOptions = Annotated[Conditions, tyro.conf.arg(name="")]
-
-
 def verify(
     run_task_or_file: Annotated[
         tyro.conf.Positional[str],
@@ -379,11 +367,11 @@ def verify(
         ),
     ],
     /,
-    which: WhichOptions = Which(),
+    which: Flat[Which] = Which(),
     device: str | None = None,
     alone: bool = False,
     out: Path | None = None,
-    conditions: ConditionOptions = DEFAULT,
+    conditions: Flat[Conditions] = DEFAULT,
 ) -> None:
     """Play a policy, as exported, in its task in C MuJoCo, by the model's own options; status 1 if it does not hold.
 

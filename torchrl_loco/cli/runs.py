@@ -10,8 +10,8 @@ import tyro
 from torchrl_loco import training
 from torchrl_loco.checks import SEED, check_int, check_run
 from torchrl_loco.cli.errors import user_errors
-from torchrl_loco.cli.motions import THOSE_OF_TRAINING, MotionOptions
-from torchrl_loco.cli.options import OtherTask, settings
+from torchrl_loco.cli.motions import THOSE_OF_TRAINING, Motions
+from torchrl_loco.cli.options import Flat, OtherTask, settings
 from torchrl_loco.garbage import importing
 from torchrl_loco.registry import task_name
 
@@ -44,7 +44,7 @@ def resume(
     total_frames: int | None = None,
     device: str | None = None,
     task: OtherTask = None,
-    motions: MotionOptions = THOSE_OF_TRAINING,
+    motions: Flat[Motions] = THOSE_OF_TRAINING,
 ) -> None:
     """Continue a run that was stopped, from its last checkpoint, as if it had not been stopped.
 
