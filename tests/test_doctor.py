@@ -35,6 +35,8 @@ def test_wrong_physics(capsys, monkeypatch):
     make = doctor.make
 
     def spoilt(*args, **kwargs):
+        if kwargs.get("engine") == "mujoco":
+            return make(*args, **kwargs)
         env = make(*args, **kwargs, engine="mujoco_warp")  # whose model can be changed
         env.sim.model.opt.gravity.fill_(0.0 if env.body == "walker" else float("nan"))
         return env
