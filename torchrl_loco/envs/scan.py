@@ -1,6 +1,7 @@
 """Scans of the ground below a body, and what cameras see, as arrays: made before the part of hooks that reads them."""
 
 import dataclasses
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,6 @@ from torchrl_loco.sim import Buffer, fill_from_numbers
 from torchrl_loco.sim.compiled.collision.ground import NOTHING
 
 if TYPE_CHECKING:
-    from torchrl_loco.envs.view import Catalog
     from torchrl_loco.sim import Simulation
 
 UPRIGHT = 0.1
@@ -64,6 +64,9 @@ class RayRequest:
     site: int
     directions: tuple[tuple[float, float, float], ...]
     far: float
+
+
+Request = ScanRequest | DepthRequest | RayRequest
 
 
 @wp.struct
@@ -140,17 +143,20 @@ def scan(
 class Scans:
     """The scans, depths and rays that hooks ask for, by name; ``mask`` tells in which worlds episodes begin.
 
+    The ground is asked for only if one scans it.
+
     Attributes:
         arrays: of scans, heights of the body above the ground at each point (m), NaN where there is none, ``(nworld,
             points)``; of cameras, depths (m), ``(nworld, height, width)``; of rays, distances (m), ``(nworld, rays)``.
     """
 
-    def __init__(self, sim: "Simulation", catalog: "Catalog", mask: wp.array) -> None:
-        asked = catalog.scans
+    def __init__(
+        self, sim: "Simulation", asked: Mapping[str, Request], ground: Callable[[], Ground], mask: wp.array
+    ) -> None:
         self._eyes = {name: eye_of(sim, one) for name, one in asked.items() if not isinstance(one, ScanRequest)}
         self._asked = {name: one for name, one in asked.items() if isinstance(one, ScanRequest)}
         self._sim, self._mask = sim, mask
-        self._ground = tables(catalog.ground, sim.device) if self._asked else None
+        self._ground = tables(ground(), sim.device) if self._asked else None
         kept = {name: np.array(one.points, dtype=np.float32) for name, one in self._asked.items()}
         self._points = {name: wp.array(points, dtype=wp.vec2, device=sim.device) for name, points in kept.items()}
         self._out = {name: Buffer((sim.num_envs, len(points)), float, sim.device) for name, points in kept.items()}

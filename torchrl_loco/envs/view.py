@@ -13,7 +13,7 @@ import torch
 from torchrl_loco.checks import POSITIVE, check_float, check_int
 from torchrl_loco.envs import draws, heights, sensors
 from torchrl_loco.envs.names import Elements, Names
-from torchrl_loco.envs.scan import DepthRequest, RayRequest, ScanRequest
+from torchrl_loco.envs.scan import DepthRequest, RayRequest, Request, ScanRequest
 from torchrl_loco.envs.tables import Entry, Table
 from torchrl_loco.envs.variation import Variation, constant_of
 from torchrl_loco.eyes.placing import bytes_placed
@@ -67,7 +67,7 @@ class Catalog(Elements):
         self.arrays: set[str] = set()
         self.sensors: set[int] = set()
         self.contact_geoms: list[int] = []
-        self.scans: dict[str, ScanRequest | DepthRequest | RayRequest] = {}
+        self.scans: dict[str, Request] = {}
         self.bytes_scanned = 0
         self.scanning: dict[str, set[str]] = {}
         self.complete = False
@@ -439,7 +439,7 @@ class View:
             raise ValueError(f"name one {kind}: {name!r} matches {len(ids)}")
         return ids[0]
 
-    def _scanned(self, asked: ScanRequest | DepthRequest | RayRequest, shape: tuple[int, ...]) -> torch.Tensor:
+    def _scanned(self, asked: Request, shape: tuple[int, ...]) -> torch.Tensor:
         """Returns the array of a scan, depths or rays, of a shape in each world: at the first call, numbers like them.
 
         Raises:

@@ -255,7 +255,7 @@ class World:
     def _make_parts(self, task: "LocoEnv") -> None:
         sim, hooks, own, variation = self.sim, task.hooks, self._own, self._variation
         self._moved = Buffer(task.num_envs, bool, sim.device)
-        self._scans = Scans(sim, hooks.catalog, self.mask.warp)
+        self._scans = Scans(sim, hooks.catalog.scans, lambda: hooks.catalog.ground, self.mask.warp)
         streams = self._streams(task)
         arrays = {**streams, **self._arrays(hooks), **self._scans.arrays}
 
