@@ -46,6 +46,8 @@ def draw_svg(ppo: dict[str, list[dict[str, str]]], svg: dict[str, list[dict[str,
             dashes = ":" if "anew" in name else "-"
             episodes.plot(*columns, dashes, color=color, lw=1.2, label=label + ", compiled anew" * (dashes == ":"))
     for name, rows in read(OF_SVG / "evaluations.csv").items():
+        if name.startswith("svg, horizon"):  # settings of before
+            continue
         seconds, reached = ([float(row[key]) for row in rows] for key in ("seconds", "return"))
         color = next(color for color, label, _ in reversed(groups) if name.startswith(label))
         dashes = ":" if "anew" in name else "-"
@@ -56,7 +58,7 @@ def draw_svg(ppo: dict[str, list[dict[str, str]]], svg: dict[str, list[dict[str,
     for axis in (episodes, returns):
         axis.set_xlabel("seconds of training, with compiling")
         axis.set_xlim(0 if axis is episodes else 40, 200 if axis is episodes else 800)
-        axis.set_ylim(0.0, 500.0 if axis is episodes else 1.0)
+        axis.set_ylim(*((0.0, 500.0) if axis is episodes else (0.7, 1.0)))
         axis.grid(alpha=0.3)
     returns.set_xscale("log")
     returns.set_xticks([60, 120, 180, 600], ["60", "120", "180", "600"])

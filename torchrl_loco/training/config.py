@@ -393,10 +393,10 @@ class SVGConfig(TrainingConfig):
         "cuda": {
             "num_envs": 4096,
             "num_steps": 16,
-            "total_frames": 60_000_000,
-            "epochs": 6,
+            "total_frames": 46_000_000,
+            "epochs": 14,
             "minibatch_size": 4096,
-            "lr": 5e-4,
+            "lr": 1e-3,
             "final_lr_fraction": 0.1,
             "hidden": (1024, 512, 256),
             "bf16": True,
@@ -413,9 +413,9 @@ class SVGConfig(TrainingConfig):
     compile: bool = True
     """Whether torch.compile makes kernels of what is imagined on CUDA; the first start on a machine takes a minute
     longer then."""
-    horizon: int = 16
+    horizon: int = 8
     """Steps that are imagined in a row, along which the actor's gradient flows."""
-    window: int = 16
+    window: int = 8
     """Steps that the model predicts in a row where it is fitted."""
     replay: int = 8
     """Batches that are remembered."""
