@@ -538,9 +538,9 @@ def test_a_table_makes_a_task_of_a_users_robot(caplog):
     assert "meshes without contacts are drawn and touch nothing: shell" in caplog.text
     with pytest.raises(TypeError, match="Bare must set base, trunk, feet, stand, walk, run"):
         type("Bare", (velocity.Velocity,), {"model": Table.model})(1, "cpu")
-    for wrong in ({"max_delay": 4}, {"push_scale": -1.0}):
-        with pytest.raises(ValueError, match=f"{next(iter(wrong))} of Slow must lie in"):
-            type("Slow", (Table,), wrong)(1, "cpu")
+    for name, wrong in (("max_delay", 4), ("push_scale", -1.0), ("holds", {"delay": (0, 4)})):
+        with pytest.raises(ValueError, match=rf"{name}.* of Slow must lie in"):
+            type("Slow", (Table,), {name: wrong})(1, "cpu")
 
 
 UNFIT = [

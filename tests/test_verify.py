@@ -156,6 +156,30 @@ def test_a_task_of_a_users_own_is_verified_by_its_own_hooks(tmp_path):
     assert list(report.figures["outcomes"]) == ["C MuJoCo"]
 
 
+class Held(Late):
+    """Holds actions back by itself, by one step at most."""
+
+    memory = {**Late.memory, "delay": (), "last": 6}
+    holds = {**Late.holds, "delay": (0, 1)}
+
+    def control(self, s, action):
+        return torch.where(s.delay.unsqueeze(-1) > 0.0, s.last, action)
+
+    def metrics(self, s):
+        return {"late": torch.where(s.steps < 4, s.ctrl[:, 0] == 0.0, torch.nan)}
+
+    def events(self, s):
+        return {**super().events(s), "last": s.action}
+
+
+def test_actions_are_as_late_as_asked_for_where_the_task_holds_them_back_itself(tmp_path):
+    path = tmp_path / "held.onnx"
+    export_policy(constant(torchrl_loco.registry.task_name(Held), 1, 6, 1.0), path)
+    report = verify(path, Conditions(episodes=8, delay=(0, 3)), "cpu", alone=True)
+    for delay in range(4):
+        assert report.figures["outcomes"]["C MuJoCo"][f"delay {delay}"]["late"] == pytest.approx(delay / 4)
+
+
 class Levels(Late):
     """Begins an episode one level above the last, and earns the level."""
 

@@ -305,8 +305,9 @@ def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -
     td = env.reset()
     behind = torch.from_numpy(delay).to(env.device)
     if "delay" in env.world.memory and env.world.memory["delay"].ndim == 1:  # the task's hooks hold its actions back
-        env.world.memory["delay"].copy_(behind)
-        behind = torch.zeros_like(behind)
+        held = behind.clamp(max=(type(env).holds.get("delay") or (0, 0))[1])  # as far as it says
+        env.world.memory["delay"].copy_(held)
+        behind = behind - held
     late = torch.zeros(most + 1, n, env.mj_model.nu, device=env.device)
     alive, taken, figures = torch.ones(n, dtype=torch.bool, device=env.device), [], []
     for t in trange(steps, desc=label, leave=False, disable=None):  # no bar in logs
