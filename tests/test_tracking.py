@@ -204,6 +204,29 @@ def test_what_is_seen():
     assert torch.allclose(ahead[..., 59:62], -upright, atol=1e-6)
 
 
+def test_actions_come_a_step_late_in_every_other_episode_if_asked_for():
+    env = loco.make("h1_tracking", 100, "cpu", 0, max_delay=1, **PLAIN)
+    td = env.reset()
+    is_late = env.world.memory["delay"] == 1.0
+    assert 30 < is_late.sum() < 70
+    assert ((env.world.memory["delay"] == 0.0) | is_late).all()
+    first, second = 0.1 * torch.randn(2, 100, 19)
+    td = env.step(td.set("action", first))["next"]
+    goes_on = ~td["done"].squeeze(-1)
+    env.step(td.exclude("reward").set("action", second))
+    arrived = torch.where(is_late.unsqueeze(-1), first, second)
+    torch.testing.assert_close(env.sim.ctrl[goes_on], targets_of(env, arrived)[goes_on])
+    assert not loco.make("h1_tracking", 9, "cpu", 0, play=True, max_delay=1, **PLAIN).world.memory["delay"].any()
+    with pytest.raises(ValueError, match="max_delay must lie in"):
+        loco.make("h1_tracking", 1, "cpu", 0, max_delay=2)
+
+
+def targets_of(env, action):
+    """Returns the targets of the joints that actions mean (rad)."""
+    facts = env.facts(env.mj_model, {})
+    return torch.tensor(facts["action_offset"]) + torch.tensor(facts["action_scale"]) * action
+
+
 def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_path, short):
     given = Motion(short / "a.csv", fps=25, ground=True, weight=2.0)
     one = loco.make("h1_tracking", 1, "cpu", 0, motion=given, **PLAIN)
@@ -226,6 +249,8 @@ def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_p
     for future in ((-1,), (0,), ("a",), 1.5):
         with pytest.raises(ValueError, match="future must be whole numbers"):
             loco.make("h1_tracking", 1, "cpu", 0, future=future)
+    with pytest.raises(ValueError, match="twice"):
+        loco.make("h1_tracking", 1, "cpu", 0, future=(1, 1))
     with pytest.raises(ValueError, match="names none"):
         loco.make("h1_tracking", 1, "cpu", 0, motion=[])
     with pytest.raises(ValueError, match="motion: options are those of the environment"):

@@ -70,7 +70,8 @@ def memory(joints: int) -> dict[str, Any]:
     """Returns what a robot with so many joints remembers."""
     return {
         "frame": torch.int32,  # of the reference that the robot is at
-        **{"last_action": joints, "bias": joints, "until_push": ()},  # bias in rad; s
+        **{"last_action": joints, "delay": ()},  # of actions (control steps)
+        **{"bias": joints, "until_push": ()},  # rad; s
         **{"clip": (), "phase": ()},  # of play: the clip, counted from the world's own, and where in it to begin
         **{"began_clip": (), "began_phase": ()},  # what they were then
     }
@@ -91,7 +92,8 @@ class Tracking(Robot):
         ``privileged``: the same without noise, and position and orientation of all bodies in the frame of the anchor.
 
     Action:
-        Changes of the joints' targets from home, scaled, without bounds.
+        Changes of the joints' targets from home, scaled, without bounds. With ``max_delay`` of 1 they come a control
+        step late in every other episode.
 
     Reward:
         ``FOLLOWED``: of the anchor in the world, and of all bodies, whose reference is moved and turned about the
@@ -115,6 +117,7 @@ class Tracking(Robot):
         "motion": ((), "Motions to follow: CSV or npz files, folders or globs; without any, those of the package."),
         "fps": (0.0, "Frames per second of motions in CSV files, which do not say it."),
         "future": ((), "Frames ahead that the policy sees of the reference too, such as 1 2 3."),
+        "max_delay": (0, "Greatest delay of an action in training (control steps), 0 or 1; verify plays both."),
     }
     config = G1Velocity.config
     episode_length = 500
@@ -134,6 +137,7 @@ class Tracking(Robot):
     motion: Any
     fps: float
     future: tuple[int, ...]
+    max_delay: int
     frames: motions.Frames
     """The motions as tables."""
 
@@ -164,6 +168,7 @@ class Tracking(Robot):
             kept["motion"] = [_kept(one) for one in several]
         elif kept.get("fps"):
             raise ValueError("fps is that of motions in CSV files: pass motion too")
+        check_int("max_delay", kept.get("max_delay", 0), Interval(0, 1, with_high=True))
         if "future" in kept:
             steps = kept["future"] if isinstance(kept["future"], list | tuple) else [kept["future"]]
             try:
@@ -172,6 +177,8 @@ class Tracking(Robot):
                 ]
             except (TypeError, ValueError) as error:
                 raise ValueError(f"future must be whole numbers of control steps, 1 or more: {error}") from None
+            if len(set(kept["future"])) < len(kept["future"]):
+                raise ValueError(f"future names a frame twice: {kept['future']}")
         return kept
 
     @classmethod
@@ -272,6 +279,10 @@ class Tracking(Robot):
         return {**super().facts(m, info), "tracking": tracking}
 
     # The hooks, in the order in which they are called.
+
+    def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
+        """Returns the targets of the joints (rad): the home pose and a multiple of the action that arrives."""
+        return super().control(s, torch.where(s.delay.unsqueeze(-1) > 0.0, s.last_action, action))
 
     def reward(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the terms of the reward."""
@@ -392,6 +403,7 @@ class Tracking(Robot):
             "qvel": torch.cat([rows["qvel"][:, :6] + push, rows["qvel"][:, 6:]], dim=-1),
             "bias": s.uniform(-BIAS, BIAS, len(self.joints)),
             "until_push": s.uniform(*PUSH_EVERY),
+            "delay": s.uniform(0.0, self.max_delay + 1.0).floor() if self.max_delay else torch.zeros_like(drawn),
         }
 
     def at(self, s: "View", frame: torch.Tensor) -> dict[str, torch.Tensor]:
