@@ -151,11 +151,7 @@ class Motion:
         return stated, np.concatenate([pos[:, 0], quat[:, 0], joints], axis=1).astype(float)
 
     def _check(self) -> None:
-        """Checks all that needs no model.
-
-        Raises:
-            ValueError: there are fewer than two frames, a number is not finite, a quaternion is none, or it jumps.
-        """
+        """Checks all that needs no model."""
         q = self.qpos
         if len(q) < 2:
             raise ValueError(f"{self.path} has {len(q)} frames: a motion has at least 2")
@@ -228,11 +224,7 @@ class Motion:
         return q, said
 
     def _compare_bodies(self, m: mujoco.MjModel, q: np.ndarray) -> list[str]:
-        """Returns what is to be said of the bodies of a file, which must lie where the joints put them.
-
-        Raises:
-            ValueError: they lie elsewhere.
-        """
+        """Returns what is to be said of the bodies of a file, which must lie where the joints put them."""
         if self._bodies is None:
             return []
         there, names = self._bodies

@@ -259,11 +259,7 @@ def _description(layer: nn.Module) -> str | list[Any]:
 
 
 def _make_layer(description: str | list[Any], tensors: dict[str, torch.Tensor]) -> nn.Module:
-    """Returns the layer of a description, with the sizes of its tensors.
-
-    Raises:
-        ValueError: there is no such layer, or it needs a tensor.
-    """
+    """Returns the layer of a description, with the sizes of its tensors."""
     name, settings = (description, {}) if isinstance(description, str) else description
     if name not in KINDS:
         raise ValueError(f"unknown layer {name!r}")

@@ -248,14 +248,7 @@ def is_place(task: str) -> bool:
 
 
 def _class_at(place: str, by_user: bool) -> "type[LocoEnv]":
-    """Returns the class at ``"path/to/file.py:Class"`` or ``"module:Class"``.
-
-    Raises:
-        ValueError: there is no such class.
-        TypeError: it is a class of something else.
-        OSError: there is no such file.
-        ImportError: the file or the module raises an error, or the user has not named it.
-    """
+    """Returns the class at ``"path/to/file.py:Class"`` or ``"module:Class"``."""
     source, _, name = place.rpartition(":") if ":" in place else (place, "", "")
     try:
         module = _loaded(source) or _run(source, name, by_user)
@@ -294,13 +287,7 @@ def _loaded(source: str) -> ModuleType | None:
 
 
 def _run(source: str, name: str, by_user: bool) -> ModuleType:
-    """Returns a file or a module, which is run, if the user has named it, now or before.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        UnnamedFileError: the user has not named it.
-        ImportError: it raises an error.
-    """
+    """Returns a file or a module, which is run, if the user has named it, now or before."""
     path = Path(source).expanduser().resolve() if source.endswith(".py") else None
     if path is not None and not path.is_file():
         raise FileNotFoundError(f"there is no file {path}: where its class is now is told by --task FILE.py:CLASS")
@@ -336,11 +323,7 @@ def _file_of(module: str) -> Path | None:
 
 
 def _module_of_file(path: Path) -> ModuleType:
-    """Returns a file as a module, which is run.
-
-    Raises:
-        ImportError: it raises an error.
-    """
+    """Returns a file as a module, which is run."""
     name = _name_of(path)
     if known_files.is_kept(path):
         sys.dont_write_bytecode = True  # only sources are compared with those that are known

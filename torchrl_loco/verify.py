@@ -189,11 +189,7 @@ def _case_lines(cases: dict[str, dict[str, dict[str, Any]]]) -> list[str]:
 def _worlds(
     cls: Any, exported: Exported, conditions: Conditions, engine: str, device: str | None, **more: Any
 ) -> LocoEnv:
-    """Returns worlds of a policy's task, a world for each episode.
-
-    Raises:
-        ValueError: the policy does not fit the task.
-    """
+    """Returns worlds of a policy's task, a world for each episode."""
     facts, settings = exported.facts, arguments_of(exported.facts.get("info", {}))
     if conditions.friction is not None:
         ground = cls.model.geom("terrain") if isinstance(cls.model, mujoco.MjSpec) else None
@@ -344,11 +340,7 @@ def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -
 
 
 def _pushes(env: LocoEnv, generator: np.random.Generator, steps: int, scale: float) -> dict[int, np.ndarray]:
-    """Returns changes of the bases' velocities ``(n, 6)`` (m/s, rad/s), by the control step after which they come.
-
-    Raises:
-        ValueError: nothing floats that could be pushed.
-    """
+    """Returns changes of the bases' velocities ``(n, 6)`` (m/s, rad/s), by the control step after which they come."""
     if not scale:
         return {}
     if env.mj_model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:

@@ -135,11 +135,7 @@ def _annotated(value: Any, words: str) -> Any:
 
 
 def _check_names(args: list[str], config: Any) -> None:
-    """Checks that options are settings: the parser's own message does not say which there are.
-
-    Raises:
-        ValueError: there is no such setting; the message names the nearest or all, or the algorithm that has it.
-    """
+    """Checks that options are settings: the parser's own message does not say which there are."""
     settings_of = {algorithm: {field.name for field in dataclasses.fields(kind)} for algorithm, kind in CONFIGS.items()}
     mine = {field.name for field in dataclasses.fields(config)} - {"task", "options"} | set(_of_task(config.task))
     for arg in args:

@@ -90,11 +90,7 @@ def plot(runs: tyro.conf.Positional[tuple[Path, ...]], /, out: Path = Path("lear
 
 
 def _check_seeds(seeds: tuple[int, ...], gpus: int | None) -> None:
-    """Checks the seeds that are trained one after the other, by one process: ranks have not been tried with several.
-
-    Raises:
-        ValueError: one is out of range or named twice, or there are several processes.
-    """
+    """Checks the seeds that are trained one after the other, by one process: ranks have not been tried with several."""
     for seed in seeds:
         check_int("each of seeds", seed, SEED)
     if twice := [seed for seed in seeds if seeds.count(seed) > 1]:

@@ -68,11 +68,7 @@ class Ground:
 
 
 def _grid(boxes: np.ndarray) -> tuple[Grid | None, np.ndarray]:
-    """Returns the grid of boxes ``(count, 5)``, and the boxes over each cell.
-
-    Raises:
-        ValueError: they are too many.
-    """
+    """Returns the grid of boxes ``(count, 5)``, and the boxes over each cell."""
     if not len(boxes):
         return None, np.zeros((1, 0), dtype=int)
     if len(boxes) >= MOST_BOXES:

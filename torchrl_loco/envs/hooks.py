@@ -230,11 +230,7 @@ class Hooks:
         self._declare_noise_and_history()
 
     def _declare_noise_and_history(self) -> None:
-        """Takes ``noise`` and ``history`` of the class.
-
-        Raises:
-            ValueError: one names no term or group, or is out of range.
-        """
+        """Takes ``noise`` and ``history`` of the class."""
         env = self._env()
         assert env is not None
         seen = {name: sizes or {name: 0} for name, sizes in self.terms.items() if name != CRITIC}
@@ -282,11 +278,7 @@ class Hooks:
         return False
 
     def _groups(self, arrays: Arrays, steps: int = 0) -> dict[str, torch.Tensor]:
-        """Returns the present observation by group, if a hook makes it: its terms joined in their order, with noise.
-
-        Raises:
-            ValueError: a group has a name that it cannot have.
-        """
+        """Returns the present observation by group, if a hook makes it: its terms joined in their order, with noise."""
         if "observation" not in self.own:
             return {}
         view = self.view(self.catalog, arrays, "observation", steps)
@@ -347,12 +339,7 @@ class Hooks:
     def _rows(
         self, hook: str, arrays: Arrays, known: Mapping[str, Entry], *, by_world: bool = True
     ) -> dict[str, torch.Tensor]:
-        """Returns the new rows that a hook returns, if it is the task's own, by name, each of full shape.
-
-        Raises:
-            TypeError: it returns no rows by name, or one of another type.
-            ValueError: a name is unknown, or a row has the wrong shape.
-        """
+        """Returns the new rows that a hook returns, if it is the task's own, by name, each of full shape."""
         rows = self._call(hook, arrays, steps=0 if hook == "begin" else 1) if hook in self.own else None
         if rows is None:
             return {}

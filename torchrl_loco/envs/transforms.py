@@ -99,11 +99,7 @@ def load_transforms(env: EnvBase, states: Mapping[str, Any]) -> None:
 
 
 def _copied(value: Any, device: torch.device | None = None) -> Any:
-    """Returns a copy of tensors, numbers and text in dictionaries.
-
-    Raises:
-        TypeError: something else is among them.
-    """
+    """Returns a copy of tensors, numbers and text in dictionaries."""
     if isinstance(value, torch.Tensor):
         return value.detach().to(device, copy=True)
     if isinstance(value, Mapping):

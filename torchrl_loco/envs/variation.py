@@ -57,11 +57,7 @@ class Change:
 
 
 def _ids(vary: Vary, elements: Elements) -> list[int]:
-    """Returns the ids of the elements that a Vary names; of a field of the model, ``[0]``.
-
-    Raises:
-        ValueError: one is not there, or does not have such a number.
-    """
+    """Returns the ids of the elements that a Vary names; of a field of the model, ``[0]``."""
     m, kind = elements.mj_model, FIELDS[vary.field].of
     if not kind:
         return [0]
@@ -208,11 +204,7 @@ class Variation(Varied):
     # What they may become.
 
     def _check(self) -> None:
-        """Checks the numbers at all combinations of least and greatest draws, between which they lie.
-
-        Raises:
-            ValueError: one is impossible.
-        """
+        """Checks the numbers at all combinations of least and greatest draws, between which they lie."""
         bits: list[list[int]] = []  # of each draw, which bit of a combination it takes
         for i, change in enumerate(self._changes):
             touched = self._touched(change)
@@ -232,11 +224,7 @@ class Variation(Varied):
         return {(name.replace("biasprm", "gainprm"), index // FIELDS[name].size) for name, index in change.places}
 
     def _check_change(self, change: Change, numbers: np.ndarray) -> None:
-        """Checks the numbers ``(combinations, count)`` of what a Vary changes.
-
-        Raises:
-            ValueError: one is impossible.
-        """
+        """Checks the numbers ``(combinations, count)`` of what a Vary changes."""
         valid = FIELDS[change.vary.field].valid
         if valid in ("rising", "inertia"):
             name = change.vary.field

@@ -291,11 +291,7 @@ class View:
         self.lost[gave_nan] = self.lost[gave_nan] | lost if gave_nan in self.lost else lost
 
     def _by_warp(self, name: str) -> torch.Tensor:
-        """Returns what the Warp function of the class has made in this step, its ``observation`` or ``reward``.
-
-        Raises:
-            NotImplementedError: the class has none.
-        """
+        """Returns what the Warp function of the class has made in this step, its ``observation`` or ``reward``."""
         if self._catalog.warp_outputs is None:
             raise NotImplementedError(f"no class above this one has {name}(self, s)")
         self._catalog.arrays.add("warp")
@@ -428,12 +424,7 @@ class View:
         return self._scanned(asked, (len(rows),))
 
     def _id(self, kind: str, name: str) -> int:
-        """Returns the id of the one element that a name or a regular expression matches.
-
-        Raises:
-            KeyError: it matches none.
-            ValueError: it matches several.
-        """
+        """Returns the id of the one element that a name or a regular expression matches."""
         ids, _ = self._catalog.ids(kind, _one(kind, name))
         if len(ids) > 1:
             raise ValueError(f"name one {kind}: {name!r} matches {len(ids)}")
@@ -460,11 +451,7 @@ class View:
         return self._array(name)
 
     def _make_room(self, count: int, *, eyes: bool) -> None:
-        """Checks that so many more numbers of each world fit into memory, with what eyes need to find them.
-
-        Raises:
-            MemoryError: they do not.
-        """
+        """Checks that so many more numbers of each world fit into memory, with what eyes need to find them."""
         catalog = self._catalog
         catalog.bytes_scanned += 4 * COPIES_IN_HOOKS * count + (bytes_placed(catalog.mj_model) if eyes else 0)
         check_memory(catalog.num_envs * catalog.bytes_scanned, catalog.num_envs, catalog.device)

@@ -248,11 +248,7 @@ def _squashed(bound: float | None, last: Any) -> list[nn.Module]:
 
 
 def _first_half(last: nn.Module) -> nn.Module:
-    """Returns the layer that gives the first half of what a last layer gives: the means.
-
-    Raises:
-        TypeError: it is no linear one.
-    """
+    """Returns the layer that gives the first half of what a last layer gives: the means."""
     if not isinstance(last, nn.Linear):
         raise TypeError(
             f"the network must end in a Linear that gives means and deviations, not in {type(last).__name__}"
@@ -266,11 +262,7 @@ def _first_half(last: nn.Module) -> nn.Module:
 
 @torch.no_grad()
 def _check_that_they_agree(policy: Policy, actor: ProbabilisticActor) -> None:
-    """Compares a policy with the actor that it was made of, on the CPU and on random observations.
-
-    Raises:
-        RuntimeError: their actions differ by more than rounding does.
-    """
+    """Compares a policy with the actor that it was made of, on the CPU and on random observations."""
     observation = random_observations(policy.module, 64, 2.0)
     network, last = copy.deepcopy(actor[0].module).cpu(), actor[-1]  # as a module it would import pandas
     expected = last.distribution_class(*network(observation), **last.distribution_kwargs).deterministic_sample

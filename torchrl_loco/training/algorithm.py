@@ -359,11 +359,7 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
 
 
 def _copy(own: nn.Module, other: nn.Module, source: Path, *, last: bool) -> None:
-    """Copies the weights of a layer; the last of an actor also gives what a policy does not have: its deviations.
-
-    Raises:
-        ValueError: they have other sizes.
-    """
+    """Copies the weights of a layer; the last of an actor also gives what a policy does not have: its deviations."""
     mine, theirs = own.state_dict(), other.state_dict()
     for name, values in theirs.items():
         fits = name in mine and mine[name].shape[1:] == values.shape[1:]

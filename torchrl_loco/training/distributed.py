@@ -299,11 +299,7 @@ def _device() -> torch.device:
 
 @contextlib.contextmanager
 def _peers() -> Iterator[None]:
-    """Turns a failed exchange into a RankLostError, its usual cause.
-
-    Raises:
-        RankLostError: it failed.
-    """
+    """Turns a failed exchange into a RankLostError, its usual cause."""
     try:
         yield
     except RuntimeError as error:

@@ -181,11 +181,7 @@ class Environments:
 
 
 def _refuse_further_arguments(cls: type[LocoEnv]) -> None:
-    """Refuses a class that takes arguments of its own: worlds for evaluations are made anew, without their values.
-
-    Raises:
-        ValueError: it does.
-    """
+    """Refuses a class that takes arguments of its own: worlds for evaluations are made anew, without their values."""
     known = inspect.signature(LocoEnv.__init__).parameters
     kinds = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     parameters = inspect.signature(cls.__init__).parameters.values()

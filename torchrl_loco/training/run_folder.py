@@ -33,11 +33,7 @@ def _as_json(config: TrainingConfig) -> bytes:
 
 
 def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
-    """Returns the columns of a CSV file and its rows, without those that a crash or a full disk has cut.
-
-    Raises:
-        ValueError: a row has more columns than the head.
-    """
+    """Returns the columns of a CSV file and its rows, without those that a crash or a full disk has cut."""
     rows = csv.DictReader(path.read_text().split("\n")[:-1] if path.exists() else [])
     columns, found = list(rows.fieldnames or ()), [dict[Any, Any](row) for row in rows]
     if longer := [row for row in found if None in row]:

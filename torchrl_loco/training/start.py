@@ -92,11 +92,7 @@ def train(
 def _config(
     task: Any, config: TrainingConfig | None, algorithm: str | type[Algorithm] | None, settings: dict[str, Any]
 ) -> TrainingConfig:
-    """Returns the settings of a new run.
-
-    Raises:
-        ValueError: ``config`` is of another task or algorithm, or ``settings`` names something else.
-    """
+    """Returns the settings of a new run."""
     name = algorithm.config_type.algorithm if isinstance(algorithm, type) else algorithm
     if config is None:
         return preset(task, settings.pop("device", None), name, **settings)
@@ -110,11 +106,7 @@ def _config(
 
 
 def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
-    """Returns the settings that follow from an environment that is made already.
-
-    Raises:
-        ValueError: ``settings`` has another value for one.
-    """
+    """Returns the settings that follow from an environment that is made already."""
     base, _ = unwrapped(env)
     own: dict[str, Any] = {"num_envs": base.num_envs, "device": str(base.device), "protocol": base.protocol}
     own |= {"episode_length": base.config.episode_length}
@@ -135,11 +127,7 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_same(run: RunFolder, env: EnvBase) -> None:
-    """Checks that a run that is resumed goes on in an environment as that in which it was begun.
-
-    Raises:
-        ValueError: it has another protocol, other options, or sees other pixels.
-    """
+    """Checks that a run that is resumed goes on in an environment as that in which it was begun."""
     stored = dataclasses.asdict(run.load_config())
     found = {"options": {}, **_settings_of(env, {})}
     for name in ("protocol", "options", "from_pixels", "camera", "size", "frame_stack"):
@@ -148,11 +136,7 @@ def _check_same(run: RunFolder, env: EnvBase) -> None:
 
 
 def _resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
-    """Returns the run that is to be continued.
-
-    Raises:
-        ValueError: it is of another task.
-    """
+    """Returns the run that is to be continued."""
     run = resume if isinstance(resume, RunFolder) else RunFolder(Path(resume))
     named, of = task_name(task, by_user=True), run.load_config().task
     moved = is_place(named) and is_place(of) and named.rpartition(":")[2] == of.rpartition(":")[2]

@@ -442,11 +442,7 @@ class Trainer:
             self.algorithm.generator.set_state(own["generator"].cpu())
 
     def _say_what_changes(self, ranks_before: int) -> None:
-        """Prints what a run gets that was trained by another number of ranks.
-
-        Raises:
-            ValueError: what remains is less than a batch of so many ranks.
-        """
+        """Prints what a run gets that was trained by another number of ranks."""
         if self.frames >= self.last_frame:
             raise ValueError(
                 f"only {self.config.total_frames - self.frames} frames remain, less than a batch of "

@@ -39,11 +39,7 @@ class Value:
     world: int | None
 
     def rowwise(self, dims: Iterable[int]) -> list[int]:
-        """Returns dimensions as numbers from 0, none of which may be that of the worlds.
-
-        Raises:
-            CannotFuse: one is that.
-        """
+        """Returns dimensions as numbers from 0, none of which may be that of the worlds."""
         ndim = self.array.ndim
         found = [dim % ndim for dim in dims] if ndim else []  # a number has none, though torch lets one name 0
         if self.world in found:
@@ -119,11 +115,7 @@ class Program:
     # Nodes and values.
 
     def node(self, text: str, dtype: torch.dtype, *args: Node, number: Any = None, place: Any = None) -> Node:
-        """Returns a number, a new one if there is none like it.
-
-        Raises:
-            CannotFuse: there are too many.
-        """
+        """Returns a number, a new one if there is none like it."""
         if text == WHERE and args[1] is args[2]:
             return args[1]
         if text in OF_INTEGERS and dtype != torch.float32:
@@ -155,11 +147,7 @@ class Program:
         return np.asarray(made, dtype=object)
 
     def value(self, x: Any) -> Value:
-        """Returns an operand as a value: a number or a constant tensor, or what already is one.
-
-        Raises:
-            CannotFuse: it is nothing of these.
-        """
+        """Returns an operand as a value: a number or a constant tensor, or what already is one."""
         if isinstance(x, Value):
             return x
         if isinstance(x, bool | int | float):
@@ -177,11 +165,7 @@ class Program:
         return Value(array, x.dtype, None)
 
     def cast(self, x: Any, dtype: torch.dtype) -> Value:
-        """Returns an operand as a value of a type.
-
-        Raises:
-            CannotFuse: there is no such type of C++ here.
-        """
+        """Returns an operand as a value of a type."""
         x = self.value(x)
 
         def convert(node: Node) -> Node:
@@ -196,11 +180,7 @@ class Program:
         return Value(np.asarray(np.frompyfunc(convert, 1, 1)(x.array), dtype=object), dtype, x.world)
 
     def source(self, tensor: torch.Tensor, world: int | None) -> Value:
-        """Returns a tensor that is read from memory, and whose changes are written there.
-
-        Raises:
-            CannotFuse: it is too large, or of another type.
-        """
+        """Returns a tensor that is read from memory, and whose changes are written there."""
         key = tensor.data_ptr(), tuple(tensor.shape), tensor.stride(), tensor.dtype
         if key not in self._sources:
             if tensor.dtype not in TYPES or tensor.numel() > (MOST_NUMBERS * (1 if world is None else self._n)):
@@ -221,11 +201,7 @@ class Program:
         return self.node(f"p{index}_{by_world}[{offset}]", dtype, place=(index, offset, by_world))
 
     def aligned(self, *operands: Any) -> tuple[list[Value], int | None]:
-        """Returns operands with the same number of dimensions, and where the worlds are.
-
-        Raises:
-            CannotFuse: they are in different places.
-        """
+        """Returns operands with the same number of dimensions, and where the worlds are."""
         values = [self.value(x) for x in operands]
         ndim = max(x.array.ndim for x in values)
         places = [None if x.world is None else x.world + ndim - x.array.ndim for x in values]
@@ -245,11 +221,7 @@ class Program:
         return result, world
 
     def _by_world(self, array: np.ndarray, world: int) -> np.ndarray:
-        """Returns what each world takes of a tensor that has a row for each.
-
-        Raises:
-            CannotFuse: its rows are not those of the worlds.
-        """
+        """Returns what each world takes of a tensor that has a row for each."""
         rows = np.moveaxis(array, world, 0)
         made = np.empty(rows.shape[1:], dtype=object)
         for at in np.ndindex(*made.shape):
@@ -279,11 +251,7 @@ class Program:
         return self.apply(WHERE, dtype, mask, a, b, of=(torch.bool, dtype, dtype))
 
     def numbers(self, x: Any) -> np.ndarray:
-        """Returns constants as numbers: for indices.
-
-        Raises:
-            CannotFuse: they are known only when the kernel runs.
-        """
+        """Returns constants as numbers: for indices."""
         if isinstance(x, torch.Tensor):
             return x.numpy()
         values = np.empty(x.array.shape, dtype=bool if x.dtype == torch.bool else int)
@@ -295,11 +263,7 @@ class Program:
         return values
 
     def table(self, x: Any) -> tuple[int, int, list[int], torch.dtype]:
-        """Returns where a tensor without worlds is in memory: its index, first element and steps, and its type.
-
-        Raises:
-            CannotFuse: it is computed when the kernel runs.
-        """
+        """Returns where a tensor without worlds is in memory: its index, first element and steps, and its type."""
         if isinstance(x, torch.Tensor | Huge):
             tensor = x.tensor if isinstance(x, Huge) else x
             return self._index_of(tensor), 0, list(tensor.stride()), tensor.dtype
@@ -316,11 +280,7 @@ class Program:
         return first[0], first[1], steps, x.dtype
 
     def _index_of(self, x: torch.Tensor) -> int:
-        """Returns the index of a constant among the tensors: of what is on the device already, or of a copy there.
-
-        Raises:
-            CannotFuse: its numbers are of another type than those of kernels.
-        """
+        """Returns the index of a constant among the tensors: of what is on the device already, or of a copy there."""
         key = x.data_ptr(), tuple(x.shape), x.stride(), x.dtype
         if key not in self._tables:
             if x.dtype not in TYPES:
@@ -339,11 +299,7 @@ class Program:
     # The graph.
 
     def run(self, graph: torch.fx.Graph, constants: Callable[[str], torch.Tensor]) -> Source:
-        """Returns the C++ of a graph.
-
-        Raises:
-            CannotFuse: it cannot be written so.
-        """
+        """Returns the C++ of a graph."""
         inputs, found = iter(self._arrays.items()), dict[torch.fx.Node, Any]()
         for node in graph.nodes:
             if node.op == "placeholder":
@@ -418,11 +374,7 @@ class Program:
         target.array[...] = source.array
 
     def _source(self) -> Source:
-        """Returns the C++ that computes what has changed, and writes it.
-
-        Raises:
-            CannotFuse: it cannot be written by one thread a world.
-        """
+        """Returns the C++ that computes what has changed, and writes it."""
         stores: list[tuple[Node, Node]] = []
         for _, value, before in self._sources.values():
             for old, new in zip(before.flat, value.array.flat, strict=True):

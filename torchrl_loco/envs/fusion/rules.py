@@ -132,11 +132,7 @@ def _clamp(p: Program, x: Value, min: Any = None, max: Any = None) -> Value:
 
 
 def _filler(number: Any, p: Program, *args: Any, **kwargs: Any) -> Value:
-    """Returns a new tensor: one with a row for each world is one of worlds.
-
-    Raises:
-        CannotFuse: it is of another type.
-    """
+    """Returns a new tensor: one with a row for each world is one of worlds."""
     like, dtype, shape = args[0] if args else None, p._meta.dtype, list(p._meta.shape)
     number = (kwargs.get("fill_value", args[-1]) if args else kwargs["fill_value"]) if number is None else number
     if dtype not in TYPES or not isinstance(number, bool | int | float):
@@ -177,11 +173,7 @@ def _view(p: Program, x: Any, *args: Any, **kwargs: Any) -> Value:
 
 
 def _seen(op: Any, p: Program, x: Value, *args: Any, **kwargs: Any) -> Any:
-    """Returns the view, or views, that an operator of torch makes of a value: strides tell what has gone where.
-
-    Raises:
-        CannotFuse: it is of a part of the worlds, which differ.
-    """
+    """Returns the view, or views, that an operator of torch makes of a value: strides tell what has gone where."""
     array, step = x.array, x.array.itemsize
     shape, steps = list(array.shape), [stride // step for stride in array.strides]
     if x.world is not None:
@@ -236,11 +228,7 @@ def _stack(p: Program, tensors: Sequence[Any], dim: int = 0) -> Any:
 
 
 def _pick(p: Program, columns: Sequence[Any], index: Value) -> Value:
-    """Returns of several values that of an index, which may be counted from the end.
-
-    Raises:
-        CannotFuse: there are many.
-    """
+    """Returns of several values that of an index, which may be counted from the end."""
     if len(columns) > LONG:
         raise CannotFuse(f"{{op}} chooses among {len(columns)} numbers")
     index, first = p.cast(index, torch.int64), p.value(columns[0])

@@ -204,11 +204,7 @@ def span(tensor: torch.Tensor) -> int:
 
 
 def _check_overlap(tensors: Sequence[torch.Tensor], used: list[int], written: set[int]) -> None:
-    """Checks that what is written is read nowhere else.
-
-    Raises:
-        CannotFuse: it is.
-    """
+    """Checks that what is written is read nowhere else."""
 
     def ends(index: int) -> tuple[int, int]:
         first, tensor = tensors[index].data_ptr(), tensors[index]
