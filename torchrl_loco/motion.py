@@ -327,33 +327,19 @@ def expand(place: Path | str) -> list[Path]:
 
 @dataclasses.dataclass(frozen=True)
 class Frames:
-    """Motions as tables, one after the other, a frame for each control step.
+    """Motions as tables, one after the other, a frame for each control step; velocities are in the world's frame."""
 
-    Attributes:
-        names: of the clips.
-        first: first frame of each clip, ``(clips,)``.
-        last: last frame of each, ``(clips,)``.
-        weights: of each, ``(clips,)``.
-        qpos: poses, ``(frames, nq)``, and
-        qvel: velocities as MuJoCo has them, ``(frames, nv)``.
-        pos: positions of bodies (m), ``(frames, bodies, 3)``.
-        mat: their orientations, ``(frames, bodies, 3, 3)``.
-        lin: their velocities (m/s), world frame, ``(frames, bodies, 3)``.
-        ang: their angular velocities (rad/s), world frame, ``(frames, bodies, 3)``.
-        said: what is to be said of the motions, by name.
-    """
-
-    names: tuple[str, ...]
-    first: np.ndarray
+    names: tuple[str, ...]  # of the clips
+    first: np.ndarray  # frame of each clip, (clips,)
     last: np.ndarray
     weights: np.ndarray
-    qpos: np.ndarray
+    qpos: np.ndarray  # poses and velocities as MuJoCo has them, (frames, nq) and (frames, nv)
     qvel: np.ndarray
-    pos: np.ndarray
-    mat: np.ndarray
-    lin: np.ndarray
-    ang: np.ndarray
-    said: Mapping[str, list[str]]
+    pos: np.ndarray  # of bodies (m), (frames, bodies, 3)
+    mat: np.ndarray  # their orientations, (frames, bodies, 3, 3)
+    lin: np.ndarray  # their velocities (m/s), (frames, bodies, 3)
+    ang: np.ndarray  # their angular velocities (rad/s), (frames, bodies, 3)
+    said: Mapping[str, list[str]]  # what is to be said of the motions, by name
 
     @classmethod
     def of(cls, motions: Sequence[Motion], m: mujoco.MjModel, bodies: Sequence[str], dt: float) -> "Frames":

@@ -28,19 +28,12 @@ GROUP = "torchrl_loco.envs"
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """An environment that :func:`make` knows.
+    """An environment that :func:`make` knows."""
 
-    Attributes:
-        target: where its class is, as ``"module:Class"``.
-        summary: what the task asks for, in a sentence; empty for a plug-in: its class docstring is used.
-        distribution: name and version of the distribution that a plug-in comes from; empty for the others.
-        cls: the class, if it was registered at run time.
-    """
-
-    target: str
-    summary: str = ""
-    distribution: str = ""
-    cls: "type[LocoEnv] | None" = None
+    target: str  # where its class is, as "module:Class"
+    summary: str = ""  # what the task asks for, in a sentence; empty for a plug-in: its class docstring is used
+    distribution: str = ""  # name and version of the distribution that a plug-in comes from; empty for the others
+    cls: "type[LocoEnv] | None" = None  # if it was registered at run time
 
 
 OURS = {id: Entry(f"{task.module}:{task.name}", task.summary) for id, task in tasks.found().items()}

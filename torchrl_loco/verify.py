@@ -224,29 +224,17 @@ def _begins_alike(env: LocoEnv, conditions: Conditions) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How a policy did, by episode.
+    """How a policy did, by episode: each array is ``(n,)``."""
 
-    Attributes:
-        fell: whether it terminated, ``(n,)``.
-        steps: control steps until then or to the end, ``(n,)``.
-        returns: what it earned, ``(n,)``.
-        sums: by term of the reward and by metric, what it summed up to, and over how many control steps, ``(n,)`` each.
-        delay: control steps by which actions were late, ``(n,)``.
-        is_fixed: whether it had one command throughout, ``(n,)``.
-        steps_of_episode: control steps of a whole one.
-        metrics: names of the metrics.
-        cases: names of the cases that the episodes play in turn.
-    """
-
-    fell: np.ndarray
-    steps: np.ndarray
+    fell: np.ndarray  # whether it terminated
+    steps: np.ndarray  # control steps until then or to the end
     returns: np.ndarray
-    sums: dict[str, tuple[np.ndarray, np.ndarray]]
-    delay: np.ndarray
-    is_fixed: np.ndarray
-    steps_of_episode: int
+    sums: dict[str, tuple[np.ndarray, np.ndarray]]  # of terms and metrics, and over how many control steps
+    delay: np.ndarray  # control steps by which actions were late
+    is_fixed: np.ndarray  # whether it had one command throughout
+    steps_of_episode: int  # control steps of a whole one
     metrics: tuple[str, ...]
-    cases: tuple[str, ...]
+    cases: tuple[str, ...]  # names of those that the episodes play in turn
 
     def by_case(self) -> dict[str, dict[str, Any]]:
         """Returns the figures of each case that was played, as :meth:`of` has them."""

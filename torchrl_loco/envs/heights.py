@@ -22,21 +22,13 @@ FEW, MOST_CELLS, MOST_BOXES = 6, 4_000_000, 2**24
 
 @dataclasses.dataclass(frozen=True)
 class Ground:
-    """What a ray from above can meet.
+    """What a ray from above can meet."""
 
-    Attributes:
-        plane: height of the highest level plane (m).
-        fields: the height fields.
-        boxes: centers along x and y, half sizes along both, and tops (m), ``(count + 1, 5)``; the last is none.
-        grid: the cells that name the boxes; ``None`` without boxes.
-        cells: the boxes over each cell, ``(cells, most)``, the number of the last one where there are fewer.
-    """
-
-    plane: float
+    plane: float  # height of the highest level plane (m)
     fields: list[Field]
-    boxes: np.ndarray
-    grid: Grid | None
-    cells: np.ndarray
+    boxes: np.ndarray  # centers along x and y, half sizes along both, tops (m), (count + 1, 5); the last is none
+    grid: Grid | None  # the cells that name the boxes, if there are any
+    cells: np.ndarray  # the boxes over each cell, (cells, most), the number of the last one where there are fewer
 
     @classmethod
     def of(cls, m: mujoco.MjModel) -> "Ground":

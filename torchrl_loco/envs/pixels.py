@@ -25,24 +25,15 @@ DEPTHS = Interval(0, float("inf"))
 
 @dataclasses.dataclass(frozen=True)
 class Pixels:
-    """What an environment returns of a camera.
+    """What an environment returns of a camera."""
 
-    Attributes:
-        camera: number of the camera.
-        width, height: of the pixels.
-        kinds: what is drawn, of :data:`torchrl_loco.eyes.tracer.KINDS`.
-        far: greatest depth (m).
-        stack: how many of the last pictures in colour an entry holds, the newest last.
-        only: whether the groups of the observation are left out.
-    """
-
-    camera: int
+    camera: int  # its number
     width: int
     height: int
-    kinds: tuple[str, ...]
-    far: float
-    stack: int
-    only: bool
+    kinds: tuple[str, ...]  # what is drawn, of torchrl_loco.eyes.tracer.KINDS
+    far: float  # greatest depth (m)
+    stack: int  # how many of the last pictures in colour an entry holds, the newest last
+    only: bool  # whether the groups of the observation are left out
 
     @classmethod
     def checked(

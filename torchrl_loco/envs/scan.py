@@ -24,46 +24,29 @@ NONE = wp.constant(wp.float32(NOTHING))
 
 @dataclasses.dataclass(frozen=True)
 class ScanRequest:
-    """A scan that hooks have asked for.
-
-    Attributes:
-        body: the body.
-        points: where its points are, ahead of the body and to its left (m).
-    """
+    """A scan that hooks have asked for."""
 
     body: int
-    points: tuple[tuple[float, float], ...]
+    points: tuple[tuple[float, float], ...]  # ahead of the body and to its left (m)
 
 
 @dataclasses.dataclass(frozen=True)
 class DepthRequest:
-    """What a camera sees, for which hooks have asked.
-
-    Attributes:
-        camera: the camera.
-        width, height: how many pixels.
-        far: greatest depth (m).
-    """
+    """What a camera sees, for which hooks have asked."""
 
     camera: int
     width: int
     height: int
-    far: float
+    far: float  # greatest depth (m)
 
 
 @dataclasses.dataclass(frozen=True)
 class RayRequest:
-    """Rays from a site, for which hooks have asked.
-
-    Attributes:
-        site: the site.
-        directions: in its frame, of length 1.
-        far: greatest distance (m).
-    """
+    """Rays from a site, for which hooks have asked."""
 
     site: int
-    directions: tuple[tuple[float, float, float], ...]
-    far: float
+    directions: tuple[tuple[float, float, float], ...]  # in its frame, of length 1
+    far: float  # greatest distance (m)
 
 
 Request = ScanRequest | DepthRequest | RayRequest

@@ -11,14 +11,9 @@ DTYPES = (torch.float32, torch.int32, torch.int64, torch.bool)
 
 
 class Entry(NamedTuple):
-    """An entry of ``memory`` or ``shared``.
+    """An entry of ``memory`` or ``shared``."""
 
-    Attributes:
-        shape: of a row of a world, or of what worlds share.
-        dtype: its type.
-    """
-
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # of a row of a world, or of what worlds share
     dtype: torch.dtype
 
 

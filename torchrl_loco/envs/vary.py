@@ -13,24 +13,14 @@ HOWS = ("scale", "add", "set")
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """What a field of the model is.
+    """What a field of the model is."""
 
-    Attributes:
-        of: kind of the elements that have it, as ``names`` of them are given; empty if the model has it.
-        size: numbers of an element.
-        unit: their unit.
-        meaning: what they are.
-        valid: ``"positive"`` (0 stays allowed where the model has it), ``"not negative"``, ``"finite"``, ``"rising"``
-            or ``"inertia"``.
-        drawn: which numbers of an element ``add`` and ``set`` change by default; those of a group by one draw.
-    """
-
-    of: str
-    size: int
+    of: str  # kind of the elements that have it, as their names are given; empty if the model has it
+    size: int  # numbers of an element
     unit: str
     meaning: str
-    valid: str = "finite"
-    drawn: tuple[tuple[int, ...], ...] = ((0,),)
+    valid: str = "finite"  # or positive (0 stays allowed where the model has it), not negative, rising, inertia
+    drawn: tuple[tuple[int, ...], ...] = ((0,),)  # what add and set change by default; those of a group by one draw
 
 
 EACH_OF_THREE = ((0,), (1,), (2,))

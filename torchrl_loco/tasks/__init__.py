@@ -13,19 +13,12 @@ from typing import NamedTuple
 
 
 class Task(NamedTuple):
-    """Where a task is, and what it asks for.
-
-    Attributes:
-        module: the module of its class.
-        name: the name of its class.
-        summary: the first line of the docstring of its class.
-        has_options: whether a class of its module declares options.
-    """
+    """Where the class of a task is, and what it asks for."""
 
     module: str
     name: str
-    summary: str
-    has_options: bool
+    summary: str  # the first line of its docstring
+    has_options: bool  # whether a class of its module declares options
 
 
 @functools.cache

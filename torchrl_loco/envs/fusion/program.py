@@ -26,17 +26,11 @@ FILLERS = ("empty", "empty_like", "empty_strided", "full", "full_like")
 
 @dataclass
 class Value:
-    """A tensor of nodes.
+    """A tensor of nodes."""
 
-    Attributes:
-        array: nodes, of the tensor's shape, but that the dimension of the worlds counts what each of them has there.
-        dtype: type of the tensor.
-        world: dimension of the worlds; ``None`` if there is none.
-    """
-
-    array: Any
+    array: Any  # of the tensor's shape, but that the dimension of the worlds counts what each of them has there
     dtype: torch.dtype
-    world: int | None
+    world: int | None  # dimension of the worlds, if there is one
 
     def rowwise(self, dims: Iterable[int]) -> list[int]:
         """Returns dimensions as numbers from 0, none of which may be that of the worlds."""
@@ -81,9 +75,7 @@ class Program:
     """A traced graph as C++.
 
     Args:
-        arrays: what it is called with.
-        num_envs: number of worlds.
-        device: where they live.
+        arrays: what it is called with; of ``num_envs`` worlds on ``device``.
         rules: by operator's name without overload, a function of the program and the operator's arguments.
         fixed: tensors that never change: they are constants, and can be indices and tables.
         long: rows of a user's tensor from which it is taken for one of the worlds, if there are as many worlds.
