@@ -3,7 +3,7 @@
 import difflib
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mujoco
@@ -32,24 +32,6 @@ class Catalog(Elements):
     """What is the same at every step: the model's names, its numbers as tensors, and what hooks have asked for.
 
     It keeps no reference to the environment.
-
-    Attributes:
-        ctrl_dt: time of a control step (s).
-        bounded: whether actions are clipped to [-1, 1].
-        variation: which numbers of the model differ from world to world, if any do.
-        arrays: names of the arrays that hooks have read.
-        sensors: ids of the sensors that only an engine can evaluate.
-        contact_geoms: ids of the geoms whose contacts were asked for, in the order of the engine's columns.
-        scans: the scans of the ground, depths and rays that were asked for, by the name of their array.
-        bytes_scanned: memory that they take in a world.
-        scanning: by hook, the names of those that it reads.
-        sensor_address: where a sensor's numbers begin in ``sensordata``, by its id.
-        constants: the task's tables by name.
-        starts: what entries of ``shared`` begin with, by name, where it is not zero.
-        warp_outputs: size of the observation of the class's Warp function; ``None`` if it has none.
-        draws_states: whether a Warp function or a table of the class begins its episodes.
-        complete: whether all that hooks ask for is known: what else they ask for later is refused.
-        home: home pose, ``(nq,)``: the keyframe ``home`` if there is one, else ``qpos0``.
     """
 
     def __init__(
@@ -58,21 +40,21 @@ class Catalog(Elements):
         super().__init__(mj_model)
         self.num_envs: int = env.num_envs
         self.device: torch.device = env.device
-        self.variation: Variation | None = env.variation
+        self.variation: Variation | None = env.variation  # which numbers of the model differ from world to world
         self.memory, self.shared, self.constants = dict(memory), dict(shared), dict[str, torch.Tensor]()
         self.ctrl_dt, self.bounded = env.config.ctrl_dt, env.action_range != (-math.inf, math.inf)
-        self.starts: dict[str, torch.Tensor] = {}
-        self.warp_outputs: int | None = None
-        self.draws_states = False
-        self.arrays: set[str] = set()
-        self.sensors: set[int] = set()
-        self.contact_geoms: list[int] = []
-        self.scans: dict[str, Request] = {}
-        self.bytes_scanned = 0
-        self.scanning: dict[str, set[str]] = {}
-        self.complete = False
-        self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}
-        self.home = self._tensor(models.home_pose(mj_model))
+        self.starts: dict[str, torch.Tensor] = {}  # what entries of shared begin with, where it is not zero
+        self.warp_outputs: int | None = None  # size of the observation of the class's Warp function, if it has one
+        self.draws_states = False  # whether a Warp function or a table of the class begins its episodes
+        self.arrays: set[str] = set()  # those that hooks have read
+        self.sensors: set[int] = set()  # ids of those that only an engine can evaluate
+        self.contact_geoms: list[int] = []  # ids of those whose contacts were asked for: the engine's columns
+        self.scans: dict[str, Request] = {}  # the scans, depths and rays that were asked for, by their array
+        self.bytes_scanned = 0  # memory that they take in a world
+        self.scanning: dict[str, set[str]] = {}  # by hook, the names of those that it reads
+        self.complete = False  # whether all that hooks ask for is known: what else they ask for later is refused
+        self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}  # in sensordata
+        self.home = self._tensor(models.home_pose(mj_model))  # (nq,)
         self._index: dict[tuple[int, ...], torch.Tensor] = {}
         self._constants: dict[Any, torch.Tensor] = {}
         self._tables: dict[Any, torch.Tensor] = {}
@@ -100,13 +82,9 @@ class Catalog(Elements):
             self._index[key] = torch.tensor(ids, device=self.device)
         return values.index_select(1, self._index[key])
 
-    def constant(self, field: str, ids: Sequence[int] | None = None) -> torch.Tensor:
-        """Returns numbers of a field of the model, float32, of the elements ``ids`` or of all."""
-        key = field, None if ids is None else tuple(ids)
-        if key not in self._constants:
-            values = constant_of(self.mj_model, field)
-            self._constants[key] = self._tensor(values if ids is None else values[list(ids)])
-        return self._constants[key]
+    def constant(self, field: str) -> torch.Tensor:
+        """Returns the numbers of a field of the model, float32."""
+        return self.derived(field, lambda: constant_of(self.mj_model, field))
 
     def field(self, name: str, numbers: Callable[[], torch.Tensor]) -> torch.Tensor:
         """Returns a field in all worlds, ``(num_envs, *shape)``; one that varies, by their ``numbers()``."""
@@ -316,13 +294,11 @@ class View:
 
     def linvel(self, bodies: Names) -> torch.Tensor:
         """Returns velocities of the origins of bodies in the world's frame (m/s), shaped as :meth:`xpos`."""
-        ids, one = self._catalog.ids("body", bodies)
-        return sensors.linear_velocity(self, ids, one)
+        return sensors.linear_velocity(self, *self._catalog.ids("body", bodies))
 
     def angvel(self, bodies: Names) -> torch.Tensor:
         """Returns angular velocities of bodies in the world's frame (rad/s), shaped as :meth:`xpos`."""
-        ids, one = self._catalog.ids("body", bodies)
-        return sensors.angular_velocity(self, ids, one)
+        return sensors.angular_velocity(self, *self._catalog.ids("body", bodies))
 
     def site_xpos(self, sites: Names) -> torch.Tensor:
         """Returns positions of sites (m), shaped as :meth:`xpos`."""
@@ -425,7 +401,9 @@ class View:
 
     def _id(self, kind: str, name: str) -> int:
         """Returns the id of the one element that a name or a regular expression matches."""
-        ids, _ = self._catalog.ids(kind, _one(kind, name))
+        if not isinstance(name, str):
+            raise TypeError(f"name one {kind}, got {name!r}")
+        ids, _ = self._catalog.ids(kind, name)
         if len(ids) > 1:
             raise ValueError(f"name one {kind}: {name!r} matches {len(ids)}")
         return ids[0]
@@ -440,8 +418,10 @@ class View:
         name = next((name for name, other in scans.items() if other == asked), f"scan.{len(scans)}")
         if not self._catalog.complete:
             if name not in scans:
-                scans[name] = asked
-                self._make_room(math.prod(shape), eyes=not isinstance(asked, ScanRequest))
+                scans[name], catalog = asked, self._catalog
+                of_eyes = 0 if isinstance(asked, ScanRequest) else bytes_placed(catalog.mj_model)
+                catalog.bytes_scanned += 4 * COPIES_IN_HOOKS * math.prod(shape) + of_eyes
+                check_memory(catalog.num_envs * catalog.bytes_scanned, catalog.num_envs, catalog.device)
             self._catalog.scanning.setdefault(self._hook, set()).add(name)
             if isinstance(asked, ScanRequest):
                 _ = self._catalog.ground  # which may refuse
@@ -449,12 +429,6 @@ class View:
         if name not in self._catalog.scanning.get(self._hook, ()):
             raise ValueError(f"{self._hook}() did not ask for this scan when it was first called: it is not computed")
         return self._array(name)
-
-    def _make_room(self, count: int, *, eyes: bool) -> None:
-        """Checks that so many more numbers of each world fit into memory, with what eyes need to find them."""
-        catalog = self._catalog
-        catalog.bytes_scanned += 4 * COPIES_IN_HOOKS * count + (bytes_placed(catalog.mj_model) if eyes else 0)
-        check_memory(catalog.num_envs * catalog.bytes_scanned, catalog.num_envs, catalog.device)
 
     def geom_xpos(self, geoms: Names) -> torch.Tensor:
         """Returns positions of the centers of geoms (m), shaped as :meth:`xpos`."""
@@ -503,7 +477,7 @@ class View:
         and torque at a site, and velocity and angular momentum of a subtree, by the engine. Any other is refused where
         the task is made.
         """
-        (sensor,), _ = self._catalog.ids("sensor", _one("sensor", name))
+        sensor = self._id("sensor", name)
         derived = sensors.evaluate(self, sensor)
         if derived is not None:
             return derived
@@ -564,12 +538,6 @@ class View:
             )
         first, self._drawn = self._drawn, self._drawn + count
         return draws.mix(self._stream + self._catalog.places(first, count))
-
-
-def _one(kind: str, name: Any) -> str:
-    if not isinstance(name, str):
-        raise TypeError(f"name one {kind}, got {name!r}")
-    return name
 
 
 def usable(action: torch.Tensor, bounded: bool) -> torch.Tensor:
