@@ -228,7 +228,6 @@ class Recording:
 
     Attributes:
         carried: what the next batch begins with, at an address that stays.
-        world: the worlds that are stepped.
         works: whether it was replayed at least once.
     """
 

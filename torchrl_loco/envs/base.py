@@ -303,12 +303,9 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         return self._outputs(with_reward=True)
 
     def _step_part(self, tensordict: TensorDictBase, action: torch.Tensor, part: torch.Tensor) -> TensorDictBase:
-        """Steps the worlds of a mask ``(num_envs,)``.
+        """Returns the results of a step of the worlds of a mask ``(num_envs,)``; of the others, what they began with.
 
         The worlds cannot be stepped apart: the others are stepped too, without control, and put back.
-
-        Returns:
-            The results of the step, of the other worlds what they began with and no reward.
         """
         before, held = self.get_state(), ~part.to(self.device)
         self.world.step(action.masked_fill(held.unsqueeze(-1), 0.0))
@@ -340,9 +337,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
     def _outputs(self, *, with_reward: bool = False, unrewarded: torch.Tensor | None = None) -> TensorDict:
         """Returns a copy of what the kernels wrote: the buffers themselves change at the next step.
 
-        Args:
-            with_reward: whether the reward is in it.
-            unrewarded: worlds ``(*batch, 1)`` whose terms of the reward, and metrics, are zero.
+        Terms of the reward, and metrics, are zero in the worlds ``unrewarded``, ``(*batch, 1)``.
         """
         outputs, batch = self.world.outputs, self.batch_size
         *groups, reward, terms, metrics, flags = outputs.parts(outputs.memory.clone())

@@ -30,12 +30,8 @@ def stream(
 ) -> torch.Tensor:
     """Returns where the stream of a hook begins in each world, int64 ``(num_envs, 1)``.
 
-    Args:
-        seed: the seed, int64 ``(1,)``.
-        world: index of the world among all workers', int64 ``(num_envs,)``.
-        episode: episodes begun, int ``(num_envs,)``.
-        step: control steps since the world's reset, int ``(num_envs,)``.
-        hook: name of the hook: a draw that is added to one changes no other.
+    The seed is int64 ``(1,)``; world (its index among all workers'), episodes begun and control steps since the reset
+    are integers ``(num_envs,)``. A draw that is added to one hook changes no other.
     """
     start = mix(seed + ((zlib.crc32(hook.encode()) >> 1) << 32))
     for part in (world, episode, step):

@@ -50,11 +50,7 @@ def _noting(cls: Any) -> type:
 
 @contextlib.contextmanager
 def reads_of(env: Any) -> Iterator[set[str]]:
-    """Notes which attributes of an environment are read, by whom does not matter.
-
-    Yields:
-        Their names, in full at the end.
-    """
+    """Yields the names of the attributes of an environment that are read, by whomever, in full at the end."""
     found, cls = set[str](), type(env)
     env.__dict__["_noted"] = found
     object.__setattr__(env, "__class__", _noting(cls))
@@ -71,20 +67,6 @@ class Hooks:
     If there are any, they are called once when this is made, in worlds at rest in the home pose, which tells what they
     return and what of the physics they ask for. No reference that would keep the environment alive is kept.
 
-    Attributes:
-        own: names of the hooks.
-        catalog: the model's names, and what the hooks ask for.
-        groups: shape of a row of each tensor of the observation, by name; empty if a Warp function observes.
-        terms: by group, the sizes of its terms by name, in their order; empty for one that has no names.
-        history: how many of the last observations a group has, by name, where it is more than one.
-        term_names: names of the terms of the reward; ``None`` if a Warp function rewards.
-        metric_names: names of the metrics.
-        moves: whether ``events`` changes qpos or qvel.
-        carried: names of the entries of memory that begin an episode from what the last one left of them: a level.
-        read: by hook, the attributes of the environment that it reads.
-        commands: in worlds to play with, the commands that can be set: their values, ``(num_envs, *row)``, and in which
-            worlds they are, bool ``(num_envs,)``.
-
     Raises:
         TypeError: a hook returns something of the wrong type.
         ValueError: a hook returns something of the wrong shape, name or value.
@@ -97,7 +79,7 @@ class Hooks:
     def __init__(self, env: Any, mj_model: mujoco.MjModel) -> None:
         self._env = weakref.ref(env)
         self._title = type(env).__name__
-        self.own = own_hooks(type(env))
+        self.own = own_hooks(type(env))  # their names
         if models.has_home(mj_model) and not draws_states(type(env)):
             self.own |= {"begin"}
         self._substeps, (memory, shared) = env.config.substeps, declared(type(env))
@@ -113,22 +95,22 @@ class Hooks:
         if not env.with_metrics:
             self.own -= {"metrics"}
         kept: dict[str, Any] = {"device": env.device}
-        self.commands = {
+        self.commands = {  # those that can be set, in worlds to play with: their values, and in which worlds they are
             entry: (torch.zeros(env.num_envs, *memory[entry].shape, **kept), torch.zeros(env.num_envs, **kept) > 0)
             for entry in (env.command_ranges if env.play else ())
         }
-        self.groups: dict[str, tuple[int, ...]] = {}
-        self.terms: dict[str, dict[str, int]] = {}
-        self.history: dict[str, int] = {}
+        self.groups: dict[str, tuple[int, ...]] = {}  # shapes of rows; empty if a Warp function observes
+        self.terms: dict[str, dict[str, int]] = {}  # by group, sizes of its terms in their order, if they have names
+        self.history: dict[str, int] = {}  # by group, how many of the last ones it has, where it is more than one
         self._shapes: dict[tuple[str, str], tuple[int, ...]] = {}
         self._noise_scale = env.noise_scale
         self._noise: dict[tuple[str, str], tuple[float, str | None]] = {}
-        self.term_names: tuple[str, ...] | None = None
+        self.term_names: tuple[str, ...] | None = None  # those of the reward; None if a Warp function rewards
         self.metric_names: tuple[str, ...] = ()
-        self.moves = False
-        self.carried: tuple[str, ...] = ()
+        self.moves = False  # whether events changes qpos or qvel
+        self.carried: tuple[str, ...] = ()  # entries of memory that begin from what the last episode left: a level
         self._pose = {"qpos": Entry((mj_model.nq,), torch.float32), "qvel": Entry((mj_model.nv,), torch.float32)}
-        self.read: dict[str, set[str]] = {}
+        self.read: dict[str, set[str]] = {}  # by hook, the attributes of the environment that it reads
         if self.own:
             with torch.no_grad():
                 self._probe(self._at_home())

@@ -74,10 +74,9 @@ class Part:
 
     @torch.no_grad()
     def compile(self, num_envs: int, device: wp.Device) -> bool:
-        """Makes a kernel of it, or on CUDA what torch.compile makes; if it can be neither, logs why.
+        """Returns whether a kernel is made of it, which :meth:`record` completes once it is compiled.
 
-        Returns:
-            Whether :meth:`record` is to follow, once kernels are compiled.
+        Else torch.compile makes something on CUDA, or the log says why it stays as it is.
         """
         try:
             with no_collection():  # an environment that is dropped meanwhile computes, which would be traced too

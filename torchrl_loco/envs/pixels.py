@@ -146,11 +146,7 @@ class Seen:
             self.stack.copy_(torch.cat([self.stack[..., 3:], self.eye.rgb], dim=-1))
 
     def begin(self, kept: bool = False) -> None:
-        """Begins anew in the worlds in which episodes begin, with what was drawn of them.
-
-        Args:
-            kept: whether earlier pictures stay where there are any: those of a state that was restored.
-        """
+        """Begins anew in the worlds of the mask with what was drawn; ``kept`` leaves earlier pictures, if any."""
         if self.count > 1:
             masked, begun = self._mask.torch.view(-1, 1, 1, 1), self.eye.rgb.repeat(1, 1, 1, self.count)
             if kept:  # but the newest, as the state may have been changed

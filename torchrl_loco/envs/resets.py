@@ -23,9 +23,7 @@ class QuickResets(EnvBase):
     ) -> tuple[TensorDictBase, TensorDictBase]:
         """Returns what TorchRL's method returns; for a plain TensorDict, after a third of the work on the host.
 
-        Args:
-            tensordict: has an ``action``, batch ``(num_envs,)``.
-            rewritten: entries that the next step need not begin with.
+        The next step need not begin with the entries ``rewritten``.
         """
         if not self._is_plain(tensordict):
             return super()._step_and_maybe_reset(tensordict)
@@ -57,14 +55,7 @@ class QuickResets(EnvBase):
         )
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Resets the worlds that are done, without reading from the device.
-
-        Args:
-            tensordict: what ``step_mdp`` makes of a step, batch ``(num_envs,)``.
-
-        Returns:
-            The same, batch ``(num_envs,)``, with new episodes in the worlds that were done.
-        """
+        """Returns what :func:`reset_done_worlds` does, without reading from the device."""
         return reset_done_worlds(self, tensordict)
 
 
@@ -76,16 +67,15 @@ def rows_of(mask: torch.Tensor, entry: torch.Tensor) -> torch.Tensor:
 def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:
     """Does what TorchRL's ``maybe_reset`` does, without reading from the device.
 
-    The result is the same. What is left out is TorchRL's check that no world is done after its reset; the environments
-    of this package cannot be.
+    What is left out is TorchRL's check that no world is done after its reset; the environments of this package cannot
+    be.
 
     Args:
         env: an environment of this package, or one around it.
         tensordict: what ``step_mdp`` makes of a step, batch ``(num_envs,)``.
 
     Returns:
-        The same TensorDict, batch ``(num_envs,)``, with the first observation of the next episode in the worlds that
-        were done.
+        The same, with the first observation of the next episode in the worlds that were done.
     """
     mask, batch = tensordict.get("done").clone(), tensordict.batch_size
     request = TensorDict({"_reset": mask}, batch_size=batch, device=tensordict.device)

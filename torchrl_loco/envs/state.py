@@ -59,16 +59,7 @@ class State(TensorDict):
         return State(copies, batch_size=[count], device=self.device)
 
     def select(self, *keys: Any, inplace: bool = False, strict: bool = True) -> TensorDictBase:
-        """Selects ``keys``, and the state if ``"_reset"`` is among them.
-
-        Args:
-            keys: names of entries.
-            inplace: whether to remove the others instead of making a new TensorDict.
-            strict: whether a key that is not there raises a KeyError.
-
-        Returns:
-            The selection, batch ``(num_envs,)``.
-        """
+        """Returns what TensorDict's own does of ``keys``, and the state if ``"_reset"`` is among them."""
         state = [key for key in self.KEYS if key in self] if "_reset" in keys else []
         return super().select(*keys, *state, inplace=inplace, strict=strict)
 

@@ -119,14 +119,7 @@ class TransformedEnv(TorchRLTransformedEnv):
     """
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Resets the worlds that are done; see :func:`reset_done_worlds`.
-
-        Args:
-            tensordict: what ``step_mdp`` makes of a step, batch ``(num_envs,)``.
-
-        Returns:
-            The same, batch ``(num_envs,)``, with new episodes in the worlds that were done.
-        """
+        """Returns what ``step_mdp`` makes of a step, with new episodes in the worlds that were done."""
         env: EnvBase = self
         while isinstance(env, TorchRLTransformedEnv):
             if not resets_by_mask(env.transform):

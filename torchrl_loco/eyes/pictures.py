@@ -20,11 +20,7 @@ GHOST_COLOR = (0.2, 0.75, 0.35)
 
 
 def with_ghost(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Returns a model with its first body once more, which touches nothing: its positions follow those of the model.
-
-    Args:
-        spec: the model, which stays as it is.
-    """
+    """Returns a model with its first body once more, which touches nothing: its positions follow those of the model."""
     seen, other = spec.copy(), spec.copy()
     for geom in other.geoms:
         geom.contype = geom.conaffinity = 0

@@ -131,15 +131,9 @@ def bytes_placed(m: mujoco.MjModel) -> int:
 class Placed:
     """The shapes of a model as they lie before a camera, or before where rays begin, in each of several worlds.
 
-    Args:
-        m: the model.
-        device: where.
-        mounts: what holds the camera and the lights.
-        worlds: how many worlds.
+    ``mounts`` tells what holds the camera and the lights.
 
     Attributes:
-        shapes: the shapes.
-        has_meshes: whether there are triangles among them.
         camera: its frame in the world.
         lights: where they are, and against what they shine, in the camera's frame.
         placed: origin and axes of the camera in the frame of each shape.
@@ -158,12 +152,9 @@ class Placed:
             self.bounds = wp.empty(size, dtype=wp.vec4)
 
     def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array | None) -> None:
-        """Launches what places them, on Warp's current stream.
+        """Launches what places them in the worlds of a mask, ``None`` for all, on Warp's current stream.
 
-        Args:
-            xpos: positions of the bodies (m), ``(worlds or more, nbody)``.
-            xmat: their orientations.
-            mask: the worlds; ``None`` is all.
+        ``xpos`` and ``xmat`` are positions (m) and orientations of the bodies, ``(worlds or more, nbody)``.
         """
         here, camera = [mask, xpos, xmat], [self._pos, self.camera]
         for kernel, dim, inputs, outputs in (

@@ -40,13 +40,7 @@ def cast(
 class Rays:
     """Rays from a site, in each of several worlds of a model.
 
-    Args:
-        m: the model.
-        device: where.
-        site: where they begin, and whose frame that of their directions is.
-        directions: of length 1, ``(count, 3)``.
-        worlds: how many worlds.
-        far: greatest distance (m).
+    Their directions are in the frame of the site, of length 1, ``(count, 3)``; ``far`` is the greatest distance (m).
 
     Attributes:
         distance: how far what they meet lies, or ``far`` (m), ``(worlds, count)``.

@@ -46,9 +46,6 @@ class Tracer(TorchDispatchMode):
     """Notes each operator while it runs.
 
     A result bears its node as an attribute, which is dropped with it: all results together may not fit in memory.
-
-    Attributes:
-        arrays: what the graph takes, in this order.
     """
 
     def __init__(self, arrays: dict[str, torch.Tensor]) -> None:
