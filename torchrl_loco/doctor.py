@@ -36,16 +36,13 @@ class Finding:
 
 
 def diagnose(body: str = "walker") -> Iterator[Finding]:
-    """Looks at versions, devices and the kernel cache, and tests the physics of a body on each device.
+    """Yields what it finds of versions, devices and the kernel cache, and of the physics of a body on each device.
 
     The self-test of a body plays 20 random control steps in 4 worlds, each step also in C MuJoCo, which computes in
     double precision, from the same state.
 
     Args:
         body: the body, or a task, which may be ``file.py:Class``; ``"all"`` takes every body, those of plug-ins too.
-
-    Yields:
-        What was found, line by line.
 
     Raises:
         ValueError: there is no such body or task.
@@ -116,12 +113,9 @@ def _describe_cache() -> str:
 
 
 def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) -> dict[str, tuple[int, int]]:
-    """Measures the ``njmax`` and ``naconmax`` that a task needs under MuJoCo-Warp, with limits far above the need.
+    """Returns the most ``njmax`` and ``naconmax`` that a task needs under MuJoCo-Warp, and the advised values.
 
     Actions are random, the same in every call. Other actions, a trained policy's for one, may need more.
-
-    Returns:
-        For each setting the most that was needed and the advised value.
     """
     limits = {"njmax": 1000, "naconmax": 200 * num_envs}
     env = make(task, num_envs, device, seed=0, world_offset=0, on_overflow="raise", engine="mujoco_warp", **limits)

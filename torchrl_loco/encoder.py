@@ -76,13 +76,9 @@ class PixelEncoder(nn.Module):
 
 
 def shifted(pixels: torch.Tensor, most: int) -> torch.Tensor:
-    """Returns pixels, each picture moved by up to ``most`` pixels either way in both directions.
+    """Returns pixels ``(n, height, width, channels)``, each picture moved by up to ``most`` of them each way at random.
 
     Its edges are repeated (Kostrikov et al., 2020, arXiv 2004.13649).
-
-    Args:
-        pixels: ``(n, height, width, channels)``.
-        most: the largest shift.
     """
     n, height, width, _ = pixels.shape
     by = torch.randint(-most, most + 1, (2, n, 1), device=pixels.device)

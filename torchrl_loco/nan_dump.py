@@ -158,11 +158,7 @@ def mujoco_trace(dump: NanDump) -> np.ndarray:
 
 
 def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterator[str]:
-    """Describes where the world was, what is wrong with it, and the results of the step in Warp and in C MuJoCo.
-
-    Yields:
-        Lines of text.
-    """
+    """Yields lines: where the world was, what is wrong with it, and the results of the step in Warp and in C MuJoCo."""
     settings = dump.settings
     env = settings["env"].split(".")[-1]
     yield (

@@ -343,11 +343,7 @@ def _pushes(env: LocoEnv, generator: np.random.Generator, steps: int, scale: flo
 
 
 def _fix_commands(env: LocoEnv, info: dict[str, Any]) -> np.ndarray:
-    """Lets the first half of the worlds have one command throughout, if the task says which.
-
-    Returns:
-        In which worlds, ``(n,)``.
-    """
+    """Lets half of the worlds have one command throughout, if the task says which; returns in which, ``(n,)``."""
     n, fixed = env.num_envs, type(env).fixed_commands(info)
     is_fixed = np.arange(n) < (n // 2 if fixed else 0)
     for entry, rows in fixed.items():

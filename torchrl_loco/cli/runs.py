@@ -17,12 +17,7 @@ from torchrl_loco.registry import task_name
 
 
 def train(options: Any, args: list[str]) -> None:
-    """Trains what the options of the command say.
-
-    Args:
-        options: the settings, as :func:`torchrl_loco.cli.options.task_options` types them.
-        args: of the command line.
-    """
+    """Trains what the options say, typed by :func:`torchrl_loco.cli.options.task_options`, or as in ``args``."""
     with user_errors():
         if {"--seed", "--seeds"} <= {arg.partition("=")[0] for arg in args}:
             raise ValueError("--seed trains one seed, --seeds several: pass one of them")

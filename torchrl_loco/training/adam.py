@@ -70,11 +70,7 @@ class FlatAdam:
 
     @torch.no_grad()
     def clipped_step(self, max_norm: float) -> Tensor:
-        """Averages the gradients over the ranks, clips them to a norm, and makes a step.
-
-        Returns:
-            The norm before, a scalar.
-        """
+        """Averages the gradients over the ranks, clips them to a norm and makes a step; returns the norm before."""
         gradients = [vectors.gradient() for vectors in self._vectors]
         distributed.average(gradients)
         norms = [gradient.norm() for gradient in gradients]
@@ -112,11 +108,7 @@ class FlatAdam:
 
 
 class Vectors:
-    """Parameters one after the other, and what Adam keeps of them, as vectors of one length.
-
-    Args:
-        parameters: the parameters, which become views.
-        betas: decay of the moments.
+    """Parameters one after the other, which become views, and what Adam keeps of them, as vectors of one length.
 
     Raises:
         TypeError: they are of another type than single precision.
@@ -231,13 +223,9 @@ def step_of_adam(
 
 
 def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
-    """Launches a kernel on torch's current stream, or adds it to what torch records.
+    """Launches a kernel of ``dim`` threads on torch's current stream, or adds it to what torch records.
 
-    Args:
-        kernel: the kernel.
-        dim: its threads.
-        inputs: numbers, and tensors on one device, which it reads.
-        outputs: tensors that it writes.
+    It reads ``inputs``, numbers and tensors on one device, and writes the tensors ``outputs``.
     """
     init_warp()
     device = wp.device_from_torch(outputs[0].device)

@@ -105,11 +105,7 @@ class Algorithm(ABC):
         del env
 
     def make_optimizer(self, name: str, parameters: Iterable[Any]) -> FlatAdam:
-        """Makes an optimizer of ``parameters`` or groups, whose learning rate recorded steps follow.
-
-        Returns:
-            The optimizer, which is kept as ``optimizers[name]``.
-        """
+        """Returns ``optimizers[name]``, which it makes of ``parameters`` or groups; recorded steps follow its rate."""
         lr = torch.tensor(self.config.lr, device=self.device)
         self.optimizers[name] = optimizer = FlatAdam(parameters, lr=lr, eps=1e-5)
         return optimizer
@@ -272,11 +268,7 @@ class Acting(TensorDictModuleBase):
 
 
 def clip_and_step(optimizer: FlatAdam | torch.optim.Optimizer, max_norm: float) -> torch.Tensor:
-    """Averages the gradients of an optimizer's parameters over the ranks, clips them to a norm and makes its step.
-
-    Returns:
-        The norm before, a scalar.
-    """
+    """Averages an optimizer's gradients over the ranks, clips them and makes its step; returns their norm before."""
     if isinstance(optimizer, FlatAdam):
         return optimizer.clipped_step(max_norm)
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
@@ -305,10 +297,7 @@ def settings_for_small_networks() -> Iterator[None]:
 class Packed:
     """A copy of steps whose entries lie one after the other in rows of bytes.
 
-    One kernel shuffles them: a row costs it the same however long.
-
-    Args:
-        steps: entries of any type, batch ``(n,)``.
+    One kernel shuffles them: a row costs it the same however long. Entries are of any type, batch ``(n,)``.
     """
 
     def __init__(self, steps: TensorDictBase) -> None:
@@ -381,15 +370,9 @@ def start_compiler() -> None:
 
 
 def compiled(function: Callable[..., Any], what: str, **settings: Any) -> Callable[..., Any]:
-    """Returns a function that torch.compile makes of another one, as a whole and for one shape, at the first call.
+    """Returns what torch.compile makes of a function of tensors, as a whole and for one shape, at the first call.
 
-    Args:
-        function: a function of tensors, or a module.
-        what: its name in the error.
-        settings: further ones of ``torch.compile``.
-
-    Returns:
-        The compiled function, which raises a ``TypeError`` if torch.compile cannot trace it.
+    It raises a ``TypeError`` that names ``what`` if torch.compile cannot trace it.
     """
 
     def call(*args: Any) -> Any:

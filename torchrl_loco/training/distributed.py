@@ -130,11 +130,7 @@ def joined(device: str) -> Iterator[None]:
 
 
 def launch(count: int, args: Sequence[str]) -> None:
-    """Runs the command line in several processes of this machine, as ``torchrun --standalone`` does.
-
-    Args:
-        count: number of processes.
-        args: the arguments of ``torchrl-loco``.
+    """Runs ``torchrl-loco`` in several processes of this machine, as ``torchrun --standalone`` does.
 
     Raises:
         SystemExit: a rank failed; its number is printed.

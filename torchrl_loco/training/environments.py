@@ -82,13 +82,9 @@ def _call_to_resume(run: Path, given: tuple[str, ...]) -> str:
 class Environments:
     """Makes the environments of a run, from its settings or after an environment that was handed in.
 
-    Args:
-        config: the settings of the run.
-        given: an environment of the package, which may be transformed, in which the run trains.
-
     Attributes:
         full_length: control steps of the task's own episodes.
-        transforms: the transforms of the environment that was handed in.
+        transforms: those of the environment that was handed in.
     """
 
     def __init__(self, config: TrainingConfig, given: EnvBase | None = None) -> None:

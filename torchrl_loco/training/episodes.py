@@ -101,12 +101,7 @@ class Episodes:
         return {"sum": self._sum, "steps": self._steps, "whole": self._whole, "window": list(self._window)}
 
     def load_state_dict(self, state: dict[str, Any], running: bool) -> None:
-        """Continues from a ``state`` that :meth:`state_dict` returned.
-
-        Args:
-            state: the state.
-            running: whether the worlds go on as well, and with them their episodes.
-        """
+        """Continues from a ``state`` that :meth:`state_dict` returned; ``running`` episodes, too, if worlds go on."""
         self._window = collections.deque(state["window"])
         if running:
             self._sum, self._steps, self._whole = state["sum"], state["steps"], state["whole"]

@@ -170,16 +170,7 @@ def evaluate_policy(policy: Policy, episodes: int | None = None, seed: int | Non
 def evaluate_run(
     run: RunFolder, episodes: int | None = None, seed: int | None = None, device: str | None = None
 ) -> dict[str, float]:
-    """Evaluates the policy of a run, as :func:`evaluate_policy` does.
-
-    Args:
-        run: the run.
-        episodes: number of episodes; ``None`` takes the run's own setting.
-        seed: seed of the episodes; ``None`` repeats those of the run's last evaluation.
-        device: where to play them; ``None`` takes the device on which the run was trained.
-
-    Returns:
-        Number, mean, standard deviation and extremes of the returns.
+    """Returns what :func:`evaluate_policy` does of the policy of a run; ``device=None`` takes that of its training.
 
     Raises:
         FileNotFoundError: the run has no policy yet.
@@ -259,10 +250,7 @@ def has_display() -> bool:
 def view(policy: PolicyFunc, env: LocoEnv, action_repeat: int = 1) -> None:
     """Shows the first world of an environment in MuJoCo's viewer, in real time, until its window is closed.
 
-    Args:
-        policy: reads ``observation`` and writes ``action``.
-        env: where it plays.
-        action_repeat: frames for which an action is held.
+    Arguments are those of :func:`record`.
     """
     import mujoco.viewer  # needs a display
 

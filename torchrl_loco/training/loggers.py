@@ -19,11 +19,8 @@ PROJECT = "torchrl_loco"
 class Loggers:
     """The loggers of a run, open in a ``with`` block; a resumed run continues what it has logged before.
 
-    A logger that fails later is reported and left out: a run does not end because a server is away.
-
-    Args:
-        run: the run; what loggers store on this machine lies in its folder.
-        frames: frames of the run so far.
+    A logger that fails later is reported and left out: a run does not end because a server is away. What loggers store
+    on this machine lies in the run's folder.
 
     Raises:
         OSError: one cannot be opened, for example because it needs a login.
@@ -149,11 +146,7 @@ OPENERS: dict[str, Callable[[Path, int, str | None], Logger]] = {
 
 
 def _begin(logger: Logger, settings: dict[str, Any]) -> str | None:
-    """Logs the settings.
-
-    Returns:
-        The id by which the logger finds the run again, if it has one.
-    """
+    """Logs the settings; returns the id by which the logger finds the run again, if it has one."""
     if isinstance(logger, WandbLogger):
         logger.log_hparams(settings)
         return logger.experiment.id

@@ -166,11 +166,7 @@ class REPPO(Algorithm):
         return log_prob, *self.critic.value_and_features(of_critic, action)
 
     def critic_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
-        """The critic learns the distribution of returns, and to predict its own features of the next step.
-
-        Returns:
-            Its metrics.
-        """
+        """Returns the metrics of the critic, which learns to predict returns and its own features of the next step."""
         names = self.spaces.critic_key, "action", "returns", "features", "alive"
         loss, aux = self._compiled_critic_losses(*(minibatch[name] for name in names))
         self.critic_optimizer.zero_grad()
@@ -192,11 +188,7 @@ class REPPO(Algorithm):
         return cross_entropy(logits, self.critic.bins.encode(returns)), aux
 
     def actor_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
-        """The actor ascends value and entropy where it is near the old policy, and returns to it where it is not.
-
-        Returns:
-            Its metrics.
-        """
+        """Returns the metrics of the actor: it ascends value and entropy near the old policy, and goes back to it."""
         config, temperature, kl_weight = self.config, self.dual.temperature, self.dual.kl_weight
         names = self.spaces.critic_key, "loc", "scale"
         noise, observation = torch.randn_like(minibatch["loc"]), self.observed(minibatch)

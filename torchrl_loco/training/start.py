@@ -148,17 +148,10 @@ def _resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
 def run_to_end(
     what: TrainingConfig | RunFolder, given: Given, errors: Callable[..., Any] = contextlib.nullcontext, **changes: Any
 ) -> RunFolder:
-    """Trains a new run, or goes on with one, some settings of which have changed.
+    """Returns the folder of a run that it trains: a new one of these settings, or one whose settings it changes.
 
-    Args:
-        what: the settings of a new run, or the run.
-        given: what is handed in as objects.
-        errors: makes a context that tells errors of the user: of any kind until the trainer is made, then of those that
-            it is called with. Others are bugs, which keep their traceback.
-        changes: of the settings of the run.
-
-    Returns:
-        Its folder.
+    ``errors`` makes a context that tells errors of the user: of any kind until the trainer is made, then of those that
+    it is called with. Others are bugs, which keep their traceback.
     """
     with contextlib.ExitStack() as ranks:
         with errors():

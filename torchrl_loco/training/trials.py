@@ -14,12 +14,7 @@ from torchrl_loco.training.config import TrainingConfig
 class Trials:
     """Policies that are trained for the same number of frames, one after the other; the best is then trained on.
 
-    With one trial nothing is compared. All ranks make the same calls.
-
-    Args:
-        config: the run's settings.
-        algorithm: what is trained.
-        frames_per_iteration: frames of a batch, over all ranks; a trial has whole ones.
+    With one trial nothing is compared. All ranks make the same calls. A trial has whole batches.
     """
 
     def __init__(self, config: TrainingConfig, algorithm: Algorithm, frames_per_iteration: int) -> None:
@@ -55,12 +50,7 @@ class Trials:
         return self.running and self.own_frames(frames) >= self._length
 
     def end(self, frames: int, mean: float) -> None:
-        """Ends a trial: the next policy begins, or after the last trial the best one goes on.
-
-        Args:
-            frames: frames of the run.
-            mean: return of the policy in its evaluation.
-        """
+        """Ends a trial whose evaluation had this mean: the next begins, or after the last the best one goes on."""
         if distributed.is_first():
             tqdm.write(f"trial {self.label}: {mean:.1f} after {self.own_frames(frames):,} frames")
         is_best = mean > self._mean

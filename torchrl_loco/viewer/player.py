@@ -14,11 +14,8 @@ HISTORY = 20.0
 class Player:
     """Worlds under a policy, without exploration: worlds whose episode ends begin the next.
 
-    Arguments are those of :class:`torchrl_loco.viewer.viewer.Viewer`.
-
-    Attributes:
-        policy: what acts from the next step on; another one may be set. ``None`` leaves the worlds at the start.
-        steps: control steps taken.
+    Arguments are those of :class:`torchrl_loco.viewer.viewer.Viewer`. Another policy may be set, which acts from the
+    next step on; ``None`` leaves the worlds at the start. ``steps`` counts control steps.
     """
 
     def __init__(self, env: Any, policy: Callable[[Any], Any] | None, action_repeat: int | None = None) -> None:
