@@ -6,6 +6,7 @@ from typing import Any
 
 import mujoco
 import torch
+import warp as wp
 from torchrl.data import Bounded
 
 from torchrl_loco.checks import Interval, check_bool, check_choice, check_float, check_int, checked_size
@@ -132,13 +133,9 @@ class Seen:
         self._sim, self._mask, self.eye, self.count = sim, mask, eye, count
         self.stack = eye.rgb if count == 1 else eye.rgb.repeat(1, 1, 1, count)
 
-    def draw(self) -> None:
-        """Launches what draws all worlds."""
-        self.eye.launch(self._sim.data.xpos, self._sim.data.xmat)
-
-    def draw_begun(self) -> None:
-        """Launches what draws the worlds in which episodes begin."""
-        self.eye.launch(self._sim.data.xpos, self._sim.data.xmat, self._mask.warp)
+    def launch(self, mask: wp.array | None = None) -> None:
+        """Launches what draws the worlds of a mask, all of them for ``None``."""
+        self.eye.launch(self._sim.data.xpos, self._sim.data.xmat, mask)
 
     def append(self) -> None:
         """Adds what was drawn of all worlds."""

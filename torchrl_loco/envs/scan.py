@@ -124,21 +124,17 @@ def scan(
 
 
 class Scans:
-    """The scans, depths and rays that hooks ask for, by name; ``mask`` tells in which worlds episodes begin.
-
-    The ground is asked for only if one scans it.
+    """The scans, depths and rays that hooks ask for, by name. The ground is asked for only if one scans it.
 
     Attributes:
         arrays: of scans, heights of the body above the ground at each point (m), NaN where there is none, ``(nworld,
             points)``; of cameras, depths (m), ``(nworld, height, width)``; of rays, distances (m), ``(nworld, rays)``.
     """
 
-    def __init__(
-        self, sim: "Simulation", asked: Mapping[str, Request], ground: Callable[[], Ground], mask: wp.array
-    ) -> None:
+    def __init__(self, sim: "Simulation", asked: Mapping[str, Request], ground: Callable[[], Ground]) -> None:
         self._eyes = {name: eye_of(sim, one) for name, one in asked.items() if not isinstance(one, ScanRequest)}
         self._asked = {name: one for name, one in asked.items() if isinstance(one, ScanRequest)}
-        self._sim, self._mask = sim, mask
+        self._sim = sim
         self._ground = tables(ground(), sim.device) if self._asked else None
         kept = {name: np.array(one.points, dtype=np.float32) for name, one in self._asked.items()}
         self._points = {name: wp.array(points, dtype=wp.vec2, device=sim.device) for name, points in kept.items()}
@@ -147,15 +143,8 @@ class Scans:
         for name, eye in self._eyes.items():
             self.arrays[name] = eye.depth if isinstance(eye, Eye) else eye.distance
 
-    def all(self) -> None:
-        """Launches them, in all worlds."""
-        self._launch(None)
-
-    def begun(self) -> None:
-        """Launches them, in the worlds in which episodes begin."""
-        self._launch(self._mask)
-
-    def _launch(self, mask: wp.array | None) -> None:
+    def launch(self, mask: wp.array | None = None) -> None:
+        """Launches them in the worlds of a mask, in all of them for ``None``."""
         data = self._sim.data
         for name, one in self._asked.items():
             inputs = [self._ground, one.body, self._points[name], mask, data.xpos, data.xmat]

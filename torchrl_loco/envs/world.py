@@ -21,6 +21,7 @@ from torchrl_loco.envs.body_funcs import check_pair, check_rows, of_package
 from torchrl_loco.envs.hooks import PARTS, Hooks, reads_of
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
+from torchrl_loco.envs.pixels import Seen
 from torchrl_loco.envs.scan import Scans
 from torchrl_loco.envs.state import State
 from torchrl_loco.envs.view import CONTACT_HISTORY
@@ -255,7 +256,7 @@ class World:
     def _make_parts(self, task: "LocoEnv") -> None:
         sim, hooks, own, variation = self.sim, task.hooks, self._own, self._variation
         self._moved = Buffer(task.num_envs, bool, sim.device)
-        self._scans = Scans(sim, hooks.catalog.scans, lambda: hooks.catalog.ground, self.mask.warp)
+        self._scans = Scans(sim, hooks.catalog.scans, lambda: hooks.catalog.ground)
         streams = self._streams(task)
         arrays = {**streams, **self._arrays(hooks), **self._scans.arrays}
 
@@ -292,8 +293,8 @@ class World:
         launches = [self._launch_step, self._launch_reset, *(each.launch for each in kernels)]
         launches += [self._launch_rest] if own or variation else []
         launches += [self._launch_conclude] if own else []
-        launches += [self._scans.all, self._scans.begun] if self._scans.arrays else []
-        launches += [self.seen.draw, self.seen.draw_begun] if self.seen else []
+        launches += self._everywhere_and_begun(self._scans) if self._scans.arrays else []
+        launches += self._everywhere_and_begun(self.seen) if self.seen else []
         sim.compile(*launches, *([self._launch_move] if hooks.moves else []))
         for each in kernels:
             each.record(sim)
@@ -308,17 +309,21 @@ class World:
         self._conclude = sim.capture(self._launch_conclude) if own else _nothing
         self._move = self._keeping_what_was(sim.capture(self._launch_move)) if hooks.moves else _nothing
         if self.seen:
-            self._draw, self._draw_begun = map(sim.capture, (self.seen.draw, self.seen.draw_begun))
+            self._draw, self._draw_begun = map(sim.capture, self._everywhere_and_begun(self.seen))
         self._run_step = self._as_graph("_take_step", several=bool(own or self.seen))
         self._run_reset = self._as_graph("_begin_masked", several=bool(own or self.seen) or variation is not None)
 
     def _scan_first(self, scanning: Collection[str]) -> None:
         """Lets parts whose hooks read scans or depths make them first; in resets, those of the masked worlds."""
-        scans = {False: self.sim.capture(self._scans.all), True: self.sim.capture(self._scans.begun)}
+        everywhere, begun = map(self.sim.capture, self._everywhere_and_begun(self._scans))
         for name, hooks in PARTS.items():
             part = getattr(self, f"_{name}")
             if isinstance(part, Part) and not {*scanning}.isdisjoint(hooks):
-                part.before = scans[name in ("begin", "observe_begun", "observe_restored")]
+                part.before = begun if name in ("begin", "observe_begun", "observe_restored") else everywhere
+
+    def _everywhere_and_begun(self, what: Scans | Seen) -> list[Callable[[], None]]:
+        """Returns the launches of scans or pixels in all worlds, and in those in which episodes begin."""
+        return [what.launch, functools.partial(what.launch, self.mask.warp)]
 
     def _streams(self, task: "LocoEnv") -> dict[str, torch.Tensor]:
         """Returns the arrays that tell where random streams begin, and the numbers of the model that vary."""
