@@ -180,20 +180,11 @@ class Health(Monitor):
 
     def summary(self) -> TensorDict:
         """Returns the counters, without waiting for the device; see :meth:`torchrl_loco.LocoEnv.health`."""
-        names = [*COUNTERS, "non_finite"]
-        counts = self.counts.torch.clone()
-        worlds: dict[str, Any] = dict(zip(names, counts.unbind(1), strict=True))
+        names, counts = [*COUNTERS, "non_finite"], self.counts.torch.clone()
+        kept: dict[str, Any] = {"device": counts.device}
+        worlds = TensorDict(dict(zip(names, counts.unbind(1), strict=True)), batch_size=[len(counts)], **kept)
         total = dict(zip(names, counts.sum(dim=0).unbind(), strict=True))
-        device = counts.device
-        return TensorDict(
-            {
-                "worlds": TensorDict(worlds, batch_size=[len(counts)], device=device),
-                "total": TensorDict(total, batch_size=[], device=device),
-                "peak": TensorDict(self._peaks(), batch_size=[], device=device),
-            },
-            batch_size=[],
-            device=device,
-        )
+        return TensorDict({"worlds": worlds, "total": total, "peak": self._peaks()}, batch_size=[], **kept)
 
 
 # NaN guard: keeps the inputs of the last control step until a world becomes non-finite.
@@ -265,13 +256,8 @@ class NanGuard(Monitor):
         self._kept = {name: wp.zeros_like(array) for name, array in {"action": data.ctrl, **self._inputs}.items()}
         self._first = Buffer(1, int, sim.device)
         self._found = Buffer(1, bool, sim.device)
-        kept = fill(StepInputs, **self._kept)
-        self._guarded = {
-            "first": self._first.warp,
-            "found": self._found.warp,
-            "non_finite": world.non_finite.warp,
-            "kept": kept,
-        }
+        self._guarded = {"first": self._first.warp, "found": self._found.warp, "non_finite": world.non_finite.warp}
+        self._guarded["kept"] = fill(StepInputs, **self._kept)
         super().__init__(1, self._first.torch.device)
         self._reported = False
 
