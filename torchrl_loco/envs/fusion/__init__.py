@@ -3,14 +3,6 @@
 The traced graph is interpreted once on symbols. A tensor of all worlds becomes a NumPy array of nodes, in which the
 dimension of the worlds has size 1; views of tensors are views of such arrays, so that writing to one changes the other.
 What a world does depends on no other world: on neither their number nor their numbers, bit for bit.
-
-===========  =========================================
-``trace``    the graph of a function of tensors
-``nodes``    numbers of a world, and operators on them
-``program``  the interpreter: tensors of nodes
-``rules``    what each operator of torch does, as data
-``source``   the C++ of nodes that are stored
-===========  =========================================
 """
 
 import functools
