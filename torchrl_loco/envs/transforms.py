@@ -67,13 +67,19 @@ def resets_by_mask(transform: Transform) -> bool:
     return True
 
 
-def named_transforms(env: EnvBase) -> dict[str, Transform]:
-    """Returns the transforms of an environment by number and class, the innermost first, those of a Compose singly."""
+def unwrap(env: EnvBase) -> tuple[Any, list[Transform]]:
+    """Returns the environment below transforms, and them, the innermost first."""
     found: list[Transform] = []
     while isinstance(env, TorchRLTransformedEnv):
-        found[:0] = env.transform if isinstance(env.transform, Compose) else [env.transform]
+        found.insert(0, env.transform)
         env = env.base_env
-    return {f"{i} {type(transform).__name__}": transform for i, transform in enumerate(found)}
+    return env, found
+
+
+def named_transforms(env: EnvBase) -> dict[str, Transform]:
+    """Returns the transforms of an environment by number and class, the innermost first, those of a Compose singly."""
+    parts = [one for each in unwrap(env)[1] for one in (each if isinstance(each, Compose) else [each])]
+    return {f"{i} {type(transform).__name__}": transform for i, transform in enumerate(parts)}
 
 
 def state_of_transforms(env: EnvBase) -> dict[str, Any]:
@@ -120,11 +126,8 @@ class TransformedEnv(TorchRLTransformedEnv):
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns what ``step_mdp`` makes of a step, with new episodes in the worlds that were done."""
-        env: EnvBase = self
-        while isinstance(env, TorchRLTransformedEnv):
-            if not resets_by_mask(env.transform):
-                return super().maybe_reset(tensordict)
-            env = env.base_env
+        if not all(map(resets_by_mask, unwrap(self)[1])):
+            return super().maybe_reset(tensordict)
         return reset_done_worlds(self, tensordict)
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
-from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
 from torchrl_loco.config import arguments_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.imagined import showing_states
-from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv, named_transforms
+from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv, named_transforms, unwrap
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
 from torchrl_loco.training import distributed
@@ -206,15 +205,12 @@ def unwrapped(env: EnvBase) -> tuple[LocoEnv, tuple[Transform, ...]]:
         TypeError: there is none.
         ValueError: it has no batch dimension.
     """
-    transforms: list[Transform] = []
-    while isinstance(env, TorchRLTransformedEnv):
-        transforms.insert(0, env.transform)
-        env = env.base_env
-    if not isinstance(env, LocoEnv):
-        raise TypeError(f"train takes a LocoEnv, or one in TransformedEnv, got {type(env).__name__}")
-    if not env.batch_size:
+    base, transforms = unwrap(env)
+    if not isinstance(base, LocoEnv):
+        raise TypeError(f"train takes a LocoEnv, or one in TransformedEnv, got {type(base).__name__}")
+    if not base.batch_size:
         raise ValueError("train takes a batch of worlds: make the environment with num_envs=1 or more, not None")
-    return env, tuple(part for part in transforms if not isinstance(part, Compose) or len(part))
+    return base, tuple(part for part in transforms if not isinstance(part, Compose) or len(part))
 
 
 def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: Any) -> LocoEnv:

@@ -7,10 +7,10 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite
 from torchrl.envs import EnvBase
-from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
 from torchrl_loco.checks import check_choice
 from torchrl_loco.envs import LocoEnv
+from torchrl_loco.envs.transforms import unwrap
 from torchrl_loco.registry import make
 
 RENDER_MODES = ("rgb_array",)
@@ -37,9 +37,7 @@ def made(env: str | type[LocoEnv] | EnvBase, num_envs: int | None, settings: dic
 
 def base_of(env: EnvBase) -> Any:
     """Returns the environment under the transforms."""
-    while isinstance(env, TorchRLTransformedEnv):
-        env = env.base_env
-    return env
+    return unwrap(env)[0]
 
 
 def step_worlds(env: EnvBase, td: TensorDictBase, actions: Any) -> tuple[TensorDictBase, TensorDictBase]:
