@@ -44,23 +44,10 @@ def box(spec: TensorSpec) -> Box:
 class GymnasiumEnv(common.Wrapped, Env):
     """One world as Gymnasium's ``Env``, in NumPy arrays; ``reset()`` begins its next episode.
 
-    For many worlds :class:`GymnasiumVectorEnv` is far quicker.
-
-    Args:
-        env: an id, a class, or an environment of one world that is made already.
-        render_mode: ``"rgb_array"`` if ``render()`` is to return pixels, else ``None``.
-        camera: name of the camera.
-        width: pixels in a row.
-        height: rows.
-        settings: arguments of :func:`torchrl_loco.make`, for an id or a class.
-
-    Attributes:
-        env: the environment.
-        metadata: ``render_modes`` and ``render_fps``, the control steps in a second.
+    For many worlds :class:`GymnasiumVectorEnv` is far quicker, whose arguments and errors it has.
 
     Raises:
-        ValueError: an argument is out of range or unknown, or the environment has several worlds.
-        TypeError: ``env`` is no environment of this package, or has settings though it is made already.
+        ValueError: the environment has several worlds.
     """
 
     def __init__(

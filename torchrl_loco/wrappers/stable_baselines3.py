@@ -20,23 +20,7 @@ class StableBaselines3VecEnv(common.Wrapped, VecEnv):
     The infos of a world that is done have ``terminal_observation``, the true last one, and ``TimeLimit.truncated``,
     whether it was truncated and not terminated.
 
-    Args:
-        env: an id, a class, or an environment that is made already, with TorchRL's transforms or without.
-        num_envs: number of worlds of an id or a class; ``None`` means 1.
-        render_mode: ``"rgb_array"`` if ``render()`` is to return pixels, else ``None``.
-        camera: name of the camera.
-        width: pixels in a row.
-        height: rows.
-        settings: arguments of :func:`torchrl_loco.make`, for an id or a class.
-
-    Attributes:
-        env: the environment.
-        num_envs: number of worlds.
-        metadata: ``render_modes`` and ``render_fps``, the control steps in a second.
-
-    Raises:
-        ValueError: an argument is out of range or unknown, or the environment has no batch of worlds.
-        TypeError: ``env`` is no environment of this package, or has settings though it is made already.
+    Arguments, attributes and errors are those of :class:`.GymnasiumVectorEnv`.
     """
 
     _seeds: list[int | None]
