@@ -1,6 +1,7 @@
 """Checks of user input, one function per kind of argument. Each returns the value in its canonical type.
 
-A message says what is wrong and what is valid.
+A value of another type is a TypeError, one that is not valid a ValueError, unless a docstring names another. A message
+says what is wrong and what is valid.
 """
 
 import dataclasses
@@ -54,12 +55,7 @@ EXTENDED = Interval(-math.inf, math.inf, with_high=True)
 
 
 def check_int(name: str, value: Any, interval: Interval = POSITIVE_INT) -> int:
-    """Returns ``value`` as an int.
-
-    Raises:
-        TypeError: it is no integer.
-        ValueError: it lies outside the interval.
-    """
+    """Returns ``value`` as an int."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -71,12 +67,7 @@ def check_int(name: str, value: Any, interval: Interval = POSITIVE_INT) -> int:
 
 
 def check_float(name: str, value: Any, interval: Interval = POSITIVE) -> float:
-    """Returns ``value`` as a float.
-
-    Raises:
-        TypeError: it is no real number.
-        ValueError: it lies outside the interval, or is NaN.
-    """
+    """Returns ``value`` as a float."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name} must be a number, got {value!r}")
     _check_interval(name, float(value), interval)
@@ -89,11 +80,7 @@ def _check_interval(name: str, value: float, interval: Interval) -> None:
 
 
 def check_pair(name: str, value: Any) -> tuple[float, float]:
-    """Returns two numbers, which may be infinite, of a tuple, a list, an array or a tensor.
-
-    Raises:
-        TypeError: it is something else.
-    """
+    """Returns two numbers, which may be infinite, of a tuple, a list, an array or a tensor."""
     entries = value.tolist() if hasattr(value, "tolist") else value
     if not isinstance(entries, tuple | list) or len(entries) != 2:
         raise TypeError(f"{name} must be two numbers, got {value!r}")
@@ -102,22 +89,14 @@ def check_pair(name: str, value: Any) -> tuple[float, float]:
 
 
 def check_bool(name: str, value: Any) -> bool:
-    """Returns ``value`` as a bool.
-
-    Raises:
-        TypeError: it is neither True nor False.
-    """
+    """Returns ``value`` as a bool."""
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"{name} must be True or False, got {value!r}")
     return bool(value)
 
 
 def check_choice(name: str, value: Any, choices: Collection[str], also: Collection[str] = ()) -> str:
-    """Returns ``value``; of ``also``, such as aliases, the message may suggest names too.
-
-    Raises:
-        ValueError: it is none of the choices.
-    """
+    """Returns ``value``; of ``also``, such as aliases, the message may suggest names too."""
     if not isinstance(value, str) or value not in choices:
         hint = suggestion(str(value), [*choices, *also])
         raise ValueError(f"unknown {name} {value!r}{hint}: choose one of {', '.join(choices)}")
@@ -134,10 +113,6 @@ def check_fields(config: Any, intervals: Mapping[str, Interval]) -> None:
     """Checks the fields of a dataclass that are numbers or flags, and stores them in their canonical type.
 
     It may be frozen and just being made. Fields without an interval are positive.
-
-    Raises:
-        TypeError: a field has the wrong type.
-        ValueError: a field lies outside its interval.
     """
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
@@ -153,11 +128,7 @@ def check_fields(config: Any, intervals: Mapping[str, Interval]) -> None:
 
 
 def check_multiple(name: str, value: float, base_name: str, base: float) -> int:
-    """Returns ``value / base`` as a whole number.
-
-    Raises:
-        ValueError: it is no whole number of at least 1.
-    """
+    """Returns ``value / base`` as a whole number."""
     ratio = round(value / base)
     if ratio < 1 or not math.isclose(value, ratio * base, rel_tol=1e-6):
         raise ValueError(
@@ -167,11 +138,7 @@ def check_multiple(name: str, value: float, base_name: str, base: float) -> int:
 
 
 def check_device(device: "torch.device | str | None") -> "torch.device":
-    """Returns the device with its index; ``None`` stands for CUDA if there is any, else the CPU.
-
-    Raises:
-        ValueError: this machine does not have it; the message names the devices that it has.
-    """
+    """Returns the device with its index; ``None`` stands for CUDA if there is any, else the CPU."""
     import torch  # takes seconds, which the other checks need not wait for
 
     cuda = [f"cuda:{i}" for i in range(torch.cuda.device_count())]
@@ -216,12 +183,7 @@ def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> 
 
 
 def checked_size(size: Any) -> tuple[int, int]:
-    """Returns the width and height of pixels.
-
-    Raises:
-        ValueError: they are not two, or not positive.
-        TypeError: they are no integers.
-    """
+    """Returns the width and height of pixels."""
     if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
         raise ValueError(f"size must be the width and height of pixels, such as (84, 84), got {size!r}")
     return check_int("width", size[0]), check_int("height", size[1])

@@ -270,11 +270,7 @@ class Outcome:
 
 
 def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -> Outcome:
-    """Returns how the policy does in worlds of its task, a world for each episode, beside a progress bar with a label.
-
-    Raises:
-        ValueError: nothing floats that could be pushed.
-    """
+    """Returns how the policy does in worlds of its task, one for each episode, beside a progress bar with a label."""
     n, steps, dt = env.num_envs, env.config.episode_length, env.config.ctrl_dt
     if conditions.seconds is not None:
         steps = min(steps, max(round(conditions.seconds / dt), 1))

@@ -10,11 +10,7 @@ AROUND = 4096
 
 
 def check_pair(method: str, returned: Any) -> tuple[wp.Function, Any]:
-    """Returns what a method of a body returned: a function, and an instance of the ``wp.struct`` that it takes.
-
-    Raises:
-        TypeError: it is something else.
-    """
+    """Returns what a method of a body returned: a function, and an instance of the ``wp.struct`` that it takes."""
     if not isinstance(returned, tuple) or len(returned) != 2:
         raise TypeError(f"{method} must return a wp.func and its inputs, got {returned!r}")
     func, inputs = returned

@@ -105,12 +105,7 @@ class Pixels:
 
 
 def checked_camera(m: mujoco.MjModel, camera: str | int | None) -> int:
-    """Returns the number of a camera; of the first for ``None``.
-
-    Raises:
-        ValueError: the model has no such camera; the message names those that it has.
-        TypeError: ``camera`` has another type.
-    """
+    """Returns the number of a camera; of the first for ``None``."""
     if not m.ncam:
         raise ValueError("pixels need a camera: the model has none")
     if isinstance(camera, str):

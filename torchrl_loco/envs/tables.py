@@ -18,12 +18,7 @@ class Entry(NamedTuple):
 
 
 def entries(cls: type, attribute: str, taken: Collection[str]) -> dict[str, Entry]:
-    """Returns the entries of ``memory`` or ``shared`` that a class declares by name; those ``taken`` they cannot have.
-
-    Raises:
-        TypeError: the attribute is no table of names and shapes or types.
-        ValueError: a name is taken, or a size is less than 1.
-    """
+    """Returns the entries of ``memory`` or ``shared`` that a class declares, by names that are not ``taken``."""
     declared: Any = getattr(cls, attribute)
     title = f"{cls.__name__}.{attribute}"
     if not isinstance(declared, Mapping):
@@ -55,12 +50,7 @@ def entries(cls: type, attribute: str, taken: Collection[str]) -> dict[str, Entr
 
 
 def constants(title: str, declared: Any, taken: Collection[str], device: torch.device) -> dict[str, torch.Tensor]:
-    """Returns the tables of a task on its device, but for names that are taken: floats are float32, integers int64.
-
-    Raises:
-        TypeError: it is no dict, or a table is no array of numbers.
-        ValueError: a name is taken.
-    """
+    """Returns the tables of a task on its device, but for names that are taken: floats are float32, integers int64."""
     if not isinstance(declared, Mapping):
         raise TypeError(f"{title}.constants must be a dict of tables by name, got {declared!r}")
     found = {}

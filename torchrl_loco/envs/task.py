@@ -402,24 +402,14 @@ def draws_by_warp(cls: type[Task]) -> bool:
 
 
 def declared(cls: type[Task]) -> tuple[dict[str, Entry], dict[str, Entry]]:
-    """Returns the entries of ``memory`` and of ``shared`` that a class declares.
-
-    Raises:
-        TypeError: one is no table of names and shapes.
-        ValueError: a name is taken, or a size is less than 1.
-    """
+    """Returns the entries of ``memory`` and of ``shared`` that a class declares."""
     taken = {name for name in vars(View) if not name.startswith("_")}
     memory = entries(cls, "memory", taken)
     return memory, entries(cls, "shared", {*taken, *memory})
 
 
 def check_commands(cls: type[Task], memory: Mapping[str, Entry]) -> None:
-    """Checks the commands that a class with this memory declares.
-
-    Raises:
-        ValueError: there is no such entry, it has another number of numbers, or a range is empty.
-        TypeError: ``command_ranges`` is no table of names and ranges.
-    """
+    """Checks the commands that a class with this memory declares."""
     title, entries = f"{cls.__name__}.command_ranges", cls.command_ranges
     if not isinstance(entries, Mapping) or not all(isinstance(ranges, Mapping) for ranges in entries.values()):
         raise TypeError(f"{title} must be a dict such as {{'command': {{'forward (m/s)': (-1.0, 2.0)}}}}")
@@ -436,12 +426,7 @@ def check_commands(cls: type[Task], memory: Mapping[str, Entry]) -> None:
 
 
 def check_options(cls: type[Task]) -> None:
-    """Checks the options that a class declares.
-
-    Raises:
-        TypeError: they are no table of names, values and words.
-        ValueError: a name is taken.
-    """
+    """Checks the options that a class declares."""
     for name, entry in cls.options.items():
         if not (isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[1], str)):
             raise TypeError(f"{cls.__name__}.options[{name!r}] must be a value and what it is for, got {entry!r}")

@@ -160,11 +160,7 @@ class Vary:
 
 
 def check_randomize(name: str, value: Any) -> tuple[Vary, ...]:
-    """Returns what ``randomize`` names.
-
-    Raises:
-        TypeError: it is no sequence of :class:`Vary`.
-    """
+    """Returns what ``randomize`` names."""
     if not isinstance(value, Sequence) or not all(isinstance(vary, Vary) for vary in value):
         raise TypeError(f"{name} must be a list of torchrl_loco.Vary, got {value!r}")
     return tuple(value)

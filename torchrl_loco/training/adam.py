@@ -108,11 +108,7 @@ class FlatAdam:
 
 
 class Vectors:
-    """Parameters one after the other, which become views, and what Adam keeps of them, as vectors of one length.
-
-    Raises:
-        TypeError: they are of another type than single precision.
-    """
+    """Parameters one after the other, which become views, and what Adam keeps of them, as vectors of one length."""
 
     def __init__(self, parameters: Sequence[nn.Parameter], betas: tuple[float, float]) -> None:
         if others := {str(part.dtype) for part in parameters} - {"torch.float32"}:

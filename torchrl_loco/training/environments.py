@@ -228,11 +228,7 @@ def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: 
 
 
 def refuse_transforms(policy: Policy) -> None:
-    """Refuses a policy that was trained behind transforms.
-
-    Raises:
-        ValueError: it was.
-    """
+    """Refuses a policy that was trained behind transforms."""
     if names := policy.info.get("transforms"):
         raise ValueError(
             f"this policy was trained behind {', '.join(names)}, which its file does not hold: play it in an "

@@ -32,11 +32,7 @@ class Loggers:
         self._open: dict[str, Logger] = {}
 
     def __enter__(self) -> "Loggers":
-        """Returns itself, with all of them open.
-
-        Raises:
-            OSError: one cannot be opened.
-        """
+        """Returns itself, with all of them open."""
         config = self._run.load_config()
         ids = self._run.read_logger_ids()
         for name in config.logger:

@@ -194,11 +194,7 @@ def normalise_of(dtype: torch.dtype) -> wp.Kernel:
 
 @torch.no_grad()
 def normalised(rows: torch.Tensor, norm: ObservationNorm, dtype: torch.dtype, aligned: int) -> torch.Tensor:
-    """Returns what ``norm`` makes of rows of shape ``(..., n)``, with zeros up to a multiple of ``aligned``.
-
-    Raises:
-        ValueError: they have another length.
-    """
+    """Returns what ``norm`` makes of rows of shape ``(..., n)``, with zeros up to a multiple of ``aligned``."""
     norm.check(rows)
     wide = rows.new_empty(*rows.shape[:-1], -(-rows.shape[-1] // aligned) * aligned, dtype=dtype)
     flat, out = rows.reshape(-1, rows.shape[-1]), wide.view(-1, wide.shape[-1])

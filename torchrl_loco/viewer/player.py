@@ -42,11 +42,7 @@ class Player:
 
     @torch.no_grad()
     def step(self) -> None:
-        """Takes a control step in every world.
-
-        Raises:
-            ValueError: there is no policy.
-        """
+        """Takes a control step in every world."""
         if self.policy is None:
             raise ValueError("there is no policy to step the worlds with")
         if self._action is None or self.steps % self.action_repeat == 0:

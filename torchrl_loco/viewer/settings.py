@@ -16,11 +16,7 @@ SHARE = Interval(0, 1, with_low=False, with_high=True)
 
 
 def check_viewer() -> None:
-    """Checks that the extra ``viewer`` is installed.
-
-    Raises:
-        ImportError: it is not; the message says how to install it.
-    """
+    """Checks that the extra ``viewer`` is installed."""
     check_packages("the viewer in the browser", ("viser", "mjviser"), "viewer")
 
 

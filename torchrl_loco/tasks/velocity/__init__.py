@@ -403,11 +403,7 @@ def _some(names: list[str], which: np.ndarray) -> str:
 
 
 def find(table: Mapping[str, float], name: str) -> float:
-    """Returns the entry of the first regular expression that matches a whole name.
-
-    Raises:
-        KeyError: none does.
-    """
+    """Returns the entry of the first regular expression that matches a whole name."""
     for pattern, value in table.items():
         if re.fullmatch(pattern, name):
             return value
