@@ -30,17 +30,8 @@ class REPPO(Algorithm):
 
     config_type = REPPOConfig
     metric_names = (
-        "loss_critic",
-        "loss_aux",
-        "value",
-        "grad_norm_critic",
-        "loss_actor",
-        "kl",
-        "kl_exceeded",
-        "entropy",
-        "temperature",
-        "kl_weight",
-        "grad_norm_actor",
+        *("loss_critic", "loss_aux", "value", "grad_norm_critic"),
+        *("loss_actor", "kl", "kl_exceeded", "entropy", "temperature", "kl_weight", "grad_norm_actor"),
     )
     batch_metric_names = ("return_min", "return_max", "return_clipped")
     config: REPPOConfig
