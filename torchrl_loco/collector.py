@@ -225,10 +225,6 @@ class Recording:
 
     ``take_steps`` takes the steps of a batch that begins with a TensorDict, such as ``carried``; it returns them, and
     what the next begins with. The environment is without transforms.
-
-    Attributes:
-        carried: what the next batch begins with, at an address that stays.
-        works: whether it was replayed at least once.
     """
 
     def __init__(
@@ -238,7 +234,8 @@ class Recording:
         policy: Any,
         env: LocoEnv,
     ) -> None:
-        self.carried, self.world, self.works = carried.clone(), env.world, False
+        self.carried = carried.clone()  # what the next batch begins with, at an address that stays
+        self.world, self.works = env.world, False  # whether it was replayed at least once
         self._policy, self._addresses = policy, addresses(policy)
         self._take_steps, self._taken = take_steps, [carried]
         self._graph = TorchGraph(self._work, env.device)

@@ -46,10 +46,6 @@ class Report:
 class Exported:
     """A policy in an ONNX file that :func:`torchrl_loco.export_policy` wrote, of the task that the user or it names.
 
-    Attributes:
-        facts: what the file says, by name: see :func:`torchrl_loco.export.of_robot`.
-        reads: the entry of an environment that it reads.
-
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: it is no exported policy.
@@ -64,7 +60,7 @@ class Exported:
             self._session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's have no base of their own
             raise ValueError(f"{path} cannot be read as an ONNX file: {error}") from error
-        self.facts: dict[str, Any] = {}
+        self.facts: dict[str, Any] = {}  # what the file says, by name: see torchrl_loco.export.of_robot
         for name, word in self._session.get_modelmeta().custom_metadata_map.items():
             self.facts[name] = word
             with contextlib.suppress(json.JSONDecodeError):  # words are not quoted

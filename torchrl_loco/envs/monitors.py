@@ -127,11 +127,8 @@ DROPPED = ("constraints", "contacts")
 class Health(Monitor):
     """Counts, for each world, the control steps in which something went wrong in the physics.
 
-    What ends a control step counts (:func:`torchrl_loco.envs.episode.finish_step`).
-
-    Attributes:
-        counter_bits: the bits of ``overflow`` that each counter but the last counts.
-        counts: counters of each world; the last counts steps that ended non-finite.
+    What ends a control step counts (:func:`torchrl_loco.envs.episode.finish_step`): bits of ``overflow`` and, last,
+    steps that ended non-finite.
     """
 
     def __init__(self, sim: Simulation, on_overflow: str) -> None:

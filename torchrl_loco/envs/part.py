@@ -40,10 +40,6 @@ class Part:
         arrays: the arrays, by name, at addresses that stay.
         title: names of the task and of its hooks, for messages.
         fixed: tensors that it uses and that never change.
-
-    Attributes:
-        kind: how it runs, ``"kernel"``, ``"torch.compile"`` or ``"plain torch"``.
-        before: makes what it reads, such as scans of the ground.
     """
 
     def __init__(
@@ -58,8 +54,8 @@ class Part:
         self._launch: Callable[[], None] | None = None
         self._traced: torch.fx.GraphModule | None = None  # until its kernel is compared
         self._run: Callable[[], None] = lambda: work(arrays)
-        self.kind = "plain torch"
-        self.before: Callable[[], None] = lambda: None
+        self.kind = "plain torch"  # how it runs, or "kernel" or "torch.compile"
+        self.before: Callable[[], None] = lambda: None  # makes what it reads, such as scans of the ground
 
     @torch.no_grad()
     def __call__(self) -> None:

@@ -115,13 +115,9 @@ def checked_camera(m: mujoco.MjModel, camera: str | int | None) -> int:
 
 
 class Seen:
-    """What is drawn in all worlds, with the pictures before.
+    """What ``eye`` draws in all worlds: ``stack`` has the last ``count`` pictures, the newest last.
 
-    Attributes:
-        eye: what draws.
-        count: how many pictures are kept.
-        stack: the last pictures, uint8 ``(worlds, height, width, 3 * count)``, the newest last; after a reset all are
-            the first one.
+    It is uint8 ``(worlds, height, width, 3 * count)``; after a reset all are the first one.
     """
 
     def __init__(self, sim: Simulation, mask: Buffer, eye: Eye, count: int) -> None:

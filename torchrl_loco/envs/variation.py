@@ -28,12 +28,6 @@ MOST_BITS = 12
 class Change:
     """What a :class:`Vary` does to the numbers of a model. Its random stream depends on ``label``.
 
-    Attributes:
-        places: numbers that it changes, as fields and indices of their flattened arrays.
-        which: of each of them, the index of its draw.
-        signs: of each of them, what an offset or number is multiplied by: -1 for the bias of ``kp`` and ``kv``.
-        group_of: of each draw, the group of numbers of an element that it is for.
-
     Raises:
         ValueError: a name is not in the model, an element does not have such a number, or all of them stay 0.
     """
@@ -42,6 +36,7 @@ class Change:
         m, groups = elements.mj_model, vary.groups
         per_element = [_places(vary.field, m, i) for i in _ids(vary, elements)]
         self.vary, self.label = vary, label
+        # Of each draw, the group of numbers of an element that it is for.
         self.group_of = list(range(len(groups))) * (1 if vary.shared else len(per_element))
         found = [
             ((name, index), group if vary.shared else rank * len(groups) + group, sign)
@@ -53,6 +48,8 @@ class Change:
         ]
         if not found:
             raise ValueError(f"{vary}: {vary.field} is 0 in the model, so nothing is scaled: use how='add' or 'set'")
+        # Numbers that it changes, as fields and indices of their flattened arrays; of each of them the index of its
+        # draw, and what an offset or number is multiplied by: -1 for the bias of kp and kv.
         self.places, self.which, self.signs = map(list, zip(*found, strict=True))
 
 

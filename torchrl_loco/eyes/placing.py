@@ -132,12 +132,6 @@ class Placed:
     """The shapes of a model as they lie before a camera, or before where rays begin, in each of several worlds.
 
     ``mounts`` tells what holds the camera and the lights.
-
-    Attributes:
-        camera: its frame in the world.
-        lights: where they are, and against what they shine, in the camera's frame.
-        placed: origin and axes of the camera in the frame of each shape.
-        bounds: from where to where each can be in the picture.
     """
 
     def __init__(self, m: mujoco.MjModel, device: wp.Device, mounts: Mounts, worlds: int) -> None:
@@ -147,7 +141,9 @@ class Placed:
             self.has_meshes = bool(self._meshes)
             size = worlds, self.shapes.kind.shape[0]
             self._pos, self.camera = wp.empty(worlds, dtype=wp.vec3), wp.empty(worlds, dtype=wp.mat33)
+            # Where they are, and against what they shine, in the camera's frame.
             self.lights = [wp.empty((worlds, mounts.mode.shape[0] - 1), dtype=wp.vec3) for _ in range(2)]
+            # Origin and axes of the camera in the frame of each shape; from where to where each can be in the picture.
             self.placed = [wp.empty(size, dtype=kind) for kind in (wp.vec3, wp.mat33)]
             self.bounds = wp.empty(size, dtype=wp.vec4)
 

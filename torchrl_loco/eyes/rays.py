@@ -40,10 +40,8 @@ def cast(
 class Rays:
     """Rays from a site, in each of several worlds of a model.
 
-    Their directions are in the frame of the site, of length 1, ``(count, 3)``; ``far`` is the greatest distance (m).
-
-    Attributes:
-        distance: how far what they meet lies, or ``far`` (m), ``(worlds, count)``.
+    Their directions are in the frame of the site, of length 1, ``(count, 3)``. ``distance`` tells how far what they
+    meet lies, or ``far`` (m), ``(worlds, count)``.
     """
 
     def __init__(

@@ -237,15 +237,9 @@ def tracer(rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool) -> 
 
 
 class Eye:
-    """A camera in each of several worlds of a model.
+    """A camera, by its name or number, in each of several worlds of a model.
 
     Args:
-        m: the model.
-        device: where.
-        camera: name or number of a camera of the model.
-        width: pixels in a row, at least 1.
-        height: rows, at least 1.
-        worlds: how many worlds.
         kinds: what it tells of each pixel, some of ``KINDS``.
         shadows: whether lights cast shadows.
         samples: rays along each side of a pixel, whose colors are averaged; depth and geoms are of the last.

@@ -79,21 +79,17 @@ def _call_to_resume(run: Path, given: tuple[str, ...]) -> str:
 
 
 class Environments:
-    """Makes the environments of a run, from its settings or after an environment that was handed in.
-
-    Attributes:
-        full_length: control steps of the task's own episodes.
-        transforms: those of the environment that was handed in.
-    """
+    """Makes the environments of a run, from its settings or after an environment that was handed in."""
 
     def __init__(self, config: TrainingConfig, given: EnvBase | None = None) -> None:
         self._config, self._given, self._evaluating = config, given, dict[int, LocoEnv]()
-        self.transforms: tuple[Transform, ...] = ()
+        self.transforms: tuple[Transform, ...] = ()  # those of the environment that was handed in
         if given is None:
             self._task: type[LocoEnv] = resolve(config.task)
             self._protocol: str = config.protocol
             self._arguments = {**config.of_env, "reward_terms": not is_runner(config.task)}
             length = self._task.episode_length
+            # Control steps of the task's own episodes.
             self.full_length = self._task.config.episode_length if length is None else length
         else:
             base, self.transforms = unwrapped(given)

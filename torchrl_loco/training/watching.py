@@ -17,10 +17,8 @@ class Watched:
     """Worlds of a run's task, and the run's newest policy.
 
     That is the one of ``checkpoint.pt`` or of ``policy.safetensors``, whichever was written last. A run that was begun
-    with objects of one's own (:class:`torchrl_loco.training.Given`) has them in no file, so it is the latter.
-
-    Attributes:
-        env: the worlds, without noise and pushes.
+    with objects of one's own (:class:`torchrl_loco.training.Given`) has them in no file, so it is the latter. The
+    worlds, ``env``, are without noise and pushes.
     """
 
     def __init__(self, run: RunFolder, num_envs: int, device: str, seed: int) -> None:

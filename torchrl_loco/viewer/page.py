@@ -78,13 +78,8 @@ class _Server(viser.ViserServer):
 class Page:
     """The page of some worlds, under a title; the next free port serves it if its own is taken.
 
-    ``act`` takes what a click asks for, a function to be called by whoever steps the worlds.
-
-    Attributes:
-        world: index of the chosen world.
-        server: viser's server.
-        clock: buttons of the clock, whose clicks are for the caller.
-        speed: buttons of its speed, likewise.
+    ``act`` takes what a click asks for, a function to be called by whoever steps the worlds. ``world`` is the index of
+    the chosen world; clicks on the buttons ``clock`` and ``speed`` are for the caller.
     """
 
     def __init__(

@@ -41,11 +41,7 @@ Store = tuple[Node, Node]
 
 
 class Source:
-    """C++ of stores.
-
-    Attributes:
-        text: the statements of one world, which find the tensors in ``args.p0``, ``args.p1``, ...
-        used: indices of the tensors.
+    """C++ of stores: the statements of one world, which find the tensors ``used`` in ``args.p0``, ``args.p1``, ...
 
     Raises:
         CannotFuse: it is too much, or reads what it writes elsewhere.
