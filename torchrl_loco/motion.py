@@ -282,13 +282,7 @@ def read(motion: Any, fps: float = 0.0) -> list[Motion]:
 
 
 def named(motion: Any, fps: float = 0.0) -> list[Motion | dict[str, Any]]:
-    """Returns the motions that are named, as :func:`read` takes them; of files, the arguments of :class:`Motion`.
-
-    Raises:
-        FileNotFoundError: there is no such file, or no motion in a folder.
-        ValueError: none is named.
-        TypeError: it is something else.
-    """
+    """Returns the motions that are named, as :func:`read` takes them; of files, the arguments of :class:`Motion`."""
     found = list[Motion | dict[str, Any]]()
     for one in motion if isinstance(motion, list | tuple) else [motion]:
         if isinstance(one, Motion):
@@ -305,11 +299,7 @@ def named(motion: Any, fps: float = 0.0) -> list[Motion | dict[str, Any]]:
 
 
 def expand(place: Path | str) -> list[Path]:
-    """Returns the files of a path, a folder or a glob, in the order of their names.
-
-    Raises:
-        FileNotFoundError: there are none.
-    """
+    """Returns the files of a path, a folder or a glob, in the order of their names."""
     path = Path(place).expanduser()
     if path.is_file():
         return [path]

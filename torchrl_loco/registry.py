@@ -128,21 +128,12 @@ def list_envs() -> list[str]:
 
 
 def canonical_id(id: str) -> str:
-    """Returns the id that ``id``, or an alias, stands for.
-
-    Raises:
-        ValueError: there is no such id; the message names the nearest one and all of them.
-    """
+    """Returns the id that ``id``, or an alias, stands for."""
     return check_choice("environment", ALIASES.get(id, id) if isinstance(id, str) else id, list_envs(), also=ALIASES)
 
 
 def env_class(id: str) -> "type[LocoEnv]":
-    """Returns the class of ``id`` or an alias.
-
-    Raises:
-        ValueError: there is no such id; the message names the nearest one and all of them.
-        ImportError: the plug-in that it comes from is broken; the message names its distribution.
-    """
+    """Returns the class of ``id`` or an alias."""
     name = canonical_id(id)
     entry = registered()[name]
     if entry.cls is not None:

@@ -44,12 +44,7 @@ class Report:
 
 
 class Exported:
-    """A policy in an ONNX file that :func:`torchrl_loco.export_policy` wrote, of the task that the user or it names.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no exported policy.
-    """
+    """A policy in an ONNX file that :func:`torchrl_loco.export_policy` wrote, of the task that the user or it names."""
 
     def __init__(self, path: Path, task: str | None = None) -> None:
         import onnxruntime

@@ -32,11 +32,7 @@ class Ground:
 
     @classmethod
     def of(cls, m: mujoco.MjModel) -> "Ground":
-        """Returns that of a model: what is fixed to the world and may be touched.
-
-        Raises:
-            ValueError: there is none, or a part of it is turned: a box or field about any axis, a plane that slopes.
-        """
+        """Returns that of a model: what is fixed to the world and may be touched."""
         data = mujoco.MjData(m)
         mujoco.mj_kinematics(m, data)
         geoms = [g for g in np.flatnonzero(of_ground(m)).tolist() if m.geom_type[g] in (PLANE, FIELD, BOX)]

@@ -40,13 +40,7 @@ class Pixels:
     def checked(
         cls, m: mujoco.MjModel, given: Mapping[str, Any], num_envs: int, device: torch.device
     ) -> "Pixels | None":
-        """Returns what arguments of :class:`torchrl_loco.LocoEnv` ask for, ``None`` if that is no pixels.
-
-        Raises:
-            ValueError: the model has no such camera, a number is out of range, or an argument needs another.
-            TypeError: an argument has the wrong type.
-            MemoryError: the device has no room for the pixels.
-        """
+        """Returns what arguments of :class:`torchrl_loco.LocoEnv` ask for, ``None`` if that is no pixels."""
         with_rgb = check_bool("from_pixels", given["from_pixels"])
         far = check_float("depth, the greatest that is seen (m) or 0 for none,", given["depth"], DEPTHS)
         if not with_rgb and not far:
@@ -72,11 +66,7 @@ class Pixels:
         return {**seen, "frame_stack": self.stack if rgb else None}
 
     def settings(self, m: mujoco.MjModel) -> dict[str, Any]:
-        """Returns the settings of a training in which the same is seen.
-
-        Raises:
-            ValueError: the camera has no name.
-        """
+        """Returns the settings of a training in which the same is seen."""
         if not (name := m.camera(self.camera).name) and self.camera:
             raise ValueError(f"camera {self.camera} needs a name to train with")
         seen = {"camera": name, "size": (self.width, self.height), "frame_stack": self.stack}

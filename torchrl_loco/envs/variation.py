@@ -26,11 +26,7 @@ MOST_BITS = 12
 
 
 class Change:
-    """What a :class:`Vary` does to the numbers of a model. Its random stream depends on ``label``.
-
-    Raises:
-        ValueError: a name is not in the model, an element does not have such a number, or all of them stay 0.
-    """
+    """What a :class:`Vary` does to the numbers of a model. Its random stream depends on ``label``."""
 
     def __init__(self, vary: Vary, elements: Elements, label: str) -> None:
         m, groups = elements.mj_model, vary.groups
@@ -274,11 +270,7 @@ class Variation(Varied):
 
 
 def constant_of(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Returns a field of a model, or the gravity of its options.
-
-    Raises:
-        AttributeError: there is no such field, or it is no array of numbers.
-    """
+    """Returns a field of a model, or the gravity of its options."""
     values = mj_model.opt.gravity if name == "gravity" else getattr(mj_model, name, None)
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "biuf":
         arrays = [key for key in dir(mj_model) if isinstance(getattr(mj_model, key, None), np.ndarray)]

@@ -89,11 +89,7 @@ def to_the_horizon(mj_model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device) -> Mounts:
-    """Returns what holds a camera and the lights that are on.
-
-    Raises:
-        ValueError: the camera projects along parallel rays, or has a sensor of a size of its own.
-    """
+    """Returns what holds a camera and the lights that are on."""
     name = m.camera(camera).name or camera
     if m.cam_projection[camera] != int(mujoco.mjtProjection.mjPROJ_PERSPECTIVE) or m.cam_sensorsize[camera].any():
         raise ValueError(f"camera {name!r} must have a perspective that fovy alone tells, to be drawn from")

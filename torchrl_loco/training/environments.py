@@ -195,12 +195,7 @@ def source_of(task: str) -> str:
 
 
 def unwrapped(env: EnvBase) -> tuple[LocoEnv, tuple[Transform, ...]]:
-    """Returns the environment of this package that lies below transforms, and them, the innermost first.
-
-    Raises:
-        TypeError: there is none.
-        ValueError: it has no batch dimension.
-    """
+    """Returns the environment of this package that lies below transforms, and them, the innermost first."""
     base, transforms = unwrap(env)
     if not isinstance(base, LocoEnv):
         raise TypeError(f"train takes a LocoEnv, or one in TransformedEnv, got {type(base).__name__}")
