@@ -1,7 +1,7 @@
 """Vary: a number of the model that differs from world to world."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 from torchrl_loco.checks import ANY, Interval, check_bool, check_choice, check_float, check_int
@@ -92,10 +92,7 @@ class Vary:
         for name in ("shared", "log", "once"):
             self._set(name, check_bool(name, getattr(self, name)))
         for name in ("low", "high"):
-            value = getattr(self, name)
-            many = isinstance(value, Sequence) and not isinstance(value, str)
-            numbers = [check_float(name, number, ANY) for number in (value if many else [value])]
-            self._set(name, tuple(numbers) if many else numbers[0])
+            self._set(name, _one_or_several(check_float, name, getattr(self, name), ANY))
         if self.of is not None and not isinstance(self.of, str):
             names = list(self.of) if isinstance(self.of, Sequence) else [self.of]
             if not names or not all(isinstance(name, str) for name in names):
@@ -103,10 +100,7 @@ class Vary:
             self._set("of", tuple(names))
         if self.component is not None:
             interval = Interval(0, FIELDS[self.field].size)
-            many = isinstance(self.component, Sequence)
-            given: Any = self.component if many else [self.component]
-            indices = [check_int("component", index, interval) for index in given]
-            self._set("component", tuple(indices) if many else indices[0])
+            self._set("component", _one_or_several(check_int, "component", self.component, interval))
         if self.of is not None and not FIELDS[self.field].of:
             raise ValueError(f"{self}: {self.field} is of the model, so it takes no of=")
         for low, high in self.bounds:
@@ -157,6 +151,12 @@ class Vary:
                 f"{self}: low and high must be numbers, or have {count}, one for each number of an element"
             )
         return list(zip(low, high, strict=True))
+
+
+def _one_or_several(check: Callable[..., Any], name: str, value: Any, interval: Interval) -> Any:
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return tuple(check(name, number, interval) for number in value)
+    return check(name, value, interval)
 
 
 def check_randomize(name: str, value: Any) -> tuple[Vary, ...]:

@@ -219,11 +219,8 @@ def deterministic_policy(actor: ProbabilisticActor, config: TrainingConfig, info
     if not any(isinstance(part, AddStateIndependentNormalScale) for part in actor[0].module):
         last = _first_half(last)
     squashed = _squashed(actor[-1].distribution_kwargs.get("bound"), last)
-    settings = {
-        name: value
-        for name, value in dataclasses.asdict(config).items()
-        if name not in ("out", "device", "logger", "init")
-    }
+    elsewhere = ("out", "device", "logger", "init")
+    settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in elsewhere}
     policy = Policy(nn.Sequential(*layers, last, *squashed), {"algorithm": config.algorithm, **settings, **info})
     _check_that_they_agree(policy, actor)
     return policy

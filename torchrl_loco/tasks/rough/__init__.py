@@ -148,9 +148,7 @@ class Rough(Velocity):
             "origins": self.ground.origins.reshape(-1, 3).astype(np.float32),
             "first_column": np.cumsum([0, *counts[:-1]]).astype(np.int32),
             "columns_of": np.array(counts, dtype=np.int32),
-            "standing": np.concatenate([data.geom_xpos[geoms, :2] - data.qpos[:2], np.zeros((1, 2))]).astype(
-                np.float32
-            ),
+            "standing": np.vstack([data.geom_xpos[geoms, :2] - data.qpos[:2], np.zeros(2)]).astype(np.float32),
             "sunk": np.array([max(0.0, -lowest)], dtype=np.float32),
         }
 
