@@ -153,11 +153,7 @@ NO_ARGUMENTS = {
 
 
 def sim_config(
-    defaults: SimConfig,
-    protocol: str,
-    num_envs: int,
-    overrides: dict[str, Any],
-    arguments: Collection[str] = (),
+    defaults: SimConfig, protocol: str, num_envs: int, overrides: dict[str, Any], arguments: Collection[str] = ()
 ) -> SimConfig:
     """Returns the settings of an environment under ``protocol`` for ``num_envs`` worlds, with ``overrides`` on top.
 

@@ -44,12 +44,7 @@ def sigmoid(x: float, value_at_1: float, kind: int) -> float:
 
 @wp.func
 def tolerance(
-    x: float,
-    lower: float,
-    upper: float,
-    margin: float = 0.0,
-    kind: int = 0,
-    value_at_margin: float = 0.1,
+    x: float, lower: float, upper: float, margin: float = 0.0, kind: int = 0, value_at_margin: float = 0.1
 ) -> float:
     """Returns 1 where ``lower <= x <= upper`` and falls off outside, in [0, 1].
 

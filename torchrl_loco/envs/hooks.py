@@ -465,11 +465,7 @@ CRITIC = "privileged"
 """Group of the observation that the critic alone sees: it has no noise."""
 HISTORY = "{}.history"
 """Name of the entry of memory that keeps the last observations of a group."""
-NO_GROUPS = (
-    *("reward", "done", "terminated", "truncated", "action", "next", "_reset", "_step"),
-    *NESTED,
-    *State.KEYS,
-)
+NO_GROUPS = (*("reward", "done", "terminated", "truncated", "action", "next", "_reset", "_step"), *NESTED, *State.KEYS)
 """Names that a tensor of the observation cannot have: those of a step's other entries, and of a state."""
 
 
