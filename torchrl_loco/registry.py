@@ -363,7 +363,6 @@ def _name_of(path: Path) -> str:
 
 
 def _file(module: ModuleType | None) -> Path | None:
-    """Returns the file of a module, ``None`` if it has none."""
     file = getattr(module, "__file__", None)
     return Path(file).resolve() if file else None
 

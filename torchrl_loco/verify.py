@@ -204,7 +204,6 @@ def _worlds(
 
 
 def _begins_alike(env: LocoEnv, conditions: Conditions) -> bool:
-    """Returns whether all episodes are the same one."""
     env.reset()
     same = all(bool((view == view[:1]).all()) for view in (env.sim.qpos, env.sim.qvel))
     least, most = conditions.delay or (0, 0)

@@ -39,7 +39,6 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _run(args: list[str]) -> None:
-    """Runs one command."""
     if args == ["--version"]:
         print(torchrl_loco.__version__)
         return

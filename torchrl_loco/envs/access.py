@@ -327,7 +327,6 @@ class WorldAccess(EnvBase):
         return state
 
     def _set_state(self, state: TensorDictBase | None, mask: torch.Tensor | None) -> None:
-        """Writes a state into the worlds of ``mask``."""
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if state is not None and not self.batch_size:

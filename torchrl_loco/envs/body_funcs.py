@@ -63,7 +63,6 @@ def check_rows(func: wp.Function, inputs: Any, world: int, size: int, terms: int
 
 
 def _some(numbers: list[int]) -> str:
-    """Returns the first few of some numbers, as text."""
     return ", ".join(map(str, numbers[:5])) + (", ..." if len(numbers) > 5 else "")
 
 

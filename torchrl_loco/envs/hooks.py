@@ -212,7 +212,6 @@ class Hooks:
         self._declare_noise_and_history()
 
     def _declare_noise_and_history(self) -> None:
-        """Takes ``noise`` and ``history`` of the class."""
         env = self._env()
         assert env is not None
         seen = {name: sizes or {name: 0} for name, sizes in self.terms.items() if name != CRITIC}

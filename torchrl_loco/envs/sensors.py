@@ -54,7 +54,6 @@ class Frames:
         self._bodies = [int(b) for b in getattr(m, f"{kind}_bodyid")[ids]] if kind in ("site", "geom") else ids
 
     def _pick(self, name: str) -> torch.Tensor:
-        """Returns an array of their bodies."""
         return self._s._catalog.pick(self._s._array(name), self._bodies, self._one)
 
     def _there(self, what: str) -> torch.Tensor:

@@ -187,7 +187,6 @@ class Algorithm(ABC):
                 group["lr"].fill_(lr)
 
     def _gradient_steps(self) -> None:
-        """Makes those of one epoch."""
         assert self._data is not None
         for minibatch in self._data[self._order].split(self.config.minibatch_size):
             self._totals += torch.stack([metric.detach() for metric in self.gradient_step(minibatch)])

@@ -92,7 +92,6 @@ def train(
 def _config(
     task: Any, config: TrainingConfig | None, algorithm: str | type[Algorithm] | None, settings: dict[str, Any]
 ) -> TrainingConfig:
-    """Returns the settings of a new run."""
     name = algorithm.config_type.algorithm if isinstance(algorithm, type) else algorithm
     if config is None:
         return preset(task, settings.pop("device", None), name, **settings)
@@ -136,7 +135,6 @@ def _check_same(run: RunFolder, env: EnvBase) -> None:
 
 
 def _resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
-    """Returns the run that is to be continued."""
     run = resume if isinstance(resume, RunFolder) else RunFolder(Path(resume))
     named, of = task_name(task, by_user=True), run.load_config().task
     moved = is_place(named) and is_place(of) and named.rpartition(":")[2] == of.rpartition(":")[2]

@@ -123,7 +123,6 @@ class Viewer:
         self.close()
 
     def _repr_html_(self) -> str:
-        """Returns the page as a frame of a notebook."""
         return f'<iframe src="{self.url}" width="100%" height="640" style="border: 0"></iframe>'
 
     def tick(self) -> None:

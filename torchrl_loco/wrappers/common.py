@@ -80,7 +80,6 @@ class Wrapped:
         self._groups = groups_of(self.env)
 
     def _render_metadata(self) -> dict[str, Any]:
-        """Returns what Gymnasium's metadata say of pictures."""
         return {"render_modes": list(RENDER_MODES), "render_fps": round(1 / base_of(self.env).config.ctrl_dt)}
 
     def _seen(self, td: TensorDictBase) -> Any:
