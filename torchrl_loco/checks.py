@@ -40,18 +40,14 @@ class Interval(NamedTuple):
         return f"{'[' if self.with_low else '('}{self.low:g}, {high}{']' if self.with_high else ')'}"
 
 
-POSITIVE_INT = Interval(1, 2**31)
-"""Counts: kernels index with 32 bits."""
-COUNT = Interval(0, 2**31)
-"""Counts that may be zero."""
+POSITIVE_INT = Interval(1, 2**31)  # counts: kernels index with 32 bits
+COUNT = Interval(0, 2**31)  # counts that may be zero
 SEED = Interval(0, 2**32)
 POSITIVE = Interval(0, math.inf, with_low=False)
 NOT_NEGATIVE = Interval(0, math.inf)
 FRACTION = Interval(0, 1, with_high=True)
-ANY = Interval(-math.inf, math.inf, with_low=False)
-"""All finite numbers."""
-EXTENDED = Interval(-math.inf, math.inf, with_high=True)
-"""Those, and the two infinities."""
+ANY = Interval(-math.inf, math.inf, with_low=False)  # all finite numbers
+EXTENDED = Interval(-math.inf, math.inf, with_high=True)  # those, and the two infinities
 
 
 def check_int(name: str, value: Any, interval: Interval = POSITIVE_INT) -> int:

@@ -8,8 +8,7 @@ from torchrl_loco.checks import COUNT, FRACTION, NOT_NEGATIVE, SEED, check_field
 
 PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
 """Greatest change of a floating base's velocity by a push (m/s, rad/s), as mjlab 1.6 has it."""
-PUSH_EVERY = (1.0, 3.0)
-"""Least and greatest time between two pushes (s)."""
+PUSH_EVERY = (1.0, 3.0)  # least and greatest time between two pushes (s)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,5 +61,4 @@ class Conditions:
         )
 
 
-DEFAULT = Conditions()
-"""What each task asks for."""
+DEFAULT = Conditions()  # what each task asks for

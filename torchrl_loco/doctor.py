@@ -22,8 +22,7 @@ from torchrl_loco.sim.simulation import free_memory
 from torchrl_loco.sim.warp_init import init_warp
 
 PACKAGES = ("torch", "torchrl", "tensordict", "warp-lang", "mujoco-warp", "mujoco")
-TOLERANCE = 1e-4
-"""Largest median error of qpos (m, rad) after a control step that counts as correct."""
+TOLERANCE = 1e-4  # largest median error of qpos (m, rad) after a control step that counts as correct
 
 
 @dataclasses.dataclass(frozen=True)

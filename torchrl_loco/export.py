@@ -25,14 +25,12 @@ from torchrl_loco.policy import Policy, difference, random_observations
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
 
-SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
-"""Formats and the suffixes of their files."""
+SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}  # formats and the suffixes of their files
 
 TOLERANCE = 1e-5
 """Largest difference from the policy's own actions, a fraction of those above 1, that an exported policy may have."""
 
-BATCH_SIZES = (1, 2, 1000)
-"""Batches of random observations on which they are compared."""
+BATCH_SIZES = (1, 2, 1000)  # batches of random observations on which they are compared
 
 
 def export_policy(policy: Policy, path: Path) -> float:

@@ -7,8 +7,7 @@ import threading
 from collections.abc import Iterator
 
 _LOCK = threading.RLock()
-_blocks, _was_enabled = 0, False
-"""Blocks that threads are in, and whether garbage was collected before the first."""
+_blocks, _was_enabled = 0, False  # blocks that threads are in, and whether garbage was collected before the first
 
 
 OWN_PROCESS = threading.Event()

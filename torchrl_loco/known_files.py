@@ -17,11 +17,9 @@ from pathlib import Path
 KEPT = "source"
 """Folder in a run folder that holds a copy of the task's file, and of what lies beside it and belongs to it."""
 
-DIGITS = 64
-"""Of a SHA-256, before two spaces and the path."""
+DIGITS = 64  # of a SHA-256, before two spaces and the path
 
-_added: set[str] = set()
-"""Lines of this process: they count where they cannot be written, too."""
+_added: set[str] = set()  # lines of this process: they count where they cannot be written, too
 
 
 class UnnamedFileError(ImportError):

@@ -20,8 +20,7 @@ MARKS = "allow_in_graph", "assume_constant_result"
 """Functions of the compiler that note something of a function, and return it."""
 
 _marked: list[tuple[str, Callable[..., Any]]] = []
-_own: dict[str, Callable[..., Any]] = {}
-"""Functions of ``torch.compiler`` that ours stand for."""
+_own: dict[str, Callable[..., Any]] = {}  # functions of torch.compiler that ours stand for
 _is_imported = False
 
 

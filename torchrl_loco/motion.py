@@ -17,24 +17,17 @@ import numpy as np
 from torchrl_loco.checks import check_float, suggestion
 from torchrl_loco.storage import replace_file
 
-SUFFIXES = (".csv", ".npz")
-"""Of files that motions are read from."""
+SUFFIXES = (".csv", ".npz")  # of files that motions are read from
 MAX_SPEED, MAX_TURN = 12.0, 40.0
 """Speed (m/s) and rate of turn (rad/s) of the base between two frames that no robot has: the motion jumps there."""
-QUICK = 40.0
-"""Rate of a joint (rad/s) between two frames that is said."""
+QUICK = 40.0  # rate of a joint (rad/s) between two frames that is said
 SUNK, FLOATS, PENETRATES = 0.02, 0.03, 0.005
 """How far the lowest frame may lie below and above the ground (m) before it is said; where a shift puts it, below."""
-BODY_ERROR = 0.05
-"""How far bodies in a file may lie from where the model puts them (m)."""
-MAX_BEYOND = 7.0
-"""How far a joint may be beyond its limit (rad): more are degrees."""
-LOOKED_AT = 20.0
-"""Frames per second whose bodies are compared with the ground and with the file."""
-FAR_BEYOND = 0.8
-"""From where on it may be another joint (rad)."""
-NORM_ERROR = 0.05
-"""How far the length of a quaternion may be from 1."""
+BODY_ERROR = 0.05  # how far bodies in a file may lie from where the model puts them (m)
+MAX_BEYOND = 7.0  # how far a joint may be beyond its limit (rad): more are degrees
+LOOKED_AT = 20.0  # frames per second whose bodies are compared with the ground and with the file
+FAR_BEYOND = 0.8  # from where on it may be another joint (rad)
+NORM_ERROR = 0.05  # how far the length of a quaternion may be from 1
 
 
 class Motion:

@@ -16,8 +16,7 @@ from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.encoder import PixelEncoder
 from torchrl_loco.registry import canonical_id
 
-SHIPPED = Path(__file__).parent / "policies"
-"""Has a folder for each protocol."""
+SHIPPED = Path(__file__).parent / "policies"  # has a folder for each protocol
 
 
 class ObservationNorm(nn.Module):
@@ -162,8 +161,7 @@ class Policy(TensorDictModule):
         return cls(network.to(device).requires_grad_(False), info)
 
 
-SCALE = ".scale"
-"""What a file adds to the name of weights in 8 bits, for what to multiply them with."""
+SCALE = ".scale"  # what a file adds to the name of weights in 8 bits, for what to multiply them with
 
 
 def _in_8_bits(name: str, weight: torch.Tensor) -> dict[str, torch.Tensor]:

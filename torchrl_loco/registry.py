@@ -44,8 +44,7 @@ ALIASES = {f"mjx/{id}-v0": id for id in OURS}
 ID = r"[\w.-]+"
 MALFORMED = "an id consists of letters, digits and _ . -, because run folders are named after it"
 
-_added: dict[str, Entry] = {}
-"""What was registered at run time, by id."""
+_added: dict[str, Entry] = {}  # what was registered at run time, by id
 
 
 @functools.cache
@@ -335,8 +334,7 @@ class _ReadEnough(BaseException):
     """A script was read up to where it trains."""
 
 
-_reading: list[Path] = []
-"""Files that run now because a class in them was named."""
+_reading: list[Path] = []  # files that run now because a class in them was named
 
 
 def check_is_run() -> None:

@@ -24,8 +24,7 @@ from torchrl_loco.envs.vary import Vary
 from torchrl_loco.registry import resolve
 
 ENGINES = ("C MuJoCo", "training simulator")
-UNDISTURBED = Conditions(delay=(0, 0), noise=0.0, pushes=0.0)
-"""In which each case of a task is played once."""
+UNDISTURBED = Conditions(delay=(0, 0), noise=0.0, pushes=0.0)  # in which each case of a task is played once
 
 
 @dataclasses.dataclass(frozen=True)

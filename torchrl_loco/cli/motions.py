@@ -37,8 +37,7 @@ class Motions:
 
 THOSE_OF_TRAINING = Motions()
 
-FRAME_RATE = 25
-"""Frames per second of videos."""
+FRAME_RATE = 25  # frames per second of videos
 
 
 def motion(

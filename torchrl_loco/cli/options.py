@@ -15,8 +15,7 @@ from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.registry import list_envs, resolve, summary, task_name
 from torchrl_loco.training.config import CONFIGS, Sim, TrainingConfig, preset, tuning_note
 
-VALUES = tyro.constructors.ConstructorRegistry()
-"""How values are parsed, where the parser's own rules are inconvenient."""
+VALUES = tyro.constructors.ConstructorRegistry()  # how values are parsed, where the parser's own rules are inconvenient
 
 
 @VALUES.primitive_rule
@@ -89,8 +88,7 @@ def task_options(args: list[str]) -> Any:
 
 
 T = TypeVar("T")
-Flat = Annotated[T, tyro.conf.arg(name="")]
-"""Options of a dataclass, whose names stand alone."""
+Flat = Annotated[T, tyro.conf.arg(name="")]  # options of a dataclass, whose names stand alone
 
 OtherTask = Annotated[
     str | None,

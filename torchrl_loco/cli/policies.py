@@ -33,8 +33,7 @@ from torchrl_loco.known_files import place_of
 from torchrl_loco.registry import label, task_name
 from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_host, check_viewer
 
-CONTAINERS = (".mp4", ".mkv", ".mov")
-"""Suffixes of a video."""
+CONTAINERS = (".mp4", ".mkv", ".mov")  # suffixes of a video
 
 RunOrTask = Annotated[
     tyro.conf.Positional[str],

@@ -27,8 +27,7 @@ from torchrl_loco.eyes.pictures import LOOKS_WELL, OPACITY, Poses, with_ghost
 from torchrl_loco.eyes.tracer import KINDS, Eye
 from torchrl_loco.sim import Simulation, models
 
-STAGE_WORLDS = 64
-"""Of how many worlds a stage keeps the memory, at most."""
+STAGE_WORLDS = 64  # of how many worlds a stage keeps the memory, at most
 
 
 class WorldAccess(EnvBase):

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-AROUND = 4096
-"""Numbers before and behind a row in which a write beyond its ends is noticed."""
+AROUND = 4096  # numbers before and behind a row in which a write beyond its ends is noticed
 
 
 def check_pair(method: str, returned: Any) -> tuple[wp.Function, Any]:

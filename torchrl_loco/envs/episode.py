@@ -8,11 +8,9 @@ from torchrl_loco.sim import WorldFunc, fill
 from torchrl_loco.sim.sampling import world_stream
 from torchrl_loco.sim.world_func import write_rows
 
-MAX_VALUE = 1.0e10
-"""Magnitude from which a number counts as not finite: MuJoCo's mjMAXVAL."""
+MAX_VALUE = 1.0e10  # magnitude from which a number counts as not finite: MuJoCo's mjMAXVAL
 
-AT_ONCE = 16
-"""Numbers of a row that are read before any is written."""
+AT_ONCE = 16  # numbers of a row that are read before any is written
 
 Numbers = wp.types.vector(length=AT_ONCE, dtype=wp.float32)
 

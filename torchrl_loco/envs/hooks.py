@@ -33,8 +33,7 @@ PARTS = {
 }
 """The hooks that each part of a step or reset calls, in their order."""
 
-ENDS = {"terminated": "ended", "truncated": "cut_off"}
-"""The hooks that end an episode, and the flag that each writes."""
+ENDS = {"terminated": "ended", "truncated": "cut_off"}  # the hooks that end an episode, and the flag that each writes
 
 
 def _noting(cls: Any) -> type:
@@ -460,10 +459,8 @@ class Hooks:
             (a[f"memory.{name}"] if name in self.catalog.memory else a[name]).copy_(row)
 
 
-CRITIC = "privileged"
-"""Group of the observation that the critic alone sees: it has no noise."""
-HISTORY = "{}.history"
-"""Name of the entry of memory that keeps the last observations of a group."""
+CRITIC = "privileged"  # group of the observation that the critic alone sees: it has no noise
+HISTORY = "{}.history"  # name of the entry of memory that keeps the last observations of a group
 NO_GROUPS = (*("reward", "done", "terminated", "truncated", "action", "next", "_reset", "_step"), *NESTED, *State.KEYS)
 """Names that a tensor of the observation cannot have: those of a step's other entries, and of a state."""
 

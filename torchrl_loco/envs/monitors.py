@@ -19,14 +19,11 @@ from torchrl_loco.envs.state import State
 from torchrl_loco.sim import Buffer, Overflow, Simulation, WorldFunc, fill
 from torchrl_loco.sim.world_func import copy_row
 
-INTERVAL = 100
-"""Control steps between two reads."""
+INTERVAL = 100  # control steps between two reads
 
-ON_OVERFLOW = ("warn", "raise", "ignore")
-"""What can be done when the physics dropped contacts or constraints."""
+ON_OVERFLOW = ("warn", "raise", "ignore")  # what can be done when the physics dropped contacts or constraints
 
-NAN_DUMP = "NaN dump"
-"""Kind of file, stored in a NaN dump."""
+NAN_DUMP = "NaN dump"  # kind of file, stored in a NaN dump
 
 
 class PhysicsOverflowWarning(UserWarning):
@@ -120,8 +117,7 @@ COUNTERS = {
     "index_error": Overflow.INDEX,
 }
 """Name of a counter and the bits of ``Data.overflow`` that it counts."""
-DROPPED = ("constraints", "contacts")
-"""What the first two counters count as dropped."""
+DROPPED = ("constraints", "contacts")  # what the first two counters count as dropped
 
 
 class Health(Monitor):

@@ -16,8 +16,7 @@ from torchrl_loco.envs.hooks import Arrays
 from torchrl_loco.garbage import no_collection
 from torchrl_loco.sim import Simulation
 
-COMPARED = 64
-"""Worlds in which a trace or a kernel is compared with the hooks themselves."""
+COMPARED = 64  # worlds in which a trace or a kernel is compared with the hooks themselves
 SPREADS = (0.02, 2.0)
 """How far the numbers of a comparison are from those of worlds at rest: hooks may refuse wild ones, as an index."""
 TRACE = (

@@ -15,10 +15,8 @@ from torchrl_loco.eyes.tracer import Eye
 from torchrl_loco.sim import Buffer, Simulation
 from torchrl_loco.sim.simulation import check_memory
 
-SIZE = (84, 84)
-"""Width and height of pixels, those of dm_control's benchmarks from pixels."""
-KEYS = {"rgb": "pixels", "depth": "depth"}
-"""Keys of what is drawn."""
+SIZE = (84, 84)  # width and height of pixels, those of dm_control's benchmarks from pixels
+KEYS = {"rgb": "pixels", "depth": "depth"}  # keys of what is drawn
 COPIES_IN_STEP = 3
 """How often pixels lie in memory: where they are drawn, in what a step returns, and in what the next begins with."""
 DEPTHS = Interval(0, float("inf"))

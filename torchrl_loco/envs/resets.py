@@ -9,8 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-NESTED = ("reward_terms", "metrics", "observation_terms")
-"""Entries of a step that are TensorDicts."""
+NESTED = ("reward_terms", "metrics", "observation_terms")  # entries of a step that are TensorDicts
 
 
 class QuickResets(EnvBase):

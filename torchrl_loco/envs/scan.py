@@ -17,8 +17,7 @@ from torchrl_loco.sim.compiled.collision.ground import NOTHING
 if TYPE_CHECKING:
     from torchrl_loco.sim import Simulation
 
-UPRIGHT = 0.1
-"""Length of the body's x axis, laid flat, below which its y axis tells the yaw."""
+UPRIGHT = 0.1  # length of the body's x axis, laid flat, below which its y axis tells the yaw
 NONE = wp.constant(wp.float32(NOTHING))
 
 

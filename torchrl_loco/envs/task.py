@@ -37,11 +37,9 @@ FUSED = {
 }
 """The methods that name a Warp function instead of a hook."""
 
-BOUNDED, UNBOUNDED = (-1.0, 1.0), (-math.inf, math.inf)
-"""What ``action_range`` can be."""
+BOUNDED, UNBOUNDED = (-1.0, 1.0), (-math.inf, math.inf)  # what action_range can be
 
-HOLDS = ("falls", "return", "kept", "delay", "friction", "pushes")
-"""What a task can ask for: see :attr:`Task.holds`."""
+HOLDS = ("falls", "return", "kept", "delay", "friction", "pushes")  # what a task can ask for: see Task.holds
 
 
 class _OfModel:

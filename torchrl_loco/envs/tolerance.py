@@ -19,8 +19,7 @@ SIGMOIDS: dict[str, Callable[[torch.Tensor, float], torch.Tensor]] = {
 }
 """By name: 1 at 0, and ``value`` at 1."""
 
-FALLS_TO_ZERO = ("linear", "cosine", "quadratic")
-"""Sigmoids whose value at the margin may be 0."""
+FALLS_TO_ZERO = ("linear", "cosine", "quadratic")  # sigmoids whose value at the margin may be 0
 
 
 def tolerance(

@@ -21,8 +21,7 @@ VALID = {
 }
 """What must be true of a field's numbers, for messages."""
 
-MOST_BITS = 12
-"""Draws on which the numbers of an element may depend: all combinations are checked."""
+MOST_BITS = 12  # draws on which the numbers of an element may depend: all combinations are checked
 
 
 class Change:

@@ -22,10 +22,8 @@ from torchrl_loco.sim.simulation import check_memory
 
 OF_A_STEP = frozenset({"action", "ctrl"})
 """What belongs to a step: an observation is also made after a reset, where there was none."""
-CONTACT_HISTORY = ("contact_force_history", "in_contact_history")
-"""Arrays of contacts with a row for each substep."""
-COPIES_IN_HOOKS = 2
-"""How often what eyes see lies in memory: where it is found, and in what a hook makes of it."""
+CONTACT_HISTORY = ("contact_force_history", "in_contact_history")  # arrays of contacts with a row for each substep
+COPIES_IN_HOOKS = 2  # how often what eyes see lies in memory: where it is found, and in what a hook makes of it
 
 
 class Catalog(Elements):

@@ -527,8 +527,7 @@ class World:
     __del__ = _close_quietly
 
 
-OPEN: weakref.WeakSet[World] = weakref.WeakSet()
-"""Worlds that are closed before torch is torn down."""
+OPEN: weakref.WeakSet[World] = weakref.WeakSet()  # worlds that are closed before torch is torn down
 
 
 @atexit.register

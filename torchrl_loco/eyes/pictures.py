@@ -13,10 +13,8 @@ from torchrl_loco.sim import EXCLUSIVE, current_stream
 LOOKS_WELL: dict[str, Any] = {"shadows": True, "samples": 2}
 """Settings of an :class:`~torchrl_loco.eyes.tracer.Eye` for pictures that people look at."""
 
-GHOST, OPACITY = "ghost/", 0.4
-"""What the names of a ghost's bodies begin with, and how much of it is seen."""
-GHOST_COLOR = (0.2, 0.75, 0.35)
-"""Of a ghost: red, green, blue."""
+GHOST, OPACITY = "ghost/", 0.4  # what the names of a ghost's bodies begin with, and how much of it is seen
+GHOST_COLOR = (0.2, 0.75, 0.35)  # of a ghost: red, green, blue
 
 
 def with_ghost(spec: mujoco.MjSpec) -> mujoco.MjModel:

@@ -7,10 +7,8 @@ from torchrl_loco.eyes.scene import AT_BODY, AT_COM, OF_COM, TRACKS, Mounts, Sha
 from torchrl_loco.sim import EXCLUSIVE
 from torchrl_loco.sim.compiled.collision.kinds import CAPSULE, CYLINDER, PLANE
 
-WHOLE = wp.constant(wp.float32(1.0e6))
-"""Bound of a picture on the plane in front of the camera."""
-NEAR = wp.constant(wp.float32(1.0e-4))
-"""Depth from which a sphere is wholly in front of the camera (m)."""
+WHOLE = wp.constant(wp.float32(1.0e6))  # bound of a picture on the plane in front of the camera
+NEAR = wp.constant(wp.float32(1.0e-4))  # depth from which a sphere is wholly in front of the camera (m)
 
 
 @wp.func

@@ -12,14 +12,10 @@ from torchrl_loco.sim import fill_from_numbers
 from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, CYLINDER, ELLIPSOID, FIELD, MESH, PLANE, SPHERE
 from torchrl_loco.sim.corners import axes_of
 
-KINDS = (PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)
-"""Types of geoms that are seen."""
-GROUPS = 3
-"""Groups of geoms that are seen, from 0 on, as in MuJoCo's viewer."""
-FULL_SHINE = 128.0
-"""Exponent of a highlight where a material's shininess is 1."""
-HIDDEN = 1e-3
-"""Opacity up to which a geom is not seen."""
+KINDS = (PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)  # types of geoms that are seen
+GROUPS = 3  # groups of geoms that are seen, from 0 on, as in MuJoCo's viewer
+FULL_SHINE = 128.0  # exponent of a highlight where a material's shininess is 1
+HIDDEN = 1e-3  # opacity up to which a geom is not seen
 TRACKS = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK))
 OF_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
 AT_BODY = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY))

@@ -7,8 +7,7 @@ import warp as wp
 
 from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, SPHERE
 
-MISS = wp.constant(wp.float32(1.0e10))
-"""The distance of what is not met."""
+MISS = wp.constant(wp.float32(1.0e10))  # the distance of what is not met
 TINY = wp.constant(wp.float32(1.0e-12))
 
 

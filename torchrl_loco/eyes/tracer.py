@@ -13,8 +13,7 @@ from torchrl_loco.eyes.shapes import MISS, normal_of, to_mesh, to_shape
 from torchrl_loco.sim import EXCLUSIVE, Buffer, current_stream
 from torchrl_loco.sim.compiled.collision.kinds import MESH, PLANE
 
-KINDS = ("rgb", "depth", "geoms")
-"""What a camera tells of each pixel."""
+KINDS = ("rgb", "depth", "geoms")  # what a camera tells of each pixel
 Color = wp.types.vector(length=3, dtype=wp.uint8)
 
 

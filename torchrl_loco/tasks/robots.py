@@ -14,8 +14,7 @@ from torchrl_loco.envs.vary import Vary
 from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
 
-HARD_CONTACT = 10.0
-"""Force from which a contact of the robot with itself counts (N)."""
+HARD_CONTACT = 10.0  # force from which a contact of the robot with itself counts (N)
 
 
 class Robot(LocoEnv):

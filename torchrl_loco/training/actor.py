@@ -20,8 +20,7 @@ from torchrl.modules.distributions.continuous import SafeTanhTransform
 from torchrl_loco.policy import Policy, copied, difference, layers_of, random_observations
 from torchrl_loco.training.config import TrainingConfig
 
-Network = Callable[[int, int], nn.Module]
-"""Makes a network of so many inputs and so many outputs."""
+Network = Callable[[int, int], nn.Module]  # makes a network of so many inputs and so many outputs
 
 TOLERANCE = 1e-4
 """Largest difference of an action of a saved policy from the actor's, as a fraction of those above 1: rounding."""

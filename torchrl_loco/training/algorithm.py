@@ -24,10 +24,8 @@ from torchrl_loco.training.adam import FlatAdam
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
 
-WARMUP = 1
-"""Epochs before one is recorded: cuBLAS allocates at its first product, and torch.compile compiles."""
-ROW_ALIGNED = 16
-"""Bytes at a multiple of which each entry of a row of steps begins."""
+WARMUP = 1  # epochs before one is recorded: cuBLAS allocates at its first product, and torch.compile compiles
+ROW_ALIGNED = 16  # bytes at a multiple of which each entry of a row of steps begins
 
 
 class Algorithm(ABC):

@@ -23,8 +23,7 @@ from torch.distributed.rendezvous import rendezvous
 TIMEOUT = datetime.timedelta(hours=2)
 """For how long a rank waits for another. Rank 0 evaluates and records alone; a rank that dies is noticed at once."""
 
-GRACE = 5.0
-"""Seconds for which a rank that lost another one stays alive, so that torchrun sees first which one died."""
+GRACE = 5.0  # seconds for which a rank that lost another one stays alive, so that torchrun sees first which one died
 
 
 class RankLostError(ConnectionError):

@@ -5,8 +5,7 @@ from typing import Any
 
 import torch
 
-WINDOW = 100
-"""Episodes over which a mean is taken, at least, as soon as so many have ended."""
+WINDOW = 100  # episodes over which a mean is taken, at least, as soon as so many have ended
 
 
 class Episodes:

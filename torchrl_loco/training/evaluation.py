@@ -28,13 +28,10 @@ from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.environments import make_for
 from torchrl_loco.training.run_folder import RunFolder
 
-PolicyFunc = Callable[[TensorDictBase], TensorDictBase]
-"""Reads ``observation`` and writes ``action``."""
+PolicyFunc = Callable[[TensorDictBase], TensorDictBase]  # reads observation and writes action
 
-PIECE = 25
-"""About how many frames are taken, and recorded, at a time: a whole number of actions."""
-SIZE = 480, 360
-"""Width and height of videos."""
+PIECE = 25  # about how many frames are taken, and recorded, at a time: a whole number of actions
+SIZE = 480, 360  # width and height of videos
 
 
 class Evaluator:

@@ -5,12 +5,9 @@ from typing import Any
 
 import torch
 
-COEFFICIENTS = (3.4445, -4.775, 2.0315)
-"""Of the polynomial that brings singular values near 1 (Jordan et al., 2024)."""
-STEPS = 5
-"""How often it is applied."""
-RMS = 0.2
-"""Root mean square of a step's entries at a learning rate of 1, as Adam's have it (Liu et al., 2025)."""
+COEFFICIENTS = (3.4445, -4.775, 2.0315)  # of the polynomial that brings singular values near 1 (Jordan et al., 2024)
+STEPS = 5  # how often it is applied
+RMS = 0.2  # root mean square of a step's entries at a learning rate of 1, as Adam's have it (Liu et al., 2025)
 
 
 class Muon(torch.optim.Optimizer):

@@ -23,14 +23,12 @@ from torchrl_loco.training.adam import ALIGNED, launch
 from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
 from torchrl_loco.training.config import PPOConfig
 
-LR_RANGE = (1e-5, 1e-2)
-"""Of a learning rate that follows the divergence."""
+LR_RANGE = (1e-5, 1e-2)  # of a learning rate that follows the divergence
 
 HALF_LOG_2_PI = wp.constant(0.5 * math.log(2.0 * math.pi))
 LOG_2 = wp.constant(math.log(2.0))
 CRITIC_COEFF = 0.5
-METRICS = 5
-"""Numbers of a step whose means are metrics; the slopes of the deviations follow them."""
+METRICS = 5  # numbers of a step whose means are metrics; the slopes of the deviations follow them
 
 
 class PPO(Algorithm):

@@ -9,8 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-_held: dict[Path, int] = {}
-"""File descriptors of the locks of this process, by folder."""
+_held: dict[Path, int] = {}  # file descriptors of the locks of this process, by folder
 
 
 def lock(folder: Path) -> bool:

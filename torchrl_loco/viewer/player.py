@@ -7,8 +7,7 @@ import numpy as np
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-HISTORY = 20.0
-"""Time that curves show (s)."""
+HISTORY = 20.0  # time that curves show (s)
 
 
 class Player:

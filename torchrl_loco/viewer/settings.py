@@ -6,13 +6,10 @@ from urllib.parse import urlsplit
 
 from torchrl_loco.checks import Interval, check_packages
 
-LOOPBACK = "127.0.0.1"
-"""Address that this machine alone reaches."""
+LOOPBACK = "127.0.0.1"  # address that this machine alone reaches
 PORT = 8080
-WORLDS = Interval(1, 64, with_high=True)
-"""How many worlds a page shows."""
-SHARE = Interval(0, 1, with_low=False, with_high=True)
-"""Shares of the machine's CPU time that a viewer may take."""
+WORLDS = Interval(1, 64, with_high=True)  # how many worlds a page shows
+SHARE = Interval(0, 1, with_low=False, with_high=True)  # shares of the machine's CPU time that a viewer may take
 
 
 def check_viewer() -> None:

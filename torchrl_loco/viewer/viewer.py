@@ -12,8 +12,7 @@ from torchrl_loco.checks import check_float, check_int
 from torchrl_loco.viewer.player import Player
 from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_host, check_viewer, url_of
 
-SPEEDS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
-"""Of the simulation, by real time."""
+SPEEDS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)  # of the simulation, by real time
 PICTURE, CURVES, LOOK_FOR_POLICY, IDLE = 1 / 30, 0.25, 1.0, 0.1
 """Time between two pictures, two updates of curves, two looks for a newer policy, and two looks for a page (s)."""
 

@@ -17,8 +17,7 @@ from torchrl_loco.sim.compiled.ir.symbols import literal
 LONG = 64
 """Rows of a user's tensor that are taken for those of the worlds, if there are as many worlds; fewer may be chance."""
 
-GLOBAL = ("seed", "shared.")
-"""How the names of arrays begin that are the same in all worlds."""
+GLOBAL = ("seed", "shared.")  # how the names of arrays begin that are the same in all worlds
 INFINITE = "(1e30f * 1e30f)"
 FILLERS = ("empty", "empty_like", "empty_strided", "full", "full_like")
 """Operators that make tensors, which may have a row for each world."""

@@ -59,11 +59,9 @@ TESTS = {
 
 VIEWS = ("expand", "permute", "unsqueeze", "squeeze", "slice", "select", "split_with_sizes")
 """Operators that look at a tensor in another way."""
-FAR = 2**32
-"""How many numbers, for torch, a world begins behind the one before: more than any tensor has of one."""
+FAR = 2**32  # how many numbers, for torch, a world begins behind the one before: more than any tensor has of one
 
-FOLDS = {"sum": ADD, "prod": MUL, "amax": MOST, "amin": LEAST, "all": AND, "any": OR}
-"""Reductions, from left to right."""
+FOLDS = {"sum": ADD, "prod": MUL, "amax": MOST, "amin": LEAST, "all": AND, "any": OR}  # reductions, from left to right
 
 
 # Rules: an operator's result, of the program and the operator's arguments.

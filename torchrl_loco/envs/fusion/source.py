@@ -13,8 +13,7 @@ from torchrl_loco.envs.fusion.nodes import MOST_NUMBERS, TYPES, WHERE, CannotFus
 from torchrl_loco.sim.compiled.step import WARP
 from torchrl_loco.sim.world_func import BLOCK_DIM
 
-LEAST_TOGETHER, WIDEST = 4, 64
-"""Numbers of a row that are worth writing together, and the longest piece of a row."""
+LEAST_TOGETHER, WIDEST = 4, 64  # numbers of a row that are worth writing together, and the longest piece of a row
 
 ROWS = f"""
 #ifdef __CUDA_ARCH__
@@ -36,8 +35,7 @@ const bool full = __activemask() == 0xffffffffu;
 #define WRITE_ROW(numbers, at, count, step) for (int i = 0; i < count; ++i) (at)[i] = numbers[i];
 #endif"""
 
-Store = tuple[Node, Node]
-"""A number in memory, and what is written there."""
+Store = tuple[Node, Node]  # A number in memory, and what is written there
 
 
 class Source:

@@ -15,13 +15,10 @@ from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
 from torchrl_loco.sim import fill
 
-RUN_SPEED = 10.0
-"""Horizontal speed that counts as running (m/s)."""
+RUN_SPEED = 10.0  # horizontal speed that counts as running (m/s)
 
-SETTLED_STATES = 512
-"""States in the table from which episodes start."""
-SETTLING_TIME = 2.0
-"""Time for which a random pose settles (s): 200 physics steps of 0.01 s."""
+SETTLED_STATES = 512  # states in the table from which episodes start
+SETTLING_TIME = 2.0  # time for which a random pose settles (s): 200 physics steps of 0.01 s
 
 
 @wp.func

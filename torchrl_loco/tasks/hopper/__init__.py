@@ -13,12 +13,9 @@ from torchrl_loco.rewards import Sigmoid, small_control, tolerance
 from torchrl_loco.sim import fill
 from torchrl_loco.sim.sampling import PlanarBody, draw_pitch_and_hinges
 
-STAND_HEIGHT = wp.constant(0.6)
-"""Height of the torso above the foot from which the hopper counts as standing (m)."""
-MAX_HEIGHT = wp.constant(2.0)
-"""Height up to which it counts as standing (m), more than its length."""
-HOP_SPEED = 2.0
-"""Horizontal speed that counts as hopping (m/s)."""
+STAND_HEIGHT = wp.constant(0.6)  # height of the torso above the foot from which the hopper counts as standing (m)
+MAX_HEIGHT = wp.constant(2.0)  # height up to which it counts as standing (m), more than its length
+HOP_SPEED = 2.0  # horizontal speed that counts as hopping (m/s)
 
 
 @wp.func

@@ -13,17 +13,12 @@ from torchrl_loco.rewards import Sigmoid, small_control, tolerance
 from torchrl_loco.sim import fill
 from torchrl_loco.sim.sampling import FreePose, draw_free_pose, make_skeleton
 
-STAND_HEIGHT = wp.constant(1.4)
-"""Height of the head from which the humanoid counts as standing (m)."""
-WALK_SPEED = 1.0
-"""Horizontal speed that counts as walking (m/s)."""
-RUN_SPEED = 10.0
-"""Horizontal speed that counts as running (m/s)."""
+STAND_HEIGHT = wp.constant(1.4)  # height of the head from which the humanoid counts as standing (m)
+WALK_SPEED = 1.0  # horizontal speed that counts as walking (m/s)
+RUN_SPEED = 10.0  # horizontal speed that counts as running (m/s)
 
-EXTREMITIES = ("left_hand", "left_foot", "right_hand", "right_foot")
-"""Bodies whose position is observed, in order."""
-ROOT_QPOS = wp.constant(7)
-"""Numbers of qpos that place the root: position and quaternion; the hinges follow."""
+EXTREMITIES = ("left_hand", "left_foot", "right_hand", "right_foot")  # bodies whose position is observed, in order
+ROOT_QPOS = wp.constant(7)  # numbers of qpos that place the root: position and quaternion; the hinges follow
 
 
 @wp.func

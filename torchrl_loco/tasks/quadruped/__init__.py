@@ -13,21 +13,14 @@ from torchrl_loco.rewards import Sigmoid, tolerance
 from torchrl_loco.sim import fill
 from torchrl_loco.sim.sampling import RootAboveFloor, draw_orientation_above_floor, make_outline
 
-WALK_SPEED = 0.5
-"""Forward speed that counts as walking (m/s)."""
-RUN_SPEED = 5.0
-"""Forward speed that counts as running (m/s)."""
-INCREMENT = 0.01
-"""A start is raised in steps of this height until it is off the floor (m)."""
+WALK_SPEED = 0.5  # forward speed that counts as walking (m/s)
+RUN_SPEED = 5.0  # forward speed that counts as running (m/s)
+INCREMENT = 0.01  # A start is raised in steps of this height until it is off the floor (m)
 
-ROOT_QPOS = wp.constant(7)
-"""Numbers of qpos that place the root: position and quaternion; the hinges follow."""
-ROOT_QVEL = wp.constant(6)
-"""Numbers of qvel that move the root."""
-IMU = wp.constant(6)
-"""Numbers of the accelerometer (m/s^2) and the gyroscope (rad/s)."""
-FORCES = wp.constant(24)
-"""Numbers of the forces at the toes (N), then of the torques (Nm)."""
+ROOT_QPOS = wp.constant(7)  # numbers of qpos that place the root: position and quaternion; the hinges follow
+ROOT_QVEL = wp.constant(6)  # numbers of qvel that move the root
+IMU = wp.constant(6)  # numbers of the accelerometer (m/s^2) and the gyroscope (rad/s)
+FORCES = wp.constant(24)  # numbers of the forces at the toes (N), then of the torques (Nm)
 
 
 @wp.func

@@ -22,16 +22,12 @@ from torchrl_loco.terrain.kinds import Patch, points
 
 SCAN = tuple((round(0.1 * x, 1), round(0.1 * y, 1)) for y in range(-5, 6) for x in range(-8, 9))
 """Where the heights around a robot are seen, ahead of it and to its left (m)."""
-MISS, SCALE = 5.0, 0.2
-"""Height over the ground where there is none (m), and how heights are scaled."""
-FIRST_LEVELS = 6
-"""Levels among which first episodes begin."""
+MISS, SCALE = 5.0, 0.2  # height over the ground where there is none (m), and how heights are scaled
+FIRST_LEVELS = 6  # levels among which first episodes begin
 EXPECTED, LEAST_EXPECTED = 0.5, 2.0
 """Share of the way that commands led at which a robot still keeps its level, and from which way on it counts (m)."""
-ACROSS = 8.0
-"""Way that commands lead by which a robot must have left its patch, which is half as far (m)."""
-EDGE = 0.3
-"""How near the end of the ground an episode is cut off (m)."""
+ACROSS = 8.0  # way that commands lead by which a robot must have left its patch, which is half as far (m)
+EDGE = 0.3  # how near the end of the ground an episode is cut off (m)
 AROUND = ((0.4, 0.0), (-0.4, 0.0), (0.0, 0.25), (0.0, -0.25))
 """Points ahead and to the left by which the slope of the ground is judged (m)."""
 

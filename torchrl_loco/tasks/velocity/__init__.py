@@ -23,8 +23,7 @@ FOLDER = Path(__file__).parent
 LEGS = ("FR", "FL", "RR", "RL")
 FREE, JOINT = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtTrn.mjTRN_JOINT)
 FIXED, AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
-TABLE = ("base", "trunk", "feet", "stand", "walk", "run")
-"""What a robot sets beside what every task does."""
+TABLE = ("base", "trunk", "feet", "stand", "walk", "run")  # what a robot sets beside what every task does
 
 CURRICULUM: dict[int, commands.Ranges] = {
     0: ((-1.0, 1.0), (-1.0, 1.0), (-0.5, 0.5)),
@@ -32,18 +31,12 @@ CURRICULUM: dict[int, commands.Ranges] = {
     240_000: ((-2.0, 3.0), (-1.0, 1.0), (-0.7, 0.7)),
 }
 """Ranges of the commands by the control step of training from which they hold."""
-SETTLING = 1.5
-"""Time after a new command for which its errors do not count (s)."""
-BIAS = 0.015
-"""Greatest error of a joint's encoder in an episode (rad)."""
-MAX_DELAY = 3
-"""Greatest delay that a robot may set (control steps): memory has the actions up to it."""
-START_HEIGHT = (0.01, 0.05)
-"""Least and greatest height above the home pose at the start (m)."""
-STANDS, RUNS = 0.05, 1.5
-"""Speed of a command (m/s + rad/s) up to which a robot stands, and from which it runs."""
-UPSIDE = math.cos(math.radians(70.0))
-"""Cosine of the tilt at which a trunk has fallen."""
+SETTLING = 1.5  # time after a new command for which its errors do not count (s)
+BIAS = 0.015  # greatest error of a joint's encoder in an episode (rad)
+MAX_DELAY = 3  # greatest delay that a robot may set (control steps): memory has the actions up to it
+START_HEIGHT = (0.01, 0.05)  # least and greatest height above the home pose at the start (m)
+STANDS, RUNS = 0.05, 1.5  # speed of a command (m/s + rad/s) up to which a robot stands, and from which it runs
+UPSIDE = math.cos(math.radians(70.0))  # cosine of the tilt at which a trunk has fallen
 
 WEIGHTS = {
     "track_linear": 2.0,

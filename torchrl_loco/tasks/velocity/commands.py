@@ -12,17 +12,12 @@ Ranges = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 A curriculum has them by the control step of training from which they hold, in rising order.
 """
 
-STAND, TURN, AHEAD = 0.1, 0.3, 0.2
-"""Shares of the commands that stand still, hold a heading, and go straight ahead."""
-EVERY = (3.0, 8.0)
-"""Least and greatest time for which a command holds (s)."""
-SLOWEST = 0.3
-"""Least velocity straight ahead (m/s)."""
-STIFFNESS = 0.5
-"""Yaw rate by error of heading (1/s)."""
+STAND, TURN, AHEAD = 0.1, 0.3, 0.2  # shares of the commands that stand still, hold a heading, and go straight ahead
+EVERY = (3.0, 8.0)  # least and greatest time for which a command holds (s)
+SLOWEST = 0.3  # least velocity straight ahead (m/s)
+STIFFNESS = 0.5  # yaw rate by error of heading (1/s)
 
-NAMES = ("forward (m/s)", "left (m/s)", "yaw rate (rad/s)")
-"""Of the numbers of a command."""
+NAMES = ("forward (m/s)", "left (m/s)", "yaw rate (rad/s)")  # of the numbers of a command
 
 ROWS: dict[str, int | tuple[int, ...]] = {
     "command": 3,

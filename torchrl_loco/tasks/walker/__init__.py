@@ -13,12 +13,9 @@ from torchrl_loco.rewards import Sigmoid, tolerance
 from torchrl_loco.sim import fill
 from torchrl_loco.sim.sampling import PlanarBody, draw_pitch_and_hinges
 
-STAND_HEIGHT = wp.constant(1.2)
-"""Height of the torso from which the walker counts as standing (m)."""
-WALK_SPEED = 1.0
-"""Horizontal speed that counts as walking (m/s)."""
-RUN_SPEED = 8.0
-"""Horizontal speed that counts as running (m/s)."""
+STAND_HEIGHT = wp.constant(1.2)  # height of the torso from which the walker counts as standing (m)
+WALK_SPEED = 1.0  # horizontal speed that counts as walking (m/s)
+RUN_SPEED = 8.0  # horizontal speed that counts as running (m/s)
 
 SHORT_EPISODES = {
     "lr": 1e-3,
@@ -32,8 +29,7 @@ SHORT_EPISODES = {
 """Settings of the training that standing and walking share."""
 
 BODIES = wp.constant(7)
-Rows = wp.types.matrix(shape=(7, 3), dtype=wp.float32)
-"""First rows of the bodies' orientations."""
+Rows = wp.types.matrix(shape=(7, 3), dtype=wp.float32)  # first rows of the bodies' orientations
 
 
 @wp.func
