@@ -50,8 +50,6 @@ def observe_cheetah(world: int, inputs: CheetahInputs, observation: wp.array[flo
 class CheetahRun(LocoEnv):
     """Run at 10 m/s or faster.
 
-    Arguments as in :class:`~torchrl_loco.LocoEnv`.
-
     Observation:
         17 numbers: height and pitch of the torso and the hinges, qpos[1:] (8, m and rad); qvel (9, m/s and rad/s).
 
@@ -66,8 +64,7 @@ class CheetahRun(LocoEnv):
         One of 512 states, in each of which random hinges have settled for 2 s without action.
 
     Termination:
-        None by falling; truncation after 1000 steps; a non-finite world is terminated with reward 0 and a
-        zero observation.
+        None by falling; truncation after 1000 steps; a world that is not finite ends with reward and observation 0.
 
     Source:
         dm_control ``suite/cheetah.py``.

@@ -103,8 +103,6 @@ class Hopper(LocoEnv):
 class HopperStand(Hopper):
     """Stand upright on one leg.
 
-    Arguments as in :class:`~torchrl_loco.LocoEnv`.
-
     Observation:
         15 numbers: height and pitch of the torso and the hinges, qpos[1:] (6, m and rad); qvel (7, m/s and rad/s); what
         toe and heel feel, as log(1 + N) of the contact forces (2).
@@ -121,8 +119,7 @@ class HopperStand(Hopper):
         At rest, pitch uniform in (-pi, pi), hinges uniform in their ranges.
 
     Termination:
-        None by falling; truncation after 1000 steps; a non-finite world is terminated with reward 0 and a
-        zero observation.
+        None by falling; truncation after 1000 steps; a world that is not finite ends with reward and observation 0.
 
     Source:
         dm_control ``suite/hopper.py``.

@@ -135,8 +135,6 @@ class Humanoid(LocoEnv):
 class HumanoidStand(Humanoid):
     """Stand still and upright.
 
-    Arguments as in :class:`~torchrl_loco.LocoEnv`.
-
     Observation:
         67 numbers: hinge angles, qpos[7:] (21, rad); head height (1, m); left hand, left foot, right hand and right
         foot relative to the torso, in its frame (12, m); the torso's z row of xmat (3); velocity of the torso
@@ -156,8 +154,7 @@ class HumanoidStand(Humanoid):
         At rest; the default pose under ``playground``, a random one free of contact under ``dm_control``.
 
     Termination:
-        None by falling; truncation after 1000 steps; a non-finite world is terminated with reward 0 and a
-        zero observation.
+        None by falling; truncation after 1000 steps; a world that is not finite ends with reward and observation 0.
 
     Source:
         dm_control ``suite/humanoid.py``.

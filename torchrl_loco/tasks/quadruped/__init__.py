@@ -129,8 +129,6 @@ class Quadruped(LocoEnv):
 class QuadrupedWalk(Quadruped):
     """Walk forward at 0.5 m/s or faster.
 
-    Arguments as in :class:`~torchrl_loco.LocoEnv`.
-
     Observation:
         78 numbers: hinge angles (16, rad), their velocities (16, rad/s) and the actuators' activations (12); velocity
         of the torso in its own frame (3, m/s); torso zz (1); accelerometer (3, m/s^2) and gyroscope (3, rad/s) of the
@@ -150,8 +148,7 @@ class QuadrupedWalk(Quadruped):
         At rest with straight hinges, in any orientation, just above the ground.
 
     Termination:
-        None by falling; truncation after 1000 steps; a non-finite world is terminated with reward 0 and a
-        zero observation.
+        None by falling; truncation after 1000 steps; a world that is not finite ends with reward and observation 0.
 
     Source:
         dm_control ``suite/quadruped.py``.

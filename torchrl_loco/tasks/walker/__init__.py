@@ -115,8 +115,6 @@ class Walker(LocoEnv):
 class WalkerStand(Walker):
     """Stand up and stay upright.
 
-    Arguments as in :class:`~torchrl_loco.LocoEnv`.
-
     Observation:
         24 numbers: for torso, right thigh, leg, foot and left thigh, leg, foot the pair (xmat_xx, xmat_xz); one height
         entry, which is the torso's height (m) under ``dm_control`` and its zz under ``playground``; qvel (9, m/s and
@@ -133,8 +131,7 @@ class WalkerStand(Walker):
         At rest, pitch uniform in (-pi, pi), hinges uniform in their ranges.
 
     Termination:
-        None by falling; truncation after 1000 steps; a non-finite world is terminated with reward 0 and a
-        zero observation.
+        None by falling; truncation after 1000 steps; a world that is not finite ends with reward and observation 0.
 
     Source:
         dm_control ``suite/walker.py``.
