@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,11 +10,8 @@ import warp as wp
 from torchrl_loco.envs.heights import Ground
 from torchrl_loco.eyes.rays import Rays
 from torchrl_loco.eyes.tracer import Eye
-from torchrl_loco.sim import Buffer, fill_from_numbers
+from torchrl_loco.sim import Buffer, Simulation, fill_from_numbers
 from torchrl_loco.sim.compiled.collision.ground import NOTHING
-
-if TYPE_CHECKING:
-    from torchrl_loco.sim import Simulation
 
 UPRIGHT = 0.1  # length of the body's x axis, laid flat, below which its y axis tells the yaw
 NONE = wp.constant(wp.float32(NOTHING))
@@ -130,7 +126,7 @@ class Scans:
             points)``; of cameras, depths (m), ``(nworld, height, width)``; of rays, distances (m), ``(nworld, rays)``.
     """
 
-    def __init__(self, sim: "Simulation", asked: Mapping[str, Request], ground: Callable[[], Ground]) -> None:
+    def __init__(self, sim: Simulation, asked: Mapping[str, Request], ground: Callable[[], Ground]) -> None:
         self._eyes = {name: eye_of(sim, one) for name, one in asked.items() if not isinstance(one, ScanRequest)}
         self._asked = {name: one for name, one in asked.items() if isinstance(one, ScanRequest)}
         self._sim = sim
@@ -153,7 +149,7 @@ class Scans:
             eye.launch(data.xpos, data.xmat, mask)
 
 
-def eye_of(sim: "Simulation", asked: DepthRequest | RayRequest) -> Eye | Rays:
+def eye_of(sim: Simulation, asked: DepthRequest | RayRequest) -> Eye | Rays:
     """Returns what sees for hooks."""
     m, n = sim.mj_model, sim.num_envs
     if isinstance(asked, DepthRequest):
