@@ -7,9 +7,9 @@ import torch
 TYPES = {torch.float32: "float", torch.int64: "long long", torch.int32: "int", torch.bool: "bool"}
 MOST_NUMBERS = 100_000  # numbers of a tensor, or of a part, that are still worth writing out one by one
 
-ADD, SUB, MUL, NEG, SHL, DIV = "{0} + {1}", "{0} - {1}", "{0} * {1}", "-{0}", "{0} << {1}", "{0} / {1}"
+ADD, SUB, MUL, NEG, SHL = "{0} + {1}", "{0} - {1}", "{0} * {1}", "-{0}", "{0} << {1}"
 WRAPPING = (ADD, SUB, MUL, NEG, SHL)  # operators that wrap around for integers: C++ defines that for unsigned ones only
-WHERE, AND, OR, EQUAL = "{0} ? {1} : {2}", "{0} & {1}", "{0} | {1}", "{0} == {1}"
+WHERE = "{0} ? {1} : {2}"
 LEAST, MOST = "{0} < {1} || {0} != {0} ? {0} : {1}", "{0} > {1} || {0} != {0} ? {0} : {1}"  # NaN wins, as in torch
 OF_INTEGERS = {LEAST: "{0} < {1} ? {0} : {1}", MOST: "{0} > {1} ? {0} : {1}"}
 

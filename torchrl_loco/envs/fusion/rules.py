@@ -8,26 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchrl_loco.envs.fusion.nodes import (
-    ADD,
-    AND,
-    DIV,
-    EQUAL,
-    LEAST,
-    MOST,
-    MUL,
-    NEG,
-    OR,
-    SHL,
-    SUB,
-    TYPES,
-    WHERE,
-    CannotFuse,
-)
+from torchrl_loco.envs.fusion.nodes import ADD, LEAST, MOST, MUL, NEG, SHL, SUB, TYPES, WHERE, CannotFuse
 from torchrl_loco.envs.fusion.program import FILLERS, INFINITE, LONG, Program, Value, _shifted, offsets_of, shape_of
 
 aten = torch.ops.aten
 
+DIV, AND, OR, EQUAL = "{0} / {1}", "{0} & {1}", "{0} | {1}", "{0} == {1}"
 BEATS = {"max": "{0} > {1} || ({0} != {0} && {1} == {1})", "min": "{0} < {1} || ({0} != {0} && {1} == {1})"}
 REMAINDER = "{0} != 0 && ({0} < 0) != ({1} < 0) ? {0} + {1} : {0}"
 
