@@ -13,10 +13,7 @@ _held: dict[Path, int] = {}  # file descriptors of the locks of this process, by
 
 
 def lock(folder: Path) -> bool:
-    """Takes the lock of a folder, if this process does not have it. The system frees it when the process ends.
-
-    Returns:
-        Whether this call has taken it.
+    """Returns whether it takes the lock of a folder, which this process may have. The system frees it when that ends.
 
     Raises:
         BlockingIOError: another process has it.

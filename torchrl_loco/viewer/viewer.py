@@ -96,11 +96,7 @@ class Viewer:
             self.page.server.stop()
 
     def start(self) -> "Viewer":
-        """Plays in a thread of its own until :meth:`close` is called.
-
-        Returns:
-            The viewer.
-        """
+        """Returns itself; it plays in a thread of its own until :meth:`close` is called."""
         self._thread = threading.Thread(target=self.run, name="torchrl-loco viewer", daemon=True)
         self._thread.start()
         atexit.register(self.close)  # before the worlds are, which the thread would step on

@@ -41,11 +41,7 @@ def base_of(env: EnvBase) -> Any:
 
 
 def step_worlds(env: EnvBase, td: TensorDictBase, actions: Any) -> tuple[TensorDictBase, TensorDictBase]:
-    """Steps all worlds, and resets those that are done.
-
-    Returns:
-        The results of the step, and what the next one begins with, batch ``(num_envs,)`` each.
-    """
+    """Returns the results of a step of all worlds, and what the next begins with: those that are done are reset."""
     actions = torch.as_tensor(actions, device=env.device, dtype=env.action_spec.dtype)
     step, begin = env.step_and_maybe_reset(td.set("action", actions))
     return step["next"], begin
