@@ -7,7 +7,7 @@ import mujoco
 
 from torchrl_loco.checks import suggestion
 
-Names = str | Sequence[str]  # A name, several names, or a regular expression that matches whole names
+Names = str | Sequence[str]  # a name, several names, or a regular expression that matches whole names
 
 KINDS = {
     **{"body": "nbody", "joint": "njnt", "geom": "ngeom", "site": "nsite", "sensor": "nsensor", "actuator": "nu"},

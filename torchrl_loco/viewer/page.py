@@ -25,7 +25,7 @@ SPACING = 1.5  # distance between worlds, by the size of the model
 ELEVATION, AZIMUTH = np.deg2rad(20.0), np.deg2rad(120.0)  # where the camera is at first, seen from the chosen world
 COLORS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
 """Of the lines of a plot, again from the first after the last."""
-OVER_TIME = {"x": uplot.Scale(time=False, auto=True)}  # A plot's axis of seconds, which are no dates
+OVER_TIME = {"x": uplot.Scale(time=False, auto=True)}  # a plot's axis of seconds, which are no dates
 
 
 _SERVING = threading.Lock()

@@ -35,7 +35,7 @@ const bool full = __activemask() == 0xffffffffu;
 #define WRITE_ROW(numbers, at, count, step) for (int i = 0; i < count; ++i) (at)[i] = numbers[i];
 #endif"""
 
-Store = tuple[Node, Node]  # A number in memory, and what is written there
+Store = tuple[Node, Node]  # a number in memory, and what is written there
 
 
 class Source:

@@ -15,7 +15,7 @@ from torchrl_loco.sim.sampling import RootAboveFloor, draw_orientation_above_flo
 
 WALK_SPEED = 0.5  # forward speed that counts as walking (m/s)
 RUN_SPEED = 5.0  # forward speed that counts as running (m/s)
-INCREMENT = 0.01  # A start is raised in steps of this height until it is off the floor (m)
+INCREMENT = 0.01  # a start is raised in steps of this height until it is off the floor (m)
 
 ROOT_QPOS = wp.constant(7)  # numbers of qpos that place the root: position and quaternion; the hinges follow
 ROOT_QVEL = wp.constant(6)  # numbers of qvel that move the root
