@@ -34,11 +34,7 @@ class Part:
     :meth:`compile` runs it once on the present worlds to trace it. Whatever Python hooks use is evaluated then: what
     shall change later must be a tensor that is changed in place.
 
-    Args:
-        work: the function.
-        arrays: the arrays, by name, at addresses that stay.
-        title: names of the task and of its hooks, for messages.
-        fixed: tensors that it uses and that never change.
+    The arrays stay at their addresses, and the tensors ``fixed`` as they are; ``title`` is for messages.
     """
 
     def __init__(

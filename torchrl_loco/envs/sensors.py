@@ -40,13 +40,9 @@ def angular_velocity(s: Any, bodies: list[int], one: bool) -> torch.Tensor:
 
 
 class Frames:
-    """Frames of bodies, or of what is attached to them: sites, geoms, centers of inertia.
+    """Frames of bodies, or of what is attached to them: a kind of ``"body"``, ``"site"``, ``"geom"`` or ``"inertia"``.
 
-    Args:
-        s: the worlds.
-        kind: ``"body"``, ``"site"``, ``"geom"`` or ``"inertia"``.
-        ids: their ids; of centers of inertia, those of the bodies.
-        one: whether it is one that is named alone, which has no dimension of its own.
+    The ids of centers of inertia are those of the bodies. ``one`` that is named alone has no dimension of its own.
     """
 
     def __init__(self, s: Any, kind: str, ids: list[int], one: bool) -> None:

@@ -37,12 +37,8 @@ SIZE = 480, 360  # width and height of videos
 class Evaluator:
     """Plays full episodes without exploration, for the same seed the same ones.
 
-    On CUDA the steps are recorded in the first evaluation, and then replayed.
-
-    Args:
-        policy: what is evaluated; for another one of its kind, load its weights into this one.
-        env: the worlds, one for each episode.
-        action_repeat: frames for which an action is held.
+    On CUDA the steps are recorded in the first evaluation, and then replayed: for another policy of the same kind, load
+    its weights into this one. There is a world for each episode.
 
     Attributes:
         metrics: of the last evaluation, by name, the terms of the reward, summed over an episode, and the task's
