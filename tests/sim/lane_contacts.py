@@ -36,12 +36,12 @@ def find_contacts(m: mujoco.MjModel, qpos: np.ndarray) -> list[list[tuple[tuple[
     description = lanes.Description(m)
     most = description.layout.frictional + description.layout.frictionless + 1
     text = lanes.source(m, 1)
-    assert text.count("    jacobians();\n") == 1
+    assert text.count("  jacobians();\n") == 1
     # A model without numbers of each world leaves their array alone.
     head = "static float* contact_dump;\ncontact_dump = numbers_out.data + world * numbers_out.shape[1];\n"
 
     before, after = Chain(()), Chain(())
-    text = head + text.replace("    jacobians();\n", DUMP)
+    text = head + text.replace("  jacobians();\n", DUMP)
     kernel = _kernel(text, before, after)
     count = len(qpos)
     data = Data(Setup(m, SimConfig.of(m), count, wp.get_device("cpu")))

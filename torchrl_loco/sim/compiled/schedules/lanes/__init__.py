@@ -21,14 +21,19 @@ from torchrl_loco.sim.compiled.schedules.lanes.description import Description as
 from torchrl_loco.sim.compiled.schedules.lanes.description import is_implicitfast as is_implicitfast
 from torchrl_loco.sim.compiled.schedules.lanes.members import members
 
-FILES = (
-    *("world", "friction", "group", "kinematics", "welds", "dynamics"),
+MEMBERS = (
+    *("group", "kinematics", "welds", "dynamics"),
     *("contacts", "planes", "segments", "solids", "boxes", "box_pairs", "fields", "many_boxes", "collide"),
-    *("rows", "sides", "eliminate", "limbs", "solve", "outputs", "site_sensors", "step"),
+    *("rows", "sides", "eliminate", "limbs", "solve", "outputs", "site_sensors"),
 )
-"""The headers, in their order: from ``group`` on, each adds a struct that is built on the one before. The last one is a
-control step, from the arrays of all worlds and back."""
-HEADERS = "\n".join(pathlib.Path(__file__).with_name(f"{name}.h").read_text() for name in FILES)
+"""The headers that are members of struct ``Step``: what the lanes of a world keep and do."""
+
+
+def _read(*names: str) -> str:
+    return "\n".join(pathlib.Path(__file__).with_name(f"{name}.h").read_text() for name in names)
+
+
+HEADERS = "\n".join([_read("world", "friction"), "struct Step : Math {", _read(*MEMBERS), "};", _read("step")])
 LINE_SEARCH = shared.line_search("Model::scale()", "Model::ls_tolerance()", "Model::ls_near()", "Model::LS_ITERATIONS")
 NEWTON = shared.newton(
     "Model::scale()",
