@@ -65,8 +65,9 @@ NOT_COMPILED = Kind(0, "")
 FUNCTIONS = tuple(dict.fromkeys([*(kind.function for kind in KINDS.values()), *ON_BOXES.values()]))
 """The functions of lanes, in the order in which they look at their pairs."""
 
+ON_PLANES = {kind.function for (first, _), kind in KINDS.items() if first == PLANE}
 GROUND_FUNCTIONS = {kind.function for (first, _), kind in KINDS.items() if first in GROUND} | {*ON_BOXES.values()}
-"""Those of contacts with the ground. The others look at pairs whose bounding spheres are near."""
+"""Those of contacts with planes, and with any ground. The others look at pairs whose bounding spheres are near."""
 
 POINT_BITS = max(kind.points - 1 for kind in KINDS.values()).bit_length()
 """Bits of the number of a contact within its pair."""

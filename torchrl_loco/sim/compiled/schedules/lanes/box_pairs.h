@@ -177,18 +177,14 @@ INLINE void touch_box_and_box(bool near, int pair, Vec origin, const Mat& axes, 
     if (!ballot(exists)) break;
     const float distance = exists ? found.distances[k] : 0.0f;
     add_contact(exists && distance < Model::margin(pair), friction, pair, k,
-                origin + axes * found.points[exists ? k : 0], distance, normal, {0.0f, 0.0f, 0.0f});
+                origin + axes * found.points[exists ? k : 0], distance, normal);
   }
 }
 
 #if WITH_BOX_AND_BOX
-INLINE void collide_box_and_box(int& at, const int count, const int begin, const int end, const bool friction) {
-  if (begin == end) return;
-  ROLLED_FOR(; at < count && w.candidates[at] < end;) {
-    const Listed own = listed(at, count, end);
-    const int g = Model::first_geom(own.pair);
-    touch_box_and_box(own.valid, own.pair, w.geoms[g].center, geom_axes(g), Model::geom_size(g), friction);
-  }
+INLINE void collide_box_and_box(const OwnPair own, const bool friction) {
+  const int g = Model::first_geom(own.pair);
+  touch_box_and_box(own.valid, own.pair, w.geoms[g].center, geom_axes(g), Model::geom_size(g), friction);
 }
 #endif
 #endif

@@ -157,18 +157,14 @@ INLINE void touch_round_and_box(bool near, int pair, int first, Vec origin, cons
   ROLLED_FOR(int i = 0; i < 2; ++i) {
     const Depth depth = sphere_and_box(center + half * (i ? ends.second : ends.first), geom.radius, size);
     add_contact(near && i < ends.points && depth.distance < Model::margin(pair), friction, pair, first + i,
-                origin + axes * depth.point, depth.distance, axes * depth.normal, {0.0f, 0.0f, 0.0f});
+                origin + axes * depth.point, depth.distance, axes * depth.normal);
   }
 }
 
 #if WITH_ROUND_AND_BOX
-INLINE void collide_round_and_box(int& at, const int count, const int begin, const int end, const bool friction) {
-  if (begin == end) return;
-  ROLLED_FOR(; at < count && w.candidates[at] < end;) {
-    const Listed own = listed(at, count, end);
-    const int g = Model::second_geom(own.pair);
-    touch_round_and_box(own.valid, own.pair, 0, w.geoms[g].center, geom_axes(g), Model::geom_size(g), friction);
-  }
+INLINE void collide_round_and_box(const OwnPair own, const bool friction) {
+  const int g = Model::second_geom(own.pair);
+  touch_round_and_box(own.valid, own.pair, 0, w.geoms[g].center, geom_axes(g), Model::geom_size(g), friction);
 }
 #endif
 #endif

@@ -17,7 +17,7 @@ INLINE void hold_equalities() {
       wanted = Model::polynomial(5 * i + power) + second * wanted;
     }
     add_contact(valid, false, Model::PAIRS + Model::BALL_LIMITS + i, 0, {0.0f, 0.0f, 0.0f}, first - wanted,
-                {slope, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f});
+                {slope, 0.0f, 0.0f});
   }
 }
 
@@ -27,7 +27,7 @@ INLINE void hold_welds() {
     const bool valid = base + lane < Model::WELD_ROWS;
     const int i = valid ? base + lane : 0;
     const WeldRow row = weld_row(i);
-    add_contact(valid, false, Model::FIRST_WELD + i, 0, row.point, row.distance, row.other, {0.0f, 0.0f, 0.0f});
+    add_contact(valid, false, Model::FIRST_WELD + i, 0, row.point, row.distance, row.other);
   }
 }
 
@@ -40,8 +40,7 @@ INLINE void limit_balls() {
     float angle;
     const Vec axis = qpos_quat(Model::ball_qpos(i)).axis(angle);
     const float distance = Model::ball_range(i) - angle;
-    add_contact(valid && distance < Model::margin(pair), false, pair, 0, {0.0f, 0.0f, 0.0f}, distance, axis * -1.0f,
-                {0.0f, 0.0f, 0.0f});
+    add_contact(valid && distance < Model::margin(pair), false, pair, 0, {0.0f, 0.0f, 0.0f}, distance, axis * -1.0f);
   }
 }
 

@@ -51,7 +51,7 @@ INLINE int make_room(bool touches, Contact* stored, int place, int places, int i
 // Stores a contact where `touches`. The first tangent follows the hint, unless that is nearly normal (or nothing);
 // then a coordinate axis. All lanes call this together, so that contacts lie in the order of the lanes.
 INLINE void add_contact(bool touches, const bool friction, int pair, int number, Vec point, float distance, Vec normal,
-                        Vec hint) {
+                        Vec hint = {}) {
   const int id = pair << Model::POINT_BITS | number;
   const int left = Model::JACOBIAN_ROWS - DIRECTIONS * frictional;
   const int places = friction ? Model::FRICTIONAL : left < Model::FRICTIONLESS ? left : Model::FRICTIONLESS;
@@ -104,12 +104,17 @@ INLINE int near_pairs() {
   return count;
 }
 
-// This lane's pair of those that are listed from `at` on, up to pair `end`; `at` moves on by all that the lanes have.
-struct Listed {
+// This lane's pair, if there is one for it: of those from `begin` on, up to `end`; or of those that are listed from `at`
+// on, up to pair `end`, where `at` moves on by all that the lanes have.
+struct OwnPair {
   int pair;
   bool valid;
 };
-INLINE Listed listed(int& at, const int count, const int end) const {
+INLINE OwnPair own_pair(const int begin, const int end) const {
+  const bool valid = begin + lane < end;
+  return {valid ? begin + lane : begin, valid};
+}
+INLINE OwnPair own_pair(int& at, const int count, const int end) const {
   const int pair = at + lane < count ? w.candidates[at + lane] : end;
   const bool valid = pair < end;
   at += bits(ballot(valid));

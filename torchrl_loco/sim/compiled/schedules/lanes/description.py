@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.collision.ground import Ground
-from torchrl_loco.sim.compiled.collision.kinds import BOX, FUNCTIONS, GROUND_FUNCTIONS, MESH, PLANE, SOLID
+from torchrl_loco.sim.compiled.collision.kinds import BOX, FUNCTIONS, GROUND_FUNCTIONS, MESH, ON_PLANES, PLANE, SOLID
 from torchrl_loco.sim.compiled.collision.meshes import Mesh
 from torchrl_loco.sim.compiled.collision.pairs import Pair, half_length, is_elliptic, kind, looked_up, pairs, stand_ins
 from torchrl_loco.sim.compiled.ir import symbols
@@ -197,8 +197,14 @@ class Description:
                 found = [i for i, key in enumerate(kinds) if key == (function, friction)]
                 spans.append((found[0], found[-1] + 1) if found else (0, 0))
             begin, end = (f"friction ? {x} : {y}" for x, y in zip(*spans, strict=True))
-            listed = "" if function in GROUND_FUNCTIONS else "at, count, "
-            calls.append(f"      collide_{function}({listed}{begin}, {end}, friction);")
+            if function in ON_PLANES:
+                calls.append(f"ROLLED_FOR(int i = {begin}, end = {end}; i < end; i += LANES)")
+                calls.append(f"  collide_{function}(own_pair(i, end), friction);")
+            elif function in GROUND_FUNCTIONS:
+                calls.append(f"collide_{function}(friction);")
+            else:
+                calls.append(f"if (const int end = {end}) ROLLED_FOR(; at < count && w.candidates[at] < end;)")
+                calls.append(f"  collide_{function}(own_pair(at, count, end), friction);")
         return "\n".join(calls)
 
     def _standing(self) -> tuple[int, int]:

@@ -274,7 +274,7 @@ INLINE void touch_prisms(int field, const int count, const bool friction) {
     const Vec point = (touch.on_prism + touch.on_axis - touch.normal * geom.radius) * 0.5f;
     const int cell = k >> 1, row = o.row + cell / o.columns, column = o.column + cell % o.columns;
     add_contact(valid && distance < Model::margin(pair), friction, pair, (row & 1) << 2 | (column & 1) << 1 | (k & 1),
-                geom.center + axes * point, distance, axes * touch.normal, {0.0f, 0.0f, 0.0f});
+                geom.center + axes * point, distance, axes * touch.normal);
   }
 }
 
@@ -288,7 +288,7 @@ INLINE bool reaches(int field, int pair, int k) const {
   return most >= o.center.z - o.reach.z && above(p, 0, o.half) <= r && above(p, slanted, o.half) <= r;
 }
 
-INLINE void collide_round_on_field(const int, const int, const bool friction) {
+INLINE void collide_round_on_field(const bool friction) {
   ROLLED_FOR(int field = 0; field < Model::FIELDS; ++field) {
     const int begin = Model::field_pair(4 * field + 2 * friction),
               end = Model::field_pair(4 * field + 2 * friction + 1);

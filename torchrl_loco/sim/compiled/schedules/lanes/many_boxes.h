@@ -135,7 +135,7 @@ INLINE void look_up_boxes(const bool round, const int first, const int end, cons
 #endif
 
 #if WITH_ROUND_ON_BOXES
-INLINE void collide_round_on_boxes(const int, const int, const bool friction) {
+INLINE void collide_round_on_boxes(const bool friction) {
   ROLLED_FOR(int kind = 0; kind < Model::BOX_KINDS; ++kind) {
     const int i = 4 * kind + 2 * friction;
     look_up_boxes(true, Model::round_on_boxes_pair(i), Model::round_on_boxes_pair(i + 1), kind, friction);
@@ -143,7 +143,7 @@ INLINE void collide_round_on_boxes(const int, const int, const bool friction) {
 }
 #endif
 #if WITH_BOX_ON_BOXES
-INLINE void collide_box_on_boxes(const int, const int, const bool friction) {
+INLINE void collide_box_on_boxes(const bool friction) {
   ROLLED_FOR(int kind = 0; kind < Model::BOX_KINDS; ++kind) {
     const int i = 4 * kind + 2 * friction;
     look_up_boxes(false, Model::box_on_boxes_pair(i), Model::box_on_boxes_pair(i + 1), kind, friction);

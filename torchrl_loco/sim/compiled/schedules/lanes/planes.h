@@ -1,21 +1,18 @@
 // Contacts with planes of the world.
 
 // Spheres and the ends of capsules against planes of the world.
-INLINE void collide_round_on_plane(const int begin, const int end, const bool friction) {
-  ROLLED_FOR(int base = begin; base < end; base += LANES) {
-    const bool valid = base + lane < end;
-    const int pair = valid ? base + lane : begin;
-    const Geom geom = w.geoms[Model::second_geom(pair)];
-    const Vec normal = Model::plane_normal(pair);
-    const float height = normal.dot(geom.center) + normal.dot(w.com[0]) - Model::plane_offset(pair) - geom.radius;
-    const float rise = normal.dot(geom.half_axis), inverse_half = Model::inverse_half_length(pair);
-    ROLLED_FOR(int side = 0; side < 2; ++side) {
-      const float sign = side ? -1.0f : 1.0f, distance = height + sign * rise;
-      const bool exists = valid && (side == 0 || inverse_half > 0.0f);
-      add_contact(exists && distance < Model::margin(pair), friction, pair, side,
-                  geom.center + geom.half_axis * sign - normal * (geom.radius + 0.5f * distance), distance, normal,
-                  geom.half_axis * inverse_half);
-    }
+INLINE void collide_round_on_plane(const OwnPair own, const bool friction) {
+  const int pair = own.pair;
+  const Geom geom = w.geoms[Model::second_geom(pair)];
+  const Vec normal = Model::plane_normal(pair);
+  const float height = normal.dot(geom.center) + normal.dot(w.com[0]) - Model::plane_offset(pair) - geom.radius;
+  const float rise = normal.dot(geom.half_axis), inverse_half = Model::inverse_half_length(pair);
+  ROLLED_FOR(int side = 0; side < 2; ++side) {
+    const float sign = side ? -1.0f : 1.0f, distance = height + sign * rise;
+    const bool exists = own.valid && (side == 0 || inverse_half > 0.0f);
+    add_contact(exists && distance < Model::margin(pair), friction, pair, side,
+                geom.center + geom.half_axis * sign - normal * (geom.radius + 0.5f * distance), distance, normal,
+                geom.half_axis * inverse_half);
   }
 }
 
@@ -84,32 +81,29 @@ static INLINE bool point_below(int g, int k, Vec n, Vec& point) {
 }
 
 // Boxes, cylinders, ellipsoids and meshes against planes of the world.
-INLINE void collide_solid_on_plane(const int begin, const int end, const bool friction) {
-  ROLLED_FOR(int base = begin; base < end; base += LANES) {
-    const bool valid = base + lane < end;
-    const int pair = valid ? base + lane : begin, g = Model::second_geom(pair);
-    const Geom geom = w.geoms[g];
-    const Vec normal = Model::plane_normal(pair);
-    const float height = normal.dot(geom.center) + normal.dot(w.com[0]) - Model::plane_offset(pair);
-    const bool near = valid && height - geom.radius < Model::margin(pair);
-    if (!ballot(near)) continue;
-    const Mat axes = geom_axes(g);
-    const Vec n = axes.transposed_times(normal);
+INLINE void collide_solid_on_plane(const OwnPair own, const bool friction) {
+  const int pair = own.pair, g = Model::second_geom(pair);
+  const Geom geom = w.geoms[g];
+  const Vec normal = Model::plane_normal(pair);
+  const float height = normal.dot(geom.center) + normal.dot(w.com[0]) - Model::plane_offset(pair);
+  const bool near = own.valid && height - geom.radius < Model::margin(pair);
+  if (!ballot(near)) return;
+  const Mat axes = geom_axes(g);
+  const Vec n = axes.transposed_times(normal);
 #if WITH_MESHES
-    const bool is_mesh = near && Model::geom_shape(g) == MESH;
-    const Corner lowest = is_mesh ? lowest_corner(g, n) : Corner{0, -1};
+  const bool is_mesh = near && Model::geom_shape(g) == MESH;
+  const Corner lowest = is_mesh ? lowest_corner(g, n) : Corner{0, -1};
 #endif
-    ROLLED_FOR(int k = 0; k < 4; ++k) {
-      Vec point;
+  ROLLED_FOR(int k = 0; k < 4; ++k) {
+    Vec point;
 #if WITH_MESHES
-      const bool exists = is_mesh ? vertex_below(lowest, k, n, point) : point_below(g, k, n, point);
+    const bool exists = is_mesh ? vertex_below(lowest, k, n, point) : point_below(g, k, n, point);
 #else
-      const bool exists = point_below(g, k, n, point);
+    const bool exists = point_below(g, k, n, point);
 #endif
-      const float distance = height + n.dot(point);
-      add_contact(near && exists && distance < Model::margin(pair), friction, pair, k,
-                  geom.center + axes * point - normal * (0.5f * distance), distance, normal, {0.0f, 0.0f, 0.0f});
-    }
+    const float distance = height + n.dot(point);
+    add_contact(near && exists && distance < Model::margin(pair), friction, pair, k,
+                geom.center + axes * point - normal * (0.5f * distance), distance, normal);
   }
 }
 #endif

@@ -106,36 +106,32 @@ static INLINE OnCap along_cap(Vec size, Vec middle, Vec half, float up, float ma
   return {high, high, !high_is_in ? 0 : high < 1.0f ? 2 : 1};
 }
 
-INLINE void collide_round_and_solid(int& at, const int count, const int begin, const int end, const bool friction) {
-  if (begin == end) return;
-  ROLLED_FOR(; at < count && w.candidates[at] < end;) {
-    const Listed own = listed(at, count, end);
-    const int pair = own.pair, g = Model::second_geom(pair), shape = Model::geom_shape(g);
-    const Geom geom = w.geoms[Model::first_geom(pair)];
-    const Vec origin = w.geoms[g].center, size = Model::geom_size(g);
-    const Mat axes = geom_axes(g);
-    const Vec center = axes.transposed_times(geom.center - origin), half = axes.transposed_times(geom.half_axis);
-    const float margin = Model::margin(pair), length = half.norm();
-    const bool near = own.valid && surface(shape, center, size).distance - length < geom.radius + margin;
-    if (!ballot(near)) continue;
-    const float t = near && length > 0.0f ? nearest_on_segment(shape, size, center, half) : 0.0f;
-    const Surface nearest = surface(shape, center + half * t, size);
-    const Vec out = nearest.normal, cap = {0.0f, 0.0f, out.z < 0.0f ? -1.0f : 1.0f};
-    // The line that touches: the nearest point on the capsule, and as much of its axis as there is on both sides.
-    const Vec axis = half * (length > 0.0f ? divide(1.0f, length) : 0.0f);
-    const Vec middle = center - (out - axis * axis.dot(out)) * (geom.radius + 0.5f * margin);
-    const bool lies = near && shape == CYLINDER && length > 0.0f && out.z != 0.0f && fabsf(axis.z) < 0.0887829f;
-    const OnCap on_cap = lies ? along_cap(size, middle, half, cap.z, margin) : OnCap{0.0f, 0.0f, 0};
-    ROLLED_FOR(int i = 0; i < 2; ++i) {
-      const bool along = on_cap.points > 0;
-      const Vec lowest =
-          along ? middle + half * (i ? on_cap.second : on_cap.first) : center + half * t - out * geom.radius;
-      const float distance = along ? cap.z * lowest.z - size.y + 0.5f * margin : nearest.distance - geom.radius;
-      const Vec normal = (along ? cap : out) * -1.0f;
-      add_contact(near && i < (along ? on_cap.points : 1) && distance < margin, friction, pair, i,
-                  origin + axes * (lowest + normal * (0.5f * distance - (along ? 0.5f * margin : 0.0f))), distance,
-                  axes * normal, {0.0f, 0.0f, 0.0f});
-    }
+INLINE void collide_round_and_solid(const OwnPair own, const bool friction) {
+  const int pair = own.pair, g = Model::second_geom(pair), shape = Model::geom_shape(g);
+  const Geom geom = w.geoms[Model::first_geom(pair)];
+  const Vec origin = w.geoms[g].center, size = Model::geom_size(g);
+  const Mat axes = geom_axes(g);
+  const Vec center = axes.transposed_times(geom.center - origin), half = axes.transposed_times(geom.half_axis);
+  const float margin = Model::margin(pair), length = half.norm();
+  const bool near = own.valid && surface(shape, center, size).distance - length < geom.radius + margin;
+  if (!ballot(near)) return;
+  const float t = near && length > 0.0f ? nearest_on_segment(shape, size, center, half) : 0.0f;
+  const Surface nearest = surface(shape, center + half * t, size);
+  const Vec out = nearest.normal, cap = {0.0f, 0.0f, out.z < 0.0f ? -1.0f : 1.0f};
+  // The line that touches: the nearest point on the capsule, and as much of its axis as there is on both sides.
+  const Vec axis = half * (length > 0.0f ? divide(1.0f, length) : 0.0f);
+  const Vec middle = center - (out - axis * axis.dot(out)) * (geom.radius + 0.5f * margin);
+  const bool lies = near && shape == CYLINDER && length > 0.0f && out.z != 0.0f && fabsf(axis.z) < 0.0887829f;
+  const OnCap on_cap = lies ? along_cap(size, middle, half, cap.z, margin) : OnCap{0.0f, 0.0f, 0};
+  ROLLED_FOR(int i = 0; i < 2; ++i) {
+    const bool along = on_cap.points > 0;
+    const Vec lowest =
+        along ? middle + half * (i ? on_cap.second : on_cap.first) : center + half * t - out * geom.radius;
+    const float distance = along ? cap.z * lowest.z - size.y + 0.5f * margin : nearest.distance - geom.radius;
+    const Vec normal = (along ? cap : out) * -1.0f;
+    add_contact(near && i < (along ? on_cap.points : 1) && distance < margin, friction, pair, i,
+                origin + axes * (lowest + normal * (0.5f * distance - (along ? 0.5f * margin : 0.0f))), distance,
+                axes * normal);
   }
 }
 #endif
