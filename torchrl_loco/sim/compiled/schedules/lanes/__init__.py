@@ -48,20 +48,13 @@ NEWTON = shared.newton(
 def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked = shared.NO_MORE) -> str:
     """Returns the C++ of a control step of one world, by the arguments of :func:`.step.source`."""
     d = Description(m)
-    tables, count = members(d, substeps, asked), len(asked.contact_geoms)
+    tables = members(d, substeps, asked)
     parts = {
-        "CONTACT_GEOMS": count > 0,
-        "KEPT_CONTACTS": count > 0 or len(d.wrenches) > 0,
         "ELLIPTIC": d.elliptic,
         "LIMBS": d.limbs is not None,
-        "MESHES": bool(d.meshes),
         "SOLIDS": d.has_solids or d.ground.boxes is not None,
         "GROUND": d.layout.near_ground > 0,
         "TENDONS": d.pulls_tendons,
-        "ACTIVATIONS": d.layout.activations > 0,
-        "WELDS": len(d.welds) > 0,
-        "ACCELEROMETERS": len(d.accelerometers) > 0,
-        "WRENCHES": len(d.wrenches) > 0,
         **{function.upper(): function in d.functions for function in FUNCTIONS},
     }
     defined = [f"#define WITH_{part} {needed:d}" for part, needed in parts.items()]

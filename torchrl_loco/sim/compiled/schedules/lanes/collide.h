@@ -21,7 +21,6 @@ INLINE void hold_equalities() {
   }
 }
 
-#if WITH_WELDS
 INLINE void hold_welds() {
   ROLLED_FOR(int base = 0; base < Model::WELD_ROWS; base += LANES) {
     const bool valid = base + lane < Model::WELD_ROWS;
@@ -31,7 +30,6 @@ INLINE void hold_welds() {
   }
 }
 
-#endif
 // The limit of a ball joint is a row along three degrees of freedom; it lies among the contacts without friction.
 INLINE void limit_balls() {
   ROLLED_FOR(int base = 0; base < Model::BALL_LIMITS; base += LANES) {
@@ -78,9 +76,7 @@ INLINE void find_contacts() {
   ROLLED_FOR(int kind = 0; kind < 2; ++kind) {
     const bool friction = kind == 0;
     if (!friction) hold_equalities();
-#if WITH_WELDS
     if (!friction) hold_welds();
-#endif
     if (!friction) limit_balls();
     //COLLIDE
   }

@@ -35,9 +35,7 @@ INLINE void accelerate(Motion* accelerations, const bool with_qacc) const {
 INLINE void subtrees() {
   Motion accelerations[LINK_SLOTS];
   accelerate(accelerations, false);
-#if WITH_WELDS
-  accelerate_welds(accelerations);
-#endif
+  if (Model::WELD_ROWS > 0) accelerate_welds(accelerations);
   OWN_LINKS(slot, b) {
     if (b >= Model::LINKS) continue;
     const Motion velocity = w.velocity[b];
@@ -67,7 +65,6 @@ INLINE void subtrees() {
 }
 
 //ACTUATOR
-#if WITH_ACTIVATIONS
 INLINE float control_of(int a) const {
   return clamp(ctrl[Model::control(a)], Model::control_low(a), Model::control_high(a));
 }
@@ -75,12 +72,11 @@ INLINE float control_of(int a) const {
 // Activations follow their controls, of which each step they take a share, and lose one of themselves.
 INLINE void activate() {
   SHARED_LOOP(i, Model::ACTIVATIONS) {
-    const float act = w.act[i], control = control_of(Model::activated(i));
+    const float act = w.act()[i], control = control_of(Model::activated(i));
     const float next = act + (Model::inflow(i) * control - Model::outflow(i) * act);
-    w.act[i] = clamp(next, Model::act_low(i), Model::act_high(i));
+    w.act()[i] = clamp(next, Model::act_low(i), Model::act_high(i));
   }
 }
-#endif
 
 // Passive and actuator forces of a degree of freedom, and its damping: minus the derivative of the force by its
 // velocity. MuJoCo leaves out of that actuators whose force a limit holds.
@@ -103,12 +99,10 @@ INLINE float joint_force(int d, float& damping) const {
 #else
     const float position = w.qpos[q], velocity = w.qvel[d], moment = gear;
 #endif
-#if WITH_ACTIVATIONS
     const int activation = Model::activation(a);
-    const float input = activation < 0 ? control_of(a) : w.act[activation];
-#else
-    const float input = ctrl[Model::control(a)];
-#endif
+    const float input = Model::ACTIVATIONS == 0 ? ctrl[Model::control(a)]
+                        : activation < 0        ? control_of(a)
+                                                : w.act()[activation];
     const float f = actuator_force(a, input, position, velocity);
     if (Model::IMPLICIT_ACTUATORS && Model::force_low(a) < f && f < Model::force_high(a))
       damping = damping - gear * gear * Model::bias_velocity(a);

@@ -3,7 +3,6 @@
 // The law of a contact with friction: gradient and Hessian of its cost, as a function of its residuals in its
 // directions, which are the normal, two tangents, and turning about these three.
 
-#if WITH_ELLIPTIC
 // An elliptic cone. With a residual n along the normal and one of length t off it, it costs D / 2 times their squared
 // distance from n >= mu t. That is a parabola of how far they lie beside the cone, and one of how far beyond its tip,
 // each with one side (in the plane of n and t, the two axes are at right angles):
@@ -103,8 +102,7 @@ struct Cone {
     }
   };
 };
-typedef Cone Law;
-#else
+
 // A pyramid. Its edges, the normal plus or minus one of the others, are rows of their own.
 struct Pyramid {
   float gradient[DIRECTIONS];
@@ -115,7 +113,7 @@ struct Pyramid {
     UNROLLED_FOR(int i = 0; i < CONTACT_ROWS; ++i) found |= (unsigned)(x[i] < 0.0f) << i;
     return found;
   }
-  INLINE Pyramid(const float* x, float weight, unsigned sides) {
+  INLINE Pyramid(const float* x, float weight, float, unsigned sides) {
     UNROLLED_FOR(int j = 1; j < DIRECTIONS; ++j) {
       const float plus = x[2 * j - 2], minus = x[2 * j - 1];
       const float d = sides >> (2 * j - 2) & 1 ? weight : 0.0f, e = sides >> (2 * j - 1) & 1 ? weight : 0.0f;
@@ -134,5 +132,8 @@ struct Pyramid {
     }
   }
 };
+#if WITH_ELLIPTIC
+typedef Cone Law;
+#else
 typedef Pyramid Law;
 #endif

@@ -1,7 +1,6 @@
 // The Hessian of a body with limbs, which are eliminated side by side.
 
-#if WITH_LIMBS
-#ifdef __CUDA_ARCH__
+#if WITH_LIMBS && defined(__CUDA_ARCH__)
 // The Hessian without its zeros. The trunk is what several limbs share, a limb what branches off and does not branch
 // again. While no contact couples two limbs, a row of a limb has the columns of the trunk and those of its limb, and
 // the limbs are eliminated side by side, from their ends. What they leave of the trunk is small enough for each lane
@@ -226,6 +225,4 @@ INLINE void solve_by_limbs(Branches& h, const bool damping_alone, float& decreme
     decrement = decrement + solution[hold] * before[hold];
   }
 }
-#endif
-
 #endif

@@ -76,9 +76,8 @@ def members(d: Description, substeps: int, asked: Asked) -> Tables:
     _add_limits(tables, d)
     _add_outputs(tables, d)
     tables.integers("root_body", d.roots)
-    tables.size(CONTACT_GEOMS=len(asked.contact_geoms), HISTORY=asked.contact_rows, SUBTREE_COM=asked.with_subtree_com)
-    if asked.contact_geoms:
-        _add_contact_geoms(tables, d, asked.contact_geoms)
+    tables.size(HISTORY=asked.contact_rows, SUBTREE_COM=asked.with_subtree_com)
+    _add_contact_geoms(tables, d, asked.contact_geoms)
     return tables
 
 
@@ -146,6 +145,7 @@ def _add_joints(tables: Tables, d: Description) -> None:
 
 
 def _add_limbs(tables: Tables, d: Description) -> None:
+    tables.integers("crosses", [d.limbs is not None and d.limbs.crosses(d.apart(pair)) for pair in d.pairs])
     if d.limbs is None:
         return
     limbs, trunk, rows = d.limbs.limbs, d.limbs.trunk, d.limbs.rows
@@ -163,7 +163,6 @@ def _add_limbs(tables: Tables, d: Description) -> None:
     corner = [*gradient, *unused[: -len(trunk) % 4], *lower, *unused[: -len(lower) % 4]]
     tables.integers("corner_row", [i for i, _ in corner])
     tables.integers("corner_column", [j for _, j in corner])
-    tables.integers("crosses", [d.limbs.crosses(d.apart(pair)) for pair in d.pairs])
 
 
 def _add_forces(tables: Tables, d: Description) -> None:
@@ -212,8 +211,6 @@ def _add_forces(tables: Tables, d: Description) -> None:
 
 def _add_activations(tables: Tables, d: Description, order: list[int]) -> None:
     m = d.m
-    if not m.na:
-        return
     tables.integers("activation", [m.actuator_actadr[d.acting[i]] for i in order])
     found = sorted((m.actuator_actadr[i], i) for i in d.acting if m.actuator_actadr[i] >= 0)
     tables.integers("activated", [order.index(d.acting.index(i)) for _, i in found])
@@ -273,8 +270,7 @@ def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
         tables.structs("Mat", "geom_orientation", [matrix(turn) for turn in turns])
         solid = np.isin(m.geom_type[d.geoms], SOLID)
         tables.size(SOLIDS_TURNED=any(abs(turn[0]) < 1 for turn in itertools.compress(turns, solid)))
-    if d.meshes:
-        _add_meshes(tables, d)
+    _add_meshes(tables, d)
     _add_ground(tables, d)
     index = {g: i for i, g in enumerate(d.geoms)}
     tables.integers("first_geom", [index.get(p.geoms[0], 0) for p in found])
@@ -361,10 +357,8 @@ def _add_friction(tables: Tables, d: Description) -> None:
     """
     found, ratio = d.pairs, math.sqrt(d.m.opt.impratio)
     tables.size(ELLIPTIC=d.elliptic)
-    slopes: list[Number] = [1.0] * len(found)
-    if d.elliptic:
-        slopes = [p.friction / ratio if p.condim > 1 else 1.0 for p in found]
-        tables.floats("mu", slopes)
+    slopes: list[Number] = [p.friction / ratio if d.elliptic and p.condim > 1 else 1.0 for p in found]
+    tables.floats("mu", slopes)
     tables.floats("friction", [ratio if d.elliptic else p.friction for p in found])
     tables.floats("friction_ratio", [p.friction_ratio for p in found])
     tables.floats("torsional", [p.torsional / mu for p, mu in zip(found, slopes, strict=True)])
@@ -386,9 +380,10 @@ def _add_meshes(tables: Tables, d: Description) -> None:
         for normal, others in of_vertex
     ]
     counts = [len(of_vertex) for mesh in meshes for of_vertex in mesh.corners]
+    tables.size(MESHES=len(meshes))
     tables.integers("first_vertex", [sizes[used.index(mesh)] if mesh >= 0 else 0 for mesh in of])
     tables.integers("last_vertex", [sizes[used.index(mesh) + 1] if mesh >= 0 else 0 for mesh in of])
-    tables.structs("Vec", "vertex", np.concatenate([mesh.vertices for mesh in meshes]))
+    tables.structs("Vec", "vertex", [vertex for mesh in meshes for vertex in mesh.vertices])
     tables.integers("first_corner", np.cumsum([0, *counts]))
     tables.structs("Vec", "corner_normal", [normal for normal, _ in corners])
     tables.integers("corner_vertex", [vertex for _, others in corners for vertex in others])
@@ -525,5 +520,6 @@ def _add_touch(tables: Tables, d: Description) -> None:
 
 def _add_contact_geoms(tables: Tables, d: Description, geoms: Sequence[int]) -> None:
     index, none = {geom: i for i, geom in enumerate(geoms)}, [-1] * d.lasting
+    tables.size(CONTACT_GEOMS=len(geoms), KEPT_CONTACTS=bool(geoms or d.wrenches))
     for i, title in enumerate(("first", "second")):
         tables.integers(f"{title}_contact_geom", [*(index.get(p.geoms[i], -1) for p in d.pairs), *none])

@@ -1,25 +1,19 @@
 // Bodies, sensors and contact forces.
 
-#if WITH_KEPT_CONTACTS
 // What the solver overwrites of the contacts that this lane adds up: number lane, lane + LANES, ...
 enum { OWN_CONTACTS = (CONTACTS + LANES - 1) / LANES };
 struct OwnContact {
-  Vec normal, tangent;
-#if WITH_WRENCHES
-  Vec point;
-#endif
+  Vec normal, tangent, point;
   int pair;
 } own_contacts[OWN_CONTACTS];
-#endif
 
 // The sum of the normal forces of the contacts that each sensor feels.
 INLINE void write_touch(float* sensordata) const {
   ROLLED_FOR(int s = 0; s < Model::TOUCH; ++s) {
     float force = 0.0f;
-#if WITH_ELLIPTIC
-    SHARED_LOOP(k, frictional)
-      if (w.zones[k] >> s & 1) force -= law(k).gradient[0];
-#endif
+    if (Model::ELLIPTIC)
+      SHARED_LOOP(k, frictional)
+        if (w.zones[k] >> s & 1) force -= law(k).gradient[0];
     SHARED_LOOP(i, first_limit() - first_single()) {
       const int r = first_single() + i;
       const bool felt = w.zones[place_of(contact_of_row(r))] >> s & 1;
@@ -30,7 +24,6 @@ INLINE void write_touch(float* sensordata) const {
   }
 }
 
-#if WITH_KEPT_CONTACTS
 // ---- Contact forces
 
 INLINE void keep_contacts() {
@@ -40,9 +33,7 @@ INLINE void keep_contacts() {
     const Contact c = contact(i);
     own_contacts[own].normal = own_contacts[own].tangent = c.normal;
     own_contacts[own].pair = c.pair();
-#if WITH_WRENCHES
     own_contacts[own].point = c.point;
-#endif
     if (i < frictional) own_contacts[own].tangent = w.tangents[i] * Model::friction(c.pair());
   }
   sync();
@@ -58,12 +49,10 @@ INLINE Vec contact_force(int i, const OwnContact& c) const {
   return c.normal * -cost.gradient[0] + c.tangent * -cost.gradient[1] +
          second_tangent(c.normal, c.tangent, c.pair) * -cost.gradient[2];
 }
-#endif
 
-#if WITH_CONTACT_GEOMS
 // The sum of the contact forces on each geom, and whether there is a contact. A lane adds up those of its geoms.
 INLINE void write_contact_forces(float* forces, bool* touches) const {
-  enum { OWN_GEOMS = (Model::CONTACT_GEOMS + LANES - 1) / LANES };
+  enum { OWN_GEOMS = Model::CONTACT_GEOMS > 0 ? (Model::CONTACT_GEOMS + LANES - 1) / LANES : 1 };
   Vec total[OWN_GEOMS];
   bool touched[OWN_GEOMS];
   UNROLLED_FOR(int own = 0; own < OWN_GEOMS; ++own) {
@@ -100,8 +89,6 @@ INLINE void write_contact_forces(float* forces, bool* touches) const {
     touches[g] = touched[own];
   }
 }
-
-#endif
 
 // Poses of all bodies, and their velocities unless nobody asked for them.
 INLINE void write_bodies(float* xpos, float* xmat, float* cvel) const {

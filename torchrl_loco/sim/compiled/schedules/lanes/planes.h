@@ -17,7 +17,6 @@ INLINE void collide_round_on_plane(const OwnPair own, const bool friction) {
 }
 
 #if WITH_SOLID_ON_PLANE
-#if WITH_MESHES
 struct Corner {
   int vertex, corner;
 };  // of a mesh; the corner is that of a face, or -1
@@ -52,7 +51,6 @@ static INLINE bool vertex_below(Corner lowest, int k, Vec n, Vec& point) {
   return k == 0 || n.dot(point) <= 0.0f;
 }
 
-#endif
 // Point k of a solid that may touch a plane with normal n, in the frame of the solid; returns false if there is none.
 static INLINE bool point_below(int g, int k, Vec n, Vec& point) {
   const Vec size = Model::geom_size(g);
@@ -90,17 +88,11 @@ INLINE void collide_solid_on_plane(const OwnPair own, const bool friction) {
   if (!ballot(near)) return;
   const Mat axes = geom_axes(g);
   const Vec n = axes.transposed_times(normal);
-#if WITH_MESHES
-  const bool is_mesh = near && Model::geom_shape(g) == MESH;
+  const bool is_mesh = Model::MESHES && near && Model::geom_shape(g) == MESH;
   const Corner lowest = is_mesh ? lowest_corner(g, n) : Corner{0, -1};
-#endif
   ROLLED_FOR(int k = 0; k < 4; ++k) {
     Vec point;
-#if WITH_MESHES
     const bool exists = is_mesh ? vertex_below(lowest, k, n, point) : point_below(g, k, n, point);
-#else
-    const bool exists = point_below(g, k, n, point);
-#endif
     const float distance = height + n.dot(point);
     add_contact(near && exists && distance < Model::margin(pair), friction, pair, k,
                 geom.center + axes * point - normal * (0.5f * distance), distance, normal);

@@ -4,9 +4,7 @@ int limits;                                // violated limits of hinges and slid
 int limit_row[Model::LIMIT_SIDES][SLOTS];  // the row of the limit of each own degree of freedom, or -1
 // Of this lane's contacts, with friction and without, the quads of columns in which the Jacobian has numbers.
 unsigned frictional_quads, frictionless_quads;
-#if WITH_LIMBS
 bool crossing;  // whether a contact couples two limbs
-#endif
 
 // Jacobian rows and constraint rows, in their order. A contact with friction has a Jacobian row for each direction
 // (all but the normal times a factor), and a constraint row for each edge of its pyramid, or each direction of its
@@ -41,16 +39,12 @@ INLINE void jacobians() {
   const bool own = Model::VARIED && LANES > 1 && Model::FRICTIONAL <= LANES;
   float own_friction = 0.0f;  // of the lane's contact: in the loop, all would wait for one after the other
   if (own && lane < frictional) own_friction = Model::friction(w.contacts[lane].pair());
-#if WITH_LIMBS
   crossing = false;
-#endif
   ROLLED_FOR(int i = 0; i < frictional + frictionless; ++i) {
     const Contact c = contact(i);
     const bool friction = i < frictional, touches = c.pair() < Model::PAIRS;
     const int pair = touches ? c.pair() : 0;
-#if WITH_LIMBS
     crossing = crossing || (touches && Model::crosses(pair));
-#endif
     const Model::Dofs against = Model::first_dofs(pair), with = Model::second_dofs(pair);
     Vec tangent = {0.0f, 0.0f, 0.0f}, other = tangent;
     if (friction) {
@@ -68,8 +62,7 @@ INLINE void jacobians() {
       Vec velocity = axes[slot].at(point);
       const float sign = d < DOFS ? (float)((int)(with >> d & 1) - (int)(against >> d & 1)) : 0.0f;
       velocity = velocity * sign;
-#if WITH_WELDS
-      if (c.pair() >= Model::FIRST_WELD) {
+      if (Model::WELD_ROWS > 0 && c.pair() >= Model::FIRST_WELD) {
         const int row_of_weld = c.pair() - Model::FIRST_WELD, axis = Model::weld_axis(row_of_weld);
         const int weld = Model::weld_of_row(row_of_weld);
         const float plus = Model::weld_first_dofs(weld) >> d & 1 ? 1.0f : 0.0f;
@@ -79,7 +72,6 @@ INLINE void jacobians() {
         row[d] = axis < 3 ? pushed.component(axis) : axes[slot].angular.dot(c.normal) * (plus - minus);
         continue;
       }
-#endif
       if (Model::EQUALITIES && c.pair() >= Model::PAIRS + Model::BALL_LIMITS) {
         const int equality = c.pair() - (Model::PAIRS + Model::BALL_LIMITS), end = Model::first_share(equality + 1);
         float total = 0.0f;
@@ -122,36 +114,30 @@ INLINE int contact_of_row(int r) const {
 INLINE void set_rows() {
   SHARED_LOOP(r, first_limit()) {
     const Contact& c = contact(contact_of_row(r));
-#if WITH_ELLIPTIC
-    if (r < first_frictionless() && r % CONTACT_ROWS > 0) {  // nothing is violated off the normal
+    if (Model::ELLIPTIC && r < first_frictionless() && r % CONTACT_ROWS > 0) {  // nothing is violated off the normal
       w.weight[r] = Model::mu(c.pair());
       w.x[r] = 0.0f;
       continue;
     }
-#endif
     if (r < first_frictionless() && r % CONTACT_ROWS >= Model::edges(c.pair())) {  // so far open that it stays so
       w.weight[r] = 0.0f;
       w.x[r] = 1e15f;
       continue;
     }
     float distance = c.distance;
-#if WITH_WELDS
-    if (c.pair() >= Model::FIRST_WELD) {  // the impedance is that of all of its rows together
+    if (Model::WELD_ROWS > 0 && c.pair() >= Model::FIRST_WELD) {  // the impedance is that of all of its rows together
       const int i = c.pair() - Model::FIRST_WELD, axis = Model::weld_axis(i);
       const int first = contact_of_row(r) - axis, count = Model::weld_rows(Model::weld_of_row(i));
       float squared = 0.0f;
       ROLLED_FOR(int k = 0; k < count; ++k) squared += contact(first + k).distance * contact(first + k).distance;
       distance = root(squared);
     }
-#endif
     set_row(r, Model::contact_softness(c.pair()), Model::inverse_inertia(c.pair()), distance,
             Model::least_regularisation(c.pair()));
-#if WITH_WELDS
-    if (c.pair() >= Model::FIRST_WELD) {
+    if (Model::WELD_ROWS > 0 && c.pair() >= Model::FIRST_WELD) {
       const float share = distance > 0.0f ? divide(c.distance, distance) : 0.0f;
-      w.x[r] = w.x[r] * share + w.weld_bias[c.pair() - Model::FIRST_WELD];
+      w.x[r] = w.x[r] * share + w.weld_bias()[c.pair() - Model::FIRST_WELD];
     }
-#endif
   }
   limits = 0;
   OWN_DOFS(slot, d)
@@ -202,20 +188,12 @@ INLINE float row_velocity(int r, const float* vector) const {
 // weight of all; of a cone, the second has mu.
 INLINE unsigned sides_of(int contact) const {
   const float* const x = w.x + CONTACT_ROWS * contact;
-#if WITH_ELLIPTIC
-  return Cone::state(x, w.weight[CONTACT_ROWS * contact + 1]);
-#else
-  return Pyramid::sides(x);
-#endif
+  return Model::ELLIPTIC ? (unsigned)Cone::state(x, w.weight[CONTACT_ROWS * contact + 1]) : Pyramid::sides(x);
 }
 INLINE Law law(int contact, unsigned sides) const {
   const float *const x = w.x + CONTACT_ROWS * contact, *const weight = w.weight + CONTACT_ROWS * contact;
-#if WITH_ELLIPTIC
-  return Law(x, weight[0], weight[1], sides);
-#else
-  float edges[CONTACT_ROWS];
-  UNROLLED_FOR(int i = 0; i < CONTACT_ROWS; ++i) edges[i] = CONTACT_ROWS == 4 ? read4(x).v[i & 3] : x[i];
-  return Law(edges, weight[0], sides);
-#endif
+  float rows[CONTACT_ROWS];
+  UNROLLED_FOR(int i = 0; i < CONTACT_ROWS; ++i) rows[i] = CONTACT_ROWS == 4 ? read4(x).v[i & 3] : x[i];
+  return Law(rows, weight[0], weight[1], sides);
 }
 INLINE Law law(int contact) const { return law(contact, sides_of(contact)); }

@@ -57,9 +57,7 @@ INLINE bool find_sides() {
   OWN_PLACES(own, 0, CONTACT_SLOTS) {
     const unsigned now = sides_now(own);
     differs = differs || now != sides(own);
-#if WITH_ELLIPTIC
-    differs = differs || (has_friction(own) && now == Cone::SLIDING);
-#endif
+    differs = differs || (Model::ELLIPTIC && has_friction(own) && now == Cone::SLIDING);
     contact_sides[own] = contact_sides[own] >> SIDE_BITS << SIDE_BITS | now;
   }
   OWN_DOFS(slot, d)

@@ -20,7 +20,6 @@ INLINE void write_velocities(float* sensordata) const {
   }
 }
 
-#if WITH_WRENCHES
 // This lane's share of the force in the joint above a subtree, about the centre of mass of its tree: what accelerates its
 // parts, less what contacts push.
 INLINE Motion own_wrench(int s, const Vec* pushes) const {
@@ -47,17 +46,13 @@ INLINE Motion own_wrench(int s, const Vec* pushes) const {
   }
   return wrench;
 }
-#endif
 
-#if WITH_ACCELEROMETERS || WITH_WRENCHES
 // After the solver, which has overwritten poses and velocities: they are found again.
 INLINE void write_accelerations(float* sensordata) {
-#if WITH_WRENCHES
   Vec pushes[OWN_CONTACTS];
   UNROLLED_FOR(int own = 0; own < OWN_CONTACTS; ++own)
-    if (lane + LANES * own < frictional + frictionless)
+    if (Model::WRENCHES > 0 && lane + LANES * own < frictional + frictionless)
       pushes[own] = contact_force(lane + LANES * own, own_contacts[own]);
-#endif
   sync();
   kinematics();
   Motion accelerations[LINK_SLOTS];
@@ -72,7 +67,6 @@ INLINE void write_accelerations(float* sensordata) {
     const int s = Model::MOTION_SENSORS + i, link = Model::frame_link(s);
     write(s, acceleration_at(w.momentum[link], w.velocity[link], offset_of(s)), sensordata);
   }
-#if WITH_WRENCHES
   ROLLED_FOR(int i = 0; i < Model::WRENCHES; ++i) {
     const int s = Model::FIRST_WRENCH + i;
     const Motion own = own_wrench(i, pushes);
@@ -81,7 +75,5 @@ INLINE void write_accelerations(float* sensordata) {
     const Vec torque = {total[0], total[1], total[2]}, force = {total[3], total[4], total[5]};
     if (lane == 0) write(s, Model::frame_turning(s) ? torque - offset_of(s).cross(force) : force, sensordata);
   }
-#endif
   sync();
 }
-#endif

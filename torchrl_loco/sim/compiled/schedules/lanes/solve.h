@@ -7,8 +7,7 @@ INLINE void set_direction(const bool damping_alone, const float regularisation, 
   float diagonal[SLOTS], gradient[SLOTS], sums[2] = {0.0f, 0.0f};
   own_terms(damping_alone, regularisation, diagonal, gradient);
   bool by_limbs = false;
-#if WITH_LIMBS
-#ifdef __CUDA_ARCH__
+#if WITH_LIMBS && defined(__CUDA_ARCH__)
   by_limbs = damping_alone || !crossing;
   if (by_limbs) {
     Branches h;
@@ -17,7 +16,6 @@ INLINE void set_direction(const bool damping_alone, const float regularisation, 
       if (row < LIMB_ROWS + TRUNK) sums[0] += h.gradient[hold] * h.gradient[hold];
     solve_by_limbs(h, damping_alone, sums[1]);
   }
-#endif
 #endif
   if (!by_limbs) {
     Slots h;
@@ -102,23 +100,16 @@ INLINE ConstraintRow single(int r) const {
   return {w.x[r], w.change[r], w.weight[r], dry ? Model::friction_bound(r - first_friction()) : 0.0f, dry};
 }
 
-#if WITH_ELLIPTIC
-enum { OWN_CONES = (Model::FRICTIONAL + LANES - 1) / LANES };
-struct Lines {
-  Cone::Line of[OWN_CONES];
-};  // of the contacts lane, lane + LANES, ...
-#else
-struct Lines {};
-#endif
+struct Cones {  // the contacts lane, lane + LANES, ... along the direction
+  Cone::Line of[Model::ELLIPTIC ? OWN_FRICTIONAL : 1];
+};
 
 // Adds what n steps change of the costs of all rows, and slopes and curvatures there, to three sums each.
-INLINE void add_rows(const Lines& lines, const float* alphas, const int n, float* sums) const {
-#if WITH_ELLIPTIC
-  UNROLLED_FOR(int own = 0; own < OWN_CONES; ++own) {
+INLINE void add_rows(const Cones& cones, const float* alphas, const int n, float* sums) const {
+  UNROLLED_FOR(int own = 0; Model::ELLIPTIC && own < OWN_FRICTIONAL; ++own) {
     if (lane + LANES * own >= frictional) break;
-    UNROLLED_FOR(int k = 0; k < n; ++k) lines.of[own].add(alphas[k], sums + 3 * k);
+    UNROLLED_FOR(int k = 0; k < n; ++k) cones.of[own].add(alphas[k], sums + 3 * k);
   }
-#endif
   SHARED_LOOP(i, rows() - first_single()) {
     const ConstraintRow row = single(first_single() + i);
     UNROLLED_FOR(int k = 0; k < n; ++k) row.add(alphas[k], sums + 3 * k);
@@ -135,17 +126,15 @@ INLINE Search line_search(const float decrement, const bool guessed) {
     t[1] += s * w.mass_search[d];
     t[2] += s * s;
   }
-  Lines lines;
-#if WITH_ELLIPTIC
-  UNROLLED_FOR(int own = 0; own < OWN_CONES; ++own) {
+  Cones cones;
+  UNROLLED_FOR(int own = 0; Model::ELLIPTIC && own < OWN_FRICTIONAL; ++own) {
     const int first = CONTACT_ROWS * (lane + LANES * own);
     if (first >= first_frictionless()) break;
-    Cone::Line& line = lines.of[own];
+    Cone::Line& line = cones.of[own];
     line.set(w.x + first, w.change + first, w.weight[first], w.weight[first + 1]);
     t[3] += line.cost();
     line.add(1.0f, t + 4);
   }
-#endif
   SHARED_LOOP(i, rows() - first_single()) {
     const ConstraintRow row = single(first_single() + i);
     t[3] += row.cost();
@@ -153,7 +142,7 @@ INLINE Search line_search(const float decrement, const bool guessed) {
   }
   sum(t, 7);
   const float *const quadratic = t, *const whole = t + 3;
-  const auto add_rows = [&](const float* alphas, const int n, float* sums) { this->add_rows(lines, alphas, n, sums); };
+  const auto add_rows = [&](const float* alphas, const int n, float* sums) { this->add_rows(cones, alphas, n, sums); };
   //LINE_SEARCH
 }
 
@@ -200,9 +189,7 @@ INLINE void dynamics() {
 // Semi-implicit Euler.
 INLINE void integrate() {
   const float h = Model::timestep();
-#if WITH_ACTIVATIONS
-  activate();
-#endif
+  if (Model::ACTIVATIONS > 0) activate();
   OWN_DOFS(slot, d) {
     if (d >= DOFS) continue;
     const float v = w.qvel[d] + h * (Model::IMPLICIT_DAMPING ? w.qacc[d] + w.search[d] : w.qacc[d]);

@@ -30,33 +30,24 @@ if (live) {
     w.qacc[i] = i < DOFS ? row_of(qacc_warmstart_out.data, DOFS)[i] : 0.0f;
     w.search[i] = 0.0f;
   }
-#if WITH_ACTIVATIONS
-  SHARED_LOOP(i, Model::ACTIVATIONS) w.act[i] = row_of(act_out.data, Model::ACTIVATIONS)[i];
-#endif
+  if (Model::ACTIVATIONS > 0)
+    SHARED_LOOP(i, Model::ACTIVATIONS) w.act()[i] = row_of(act_out.data, Model::ACTIVATIONS)[i];
   SHARED_LOOP(i, DOFS * STRIDE) w.mass[i] = 0.0f;
   step.sync();
 }
-#if WITH_CONTACT_GEOMS
 const int contacts = Model::HISTORY * Model::CONTACT_GEOMS;
 float* const contact_forces = reinterpret_cast<float*>(row_of(contact_force_out.data, contacts));
 bool* const in_contact = row_of(in_contact_out.data, contacts);
-#endif
 if (live && Model::SUBSTEPS == 0 &&
     Model::TOUCH + Model::CONTACT_GEOMS + Model::ACCELERATIONS > 0) {  // a step that is not taken finds forces
   step.kinematics();
   step.dynamics();
-#if WITH_KEPT_CONTACTS
-  step.keep_contacts();
-#endif
+  if (Model::KEPT_CONTACTS) step.keep_contacts();
   step.solve(true);
   step.write_touch(sensors);
-#if WITH_CONTACT_GEOMS
-  ROLLED_FOR(int row = 0; row < Model::HISTORY; ++row)
+  ROLLED_FOR(int row = 0; Model::CONTACT_GEOMS > 0 && row < Model::HISTORY; ++row)
     step.write_contact_forces(contact_forces + 3 * Model::CONTACT_GEOMS * row, in_contact + Model::CONTACT_GEOMS * row);
-#endif
-#if WITH_ACCELEROMETERS || WITH_WRENCHES
-  step.write_accelerations(sensors);
-#endif
+  if (Model::ACCELERATIONS > 0) step.write_accelerations(sensors);
 }
 ROLLED_FOR(int substep = 0;; ++substep) {
   LOCKSTEP();
@@ -64,20 +55,15 @@ ROLLED_FOR(int substep = 0;; ++substep) {
   if (substep == Model::SUBSTEPS) break;
   if (live) {
     step.dynamics();
-#if WITH_KEPT_CONTACTS
-    if (substep >= Model::SUBSTEPS - Model::HISTORY) step.keep_contacts();
-#endif
+    if (Model::KEPT_CONTACTS && substep >= Model::SUBSTEPS - Model::HISTORY) step.keep_contacts();
   }
   step.solve(live);
   if (live) {
     if (Model::TOUCH && substep == Model::SUBSTEPS - 1) step.write_touch(sensors);
-#if WITH_CONTACT_GEOMS
     const int first = Model::CONTACT_GEOMS * (substep - (Model::SUBSTEPS - Model::HISTORY));
-    if (first >= 0) step.write_contact_forces(contact_forces + 3 * first, in_contact + first);
-#endif
-#if WITH_ACCELEROMETERS || WITH_WRENCHES
-    if (substep == Model::SUBSTEPS - 1) step.write_accelerations(sensors);
-#endif
+    if (Model::CONTACT_GEOMS > 0 && first >= 0)
+      step.write_contact_forces(contact_forces + 3 * first, in_contact + first);
+    if (Model::ACCELERATIONS > 0 && substep == Model::SUBSTEPS - 1) step.write_accelerations(sensors);
     step.integrate();
   }
 }
@@ -91,9 +77,8 @@ if (live) {
   step.write_angular_momenta(sensors);
   if (Model::SUBSTEPS > 0) {
     SHARED_LOOP(i, Model::POSITIONS) row_of(qpos_out.data, Model::POSITIONS)[i] = w.qpos[i];
-#if WITH_ACTIVATIONS
-    SHARED_LOOP(i, Model::ACTIVATIONS) row_of(act_out.data, Model::ACTIVATIONS)[i] = w.act[i];
-#endif
+    if (Model::ACTIVATIONS > 0)
+      SHARED_LOOP(i, Model::ACTIVATIONS) row_of(act_out.data, Model::ACTIVATIONS)[i] = w.act()[i];
     SHARED_LOOP(i, DOFS) {
       row_of(qvel_out.data, DOFS)[i] = w.qvel[i];
       row_of(qacc_warmstart_out.data, DOFS)[i] = w.qacc[i];

@@ -1,7 +1,6 @@
 // Welds and connections of two bodies: rows of how far apart two points are, along the axes of the world, and of the vector
 // part of the quaternion between two frames, about the axes of the second.
 
-#if WITH_WELDS
 struct WeldRow {
   Vec point;
   Vec other;  // the second point; of a row about an axis, what a rotation of the first body changes it along
@@ -64,8 +63,7 @@ INLINE void accelerate_welds(const Motion* accelerations) {
       const Vec half = (u * frames.turn.w + u.cross(v)) * 0.5f - v * (0.25f * between.dot(between));
       bias = Model::weld_scale(weld) * half.component(axis);
     }
-    if (base + lane < Model::WELD_ROWS) w.weld_bias[i] = bias;
+    if (base + lane < Model::WELD_ROWS) w.weld_bias()[i] = bias;
   }
   sync();
 }
-#endif

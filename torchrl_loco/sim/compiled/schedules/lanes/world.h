@@ -66,6 +66,7 @@ enum {
   LINK_SLOTS = (Model::LINKS + LANES - 1) / LANES,
   SEVERAL_ROWS = SLOTS > 1,  // a lane has some: then what spares rounds pays for a longer text
   CONTACTS = Model::FRICTIONAL + Model::FRICTIONLESS,
+  ACT = (Model::POSITIONS + 3) / 4 * 4,  // where activations are, behind the positions
   // A lane looks after the contacts lane, lane + LANES, ... with friction, then after those without.
   OWN_FRICTIONAL = (Model::FRICTIONAL + LANES - 1) / LANES,
   GUESSES = Model::SUBSTEPS > 1 && Model::ITERATIONS > 2,  // a guess that is refused has cost one of them
@@ -131,13 +132,9 @@ struct alignas(16) Contact {
 };
 
 struct alignas(16) World {
-  float qpos[(Model::POSITIONS + 3) / 4 * 4];
-#if WITH_ACTIVATIONS
-  float act[(Model::ACTIVATIONS + 3) / 4 * 4];
-#endif
-#if WITH_WELDS
-  float weld_bias[(Model::WELD_ROWS + 3) / 4 * 4];
-#endif
+  float qpos[ACT + (Model::ACTIVATIONS + 3) / 4 * 4 + (Model::WELD_ROWS + 3) / 4 * 4];  // C++ has no empty arrays
+  INLINE float* act() { return qpos + ACT; }
+  INLINE float* weld_bias() { return act() + (Model::ACTIVATIONS + 3) / 4 * 4; }
   float qvel[STRIDE], qacc[STRIDE], search[STRIDE];
   float residual[STRIDE];  // M qacc minus the smooth forces
   float mass[DOFS * STRIDE];
