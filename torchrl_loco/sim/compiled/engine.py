@@ -73,6 +73,10 @@ class Data:
         time: time since the world's reset (s), ``(nworld,)``.
         xpos: positions of the bodies (m), ``(nworld, nbody)`` vec3.
         xmat: orientations of the bodies, ``(nworld, nbody)`` mat33.
+        cvel: velocities of the bodies about the center of mass of their tree (rad/s, m/s), ``(nworld, nbody)``.
+        subtree_com: centers of mass of the trees (m), ``(nworld, nbody)`` vec3, in the rows of their roots; other rows
+            are zero. Both are computed if they were asked for before the first step, as an environment's
+            ``observation_func`` does.
         contact_force: net force of the contacts on each of the geoms that were asked for, in the world's frame (N),
             ``(nworld, contacts)`` vec3, substep by substep.
         in_contact: whether they have any, ``(nworld, contacts)`` bool.
@@ -87,7 +91,6 @@ class Data:
             return _zeros(_shape(setup, name), ROWS[name][1], setup.device, structure_of_arrays=by_world)
 
         self._make: Callable[[str], wp.array] | None = make
-        self._later: dict[str, wp.array] = {}
         for name in ROWS:
             if name not in LATER:
                 setattr(self, name, make(name))
@@ -100,53 +103,32 @@ class Data:
         _fill_rows(self.xpos, start.xpos)  # the step leaves out what is constant
         _fill_rows(self.xmat, start.xmat)
 
-    @property
-    def cvel(self) -> wp.array:
-        """Velocities of the bodies about the center of mass of their tree (rad/s, m/s), ``(nworld, nbody)``.
-
-        They are computed if they were asked for before the first step, as an environment's ``observation_func`` does.
-
-        Raises:
-            RuntimeError: it is too late.
-        """
-        return self._asked("cvel")
-
-    @property
-    def subtree_com(self) -> wp.array:
-        """Centers of mass of the trees (m), ``(nworld, nbody)`` vec3, in the rows of their roots; other rows are zero.
-
-        The root of a body is ``mj_model.body_rootid``, and :attr:`cvel` is about that row: a point ``p`` of the body
-        moves with ``cvel[3:] + cross(cvel[:3], p - subtree_com[root])``. They are computed if they were asked for
-        before the first step.
-
-        Raises:
-            RuntimeError: it is too late.
-        """
-        return self._asked("subtree_com")
-
-    def _asked(self, name: str) -> wp.array:
-        if name not in self._later:
-            if self._make is None:
-                raise RuntimeError(f"{name} is not computed: ask for data.{name} before the first step")
-            self._later[name] = self._make(name)
-            if name == "subtree_com":
-                _fill_rows(self._later[name], self._start_com)
-        return self._later[name]
-
     def __getattr__(self, name: str) -> Any:
+        """Returns one of ``LATER``, which is made, and computed from then on.
+
+        Raises:
+            AttributeError: there is no such array.
+            RuntimeError: it is too late.
+        """
         if name.startswith("_"):
             raise AttributeError(name)
-        raise AttributeError(
-            f"the compiled engine has no data.{name}, only {', '.join(ROWS)}: pass engine='mujoco_warp', or set it in "
-            "the defaults of the body"
-        )
+        if name not in LATER:
+            raise AttributeError(
+                f"the compiled engine has no data.{name}, only {', '.join(ROWS)}: pass engine='mujoco_warp', or set it "
+                "in the defaults of the body"
+            )
+        if self._make is None:
+            raise RuntimeError(f"{name} is not computed: ask for data.{name} before the first step")
+        array = self._make(name)
+        if name == "subtree_com":
+            _fill_rows(array, self._start_com)
+        setattr(self, name, array)
+        return array
 
     def outputs(self) -> dict[str, wp.array | None]:
         """Returns what the kernels write, by name; ``None`` for those of ``LATER`` that nothing has asked for."""
         self._make = None
-        written = {name: self._later.get(name) if name in LATER else getattr(self, name) for name in ROWS}
-        del written["ctrl"]
-        return written
+        return {name: self.__dict__.get(name) for name in ROWS if name != "ctrl"}
 
 
 def _zeros(shape: tuple[int, ...], dtype: Any, device: wp.Device, *, structure_of_arrays: bool) -> wp.array:
