@@ -1,6 +1,7 @@
 """Numbers of a model that can be read but not written, since the compiled step has them as constants."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 import numpy as np
@@ -34,6 +35,10 @@ class ReadOnly:
         raise AttributeError(f"{name} cannot be set: {REMEDY}")
 
 
+def _read_only_view(method: Callable[..., Any]) -> Any:
+    return lambda self, *args, **options: read_only(method(self, *args, **options))
+
+
 class ReadOnlyArray(wp.array):
     """A Warp array that kernels and structs take like any other, and that Python cannot write.
 
@@ -65,24 +70,9 @@ class ReadOnlyArray(wp.array):
     def __dlpack__(self, stream: Any = None) -> NoReturn:
         self._no_view()
 
-    def __getitem__(self, key: Any) -> Any:
-        return read_only(super().__getitem__(key))
-
-    def flatten(self) -> Any:
-        """Returns a read-only view."""
-        return read_only(super().flatten())
-
-    def reshape(self, shape: Any) -> Any:
-        """Returns a read-only view."""
-        return read_only(super().reshape(shape))
-
-    def view(self, dtype: Any) -> Any:
-        """Returns a read-only view."""
-        return read_only(super().view(dtype))
-
-    def transpose(self, axes: Any = None) -> Any:
-        """Returns a read-only view."""
-        return read_only(super().transpose(axes))
+    __getitem__, flatten, reshape, view, transpose = map(
+        _read_only_view, (wp.array.__getitem__, wp.array.flatten, wp.array.reshape, wp.array.view, wp.array.transpose)
+    )
 
 
 def read_only(value: Any) -> Any:
