@@ -5,12 +5,13 @@ Source: MuJoCo's documentation, chapter Computation ("Collision detection").
 """
 
 import dataclasses
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, FIELD, KINDS, NOT_COMPILED, ON_BOXES, Kind
-from torchrl_loco.sim.compiled.ir.parameters import Number, largest, varies
+from torchrl_loco.sim.compiled.ir.parameters import Number, largest
 from torchrl_loco.sim.compiled.ir.symbols import Scalar, select
 from torchrl_loco.sim.compiled.physics.dynamics import MINVAL
 from torchrl_loco.sim.models import NEVER
@@ -48,8 +49,8 @@ class Pair:
     solref: tuple[float, ...]
     solimp: tuple[float, ...]
     weight: Number
-    friction_ratio: Number = 1.0
-    rolling_ratio: Number = 1.0
+    friction_ratio: Number
+    rolling_ratio: Number
 
 
 def pairs(m: mujoco.MjModel) -> list[Pair]:
@@ -188,39 +189,25 @@ def _pair(m: mujoco.MjModel, a: int, b: int) -> Pair:
     else:
         solref = solref.min(axis=0)
     solimp = first * m.geom_solimp[a] + (1 - first) * m.geom_solimp[b]
-    weight = m.body_invweight0[m.geom_bodyid[[a, b]], 0].sum()
     margin = m.geom_margin[a] + m.geom_margin[b]
-    sliding, torsional, rolling = (
-        largest(x, MINMU) if condim >= least else 0.0 for x, least in zip(friction, (3, 4, 6), strict=True)
-    )
-    return Pair(
-        (a, b), int(condim), sliding, torsional, rolling, float(margin), tuple(solref), tuple(solimp), float(weight)
-    )
+    return _with_parameters(m, (a, b), condim, np.asarray(friction)[[0, 0, 1, 2, 2]], margin, solref, solimp)
 
 
 def _explicit_pair(m: mujoco.MjModel, i: int) -> Pair:
     """Returns a pair with the parameters that the model gives it."""
     a, b = sorted((int(m.pair_geom1[i]), int(m.pair_geom2[i])), key=lambda g: m.geom_type[g])
-    condim = int(m.pair_dim[i])
+    numbers = m.pair_dim[i], m.pair_friction[i], m.pair_margin[i], m.pair_solref[i], m.pair_solimp[i]
+    return _with_parameters(m, (a, b), *numbers)
+
+
+def _with_parameters(
+    m: mujoco.MjModel, geoms: tuple[int, int], condim: int, frictions: Any, margin: float, solref: Any, solimp: Any
+) -> Pair:
+    """Returns a pair with coefficients of friction ``(5,)``: of two tangents, and about all axes of the contact."""
     sliding, second, torsional, rolling, second_rolling = (
-        largest(x, MINMU) if condim >= least else 0.0
-        for x, least in zip(m.pair_friction[i], (3, 3, 4, 6, 6), strict=True)
+        largest(x, MINMU) if condim >= least else 0.0 for x, least in zip(frictions, (3, 3, 4, 6, 6), strict=True)
     )
-    return Pair(
-        geoms=(a, b),
-        condim=condim,
-        friction=sliding,
-        torsional=torsional,
-        rolling=rolling,
-        margin=float(m.pair_margin[i]),
-        solref=tuple(m.pair_solref[i]),
-        solimp=tuple(m.pair_solimp[i]),
-        weight=float(m.body_invweight0[m.geom_bodyid[[a, b]], 0].sum()),
-        friction_ratio=_ratio(second, sliding),
-        rolling_ratio=_ratio(second_rolling, rolling),
-    )
-
-
-def _ratio(a: Number, b: Number) -> Number:
-    same = not varies(a) and not varies(b) and a == b
-    return 1.0 if same else a / b
+    weight = m.body_invweight0[m.geom_bodyid[list(geoms)], 0].sum()
+    ratios = (1.0 if x == y else x / y for x, y in ((second, sliding), (second_rolling, rolling)))
+    of_constraint = float(margin), tuple(solref), tuple(solimp), float(weight)
+    return Pair(geoms, int(condim), sliding, torsional, rolling, *of_constraint, *ratios)
