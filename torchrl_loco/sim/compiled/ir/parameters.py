@@ -3,7 +3,9 @@
 Which rows and axes there are is decided once, on nominal numbers; a number that varies counts as one that is not zero.
 """
 
-from collections.abc import Iterable, Sequence
+import operator
+import types
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeGuard
 
 import mujoco
@@ -14,6 +16,13 @@ from torchrl_loco.sim.varied import Varied, field, subtree_masses
 
 Number = float | Scalar
 """A constant, or what varies."""
+OPERATORS: dict[str, Callable[..., float]] = {
+    "neg": operator.neg,
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+}
 
 
 class VariedModel:
@@ -38,7 +47,8 @@ class VariedModel:
             losses[:] = [maximum(x, 0) if varies(x) else x for x in losses]
         if "body_mass" in self._arrays:
             self._arrays["body_subtreemass"] = self._subtree_masses()
-        self.opt = _Options(m.opt, self._arrays.get("gravity"))
+        given = {name: getattr(m.opt, name) for name in dir(m.opt) if not name.startswith("_")}
+        self.opt = types.SimpleNamespace(**given | {"gravity": self._arrays.get("gravity", m.opt.gravity)})
 
     def _subtree_masses(self) -> np.ndarray:
         m = self.nominal
@@ -49,18 +59,6 @@ class VariedModel:
         if name.startswith("_"):
             raise AttributeError(name)
         return self._arrays[name] if name in self._arrays else getattr(self.nominal, name)
-
-
-class _Options:
-    def __init__(self, options: Any, gravity: np.ndarray | None) -> None:
-        self._options = options
-        if gravity is not None:
-            self.gravity = gravity
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return getattr(self._options, name)
 
 
 def number(column: int) -> Scalar:
@@ -107,21 +105,13 @@ def numbers_in(expressions: Iterable[Scalar]) -> list[Scalar]:
 def evaluate(x: Scalar, row: Sequence[float] | np.ndarray) -> float:
     """Returns the value of an expression of numbers of the model for a row of them."""
     a = [evaluate(arg, row) for arg in x.args if isinstance(arg, Scalar)]
+    if x.op in OPERATORS:
+        return OPERATORS[x.op](*a)
     match x.op:
         case "const":
             return x.args[0]
         case "number":
             return float(row[x.args[1]])
-        case "neg":
-            return -a[0]
-        case "+":
-            return a[0] + a[1]
-        case "-":
-            return a[0] - a[1]
-        case "*":
-            return a[0] * a[1]
-        case "/":
-            return a[0] / a[1]
         case "call" if x.args[0] == "Math::larger":
             return max(a)
         case "select" if x.args[0] == "<=":

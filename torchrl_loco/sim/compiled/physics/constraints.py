@@ -169,19 +169,12 @@ class Table:
 
     def column(self, title: str, values: Sequence[Number]) -> Scalar:
         """Returns the number of the current row."""
-        if any(map(varies, values)):
-            return self._varying(title, [scalar(x) for x in values])
-        if len({constant(x) for x in values}) == 1:
-            return scalar(values[0])
-        listed = ", ".join(literal(constant(x)) for x in values)
-        self.block(f"static const float {self.prefix}_{title}[{len(values)}] = {{{listed}}};")
-        return name(f"{self.prefix}_{title}[{self.index}]")
-
-    def _varying(self, title: str, values: list[Scalar]) -> Scalar:
-        if len(set(values)) == 1:
-            return values[0]
-        listed = ", ".join([self.block.value(x) for x in values])
-        self.block(f"const float {self.prefix}_{title}[{len(values)}] = {{{listed}}};")
+        nodes = [scalar(x) for x in values]
+        if len(set(nodes)) == 1:
+            return nodes[0]
+        listed = ", ".join([self.block.value(x) for x in nodes])
+        kept = "const" if any(map(varies, nodes)) else "static const"
+        self.block(f"{kept} float {self.prefix}_{title}[{len(values)}] = {{{listed}}};")
         return name(f"{self.prefix}_{title}[{self.index}]")
 
     def integers(self, title: str, values: Sequence[int]) -> str:

@@ -39,12 +39,9 @@ def _least_pivot_of_mass(m: mujoco.MjModel) -> float:
         mujoco.mj_kinematics(m, data)
         mujoco.mj_comPos(m, data)
         mujoco.mj_makeM(m, data)
+        mujoco.mj_factorM(m, data)
         matrix = np.zeros((m.nv, m.nv))
         mujoco.mj_fullM(m, data, matrix)
-        whole = np.maximum(np.diag(matrix), mujoco.mjMINVAL)
-        for d in reversed(range(m.nv)):
-            pivot = max(matrix[d, d], mujoco.mjMINVAL)
-            least = min(least, pivot / whole[d])
-            matrix[:d, :d] -= np.outer(matrix[d, :d], matrix[d, :d]) / pivot
+        least = min(least, (1 / (data.qLDiagInv * np.maximum(np.diag(matrix), mujoco.mjMINVAL))).min())
         mujoco.mj_integratePos(m, data.qpos, rng.normal(size=m.nv), 1.0)
     return least
