@@ -53,11 +53,6 @@ Variables = tuple[list[Scalar], list[Scalar], list[Scalar]]
 """Symbols of qpos, qvel and qacc."""
 
 
-def tolerance(m: mujoco.MjModel) -> float:
-    """Returns the tolerance of the solver, relative to the inertia of the model."""
-    return max(m.opt.tolerance, MIN_TOLERANCE)
-
-
 def near(m: mujoco.MjModel) -> float:
     """Returns the share of its first slope at which a line search may end, besides where the slope vanishes."""
     return NEAR if m.opt.iterations >= MANY_ITERATIONS else 0.0

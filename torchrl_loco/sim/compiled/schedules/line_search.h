@@ -7,12 +7,13 @@
 //   whole[4]                    of all rows the cost at alpha = 0, and at alpha = 1 what add_rows adds
 //   add_rows(alphas, n, sums)   adds three numbers for each of n steps, over all rows
 // A step of length 0 has the slope at alpha = 0 where no other is acceptable, and 0 where that slope is rounding.
-// With BY_SLOPES nothing adds the first of these three, the change of cost: what a step gains is for who takes it to say.
+// By slopes nothing adds the first of these three, the change of cost: what a step gains is for who takes it to say.
 
-const float slope = quadratic[0], curvature = quadratic[1];
+const float slope = quadratic[0], curvature = quadratic[1], near = Model::ls_near();
 const Point start = {0.0f, 0.0f, -decrement, fabsf(decrement)};
 // Slopes below `noise` are rounding: the sums behind them are that large.
-const float tolerance = Math::larger(LS_TOLERANCE * Math::divide(Math::root(quadratic[2]), SCALE), 1e-6f);
+const float tolerance =
+    Math::larger(Model::ls_tolerance() * Math::divide(Math::root(quadratic[2]), Model::scale()), 1e-6f);
 const float sizes = Math::root(2.0f * whole[0] * Math::larger(start.curvature - curvature, 0.0f)) + fabsf(slope);
 const float noise = 8.0f * 1.1920929e-7f * sizes, accept = Math::larger(tolerance, noise);
 Search result = {0.0f, 0.0f, 0.0f};
@@ -24,7 +25,8 @@ if (guessed) {  // the decrement is not the slope at alpha = 0, where other rows
 if (fabsf(start.slope) < noise) return result;
 result.slope = start.slope;
 
-if (BY_SLOPES) {  // Newton's method between two slopes of different sign: it is exact once it knows which rows are active
+// Newton's method between two slopes of different sign: it is exact once it knows which rows are active.
+if (Model::BY_SLOPES) {
   float low = 0.0f, high = Math::from_bits(INFINITE_BITS);
   // Where the cost rises, a step leaves what is rounding of alpha: a heavy row may begin just before p.
   const auto step = [&](const Point& p) {
@@ -37,8 +39,8 @@ if (BY_SLOPES) {  // Newton's method between two slopes of different sign: it is
   };
   float left = step(first);
   Point last = first;
-  bool flat = found(first, left), stuck = false, ends = flat | (LS_ITERATIONS == 0);
-  ROLLED_FOR(int more = 3 * LS_ITERATIONS; !ends; --more) {
+  bool flat = found(first, left), stuck = false, ends = flat | (Model::LS_ITERATIONS == 0);
+  ROLLED_FOR(int more = 3 * Model::LS_ITERATIONS; !ends; --more) {
     low = last.slope < 0.0f ? last.alpha : low;
     high = last.slope < 0.0f ? high : last.alpha;
     const float next = last.alpha + left;
@@ -55,12 +57,12 @@ if (BY_SLOPES) {  // Newton's method between two slopes of different sign: it is
   result = {falls ? last.alpha : low, 0.0f, falls ? last.slope : start.slope};
   return result;
 }
-result.take(first, first.ends(start, accept, LS_NEAR));
-if (LS_NEAR > 0.0f && LS_ITERATIONS > 3) {  // a step at a time: most searches end with the first or the second
+result.take(first, first.ends(start, accept, near));
+if (near > 0.0f && Model::LS_ITERATIONS > 3) {  // a step at a time: most searches end with the first or the second
   Point low = start, high = start, last = first;
   bool ends = result.improvement > 0.0f, between = false;  // whether the minimum lies between low and high
   result.take(first, true);
-  ROLLED_FOR(int i = 0; i < LS_ITERATIONS && !ends; ++i) {
+  ROLLED_FOR(int i = 0; i < Model::LS_ITERATIONS && !ends; ++i) {
     if (last.slope < 0.0f) {
       low = last;
     } else {
@@ -73,7 +75,7 @@ if (LS_NEAR > 0.0f && LS_ITERATIONS > 3) {  // a step at a time: most searches e
     float sums[3] = {0.0f, 0.0f, 0.0f};
     add_rows(alphas, 1, sums);
     last = Point::at(alphas[0], slope, curvature, sums);
-    ends = last.ends(start, accept, LS_NEAR);
+    ends = last.ends(start, accept, near);
     result.take(last, true);
   }
   return result;
@@ -81,7 +83,7 @@ if (LS_NEAR > 0.0f && LS_ITERATIONS > 3) {  // a step at a time: most searches e
 const bool less = first.slope < start.slope;
 Point low = less ? first : start, high = less ? start : first;
 bool found = result.improvement > 0.0f;
-ROLLED_FOR(int i = 0; i < LS_ITERATIONS && !found; ++i) {
+ROLLED_FOR(int i = 0; i < Model::LS_ITERATIONS && !found; ++i) {
   // Newton's step from the start led here.
   const float from_low = i > 0 ? low.newton() : low.secant(high);
   const float alphas[3] = {from_low, high.newton(), 0.5f * (low.alpha + high.alpha)};
@@ -90,8 +92,8 @@ ROLLED_FOR(int i = 0; i < LS_ITERATIONS && !found; ++i) {
   const Point next_low = Point::at(alphas[0], slope, curvature, sums);
   const Point next_high = Point::at(alphas[1], slope, curvature, sums + 3);
   const Point middle = Point::at(alphas[2], slope, curvature, sums + 6);
-  const bool low_ends = next_low.ends(start, accept, LS_NEAR), high_ends = next_high.ends(start, accept, LS_NEAR);
-  const bool middle_ends = middle.ends(start, accept, LS_NEAR);
+  const bool low_ends = next_low.ends(start, accept, near), high_ends = next_high.ends(start, accept, near);
+  const bool middle_ends = middle.ends(start, accept, near);
   found = low_ends | high_ends | middle_ends;
   if (found) {
     result = {0.0f, 0.0f, start.slope};

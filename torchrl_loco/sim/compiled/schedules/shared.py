@@ -4,6 +4,10 @@ import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import mujoco
+
+from torchrl_loco.sim.compiled.ir.tables import Tables
+from torchrl_loco.sim.compiled.physics.constraints import MIN_TOLERANCE, near
 from torchrl_loco.sim.overflow import Overflow
 
 FOLDER = pathlib.Path(__file__).parents[1]
@@ -12,11 +16,10 @@ FLAGS = (
     f"UNSOLVED = {Overflow.UNSOLVED:d} }};\n"
 )
 """Bits of overflow."""
-MUCH = 1.0
-"""Mean square of the acceleration (rad^2/s^4, m^2/s^4) above which a solver that gains nothing has lost its world."""
 LAWS = "".join((FOLDER / "physics" / f"{name}.h").read_text() + "\n" for name in ("arithmetic", "laws")) + FLAGS
 """Declarations, for the head of a function."""
-_LINE_SEARCH, _NEWTON = ((FOLDER / "schedules" / f"{name}.h").read_text() for name in ("line_search", "newton"))
+LINE_SEARCH, NEWTON = ((FOLDER / "schedules" / f"{name}.h").read_text() for name in ("line_search", "newton"))
+"""Bodies of functions."""
 
 
 class Asked(NamedTuple):
@@ -38,36 +41,12 @@ class Asked(NamedTuple):
 NO_MORE = Asked()
 
 
-def line_search(scale: str, tolerance: str, near: str, iterations: str, by_slopes: str = "false") -> str:
-    """Returns the body of the function of the line search.
+def add_options(tables: Tables, m: mujoco.MjModel, **flags: int) -> None:
+    """Adds to struct ``Model`` what Newton's method and its line search go by: options of a model, and more flags.
 
-    Args:
-        scale: C++ expression of one over the inertia of the model.
-        tolerance: of the slope, relative to it.
-        near: the share of its first slope at which it may end.
-        iterations: how many steps are tried, or brackets of three where ``near`` is 0 or there are at most 3.
-        by_slopes: whether costs are left out; three steps are tried then where a bracket would be.
+    These are ``DELICATE`` (whether single precision may not be enough: :func:`.delicate.is_delicate`), ``BY_SLOPES``
+    (whether searches leave out costs) and ``IMPLICIT_DAMPING`` (whether the method ends with what that adds).
     """
-    values = {"LS_TOLERANCE": tolerance, "LS_NEAR": near, "LS_ITERATIONS": iterations, "BY_SLOPES": by_slopes}
-    return _filled(_LINE_SEARCH, SCALE=scale, **values)
-
-
-def newton(scale: str, tolerance: str, iterations: str, implicit_damping: str, guesses: str, delicate: str) -> str:
-    """Returns the body of the function of Newton's method.
-
-    Args:
-        scale: C++ expression of one over the inertia of the model.
-        tolerance: of improvement and gradient, relative to it.
-        iterations: at most.
-        implicit_damping: whether it ends with what implicit damping adds.
-        guesses: whether it begins with a guess.
-        delicate: whether single precision may not be enough (:func:`.delicate.is_delicate`).
-    """
-    values = {"SCALE": scale, "TOLERANCE": tolerance, "ITERATIONS": iterations, "MUCH": f"{MUCH}f"}
-    return _filled(_NEWTON, **values, IMPLICIT_DAMPING=implicit_damping, GUESSES=guesses, DELICATE=delicate)
-
-
-def _filled(text: str, **values: str) -> str:
-    for word, value in values.items():
-        text = text.replace(word, value)
-    return text
+    tables.size(ITERATIONS=m.opt.iterations, LS_ITERATIONS=m.opt.ls_iterations, **flags)
+    scale, tolerance = 1 / (m.stat.meaninertia * m.nv), max(m.opt.tolerance, MIN_TOLERANCE)  # relative to the inertia
+    tables.constant(scale=scale, tolerance=tolerance, ls_tolerance=tolerance * m.opt.ls_tolerance, ls_near=near(m))

@@ -9,8 +9,8 @@ import numpy as np
 
 from torchrl_loco.sim.compiled.collision.pairs import Pair
 from torchrl_loco.sim.compiled.ir.parameters import nominal
-from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, cell, cells, dot, literal, name, total
-from torchrl_loco.sim.compiled.physics.constraints import DryFriction, JointLimits, Variables, near, tolerance
+from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, cell, cells, dot, name, total
+from torchrl_loco.sim.compiled.physics.constraints import DryFriction, JointLimits, Variables, near
 from torchrl_loco.sim.compiled.physics.delicate import LEAST_PIVOT, is_delicate
 from torchrl_loco.sim.compiled.physics.dynamics import ArticulatedFactor, Dynamics
 from torchrl_loco.sim.compiled.physics.sensors import ContactForces, TouchSensors
@@ -69,12 +69,11 @@ class NewtonSolver:
 
     def write(self, block: Block, variables: Variables) -> None:
         """Appends constraints and solver to a block, in which ``force`` is set, and ``qacc`` holds the start."""
-        m, option = self.m, self.m.opt
+        m = self.m
         for rows in (self.limits, self.friction, self.ground, self.dense):
             rows.create(block, variables)
         for i, product in enumerate(self.tree.mass_times(cells("qacc", m.nv))):
             block.set(f"M_qacc[{i}]", product)
-        scale = 1 / (m.stat.meaninertia * max(m.nv, 1))
         with block.function(
             "set_direction", "bool, float regularisation, float& gradient_squared, float& decrement"
         ) as direction:
@@ -83,15 +82,14 @@ class NewtonSolver:
         with block.function("project") as projection:
             self._project(projection)
         with block.function("line_search", "const float decrement, const bool guessed") as search:
-            self._line_search(search, scale)
+            self._line_search(search)
         with block.function("move", "Search& step") as step:
             self._move(step)
         block("const auto any_of_block = [](bool x) { return x; };")
         with block.function("lose", "") as loss:
             loss("qacc[0] = M_qacc[0] = Math::from_bits(NAN_BITS);")
-        stopping = literal(scale), literal(tolerance(m)), str(option.iterations)
-        delicate = "true" if self.delicate else "false"
-        block(shared.newton(*stopping, implicit_damping="false", guesses="false", delicate=delicate))
+        block("const bool guesses = false;")
+        block(shared.NEWTON)
 
     def read_touch(self, block: Block) -> None:
         """Sets the touch sensors from the forces that were found."""
@@ -158,9 +156,9 @@ class NewtonSolver:
         for i, product in enumerate(self.tree.mass_times(search)):
             block.set(f"M_search[{i}]", product)
 
-    def _line_search(self, block: Block, scale: float) -> None:
+    def _line_search(self, block: Block) -> None:
         """Returns a step along the direction, and sets the quadratic form there."""
-        m, nv, option = self.m, self.m.nv, self.m.opt
+        nv = self.m.nv
         search = cells("search", nv)
         residual = [cell(f"M_qacc[{i}]") - cell(f"force[{i}]") for i in range(nv)]
         sums = (dot(search, residual), dot(search, cells("M_search", nv)), dot(search, search))
@@ -169,8 +167,7 @@ class NewtonSolver:
         block("const auto add_rows = [&](const float* alphas, const int n, float* sums) {")
         block(self._each_row(STEPS_BY_SLOPES if self.by_slopes else STEPS))
         block("};")
-        tolerances = literal(scale), literal(tolerance(m) * option.ls_tolerance), literal(near(m))
-        block(shared.line_search(*tolerances, str(option.ls_iterations), "true" if self.by_slopes else "false"))
+        block(shared.LINE_SEARCH)
 
     def _each_row(self, body: str, *, ground: bool = True) -> str:
         """Returns C++ that runs ``body`` for each row, ``row``, with or without contacts with the ground."""

@@ -7,6 +7,7 @@ import mujoco
 from torchrl_loco.sim.compiled.collision.pairs import pairs
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel, number, present
 from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, cells, literal, names, scalar, zeros
+from torchrl_loco.sim.compiled.ir.tables import Tables
 from torchrl_loco.sim.compiled.physics import sensors
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE, Dynamics
 from torchrl_loco.sim.compiled.physics.sensors import TOUCH, TouchSensors
@@ -44,6 +45,10 @@ def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked) -> str:
         if not substeps:
             world("// Touch is a force: a step that is not taken finds it, without actuation.")
         step, solver = _substep(m, substeps, asked.contact_geoms, asked.contact_rows)
+        options = Tables()
+        flags = {"DELICATE": solver.delicate, "BY_SLOPES": solver.by_slopes, "IMPLICIT_DAMPING": False}
+        shared.add_options(options, m, **flags)
+        world(options.text())
         for title, count in solver.arrays.items():
             if count and title != "qacc":
                 world(f"float {title}[{count}];")

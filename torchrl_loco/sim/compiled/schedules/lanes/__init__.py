@@ -34,15 +34,6 @@ def _read(*names: str) -> str:
 
 
 HEADERS = "\n".join([_read("world", "friction"), "struct Step : Math {", _read(*MEMBERS), "};", _read("step")])
-LINE_SEARCH = shared.line_search("Model::scale()", "Model::ls_tolerance()", "Model::ls_near()", "Model::LS_ITERATIONS")
-NEWTON = shared.newton(
-    "Model::scale()",
-    "Model::tolerance()",
-    "Model::ITERATIONS",
-    "Model::IMPLICIT_DAMPING",
-    guesses="guesses",
-    delicate="Model::DELICATE",
-)
 
 
 def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked = shared.NO_MORE) -> str:
@@ -64,8 +55,8 @@ def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked = shared.NO_MOR
         "SHARED": shared.LAWS,
         "SOFTNESS": Softness.as_cpp(),
         "SPATIAL": spatial.as_cpp(),
-        "LINE_SEARCH": LINE_SEARCH,
-        "NEWTON": NEWTON,
+        "LINE_SEARCH": shared.LINE_SEARCH,
+        "NEWTON": shared.NEWTON,
         "MODEL": tables.text(),
         "COLLIDE": d.collide(),
         "ELIMINATE": d.elimination(),

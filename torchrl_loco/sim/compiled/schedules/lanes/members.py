@@ -16,7 +16,6 @@ from torchrl_loco.sim.compiled.ir import symbols
 from torchrl_loco.sim.compiled.ir.parameters import Number, VariedModel, nominal, present, varies
 from torchrl_loco.sim.compiled.ir.tables import Tables
 from torchrl_loco.sim.compiled.physics.actuators import activation_flow
-from torchrl_loco.sim.compiled.physics.constraints import near, tolerance
 from torchrl_loco.sim.compiled.physics.delicate import LEAST_PIVOT, is_delicate
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE, MINVAL, SLIDE
 from torchrl_loco.sim.compiled.physics.lengths import Length
@@ -24,7 +23,7 @@ from torchrl_loco.sim.compiled.physics.links import matrix
 from torchrl_loco.sim.compiled.physics.sensors import GYRO, TORQUE, subtree
 from torchrl_loco.sim.compiled.schedules.lanes.description import LANES, Description, dofs_of, is_implicitfast
 from torchrl_loco.sim.compiled.schedules.lanes.layout import pad
-from torchrl_loco.sim.compiled.schedules.shared import Asked
+from torchrl_loco.sim.compiled.schedules.shared import Asked, add_options
 
 TRANSLATION, ROTATION = 0, 1
 """Kinds of a degree of freedom in ``world.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
@@ -44,8 +43,6 @@ def members(d: Description, substeps: int, asked: Asked) -> Tables:
     tables.lines.append(f"  typedef {mask} Dofs;  // a bit for each degree of freedom")
     tables.size(
         SUBSTEPS=substeps,
-        ITERATIONS=m.opt.iterations,
-        LS_ITERATIONS=m.opt.ls_iterations,
         WORLD_BYTES=layout.bytes,
         WORLDS_PER_BLOCK=d.worlds_per_block(),
         LOCKSTEP=LOCKSTEP,
@@ -54,19 +51,11 @@ def members(d: Description, substeps: int, asked: Asked) -> Tables:
         SENSOR_VALUES=m.nsensordata,
         LIMIT_SIDES=d.limit_sides,
         VARIED=isinstance(m, VariedModel),
-        DELICATE=is_delicate(nominal(m)),
         ROWS=layout.rows,
         **{name.upper(): size for name, size in dataclasses.asdict(layout).items()},
     )
-    tables.constant(
-        timestep=m.opt.timestep,
-        scale=1 / (m.stat.meaninertia * m.nv),
-        tolerance=tolerance(m),
-        ls_tolerance=tolerance(m) * m.opt.ls_tolerance,
-        ls_near=near(m),
-        least_aligned=LEAST_ALIGNED,
-        least_pivot=LEAST_PIVOT,
-    )
+    add_options(tables, m, DELICATE=is_delicate(nominal(m)), BY_SLOPES=False)
+    tables.constant(timestep=m.opt.timestep, least_aligned=LEAST_ALIGNED, least_pivot=LEAST_PIVOT)
     tables.vector("gravity", m.opt.gravity)
     _add_links(tables, d)
     _add_joints(tables, d)
