@@ -48,7 +48,7 @@ def test_the_estimate_is_what_is_allocated(body, num_envs, overrides, geoms, row
     assert mujoco_warp.data_bytes(setup) == needed
     data = compiled.CompiledEngine(setup).data
     arrays = [array for array in vars(data).values() if isinstance(array, wp.array)]
-    assert compiled.data_bytes(setup) == sum(array.capacity for array in arrays)
+    assert compiled.CompiledEngine.memory(setup) == sum(array.capacity for array in arrays)
 
 
 def test_scratch_memory_is_used_again():
@@ -62,8 +62,7 @@ def test_scratch_memory_is_used_again():
 
 def test_too_many_worlds_are_refused_before_they_are_allocated(engine, monkeypatch):
     """A billion not for contacts, which the compiled step does not list; under MuJoCo-Warp they would exceed 2**31."""
-    monkeypatch.setattr(mujoco_warp, "MujocoWarpEngine", None)
-    monkeypatch.setitem(simulation.ENGINES, "compiled", None)
+    monkeypatch.setattr(simulation.ENGINES[engine], "__init__", None)
     for num_envs in (10**7, 10**9):
         monkeypatch.setattr(simulation, "free_memory", lambda device, free=107 * num_envs: free)
         with pytest.raises(MemoryError, match=rf"num_envs={num_envs} needs about \d+\.\d GiB on cpu.* \d+ worlds fit"):
@@ -83,7 +82,7 @@ def test_more_worlds_than_warp_can_address_are_refused():
 def test_as_many_as_fit_are_made(engine, monkeypatch):
     config = sim_config(CONFIGS["walker"], "playground", 8, {"engine": engine})
     model = models.load(MODELS["walker"])
-    needed = simulation.memory(engine, Setup(model, config, 8, wp.get_device("cpu")))
+    needed = simulation.ENGINES[engine].memory(Setup(model, config, 8, wp.get_device("cpu")))
     for free, fits in ((needed + 1, True), (needed / 2, False)):
         monkeypatch.setattr(simulation, "free_memory", lambda device, free=free: free)
         if fits:

@@ -330,5 +330,5 @@ def test_memory_counts_the_numbers(kind):
         bytes_ = [mujoco_warp.data_bytes(s) for s in (setup, plain)]
     else:
         taken = compiled.CompiledEngine(setup)._rows.capacity
-        bytes_ = [compiled.data_bytes(s) for s in (setup, plain)]
+        bytes_ = [compiled.CompiledEngine.memory(s) for s in (setup, plain)]
     assert bytes_[0] - bytes_[1] == taken

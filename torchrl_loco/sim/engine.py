@@ -80,6 +80,11 @@ class Engine(abc.ABC):
         self.peak_constraints = Buffer(setup.num_envs, int, setup.device)
         self.peak_contacts = Buffer(1, int, setup.device)
 
+    @staticmethod
+    @abc.abstractmethod
+    def memory(setup: Setup) -> int:
+        """Returns the memory that the engine takes (bytes), without allocating it."""
+
     @abc.abstractmethod
     def remedy(self, dropped: str, most: int) -> str:
         """Returns advice for the warning about dropped constraints or contacts, of which a substep needed ``most``."""

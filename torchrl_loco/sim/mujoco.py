@@ -121,6 +121,12 @@ class MujocoEngine(Engine):
         return [world.data for world in self._worlds]
 
     @override
+    @staticmethod
+    def memory(setup: Setup) -> int:
+        data: Any = mujoco.MjData(setup.mj_model)
+        return setup.num_envs * (2 * int(data.nbuffer) + 65_536)  # about: an mjData uses a small part of its arena
+
+    @override
     def remedy(self, dropped: str, most: int) -> str:
         return f'C MuJoCo had no memory for more {dropped} than {most}: raise <size memory="..."/> in the model'
 
@@ -272,9 +278,3 @@ def _without_actuation(m: mujoco.MjModel) -> mujoco.MjModel:
     passive = copy.copy(m)
     passive.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     return passive
-
-
-def data_bytes(setup: Setup) -> int:
-    """Returns about how much memory the worlds take (bytes): an ``mjData`` uses a small part of its arena."""
-    data: Any = mujoco.MjData(setup.mj_model)
-    return setup.num_envs * (2 * int(data.nbuffer) + 65_536)

@@ -23,17 +23,10 @@ from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.warp_init import init_warp
 from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, WorldKernels, copy_row, fill, zero_row
 
-SCRATCH = 1.4
-"""Memory of a simulation as a multiple of its ``mjData``; the rest is scratch memory (measured: 1.3 to 1.4)."""
-
 TOLERANCE = 1e-8
 """MuJoCo's default tolerance of the solver."""
 
-DETERMINISTIC_SCRATCH = 11.0
-"""The same with ``deterministic=True`` on CUDA (measured: 6 to 8 times the memory of a world)."""
-
-
-ENGINES: dict[str, Callable[[Setup], Engine]] = {
+ENGINES: dict[str, type[Engine]] = {
     "compiled": compiled.CompiledEngine,
     "mujoco_warp": mujoco_warp.MujocoWarpEngine,
     "mujoco": c_mujoco.MujocoEngine,
@@ -148,7 +141,7 @@ class Simulation:
         init_warp()
         self.device = wp.get_device(str(device))
         setup = Setup(mj_model, config, num_envs, self.device, geoms, differing, rows)
-        check_memory(memory(name, setup), num_envs, device)
+        check_memory(ENGINES[name].memory(setup), num_envs, device)
         self.engine = ENGINES[name](setup)
         self.model, self.data = self.engine.model, self.engine.data
         self._batched: BatchedModel | None = None
@@ -378,16 +371,6 @@ def choose_engine(mj_model: mujoco.MjModel, config: SimConfig, varied: Varied | 
         "stepping with MuJoCo-Warp: engine 'compiled' does not have: %s%s", missing[0], more
     )
     return "mujoco_warp", f"engine 'compiled' does not have: {'; '.join(missing)}"
-
-
-def memory(engine: str, setup: Setup) -> int:
-    """Returns the memory that a simulation takes (bytes)."""
-    if engine == "compiled":
-        return compiled.data_bytes(setup)
-    if engine == "mujoco":
-        return c_mujoco.data_bytes(setup)
-    scratch = DETERMINISTIC_SCRATCH if setup.config.deterministic and setup.device.is_cuda else SCRATCH
-    return int(scratch * mujoco_warp.data_bytes(setup))
 
 
 def check_memory(needed: int, num_envs: int, device: torch.device) -> None:

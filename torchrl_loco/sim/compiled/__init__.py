@@ -25,7 +25,6 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 """
 
 from torchrl_loco.sim.compiled.engine import CompiledEngine as CompiledEngine
-from torchrl_loco.sim.compiled.engine import data_bytes as data_bytes
 from torchrl_loco.sim.compiled.schedules import lanes as lanes
 from torchrl_loco.sim.compiled.step import source as source
 from torchrl_loco.sim.compiled.support import unsupported as unsupported

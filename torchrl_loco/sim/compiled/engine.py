@@ -153,21 +153,6 @@ def _shape(setup: Setup, name: str) -> tuple[int, ...]:
             return setup.num_envs, getattr(setup.mj_model, size)
 
 
-def data_bytes(setup: Setup) -> int:
-    """Returns the memory that the state takes, without what is asked for later (bytes).
-
-    Numbers that differ from world to world are counted too.
-    """
-    rows = sum(
-        math.prod(_shape(setup, name)) * wp.types.type_size_in_bytes(dtype)
-        for name, (_, dtype) in ROWS.items()
-        if name not in LATER
-    )
-    if setup.varied is None:
-        return rows
-    return rows + 4 * setup.num_envs * nominal_row(VariedModel(setup.mj_model, setup.varied)).size
-
-
 class Model(ReadOnly):
     """The model on the device: what ``mujoco_warp.Model`` has, under the same names, to be read only.
 
@@ -224,6 +209,18 @@ class CompiledEngine(Engine):
         self._terrain = wp.array(Ground.of(mj_model).numbers(), dtype=wp.float32, device=device)
         self.coalesced = by_world and not self._launch_size.one_kernel
         self._steps: dict[tuple, tuple[wp.Kernel, Chain, Chain]] = {}
+
+    @override
+    @staticmethod
+    def memory(setup: Setup) -> int:
+        rows = sum(
+            math.prod(_shape(setup, name)) * wp.types.type_size_in_bytes(dtype)
+            for name, (_, dtype) in ROWS.items()
+            if name not in LATER
+        )
+        if setup.varied is None:
+            return rows
+        return rows + 4 * setup.num_envs * nominal_row(VariedModel(setup.mj_model, setup.varied)).size
 
     @override
     def remedy(self, dropped: str, most: int) -> str:
