@@ -112,40 +112,15 @@ struct Interval {  // of a ray's parameter: the part that lies in a convex shape
 // is gained. Minima and maxima, not conditions: what a predicate guards waits 13 cycles for it on a GPU.
 
 struct OneSided {  // costs D x^2 / 2 where x < 0
-  static INLINE float cost(float x, float weight) { return x < 0.0f ? 0.5f * weight * x * x : 0.0f; }
   static INLINE float gradient(float x, float weight) { return weight * Math::smaller(x, 0.0f); }
   static INLINE float curvature(float x, float weight) { return x < 0.0f ? weight : 0.0f; }
-  static INLINE bool crosses(float x, float next) { return (x < 0.0f) != (next < 0.0f); }
-  static INLINE float change(float x, float v, float weight, float alpha) {
-    const float out = Math::larger(x, 0.0f), in = Math::larger(-x, 0.0f);
-    const float moved = Math::smaller(fmaf(alpha, v, out), in);
-    return weight * moved * fmaf(0.5f, moved, -in);
-  }
-  static INLINE void bend(float x, float v, float weight, float alpha, float* sums) {
-    const float y = Math::smaller(fmaf(alpha, v, x), 0.0f);
-    sums[0] = fmaf(weight * v, y, sums[0]);
-    sums[1] = fmaf(y < 0.0f ? 1.0f : 0.0f, weight * v * v, sums[1]);
-  }
 };
 
 struct DryFriction {  // costs D x^2 / 2 while |x| is below a bound, and grows linearly beyond
-  static INLINE float cost(float x, float weight, float bound) {
-    return fabsf(x) < bound ? 0.5f * weight * x * x : weight * bound * (fabsf(x) - 0.5f * bound);
-  }
   static INLINE float gradient(float x, float weight, float bound) { return weight * Math::clamp(x, -bound, bound); }
   static INLINE float curvature(float x, float weight, float bound) { return fabsf(x) < bound ? weight : 0.0f; }
   static INLINE bool crosses(float x, float next, float bound) {
     return bound > 0.0f && ((x < bound) != (next < bound) || (x > -bound) != (next > -bound));
-  }
-  static INLINE float change(float x, float v, float weight, float bound, float alpha) {
-    const float y = fmaf(alpha, v, x);
-    const bool inside = fabsf(y) < bound && fabsf(x) < bound;
-    return inside ? 0.5f * weight * (x + y) * (alpha * v) : cost(y, weight, bound) - cost(x, weight, bound);
-  }
-  static INLINE void bend(float x, float v, float weight, float bound, float alpha, float* sums) {
-    const float y = fmaf(alpha, v, x);
-    sums[0] += weight * v * Math::clamp(y, -bound, bound);
-    sums[1] += fabsf(y) < bound ? weight * v * v : 0.0f;
   }
 };
 
@@ -153,16 +128,33 @@ struct ConstraintRow {  // of either kind, along a search direction
   float x, v, weight, bound;
   bool dry;  // or one-sided, without a bound
   INLINE float after(float alpha) const { return x + alpha * v; }
-  INLINE float cost() const { return dry ? DryFriction::cost(x, weight, bound) : OneSided::cost(x, weight); }
   INLINE bool crosses(float next) const {
-    return dry ? DryFriction::crosses(x, next, bound) : OneSided::crosses(x, next);
+    return dry ? DryFriction::crosses(x, next, bound) : (x < 0.0f) != (next < 0.0f);
   }
+  INLINE float cost_at(float y) const {
+    if (dry) return fabsf(y) < bound ? 0.5f * weight * y * y : weight * bound * (fabsf(y) - 0.5f * bound);
+    return y < 0.0f ? 0.5f * weight * y * y : 0.0f;
+  }
+  INLINE float cost() const { return cost_at(x); }
   INLINE float change(float alpha) const {
-    return dry ? DryFriction::change(x, v, weight, bound, alpha) : OneSided::change(x, v, weight, alpha);
+    if (dry) {
+      const float y = fmaf(alpha, v, x);
+      const bool inside = fabsf(y) < bound && fabsf(x) < bound;
+      return inside ? 0.5f * weight * (x + y) * (alpha * v) : cost_at(y) - cost_at(x);
+    }
+    const float out = Math::larger(x, 0.0f), in = Math::larger(-x, 0.0f);
+    const float moved = Math::smaller(fmaf(alpha, v, out), in);
+    return weight * moved * fmaf(0.5f, moved, -in);
   }
   INLINE void bend(float alpha, float* sums) const {
-    if (dry) DryFriction::bend(x, v, weight, bound, alpha, sums);
-    else OneSided::bend(x, v, weight, alpha, sums);
+    const float y = fmaf(alpha, v, x);
+    if (dry) {
+      sums[0] += weight * v * Math::clamp(y, -bound, bound);
+      sums[1] += fabsf(y) < bound ? weight * v * v : 0.0f;
+      return;
+    }
+    sums[0] = fmaf(weight * v, Math::smaller(y, 0.0f), sums[0]);
+    sums[1] = fmaf(y < 0.0f ? 1.0f : 0.0f, weight * v * v, sums[1]);
   }
   INLINE void add(float alpha, float* sums) const {
     sums[0] += change(alpha);

@@ -13,7 +13,7 @@ INLINE Step(World& w, int lane, const float* ctrl, int& overflow, const float* r
 #ifdef __CUDA_ARCH__
 INLINE void sync() const { __syncwarp(); }
 INLINE unsigned ballot(bool x) const { return __ballot_sync(~0u, x); }
-INLINE bool any_of_block(bool x) const { return Model::LOCKSTEP && Model::SUBSTEPS ? __syncthreads_or(x) : x; }
+INLINE bool any_of_block(bool x) const { return Model::SUBSTEPS > 0 ? __syncthreads_or(x) : x; }
 INLINE float read(float x, int from) const { return __shfl_sync(~0u, x, from); }
 INLINE int read(int x, int from) const { return __shfl_sync(~0u, x, from); }
 INLINE unsigned read(unsigned x, int from) const { return __shfl_sync(~0u, x, from); }

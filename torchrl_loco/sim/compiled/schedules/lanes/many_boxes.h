@@ -132,21 +132,13 @@ INLINE void look_up_boxes(const bool round, const int first, const int end, cons
     }
   }
 }
-#endif
 
-#if WITH_ROUND_ON_BOXES
-INLINE void collide_round_on_boxes(const bool friction) {
+INLINE void look_up_boxes(const bool round, const bool friction) {
   ROLLED_FOR(int kind = 0; kind < Model::BOX_KINDS; ++kind) {
-    const int i = 4 * kind + 2 * friction;
-    look_up_boxes(true, Model::round_on_boxes_pair(i), Model::round_on_boxes_pair(i + 1), kind, friction);
+    const int i = 8 * kind + 4 * round + 2 * friction;
+    look_up_boxes(round, Model::on_boxes_pair(i), Model::on_boxes_pair(i + 1), kind, friction);
   }
 }
-#endif
-#if WITH_BOX_ON_BOXES
-INLINE void collide_box_on_boxes(const bool friction) {
-  ROLLED_FOR(int kind = 0; kind < Model::BOX_KINDS; ++kind) {
-    const int i = 4 * kind + 2 * friction;
-    look_up_boxes(false, Model::box_on_boxes_pair(i), Model::box_on_boxes_pair(i + 1), kind, friction);
-  }
-}
+INLINE void collide_round_on_boxes(const bool friction) { look_up_boxes(true, friction); }
+INLINE void collide_box_on_boxes(const bool friction) { look_up_boxes(false, friction); }
 #endif

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from torchrl_loco.sim.compiled.collision.ground import BOX_NUMBERS
-from torchrl_loco.sim.compiled.collision.kinds import MESH, ON_BOXES, POINT_BITS, SHAPES, SOLID
+from torchrl_loco.sim.compiled.collision.kinds import MESH, POINT_BITS, SHAPES, SOLID
 from torchrl_loco.sim.compiled.collision.pairs import Pair, contact_weight, half_length, least_regularisation
 from torchrl_loco.sim.compiled.collision.planes import LEAST_ALIGNED
 from torchrl_loco.sim.compiled.ir import symbols
@@ -28,9 +28,6 @@ from torchrl_loco.sim.compiled.schedules.shared import Asked, add_options
 TRANSLATION, ROTATION = 0, 1
 """Kinds of a degree of freedom in ``world.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
 UNLIMITED = 1e30
-LOCKSTEP = True
-"""Whether the worlds of a block begin each substep, and each iteration of its solver, together, so that they share what
-they fetch of the text."""
 MOST_ROUNDS = 4
 """Pairs of geoms whose bounding spheres a lane compares side by side, at most."""
 
@@ -45,7 +42,6 @@ def members(d: Description, substeps: int, asked: Asked) -> Tables:
         SUBSTEPS=substeps,
         WORLD_BYTES=layout.bytes,
         WORLDS_PER_BLOCK=d.worlds_per_block(),
-        LOCKSTEP=LOCKSTEP,
         CONTROLS=m.nu,
         BODIES=m.nbody,
         SENSOR_VALUES=m.nsensordata,
@@ -402,8 +398,9 @@ def _add_ground(tables: Tables, d: Description) -> None:
         tables.size(BOXES=start, CELLS=cells, NAMED=named, BOX_KINDS=len(boxes.kinds))
         tables.size(BOX_NUMBERS=BOX_NUMBERS, GRID_COLUMNS=grid.shape[0], GRID_ROWS=grid.shape[1])
         tables.constant(grid_x=grid.corner[0], grid_y=grid.corner[1], grid_cell=grid.cell)
-        for function in ON_BOXES.values():
-            tables.integers(f"{function}_pair", [i for kind in boxes.kinds for i in d.pairs_on(kind, function)])
+        functions = ("box_on_boxes", "round_on_boxes")
+        pairs = [i for kind in boxes.kinds for function in functions for i in d.pairs_on(kind, function)]
+        tables.integers("on_boxes_pair", pairs)
     tables.size(TOPS=end, TOPS_COLUMNS=tops.heights.shape[1], TOPS_ROWS=tops.heights.shape[0])
     margin = max((p.margin for p in d.pairs if d.is_ground(p)), default=0.0)
     tables.constant(ground_margin=margin, tops_x=tops.corner[0], tops_y=tops.corner[1], tops_cell=tops.cell)

@@ -4,9 +4,9 @@ static_assert(sizeof(World) == Model::WORLD_BYTES, "layout.py counts on this siz
 #ifdef __CUDA_ARCH__
 static __shared__ World worlds[Model::WORLDS_PER_BLOCK];
 World& w = worlds[threadIdx.x / LANES];
-// Warps that run in step share what they fetch of the text. Lanes without a world keep to the step but do nothing else.
-#define LOCKSTEP() \
-  if (Model::LOCKSTEP) __syncthreads()
+// The worlds of a block begin each substep, and each iteration of its solver, together: so they share what they fetch of
+// the text. Lanes without a world keep to the step but do nothing else.
+#define LOCKSTEP() __syncthreads()
 #else
 World storage;
 World& w = storage;
