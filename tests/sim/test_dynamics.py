@@ -12,7 +12,7 @@ from random_models import models
 import torchrl_loco.sim.models
 from torchrl_loco.sim.compiled import unsupported
 from torchrl_loco.sim.compiled.ir.symbols import names
-from torchrl_loco.sim.compiled.physics.dynamics import Dynamics
+from torchrl_loco.sim.compiled.physics.dynamics import ArticulatedFactor, Dynamics
 
 SETTINGS = {"deadline": None, "derandomize": True, "database": None, "phases": [hypothesis.Phase.generate]}
 EXACT = {"rtol": 1e-9, "atol": 1e-9}
@@ -24,7 +24,7 @@ def assert_agrees(model, rng):
     }
     x = names("x", model.nv)
     tree = Dynamics(model, *symbols.values())
-    factor = tree.factor([np.zeros((6, 6)) for _ in range(model.nbody)], [0.0] * model.nv)
+    factor = ArticulatedFactor(tree, [np.zeros((6, 6)) for _ in range(model.nbody)], [0.0] * model.nv)
     data = mujoco.MjData(model)
     mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
     data.qvel[:], data.ctrl[:] = rng.normal(size=model.nv), rng.uniform(-2, 2, model.nu)

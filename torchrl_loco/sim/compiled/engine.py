@@ -12,19 +12,12 @@ import warp as wp
 from typing_extensions import override
 
 from torchrl_loco.sim import mjw
+from torchrl_loco.sim.compiled import step
 from torchrl_loco.sim.compiled.collision.ground import Ground
 from torchrl_loco.sim.compiled.collision.pairs import stand_ins
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel
 from torchrl_loco.sim.compiled.read_only import ReadOnly, read_only
 from torchrl_loco.sim.compiled.schedules.shared import Asked
-from torchrl_loco.sim.compiled.step import (
-    WARP,
-    check_worlds,
-    kept_source,
-    launch_size,
-    nominal_row,
-    structure_of_arrays,
-)
 from torchrl_loco.sim.engine import Engine, Setup, Update
 from torchrl_loco.sim.world_func import ALONE, Around, Chain, WorldFunc, fill
 
@@ -85,7 +78,7 @@ class Data:
     """
 
     def __init__(self, setup: Setup) -> None:
-        m, by_world = setup.mj_model, structure_of_arrays(setup.mj_model, setup.device)
+        m, by_world = setup.mj_model, step.structure_of_arrays(setup.mj_model, setup.device)
 
         def make(name: str) -> wp.array:
             return _zeros(_shape(setup, name), ROWS[name][1], setup.device, structure_of_arrays=by_world)
@@ -194,15 +187,15 @@ class CompiledEngine(Engine):
         mj_model, num_envs, device = setup.mj_model, setup.num_envs, setup.device
         self._mj_model = mj_model if setup.varied is None else VariedModel(mj_model, setup.varied)
         self._contact_geoms, self._contact_rows = setup.contact_geoms, setup.contact_rows
-        check_worlds(mj_model, num_envs, device)
+        step.check_worlds(mj_model, num_envs, device)
         _check_forces(mj_model, self._contact_geoms)
         self.model = Model(mj_model, device)
-        self._launch_size = launch_size(self._mj_model, num_envs, device)
-        by_world = structure_of_arrays(mj_model, device)
+        self._launch_size = step.launch_size(self._mj_model, num_envs, device)
+        by_world = step.structure_of_arrays(mj_model, device)
         self.data = Data(setup)
         self._rows = self.numbers = wp.zeros((num_envs, 0), dtype=float, device=device)
         if isinstance(self._mj_model, VariedModel):
-            row = nominal_row(self._mj_model)
+            row = step.nominal_row(self._mj_model)
             self._rows = _zeros((num_envs, row.size), wp.float32, device, structure_of_arrays=by_world)
             _fill_rows(self._rows, row)
             self.numbers = self._rows[:, : self._mj_model.varied.count]
@@ -220,7 +213,7 @@ class CompiledEngine(Engine):
         )
         if setup.varied is None:
             return rows
-        return rows + 4 * setup.num_envs * nominal_row(VariedModel(setup.mj_model, setup.varied)).size
+        return rows + 4 * setup.num_envs * step.nominal_row(VariedModel(setup.mj_model, setup.varied)).size
 
     @override
     def remedy(self, dropped: str, most: int) -> str:
@@ -233,14 +226,11 @@ class CompiledEngine(Engine):
     @override
     def step(self, around: Around = ALONE) -> None:
         first, before, after, last = around
-        if self._launch_size.one_kernel:
-            self._kernels.launch(first, self._all)
-            self._launch(self._substeps, self._all, before, after, self._contact_geoms)
-            self._kernels.launch(last, self._all)
-        else:
-            self._kernels.launch([*first, *before], self._all)
-            self._launch(self._substeps, self._all, (), (), self._contact_geoms)
-            self._kernels.launch([*after, *last], self._all)
+        if not self._launch_size.one_kernel:
+            first, before, after, last = [*first, *before], (), (), [*after, *last]
+        self._kernels.launch(first, self._all)
+        self._launch(self._substeps, self._all, before, after, self._contact_geoms)
+        self._kernels.launch(last, self._all)
 
     @override
     def forward(self, mask: wp.array, update: Update) -> None:
@@ -259,7 +249,7 @@ class CompiledEngine(Engine):
         if key not in self._steps:
             with_cvel, with_com = (outputs[name] is not None for name in LATER)
             asked = Asked(with_cvel, with_com, contact_geoms, self._contact_rows)
-            text = kept_source(self._mj_model, substeps, asked)
+            text = step.kept_source(self._mj_model, substeps, asked)
             start, end = Chain(before), Chain(after)
             self._steps[key] = _kernel(text, start, end, self._launch_size.registers), start, end
         kernel, start, end = self._steps[key]
@@ -310,9 +300,9 @@ def _kernel(text: str, start: Chain, end: Chain, registers: int | None = None) -
         after_args: After,
         arrays: Arrays,
     ):
-        place = wp.tid() % WARP // lanes  # of the world in its warp
+        place = wp.tid() % step.WARP // lanes  # of the world in its warp
         lane = wp.tid() % lanes  # of the thread in its world
-        world = wp.tid() // WARP * worlds_per_warp + place
+        world = wp.tid() // step.WARP * worlds_per_warp + place
         live = place < worlds_per_warp and world < mask_in.shape[0]
         if live:
             live = mask_in[world]

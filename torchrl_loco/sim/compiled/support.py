@@ -1,5 +1,7 @@
 """Lists what a model needs that the compiled step does not support. Everything else is supported."""
 
+from collections import defaultdict
+
 import mujoco
 import numpy as np
 
@@ -24,7 +26,7 @@ MAX_TOUCH = 31
 SHOWN = 3
 """Names of elements that a line shows."""
 
-Found = dict[str, list[str]]
+Found = defaultdict[str, list[str]]
 """Names of the elements that need something, by what it is."""
 
 
@@ -125,46 +127,44 @@ def _is_plain(m: mujoco.MjModel, t: int) -> bool:
 
 
 def _joints(m: mujoco.MjModel) -> list[str]:
-    found: Found = {}
+    found = Found(list)
     for j in range(m.njnt):
         name = m.joint(j).name
         if m.jnt_type[j] in (FREE, BALL) and m.jnt_stiffness[j]:
-            found.setdefault("stiffness of a free or ball joint", []).append(name)
+            found["stiffness of a free or ball joint"].append(name)
         if lanes.is_implicitfast(m) and m.jnt_type[j] == FREE and m.tree_dofnum[m.dof_treeid[m.jnt_dofadr[j]]] == 6:
-            found.setdefault("implicitfast for a body that is alone in its tree", []).append(name)
+            found["implicitfast for a body that is alone in its tree"].append(name)
         last = m.body_jntadr[m.jnt_bodyid[j]] + m.body_jntnum[m.jnt_bodyid[j]] - 1
         if m.jnt_type[j] == BALL and j != last and not is_traced(m):
-            found.setdefault("a ball joint that another joint of the body follows, in a world of lanes", []).append(
-                name
-            )
+            found["a ball joint that another joint of the body follows, in a world of lanes"].append(name)
         if m.jnt_stiffnesspoly[j].any():
-            found.setdefault("springs that are not linear", []).append(name)
+            found["springs that are not linear"].append(name)
     dampers = ["dampers that are not linear"] if m.dof_dampingpoly.any() else []
     return _lines("joint", found) + dampers
 
 
 def _actuators(m: mujoco.MjModel) -> list[str]:
-    found: Found = {}
+    found = Found(list)
     for i in range(m.nactuator):  # not nu: an actuator may have several controls
         name, of = m.actuator(i).name, m.actuator_trnid[i, 0]
         of_tendon = m.actuator_trntype[i] == OF_TENDON
         if m.actuator_ctrlnum[i] != 1:
-            found.setdefault("other than one control", []).append(name)
+            found["other than one control"].append(name)
         if not of_tendon and (m.actuator_trntype[i] != OF_JOINT or m.jnt_type[of] in (FREE, BALL)):
-            found.setdefault("a transmission other than a hinge, slide or fixed tendon", []).append(name)
+            found["a transmission other than a hinge, slide or fixed tendon"].append(name)
         if of_tendon and lanes.is_implicitfast(m) and m.actuator_biasprm[i, 2]:
-            found.setdefault("implicitfast for a tendon's bias by velocity", []).append(name)
+            found["implicitfast for a tendon's bias by velocity"].append(name)
         plain = m.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
         if not plain and (m.actuator_dyntype[i] not in FILTERS or m.actuator_actearly[i] or i not in acting(m)):
-            found.setdefault("activation other than a filter or integrator that acts", []).append(name)
+            found["activation other than a filter or integrator that acts"].append(name)
         if m.actuator_gaintype[i] != int(mujoco.mjtGain.mjGAIN_FIXED) or m.actuator_biastype[i] not in BIASES:
-            found.setdefault("a gain that is not fixed or a bias that is not affine", []).append(name)
+            found["a gain that is not fixed or a bias that is not affine"].append(name)
         if m.actuator_delay[i] or m.actuator_damping[i] or m.actuator_armature[i] or m.actuator_dampingpoly[i].any():
-            found.setdefault("delay, damping or armature of an actuator", []).append(name)
+            found["delay, damping or armature of an actuator"].append(name)
     return _lines("actuator", found)
 
 
-def _lines(kind: str, found: Found) -> list[str]:
+def _lines(kind: str, found: dict[str, list[str]]) -> list[str]:
     """Returns a line for each thing that was found, with the names of the first elements that need it."""
     lines = []
     for what, names in found.items():

@@ -5,12 +5,7 @@ A row has a residual ``x = J a - a_ref`` of the acceleration ``a`` and a weight 
 Along a search direction ``s`` the residual changes by ``v = J s``. Source: MuJoCo's documentation, chapter Computation
 ("Constraint model"), and chapter Modeling ("Solver parameters") for ``a_ref`` and ``D``.
 
-====================  ===========================================================================================
-:class:`JointLimits`  J is plus or minus one at one degree of freedom; each limit has a place of its own
-:class:`DryFriction`  J is one at one degree of freedom
-====================  ===========================================================================================
-
-The rows of contacts are in ``ground_contacts`` and ``dense_contacts``.
+Here J has a single number, plus or minus one; the rows of contacts are in ``ground_contacts`` and ``dense_contacts``.
 """
 
 import dataclasses

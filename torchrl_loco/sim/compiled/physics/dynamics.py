@@ -2,11 +2,6 @@
 
 Spatial vectors are those of ``spatial``, about the center of mass of their tree. Bodies come in the order of the model:
 parents before children.
-
-==========================  ================================================================
-:func:`kinematics`          poses of bodies and joints
-:class:`Dynamics`           inertias, joint axes, velocities, forces; M x and (M + K)^-1 x
-==========================  ================================================================
 """
 
 import dataclasses
@@ -256,7 +251,7 @@ class Dynamics:
         return [dot(self.cdof[d], force[m.dof_bodyid[d]]) + m.dof_armature[d] * x[d] for d in range(m.nv)]
 
     def diagonal(self, stiffness: list[np.ndarray], added: list[Scalar]) -> list[Scalar]:
-        """Returns the diagonal of M + K, of which :meth:`factor` takes the same."""
+        """Returns the diagonal of M + K, of which :class:`ArticulatedFactor` takes the same."""
         m = self.m
         composite = [zeros(6, 6), *(self.inertia[b].matrix() + stiffness[b] for b in range(1, m.nbody))]
         for body in reversed(range(1, m.nbody)):
@@ -264,10 +259,6 @@ class Dynamics:
                 composite[parent] = composite[parent] + composite[body]
         along = [dot(self.cdof[d], composite[m.dof_bodyid[d]] @ self.cdof[d]) for d in range(m.nv)]
         return [x + m.dof_armature[d] + added[d] for d, x in enumerate(along)]
-
-    def factor(self, stiffness: list[np.ndarray], diagonal: list[Scalar]) -> "ArticulatedFactor":
-        """Returns a factor of M + K, with K a ``(6, 6)`` stiffness at each body and a number for each dof."""
-        return ArticulatedFactor(self, stiffness, diagonal)
 
 
 class ArticulatedFactor:

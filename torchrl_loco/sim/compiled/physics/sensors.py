@@ -1,11 +1,6 @@
 """Sensors of one world, traced for one model: motions of subtrees, touch, and contact forces of geoms.
 
-===========================  ===========================================================================
-:func:`subtree_velocity`     of the present state
-:func:`angular_momentum`     likewise
-:class:`TouchSensors`        of the forces of the last substep, as acceleration sensors are in MuJoCo
-:class:`ContactForces`       likewise
-===========================  ===========================================================================
+Touch and contact forces are those of the last substep, as acceleration sensors are in MuJoCo.
 """
 
 from collections.abc import Sequence

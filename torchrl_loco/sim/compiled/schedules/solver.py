@@ -117,7 +117,7 @@ class NewtonSolver:
         self.friction.add_to(gradient, diagonal)
         if self.delicate:
             diagonal = [x + name("regularisation") * float(m.dof_M0[i]) for i, x in enumerate(diagonal)]
-        factor = tree.factor(stiffness, diagonal)
+        factor = ArticulatedFactor(tree, stiffness, diagonal)
         if self.delicate:
             self._look_at_pivots(block, factor, stiffness, diagonal)
         if self.dense.count:

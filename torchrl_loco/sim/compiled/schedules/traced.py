@@ -9,7 +9,7 @@ from torchrl_loco.sim.compiled.ir.parameters import VariedModel, number, present
 from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, cells, literal, names, scalar, zeros
 from torchrl_loco.sim.compiled.ir.tables import Tables
 from torchrl_loco.sim.compiled.physics import sensors
-from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE, Dynamics
+from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE, ArticulatedFactor, Dynamics
 from torchrl_loco.sim.compiled.physics.sensors import TOUCH, TouchSensors
 from torchrl_loco.sim.compiled.schedules import shared
 from torchrl_loco.sim.compiled.schedules.solver import NewtonSolver
@@ -126,7 +126,7 @@ def _integrate(block: Block, m: mujoco.MjModel, tree: Dynamics) -> None:
     implicit = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
     if implicit and present(m.dof_damping):
         diagonal = [scalar(h * damping) for damping in m.dof_damping]
-        factor = tree.factor([zeros(6, 6) for _ in range(m.nbody)], diagonal)
+        factor = ArticulatedFactor(tree, [zeros(6, 6) for _ in range(m.nbody)], diagonal)
         qacc = [block.keep(a) for a in factor.solve(cells("M_qacc", m.nv))]
     for i in range(m.nv):
         block.set(f"qvel[{i}]", qacc[i] * h, "+=")

@@ -15,23 +15,13 @@ from torchrl_loco.sim.compiled.collision.meshes import Mesh
 from torchrl_loco.sim.compiled.collision.pairs import Pair, half_length, is_elliptic, kind, looked_up, pairs, stand_ins
 from torchrl_loco.sim.compiled.ir import symbols
 from torchrl_loco.sim.compiled.ir.parameters import nominal, present
+from torchrl_loco.sim.compiled.physics import sensors
 from torchrl_loco.sim.compiled.physics.actuators import Actuator, acting
 from torchrl_loco.sim.compiled.physics.constraints import DryFriction, Softness, both_sides, limited
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, HINGE, SLIDE
 from torchrl_loco.sim.compiled.physics.equalities import CONNECT, JOINT, TENDON, WELD, Equality, Weld, active
 from torchrl_loco.sim.compiled.physics.lengths import OF_TENDON
 from torchrl_loco.sim.compiled.physics.links import Mass, matrix, moved_by, moving_bodies, places
-from torchrl_loco.sim.compiled.physics.sensors import (
-    ACCELEROMETER,
-    ANGULAR_MOMENTUM,
-    FORCE,
-    GYRO,
-    SUBTREE_VELOCITY,
-    TORQUE,
-    TOUCH,
-    VELOCIMETER,
-    subtree,
-)
 from torchrl_loco.sim.compiled.schedules.lanes.layout import Layout, Limbs
 from torchrl_loco.sim.models import NEVER, home_pose
 
@@ -118,13 +108,13 @@ class Description:
         self.limit_sides = 2 if any(both_sides(m, j) for j in self.limited) else 1
         self.limited_balls = limited(m, BALL)
         self.friction = DryFriction(m)
-        sensors = [(int(m.sensor_type[i]), int(m.sensor_objid[i]), int(m.sensor_adr[i])) for i in range(m.nsensor)]
-        self.subtrees = [s for s in sensors if s[0] == SUBTREE_VELOCITY]
-        self.momenta = [s for s in sensors if s[0] == ANGULAR_MOMENTUM]
-        self.touch = [s for s in sensors if s[0] == TOUCH]
-        self.motions = [s for s in sensors if s[0] in (VELOCIMETER, GYRO)]
-        self.accelerometers = [s for s in sensors if s[0] == ACCELEROMETER]
-        self.wrenches = [s for s in sensors if s[0] in (FORCE, TORQUE)]
+        found = [(int(m.sensor_type[i]), int(m.sensor_objid[i]), int(m.sensor_adr[i])) for i in range(m.nsensor)]
+        self.subtrees = [s for s in found if s[0] == sensors.SUBTREE_VELOCITY]
+        self.momenta = [s for s in found if s[0] == sensors.ANGULAR_MOMENTUM]
+        self.touch = [s for s in found if s[0] == sensors.TOUCH]
+        self.motions = [s for s in found if s[0] in (sensors.VELOCIMETER, sensors.GYRO)]
+        self.accelerometers = [s for s in found if s[0] == sensors.ACCELEROMETER]
+        self.wrenches = [s for s in found if s[0] in (sensors.FORCE, sensors.TORQUE)]
         self.acting = acting(m)
         self.actuators = [Actuator.of(m, a) for a in self.acting]
         self.bias = np.reshape([[0.0] * 3 if a.bias is None else a.bias for a in self.actuators], (-1, 3))
@@ -317,7 +307,7 @@ class Description:
 
     def parts_below(self, body: int) -> list[tuple[int, Mass]]:
         """Returns links of a subtree, and what of each belongs to it."""
-        inside = set(subtree(self.m, body))
+        inside = set(sensors.subtree(self.m, body))
         by_link = [(i, [b for b in bodies if b in inside]) for i, bodies in enumerate(self.members)]
         return [(i, Mass.join(self.m, self.places, bodies)) for i, bodies in by_link if bodies]
 

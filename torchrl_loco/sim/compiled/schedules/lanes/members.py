@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -180,18 +181,17 @@ def _add_forces(tables: Tables, d: Description) -> None:
     tables.floats("gain", [a.gain for a in actuators])
     for k, name in enumerate(("bias", "bias_position", "bias_velocity")):
         tables.floats(name, d.bias[order, k])
-    free = (-UNLIMITED, UNLIMITED)
-    of_controls = [free if a.control_range is None else a.control_range for a in actuators]
-    of_forces = [free if a.force_range is None else a.force_range for a in actuators]
-    for k, name in enumerate(("low", "high")):
-        tables.floats(f"control_{name}", [limits[k] for limits in of_controls])
-        tables.floats(f"force_{name}", [limits[k] for limits in of_forces])
+    _add_ranges(tables, "control", [a.control_range for a in actuators])
+    _add_ranges(tables, "force", [a.force_range for a in actuators])
     _add_activations(tables, d, order)
     tables.size(IMPLICIT_ACTUATORS=d.implicit_actuators, JOINT_FORCE_LIMITS=d.joint_force_limits)
-    limited = m.jnt_actfrclimited.astype(bool)
-    forces = np.where(limited[:, None], m.jnt_actfrcrange, [-UNLIMITED, UNLIMITED])[m.dof_jntid]
-    for k, name in enumerate(("low", "high")):
-        tables.floats(f"joint_force_{name}", forces[:, k])
+    _add_ranges(tables, "joint_force", [m.jnt_actfrcrange[j] if m.jnt_actfrclimited[j] else None for j in m.dof_jntid])
+
+
+def _add_ranges(tables: Tables, name: str, ranges: Sequence[Any]) -> None:
+    """Adds the ends of ranges; ``None`` has no limits."""
+    for k, (end, free) in enumerate((("low", -UNLIMITED), ("high", UNLIMITED))):
+        tables.floats(f"{name}_{end}", [free if limits is None else limits[k] for limits in ranges])
 
 
 def _add_activations(tables: Tables, d: Description, order: list[int]) -> None:
@@ -202,9 +202,7 @@ def _add_activations(tables: Tables, d: Description, order: list[int]) -> None:
     flows = [activation_flow(m, i) for _, i in found]
     tables.floats("inflow", [flow for flow, _ in flows])
     tables.floats("outflow", [flow for _, flow in flows])
-    limits = [m.actuator_actrange[i] if m.actuator_actlimited[i] else (-UNLIMITED, UNLIMITED) for _, i in found]
-    for k, name in enumerate(("low", "high")):
-        tables.floats(f"act_{name}", [limit[k] for limit in limits])
+    _add_ranges(tables, "act", [m.actuator_actrange[i] if m.actuator_actlimited[i] else None for _, i in found])
 
 
 def _add_equalities(tables: Tables, d: Description) -> None:
@@ -410,8 +408,7 @@ def _add_limits(tables: Tables, d: Description) -> None:
     m = d.m
     joint = {int(m.jnt_dofadr[j]): j for j in d.limited}
     of = [joint.get(dof) for dof in range(m.nv)]
-    tables.floats("limit_low", [-UNLIMITED if j is None else m.jnt_range[j, 0] for j in of])
-    tables.floats("limit_high", [UNLIMITED if j is None else m.jnt_range[j, 1] for j in of])
+    _add_ranges(tables, "limit", [None if j is None else m.jnt_range[j] for j in of])
     some = [d.limited[0] if j is None and d.limited else j for j in of]  # so that equal ones fold
     tables.floats("limit_margin", [0.0 if j is None else m.jnt_margin[j] for j in some])
     tables.floats("limit_inverse_inertia", m.dof_invweight0)
