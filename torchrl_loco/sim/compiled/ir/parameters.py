@@ -5,13 +5,13 @@ Which rows and axes there are is decided once, on nominal numbers; a number that
 
 import operator
 import types
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeGuard
 
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled.ir.symbols import Scalar, leaves, maximum
+from torchrl_loco.sim.compiled.ir.symbols import Scalar, maximum
 from torchrl_loco.sim.varied import Varied, field, subtree_masses
 
 Number = float | Scalar
@@ -95,11 +95,6 @@ def is_of_model(x: Scalar) -> bool:
     """Returns whether an expression is made of numbers of the model alone, and not of the state."""
     parts = [arg for arg in x.args if isinstance(arg, Scalar)]
     return x.op in ("const", "number") if not parts else all(map(is_of_model, parts))
-
-
-def numbers_in(expressions: Iterable[Scalar]) -> list[Scalar]:
-    """Returns the numbers of the model that expressions read, in the order of their places."""
-    return sorted(leaves(expressions, "number"), key=lambda x: x.args[1])
 
 
 def evaluate(x: Scalar, row: Sequence[float] | np.ndarray) -> float:

@@ -6,8 +6,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchrl_loco.sim.compiled.ir.parameters import Number, constant, evaluate, numbers_in, varies
-from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, literal, scalar
+from torchrl_loco.sim.compiled.ir.parameters import Number, constant, evaluate, varies
+from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, leaves, literal, scalar
 from torchrl_loco.sim.varied import Varied
 
 
@@ -42,7 +42,7 @@ class Row:
     def derive(self) -> str:
         """Returns C++ that sets what follows from the numbers of a ``row``."""
         block = Block()
-        for x in numbers_in(self.derived):
+        for x in sorted(leaves(self.derived, "number"), key=lambda x: x.args[1]):
             block(f"const float {x.args[0]} = row[{x.args[1]}];")
         for place, x in enumerate(self.derived, self.numbers):
             if varies(x):  # constants are there from the start
@@ -72,18 +72,14 @@ class Tables:
     def constant(self, **values: float) -> None:
         """Adds functions that return a number."""
         for name, value in values.items():
-            self._function("float", name, [f"return {literal(value)};"], parameter="")
+            self.function("float", name, [f"return {literal(value)};"], parameter="")
 
     def vector(self, name: str, value: ArrayLike) -> None:
         """Adds a function that returns a vector."""
         if any(map(varies, np.asarray(value))):
             self._read("Vec", name, list(np.asarray(value)), parameter="")
             return
-        self._function("Vec", name, [f"return {{{', '.join(map(literal, np.asarray(value, float)))}}};"], parameter="")
-
-    def procedure(self, name: str, parameter: str, statements: list[str]) -> None:
-        """Adds a function that returns nothing."""
-        self._function("void", name, statements, parameter)
+        self.function("Vec", name, [f"return {{{', '.join(map(literal, np.asarray(value, float)))}}};"], parameter="")
 
     def floats(self, name: str, values: Sequence[Number] | np.ndarray) -> None:
         """Adds a function from an index to a number."""
@@ -91,7 +87,7 @@ class Tables:
             self._read("float", name, list(values))
             return
         statements, result = column([literal(constant(x)) for x in values], "float", "table")
-        self._function("float", name, [*statements, f"return {result};"])
+        self.function("float", name, [*statements, f"return {result};"])
 
     def integers(self, name: str, values: Sequence[int] | np.ndarray, type_: str = "int") -> None:
         """Adds a function from an index to an integer."""
@@ -103,7 +99,7 @@ class Tables:
             stored = "short"
         suffix = {"unsigned": "u", "unsigned long long": "ull"}.get(type_, "")
         statements, result = column([f"{x}{suffix}" for x in values], stored, "table")
-        self._function(type_, name, [*statements, f"return {result};"])
+        self.function(type_, name, [*statements, f"return {result};"])
 
     def structs(self, type_: str, name: str, values: Sequence[ArrayLike] | np.ndarray) -> None:
         """Adds a function from an index to a struct of numbers."""
@@ -123,7 +119,7 @@ class Tables:
             parts = [f"table[{count} * i + {k}]" for k in range(count)]
         if type_ == "Mat":
             parts = [f"{{{', '.join(parts[k : k + 3])}}}" for k in (0, 3, 6)]
-        self._function(type_, name, [*statements, f"return {{{', '.join(parts)}}};"])
+        self.function(type_, name, [*statements, f"return {{{', '.join(parts)}}};"])
 
     def formula(self, name: str, x: Scalar, **parts: str) -> None:
         """Adds a function from an index ``i`` to what is made of other functions of it, ``parts`` by their names."""
@@ -133,7 +129,8 @@ class Tables:
         result = f"return {block.value(x)};"
         self._varied[name] = f"  INLINE float {name}(int i) const {{ {' '.join([*block.lines, result])} }}"
 
-    def _function(self, type_: str, name: str, statements: list[str], parameter: str = "int i") -> None:
+    def function(self, type_: str, name: str, statements: list[str], parameter: str = "int i") -> None:
+        """Adds a function of some statements."""
         head, body = f"  static INLINE {type_} {name}({parameter}) {{", " ".join(statements)
         if len(head) + len(body) + 3 <= 120:
             self.lines.append(f"{head} {body} }}")

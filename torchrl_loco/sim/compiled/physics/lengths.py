@@ -4,8 +4,6 @@ import dataclasses
 
 import mujoco
 
-from torchrl_loco.sim.compiled.ir.parameters import nominal
-
 OF_JOINT, OF_TENDON = (int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}")) for kind in ("JOINT", "TENDON"))
 """Transmissions of an actuator."""
 
@@ -36,9 +34,3 @@ class Length:
         wraps = range(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon])
         shares = tuple((int(m.jnt_dofadr[m.wrap_objid[k]]), float(m.wrap_prm[k])) for k in wraps)
         return cls(shares, float(m.tendon_length0[tendon]), float(m.tendon_invweight0[tendon]))
-
-    @classmethod
-    def of_actuator(cls, m: mujoco.MjModel, i: int) -> "Length":
-        """Returns along what an actuator pulls."""
-        of = cls.of_tendon if m.actuator_trntype[i] == OF_TENDON else cls.of_joint
-        return of(nominal(m), int(m.actuator_trnid[i, 0]))

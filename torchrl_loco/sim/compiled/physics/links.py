@@ -30,7 +30,9 @@ class Place:
 
     def turn(self, quaternion: np.ndarray) -> np.ndarray:
         """Returns an orientation in the body as one in the link."""
-        return product(self.quaternion, quaternion)
+        result = np.empty(4)
+        mujoco.mju_mulQuat(result, self.quaternion, quaternion)
+        return result
 
 
 @dataclasses.dataclass
@@ -60,13 +62,6 @@ def matrix(quaternion: np.ndarray) -> np.ndarray:
     """Returns the matrix of a quaternion, exact zeros where rounding left something else."""
     result = axes_of(np.asarray(quaternion, float))
     result[np.abs(result) < 1e-12] = 0
-    return result
-
-
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns the product of two quaternions."""
-    result = np.zeros(4)
-    mujoco.mju_mulQuat(result, a, b)
     return result
 
 

@@ -19,7 +19,7 @@ from torchrl_loco.sim.compiled.ir.tables import Tables
 from torchrl_loco.sim.compiled.physics.actuators import activation_flow
 from torchrl_loco.sim.compiled.physics.delicate import LEAST_PIVOT, is_delicate
 from torchrl_loco.sim.compiled.physics.dynamics import BALL, FREE, MINVAL, SLIDE
-from torchrl_loco.sim.compiled.physics.lengths import Length
+from torchrl_loco.sim.compiled.physics.lengths import OF_TENDON, Length
 from torchrl_loco.sim.compiled.physics.links import matrix
 from torchrl_loco.sim.compiled.physics.sensors import GYRO, TORQUE, subtree
 from torchrl_loco.sim.compiled.schedules.lanes.description import LANES, Description, dofs_of, is_implicitfast
@@ -98,7 +98,7 @@ def _add_links(tables: Tables, d: Description) -> None:
     tables.structs("Vec", "fixed_moment", moments)
     tables.floats("inverse_mass", [1 / total for total in totals])
     steps = [f"x[{p.link}] += x[{i}];" for i, p in reversed(list(enumerate(parents))) if p.link >= 0]
-    tables.procedure("add_children", "float* x", steps)
+    tables.function("void", "add_children", steps, "float* x")
 
 
 def _add_joints(tables: Tables, d: Description) -> None:
@@ -165,7 +165,8 @@ def _add_forces(tables: Tables, d: Description) -> None:
     entries = [64 * dof + j for dof in range(m.nv) for j in reversed(range(dof)) if moved[dof] >> j & 1]
     tables.size(MASS_ENTRIES=len(entries))
     tables.integers("mass_entry", entries, "unsigned")
-    lengths = [Length.of_actuator(m, i) for i in d.acting]
+    of = [Length.of_tendon if m.actuator_trntype[i] == OF_TENDON else Length.of_joint for i in d.acting]
+    lengths = [length(nominal(m), int(m.actuator_trnid[i, 0])) for length, i in zip(of, d.acting, strict=True)]
     pulls = sorted((dof, i, share) for i, length in enumerate(lengths) for dof, share in length.shares)
     order = [i for _, i, _ in pulls]  # an actuator comes once for each degree of freedom that it pulls
     actuators = [d.actuators[i] for i in order]
@@ -236,7 +237,7 @@ def _add_welds(tables: Tables, d: Description, mask: str) -> None:
 
 
 def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
-    m, found = d.m, d.pairs
+    m, found, balls = d.m, d.pairs, d.limited_balls
     geoms = [d.geom_frame(g) for g in d.geoms]
     half = [half_length(m, g) for g in d.geoms]
     tables.integers("geom_link", [link for link, _, _ in geoms])
@@ -256,15 +257,15 @@ def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
     _add_meshes(tables, d)
     _add_ground(tables, d)
     index = {g: i for i, g in enumerate(d.geoms)}
-    tables.integers("first_geom", [index.get(p.geoms[0], 0) for p in found])
-    tables.integers("second_geom", [index.get(p.geoms[1], 0) for p in found])
     for i, title in enumerate(("first", "second")):
+        tables.integers(f"{title}_geom", [index.get(p.geoms[i], 0) for p in found])
         tables.integers(f"{title}_dofs", [d.moved[m.geom_bodyid[p.geoms[i]]] for p in found], mask)
-    apart = [d.apart(pair) for pair in found]
-    of_balls = [-1] * len(d.limited_balls)  # all of them
-    of_equalities = [dofs_of(equality) for equality in d.equalities]
-    of_equalities += [d.dofs_of_weld(weld) for weld in d.welds for _ in range(weld.rows)]
-    moved = [*apart, *of_balls, *of_equalities]
+    lasting = [  # degrees of freedom, margin, softness and inverse inertia of each
+        *((-1, m.jnt_margin[j], m.jnt_solref[j], m.jnt_solimp[j], m.dof_invweight0[m.jnt_dofadr[j]]) for j in balls),
+        *((dofs_of(e), 0.0, e.solref, e.solimp, e.weight) for e in d.equalities),
+        *((d.dofs_of_weld(x), 0.0, x.solref, x.solimp, x.weights[k // 3]) for x in d.welds for k in range(x.rows)),
+    ]
+    moved = [*map(d.apart, found), *(dofs for dofs, *_ in lasting)]
     quads = [sum(1 << i for i in range(d.layout.stride // 4) if dofs >> 4 * i & 15) for dofs in moved]
     tables.integers("quads", quads, "unsigned")
     frames = [d.geom_frame(p.geoms[0]) for p in planes]
@@ -278,20 +279,14 @@ def _add_geoms(tables: Tables, d: Description, mask: str) -> None:
     # The limits of ball joints follow the pairs, then the equalities, then the rows of welds and connections.
     _add_equalities(tables, d)
     _add_welds(tables, d, mask)
-    of_welds = [weld for weld in d.welds for _ in range(weld.rows)]  # a row each
-    balls = d.limited_balls
     tables.size(BALL_LIMITS=len(balls), LASTING=d.lasting)
     tables.integers("ball_qpos", [m.jnt_qposadr[j] for j in balls])
     tables.integers("ball_dof", [m.jnt_dofadr[j] for j in balls])
     tables.floats("ball_range", [m.jnt_range[j].max() for j in balls])
-    tables.floats(
-        "margin", [*(p.margin for p in found), *m.jnt_margin[balls], *(0.0 for _ in [*d.equalities, *of_welds])]
-    )
-    soft = [*((p.solref, p.solimp) for p in found), *((m.jnt_solref[j], m.jnt_solimp[j]) for j in balls)]
-    soft += [*((e.solref, e.solimp) for e in d.equalities), *((weld.solref, weld.solimp) for weld in of_welds)]
+    tables.floats("margin", [*(p.margin for p in found), *(margin for _, margin, *_ in lasting)])
+    soft = [*((p.solref, p.solimp) for p in found), *(softness for _, _, *softness, _ in lasting)]
     tables.structs("Softness", "contact_softness", [d.softness(*s) for s in soft])
-    inertias = [*m.dof_invweight0[m.jnt_dofadr[balls]], *(e.weight for e in d.equalities)]
-    inertias += [weld.weights[k // 3] for weld in d.welds for k in range(weld.rows)]
+    inertias = [inertia for *_, inertia in lasting]
     plain = not d.elliptic and d.layout.directions == 3
     if plain and any(varies(pair.friction) for pair in found):
         tables.floats("pair_weight", [*(pair.weight for pair in found), *inertias])
