@@ -45,7 +45,6 @@ def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked = shared.NO_MOR
         "LIMBS": d.limbs is not None,
         "SOLIDS": d.has_solids or d.ground.boxes is not None,
         "GROUND": d.layout.near_ground > 0,
-        "TENDONS": d.pulls_tendons,
         **{function.upper(): function in d.functions for function in FUNCTIONS},
     }
     defined = [f"#define WITH_{part} {needed:d}" for part, needed in parts.items()]

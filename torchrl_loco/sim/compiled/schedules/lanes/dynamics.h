@@ -88,17 +88,16 @@ INLINE float joint_force(int d, float& damping) const {
   const int end = Model::first_actuator(d + (Model::SUBSTEPS > 0));  // a step that is not taken has no actuation
   ROLLED_FOR(int a = Model::first_actuator(d); a < end; ++a) {
     const float gear = Model::gear(a);
-#if WITH_TENDONS
-    float position = 0.0f, velocity = 0.0f;
-    ROLLED_FOR(int k = Model::first_pull(a); k < Model::first_pull(a + 1); ++k) {
-      const int other = Model::pull_dof(k);
-      position = position + Model::pull(k) * w.qpos[Model::dof_qpos(other)];
-      velocity = velocity + Model::pull(k) * w.qvel[other];
+    float position = w.qpos[q], velocity = w.qvel[d];
+    if (Model::TENDONS) {
+      position = velocity = 0.0f;
+      ROLLED_FOR(int k = Model::first_pull(a); k < Model::first_pull(a + 1); ++k) {
+        const int other = Model::pull_dof(k);
+        position = position + Model::pull(k) * w.qpos[Model::dof_qpos(other)];
+        velocity = velocity + Model::pull(k) * w.qvel[other];
+      }
     }
     const float moment = gear * Model::own_pull(a);
-#else
-    const float position = w.qpos[q], velocity = w.qvel[d], moment = gear;
-#endif
     const int activation = Model::activation(a);
     const float input = Model::ACTIVATIONS == 0 ? ctrl[Model::control(a)]
                         : activation < 0        ? control_of(a)

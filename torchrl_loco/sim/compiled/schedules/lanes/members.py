@@ -172,12 +172,12 @@ def _add_forces(tables: Tables, d: Description) -> None:
     actuators = [d.actuators[i] for i in order]
     tables.integers("first_actuator", [sum(dof < k for dof, *_ in pulls) for k in range(m.nv + 1)])
     tables.integers("control", [d.acting[i] for i in order])
-    if d.pulls_tendons:
-        shares = [share for i in order for share in lengths[i].shares]
-        tables.floats("own_pull", [share for *_, share in pulls])
-        tables.integers("first_pull", np.cumsum([0, *(len(lengths[i].shares) for i in order)]))
-        tables.integers("pull_dof", [dof for dof, _ in shares])
-        tables.floats("pull", [share for _, share in shares])
+    shares = [share for i in order for share in lengths[i].shares]
+    tables.size(TENDONS=d.pulls_tendons)
+    tables.floats("own_pull", [share for *_, share in pulls])
+    tables.integers("first_pull", np.cumsum([0, *(len(lengths[i].shares) for i in order)]))
+    tables.integers("pull_dof", [dof for dof, _ in shares])
+    tables.floats("pull", [share for _, share in shares])
     tables.floats("gear", [a.gear for a in actuators])
     tables.floats("gain", [a.gain for a in actuators])
     for k, name in enumerate(("bias", "bias_position", "bias_velocity")):

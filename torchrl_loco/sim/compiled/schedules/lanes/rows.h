@@ -102,15 +102,11 @@ INLINE void jacobians() {
   }
 }
 
-// A row from the inverse inertia along it and how far it is violated. Velocity and acceleration follow.
-INLINE void set_row(int r, Softness softness, float inverse_inertia, float position, float least) {
-  softness.row(inverse_inertia, position, least, w.weight[r], w.x[r]);
-}
-
 INLINE int contact_of_row(int r) const {
   return r < first_frictionless() ? r / CONTACT_ROWS : r - (CONTACT_ROWS - 1) * frictional;
 }
 
+// Velocity and acceleration follow.
 INLINE void set_rows() {
   SHARED_LOOP(r, first_limit()) {
     const Contact& c = contact(contact_of_row(r));
@@ -132,8 +128,8 @@ INLINE void set_rows() {
       ROLLED_FOR(int k = 0; k < count; ++k) squared += contact(first + k).distance * contact(first + k).distance;
       distance = root(squared);
     }
-    set_row(r, Model::contact_softness(c.pair()), Model::inverse_inertia(c.pair()), distance,
-            Model::least_regularisation(c.pair()));
+    Model::contact_softness(c.pair()).row(Model::inverse_inertia(c.pair()), distance,
+                                          Model::least_regularisation(c.pair()), w.weight[r], w.x[r]);
     if (Model::WELD_ROWS > 0 && c.pair() >= Model::FIRST_WELD) {
       const float share = distance > 0.0f ? divide(c.distance, distance) : 0.0f;
       w.x[r] = w.x[r] * share + w.weld_bias()[c.pair() - Model::FIRST_WELD];
@@ -153,7 +149,7 @@ INLINE void set_rows() {
       if (violated) {
         const int i = limits + bits(hits & lanes_below()), r = limit_row[side][slot] = first_limit() + i;
         w.limits[i] = (unsigned char)(upper ? d + 128 : d);
-        set_row(r, Model::limit_softness(d), Model::limit_inverse_inertia(d), position, MINVAL);
+        Model::limit_softness(d).row(Model::limit_inverse_inertia(d), position, MINVAL, w.weight[r], w.x[r]);
       }
       limits += bits(hits);
     }
