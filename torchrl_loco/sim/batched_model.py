@@ -44,11 +44,7 @@ def add_up_masses(
 
 
 class BatchedModel:
-    """Gives the fields that vary a row for each world, and copies the numbers ``(nworld, varied.count)`` into them.
-
-    Attributes:
-        model: the model on the device, whose fields are replaced.
-    """
+    """Gives fields of ``model`` that vary a row for each world, and copies the numbers ``(nworld, varied.count)``."""
 
     def __init__(self, model: "mjw.Model", varied: Varied, numbers: wp.array) -> None:
         self.model, self._varied, self._numbers = model, varied, numbers

@@ -16,15 +16,9 @@ from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, WorldKernels
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """What an engine is made of.
+    """What an engine is made of: what a ``Simulation`` is given, its model with the options of ``config``.
 
     Attributes:
-        mj_model: a compiled model with the options of ``config``.
-        config: settings of the simulation.
-        num_envs: number of worlds.
-        device: where they live.
-        contact_geoms: ids of the geoms whose contact forces are computed.
-        varied: which numbers of the model differ from world to world.
         contact_rows: of how many substeps contact forces are kept: of the last, or of all.
     """
 
@@ -38,13 +32,9 @@ class Setup:
 
 
 class Update(NamedTuple):
-    """How poses and sensors of worlds are updated.
+    """How poses and sensors of worlds are updated: as arguments of ``Simulation.reset`` and ``forward`` say.
 
-    Attributes:
-        before: what each of them does first.
-        after: what it does at the end.
-        at_rest: whether they are at rest, which may cost less.
-        contacts: whether contact forces are found.
+    To know that worlds are at rest may save work.
     """
 
     before: Sequence[WorldFunc] = ()

@@ -95,18 +95,11 @@ def segment_distance(p: wp.vec3, u: wp.vec3, q: wp.vec3, v: wp.vec3) -> float:
 class Skeleton:
     """What forward kinematics and the contact test of one world need of a model. Geom 0 is the floor, z = 0.
 
+    Names, shapes and units are those of ``MjModel``, but for these.
+
     Attributes:
-        body_parentid: id of the parent body, ``(nbody,)``.
         body_jnt: first joint and number of joints, ``(nbody, 2)``.
-        body_pos: offset from the parent (m), ``(nbody,)``.
-        body_quat: rotation against the parent, ``(nbody,)``.
-        jnt_qposadr: start of the joint in qpos, ``(njnt,)``.
         jnt_free: whether it is a free joint, else a hinge, ``(njnt,)``.
-        jnt_pos: anchor in the body's frame (m), ``(njnt,)``.
-        jnt_axis: axis in the body's frame, ``(njnt,)``.
-        jnt_range: lower and upper limit (rad), ``(njnt,)``.
-        geom_bodyid: id of the geom's body, ``(ngeom,)``.
-        geom_pos: center in the body's frame (m), ``(ngeom,)``.
         geom_axis: from the center to the end of the capsule's segment (m), zero for a sphere, ``(ngeom,)``.
         geom_radius: radius (m), ``(ngeom,)``.
         pair: geoms that may touch, ``(npair,)``.

@@ -55,16 +55,11 @@ Arrays: Any = wp.struct(type("Arrays", (), {"__annotations__": WORLD_ARRAYS}))
 
 
 class Data:
-    """The state of all worlds, and what an observation reads. Names, shapes and units are those of ``mjData``.
+    """The state of all worlds, and what an observation reads.
+
+    Names, shapes and units are those of ``mjData``, with a row for each world: ``(nworld, ...)``.
 
     Attributes:
-        qpos: positions, ``(nworld, nq)``.
-        qvel: velocities, ``(nworld, nv)``.
-        act: activations of the actuators, ``(nworld, na)``.
-        qacc_warmstart: accelerations of the last substep, from which the solver starts, ``(nworld, nv)``.
-        ctrl: controls, ``(nworld, nu)``.
-        time: time since the world's reset (s), ``(nworld,)``.
-        xpos: positions of the bodies (m), ``(nworld, nbody)`` vec3.
         xmat: orientations of the bodies, ``(nworld, nbody)`` mat33.
         cvel: velocities of the bodies about the center of mass of their tree (rad/s, m/s), ``(nworld, nbody)``.
         subtree_com: centers of mass of the trees (m), ``(nworld, nbody)`` vec3, in the rows of their roots; other rows
@@ -73,7 +68,6 @@ class Data:
         contact_force: net force of the contacts on each of the geoms that were asked for, in the world's frame (N),
             ``(nworld, contacts)`` vec3, substep by substep.
         in_contact: whether they have any, ``(nworld, contacts)`` bool.
-        sensordata: sensors, ``(nworld, nsensordata)``.
         overflow: ``Overflow`` bits, ``(nworld,)``.
     """
 
