@@ -50,6 +50,7 @@ class Engine(abc.ABC):
         model: the model on the device, with nominal numbers, to be read only.
         data: the state of all worlds, and what follows from it.
         numbers: the numbers that differ, ``(nworld, varied.count)``; none without ``varied``.
+        contact_arrays: net contact forces vec3 and whether there is a contact, ``(nworld, contact_rows * geoms)`` each.
         peak_constraints: most constraint rows that a substep needed since the last reset, by world, ``(nworld,)``; zero
             where no row needs room.
         peak_contacts: most contacts that a substep needed, ``(1,)``: of all worlds together under MuJoCo-Warp, where
@@ -61,6 +62,7 @@ class Engine(abc.ABC):
     model: Any
     data: Any
     numbers: wp.array
+    contact_arrays: tuple[wp.array, wp.array]
     coalesced = False
 
     def __init__(self, setup: Setup) -> None:
@@ -78,10 +80,6 @@ class Engine(abc.ABC):
     @abc.abstractmethod
     def remedy(self, dropped: str, most: int) -> str:
         """Returns advice for the warning about dropped constraints or contacts, of which a substep needed ``most``."""
-
-    @abc.abstractmethod
-    def contact_arrays(self) -> tuple[wp.array, wp.array]:
-        """Returns net contact forces vec3 and whether there is a contact, ``(nworld, contact_rows * geoms)`` each."""
 
     def subtree_com(self) -> wp.array:
         """Returns ``data.subtree_com``, which from now on is up to date."""

@@ -108,9 +108,8 @@ class MujocoEngine(Engine):
         self._geoms, self._column = len(contact_geoms), np.full(m.ngeom + 1, -1)  # a part of a flex is geom -1
         self._column[list(contact_geoms)] = np.arange(self._geoms)
         shape = num_envs, self._rows * len(contact_geoms)
-        self._force = wp.zeros(shape, dtype=wp.vec3, device=device)
-        self._in_contact = wp.zeros(shape, dtype=bool, device=device)
-        self._forces, self._touches = self._force.numpy(), self._in_contact.numpy()
+        self.contact_arrays = wp.zeros(shape, wp.vec3, device=device), wp.zeros(shape, bool, device=device)
+        self._forces, self._touches = (array.numpy() for array in self.contact_arrays)
         self._most = self.peak_constraints.torch.numpy(), self.peak_contacts.torch.numpy()
         self._of_all = threading.Lock()  # of what the threads of all worlds write
         self._threads = concurrent.futures.ThreadPoolExecutor(os.cpu_count(), "mujoco")
@@ -129,10 +128,6 @@ class MujocoEngine(Engine):
     @override
     def remedy(self, dropped: str, most: int) -> str:
         return f'C MuJoCo had no memory for more {dropped} than {most}: raise <size memory="..."/> in the model'
-
-    @override
-    def contact_arrays(self) -> tuple[wp.array, wp.array]:
-        return self._force, self._in_contact
 
     @override
     def step(self, around: Around = ALONE) -> None:

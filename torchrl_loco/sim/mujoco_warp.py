@@ -144,7 +144,8 @@ class MujocoWarpEngine(Engine):
         self.model.block_dim.update_gradient_JTDAJ_dense = 64
         self.contact_forces: ContactForces | None = None
         if setup.contact_geoms:
-            self.contact_forces = ContactForces(mj_model, setup.contact_geoms, self.data, setup.contact_rows)
+            self.contact_forces = forces = ContactForces(mj_model, setup.contact_geoms, self.data, setup.contact_rows)
+            self.contact_arrays = forces.force, forces.in_contact
         self.with_subtree_com = False
         self._has_force_sensors = not FORCE_SENSORS.isdisjoint(mj_model.sensor_type)
         self._kept_sensors: tuple[wp.array, wp.array] | None = None
@@ -162,11 +163,6 @@ class MujocoWarpEngine(Engine):
     @override
     def remedy(self, dropped: str, most: int) -> str:
         return f"a physics step needed up to {most}: pass {ROOM[dropped]}={with_margin(most)}"
-
-    @override
-    def contact_arrays(self) -> tuple[wp.array, wp.array]:
-        assert self.contact_forces is not None
-        return self.contact_forces.force, self.contact_forces.in_contact
 
     @override
     def subtree_com(self) -> wp.array:

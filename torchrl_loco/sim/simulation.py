@@ -163,7 +163,7 @@ class Simulation:
         self.contact_force_history = torch.empty((num_envs, rows, 0, 3), device=device)
         self.in_contact_history = torch.empty((num_envs, rows, 0), dtype=torch.bool, device=device)
         if geoms:
-            kept = [wp.to_torch(array).unflatten(1, (rows, len(geoms))) for array in self.engine.contact_arrays()]
+            kept = [wp.to_torch(array).unflatten(1, (rows, len(geoms))) for array in self.engine.contact_arrays]
             self.contact_force_history, self.in_contact_history = kept
         self.contact_force, self.in_contact = self.contact_force_history[:, -1], self.in_contact_history[:, -1]
 

@@ -187,6 +187,7 @@ class CompiledEngine(Engine):
         self._launch_size = step.launch_size(self._mj_model, num_envs, device)
         by_world = step.structure_of_arrays(mj_model, device)
         self.data = Data(setup)
+        self.contact_arrays = self.data.contact_force, self.data.in_contact
         self._rows = self.numbers = wp.zeros((num_envs, 0), dtype=float, device=device)
         if isinstance(self._mj_model, VariedModel):
             row = step.nominal_row(self._mj_model)
@@ -212,10 +213,6 @@ class CompiledEngine(Engine):
     @override
     def remedy(self, dropped: str, most: int) -> str:
         return f"a world of the compiled engine has no more places for {dropped}: pass engine='mujoco_warp'"
-
-    @override
-    def contact_arrays(self) -> tuple[wp.array, wp.array]:
-        return self.data.contact_force, self.data.in_contact
 
     @override
     def step(self, around: Around = ALONE) -> None:
