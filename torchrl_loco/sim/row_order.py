@@ -117,13 +117,8 @@ class RowOrder:
         for rows in self._rows:
             dim = rows.shape[0], rows.shape[2]
             wp.launch(move_rows, dim=dim, inputs=[d.nefc, self._rank], outputs=[rows], device=device)
-        wp.launch(
-            follow_rows,
-            dim=d.contact.efc_address.shape,
-            inputs=[d.nacon, d.contact.worldid, self._rank],
-            outputs=[d.contact.efc_address],
-            device=device,
-        )
+        inputs, addresses = [d.nacon, d.contact.worldid, self._rank], d.contact.efc_address
+        wp.launch(follow_rows, dim=addresses.shape, inputs=inputs, outputs=[addresses], device=device)
 
 
 def check_order(model: "mjw.Model") -> None:

@@ -91,7 +91,7 @@ class ContactForces:
     """Net forces of the contacts on some geoms, and whether they have any contact.
 
     C++ variables: ``contact_corner``, the place of the geoms of contact ``k`` in ``pairs``; behind its end for what is
-    no contact. The results are added up where they are read from, ``contact_force`` and ``in_contact``.
+    no contact. The results are added up where they are read from, in ``row`` of ``contact_force`` and ``in_contact``.
 
     Args:
         geoms: the geoms.
@@ -103,19 +103,15 @@ class ContactForces:
         index = {geom: i for i, geom in enumerate(geoms)}
         self._places = [[*(index.get(pair[i], -1) for pair in pairs), -1] for i in range(2)]
 
-    def _place(self, geom: str, row: str | None) -> str:
-        return geom if row is None else f"{self.count} * {row} + {geom}"
-
-    def clear(self, block: Block, row: str | None = None) -> None:
-        """Sets all to no contact, in the row that a C++ expression names if there are several."""
-        place = self._place("i", row)
+    def clear(self, block: Block) -> None:
+        """Sets all to no contact, in ``row``."""
         with block.scope(f"for (int i = 0; i < {self.count}; ++i)") as each:
-            each(f"wp::index(contact_force_out, world, {place}) = wp::vec3(0.0f, 0.0f, 0.0f);")
-            each(f"wp::index(in_contact_out, world, {place}) = false;")
+            each(f"wp::index(contact_force_out, world, {self.count} * row + i) = wp::vec3(0.0f, 0.0f, 0.0f);")
+            each(f"wp::index(in_contact_out, world, {self.count} * row + i) = false;")
         for title, places in zip(("first", "second"), self._places, strict=True):
             block(f"static const int force_{title}[{len(places)}] = {{{', '.join(map(str, places))}}};")
 
-    def add(self, block: Block, bounds: tuple[str, str], force: np.ndarray, row: str | None = None) -> None:
+    def add(self, block: Block, bounds: tuple[str, str], force: np.ndarray) -> None:
         """Adds the ``force`` ``(3,)`` on its second geom of each contact ``k`` within bounds, after :meth:`clear`."""
         with block.scope(f"for (int k = {bounds[0]}; k < {bounds[1]}; ++k)") as contact:
             contact("const int first = force_first[contact_corner[k]], second = force_second[contact_corner[k]];")
@@ -124,8 +120,8 @@ class ContactForces:
             contact(f"const wp::vec3 push({parts});")
             for geom, sign in (("second", "+"), ("first", "-")):
                 with contact.scope(f"if ({geom} >= 0)") as asked:
-                    asked(f"wp::index(contact_force_out, world, {self._place(geom, row)}) {sign}= push;")
-                    asked(f"wp::index(in_contact_out, world, {self._place(geom, row)}) = true;")
+                    asked(f"wp::index(contact_force_out, world, {self.count} * row + {geom}) {sign}= push;")
+                    asked(f"wp::index(in_contact_out, world, {self.count} * row + {geom}) = true;")
 
 
 def read(m: mujoco.MjModel, tree: Dynamics, touch: TouchSensors) -> list[Scalar | None]:

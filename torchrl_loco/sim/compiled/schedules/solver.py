@@ -97,11 +97,11 @@ class NewtonSolver:
         for rows, first, end in self.contacts:
             self.touch.add(block, first, end, rows.pyramid.normal_force())
 
-    def read_contact_forces(self, block: Block, row: str | None = None) -> None:
-        """Writes the forces of the contacts on the geoms that were asked for, into a row if there are several."""
-        self.contact_forces.clear(block, row)
+    def read_contact_forces(self, block: Block) -> None:
+        """Writes the forces of the contacts on the geoms that were asked for, into ``row``."""
+        self.contact_forces.clear(block)
         for rows, first, end in self.contacts:
-            self.contact_forces.add(block, (first, end), rows.pyramid.force(rows.directions), row)
+            self.contact_forces.add(block, (first, end), rows.pyramid.force(rows.directions))
 
     def _set_direction(self, block: Block) -> None:
         """Sets ``search`` to -H^-1 gradient, and ``gradient_squared`` and ``decrement``."""

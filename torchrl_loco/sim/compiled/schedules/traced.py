@@ -101,17 +101,14 @@ def _substep(
         block.set(f"force[{i}]", force)
     solver = NewtonSolver(tree, pairs(m), contact_geoms)
     solver.write(block, (qpos, qvel, cells("qacc", m.nv)))
-    history = bool(contact_geoms) and contact_rows > 1
-    if history:
-        first, end = ("step", "step + 1") if substeps else ("0", f"{contact_rows}")
-        with block.scope(f"for (int row = {first}; row < {end}; ++row)") as each:
-            solver.read_contact_forces(each, "row")
-    if solver.touch or (contact_geoms and not history):
+    if contact_geoms:
+        row = f"step - {substeps - contact_rows}"
+        head = f"int row = {row}; row >= 0 && row <= {row}" if substeps else f"int row = 0; row < {contact_rows}"
+        with block.scope(f"for ({head}; ++row)") as each:
+            solver.read_contact_forces(each)
+    if solver.touch:
         with block.scope(f"if (step == {max(substeps - 1, 0)})") as last:
-            if solver.touch:
-                solver.read_touch(last)
-            if contact_geoms and not history:
-                solver.read_contact_forces(last)
+            solver.read_touch(last)
     if substeps:
         _integrate(block, m, tree)
     return block, solver
