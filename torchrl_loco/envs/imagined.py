@@ -17,12 +17,10 @@ from torchrl_loco.envs.view import View, usable
 from torchrl_loco.sim import models
 
 aten = torch.ops.aten
-STATE = "state_of_world"
-"""Group of the observation with all that hooks depend on, and last what events found."""
+STATE = "state_of_world"  # group of the observation with all that hooks depend on, and last what events found
 FOUND = "found_by_events"
 """Entry of memory with positions and velocities as physics made them, before events changed them, and its controls."""
-UNKNOWN = ("contact_force", "in_contact", "sensordata")
-"""Arrays of which a predicted state does not tell."""
+UNKNOWN = ("contact_force", "in_contact", "sensordata")  # arrays of which a predicted state does not tell
 INSTEAD = "train it with ppo or reppo"
 
 
@@ -214,11 +212,7 @@ class Imagined:
         self._say = module if compiled is None else compiled(module)
 
     def _checked(self, function: Callable[..., Sequence[torch.Tensor]], inputs: Sequence[torch.Tensor]) -> Any:
-        """Returns what :func:`traced` makes of a function, if it does the same with other numbers.
-
-        Raises:
-            ValueError: it does not.
-        """
+        """Returns what :func:`traced` makes of a function, if it does the same with other numbers."""
         module, generator = traced(function, inputs), torch.Generator().manual_seed(0)
         with torch.no_grad():
             others = [

@@ -15,8 +15,7 @@ FREE, SLIDE, HINGE = (
     wp.constant(int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}"))) for kind in ("FREE", "SLIDE", "HINGE")
 )
 FIXED = wp.constant(-1)
-BLOCK = 32
-"""Worlds of a block of threads: few, so that a few thousand worlds keep all multiprocessors busy."""
+BLOCK = 32  # worlds of a block of threads: few, so that a few thousand worlds keep all multiprocessors busy
 
 
 @wp.struct
@@ -48,8 +47,7 @@ COLUMNS: dict[str, Any] = {
     "rest": float,  # its position at rest
 }
 """What is known of a link, and its type."""
-OUTPUTS = {(3,): wp.vec3, (3, 3): wp.mat33}
-"""Types of what is found of a link, by shape."""
+OUTPUTS = {(3,): wp.vec3, (3, 3): wp.mat33}  # types of what is found of a link, by shape
 
 
 @wp.kernel(module="unique")

@@ -24,8 +24,7 @@ TRACE = (
     "something of its own at each call, or draws by torch.rand instead of s.uniform and s.normal"
 )
 KERNEL = "its kernel gives another {} than the hooks, which is an error of this package: please report it"
-COMPILED = "torch.compile gives another {} than the hooks"
-"""What is said where what stands for hooks differs from them."""
+COMPILED = "torch.compile gives another {} than the hooks"  # what is said where what stands for hooks differs from them
 
 
 class Part:

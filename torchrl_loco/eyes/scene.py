@@ -19,8 +19,7 @@ HIDDEN = 1e-3  # opacity up to which a geom is not seen
 TRACKS = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK))
 OF_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
 AT_BODY = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY))
-AT_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM))
-"""Modes of cameras and lights."""
+AT_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM))  # modes of cameras and lights
 EDGES = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 """Corners of a box, and of its sides, seen from outside."""

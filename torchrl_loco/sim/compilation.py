@@ -14,8 +14,7 @@ from typing import Any
 import warp as wp
 from tqdm.auto import tqdm
 
-SHOW_AFTER = 2.0
-"""Seconds after which the progress bar appears; loading from the cache is faster."""
+SHOW_AFTER = 2.0  # seconds after which the progress bar appears; loading from the cache is faster
 
 _COLLECTING = threading.Lock()
 

@@ -8,13 +8,11 @@ Boxes of the same ground are touched by the spheres too.
 import mujoco
 import numpy as np
 
-MOST_RADIUS, SHARE = 0.02, 0.5
-"""Of a sphere: at most (m), and as a fraction of the least half size of its solid."""
+MOST_RADIUS, SHARE = 0.02, 0.5  # of a sphere: at most (m), and as a fraction of the least half size of its solid
 DIAGONALS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 LIKE = ("condim", "friction", "solref", "solimp", "solmix", "priority", "margin", "gap")
 """What a sphere has of its solid."""
-BITS = 31
-"""Bits of a mask of contacts, but for its sign."""
+BITS = 31  # bits of a mask of contacts, but for its sign
 TYPE = mujoco.mjtGeom
 FIELD, ELLIPSOID, CYLINDER, BOX, MESH = (
     int(getattr(TYPE, f"mjGEOM_{kind}")) for kind in ("HFIELD", "ELLIPSOID", "CYLINDER", "BOX", "MESH")

@@ -11,11 +11,9 @@ import numpy as np
 from torchrl_loco.config import read_mjcf
 from torchrl_loco.sim.corners import BITS, stand_on_corners
 
-FOLDERS = ("assetdir", "meshdir", "texturedir")
-"""Attributes of MJCF's compiler that name folders of files."""
+FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of MJCF's compiler that name folders of files
 
-NEVER = -1e10
-"""Margin (m) of an explicit pair of geoms that does not touch: nothing is so deep."""
+NEVER = -1e10  # margin (m) of an explicit pair of geoms that does not touch: nothing is so deep
 
 VELOCITY_SENSORS = {
     int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
@@ -89,11 +87,7 @@ def specification(source: Path | str | mujoco.MjSpec, folder: Path | None = None
 
 
 def _path(source: Path | str, folder: Path | None) -> Path:
-    """Returns the path of an MJCF file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-    """
+    """Returns the path of an MJCF file."""
     tried = [Path(source) if folder is None else folder / source, Path(source)]
     path = next((path for path in tried if path.is_file()), None)
     if path is None:

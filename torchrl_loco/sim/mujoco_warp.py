@@ -26,8 +26,7 @@ is that with ``deterministic=True`` on CUDA (measured: 6 to 8 times the memory o
 UNROLLED_ITERATIONS = 10
 """Up to this many solver iterations, the recorded step contains all of them, without an early exit."""
 
-LANES = wp.constant(32)
-"""Threads that share the constraint rows of a world."""
+LANES = wp.constant(32)  # threads that share the constraint rows of a world
 
 
 @wp.kernel(enable_backward=False)
@@ -97,10 +96,8 @@ def record_peaks(
         contacts_out[0] = wp.max(contacts_out[0], wp.max(nacon_in[0], ncollision_in[0]))
 
 
-ROOM = {"constraints": "njmax", "contacts": "naconmax"}
-"""The settings that make room for constraint rows and contacts."""
-MARGIN = 1.25
-"""Advised setting divided by the largest need."""
+ROOM = {"constraints": "njmax", "contacts": "naconmax"}  # the settings that make room for constraint rows and contacts
+MARGIN = 1.25  # advised setting divided by the largest need
 
 
 def with_margin(needed: int) -> int:

@@ -23,8 +23,7 @@ from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.warp_init import init_warp
 from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, WorldKernels, copy_row, fill, zero_row
 
-TOLERANCE = 1e-8
-"""MuJoCo's default tolerance of the solver."""
+TOLERANCE = 1e-8  # MuJoCo's default tolerance of the solver
 
 ENGINES: dict[str, type[Engine]] = {
     "compiled": compiled.CompiledEngine,

@@ -96,8 +96,7 @@ class Around(NamedTuple):
     last: Sequence[WorldFunc] = ()
 
 
-ALONE = Around()
-"""The physics and nothing else."""
+ALONE = Around()  # the physics and nothing else
 
 
 class Chain:

@@ -18,12 +18,9 @@ OF_PLANE = (
     *("material", "rgba", "group"),
 )
 """What the ground has of the plane that it replaces."""
-CLEAR = 0.8
-"""Half a side of the square about the middle of a patch over which a robot may begin (m)."""
-SEAM = 1e-5
-"""By how much boxes are wider, so that points between two that meet are on one of them (m)."""
-LEAST = 1e-3
-"""Range of a height field at least (m), which MuJoCo needs to be positive."""
+CLEAR = 0.8  # half a side of the square about the middle of a patch over which a robot may begin (m)
+SEAM = 1e-5  # by how much boxes are wider, so that points between two that meet are on one of them (m)
+LEAST = 1e-3  # range of a height field at least (m), which MuJoCo needs to be positive
 
 
 class Terrain:

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.random import Generator
 
-DEEP = 1.0
-"""How far boxes reach below what lies deepest in a patch (m)."""
+DEEP = 1.0  # how far boxes reach below what lies deepest in a patch (m)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,8 +27,7 @@ class Patch:
 Kind = Callable[[float, Generator, float, float], Patch]
 """Makes a patch from a difficulty, a generator, the length of a side and the distance of two points (m)."""
 
-Bounds = tuple[float, float]
-"""A figure in the easiest patch, and in the hardest."""
+Bounds = tuple[float, float]  # a figure in the easiest patch, and in the hardest
 
 
 def between(bounds: Bounds, difficulty: float) -> float:

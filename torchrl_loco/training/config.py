@@ -27,12 +27,10 @@ if TYPE_CHECKING:
     from torchrl_loco.envs import LocoEnv
 
 LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow"]
-OF_PIXELS = ("camera", "size", "frame_stack", "random_shift", "critic_from_pixels")
-"""Settings that need ``from_pixels``."""
+OF_PIXELS = ("camera", "size", "frame_stack", "random_shift", "critic_from_pixels")  # settings that need from_pixels
 
 
-Settings = dict[str, Any]
-"""Fields of a config, by name."""
+Settings = dict[str, Any]  # fields of a config, by name
 
 _OPTIONAL: Any = [(field.name, field.type | None, None) for field in dataclasses.fields(SimConfig)]  # type: ignore[operator]
 Sim: Any = dataclasses.make_dataclass(
@@ -448,12 +446,7 @@ class SVGConfig(TrainingConfig):
 
 
 def _checked_widths(name: str, widths: Any) -> tuple[int, ...]:
-    """Returns the widths of layers.
-
-    Raises:
-        TypeError: they are no integers.
-        ValueError: there are none, or one is not positive.
-    """
+    """Returns the widths of layers."""
     several = tuple(widths) if isinstance(widths, list | tuple) else (widths,)
     if not several:
         raise ValueError(f"{name} must name the width of at least one layer")
@@ -505,8 +498,7 @@ def config_from_json(values: dict[str, Any]) -> TrainingConfig:
     return CONFIGS[algorithm](**fields)
 
 
-RUNNERS = ("walker", "humanoid", "cheetah", "hopper", "quadruped")
-"""Bodies of dm_control's runners."""
+RUNNERS = ("walker", "humanoid", "cheetah", "hopper", "quadruped")  # bodies of dm_control's runners
 
 
 def preset(

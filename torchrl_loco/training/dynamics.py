@@ -13,12 +13,9 @@ from torchrl_loco.policy import ObservationNorm, moments
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import normed_layers
 
-REACH = 8
-"""Control steps whose way, at the usual speed, is the unit of errors of place and orientation."""
-LIMIT = 10.0
-"""Of what the network gives, in standard deviations of what was seen."""
-LEAST = 1e-4
-"""Variance that is added where something hardly varies."""
+REACH = 8  # control steps whose way, at the usual speed, is the unit of errors of place and orientation
+LIMIT = 10.0  # of what the network gives, in standard deviations of what was seen
+LEAST = 1e-4  # variance that is added where something hardly varies
 
 
 class Dynamics(nn.Module):

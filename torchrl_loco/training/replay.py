@@ -28,8 +28,7 @@ class Window(NamedTuple):
     ``(steps, n)``."""
 
 
-LEAP = 1e-4
-"""Change of a position by events (m, rad) behind which a window does not go on."""
+LEAP = 1e-4  # change of a position by events (m, rad) behind which a window does not go on
 
 
 class Replay:

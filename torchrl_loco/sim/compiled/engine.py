@@ -39,8 +39,7 @@ ROWS = {
 }
 """Type of each array of :class:`Data`, and the size in the model that is the length of its rows."""
 
-LATER = ("cvel", "subtree_com")
-"""Arrays that are made, and computed, if they are asked for before the first step."""
+LATER = ("cvel", "subtree_com")  # arrays that are made, and computed, if they are asked for before the first step
 
 WORLD_ARRAYS = {
     **{"terrain_in": wp.array(dtype=float), "ctrl_in": wp.array2d(dtype=float), "numbers_out": wp.array2d(dtype=float)},
@@ -257,11 +256,7 @@ def arrays_of(data: Data, terrain: wp.array, numbers: wp.array) -> Any:
 
 
 def _check_forces(m: mujoco.MjModel, contact_geoms: Sequence[int]) -> None:
-    """Checks that forces are asked of no geom of the ground that shares its pairs with others.
-
-    Raises:
-        ValueError: they are.
-    """
+    """Checks that forces are asked of no geom of the ground that shares its pairs with others."""
     like = stand_ins(m)
     shared = collections.Counter(like.values())
     for geom in contact_geoms:

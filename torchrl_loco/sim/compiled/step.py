@@ -19,8 +19,7 @@ TRACED_DOFS = 16
 """Most degrees of freedom of a body that is traced. A thread holds its state; for the humanoid that would be 12 KiB and
 340 KB of code, which takes twice as long on a GPU as a warp of lanes. For the walker lanes take 3 times as long."""
 
-WARP = wp.constant(32)
-"""Threads of a CUDA warp, which wait for each other wherever they diverge."""
+WARP = wp.constant(32)  # threads of a CUDA warp, which wait for each other wherever they diverge
 WARPS = 2
 """Warps that each multiprocessor gets before warps are filled with worlds: a warp takes as long as its slowest world,
 and more warps wait for each other's instructions (measured)."""
@@ -29,11 +28,9 @@ MANY = 2
 """Above this multiple of the worlds that fill those warps, observation and bookkeeping run in kernels of their own:
 they wait for memory, and the registers of the physics leave too few warps to hide that."""
 
-MOST_KEPT = 64
-"""Texts of steps that a process keeps, and rows of nominal numbers."""
+MOST_KEPT = 64  # texts of steps that a process keeps, and rows of nominal numbers
 
-kept: dict[tuple, Any] = {}
-"""Those that were made last, by all that they depend on but the constants of this package."""
+kept: dict[tuple, Any] = {}  # those that were made last, by all that they depend on but the constants of this package
 
 
 def is_traced(m: mujoco.MjModel) -> bool:

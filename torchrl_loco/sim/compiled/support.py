@@ -20,14 +20,11 @@ from torchrl_loco.sim.varied import Varied
 IGNORED_FLAGS = ("EULERDAMP", "FILTERPARENT", "REFSAFE", "MIDPHASE", "NATIVECCD", "ISLAND", "AUTORESET")
 """Flags that may be set: the compiled step follows them, or they change nothing in it."""
 
-MAX_TOUCH = 31
-"""Touch sensors that fit into the bits of an int."""
+MAX_TOUCH = 31  # touch sensors that fit into the bits of an int
 
-SHOWN = 3
-"""Names of elements that a line shows."""
+SHOWN = 3  # names of elements that a line shows
 
-Found = defaultdict[str, list[str]]
-"""Names of the elements that need something, by what it is."""
+Found = defaultdict[str, list[str]]  # names of the elements that need something, by what it is
 
 
 def unsupported(mj_model: mujoco.MjModel, varied: Varied | None = None) -> list[str]:

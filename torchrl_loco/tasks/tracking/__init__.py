@@ -22,28 +22,20 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).parent
 
-AHEAD = Interval(1, 10_000)
-"""Control steps that a policy may look ahead."""
-PIECES = 2048
-"""Room for pieces of the motions, whose failures are counted apart."""
-PIECE = 0.5
-"""Length of a piece (s), more where there is no room for so many."""
-MEMORY = 0.998
-"""Share of what is known of failures that a control step keeps."""
-BEFORE = 0.6
-"""Share of a failure that counts in the piece before."""
-UNIFORM = 0.1
-"""Share of the starts that are drawn without regard to failures."""
-BIAS = 0.01
-"""Greatest error of a joint's encoder in an episode (rad)."""
+AHEAD = Interval(1, 10_000)  # control steps that a policy may look ahead
+PIECES = 2048  # room for pieces of the motions, whose failures are counted apart
+PIECE = 0.5  # length of a piece (s), more where there is no room for so many
+MEMORY = 0.998  # share of what is known of failures that a control step keeps
+BEFORE = 0.6  # share of a failure that counts in the piece before
+UNIFORM = 0.1  # share of the starts that are drawn without regard to failures
+BIAS = 0.01  # greatest error of a joint's encoder in an episode (rad)
 PUSH = (0.5, 0.5, 0.2, 0.52, 0.52, 0.78)
 """Greatest change of the base's velocity by a push, and at the start (m/s, rad/s)."""
 NEAR, TILT, BEND = (0.05, 0.05, 0.01), (0.1, 0.1, 0.2), 0.1
 """Greatest distance of a start from the reference: place (m), rotation (rad), joints (rad)."""
 MAX_HEIGHT, MAX_TILT = 0.25, 0.8
 """Differences from the reference at which it is lost: of heights (m), of the height of an axis."""
-OWN_RATE = 25.0
-"""Frames per second of the motions of the package."""
+OWN_RATE = 25.0  # frames per second of the motions of the package
 
 FOLLOWED = {
     "anchor_position": (0.5, 0.3),  # m
@@ -60,10 +52,8 @@ NOISE: dict[str, Any] = {
     **{"joint_positions": (0.01, "bias"), "joint_velocities": 0.5},  # rad, rad/s
 }
 """Noise of what the policy sees."""
-ESTIMATED = ("anchor_position", "linear_velocity")
-"""What a robot does not measure."""
-PENALTIES = {"action_rate": -0.1, "joint_limits": -10.0, "self_collision": -10.0}
-"""Weights of the other terms."""
+ESTIMATED = ("anchor_position", "linear_velocity")  # what a robot does not measure
+PENALTIES = {"action_rate": -0.1, "joint_limits": -10.0, "self_collision": -10.0}  # weights of the other terms
 
 
 def memory(joints: int) -> dict[str, Any]:
@@ -451,11 +441,7 @@ class Tracking(Robot):
 
 
 def _kept(motion: Any) -> Any:
-    """Returns a motion as a run keeps it: its whole path, or the arguments of a :class:`torchrl_loco.Motion`.
-
-    Raises:
-        TypeError: it is something else.
-    """
+    """Returns a motion as a run keeps it: its whole path, or the arguments of a :class:`torchrl_loco.Motion`."""
     if isinstance(motion, motions.Motion):
         return motion.as_json()
     if isinstance(motion, Mapping):
@@ -465,8 +451,7 @@ def _kept(motion: Any) -> Any:
     return str(Path(motion).expanduser().absolute())
 
 
-_tables: dict[Any, tuple[list[int], motions.Frames]] = {}
-"""When files were changed, and what was read of them."""
+_tables: dict[Any, tuple[list[int], motions.Frames]] = {}  # when files were changed, and what was read of them
 
 
 def angle(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:

@@ -15,12 +15,10 @@ from torchrl_loco.sim.compiled.ir.parameters import nominal
 
 BOX_NUMBERS = 24
 """Of a box: its bounds (low, high), center, axes by rows, half sizes, number of its kind, and first column and row."""
-CELLS_PER_BOX = 64
-"""Cells of the grid, at most, as a multiple of the boxes."""
+CELLS_PER_BOX = 64  # cells of the grid, at most, as a multiple of the boxes
 TOPS_CELL, NEAR_TOPS, MOST_TOPS = 0.25, 2, 4_000_000
 """Least length of a cell of the greatest heights (m), how many cells around it each knows of, most cells."""
-NOTHING = -1e30
-"""Height where there is no ground."""
+NOTHING = -1e30  # height where there is no ground
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,10 +8,8 @@ PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
     for kind in ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
 )
-SHAPES = (SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)
-"""In the order of ``enum Shape`` in ``laws.h``."""
-SOLID = (ELLIPSOID, CYLINDER, BOX, MESH)
-"""Shapes that are no segment with a radius."""
+SHAPES = (SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)  # in the order of enum Shape in laws.h
+SOLID = (ELLIPSOID, CYLINDER, BOX, MESH)  # shapes that are no segment with a radius
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,14 +51,12 @@ KINDS = {
 }
 """What is compiled, by the two shapes, the one of the smaller number first. Planes and fields belong to the world."""
 
-GROUND = (PLANE, FIELD)
-"""Shapes that belong to the world, whose pairs are never listed."""
+GROUND = (PLANE, FIELD)  # shapes that belong to the world, whose pairs are never listed
 
 ON_BOXES = {"round_and_box": "round_on_boxes", "box_and_box": "box_on_boxes"}
 """What finds the contacts of a pair instead where the box is one of many of the world."""
 
-NOT_COMPILED = Kind(0, "")
-"""That of all other shapes."""
+NOT_COMPILED = Kind(0, "")  # that of all other shapes
 
 FUNCTIONS = tuple(dict.fromkeys([*(kind.function for kind in KINDS.values()), *ON_BOXES.values()]))
 """The functions of lanes, in the order in which they look at their pairs."""

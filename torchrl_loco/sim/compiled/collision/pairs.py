@@ -16,8 +16,7 @@ from torchrl_loco.sim.compiled.ir.symbols import Scalar, select
 from torchrl_loco.sim.compiled.physics.dynamics import MINVAL
 from torchrl_loco.sim.models import NEVER
 
-MINMU = 1e-5
-"""MuJoCo's mjMINMU."""
+MINMU = 1e-5  # MuJoCo's mjMINMU
 SLIPPERY, LEAST = 0.03, 1e-4
 """Up to this friction the regularisation of a contact is no less than this share of the bodies' inverse inertia."""
 
@@ -90,10 +89,8 @@ def pairs(m: mujoco.MjModel) -> list[Pair]:
 ALIKE = ("type", "bodyid", "contype", "conaffinity", "condim", "priority")
 ALIKE_NUMBERS = ("solmix", "solref", "solimp", "friction", "margin", "gap")
 """Of geoms whose contacts have the same parameters."""
-AT_ONCE = 8
-"""Contacts of a geom with many boxes, as far as a world has room for all pairs."""
-MOST_LISTED = 8
-"""Boxes of the world up to which each has pairs of its own; more of them are looked up."""
+AT_ONCE = 8  # contacts of a geom with many boxes, as far as a world has room for all pairs
+MOST_LISTED = 8  # boxes of the world up to which each has pairs of its own; more of them are looked up
 
 
 def of_ground(m: mujoco.MjModel) -> np.ndarray:

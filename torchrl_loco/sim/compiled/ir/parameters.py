@@ -14,8 +14,7 @@ import numpy as np
 from torchrl_loco.sim.compiled.ir.symbols import Scalar, maximum
 from torchrl_loco.sim.varied import Varied, field, subtree_masses
 
-Number = float | Scalar
-"""A constant, or what varies."""
+Number = float | Scalar  # a constant, or what varies
 OPERATORS: dict[str, Callable[..., float]] = {
     "neg": operator.neg,
     "+": operator.add,

@@ -14,8 +14,7 @@ import numpy as np
 
 Vector = Sequence[Any] | np.ndarray
 
-LEAVES = ("const", "name", "cell", "number")
-"""What has no parts."""
+LEAVES = ("const", "name", "cell", "number")  # what has no parts
 
 
 class Scalar:
@@ -134,8 +133,7 @@ class Scalar:
         return f"Scalar({self.op!r}, {', '.join(map(repr, self.args))})"
 
 
-ROUNDING = 1e-14
-"""What is left of numbers that cancel, relative to them."""
+ROUNDING = 1e-14  # what is left of numbers that cancel, relative to them
 
 
 def scalar(x: Any) -> Scalar:

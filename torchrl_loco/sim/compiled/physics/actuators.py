@@ -9,8 +9,7 @@ import mujoco
 from torchrl_loco.sim.compiled.ir.symbols import Scalar, cpp_function, maximum, minimum, name
 
 AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
-BIASES = int(mujoco.mjtBias.mjBIAS_NONE), AFFINE
-"""Kinds of bias that an actuator may have."""
+BIASES = int(mujoco.mjtBias.mjBIAS_NONE), AFFINE  # kinds of bias that an actuator may have
 
 
 @dataclasses.dataclass(frozen=True)

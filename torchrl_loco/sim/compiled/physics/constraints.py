@@ -31,11 +31,9 @@ from torchrl_loco.sim.compiled.ir.symbols import (
 )
 from torchrl_loco.sim.compiled.physics.dynamics import HINGE, MINVAL, SLIDE
 
-MINIMP, MAXIMP = 1e-4, 0.9999
-"""MuJoCo's mjMINIMP and mjMAXIMP."""
+MINIMP, MAXIMP = 1e-4, 0.9999  # MuJoCo's mjMINIMP and mjMAXIMP
 
-DEFAULT_SOLREF = 0.02, 1.0
-"""What MuJoCo takes in the place of a ``solref`` that mixes its two formats, with a warning."""
+DEFAULT_SOLREF = 0.02, 1.0  # what MuJoCo takes in the place of a solref that mixes its two formats, with a warning
 
 MIN_TOLERANCE = 1e-6
 """Tolerance below which a solver in single precision would only see rounding; mujoco_warp has the same bound."""
@@ -44,8 +42,7 @@ NEAR, MANY_ITERATIONS = 0.1, 10
 """Share of its first slope at which a line search may end, and iterations that nearly always converge: with fewer, what
 is left depends on where the searches end, which is then where those of MuJoCo-Warp do."""
 
-Variables = tuple[list[Scalar], list[Scalar], list[Scalar]]
-"""Symbols of qpos, qvel and qacc."""
+Variables = tuple[list[Scalar], list[Scalar], list[Scalar]]  # symbols of qpos, qvel and qacc
 
 
 def near(m: mujoco.MjModel) -> float:

@@ -10,8 +10,7 @@ import numpy as np
 
 from torchrl_loco.sim.compiled.physics.constraints import MAXIMP
 
-LEAST_PIVOT = 256 * 2.0**-23
-"""Share of its entry of the diagonal that a pivot must keep."""
+LEAST_PIVOT = 256 * 2.0**-23  # share of its entry of the diagonal that a pivot must keep
 
 SAFE = 3e-4
 """Share above which the estimate of :func:`is_delicate` lets a model go; poses differ by a factor of 10."""

@@ -19,10 +19,8 @@ from torchrl_loco.sim.compiled.physics.spatial import Inertia, cross_force, cros
 FREE, BALL, SLIDE, HINGE = (
     int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE")
 )
-MINVAL = 1e-15
-"""MuJoCo's mjMINVAL."""
-SAME = 1e-9
-"""Relative difference below which two numbers of a model count as equal."""
+MINVAL = 1e-15  # MuJoCo's mjMINVAL
+SAME = 1e-9  # relative difference below which two numbers of a model count as equal
 
 
 # Rotations.

@@ -16,8 +16,7 @@ SUBTREE_VELOCITY, ANGULAR_MOMENTUM, TOUCH, VELOCIMETER, GYRO, ACCELEROMETER, FOR
     int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}"))
     for kind in ("SUBTREELINVEL", "SUBTREEANGMOM", "TOUCH", "VELOCIMETER", "GYRO", "ACCELEROMETER", "FORCE", "TORQUE")
 )
-AT_SITES = VELOCIMETER, GYRO, ACCELEROMETER, FORCE, TORQUE
-"""Sensors at sites that lanes alone have."""
+AT_SITES = VELOCIMETER, GYRO, ACCELEROMETER, FORCE, TORQUE  # sensors at sites that lanes alone have
 
 
 def subtree(m: mujoco.MjModel, root: int) -> list[int]:

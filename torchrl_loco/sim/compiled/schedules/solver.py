@@ -22,8 +22,7 @@ WHOLE = "whole[0] += row.cost(); row.add(1.0f, whole + 1);"
 STEPS = "UNROLLED_FOR(int s = 0; s < n; ++s) row.add(alphas[s], sums + 3 * s);"
 """What the line search does with each row."""
 WHOLE_BY_SLOPES = "whole[0] += row.cost(); row.bend(1.0f, whole + 2);"
-STEPS_BY_SLOPES = "UNROLLED_FOR(int s = 0; s < n; ++s) row.bend(alphas[s], sums + 3 * s + 1);"
-"""The same without costs."""
+STEPS_BY_SLOPES = "UNROLLED_FOR(int s = 0; s < n; ++s) row.bend(alphas[s], sums + 3 * s + 1);"  # the same without costs
 
 
 class NewtonSolver:

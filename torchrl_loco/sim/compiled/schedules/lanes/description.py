@@ -25,12 +25,9 @@ from torchrl_loco.sim.compiled.physics.links import Mass, matrix, moved_by, movi
 from torchrl_loco.sim.compiled.schedules.lanes.layout import Layout, Limbs
 from torchrl_loco.sim.models import NEVER, home_pose
 
-MOST_VERTICES = 4000
-"""Vertices of all meshes that touch something: tables count their corners with 16 bits."""
-LANES = 32
-"""Threads of a GPU that step a world."""
-BLOCK_BYTES = 48 * 1024
-"""Static shared memory that a block of a GPU may have."""
+MOST_VERTICES = 4000  # vertices of all meshes that touch something: tables count their corners with 16 bits
+LANES = 32  # threads of a GPU that step a world
+BLOCK_BYTES = 48 * 1024  # static shared memory that a block of a GPU may have
 WARP_BYTES = 4 * LANES
 """What Warp takes of it for the threads of a world, 4 bytes each, whether a kernel has tiles or not."""
 WORLD_BYTES = (
@@ -47,15 +44,13 @@ MULTIPROCESSOR_BYTES, SYSTEM_BYTES = 228 * 1024, 1024
 """Shared memory of a multiprocessor of an H100 or H200, and what the system takes of it for each block."""
 SCHEDULERS, REGISTERS = 4, 16 * 1024
 """Of a multiprocessor, and the registers of each, which it deals out to whole warps."""
-MOST_WORLDS = 4
-"""Worlds of a block, at most."""
+MOST_WORLDS = 4  # worlds of a block, at most
 ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 28, 16
 """Places for contacts with friction, which a world should have and may have, and for those without.
 
 A body that touches the floor in more places when it stands should have, and has, those.
 """
-NEAR_GROUND = 64
-"""Prisms of height fields, or boxes of the ground, that are listed and then looked at together."""
+NEAR_GROUND = 64  # prisms of height fields, or boxes of the ground, that are listed and then looked at together
 MOST_PRISMS, MOST_BOXES, MOST_ON_BOXES = 2**16 - 1, 2**24 - 1, 2**8
 """Prisms of a field near a geom, boxes of the ground, and geoms that may touch these: entries of lists hold no more."""
 STANDING, FAR = 0.025, 1e3
@@ -163,11 +158,7 @@ class Description:
         return len(self.limited_balls) + len(self.equalities) + sum(weld.rows for weld in self.welds)
 
     def _check_lists(self) -> None:
-        """Checks that what is near a geom can be listed: numbers of 32 bits hold a pair and a prism, or a box.
-
-        Raises:
-            ValueError: it cannot.
-        """
+        """Checks that what is near a geom can be listed: numbers of 32 bits hold a pair and a prism, or a box."""
         moving = [g for g in self.geoms if self.m.body_weldid[self.m.geom_bodyid[g]]]
         most = max((2 * (self.radius(g) + half_length(self.m, g)) for g in moving), default=0.0)
         for field in self.ground.fields:
@@ -231,11 +222,7 @@ class Description:
         return sum(dim > 1 for dim in touching), sum(dim == 1 for dim in touching)
 
     def _layout(self) -> Layout:
-        """Returns the sizes, with as many places for contacts as there is room for.
-
-        Raises:
-            ValueError: a world does not fit the shared memory of a GPU.
-        """
+        """Returns the sizes, with as many places for contacts as there is room for."""
         m = self.m
         frictional = sum(kind(m, p).points for p in self.pairs if p.condim != 1)
         frictionless = sum(kind(m, p).points for p in self.pairs if p.condim == 1)

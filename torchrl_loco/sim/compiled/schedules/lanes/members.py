@@ -29,8 +29,7 @@ from torchrl_loco.sim.compiled.schedules.shared import Asked, add_options
 TRANSLATION, ROTATION = 0, 1
 """Kinds of a degree of freedom in ``world.h``; SLIDE and HINGE are MuJoCo's numbers of the joints."""
 UNLIMITED = 1e30
-MOST_ROUNDS = 4
-"""Pairs of geoms whose bounding spheres a lane compares side by side, at most."""
+MOST_ROUNDS = 4  # pairs of geoms whose bounding spheres a lane compares side by side, at most
 
 
 def members(d: Description, substeps: int, asked: Asked) -> Tables:
