@@ -219,6 +219,8 @@ def test_actions_come_a_step_late_in_every_other_episode_if_asked_for():
     assert not loco.make("h1_tracking", 9, "cpu", 0, play=True, max_delay=1, **PLAIN).world.memory["delay"].any()
     with pytest.raises(ValueError, match="max_delay must lie in"):
         loco.make("h1_tracking", 1, "cpu", 0, max_delay=2)
+    with pytest.raises(ValueError, match="the delay that holds names of Later must lie in"):
+        type("Later", (H1Tracking,), {"holds": {**H1Tracking.holds, "delay": (0, 2)}})(1, "cpu")
 
 
 def targets_of(env, action):

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import torch
 
+from torchrl_loco.checks import Interval, check_int
 from torchrl_loco.conditions import PUSH_EVERY
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.vary import Vary
@@ -29,8 +30,23 @@ class Robot(LocoEnv):
     """Body that floats."""
     action_scale: ClassVar[float | None] = None
     """Change of a joint's target by an action of 1 (rad); ``None`` is a quarter of what needs the greatest torque."""
+    longest_delay: ClassVar[int] = 0
+    """Control steps by which :meth:`control` can hold an action back, as ``delay`` of :attr:`memory` says."""
     own_geoms: ClassVar[str] = ""
     """Regular expression of the geoms of which ``self_collision`` counts the contacts."""
+
+    @classmethod
+    def check_class(cls) -> None:
+        """Checks the delay of ``holds`` beside what :meth:`torchrl_loco.LocoEnv.check_class` does.
+
+        Raises:
+            ValueError: ``verify`` would ask for more than :attr:`longest_delay`.
+        """
+        super().check_class()
+        for delay in cls.holds.get("delay", ()):
+            check_int(
+                f"the delay that holds names of {cls.__name__}", delay, Interval(0, cls.longest_delay, with_high=True)
+            )
 
     @property
     def joints(self) -> list[str]:

@@ -164,10 +164,12 @@ class SVG(Algorithm):
         """Fits the model while actor and critic imagine by what it was."""
         with torch.no_grad():
             torch._foreach_copy_(list(self._known.state_dict().values()), list(self.model.state_dict().values()))
-        with self.beside() if distributed.ranks() == 1 else contextlib.nullcontext():  # ranks meet in one order
+        alone = distributed.ranks() == 1  # several meet in one order
+        with self.beside() if alone else contextlib.nullcontext():
             self.fit()
         self.improve()
-        self.join()
+        if alone:
+            self.join()
 
     def schedule(self, progress: float) -> None:
         """Sets the learning rates, as all do; that of the model is its own, and that of the actor 0 at the start."""

@@ -121,6 +121,7 @@ class Tracking(Robot):
         "ppo": {**G1Velocity.presets["ppo"], "total_frames": 300_000_000, "entropy_coeff": 0.005, "eval_episodes": 256}
     }
     noise = NOISE
+    longest_delay = 1
     command_ranges = {"phase": {"phase": (0.0, 1.0)}}  # and the clip, where there are several
     holds: ClassVar[Mapping[str, Any]] = {"falls": 0.05, "delay": (0, 1), "friction": (0.4, 1.2), "pushes": 0.5}
 
@@ -158,7 +159,7 @@ class Tracking(Robot):
             kept["motion"] = [_kept(one) for one in several]
         elif kept.get("fps"):
             raise ValueError("fps is that of motions in CSV files: pass motion too")
-        check_int("max_delay", kept.get("max_delay", 0), Interval(0, 1, with_high=True))
+        check_int("max_delay", kept.get("max_delay", 0), Interval(0, cls.longest_delay, with_high=True))
         if "future" in kept:
             steps = kept["future"] if isinstance(kept["future"], list | tuple) else [kept["future"]]
             try:

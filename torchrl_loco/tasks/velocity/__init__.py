@@ -170,6 +170,7 @@ class Velocity(Robot):
     """Ranges of the commands by the control step of training from which they hold."""
     step_height: ClassVar[float] = 0.1
     """Height of a foot in mid-swing (m)."""
+    longest_delay = MAX_DELAY
     max_delay: ClassVar[int] = 2
     """Greatest delay of an action in training (control steps), at most 3; ``verify`` delays by up to 2."""
     push_scale: ClassVar[float] = 1.0
@@ -181,15 +182,13 @@ class Velocity(Robot):
 
         Raises:
             TypeError: an attribute is missing, or has the wrong type.
-            ValueError: ``max_delay`` or the delay of ``holds`` is not 0, 1, 2 or 3, or ``push_scale`` is negative.
+            ValueError: ``max_delay`` is not 0, 1, 2 or 3, or ``push_scale`` is negative or not finite.
         """
         missing = [name for name in TABLE if not hasattr(cls, name)]
         if missing:
             raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.Velocity)")
         super().check_class()
-        most = cls.holds.get("delay", (0, 0))[1]
-        for name, delay in (("max_delay", cls.max_delay), ("the delay that holds names", most)):
-            check_int(f"{name} of {cls.__name__}", delay, Interval(0, MAX_DELAY, with_high=True))
+        check_int(f"max_delay of {cls.__name__}", cls.max_delay, Interval(0, cls.longest_delay, with_high=True))
         check_float(f"push_scale of {cls.__name__}", cls.push_scale, NOT_NEGATIVE)
 
     @classmethod
