@@ -13,7 +13,6 @@ from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.motions import THOSE_OF_TRAINING, Motions
 from torchrl_loco.cli.options import Flat, OtherTask, settings
 from torchrl_loco.garbage import importing
-from torchrl_loco.registry import task_name
 
 
 def train(options: Any, args: list[str]) -> None:
@@ -54,7 +53,11 @@ def resume(
     """
     with user_errors():
         check_run(run)
-        folder = training.RunFolder(run, None if task is None else task_name(task, by_user=True))
+        folder = training.RunFolder(run)
+        if task is not None:
+            from torchrl_loco.training.start import resumed
+
+            folder = resumed(folder, task)
         training.Given().check(folder)
         asked: dict[str, Any] = {"total_frames": total_frames, "device": device}
         changes = {name: value for name, value in asked.items() if value is not None}

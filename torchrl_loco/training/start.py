@@ -79,7 +79,7 @@ def train(
         changes = settings | chosen
         if config is not None or changes.keys() - {"total_frames", "device"} or isinstance(algorithm, str):
             raise ValueError("a run that is resumed keeps its settings: pass no other than total_frames and device")
-        run = _resumed(resume, cls)
+        run = resumed(resume, cls)
         if given.env is not None:
             _check_same(run, given.env)
         return run_to_end(run, given, **changes)
@@ -134,7 +134,12 @@ def _check_same(run: RunFolder, env: EnvBase) -> None:
             raise ValueError(f"{run.path} was begun with {name}={stored[name]!r}, the environment has {found[name]!r}")
 
 
-def _resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
+def resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
+    """Returns the folder of a run whose task is somewhere else now.
+
+    Raises:
+        ValueError: the run is of another task.
+    """
     run = resume if isinstance(resume, RunFolder) else RunFolder(Path(resume))
     named, of = task_name(task, by_user=True), run.load_config().task
     moved = is_place(named) and is_place(of) and named.rpartition(":")[2] == of.rpartition(":")[2]
