@@ -202,6 +202,24 @@ def test_command(file, actions, capsys, spoil, said, tmp_path, monkeypatch):
     file.unlink()
 
 
+class Hooked(torchrl_loco.WalkerWalk):
+    """Its third reward is not finite in one world."""
+
+    def reward(self, s):
+        return torch.where((s.env_index == BAD) & (s.time > 0.06), torch.nan, 1.0)
+
+
+def test_a_hook_that_gives_what_is_not_finite_is_told_from_the_physics(file, actions):
+    env = Hooked(WORLDS, "cpu", 7, nan_dump=file, engine="mujoco", compile_hooks=False)
+    td = env.reset()
+    for action in actions(env, 4):
+        td = stepped(env, td, action)
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    *_, said = nan_dump.describe(nan_dump.load(file))
+    assert said.startswith("state, action and physics are finite: a hook gave what is not")
+
+
 def test_a_state_written_from_outside_is_recognised(file):
     env = made(file)
     td = env.reset()

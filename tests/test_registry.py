@@ -221,6 +221,14 @@ def test_a_class_in_a_script(file, capsys, monkeypatch):
 
 
 def test_what_is_wrong_with_the_name_of_a_class(file):
+    others = file.with_name("others.py")
+    others.write_text(
+        "import torchrl_loco\n"
+        "def made():\n"
+        "    class Task(torchrl_loco.WalkerStand): pass\n"
+        "    return Task\n"
+        "Slow = Other = made()\n"
+    )
     for task, kind, message in [
         (
             "walker_wolk",
@@ -230,6 +238,8 @@ def test_what_is_wrong_with_the_name_of_a_class(file):
         ("no_such.py:Slowly", FileNotFoundError, "there is no file .*no_such.py"),
         (f"{file}:Slow", ValueError, "has no class 'Slow', did you mean 'Slowly'.*: choose one of Base, Slowly"),
         (str(file), ValueError, "names no class: choose one of Base, Slowly"),
+        (f"{others}:Fly", ValueError, "choose one of Other, Slow$"),
+        ("torchrl_loco:WalkerWolk", ValueError, "did you mean 'WalkerWalk'"),
         (f"{file.with_name('numbers_beside.py')}:A", ValueError, "has no class 'A': it defines no subclass of"),
         (f"{file}:numbers_beside", TypeError, r"walk-slowly\.py:numbers_beside: .* is no subclass of"),
         ("no_such_module:Slowly", ImportError, r"'no_such_module' cannot be loaded: .*path/to/file\.py:Class"),

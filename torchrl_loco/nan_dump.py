@@ -185,6 +185,8 @@ def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterato
     for i, (ours, theirs) in enumerate(zip(warp, c, strict=True)):
         speeds = (np.abs(values[nq:]).max() for values in (ours, theirs))
         yield "{:>7}  {:>22.6g}  {:>12.6g}  {:>18.3g}".format(i, *speeds, np.abs(ours - theirs).max())
-    for name, trace in (("Warp", warp), ("C MuJoCo", c)):
-        lost = np.flatnonzero(~(np.abs(trace) < MAX_VALUE).all(axis=1))
-        yield f"{name}: " + (f"not finite after substep {lost[0]}" if len(lost) else "finite to the end")
+    lost = [np.flatnonzero(~(np.abs(trace) < MAX_VALUE).all(axis=1)) for trace in (warp, c)]
+    for name, at in zip(("Warp", "C MuJoCo"), lost, strict=True):
+        yield f"{name}: " + (f"not finite after substep {at[0]}" if len(at) else "finite to the end")
+    if not wrong and not len(lost[0]):
+        yield "state, action and physics are finite: a hook gave what is not (control, reward, observation, memory)"

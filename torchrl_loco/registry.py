@@ -253,8 +253,14 @@ def _no_class(module: ModuleType, source: str, name: str) -> str:
     """Returns what is wrong with the name of a class that a module does not have."""
     if source in MAIN or "<locals>" in name:
         return f"{source}:{name} is of another process, of a notebook or a function: move the class into a file"
-    classes = [cls for cls in vars(module).values() if isinstance(cls, type) and cls.__module__ == module.__name__]
-    names = [cls.__name__ for cls in classes if issubclass(cls, torchrl_loco.LocoEnv)]
+    found = {each: getattr(module, each, None) for each in dir(module)}
+    classes = {each: cls for each, cls in found.items() if isinstance(cls, type)}
+    own = module.__name__.partition(".")[0]
+    names = [
+        each
+        for each, cls in classes.items()
+        if issubclass(cls, torchrl_loco.LocoEnv) and cls.__module__.partition(".")[0] == own
+    ]
     what = f"{source} has no class {name!r}{suggestion(name, names)}" if name else f"{source!r} names no class"
     choice = f"choose one of {', '.join(names)}" if names else "it defines no subclass of torchrl_loco.LocoEnv"
     return f"{what}: {choice}"

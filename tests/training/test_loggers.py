@@ -75,6 +75,11 @@ def test_a_missing_package_is_named_before_anything_is_made(tmp_path, monkeypatc
             cli.main(command)
         said = f"the logger {name} needs {name}: pip install 'torchrl-loco[{extra}]'"
         assert said in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["train", "walker_stand", "--device=cpu", f"--out={tmp_path / 'runs'}", "--logger", "csv"])
+    assert "a video (none with video_seconds=0) needs av: pip install" in capsys.readouterr().err
+    monkeypatch.delitem(sys.modules, "av")
     assert not (tmp_path / "runs").exists()
     with pytest.raises(ImportError, match="the logger wandb needs wandb"):
         Trainer(run)

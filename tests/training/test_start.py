@@ -176,6 +176,19 @@ def test_what_does_not_fit(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_class_that_cannot_be_made_leaves_no_folder(tmp_path):
+    file = tmp_path / "wrong.py"
+    file.write_text(
+        "import torchrl_loco\n"
+        "class NoModel(torchrl_loco.LocoEnv): pass\n"
+        "class NoFile(torchrl_loco.WalkerStand): model = 'none.xml'\n"
+    )
+    for name, error, message in (("NoModel", TypeError, "must set model"), ("NoFile", OSError, "no model 'none.xml'")):
+        with pytest.raises(error, match=message):
+            train(f"{file}:{name}", algorithm="ppo", device="cpu", out=tmp_path / "runs", **QUICK)
+        assert list((tmp_path / "runs").iterdir()) == []
+
+
 TASK = '''
 import torch, torchrl_loco
 

@@ -18,8 +18,9 @@ from torchrl_loco.registry import list_envs, resolve
 
 def list_tasks() -> None:
     """List the environments."""
-    for name, words in summaries().items():
-        print(f"{name:<16} {words}")
+    found = summaries()
+    for name, words in found.items():
+        print(f"{name:<{max(map(len, found))}} {words}")
 
 
 def diagnose(

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
@@ -469,13 +469,15 @@ def _stored_name(task: Any) -> str:
     return f"{Path(source).expanduser().resolve()}:{name}" if source.endswith(".py") else task
 
 
-def check_loggers(names: Collection[str]) -> None:
-    """Checks that the packages of loggers are installed.
+def check_packages_of(config: TrainingConfig) -> None:
+    """Checks that what writes a training's video and logs is installed: a video is drawn at its end.
 
     Raises:
         ImportError: one is not; the message says how to install it.
     """
-    for name in names:
+    if config.video_seconds > 0:
+        check_packages("a video (none with video_seconds=0)", VIDEO, "train")
+    for name in config.logger:
         if name != "csv":
             check_packages(f"the logger {name}", [name], "train" if name == "tensorboard" else name)
 
@@ -498,6 +500,7 @@ def config_from_json(values: dict[str, Any]) -> TrainingConfig:
     return CONFIGS[algorithm](**fields)
 
 
+VIDEO = ("imageio", "av")  # packages that write one
 RUNNERS = ("walker", "humanoid", "cheetah", "hopper", "quadruped")  # bodies of dm_control's runners
 
 

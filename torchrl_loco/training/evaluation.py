@@ -24,7 +24,7 @@ from torchrl_loco.eyes.scene import to_the_horizon
 from torchrl_loco.policy import Policy, load_policy, shipped_policies
 from torchrl_loco.storage import replace_file
 from torchrl_loco.training.algorithm import settings_for_small_networks
-from torchrl_loco.training.config import TrainingConfig
+from torchrl_loco.training.config import VIDEO, TrainingConfig
 from torchrl_loco.training.environments import make_for
 from torchrl_loco.training.run_folder import RunFolder
 
@@ -198,7 +198,7 @@ def play(policy: PolicyFunc, env: EnvBase, action_repeat: int, frames: int, labe
 
 
 def record(
-    policy: PolicyFunc, env: LocoEnv, path: Path, seconds: float, action_repeat: int = 1, camera: str = "side"
+    policy: PolicyFunc, env: LocoEnv, path: Path | str, seconds: float, action_repeat: int = 1, camera: str = "side"
 ) -> None:
     """Records the first world of an environment from its reset on, in real time.
 
@@ -216,17 +216,17 @@ def record(
         write_video(path, (env.render(camera, *SIZE, worlds=1)[0] for _ in steps), frame_rate)
 
 
-def write_video(path: Path, frames: Iterable[torch.Tensor], frame_rate: int) -> None:
+def write_video(path: Path | str, frames: Iterable[torch.Tensor], frame_rate: int) -> None:
     """Writes frames, uint8 ``(height, width, 3)``, as a video file, whole or not at all, as :func:`record` does."""
-    check_packages("a video", ("imageio", "av"), "train")
+    check_packages("a video", VIDEO, "train")
     import imageio.v3 as imageio
 
     content = io.BytesIO()
-    with imageio.imopen(content, "w", plugin="pyav", extension=path.suffix) as video:
+    with imageio.imopen(content, "w", plugin="pyav", extension=Path(path).suffix) as video:
         video.init_video_stream("h264", fps=frame_rate)
         for frame in frames:
             video.write_frame(frame.cpu().numpy())
-    replace_file(path, content.getvalue())
+    replace_file(Path(path), content.getvalue())
 
 
 def has_display() -> bool:

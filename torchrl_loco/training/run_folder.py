@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import pickle
+import shutil
 from collections.abc import Collection, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -20,7 +21,7 @@ from torchrl_loco.policy import Policy
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
 from torchrl_loco.training import distributed
-from torchrl_loco.training.config import TrainingConfig, check_loggers, config_from_json
+from torchrl_loco.training.config import TrainingConfig, check_packages_of, config_from_json
 
 CHECKPOINT_VERSION = 7
 
@@ -102,7 +103,7 @@ class RunFolder:
         """
         check_device(config.device)
         resolve(config.task)
-        check_loggers(config.logger)
+        check_packages_of(config)
         name = f"{config.label}-{datetime.now():%Y%m%d-%H%M%S}-seed{config.seed}"
         try:
             config.out.mkdir(parents=True, exist_ok=True)
@@ -119,7 +120,11 @@ class RunFolder:
         if launch := distributed.launch_id():
             storage.replace_file(path / "launch.txt", launch.encode())
         run = cls(path)
-        run.keep_source()
+        try:
+            run.keep_source()
+        except BaseException:
+            shutil.rmtree(path)
+            raise
         return run
 
     @classmethod
@@ -154,6 +159,7 @@ class RunFolder:
             return
         known_files.remember(path)
         cls, package, folder = resolve(self.task), Path(known_files.__file__).parent, self.path / known_files.KEPT
+        cls.check_class()
         copies = {}
         for file in [*known_files.with_imports(path), *models.files(cls.model, folder_of(cls))]:
             if file.is_relative_to(path.parent) and not file.is_relative_to(package):

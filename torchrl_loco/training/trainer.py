@@ -21,7 +21,7 @@ from torchrl_loco.sim.simulation import check_memory
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Spaces, deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, begin_from, settings_for_small_networks, start_compiler
-from torchrl_loco.training.config import check_loggers
+from torchrl_loco.training.config import check_packages_of
 from torchrl_loco.training.environments import Environments, Given, source_of, unwrapped
 from torchrl_loco.training.episodes import Episodes
 from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, record, shipped_return, summarize
@@ -92,7 +92,7 @@ class Trainer:
         stored = run.load_config(**changes)
         self.config = config = dataclasses.replace(stored, device=distributed.own_device(stored.device))
         check_device(config.device)
-        check_loggers(config.logger)
+        check_packages_of(config)
         checkpoint = run.load_checkpoint(config.device) if resume else None
         part, frames = config.shortest_part
         if checkpoint is None and frames < self.frames_per_iteration:
