@@ -4,6 +4,7 @@ Importing it is enough, also in a process that a test starts, which may be ``pyt
 does nothing where there is a GPU.
 """
 
+import fcntl
 import runpy
 import sys
 from pathlib import Path
@@ -23,13 +24,27 @@ def headers(runtime):
 
 
 plain = wp._src.build.build_cpu
+parsed = set()
+"""Options with which the header is there."""
 
 
 def build(obj_path, cpp_path, *args, **options):
-    """Compiles a kernel. What traces rays is optimised: a picture takes 40 times as long without."""
+    """Compiles a kernel. What traces rays is optimised: a picture takes 40 times as long without.
+
+    The first that needs the header with its options lets all others wait, in this process and in others.
+    """
     if Path(cpp_path).name.startswith("wp_tracer"):
         options["optimization_level"] = 2
-    plain(obj_path, cpp_path, *args, **options)
+    key = options["optimization_level"], options["block_dim"]
+    if key in parsed:
+        return plain(obj_path, cpp_path, *args, **options)
+    with Path(headers(None), "lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            plain(obj_path, cpp_path, *args, **options)
+            parsed.add(key)
+        finally:
+            fcntl.flock(lock, fcntl.LOCK_UN)  # a process that was forked meanwhile has the file open, too
 
 
 if not torch.cuda.is_available():
