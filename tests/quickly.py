@@ -1,4 +1,4 @@
-"""Lets kernels be compiled without optimisation, which takes longer than they run in tests; but for what draws.
+"""Lets kernels be compiled without optimisation, which takes longer than they run in tests; but for a few.
 
 Importing it is enough, also in a process that a test starts, which may be ``python -m quickly MODULE ARGUMENTS``. It
 does nothing where there is a GPU.
@@ -24,16 +24,18 @@ def headers(runtime):
 
 
 plain = wp._src.build.build_cpu
+LONG = "wp_tracer", "wp_torchrl_loco.training.adam"
+"""What is optimised: without, a picture takes 40 times as long, and so does a step of Adam."""
 parsed = set()
 """Options with which the header is there."""
 
 
 def build(obj_path, cpp_path, *args, **options):
-    """Compiles a kernel. What traces rays is optimised: a picture takes 40 times as long without.
+    """Compiles a kernel.
 
     The first that needs the header with its options lets all others wait, in this process and in others.
     """
-    if Path(cpp_path).name.startswith("wp_tracer"):
+    if Path(cpp_path).name.startswith(LONG):
         options["optimization_level"] = 2
     key = options["optimization_level"], options["block_dim"]
     if key in parsed:
