@@ -39,9 +39,9 @@ def test_a_run_begins_with_the_weights_of_another_or_of_a_policy(algorithm, tmp_
 def test_settings_of_the_simulation_are_those_of_the_run(tmp_path):
     """In training, evaluations and where its policy is played; they are kept with it."""
     with small_walker():
-        run = train("walker_stand", device="cpu", out=tmp_path, sim={"iterations": 7, "engine": "mujoco_warp"}, **SMALL)
+        run = train("walker_stand", device="cpu", out=tmp_path, sim={"iterations": 7, "engine": "mujoco"}, **SMALL)
         config = run.load_config()
-        assert config.of_env == {"iterations": 7, "engine": "mujoco_warp"}
+        assert config.of_env == {"iterations": 7, "engine": "mujoco"}
         policy = run.load_policy("cpu")
         assert make_for(policy, 1, "cpu", 0).config.iterations == 7
         assert make_for(policy, 1, "cpu", 0, iterations=3).config.iterations == 3
