@@ -113,8 +113,8 @@ def verify(
         info = exported.facts.get("info", {})
         exported.facts["info"] = {**info, "options": {**info.get("options", {}), **given}}
     conditions = conditions.of(cls.holds)
-    if alone and conditions.min_return is None and not {"falls", "return"} & cls.holds.keys():
-        raise ValueError(f"{cls.__name__} is held to its return in the training simulator: it cannot be played alone")
+    if alone:
+        check_alone(cls, conditions)
     engines = ENGINES[:1] if alone else ENGINES
     cases = _by_case(cls, exported, conditions, engines, device)
     if cases:  # each is played
@@ -256,6 +256,16 @@ class Outcome:
             "return": float(self.returns[episodes].mean()),
             **means,
         }
+
+
+def check_alone(cls: type[LocoEnv], conditions: Conditions) -> None:
+    """Checks that C MuJoCo alone can tell whether a policy holds.
+
+    Raises:
+        ValueError: it is held to its return in the training simulator.
+    """
+    if conditions.min_return is None and not {"falls", "return"} & cls.holds.keys():
+        raise ValueError(f"{cls.__name__} is held to its return in the training simulator: it cannot be played alone")
 
 
 def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -> Outcome:

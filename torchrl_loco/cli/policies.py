@@ -30,7 +30,7 @@ from torchrl_loco.cli.motions import Motions
 from torchrl_loco.cli.options import Flat, OtherTask
 from torchrl_loco.conditions import DEFAULT, Conditions
 from torchrl_loco.known_files import place_of
-from torchrl_loco.registry import label, task_name
+from torchrl_loco.registry import label, resolve, task_name
 from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_host, check_viewer
 
 CONTAINERS = (".mp4", ".mkv", ".mov")  # suffixes of a video
@@ -399,6 +399,8 @@ def verify(
             exported, beside = which.load(run_task_or_file, "cpu")
             if reason := torchrl_loco.export.why_not(exported):
                 raise ValueError(f"{run_task_or_file} cannot be verified: {reason}")
+            if alone:  # before the export, which takes seconds
+                verification.check_alone(resolve(exported.info["task"]), conditions)
             path, named = Path(folder) / "policy.onnx", None
             with user_errors(RuntimeError):  # of the export alone
                 torchrl_loco.export_policy(exported, path)

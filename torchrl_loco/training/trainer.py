@@ -331,7 +331,7 @@ class Trainer:
         """Evaluates the best policy in episodes that did not select it, plots the learning curve, records a video."""
         config = self.config
         recording = ", and its video is recorded" if config.video_seconds > 0 else ""
-        print(f"all frames are done: the best policy plays {config.eval_episodes} new episodes{recording}", flush=True)
+        print(f"all frames are done: the best policy plays new episodes{recording}", flush=True)
         policy = Policy.load(self.run.policy, config.device)
         summary = self._summary(policy, final=True)
         plot_runs([self.run], self.run.path / "learning_curve.png")
