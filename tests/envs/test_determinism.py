@@ -10,7 +10,7 @@ from for_each import for_each
 
 import torchrl_loco
 from torchrl_loco import State
-from torchrl_loco.sim.compiled import engine as compiled_engine
+from torchrl_loco.sim.compiled import step as compiled_step
 
 
 def rollouts(task, device, protocol, num_envs, steps, **settings):
@@ -100,7 +100,7 @@ def test_the_order_of_the_memory_changes_no_bit(monkeypatch, actions):
     """On CUDA the world is the fastest index of a small body's arrays; here on the CPU too."""
     settings = {"episode_length": 20, "stagger": True}
     rows = torchrl_loco.make("hopper_hop", 5, "cpu", 0, **settings)
-    monkeypatch.setattr(compiled_engine, "structure_of_arrays", lambda model, device: True)
+    monkeypatch.setattr(compiled_step, "structure_of_arrays", lambda model, device: True)
     columns = torchrl_loco.make("hopper_hop", 5, "cpu", 0, **settings)
     assert rows.sim.qpos.is_contiguous()
     assert columns.sim.qpos.stride() == (1, 5)

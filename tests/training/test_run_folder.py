@@ -224,6 +224,12 @@ import own_numbers, torchrl_loco
 class Own(torchrl_loco.LocoEnv):
     model = "robot/own.xml"
     config = torchrl_loco.SimConfig(ctrl_dt=own_numbers.DT, sim_dt=0.005)
+
+    def reward(self, s):
+        return s.time
+
+    def observation(self, s):
+        return s.qpos
 """
 MODEL = """
 <mujoco><compiler meshdir="meshes"/><include file="scene.xml"/><include file="assets.xml"/>
