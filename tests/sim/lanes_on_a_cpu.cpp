@@ -81,7 +81,7 @@ static const struct { unsigned x; } threadIdx = {0};  // of a block with one wor
 
 template <class T> struct Array { T* data; int shape[2]; };
 extern "C" {
-Array<float> ctrl_in, terrain_in, numbers_out, qpos_out, qvel_out, qacc_warmstart_out, time_out, sensordata_out;
+Array<float> ctrl_in, terrain_in, numbers_out, qpos_out, qvel_out, act_out, qacc_warmstart_out, time_out, sensordata_out;
 Array<float[3]> xpos_out, subtree_com_out, contact_force_out;
 Array<float[6]> cvel_out;
 Array<float[9]> xmat_out;
