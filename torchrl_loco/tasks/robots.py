@@ -120,6 +120,14 @@ def either(
     return {name: torch.where(mask.view(-1, *[1] * (row.ndim - 1)), row, old[name]) for name, row in new.items()}
 
 
+def arriving(s: View, action: torch.Tensor, *earlier: torch.Tensor) -> torch.Tensor:
+    """Returns the actions that arrive: of ``s.delay`` control steps ago, where ``earlier`` has the newest first."""
+    delay, arrived = s.delay.unsqueeze(-1), action
+    for steps, before in enumerate(earlier, start=1):
+        arrived = torch.where(delay < steps, arrived, before)
+    return arrived
+
+
 def hard_contacts(s: View, geoms: str) -> torch.Tensor:
     """Returns in how many physics steps one of some geoms had a hard contact, ``(num_envs,)``."""
     hard = s.contact_force([geoms], history=True).norm(dim=-1) > HARD_CONTACT

@@ -14,7 +14,7 @@ from torchrl_loco import motion as motions
 from torchrl_loco.checks import Interval, check_int
 from torchrl_loco.conditions import PUSH_EVERY
 from torchrl_loco.envs.rotations import product
-from torchrl_loco.tasks.robots import Robot, either, hard_contacts, pushed, squares
+from torchrl_loco.tasks.robots import Robot, arriving, either, hard_contacts, pushed, squares
 from torchrl_loco.tasks.velocity import G1Velocity, H1Velocity
 
 if TYPE_CHECKING:
@@ -273,7 +273,7 @@ class Tracking(Robot):
 
     def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
         """Returns the targets of the joints (rad): the home pose and a multiple of the action that arrives."""
-        return super().control(s, torch.where(s.delay.unsqueeze(-1) > 0.0, s.last_action, action))
+        return super().control(s, arriving(s, action, s.last_action))
 
     def reward(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the terms of the reward."""

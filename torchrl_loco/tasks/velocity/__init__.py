@@ -16,7 +16,18 @@ from torchrl_loco.conditions import PUSH, PUSH_EVERY
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
-from torchrl_loco.tasks.robots import Robot, actuated, com, either, hard_contacts, pushed, sliding, soft, squares
+from torchrl_loco.tasks.robots import (
+    Robot,
+    actuated,
+    arriving,
+    com,
+    either,
+    hard_contacts,
+    pushed,
+    sliding,
+    soft,
+    squares,
+)
 from torchrl_loco.tasks.velocity import commands
 
 FOLDER = Path(__file__).parent
@@ -280,10 +291,7 @@ class Velocity(Robot):
 
     def control(self, s: View, action: torch.Tensor) -> torch.Tensor:
         """Returns the targets of the joints (rad): the home pose and a multiple of the action that arrives."""
-        late, arrived = s.delay.unsqueeze(-1), action
-        for steps, earlier in enumerate([s.last_action, *s.earlier_actions.unbind(1)], start=1):
-            arrived = torch.where(late < steps, arrived, earlier)
-        return super().control(s, arrived)
+        return super().control(s, arriving(s, action, s.last_action, *s.earlier_actions.unbind(1)))
 
     def update(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the greatest height of each foot since it left the ground."""
