@@ -6,7 +6,6 @@ constants fold, and an expression that occurs twice is computed once, so that a 
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
@@ -189,8 +188,19 @@ def sqrt(x: Any) -> Scalar:
     return scalar(np.sqrt(x.constant)) if x.constant is not None else call("Math::root", x)
 
 
-minimum, maximum, absolute = (partial(call, f) for f in ("Math::smaller", "Math::larger", "fabsf"))
-"""The smaller or larger of two scalars, and the magnitude of one."""
+def minimum(a: Any, b: Any) -> Scalar:
+    """Returns the smaller of two scalars."""
+    return call("Math::smaller", a, b)
+
+
+def maximum(a: Any, b: Any) -> Scalar:
+    """Returns the larger of two scalars."""
+    return call("Math::larger", a, b)
+
+
+def absolute(x: Any) -> Scalar:
+    """Returns the magnitude."""
+    return call("fabsf", x)
 
 
 def sincos(x: Any) -> tuple[Scalar, Scalar]:
