@@ -288,32 +288,33 @@ def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -
         env.world.memory["delay"].copy_(held)
         behind = behind - held
     late = torch.zeros(most + 1, n, env.mj_model.nu, device=env.device)
-    alive, taken, figures = torch.ones(n, dtype=torch.bool, device=env.device), [], []
+    alive, sums = torch.ones(n, dtype=torch.bool, device=env.device), dict[str, torch.Tensor]()
+    counts = torch.zeros(3, n, dtype=torch.float64, device=env.device)
+    taken, fell, returns = counts  # rows of it
     for t in trange(steps, desc=label, leave=False, disable=None):  # no bar in logs
         if t % hold == 0:
             action = exported.act(td[exported.reads])
         late = torch.cat([action.unsqueeze(0), late[:-1]])
         after = env.step(td.set("action", late.gather(0, behind.view(1, n, 1).expand(1, n, late.shape[2]))[0]))["next"]
-        taken.append(torch.stack([alive, after["terminated"].squeeze(-1), after["reward"].squeeze(-1)]).double())
-        told = {**after.get("reward_terms", {}), **after.get("metrics", {})}
-        figures.append({name: values.squeeze(-1).double() for name, values in told.items()})
+        taken += alive
+        fell += alive & after["terminated"].squeeze(-1)
+        returns += torch.where(alive, after["reward"].squeeze(-1), 0.0)
+        for name, values in {**after.get("reward_terms", {}), **after.get("metrics", {})}.items():
+            value = values.squeeze(-1).double()
+            counted = alive & value.isfinite()
+            sums[name] = sums.get(name, 0.0) + torch.stack([torch.where(counted, value, 0.0), counted])
         alive = alive & ~after["done"].squeeze(-1)
         td = after.exclude("reward")
         if not alive.any():
             break
         if t in pushes:
             env.sim.qvel[:, :6] += torch.from_numpy(pushes[t]).float().to(env.device)  # poses stay
-    counts, fell, rewards = torch.stack(taken, dim=1).cpu().numpy()
-    sums = {}
-    for name in figures[0]:
-        values = torch.stack([step[name] for step in figures]).cpu().numpy()
-        counted = (counts > 0) & np.isfinite(values)
-        sums[name] = np.where(counted, values, 0.0).sum(0), counted.sum(0)
+    steps_taken, falls, earned = counts.cpu().numpy()
     return Outcome(
-        fell=(fell * counts).any(0),
-        steps=counts.sum(0),
-        returns=np.where(counts > 0, rewards, 0.0).sum(0),
-        sums=sums,
+        fell=falls > 0,
+        steps=steps_taken,
+        returns=earned,
+        sums={name: tuple(total.cpu().numpy()) for name, total in sums.items()},
         delay=delay,
         is_fixed=is_fixed,
         steps_of_episode=steps,
