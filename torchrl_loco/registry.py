@@ -253,14 +253,10 @@ def _no_class(module: ModuleType, source: str, name: str) -> str:
     """Returns what is wrong with the name of a class that a module does not have."""
     if source in MAIN or "<locals>" in name:
         return f"{source}:{name} is of another process, of a notebook or a function: move the class into a file"
-    found = {each: getattr(module, each, None) for each in dir(module)}
-    classes = {each: cls for each, cls in found.items() if isinstance(cls, type)}
-    own = module.__name__.partition(".")[0]
-    names = [
-        each
-        for each, cls in classes.items()
-        if issubclass(cls, torchrl_loco.LocoEnv) and cls.__module__.partition(".")[0] == own
-    ]
+    package = module.__name__.partition(".")[0]
+    classes = {each: cls for each in dir(module) if isinstance(cls := getattr(module, each, None), type)}
+    tasks_of = {each: cls for each, cls in classes.items() if issubclass(cls, torchrl_loco.LocoEnv)}
+    names = [each for each, cls in tasks_of.items() if cls.__module__.partition(".")[0] == package]
     what = f"{source} has no class {name!r}{suggestion(name, names)}" if name else f"{source!r} names no class"
     choice = f"choose one of {', '.join(names)}" if names else "it defines no subclass of torchrl_loco.LocoEnv"
     return f"{what}: {choice}"

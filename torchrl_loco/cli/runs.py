@@ -53,11 +53,7 @@ def resume(
     """
     with user_errors():
         check_run(run)
-        folder = training.RunFolder(run)
-        if task is not None:
-            from torchrl_loco.training.start import resumed
-
-            folder = resumed(folder, task)
+        folder = training.RunFolder(run) if task is None else training.start.resumed(run, task)
         training.Given().check(folder)
         asked: dict[str, Any] = {"total_frames": total_frames, "device": device}
         changes = {name: value for name, value in asked.items() if value is not None}

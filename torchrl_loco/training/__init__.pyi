@@ -1,5 +1,6 @@
 from . import distributed as distributed
 from . import environments as environments
+from . import start as start
 from . import watching as watching
 from .actor import Spaces as Spaces
 from .algorithm import Algorithm as Algorithm
