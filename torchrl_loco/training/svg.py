@@ -112,6 +112,9 @@ class SVG(Algorithm):
         self.model = Dynamics(m, sim.ctrl_dt, sim.substeps, config.model_hidden).to(self.device)
         self.networks.add_module("model", self.model)
         self._known = copy.deepcopy(self.model).requires_grad_(False)
+        for layer in self._known.net if config.bf16 and on_cuda else ():
+            if isinstance(layer, nn.Linear):  # as autocast has them, but once a round
+                layer.bfloat16()
         self._model_optimizers = self._optimizers_of("model", self.model.net)
         sizes = {"state": self._imagined.size, "observation": self.spaces.observation}
         self._replay = Replay(config, m, sizes, self.generator)
@@ -164,10 +167,11 @@ class SVG(Algorithm):
         """Fits the model while actor and critic imagine by what it was."""
         with torch.no_grad():
             torch._foreach_copy_(list(self._known.state_dict().values()), list(self.model.state_dict().values()))
+        # The actor is recorded first: at the end of each launch of Warp's, all branches of a recording are joined.
         alone = distributed.ranks() == 1  # several meet in one order
         with self.beside() if alone else contextlib.nullcontext():
-            self.fit()
-        self.improve()
+            self.improve()
+        self.fit()
         if alone:
             self.join()
 
@@ -276,7 +280,7 @@ class SVG(Algorithm):
         if not matrices:
             return [rest]
         self.optimizers[f"{name} matrices"] = Muon(matrices, torch.tensor(self.config.lr, device=self.device))
-        return [rest, self.optimizers[f"{name} matrices"]]
+        return [self.optimizers[f"{name} matrices"], rest]  # Adam, which is Warp's, last
 
     def _descend(self, optimizers: Iterable[Any], loss: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Makes a step of each optimizer, of zeros if a number of the gradient is not finite.
@@ -291,11 +295,12 @@ class SVG(Algorithm):
         groups = [group for optimizer in optimizers for group in optimizer.param_groups]
         slopes = [part.grad for group in groups for part in group["params"] if part.grad is not None]
         norm = torch.stack(torch._foreach_norm(slopes)).norm()
+        is_lost = ~norm.isfinite()
         for slope in slopes:
-            slope.copy_(torch.where(norm.isfinite(), slope, 0.0))
+            slope.masked_fill_(is_lost, 0.0)
         for optimizer in optimizers:
             clip_and_step(optimizer, self.config.max_grad_norm)
-        return norm.nan_to_num(0.0, 0.0, 0.0), ~norm.isfinite()
+        return norm.nan_to_num(0.0, 0.0, 0.0), is_lost
 
     def _add(self, first: str, *values: torch.Tensor) -> None:
         """Adds metrics to their totals, from the one that is named on."""
