@@ -1,6 +1,7 @@
 """Poses and velocities of bodies as functions of positions and velocities of joints, with gradients."""
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -20,10 +21,16 @@ BLOCK = 32  # worlds of a block of threads: few, so that a few thousand worlds k
 
 @wp.struct
 class Links:
-    """A model as a tree of links, each with at most one joint. The last link of a body has the number of the body."""
+    """A model as a tree of links, each with at most one joint. The last link of a body has the number of the body.
 
+    A thread goes along one chain, from the world to a leaf. What lies in several chains is computed in each, so that
+    threads need not wait for each other: it is a link of its own there.
+    """
+
+    first: wp.array[int]
+    """Where each chain begins in ``order``, and where the last one ends."""
     order: wp.array[int]
-    """The links, parents first; the first is the world."""
+    """The links of the chains, one chain after the other, parents first."""
     parent: wp.array[int]
     kind: wp.array[int]
     offset: wp.array[wp.vec3]
@@ -53,16 +60,16 @@ OUTPUTS = {(3,): wp.vec3, (3, 3): wp.mat33}  # types of what is found of a link,
 @wp.kernel(module="unique")
 def place_links(
     links: Links,
-    qpos: wp.array2d[float],
-    qvel: wp.array2d[float],
+    qpos: wp.array3d[float],
+    qvel: wp.array3d[float],
     pos: wp.array2d[wp.vec3],
     mat: wp.array2d[wp.mat33],
     lin: wp.array2d[wp.vec3],
     ang: wp.array2d[wp.vec3],
 ):
-    w = wp.tid()
+    c, w = wp.tid()
     mat[w, 0] = wp.identity(n=3, dtype=float)
-    for i in range(1, links.order.shape[0]):
+    for i in range(links.first[c], links.first[c + 1]):
         k = links.order[i]
         p = links.parent[k]
         kind = links.kind[k]
@@ -70,12 +77,12 @@ def place_links(
         v = links.v[k]
         if kind == FREE:
             free = wp.quat_to_matrix(
-                wp.normalize(wp.quat(qpos[w, q + 4], qpos[w, q + 5], qpos[w, q + 6], qpos[w, q + 3]))
+                wp.normalize(wp.quat(qpos[w, c, q + 4], qpos[w, c, q + 5], qpos[w, c, q + 6], qpos[w, c, q + 3]))
             )
-            pos[w, k] = wp.vec3(qpos[w, q], qpos[w, q + 1], qpos[w, q + 2])
+            pos[w, k] = wp.vec3(qpos[w, c, q], qpos[w, c, q + 1], qpos[w, c, q + 2])
             mat[w, k] = free
-            lin[w, k] = wp.vec3(qvel[w, v], qvel[w, v + 1], qvel[w, v + 2])
-            ang[w, k] = free * wp.vec3(qvel[w, v + 3], qvel[w, v + 4], qvel[w, v + 5])
+            lin[w, k] = wp.vec3(qvel[w, c, v], qvel[w, c, v + 1], qvel[w, c, v + 2])
+            ang[w, k] = free * wp.vec3(qvel[w, c, v + 3], qvel[w, c, v + 4], qvel[w, c, v + 5])
         else:
             start = pos[w, p] + mat[w, p] * links.offset[k]
             rest = mat[w, p] * links.turn[k]
@@ -87,22 +94,24 @@ def place_links(
                 ang[w, k] = ang[w, p]
             elif kind == SLIDE:
                 along = rest * links.axis[k]
-                moved = (qpos[w, q] - links.rest[k]) * along
+                moved = (qpos[w, c, q] - links.rest[k]) * along
                 pos[w, k] = start + moved
                 mat[w, k] = rest
-                lin[w, k] = carried + wp.cross(ang[w, p], moved) + qvel[w, v] * along
+                lin[w, k] = carried + wp.cross(ang[w, p], moved) + qvel[w, c, v] * along
                 ang[w, k] = ang[w, p]
             else:
                 frame = wp.identity(n=3, dtype=float)
                 spin = wp.vec3()
                 if kind == HINGE:
-                    frame = rest * wp.quat_to_matrix(wp.quat_from_axis_angle(links.axis[k], qpos[w, q] - links.rest[k]))
-                    spin = qvel[w, v] * (rest * links.axis[k])
+                    frame = rest * wp.quat_to_matrix(
+                        wp.quat_from_axis_angle(links.axis[k], qpos[w, c, q] - links.rest[k])
+                    )
+                    spin = qvel[w, c, v] * (rest * links.axis[k])
                 else:  # a ball
                     frame = rest * wp.quat_to_matrix(
-                        wp.normalize(wp.quat(qpos[w, q + 1], qpos[w, q + 2], qpos[w, q + 3], qpos[w, q]))
+                        wp.normalize(wp.quat(qpos[w, c, q + 1], qpos[w, c, q + 2], qpos[w, c, q + 3], qpos[w, c, q]))
                     )
-                    spin = frame * wp.vec3(qvel[w, v], qvel[w, v + 1], qvel[w, v + 2])
+                    spin = frame * wp.vec3(qvel[w, c, v], qvel[w, c, v + 1], qvel[w, c, v + 2])
                 lever = frame * links.anchor[k]
                 swung = rest * links.anchor[k] - lever
                 pos[w, k] = start + swung
@@ -111,9 +120,9 @@ def place_links(
                 ang[w, k] = ang[w, p] + spin
 
 
-def links_of(m: mujoco.MjModel) -> Iterator[tuple[int, int, dict[str, Any]]]:
-    """Yields the links of a model, parents first: their number, their body, and what :data:`COLUMNS` names."""
-    further = m.nbody
+def links_of(m: mujoco.MjModel) -> dict[int, dict[str, Any]]:
+    """Returns what :data:`COLUMNS` names of the links of a model by their numbers, parents first."""
+    rows, further = dict[int, dict[str, Any]](), int(m.nbody)
     for body in range(m.nbody):
         first, count, parent = int(m.body_jntadr[body]), int(m.body_jntnum[body]), int(m.body_parentid[body])
         for at in range(max(count, 1)):
@@ -129,9 +138,25 @@ def links_of(m: mujoco.MjModel) -> Iterator[tuple[int, int, dict[str, Any]]]:
                 row |= {"kind": int(m.jnt_type[joint]), "anchor": m.jnt_pos[joint], "axis": m.jnt_axis[joint]}
                 row |= {"q": q, "v": int(m.jnt_dofadr[joint]), "rest": float(m.qpos0[q])}
             is_last = at + 1 >= count
-            link, further = (body, further) if is_last else (further, further + 1)
-            yield link, body, row
-            parent = link
+            parent, further = (body, further) if is_last else (further, further + 1)
+            rows[parent] = row
+    return rows
+
+
+def chains_of(rows: dict[int, dict[str, Any]]) -> list[list[int]]:
+    """Returns the links from the world to each leaf, and adds to ``rows`` those that an earlier chain has as well."""
+    chains, taken = list[list[int]](), {0}
+    for leaf in sorted(rows.keys() - {row["parent"] for row in rows.values()}):
+        chain, link = list[int](), leaf
+        while link:
+            chain.insert(0, link)
+            link = rows[link]["parent"]
+        for i, link in enumerate(chain):
+            chain[i] = len(rows) if link in taken else link
+            rows[chain[i]] = {**rows[link], "parent": chain[i - 1] if i else 0}
+        taken.update(chain)
+        chains.append(chain)
+    return chains
 
 
 class Kinematics:
@@ -144,12 +169,14 @@ class Kinematics:
 
     def __init__(self, m: mujoco.MjModel, device: torch.device) -> None:
         init_warp()
-        self._device, self._bodies = wp.device_from_torch(device), int(m.nbody)
-        links = list(links_of(m))
-        rows = {link: row for link, _, row in links}
-        self.count = len(rows)
+        self._device, self.bodies = wp.device_from_torch(device), int(m.nbody)
+        rows = links_of(m)
+        chains = chains_of(rows)
+        self.count, self.chains = len(rows), len(chains)  # of links, and of chains
         self._links = Links()
-        self._links.order = wp.array([link for link, _, _ in links], dtype=int, device=self._device)
+        ends = np.cumsum([0, *map(len, chains)])
+        self._links.first = wp.array(ends, dtype=int, device=self._device)
+        self._links.order = wp.array(sum(chains, []), dtype=int, device=self._device)
         for name, kind in COLUMNS.items():
             values = np.array([rows[link][name] for link in range(self.count)])
             setattr(self._links, name, wp.array(values, dtype=kind, device=self._device))
@@ -160,8 +187,7 @@ class Kinematics:
 
         All are those of the bodies' origins, in the world's frame.
         """
-        placed = _Placed.apply(self, qpos, qvel)
-        return placed if self.count == self._bodies else tuple(each[:, : self._bodies] for each in placed)
+        return _Placed.apply(self, qpos, qvel)
 
     def named(self, bodies: Sequence[torch.Tensor]) -> dict[str, torch.Tensor]:
         """Returns these by MuJoCo's names: ``xpos``, ``xmat``, ``cvel`` and ``subtree_com``.
@@ -176,7 +202,7 @@ class Kinematics:
         """Launches the kernel on torch's current stream; with ``slopes``, its adjoint, which adds to them.
 
         Args:
-            tensors: qpos, qvel, and what is found of the links.
+            tensors: qpos and qvel, for each chain, ``(worlds, chains, ...)``, and what is found of the links.
             slopes: the gradients with regard to them.
         """
         device = self._device
@@ -187,29 +213,36 @@ class Kinematics:
         recording = torch_is_recording(device)
         with EXCLUSIVE, joined_to_torch(device) if recording else wp.ScopedStream(current_stream(device), False):
             settings = {"device": device, "block_dim": BLOCK, **adjoint}
-            wp.launch(place_links, len(tensors[0]), [self._links, *arrays[:2]], arrays[2:], **settings)
+            wp.launch(place_links, (self.chains, len(tensors[0])), [self._links, *arrays[:2]], arrays[2:], **settings)
 
 
 def _as_warp(tensor: torch.Tensor) -> wp.array:
     return wp.from_torch(tensor.detach(), dtype=OUTPUTS.get(tuple(tensor.shape[2:]), wp.float32))
 
 
+def _zeros(like: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Tensor]:
+    """Returns tensors of zeros, which one kernel fills."""
+    sizes = [math.prod(shape) for shape in shapes]
+    return [part.view(shape) for part, shape in zip(like.new_zeros(sum(sizes)).split(sizes), shapes, strict=True)]
+
+
 class _Placed(torch.autograd.Function):
-    """What is found of the links of all worlds, from positions ``(worlds, nq)`` and velocities ``(worlds, nv)``."""
+    """What is found of all bodies, from positions ``(worlds, nq)`` and velocities ``(worlds, nv)``."""
 
     @staticmethod
     def forward(ctx: Any, of: Kinematics, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        inputs = qpos.contiguous(), qvel.contiguous()
-        placed = tuple(qpos.new_zeros(len(qpos), of.count, *shape) for shape in ((3,), (3, 3), (3,), (3,)))
+        inputs = [each.contiguous().unsqueeze(1).expand(-1, of.chains, -1) for each in (qpos, qvel)]
+        placed = _zeros(qpos, *((len(qpos), of.count, *shape) for shape in ((3,), (3, 3), (3,), (3,))))
         of.launch([*inputs, *placed])
         ctx.save_for_backward(*inputs, *placed)
         ctx.of = of
-        return placed
+        return tuple(each[:, : of.bodies] for each in placed)
 
     @staticmethod
     def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         tensors = ctx.saved_tensors
-        found = [torch.zeros_like(each) for each in tensors[:2]]
-        own = [slope.clone(memory_format=torch.contiguous_format) for slope in slopes]  # the adjoint writes to them
-        ctx.of.launch(tensors, [*found, *own])
-        return None, *found
+        of_qpos, of_qvel, *own = found = _zeros(tensors[0], *(tuple(each.shape) for each in tensors))
+        for mine, slope in zip(own, slopes, strict=True):  # the adjoint writes to them
+            mine[:, : ctx.of.bodies] = slope
+        ctx.of.launch(tensors, found)
+        return None, of_qpos.sum(1), of_qvel.sum(1)
