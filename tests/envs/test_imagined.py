@@ -178,9 +178,10 @@ def test_a_task_says_of_predicted_states_what_it_says_in_its_worlds(task):
         if task == "g1_velocity":
             td = after.select("observation", "privileged", STATE)
             continue
-        of_contacts = after["reward_terms"].get("self_collision", torch.zeros(4, 1))
-        torch.testing.assert_close(said.reward, (after["reward"] - of_contacts)[:, 0], rtol=1e-4, atol=1e-5)
-        for group, rows in said.observations.items():
+        of_contacts, earned = after["reward_terms"].get("self_collision", torch.zeros(4, 1)), imagined.earned([said])
+        torch.testing.assert_close(earned.reward[0], (after["reward"] - of_contacts)[:, 0], rtol=1e-4, atol=1e-5)
+        seen = {"observation": said.observation, "privileged": earned.observations["privileged"][0]}
+        for group, rows in seen.items():
             torch.testing.assert_close(rows, after[group], rtol=1e-5, atol=1e-5)
         there, back = (imagined.unpacked(each[STATE][:, : imagined.size]) for each in (after, td))
         for row, expected, start in zip(said.rest, there[2], back[2], strict=True):
@@ -193,37 +194,50 @@ def test_a_task_says_of_predicted_states_what_it_says_in_its_worlds(task):
         start = torch.zeros(4, imagined.size)
         gone = imagined.judge(said.qpos * float("nan"), said.qvel, torch.zeros(4, 1), said.rest, start, said.over)
         assert gone.over.all()
-        assert not gone.reward.any()
-        assert not gone.observations["observation"].any()
+        assert not imagined.earned([gone]).reward.any()
+        assert not gone.observation.any()
         assert not gone.qpos.any()
 
 
-def beside_g1():
+def beside_g1(steps=1):
     env = loco.make(showing_states(resolve("g1_tracking")), num_envs=2, **PLAIN)
     state = env.reset()[STATE]
-    imagined = Imagined(env, 2)
+    imagined = Imagined(env, 2, steps)
     qpos, qvel, rest = imagined.unpacked(state[:, : imagined.size])
     over, action = torch.zeros(2, dtype=torch.bool), torch.zeros(2, env.mj_model.nu)
-    return qvel, lambda qvel: imagined.judge(qpos, qvel, action, rest, state[:, : imagined.size], over)
+    return (
+        imagined,
+        qvel,
+        lambda qvel: imagined.judge(qpos, qvel, action, rest, state[:, : imagined.size], over),
+    )
 
 
 def test_noise_is_drawn_anew():
-    qvel, judge = beside_g1()
-    first, second = (judge(qvel).observations for _ in range(2))
-    assert (first["privileged"] == second["privileged"]).all()
-    apart = (first["observation"] - second["observation"]).abs()
+    imagined, qvel, judge = beside_g1()
+    first, second = (judge(qvel) for _ in range(2))
+    of_critic = [imagined.earned([said]).observations["privileged"] for said in (first, second)]
+    assert (of_critic[0] == of_critic[1]).all()
+    apart = (first.observation - second.observation).abs()
     assert 0.8 < apart.max() <= 1.0  # rates have noise of up to 0.5, either way
     assert (apart[:, :58] == 0.0).all()  # the reference has none
 
 
-def test_rewards_have_gradients():
-    qvel, judge = beside_g1()
+def test_rewards_of_steps_in_a_row_have_gradients():
+    imagined, qvel, judge = beside_g1(steps=2)
     direction = torch.randn_like(qvel)
-    judge(qvel.requires_grad_()).reward.sum().backward()
-    slope = (qvel.grad * direction).sum(-1)
+
+    def earned(by):
+        return imagined.earned([judge(qvel + by * direction), judge(qvel - 2.0 * by * direction)]).reward
+
+    by = torch.zeros(2, 1, requires_grad=True)
+    rewards = earned(by)
+    torch.testing.assert_close(rewards[0], rewards[1])
+    slopes = [torch.autograd.grad(reward.sum(), by, retain_graph=True)[0] for reward in rewards]
     with torch.no_grad():
-        ahead, behind = (judge(qvel + by * direction).reward for by in (1e-2, -1e-2))
-    torch.testing.assert_close(slope, (ahead - behind) / 2e-2, rtol=2e-2, atol=2e-4)
+        ahead, behind = earned(torch.tensor(1e-2)), earned(torch.tensor(-1e-2))
+    expected = (ahead - behind) / 2e-2
+    torch.testing.assert_close(torch.stack(slopes).squeeze(-1), expected, rtol=2e-2, atol=2e-4)
+    assert (expected[0] - expected[1]).abs().min() > 1e-3
 
 
 class LeavesTorch(Rich):

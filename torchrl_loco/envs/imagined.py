@@ -22,6 +22,7 @@ FOUND = "found_by_events"
 """Entry of memory with positions and velocities as physics made them, before events changed them, and its controls."""
 UNKNOWN = ("contact_force", "in_contact", "sensordata")  # arrays of which a predicted state does not tell
 INSTEAD = "train it with ppo or reppo"
+OBSERVATION = "observation"  # the group that actors read
 
 
 def showing_states(cls: type[LocoEnv]) -> type[LocoEnv]:
@@ -76,19 +77,40 @@ def of_floats(rows: torch.Tensor, entry: Entry) -> torch.Tensor:
 
 
 class Judgement(NamedTuple):
-    """What a task says of a step, and what goes on after it, ``(worlds, ...)`` each."""
+    """How a step ends, and what goes on after it, ``(worlds, ...)`` each."""
 
-    reward: torch.Tensor
     terminated: torch.Tensor
     truncated: torch.Tensor
     over: torch.Tensor
     """Whether an episode has ended, in this step or before: its world is where it started."""
-    observations: dict[str, torch.Tensor]
-    """By group, also of the step that ends an episode; zeros in worlds that were over before."""
+    observation: torch.Tensor
+    """What the actor reads, also in a step that ends an episode; zeros in worlds that were over before."""
     qpos: torch.Tensor
     qvel: torch.Tensor
     rest: list[torch.Tensor]
     """What else hooks depend on."""
+    inputs: list[torch.Tensor]
+    """What hooks were called on, behind whether that is worth nothing."""
+
+
+class Called(NamedTuple):
+    """What hooks return in a step."""
+
+    reward: torch.Tensor
+    terminated: torch.Tensor
+    truncated: torch.Tensor
+    groups: dict[str, torch.Tensor]
+    rest: list[torch.Tensor]
+
+
+class Earned(NamedTuple):
+    """What steps have earned, ``(steps, worlds, ...)`` each; it does not count in worlds that were over before."""
+
+    reward: torch.Tensor
+    terminated: torch.Tensor
+    """Also by a number that is not finite."""
+    observations: dict[str, torch.Tensor]
+    """The other groups, as those that critics read."""
 
 
 class Imagined:
@@ -100,6 +122,7 @@ class Imagined:
     Args:
         env: an environment of a task that shows its states.
         worlds: how many states are judged at once.
+        steps: after how many steps it is asked what they have earned.
         compiled: makes something faster of a module of tensors; ``None`` leaves it as it is.
 
     Attributes:
@@ -110,7 +133,7 @@ class Imagined:
         ValueError: the hooks depend on what is not predicted.
     """
 
-    def __init__(self, env: LocoEnv, worlds: int, compiled: Callable[[Any], Any] | None = None) -> None:
+    def __init__(self, env: LocoEnv, worlds: int, steps: int = 1, compiled: Callable[[Any], Any] | None = None) -> None:
         self._title, asked, m = type(env).__name__, env.hooks.catalog, env.mj_model
         for is_so, what in (
             (bool(asked.scans), "it scans the ground, depths or rays"),
@@ -122,20 +145,9 @@ class Imagined:
         self._hooks = copy.copy(env.hooks)
         self._hooks.catalog = catalog = copy.copy(asked)
         self._hooks.view = WithUnits
-        catalog.num_envs = worlds
+        self._steps, self._substeps, self._shared = steps, env.config.substeps, dict(env.world.shared)
         self.kinematics = Kinematics(m, env.device)
         self.unknown = [name for name in UNKNOWN if name in asked.arrays or f"{name}_history" in asked.arrays]
-        kept: dict[str, Any] = {"device": env.device}
-        none, columns, substeps = torch.zeros(worlds, **kept) > 0, len(asked.contact_geoms), env.config.substeps
-        self._fixed: dict[str, torch.Tensor] = {
-            **{"mask": ~none, "ended": none, "overflow": torch.zeros(worlds, dtype=torch.int32, **kept)},
-            "sensordata": torch.zeros(worlds, m.nsensordata, **kept),
-            "contact_force": torch.zeros(worlds, columns, 3, **kept),
-            "contact_force_history": torch.zeros(worlds, substeps, columns, 3, **kept),
-            "in_contact": torch.zeros(worlds, columns, **kept),
-            "in_contact_history": torch.zeros(worlds, substeps, columns, **kept),
-            **{f"shared.{name}": values for name, values in env.world.shared.items()},
-        }
         numbers = {} if env.variation is None else {"numbers": Entry((env.variation.count,), torch.float32)}
         clock = {name: Entry((), torch.float32) for name in ("elapsed_steps", "world")}
         memory = {f"memory.{name}": entry for name, entry in catalog.memory.items() if name != FOUND}
@@ -144,7 +156,8 @@ class Imagined:
         widths = [math.prod(entry.shape) * n for entry, n in zip(self._rest.values(), halves, strict=True)]
         self._sizes = [int(m.nq), int(m.nv), *widths]
         self.size = sum(self._sizes)
-        self._groups = [name for name in self._hooks.groups if name != STATE]
+        self._groups = [name for name in self._hooks.groups if name not in (STATE, OBSERVATION)]
+        kept: dict[str, Any] = {"device": env.device}
         self._trace(torch.zeros(worlds, self.size, **kept), torch.zeros(worlds, int(m.nu), **kept), compiled)
 
     def _refuse(self, why: str) -> NoReturn:
@@ -171,7 +184,7 @@ class Imagined:
         start: torch.Tensor,
         over: torch.Tensor,
     ) -> Judgement:
-        """Returns what the task says of a step that has led to states.
+        """Returns how a step that has led to states ends, and what the actor sees there.
 
         A world in which a number is not finite terminates, without a reward, as a simulated one does.
 
@@ -183,11 +196,20 @@ class Imagined:
             start: states, ``(worlds, size)``, to which worlds go back that are over: nothing runs away there.
             over: which were before, bool ``(worlds,)``.
         """
-        units, count = torch.rand_like(self._units), len(self._groups)
-        found = self._say(qpos, qvel, *self.kinematics(qpos, qvel), action, units, start, over, *rest)
-        reward, terminated, truncated, over, qpos, qvel = found[:6]
-        observations = dict(zip(self._groups, found[6:], strict=False))
-        return Judgement(reward, terminated, truncated, over, observations, qpos, qvel, list(found[6 + count :]))
+        units = torch.rand_like(self._units)
+        inputs = [qpos, qvel, *self.kinematics(qpos, qvel), action, units, *rest]
+        ended, cut, over, gone, observation, qpos, qvel, *after = self._say(over, start, *inputs)
+        return Judgement(ended, cut, over, observation, qpos, qvel, after, [gone, *inputs])
+
+    def earned(self, judged: Sequence[Judgement]) -> Earned:
+        """Returns what steps in a row have earned: in one call, since nothing that comes later depends on it."""
+        by_input = zip(self._is_used, *(each.inputs for each in judged), strict=True)
+        reward, wrong, *groups = (
+            rows.unflatten(0, (len(judged), -1))
+            for rows in self._earn(*(torch.cat(rows) if used else rows[0] for used, *rows in by_input))
+        )
+        terminated = torch.stack([each.terminated for each in judged]) | wrong
+        return Earned(reward, terminated, dict(zip(self._groups, groups, strict=True)))
 
     def _trace(self, states: torch.Tensor, action: torch.Tensor, compiled: Callable[[Any], Any] | None) -> None:
         """Makes modules of the hooks, of states like those in the home pose."""
@@ -204,12 +226,16 @@ class Imagined:
         self._control = self._checked(self._controlled, (qpos, qvel, action, *rest))
         self._units = qpos.new_zeros(len(qpos), 0)
         none = torch.zeros_like(qpos[:, 0], dtype=torch.bool)
-        inputs = [qpos, qvel, *self.kinematics(qpos, qvel), action, self._units, start, none, *rest]
+        inputs = [qpos, qvel, *self.kinematics(qpos, qvel), action, self._units, *rest]
         with torch.no_grad():
             self._called(*inputs)  # which counts random numbers
         self._units = inputs[7] = qpos.new_zeros(len(qpos), WithUnits.drawn)
-        module = self._checked(self._called, inputs)
-        self._say = module if compiled is None else compiled(module)
+        say = self._checked(self._going_on, [none, start, *inputs])
+        earn = self._checked(
+            self._worth, [each.repeat(self._steps, *[1] * (each.ndim - 1)) for each in (none, *inputs)]
+        )
+        self._is_used = [bool(node.users) for node in earn.graph.find_nodes(op="placeholder")]
+        self._say, self._earn = (say, earn) if compiled is None else (compiled(say), compiled(earn))
 
     def _checked(self, function: Callable[..., Sequence[torch.Tensor]], inputs: Sequence[torch.Tensor]) -> Any:
         """Returns what :func:`traced` makes of a function, if it does the same with other numbers."""
@@ -238,20 +264,22 @@ class Imagined:
 
     def _arrays(self, qpos: torch.Tensor, qvel: torch.Tensor, rest: Sequence[torch.Tensor]) -> dict[str, torch.Tensor]:
         """Returns the arrays that hooks read of states and what is the same for all."""
-        WithUnits.drawn = 0
-        a = {
-            **self._fixed,
-            "units": qpos.new_zeros(len(qpos), 0),
-            "qpos": qpos,
-            "qvel": qvel,
-            **dict(zip(self._rest, rest, strict=True)),
-        }
-        found = torch.zeros(len(qpos), *self._hooks.catalog.memory[FOUND].shape, device=qpos.device)
-        return a | {name: a[name].long() for name in ("elapsed_steps", "world")} | {f"memory.{FOUND}": found}
+        catalog, n, WithUnits.drawn = self._hooks.catalog, len(qpos), 0
+        catalog.num_envs = n
+        of_contacts = {"contact_force": (len(catalog.contact_geoms), 3), "in_contact": (len(catalog.contact_geoms),)}
+        zeros = {name: qpos.new_zeros(n, *shape) for name, shape in of_contacts.items()}
+        zeros |= {f"{name}_history": qpos.new_zeros(n, self._substeps, *shape) for name, shape in of_contacts.items()}
+        zeros |= {"sensordata": qpos.new_zeros(n, catalog.mj_model.nsensordata), "units": qpos.new_zeros(n, 0)}
+        zeros[f"memory.{FOUND}"] = qpos.new_zeros(n, *catalog.memory[FOUND].shape)
+        none = torch.zeros_like(qpos[:, 0], dtype=torch.bool)
+        flags = {"mask": ~none, "ended": none, "overflow": none.int()}
+        shared = {f"shared.{name}": values for name, values in self._shared.items()}
+        a = {**zeros, **flags, **shared, "qpos": qpos, "qvel": qvel, **dict(zip(self._rest, rest, strict=True))}
+        return a | {name: a[name].long() for name in ("elapsed_steps", "world")}
 
-    def _called(self, qpos: torch.Tensor, qvel: torch.Tensor, *others: torch.Tensor) -> list[torch.Tensor]:
-        """Returns the parts of a judgement, in their order: hooks are called as in a control step."""
-        hooks, bodies, (action, units, start, over, *rest) = self._hooks, others[:4], others[4:]
+    def _called(self, qpos: torch.Tensor, qvel: torch.Tensor, *others: torch.Tensor) -> Called:
+        """Calls the hooks as in a control step."""
+        hooks, bodies, (action, units, *rest) = self._hooks, others[:4], others[4:]
         a = {**self._arrays(qpos, qvel, rest), **self.kinematics.named(bodies), "action": action, "units": units}
         if "ctrl" in hooks.catalog.arrays:
             a["ctrl"] = self._controlled(qpos, qvel, action, *rest)[0]
@@ -267,18 +295,31 @@ class Imagined:
         ended, cut = (hooks._call(hook, a, steps=1) if hook in hooks.own else a["ended"] for hook in ENDS)
         a["ended"] = ended
         remember(hooks._rows("events", a, {**hooks.catalog.memory, **hooks._pose}))
-        groups = hooks._groups(a, steps=1)
-        seen = [groups[name] for name in self._groups]
-        wrong = beyond(reward, qpos, qvel, *seen)
-        seen = [row.masked_fill(by_world(over | wrong, row), 0.0) for row in seen]
-        ended = ended | wrong
+        after = [rest[0] + 1.0, *(a[name] for name in self._rest if name != "elapsed_steps")]
+        return Called(reward, ended, cut, hooks._groups(a, steps=1), after)
+
+    def _going_on(
+        self, over: torch.Tensor, start: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor, *others: torch.Tensor
+    ) -> list[torch.Tensor]:
+        """Returns the parts of a judgement, and whether it says nothing of a world."""
+        _, ended, cut, groups, rest = self._called(qpos, qvel, *others)
+        wrong = beyond(qpos, qvel, seen := groups[OBSERVATION])
+        gone, ended = over | wrong, ended | wrong
         over = over | ended | cut
-        after = [qpos, qvel, rest[0] + 1.0, *(a[name] for name in self._rest if name != "elapsed_steps")]
         first, fast, then = self.unpacked(start)
         after = [
-            torch.where(by_world(over, new), old, new) for old, new in zip([first, fast, *then], after, strict=True)
+            torch.where(by_world(over, new), old, new)
+            for old, new in zip([first, fast, *then], [qpos, qvel, *rest], strict=True)
         ]
-        return [reward.masked_fill(wrong, 0.0), ended, cut, over, *after[:2], *seen, *after[2:]]
+        return [ended, cut, over, gone, seen.masked_fill(by_world(gone, seen), 0.0), *after]
+
+    def _worth(self, gone: torch.Tensor, *inputs: torch.Tensor) -> list[torch.Tensor]:
+        """Returns the reward, in which worlds a number is not finite, and what others than the actor see."""
+        reward, *_, groups, _ = self._called(*inputs)
+        seen = [groups[name] for name in self._groups]
+        wrong = beyond(reward, *seen)
+        rows = [row.masked_fill(by_world(gone | wrong, row), 0.0) for row in (reward, *seen)]
+        return [rows[0], wrong, *rows[1:]]
 
 
 class WithUnits(View):

@@ -176,7 +176,7 @@ class Kinematics:
         self._links = Links()
         ends = np.cumsum([0, *map(len, chains)])
         self._links.first = wp.array(ends, dtype=int, device=self._device)
-        self._links.order = wp.array(sum(chains, []), dtype=int, device=self._device)
+        self._links.order = wp.array([link for chain in chains for link in chain], dtype=int, device=self._device)
         for name, kind in COLUMNS.items():
             values = np.array([rows[link][name] for link in range(self.count)])
             setattr(self._links, name, wp.array(values, dtype=kind, device=self._device))

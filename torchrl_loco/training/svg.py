@@ -100,10 +100,10 @@ class SVG(Algorithm):
                     return function(*args)
 
             chosen = in_bf16 if config.bf16 and what else function  # hooks are none of networks
-            settings = {"options": {"force_shape_pad": True}}
+            settings = {"options": {"force_shape_pad": True, "combo_kernels": True}}
             return compiled(chosen, what or "a hook", **settings) if config.compile and on_cuda else chosen
 
-        self._imagined = Imagined(env, config.minibatch_size, fused)
+        self._imagined = Imagined(env, config.minibatch_size, config.horizon, fused)
         if (unknown := self._imagined.unknown) and distributed.is_first():
             logging.getLogger("torchrl_loco").warning(
                 "svg imagines neither contacts nor sensors of forces: hooks read zeros there for %s", ", ".join(unknown)
@@ -243,15 +243,18 @@ class SVG(Algorithm):
         observation = observation.clone()
         for start in (qpos, qvel, observation, *rest):
             start.requires_grad_(start.is_floating_point())  # as in later steps, so that one kernel does
-        steps, over = [], torch.zeros_like(rows[:, 0], dtype=torch.bool)
+        judged, over = [], torch.zeros_like(rows[:, 0], dtype=torch.bool)
         for noise in torch.randn(config.horizon, len(rows), self.spaces.action, device=self.device):
             action, qpos, qvel = self._dream(observation, qpos, qvel, noise, *rest)
             said = imagined.judge(qpos, qvel, action, rest, rows, over)
-            qpos, qvel, rest, over = said.qpos, said.qvel, said.rest, said.over
-            observation = said.observations["observation"]
-            of_critic = said.observations[self.spaces.critic_key]
-            steps.append((config.reward_scale * said.reward, said.terminated, said.truncated, of_critic))
-        return tuple(map(torch.stack, zip(*steps, strict=True)))
+            qpos, qvel, rest, over, observation = said.qpos, said.qvel, said.rest, said.over, said.observation
+            judged.append(said)
+        earned, cut = imagined.earned(judged), torch.stack([said.truncated for said in judged])
+        if self.spaces.critic_key in earned.observations:
+            seen = earned.observations[self.spaces.critic_key]
+        else:
+            seen = torch.stack([said.observation for said in judged])
+        return config.reward_scale * earned.reward, earned.terminated, cut, seen
 
     def _dreamt(
         self,
