@@ -1,6 +1,5 @@
 """Poses and velocities of bodies as functions of positions and velocities of joints, with gradients."""
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from torchrl_loco.sim.graph import EXCLUSIVE, current_stream, joined_to_torch, torch_is_recording
+from torchrl_loco.sim.graph import EXCLUSIVE, current_stream
 from torchrl_loco.sim.warp_init import init_warp
 
 FREE, SLIDE, HINGE = (
@@ -54,7 +53,8 @@ COLUMNS: dict[str, Any] = {
     "rest": float,  # its position at rest
 }
 """What is known of a link, and its type."""
-OUTPUTS = {(3,): wp.vec3, (3, 3): wp.mat33}  # types of what is found of a link, by shape
+SHAPES = (3,), (3, 3), (3,), (3,)  # of what is found of a link: place, orientation, velocities
+OUTPUTS = {(3,): wp.vec3, (3, 3): wp.mat33}  # their types, by shape
 
 
 @wp.kernel(module="unique")
@@ -66,58 +66,81 @@ def place_links(
     mat: wp.array2d[wp.mat33],
     lin: wp.array2d[wp.vec3],
     ang: wp.array2d[wp.vec3],
+    body_pos: wp.array2d[wp.vec3],
+    body_mat: wp.array2d[wp.mat33],
+    body_lin: wp.array2d[wp.vec3],
+    body_ang: wp.array2d[wp.vec3],
 ):
+    """Places links, as a chain goes on from them ``(links, worlds)``, and bodies ``(worlds, bodies)``.
+
+    Threads of neighbouring worlds read and write neighbouring numbers of a link.
+    """
     c, w = wp.tid()
-    mat[w, 0] = wp.identity(n=3, dtype=float)
+    pos[0, w] = wp.vec3()
+    mat[0, w] = wp.identity(n=3, dtype=float)
+    lin[0, w] = wp.vec3()
+    ang[0, w] = wp.vec3()
+    body_pos[w, 0] = wp.vec3()
+    body_mat[w, 0] = wp.identity(n=3, dtype=float)
+    body_lin[w, 0] = wp.vec3()
+    body_ang[w, 0] = wp.vec3()
     for i in range(links.first[c], links.first[c + 1]):
         k = links.order[i]
         p = links.parent[k]
         kind = links.kind[k]
         q = links.q[k]
         v = links.v[k]
+        place = wp.vec3()
+        frame = wp.identity(n=3, dtype=float)
+        speed = wp.vec3()
+        spin = wp.vec3()
         if kind == FREE:
-            free = wp.quat_to_matrix(
+            frame = wp.quat_to_matrix(
                 wp.normalize(wp.quat(qpos[w, c, q + 4], qpos[w, c, q + 5], qpos[w, c, q + 6], qpos[w, c, q + 3]))
             )
-            pos[w, k] = wp.vec3(qpos[w, c, q], qpos[w, c, q + 1], qpos[w, c, q + 2])
-            mat[w, k] = free
-            lin[w, k] = wp.vec3(qvel[w, c, v], qvel[w, c, v + 1], qvel[w, c, v + 2])
-            ang[w, k] = free * wp.vec3(qvel[w, c, v + 3], qvel[w, c, v + 4], qvel[w, c, v + 5])
+            place = wp.vec3(qpos[w, c, q], qpos[w, c, q + 1], qpos[w, c, q + 2])
+            speed = wp.vec3(qvel[w, c, v], qvel[w, c, v + 1], qvel[w, c, v + 2])
+            spin = frame * wp.vec3(qvel[w, c, v + 3], qvel[w, c, v + 4], qvel[w, c, v + 5])
         else:
-            start = pos[w, p] + mat[w, p] * links.offset[k]
-            rest = mat[w, p] * links.turn[k]
-            carried = lin[w, p] + wp.cross(ang[w, p], start - pos[w, p])
-            if kind == FIXED:
-                pos[w, k] = start
-                mat[w, k] = rest
-                lin[w, k] = carried
-                ang[w, k] = ang[w, p]
-            elif kind == SLIDE:
+            of_parent = mat[p, w]
+            turning = ang[p, w]
+            offset = of_parent * links.offset[k]
+            rest = of_parent * links.turn[k]
+            place = pos[p, w] + offset
+            frame = rest
+            speed = lin[p, w] + wp.cross(turning, offset)
+            spin = turning
+            if kind == SLIDE:
                 along = rest * links.axis[k]
                 moved = (qpos[w, c, q] - links.rest[k]) * along
-                pos[w, k] = start + moved
-                mat[w, k] = rest
-                lin[w, k] = carried + wp.cross(ang[w, p], moved) + qvel[w, c, v] * along
-                ang[w, k] = ang[w, p]
-            else:
-                frame = wp.identity(n=3, dtype=float)
-                spin = wp.vec3()
+                place = place + moved
+                speed = speed + wp.cross(turning, moved) + qvel[w, c, v] * along
+            elif kind != FIXED:
+                own = wp.vec3()
                 if kind == HINGE:
                     frame = rest * wp.quat_to_matrix(
                         wp.quat_from_axis_angle(links.axis[k], qpos[w, c, q] - links.rest[k])
                     )
-                    spin = qvel[w, c, v] * (rest * links.axis[k])
+                    own = qvel[w, c, v] * (rest * links.axis[k])
                 else:  # a ball
                     frame = rest * wp.quat_to_matrix(
                         wp.normalize(wp.quat(qpos[w, c, q + 1], qpos[w, c, q + 2], qpos[w, c, q + 3], qpos[w, c, q]))
                     )
-                    spin = frame * wp.vec3(qvel[w, c, v], qvel[w, c, v + 1], qvel[w, c, v + 2])
+                    own = frame * wp.vec3(qvel[w, c, v], qvel[w, c, v + 1], qvel[w, c, v + 2])
                 lever = frame * links.anchor[k]
                 swung = rest * links.anchor[k] - lever
-                pos[w, k] = start + swung
-                mat[w, k] = frame
-                lin[w, k] = carried + wp.cross(ang[w, p], swung) - wp.cross(spin, lever)
-                ang[w, k] = ang[w, p] + spin
+                place = place + swung
+                speed = speed + wp.cross(turning, swung) - wp.cross(own, lever)
+                spin = turning + own
+        pos[k, w] = place
+        mat[k, w] = frame
+        lin[k, w] = speed
+        ang[k, w] = spin
+        if k < body_pos.shape[1]:
+            body_pos[w, k] = place
+            body_mat[w, k] = frame
+            body_lin[w, k] = speed
+            body_ang[w, k] = spin
 
 
 def links_of(m: mujoco.MjModel) -> dict[int, dict[str, Any]]:
@@ -199,31 +222,23 @@ class Kinematics:
         return {"xpos": pos, "xmat": mat, "cvel": torch.cat([ang, of_tree], dim=-1), "subtree_com": pos}
 
     def launch(self, tensors: Sequence[torch.Tensor], slopes: Sequence[torch.Tensor] = ()) -> None:
-        """Launches the kernel on torch's current stream; with ``slopes``, its adjoint, which adds to them.
+        """Launches the kernel on torch's current stream; with ``slopes``, its adjoint.
 
         Args:
-            tensors: qpos and qvel, for each chain, ``(worlds, chains, ...)``, and what is found of the links.
-            slopes: the gradients with regard to them.
+            tensors: qpos and qvel, for each chain, ``(worlds, chains, ...)``, and what is found of links and bodies.
+            slopes: the gradients with regard to them, to which those are added that follow from later ones.
         """
-        device = self._device
         arrays, gradients = ([_as_warp(each) for each in every] for every in (tensors, slopes))
         adjoint: dict[str, Any] = {}
         if slopes:
             adjoint = {"adjoint": True, "adj_inputs": [Links(), *gradients[:2]], "adj_outputs": gradients[2:]}
-        recording = torch_is_recording(device)
-        with EXCLUSIVE, joined_to_torch(device) if recording else wp.ScopedStream(current_stream(device), False):
-            settings = {"device": device, "block_dim": BLOCK, **adjoint}
+        with EXCLUSIVE, wp.ScopedStream(current_stream(self._device), sync_enter=False):
+            settings = {"device": self._device, "block_dim": BLOCK, **adjoint}
             wp.launch(place_links, (self.chains, len(tensors[0])), [self._links, *arrays[:2]], arrays[2:], **settings)
 
 
 def _as_warp(tensor: torch.Tensor) -> wp.array:
     return wp.from_torch(tensor.detach(), dtype=OUTPUTS.get(tuple(tensor.shape[2:]), wp.float32))
-
-
-def _zeros(like: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Tensor]:
-    """Returns tensors of zeros, which one kernel fills."""
-    sizes = [math.prod(shape) for shape in shapes]
-    return [part.view(shape) for part, shape in zip(like.new_zeros(sum(sizes)).split(sizes), shapes, strict=True)]
 
 
 class _Placed(torch.autograd.Function):
@@ -232,17 +247,18 @@ class _Placed(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, of: Kinematics, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[torch.Tensor, ...]:
         inputs = [each.contiguous().unsqueeze(1).expand(-1, of.chains, -1) for each in (qpos, qvel)]
-        placed = _zeros(qpos, *((len(qpos), of.count, *shape) for shape in ((3,), (3, 3), (3,), (3,))))
-        of.launch([*inputs, *placed])
-        ctx.save_for_backward(*inputs, *placed)
+        links = [qpos.new_empty(of.count, len(qpos), *shape) for shape in SHAPES]
+        bodies = [qpos.new_empty(len(qpos), of.bodies, *shape) for shape in SHAPES]
+        of.launch([*inputs, *links, *bodies])
+        ctx.save_for_backward(*inputs, *links, *bodies)
         ctx.of = of
-        return tuple(each[:, : of.bodies] for each in placed)
+        return tuple(bodies)
 
     @staticmethod
     def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        tensors = ctx.saved_tensors
-        of_qpos, of_qvel, *own = found = _zeros(tensors[0], *(tuple(each.shape) for each in tensors))
-        for mine, slope in zip(own, slopes, strict=True):  # the adjoint writes to them
-            mine[:, : ctx.of.bodies] = slope
-        ctx.of.launch(tensors, found)
+        tensors, bodies = ctx.saved_tensors, [slope.contiguous() for slope in slopes]
+        before = tensors[: -len(bodies)]
+        parts = before[0].new_zeros(sum(each.numel() for each in before)).split([each.numel() for each in before])
+        of_qpos, of_qvel, *links = [part.view(each.shape) for part, each in zip(parts, before, strict=True)]
+        ctx.of.launch(tensors, [of_qpos, of_qvel, *links, *bodies])
         return None, of_qpos.sum(1), of_qvel.sum(1)

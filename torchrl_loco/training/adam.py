@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor, nn
 
-from torchrl_loco.sim.graph import EXCLUSIVE, current_stream, joined_to_torch, torch_is_recording
+from torchrl_loco.sim.graph import EXCLUSIVE, current_stream
 from torchrl_loco.sim.warp_init import init_warp
 from torchrl_loco.training import distributed
 
@@ -226,6 +226,5 @@ def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: Sequence[Any],
     init_warp()
     device = wp.device_from_torch(outputs[0].device)
     arrays = [[wp.from_torch(x.detach()) if isinstance(x, torch.Tensor) else x for x in xs] for xs in (inputs, outputs)]
-    stream = current_stream(device)
-    with EXCLUSIVE, joined_to_torch(device) if torch_is_recording(device) else wp.ScopedStream(stream, False):
+    with EXCLUSIVE, wp.ScopedStream(current_stream(device), sync_enter=False):
         wp.launch(kernel, dim, *arrays, device=device)
