@@ -207,7 +207,8 @@ def test_actor_and_critic_learn_from_returns_up_to_the_end_of_episodes(svg, monk
     expected = ((of_critic - returns[1:]).square() * counted).sum() / 4.0
     before = [each.clone() for each in svg._target.parameters()]
     svg._totals.zero_()
-    svg.improve()
+    svg.value(*svg.improve())
+    svg.follow()
     metrics = dict(zip(svg.metric_names, svg._totals.tolist(), strict=True))
     assert metrics["imagined_return"] == pytest.approx(returns[0].mean().item(), rel=1e-5)
     assert metrics["imagined_length"] == pytest.approx(3.0)  # of 4 and 2 steps

@@ -120,6 +120,7 @@ class SVG(Algorithm):
         self._replay = Replay(config, m, sizes, self.generator)
         self._move, self._dream = fused(self._moved, "the model"), fused(self._dreamt, "the actor")
         self._value, self._target_value = fused(self.critic, "the critic"), fused(self._valued, "the critic")
+        self._returns = fused(self._returned)
         self._learn = TorchGraph(self._round, self.device, warmup=WARMUP) if on_cuda else self._round
 
     def acting(self) -> nn.Module:
@@ -164,16 +165,17 @@ class SVG(Algorithm):
         return self._totals / max(rounds, 1)
 
     def _round(self) -> None:
-        """Fits the model while actor and critic imagine by what it was."""
+        """Fits the model, and then the critic, while the actor imagines and learns by what they were."""
         with torch.no_grad():
             torch._foreach_copy_(list(self._known.state_dict().values()), list(self.model.state_dict().values()))
-        # The actor is recorded first: at the end of each launch of Warp's, all branches of a recording are joined.
         alone = distributed.ranks() == 1  # several meet in one order
         with self.beside() if alone else contextlib.nullcontext():
-            self.improve()
+            lesson = self.improve()
         self.fit()
+        self.value(*lesson)
         if alone:
             self.join()
+        self.follow()
 
     def schedule(self, progress: float) -> None:
         """Sets the learning rates, as all do; that of the model is its own, and that of the actor 0 at the start."""
@@ -209,28 +211,49 @@ class SVG(Algorithm):
 
     # Actor and critic.
 
-    def improve(self) -> None:
-        """Makes a gradient step of actor and critic each, in steps that are imagined from remembered states on."""
-        config = self.config
+    def improve(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.cuda.Event | None]:
+        """Makes a gradient step of the actor, in steps that are imagined from remembered states on.
+
+        Returns:
+            What the critic learns from it: what it read, the returns of it, how much each counts, and when they exist.
+        """
         rewards, ended, cut, seen = self._imagine()
         values = self._target_value(seen.flatten(0, 1)).view_as(rewards)
-        returns = lambda_returns(rewards, values, ended, cut, config.gamma, config.lmbda)
+        returns, alive = self._returns(rewards, values, ended, cut)
+        lesson = seen[:-1].detach().flatten(0, 1), returns[1:].detach(), alive[1:]
+        exists = torch.cuda.current_stream(self.device).record_event() if self.device.type == "cuda" else None
+        gain = returns[0].mean()
+        of_actor = self._descend(self._actor_optimizers, -gain)
+        self._add("imagined_return", gain, alive.sum(0).mean(), values.mean())
+        self._add("grad_norm_actor", *of_actor)
+        return *lesson, exists
+
+    def value(
+        self, seen: torch.Tensor, aims: torch.Tensor, weight: torch.Tensor, exist: torch.cuda.Event | None
+    ) -> None:
+        """Makes a gradient step of the critic; the arguments are what :meth:`improve` returns."""
+        if exist is not None:
+            torch.cuda.current_stream(self.device).wait_event(exist)
+        loss = ((self._value(seen).float().view_as(aims) - aims).square() * weight).sum() / weight.sum().clamp(min=1.0)
+        self._add("loss_critic", loss)
+        self._add("grad_norm_critic", *self._descend(self._critic_optimizers, loss))
+
+    @torch.no_grad()
+    def follow(self) -> None:
+        """Moves the critic that returns are made with, and the policy that is kept, towards those that learn."""
+        for mine, new, rate in (
+            (self._target, self.critic[1], self.config.target_rate),
+            (self._average, self._mean, self.config.average_rate),
+        ):
+            torch._foreach_lerp_(list(mine.parameters()), list(new.parameters()), rate)
+
+    def _returned(
+        self, rewards: torch.Tensor, values: torch.Tensor, ended: torch.Tensor, cut: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns lambda-returns from each step on, and whether the episode goes on before it."""
         over = (ended | cut)[:-1].float()
-        alive = torch.cat([torch.ones_like(rewards[:1]), (1.0 - over).cumprod(0)])  # before each step
-        of_actor = self._descend(self._actor_optimizers, -returns[0].mean())
-        weight, aims = alive[1:], returns[1:].detach()
-        value = self._value(seen[:-1].detach().flatten(0, 1)).float().view_as(aims)
-        loss = ((value - aims).square() * weight).sum() / weight.sum().clamp(min=1.0)
-        of_critic = self._descend(self._critic_optimizers, loss)
-        with torch.no_grad():
-            for mine, new, rate in (
-                (self._target, self.critic[1], config.target_rate),
-                (self._average, self._mean, config.average_rate),
-            ):
-                for old, latest in zip(mine.parameters(), new.parameters(), strict=True):
-                    old.lerp_(latest, rate)
-        length = alive.sum(0).mean()
-        self._add("imagined_return", returns[0].mean(), length, values.mean(), loss, *of_actor, *of_critic)
+        alive = torch.cat([torch.ones_like(rewards[:1]), (1.0 - over).cumprod(0)])
+        return lambda_returns(rewards, values, ended, cut, self.config.gamma, self.config.lmbda), alive
 
     def _imagine(self) -> tuple[torch.Tensor, ...]:
         """Returns rewards, whether episodes terminated and were cut off, and what the critic reads after each step.
@@ -283,7 +306,7 @@ class SVG(Algorithm):
         if not matrices:
             return [rest]
         self.optimizers[f"{name} matrices"] = Muon(matrices, torch.tensor(self.config.lr, device=self.device))
-        return [self.optimizers[f"{name} matrices"], rest]  # Adam, which is Warp's, last
+        return [rest, self.optimizers[f"{name} matrices"]]
 
     def _descend(self, optimizers: Iterable[Any], loss: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Makes a step of each optimizer, of zeros if a number of the gradient is not finite.
