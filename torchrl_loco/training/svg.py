@@ -372,7 +372,7 @@ def lambda_returns(
         gamma: discount.
         lmbda: share of the return in what follows, instead of the value.
     """
-    follows, returns = values[-1], list[torch.Tensor]()
+    follows, returns = values[-1], []
     for t in range(len(rewards) - 1, -1, -1):
         follows = torch.where(cut[t], values[t], follows)
         returns.append(rewards[t] + torch.where(ended[t], 0.0, gamma * follows))
