@@ -96,6 +96,11 @@ class RolloutCollector:
             steps = self._recorded_steps() if self._can_replay() else self._direct_steps()
         return stack(steps).refine_names(..., "time")
 
+    @property
+    def replays(self) -> bool:
+        """Whether batches are collected by a recording, without the host."""
+        return self._recording is not None and self._recording.works
+
     def _take_steps(self, td: TensorDictBase) -> tuple[list[TensorDictBase], TensorDictBase]:
         """Returns the steps of a batch that begins with ``td``, and what the next one begins with."""
         steps = []

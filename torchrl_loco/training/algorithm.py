@@ -60,6 +60,7 @@ class Algorithm(ABC):
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
         self._data: Packed | None = None
         on_cuda = self.device.type == "cuda"
+        self.began: torch.cuda.Event | None = None  # since when an update no longer needs what a next batch changes
         self._stream = torch.cuda.Stream(self.device, priority=-1) if on_cuda else None
         self._epoch = TorchGraph(self._gradient_steps, self.device, warmup=WARMUP) if on_cuda else self._gradient_steps
 

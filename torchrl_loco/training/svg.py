@@ -35,7 +35,8 @@ from torchrl_loco.training.replay import Replay
 class SVG(Algorithm):
     """After each batch, some rounds: the model is fitted to windows of what is remembered, actor and critic imagine.
 
-    The policy that is evaluated and kept is a moving average of the one that learns and collects.
+    The policy that is evaluated and kept is a moving average of the one that learns. A copy of that collects, of before
+    the update, so that the next batch is collected meanwhile.
     """
 
     config_type = SVGConfig
@@ -71,9 +72,10 @@ class SVG(Algorithm):
         self._average = copy.deepcopy(self._mean).requires_grad_(False)
         scale = AddStateIndependentNormalScale(spaces.action, init_value=math.log(config.init_std))
         scale.requires_grad_(False)
-        self._learner, self.actor = (
+        self._shown = copy.deepcopy(self._mean).requires_grad_(False)
+        self._collector, self._learner, self.actor = (
             make_actor(spaces, self.device, nn.Sequential(self.norms["observation"], mean, scale), log_prob=False)
-            for mean in (self._mean, self._average)
+            for mean in (self._shown, self._mean, self._average)
         )
         *_, last = config.critic_hidden
         value = nn.Sequential(*normed_layers(spaces.critic, config.critic_hidden), nn.Linear(last, 1))
@@ -124,13 +126,23 @@ class SVG(Algorithm):
         self._learn = TorchGraph(self._round, self.device, warmup=WARMUP) if on_cuda else self._round
 
     def acting(self) -> nn.Module:
-        """Returns the actor that learns as a policy for collectors."""
-        return self._learner
+        """Returns the actor that learns, as it was before the last update, as a policy for collectors."""
+        return self._collector
 
     @property
     def actors(self) -> list[ProbabilisticActor]:
-        """The actor that is kept, and the one that learns."""
-        return [self.actor, self._learner]
+        """The actor that is kept, the one that learns and the one that collects."""
+        return [self.actor, self._learner, self._collector]
+
+    def load_networks(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Copies the parameters of networks."""
+        super().load_networks(state)
+        self._show()
+
+    @torch.no_grad()
+    def _show(self) -> None:
+        """Lets the actor collect that learns."""
+        torch._foreach_copy_(list(self._shown.state_dict().values()), list(self._mean.state_dict().values()))
 
     def prepare(self, batch: TensorDictBase) -> NoReturn:
         """Refuses: it remembers batches instead."""
@@ -155,6 +167,8 @@ class SVG(Algorithm):
         steps = self._replay.keep(batch)
         self.learn_moments(batch)
         self.model.learn_moments(*steps)
+        self._show()
+        self.began = torch.cuda.current_stream(self.device).record_event() if self.device.type == "cuda" else None
         self._totals.zero_()
         rounds = self.config.epochs if self._replay.has_window else 0
         for _ in range(rounds):

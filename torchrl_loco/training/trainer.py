@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tqdm.auto import tqdm
 
 from torchrl_loco.checks import check_device
@@ -129,6 +130,9 @@ class Trainer:
         self._source = source_of(run.task)
         self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
+        on_cuda = self.algorithm.device.type == "cuda"
+        self._beside = torch.cuda.Stream(self.algorithm.device) if on_cuda else None
+        self._ahead: TensorDictBase | None = None
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
         self._non_finite, self._said = 0, set[str]()
         self._alike: float | None = None  # the reward of the last batch, if there was only one
@@ -263,7 +267,7 @@ class Trainer:
             ValueError: no step of it was finite.
         """
         config, algorithm, start = self.config, self.algorithm, time.perf_counter()
-        batch = self.collector.rollout()
+        batch = self.collector.rollout() if self._ahead is None else self._ahead
         for name, kept in self._summed.items():
             distributed.add_changes(self._base.world.shared[name], kept)
         after = batch["next"]
@@ -273,9 +277,11 @@ class Trainer:
         spread, ends = after["reward"].max() - after["reward"].min(), after["done"].float().mean()
         of_env = {f"reward/{name}": after["reward_terms", name].mean() / config.action_repeat for name in self._terms}
         of_env |= {f"metric/{name}": after["metrics", name].nanmean() for name in self._base.metric_names}
-        metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
         non_finite = self._base.health()["total", "non_finite"]
-        numbers = torch.cat([ended, torch.stack([non_finite, spread, ends, reward, *of_env.values()]), metrics])
+        numbers = torch.cat([ended, torch.stack([non_finite, spread, ends, reward, *of_env.values()])])
+        metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
+        self._ahead = self._collected_ahead()
+        numbers = torch.cat([numbers, metrics])
         means = distributed.mean_of_ranks(numbers).tolist()
         self.episodes.take(*(mean * distributed.ranks() for mean in means[:3]))
         non_finite, spread, ends, mean_reward, *means = means[3:]
@@ -300,6 +306,17 @@ class Trainer:
             **self.episodes.metrics(mean_reward, self._base.config.episode_length),
             **{name: round(value, 6) for name, value in zip(names, means, strict=True)},
         }
+
+    def _collected_ahead(self) -> TensorDictBase | None:
+        """Returns the next batch if the algorithm lets it be collected while it still updates on the last one."""
+        began, is_last = self.algorithm.began, self.last_frame - self.frames <= self.frames_per_iteration
+        if self._beside is None or began is None or is_last or not self.collector.replays or distributed.ranks() > 1:
+            return None
+        with torch.cuda.stream(self._beside):
+            began.wait()
+            batch = self.collector.rollout()
+        torch.cuda.current_stream(self.algorithm.device).wait_stream(self._beside)
+        return batch
 
     def evaluate(self) -> dict[str, float]:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""
