@@ -30,8 +30,6 @@ class Links:
     """Where each chain begins in ``order``, and where the last one ends."""
     order: wp.array[int]
     """The links of the chains, one chain after the other, parents first."""
-    chain: wp.array[int]
-    """The chain of a link."""
     parent: wp.array[int]
     kind: wp.array[int]
     offset: wp.array[wp.vec3]
@@ -44,7 +42,6 @@ class Links:
 
 
 COLUMNS: dict[str, Any] = {
-    "chain": int,
     "parent": int,
     "kind": int,
     "offset": wp.vec3,  # place in the parent (m)
@@ -56,69 +53,15 @@ COLUMNS: dict[str, Any] = {
     "rest": float,  # its position at rest
 }
 """What is known of a link, and its type."""
-SHAPES = (3,), (3, 3), (3,), (3,)  # of what is found of a link: place, orientation, linear and angular velocity
-Tensors = Sequence[torch.Tensor]
+SHAPES = (3,), (3, 3), (3,), (3,)  # of what is found of a link: place, orientation, velocities
 OUTPUTS = {(3,): wp.vec3, (3, 3): wp.mat33}  # their types, by shape
-
-
-@wp.kernel(module="unique")
-def move_links(
-    links: Links,
-    qpos: wp.array3d[float],
-    qvel: wp.array3d[float],
-    pos: wp.array2d[wp.vec3],
-    mat: wp.array2d[wp.mat33],
-    lin: wp.array2d[wp.vec3],
-    ang: wp.array2d[wp.vec3],
-):
-    """Finds how joints place and move links ``(links, worlds)`` in the frames of their parents."""
-    k, w = wp.tid()
-    c = links.chain[k]
-    kind = links.kind[k]
-    q = links.q[k]
-    v = links.v[k]
-    place = links.offset[k]
-    frame = links.turn[k]
-    speed = wp.vec3()
-    spin = wp.vec3()
-    if kind == FREE:
-        frame = wp.quat_to_matrix(
-            wp.normalize(wp.quat(qpos[w, c, q + 4], qpos[w, c, q + 5], qpos[w, c, q + 6], qpos[w, c, q + 3]))
-        )
-        place = wp.vec3(qpos[w, c, q], qpos[w, c, q + 1], qpos[w, c, q + 2])
-        speed = wp.vec3(qvel[w, c, v], qvel[w, c, v + 1], qvel[w, c, v + 2])
-        spin = frame * wp.vec3(qvel[w, c, v + 3], qvel[w, c, v + 4], qvel[w, c, v + 5])
-    elif kind == SLIDE:
-        along = links.turn[k] * links.axis[k]
-        place = links.offset[k] + (qpos[w, c, q] - links.rest[k]) * along
-        speed = qvel[w, c, v] * along
-    elif kind != FIXED:
-        if kind == HINGE:
-            frame = links.turn[k] * wp.quat_to_matrix(
-                wp.quat_from_axis_angle(links.axis[k], qpos[w, c, q] - links.rest[k])
-            )
-            spin = qvel[w, c, v] * (links.turn[k] * links.axis[k])
-        else:  # a ball
-            frame = links.turn[k] * wp.quat_to_matrix(
-                wp.normalize(wp.quat(qpos[w, c, q + 1], qpos[w, c, q + 2], qpos[w, c, q + 3], qpos[w, c, q]))
-            )
-            spin = frame * wp.vec3(qvel[w, c, v], qvel[w, c, v + 1], qvel[w, c, v + 2])
-        lever = frame * links.anchor[k]
-        place = links.offset[k] + links.turn[k] * links.anchor[k] - lever
-        speed = wp.cross(lever, spin)
-    pos[k, w] = place
-    mat[k, w] = frame
-    lin[k, w] = speed
-    ang[k, w] = spin
 
 
 @wp.kernel(module="unique")
 def place_links(
     links: Links,
-    own_pos: wp.array2d[wp.vec3],
-    own_mat: wp.array2d[wp.mat33],
-    own_lin: wp.array2d[wp.vec3],
-    own_ang: wp.array2d[wp.vec3],
+    qpos: wp.array3d[float],
+    qvel: wp.array3d[float],
     pos: wp.array2d[wp.vec3],
     mat: wp.array2d[wp.mat33],
     lin: wp.array2d[wp.vec3],
@@ -128,29 +71,67 @@ def place_links(
     body_lin: wp.array2d[wp.vec3],
     body_ang: wp.array2d[wp.vec3],
 ):
-    """Finds how links are placed and move in the world ``(links, worlds)``, and so bodies ``(worlds, bodies)``.
+    """Places links, as a chain goes on from them ``(links, worlds)``, and bodies ``(worlds, bodies)``.
 
-    The first link is the world, in whose frame it is at rest.
+    Threads of neighbouring worlds read and write neighbouring numbers of a link.
     """
     c, w = wp.tid()
-    pos[0, w] = own_pos[0, w]
-    mat[0, w] = own_mat[0, w]
-    lin[0, w] = own_lin[0, w]
-    ang[0, w] = own_ang[0, w]
-    body_pos[w, 0] = own_pos[0, w]
-    body_mat[w, 0] = own_mat[0, w]
-    body_lin[w, 0] = own_lin[0, w]
-    body_ang[w, 0] = own_ang[0, w]
+    pos[0, w] = wp.vec3()
+    mat[0, w] = wp.identity(n=3, dtype=float)
+    lin[0, w] = wp.vec3()
+    ang[0, w] = wp.vec3()
+    body_pos[w, 0] = wp.vec3()
+    body_mat[w, 0] = wp.identity(n=3, dtype=float)
+    body_lin[w, 0] = wp.vec3()
+    body_ang[w, 0] = wp.vec3()
     for i in range(links.first[c], links.first[c + 1]):
         k = links.order[i]
         p = links.parent[k]
-        of_parent = mat[p, w]
-        turning = ang[p, w]
-        offset = of_parent * own_pos[k, w]
-        place = pos[p, w] + offset
-        frame = of_parent * own_mat[k, w]
-        speed = lin[p, w] + wp.cross(turning, offset) + of_parent * own_lin[k, w]
-        spin = turning + of_parent * own_ang[k, w]
+        kind = links.kind[k]
+        q = links.q[k]
+        v = links.v[k]
+        place = wp.vec3()
+        frame = wp.identity(n=3, dtype=float)
+        speed = wp.vec3()
+        spin = wp.vec3()
+        if kind == FREE:
+            frame = wp.quat_to_matrix(
+                wp.normalize(wp.quat(qpos[w, c, q + 4], qpos[w, c, q + 5], qpos[w, c, q + 6], qpos[w, c, q + 3]))
+            )
+            place = wp.vec3(qpos[w, c, q], qpos[w, c, q + 1], qpos[w, c, q + 2])
+            speed = wp.vec3(qvel[w, c, v], qvel[w, c, v + 1], qvel[w, c, v + 2])
+            spin = frame * wp.vec3(qvel[w, c, v + 3], qvel[w, c, v + 4], qvel[w, c, v + 5])
+        else:
+            of_parent = mat[p, w]
+            turning = ang[p, w]
+            offset = of_parent * links.offset[k]
+            rest = of_parent * links.turn[k]
+            place = pos[p, w] + offset
+            frame = rest
+            speed = lin[p, w] + wp.cross(turning, offset)
+            spin = turning
+            if kind == SLIDE:
+                along = rest * links.axis[k]
+                moved = (qpos[w, c, q] - links.rest[k]) * along
+                place = place + moved
+                speed = speed + wp.cross(turning, moved) + qvel[w, c, v] * along
+            elif kind != FIXED:
+                own = wp.vec3()
+                if kind == HINGE:
+                    frame = rest * wp.quat_to_matrix(
+                        wp.quat_from_axis_angle(links.axis[k], qpos[w, c, q] - links.rest[k])
+                    )
+                    own = qvel[w, c, v] * (rest * links.axis[k])
+                else:  # a ball
+                    frame = rest * wp.quat_to_matrix(
+                        wp.normalize(wp.quat(qpos[w, c, q + 1], qpos[w, c, q + 2], qpos[w, c, q + 3], qpos[w, c, q]))
+                    )
+                    own = frame * wp.vec3(qvel[w, c, v], qvel[w, c, v + 1], qvel[w, c, v + 2])
+                lever = frame * links.anchor[k]
+                swung = rest * links.anchor[k] - lever
+                place = place + swung
+                speed = speed + wp.cross(turning, swung) - wp.cross(own, lever)
+                spin = turning + own
         pos[k, w] = place
         mat[k, w] = frame
         lin[k, w] = speed
@@ -168,7 +149,7 @@ def links_of(m: mujoco.MjModel) -> dict[int, dict[str, Any]]:
     for body in range(m.nbody):
         first, count, parent = int(m.body_jntadr[body]), int(m.body_jntnum[body]), int(m.body_parentid[body])
         for at in range(max(count, 1)):
-            row: dict[str, Any] = {"chain": 0, "parent": parent, "kind": -1}
+            row: dict[str, Any] = {"parent": parent, "kind": -1}
             row |= {"offset": np.zeros(3), "turn": np.eye(3), "anchor": np.zeros(3), "axis": np.zeros(3)}
             row |= {"q": 0, "v": 0, "rest": 0.0}
             if at == 0:
@@ -195,7 +176,7 @@ def chains_of(rows: dict[int, dict[str, Any]]) -> list[list[int]]:
             link = rows[link]["parent"]
         for i, link in enumerate(chain):
             chain[i] = len(rows) if link in taken else link
-            rows[chain[i]] = {**rows[link], "chain": len(chains), "parent": chain[i - 1] if i else 0}
+            rows[chain[i]] = {**rows[link], "parent": chain[i - 1] if i else 0}
         taken.update(chain)
         chains.append(chain)
     return chains
@@ -240,26 +221,20 @@ class Kinematics:
         of_tree = lin + torch.linalg.cross(ang, pos.index_select(1, self._root) - pos)
         return {"xpos": pos, "xmat": mat, "cvel": torch.cat([ang, of_tree], dim=-1), "subtree_com": pos}
 
-    def launch(
-        self, kernel: wp.Kernel, dim: tuple[int, int], read: Tensors, written: Tensors, slopes: Tensors = ()
-    ) -> None:
-        """Launches a kernel on torch's current stream; with ``slopes``, its adjoint.
+    def launch(self, tensors: Sequence[torch.Tensor], slopes: Sequence[torch.Tensor] = ()) -> None:
+        """Launches the kernel on torch's current stream; with ``slopes``, its adjoint.
 
         Args:
-            kernel: one of the two.
-            dim: how many links or chains there are, and how many worlds.
-            read: what it reads beside the links.
-            written: what it writes.
-            slopes: the gradients with regard to both; those of what it reads are added to.
+            tensors: qpos and qvel, for each chain, ``(worlds, chains, ...)``, and what is found of links and bodies.
+            slopes: the gradients with regard to them, to which those are added that follow from later ones.
         """
-        inputs, outputs, gradients = ([_as_warp(each) for each in every] for every in (read, written, slopes))
+        arrays, gradients = ([_as_warp(each) for each in every] for every in (tensors, slopes))
         adjoint: dict[str, Any] = {}
         if slopes:
-            of_inputs, of_outputs = gradients[: len(inputs)], gradients[len(inputs) :]
-            adjoint = {"adjoint": True, "adj_inputs": [Links(), *of_inputs], "adj_outputs": of_outputs}
+            adjoint = {"adjoint": True, "adj_inputs": [Links(), *gradients[:2]], "adj_outputs": gradients[2:]}
         with EXCLUSIVE, wp.ScopedStream(current_stream(self._device), sync_enter=False):
             settings = {"device": self._device, "block_dim": BLOCK, **adjoint}
-            wp.launch(kernel, dim, [self._links, *inputs], outputs, **settings)
+            wp.launch(place_links, (self.chains, len(tensors[0])), [self._links, *arrays[:2]], arrays[2:], **settings)
 
 
 def _as_warp(tensor: torch.Tensor) -> wp.array:
@@ -271,21 +246,19 @@ class _Placed(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, of: Kinematics, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        n, inputs = len(qpos), [each.contiguous().unsqueeze(1).expand(-1, of.chains, -1) for each in (qpos, qvel)]
-        moved, links = ([qpos.new_empty(of.count, n, *shape) for shape in SHAPES] for _ in range(2))
-        bodies = [qpos.new_empty(n, of.bodies, *shape) for shape in SHAPES]
-        of.launch(move_links, (of.count, n), inputs, moved)
-        of.launch(place_links, (of.chains, n), moved, [*links, *bodies])
-        ctx.save_for_backward(*inputs, *moved, *links, *bodies)
+        inputs = [each.contiguous().unsqueeze(1).expand(-1, of.chains, -1) for each in (qpos, qvel)]
+        links = [qpos.new_empty(of.count, len(qpos), *shape) for shape in SHAPES]
+        bodies = [qpos.new_empty(len(qpos), of.bodies, *shape) for shape in SHAPES]
+        of.launch([*inputs, *links, *bodies])
+        ctx.save_for_backward(*inputs, *links, *bodies)
         ctx.of = of
         return tuple(bodies)
 
     @staticmethod
     def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        of, tensors, bodies = ctx.of, ctx.saved_tensors, [slope.contiguous() for slope in slopes]
-        n, before = len(bodies[0]), tensors[: -len(bodies)]
+        tensors, bodies = ctx.saved_tensors, [slope.contiguous() for slope in slopes]
+        before = tensors[: -len(bodies)]
         parts = before[0].new_zeros(sum(each.numel() for each in before)).split([each.numel() for each in before])
-        found = [part.view(each.shape) for part, each in zip(parts, before, strict=True)]
-        of.launch(place_links, (of.chains, n), tensors[2:6], tensors[6:], [*found[2:], *bodies])
-        of.launch(move_links, (of.count, n), tensors[:2], tensors[2:6], found[:6])
-        return None, found[0].sum(1), found[1].sum(1)
+        of_qpos, of_qvel, *links = [part.view(each.shape) for part, each in zip(parts, before, strict=True)]
+        ctx.of.launch(tensors, [of_qpos, of_qvel, *links, *bodies])
+        return None, of_qpos.sum(1), of_qvel.sum(1)
