@@ -46,9 +46,23 @@ def in_torch(data):
     return tuple(torch.tensor(np.array(each), dtype=torch.float32).unsqueeze(0) for each in (data.qpos, data.qvel))
 
 
-@pytest.fixture(params=["joints", "humanoid_walk", "go1_velocity"])
+ARM = """
+<mujoco>
+  <worldbody>
+    <body pos="0 0 1"><joint axis="0 0 1"/><geom size="0.1" pos="0.2 0 0"/>
+      <body pos="0.3 0 0"><joint axis="0 1 0"/><geom size="0.1"/>
+        <body pos="0.3 0 0"><joint type="slide" axis="1 0 0"/><geom size="0.1"/></body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+OWN = {"joints": JOINTS, "arm": ARM}
+
+
+@pytest.fixture(params=[*OWN, "humanoid_walk", "go1_velocity"])
 def model(request):
-    return models.load(JOINTS if request.param == "joints" else resolve(request.param).model)
+    return models.load(OWN[request.param] if request.param in OWN else resolve(request.param).model)
 
 
 def test_bodies_are_where_c_mujoco_has_them(model):
@@ -160,7 +174,8 @@ def imagined_beside(env, td, action):
     *before, rest = imagined.unpacked(state)
     torch.testing.assert_close(imagined.control(*before, action, rest), ctrl)
     over = torch.zeros(env.num_envs, dtype=torch.bool)
-    return imagined, imagined.judge(qpos, qvel, action, rest, state, over), after
+    units = torch.rand(env.num_envs, imagined.drawn)
+    return imagined, imagined.judge(qpos, qvel, action, rest, state, over, units), after
 
 
 @pytest.mark.parametrize("task", [Rich, "g1_tracking", "g1_velocity"])
@@ -192,11 +207,50 @@ def test_a_task_says_of_predicted_states_what_it_says_in_its_worlds(task):
     assert ended == (task is Rich)
     if ended:
         start = torch.zeros(4, imagined.size)
-        gone = imagined.judge(said.qpos * float("nan"), said.qvel, torch.zeros(4, 1), said.rest, start, said.over)
+        lost, none = said.qpos * float("nan"), torch.zeros(4, imagined.drawn)
+        gone = imagined.judge(lost, said.qvel, torch.zeros(4, 1), said.rest, start, said.over, none)
+        earned = imagined.earned([gone])
         assert gone.over.all()
-        assert not imagined.earned([gone]).reward.any()
+        assert earned.terminated.all()
+        assert not earned.reward.any()
+        assert not earned.observations["privileged"].any()
         assert not gone.observation.any()
         assert not gone.qpos.any()
+        endless = [
+            *said.rest[:-2],
+            said.rest[-2] + float("inf"),
+            said.rest[-1],
+        ]  # updates, which reward and critic read
+        said = imagined.judge(said.qpos, said.qvel, torch.zeros(4, 1), endless, start, said.over & False, none)
+        earned = imagined.earned([said])
+        assert earned.terminated.all()
+        assert not earned.reward.any()
+        assert not earned.observations["privileged"].any()
+
+
+class Shares(Rich):
+    """Its reward is what worlds share."""
+
+    def reward(self, s):
+        return s.total.expand(s.num_envs)
+
+
+def test_what_worlds_share_is_that_of_the_last_refresh():
+    env = loco.make(showing_states(Shares), num_envs=2, seed=0, **PLAIN)
+    td = env.reset()
+    imagined = Imagined(env, 2)
+    qpos, qvel, rest = imagined.unpacked(td[STATE][:, : imagined.size])
+    start, none, units = td[STATE][:, : imagined.size], torch.zeros(2) > 0, torch.zeros(2, imagined.drawn)
+
+    def earned():
+        said = imagined.judge(qpos, qvel, torch.zeros(2, 1), rest, start, none, units)
+        return imagined.earned([said]).reward.flatten().tolist()
+
+    assert earned() == [0.0, 0.0]
+    env.step(td.set("action", torch.zeros(2, 1)))
+    assert earned() == [0.0, 0.0]
+    imagined.refresh()
+    assert earned() == [1.0, 1.0]
 
 
 def beside_g1(steps=1):
@@ -208,7 +262,9 @@ def beside_g1(steps=1):
     return (
         imagined,
         qvel,
-        lambda qvel: imagined.judge(qpos, qvel, action, rest, state[:, : imagined.size], over),
+        lambda qvel: imagined.judge(
+            qpos, qvel, action, rest, state[:, : imagined.size], over, torch.rand(2, imagined.drawn)
+        ),
     )
 
 

@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import signal
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from torchrl_loco.training.dynamics import Dynamics
 from torchrl_loco.training.muon import Muon, orthogonal
 from torchrl_loco.training.replay import Replay
 from torchrl_loco.training.run_folder import RunFolder
-from torchrl_loco.training.svg import lambda_returns
+from torchrl_loco.training.svg import SVG, lambda_returns
 from torchrl_loco.training.trainer import Trainer
 
 MODEL = """
@@ -144,7 +145,7 @@ def test_windows_go_across_batches_and_no_further_than_episodes(what, behind):
 
 @pytest.fixture(scope="module")
 def made_once(tmp_path_factory):
-    """Returns a function that makes an svg, which has learned from a few batches, in the first test that needs it."""
+    """Returns a function that makes a trainer of svg, which has learned from a few batches, where first needed."""
 
     @functools.cache
     def get():
@@ -153,7 +154,7 @@ def made_once(tmp_path_factory):
         trainer = Trainer(RunFolder.create(config))
         for _ in range(3):
             trainer.iterate()
-        return trainer.algorithm
+        return trainer
 
     return get
 
@@ -161,7 +162,7 @@ def made_once(tmp_path_factory):
 @pytest.fixture
 def svg(made_once):
     """It can be asked for more, and gets its networks back after each test."""
-    svg = made_once()
+    svg = made_once().algorithm
     kept = copy.deepcopy(svg.networks.state_dict())
     yield svg
     svg.load_networks(kept)
@@ -238,16 +239,16 @@ def test_gradients_that_are_not_finite_are_left_out_and_said(svg):
     assert not svg.note(none)
 
 
-def test_a_policy_begins_both_actors(svg, tmp_path):
+def test_a_policy_begins_all_actors(svg, tmp_path):
     policy = deterministic_policy(svg.actor, svg.config, {})
     policy.save(tmp_path / "policy.safetensors")
     average = [each.clone() for each in svg._average.parameters()]
     with torch.no_grad():
-        for mine in (svg._mean, svg._average):
+        for mine in (svg._mean, svg._average, svg._shown):
             for own in mine.parameters():
                 own.normal_()
     begin_from(svg, tmp_path / "policy.safetensors", "cpu")
-    for mine in (svg._mean, svg._average):
+    for mine in (svg._mean, svg._average, svg._shown):
         for own, kept in zip(mine.parameters(), average, strict=True):
             torch.testing.assert_close(own.detach(), kept)
 
@@ -285,6 +286,17 @@ def learned(run):
     assert returns[0] < 40.0 < 70.0 < returns[-1]  # of 100
 
 
+def test_the_policy_of_before_an_update_collects(svg, made_once):
+    assert made_once().collector._policy is svg.acting()
+    before = [each.clone() for each in svg._mean.parameters()]
+    made_once().iterate()
+    assert any((old != now).any() for old, now in zip(before, svg._mean.parameters(), strict=True))
+    kept = [each.data_ptr() for each in svg.networks.state_dict().values()]  # by a checkpoint
+    for old, collects in zip(before, svg._shown.parameters(), strict=True):
+        torch.testing.assert_close(collects, old)
+        assert collects.data_ptr() in kept
+
+
 def test_it_learns_in_a_minute_of_experience(tmp_path):
     few = {"total_frames": 32 * 8 * 25, "eval_interval": 32 * 8 * 5}
     run = training.train(Spin, algorithm="svg", device="cpu", out=tmp_path, **FEW, **few)
@@ -297,14 +309,60 @@ def test_it_learns_on_cuda(tmp_path):
     learned(training.train(Spin, algorithm="svg", device="cuda", out=tmp_path, **FEW, **few))
 
 
-def test_a_run_goes_on_without_what_it_remembered(tmp_path, capsys):
-    half = 32 * 8 * 4
-    run = training.train(Spin, algorithm="svg", device="cpu", out=tmp_path, total_frames=half, **FEW)
-    training.train(Spin, resume=run.path, total_frames=2 * half)
+def stopped_and_resumed(tmp_path, device, at=9, batches=26, **settings):
+    """Returns the metrics of a run that Ctrl-C has stopped in the middle of an episode."""
+
+    def update(self, batch, progress):
+        if interrupts and len(interrupts) > at:
+            interrupts.clear()
+            signal.raise_signal(signal.SIGINT)
+        elif interrupts:
+            interrupts.append(progress)
+        return plain(self, batch, progress)
+
+    plain, interrupts = SVG.update, [0.0]
+    settings = {**FEW, "epochs": 1, "total_frames": 32 * 8 * batches, "device": device, **settings}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SVG, "update", update)
+        with pytest.raises(KeyboardInterrupt):
+            training.train(Spin, algorithm="svg", out=tmp_path, **settings)
+    (run,) = tmp_path.iterdir()
+    training.train(Spin, resume=run)
+    return RunFolder(run).read_metrics()
+
+
+def lengths(rows):
+    """Returns those of the episodes that have ended."""
+    return {length for length, count in zip(rows["episode_length"], rows["episodes"], strict=True) if count}
+
+
+def test_a_run_goes_on_without_what_it_remembered(tmp_path, capsys, monkeypatch):
+    """Nor does it learn from a batch that was collected ahead, in which the episodes have gone on."""
+
+    def ahead(self):  # as on CUDA
+        return self._collect() if self.last_frame - self.frames > self.frames_per_iteration else None
+
+    monkeypatch.setattr(Trainer, "_collected_ahead", ahead)
+    rows = stopped_and_resumed(tmp_path, "cpu")
     assert "remembers steps anew" in capsys.readouterr().err
-    rows = RunFolder(run.path).read_metrics()
-    assert rows["frames"][-1] == 2 * half
+    assert rows["frames"][-1] == 32 * 8 * 26
     assert rows["loss_model"][-1] > 0.0
+    assert lengths(rows) == {100.0}
+
+
+@pytest.mark.gpu
+def test_batches_are_collected_while_it_learns(tmp_path, monkeypatch):
+    ahead, plain = [], Trainer._collected_ahead
+
+    def noted(self):
+        collected = plain(self)
+        ahead.append(collected is not None)
+        return collected
+
+    monkeypatch.setattr(Trainer, "_collected_ahead", noted)
+    rows = stopped_and_resumed(tmp_path, "cuda", compile=False)
+    assert sum(ahead) > 15
+    assert lengths(rows) == {100.0}
 
 
 @for_each(

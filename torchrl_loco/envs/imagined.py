@@ -80,6 +80,7 @@ class Judgement(NamedTuple):
     """How a step ends, and what goes on after it, ``(worlds, ...)`` each."""
 
     terminated: torch.Tensor
+    """By the hook, or since the state or what the actor sees is not finite."""
     truncated: torch.Tensor
     over: torch.Tensor
     """Whether an episode has ended, in this step or before: its world is where it started."""
@@ -90,7 +91,7 @@ class Judgement(NamedTuple):
     rest: list[torch.Tensor]
     """What else hooks depend on."""
     inputs: list[torch.Tensor]
-    """What hooks were called on, behind whether that is worth nothing."""
+    """In which worlds the step does not count, and what hooks were called on."""
 
 
 class Called(NamedTuple):
@@ -108,7 +109,7 @@ class Earned(NamedTuple):
 
     reward: torch.Tensor
     terminated: torch.Tensor
-    """Also by a number that is not finite."""
+    """Also since the reward or what the critic sees is not finite."""
     observations: dict[str, torch.Tensor]
     """The other groups, as those that critics read."""
 
@@ -117,7 +118,8 @@ class Imagined:
     """Worlds whose states are predicted: the hooks of their task are called on them as on simulated ones.
 
     Contacts and sensors of forces are zeros there; what events do to positions and velocities does not happen, nothing
-    is added to ``shared``, no time limit ends an episode, and random numbers are torch's.
+    is added to ``shared``, which is what it was at the last :meth:`refresh`, no time limit ends an episode, and random
+    numbers are given.
 
     Args:
         env: an environment of a task that shows its states.
@@ -128,6 +130,7 @@ class Imagined:
     Attributes:
         unknown: names of the arrays that the hooks read and that are zeros.
         size: length of a state, which is the first part of ``state_of_world``.
+        drawn: how many random numbers of each world hooks draw in a step.
 
     Raises:
         ValueError: the hooks depend on what is not predicted.
@@ -145,7 +148,8 @@ class Imagined:
         self._hooks = copy.copy(env.hooks)
         self._hooks.catalog = catalog = copy.copy(asked)
         self._hooks.view = WithUnits
-        self._steps, self._substeps, self._shared = steps, env.config.substeps, dict(env.world.shared)
+        self._steps, self._substeps, self._live = steps, env.config.substeps, dict(env.world.shared)
+        self._shared = {name: values.clone() for name, values in self._live.items()}
         self.kinematics = Kinematics(m, env.device)
         self.unknown = [name for name in UNKNOWN if name in asked.arrays or f"{name}_history" in asked.arrays]
         numbers = {} if env.variation is None else {"numbers": Entry((env.variation.count,), torch.float32)}
@@ -169,6 +173,12 @@ class Imagined:
         rest = [of_floats(row, entry) for row, entry in zip(rows, self._rest.values(), strict=True)]
         return qpos.clone(), qvel.clone(), [row.clone() for row in rest]
 
+    @torch.no_grad()
+    def refresh(self) -> None:
+        """Takes what worlds share from the environment, which may change it while imagined steps are judged."""
+        for name, values in self._shared.items():
+            values.copy_(self._live[name])
+
     def control(
         self, qpos: torch.Tensor, qvel: torch.Tensor, action: torch.Tensor, rest: Sequence[torch.Tensor]
     ) -> torch.Tensor:
@@ -183,10 +193,12 @@ class Imagined:
         rest: Sequence[torch.Tensor],
         start: torch.Tensor,
         over: torch.Tensor,
+        units: torch.Tensor,
     ) -> Judgement:
         """Returns how a step that has led to states ends, and what the actor sees there.
 
-        A world in which a number is not finite terminates, without a reward, as a simulated one does.
+        A world in which a number of the state, or of what the actor sees, is not finite terminates, without a reward,
+        as a simulated one does.
 
         Args:
             qpos: positions after it, ``(worlds, nq)``.
@@ -195,8 +207,8 @@ class Imagined:
             rest: the rest of the states before the step, as :meth:`unpacked` returns it.
             start: states, ``(worlds, size)``, to which worlds go back that are over: nothing runs away there.
             over: which were before, bool ``(worlds,)``.
+            units: random numbers in [0, 1), ``(worlds, drawn)``.
         """
-        units = torch.rand_like(self._units)
         inputs = [qpos, qvel, *self.kinematics(qpos, qvel), action, units, *rest]
         ended, cut, over, gone, observation, qpos, qvel, *after = self._say(over, start, *inputs)
         return Judgement(ended, cut, over, observation, qpos, qvel, after, [gone, *inputs])
@@ -224,16 +236,17 @@ class Imagined:
         if WithUnits.drawn:
             self._refuse("its control draws random numbers")
         self._control = self._checked(self._controlled, (qpos, qvel, action, *rest))
-        self._units = qpos.new_zeros(len(qpos), 0)
         none = torch.zeros_like(qpos[:, 0], dtype=torch.bool)
-        inputs = [qpos, qvel, *self.kinematics(qpos, qvel), action, self._units, *rest]
+        inputs = [qpos, qvel, *self.kinematics(qpos, qvel), action, qpos.new_zeros(len(qpos), 0), *rest]
         with torch.no_grad():
             self._called(*inputs)  # which counts random numbers
-        self._units = inputs[7] = qpos.new_zeros(len(qpos), WithUnits.drawn)
+        self.drawn = WithUnits.drawn
+        inputs[7] = qpos.new_zeros(len(qpos), self.drawn)
         say = self._checked(self._going_on, [none, start, *inputs])
         earn = self._checked(
             self._worth, [each.repeat(self._steps, *[1] * (each.ndim - 1)) for each in (none, *inputs)]
         )
+        # What rewards do not depend on is not joined.
         self._is_used = [bool(node.users) for node in earn.graph.find_nodes(op="placeholder")]
         self._say, self._earn = (say, earn) if compiled is None else (compiled(say), compiled(earn))
 

@@ -54,7 +54,7 @@ COLUMNS: dict[str, Any] = {
 }
 """What is known of a link, and its type."""
 SHAPES = (3,), (3, 3), (3,), (3,)  # of what is found of a link: place, orientation, velocities
-OUTPUTS = {(3,): wp.vec3, (3, 3): wp.mat33}  # their types, by shape
+TYPES = wp.float32, wp.float32, *2 * (wp.vec3, wp.mat33, wp.vec3, wp.vec3)  # of what the kernel reads and writes
 
 
 @wp.kernel(module="unique")
@@ -226,19 +226,18 @@ class Kinematics:
 
         Args:
             tensors: qpos and qvel, for each chain, ``(worlds, chains, ...)``, and what is found of links and bodies.
-            slopes: the gradients with regard to them, to which those are added that follow from later ones.
+            slopes: the gradients with regard to them; those of bodies are read, others are added to.
         """
-        arrays, gradients = ([_as_warp(each) for each in every] for every in (tensors, slopes))
+        arrays, gradients = (
+            [wp.from_torch(each.detach(), dtype=kind) for each, kind in zip(every, TYPES, strict=False)]
+            for every in (tensors, slopes)
+        )
         adjoint: dict[str, Any] = {}
         if slopes:
             adjoint = {"adjoint": True, "adj_inputs": [Links(), *gradients[:2]], "adj_outputs": gradients[2:]}
         with EXCLUSIVE, wp.ScopedStream(current_stream(self._device), sync_enter=False):
             settings = {"device": self._device, "block_dim": BLOCK, **adjoint}
             wp.launch(place_links, (self.chains, len(tensors[0])), [self._links, *arrays[:2]], arrays[2:], **settings)
-
-
-def _as_warp(tensor: torch.Tensor) -> wp.array:
-    return wp.from_torch(tensor.detach(), dtype=OUTPUTS.get(tuple(tensor.shape[2:]), wp.float32))
 
 
 class _Placed(torch.autograd.Function):

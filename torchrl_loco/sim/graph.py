@@ -119,7 +119,9 @@ class TorchGraph:
     ``tensordict.nn.CudaGraphModule`` waits for the device at every call; this does not.
 
     Args:
-        work: reads and writes tensors that keep their addresses. Warp's launches need :func:`joined_to_torch`.
+        work: reads and writes tensors that keep their addresses. Warp's launches need :func:`joined_to_torch`, at the
+            end of which the branches are joined that were recorded so far; but for those of a kernel that is loaded,
+            which allocate nothing: the current stream is enough for them.
         device: a CUDA device.
         warmup: calls that run the work directly, before it is recorded.
     """

@@ -50,6 +50,9 @@ class Algorithm(ABC):
     norms: dict[str, ObservationNorm]
     """The norms of what networks read, by entry; ``observation`` is the actor's."""
     networks: nn.Module
+    began: torch.cuda.Event | None = None
+    """Behind this event an update reads neither the batch nor the environment, so that the next batch is collected from
+    there on, on one rank; ``None`` if it is collected behind the update."""
 
     def __init__(self, config: TrainingConfig, spaces: Spaces, network: Network | None = None) -> None:
         self.config, self.spaces, self.network = config, spaces, network
@@ -60,8 +63,7 @@ class Algorithm(ABC):
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
         self._data: Packed | None = None
         on_cuda = self.device.type == "cuda"
-        self.began: torch.cuda.Event | None = None  # since when an update no longer needs what a next batch changes
-        self._stream = torch.cuda.Stream(self.device, priority=-1) if on_cuda else None
+        self._stream = torch.cuda.Stream(self.device, priority=-1) if on_cuda else None  # what is put there is longer
         self._epoch = TorchGraph(self._gradient_steps, self.device, warmup=WARMUP) if on_cuda else self._gradient_steps
 
     @abstractmethod

@@ -54,7 +54,8 @@ class Replay:
         self._kept: dict[str, torch.Tensor] = {}
         n, steps, device = config.minibatch_size, config.window, generator.device
         row = sum(sizes.values()) + m.nu + m.nq + 2 * m.nv + 1
-        check_memory(4 * row * self._size * config.num_envs, config.num_envs, device)
+        steps_kept = self._size + config.num_steps  # with a batch that is collected ahead
+        check_memory(4 * row * steps_kept * config.num_envs, config.num_envs, device)
         rows = (n, sizes["state"]), (steps, n, m.nu), (steps, n, m.nq + m.nv), (steps, n, m.nv), (steps, n)
         self.window = Window(*(torch.zeros(shape, device=device) for shape in rows))
         self.starts = tuple(torch.zeros(n, size, device=device) for size in sizes.values())

@@ -35,8 +35,8 @@ from torchrl_loco.training.replay import Replay
 class SVG(Algorithm):
     """After each batch, some rounds: the model is fitted to windows of what is remembered, actor and critic imagine.
 
-    The policy that is evaluated and kept is a moving average of the one that learns. A copy of that collects, of before
-    the update, so that the next batch is collected meanwhile.
+    The policy that is evaluated and kept is a moving average of the one that learns. The one that collects is a copy of
+    that, from before the update, on all devices: on CUDA the next batch is collected meanwhile.
     """
 
     config_type = SVGConfig
@@ -81,7 +81,8 @@ class SVG(Algorithm):
         value = nn.Sequential(*normed_layers(spaces.critic, config.critic_hidden), nn.Linear(last, 1))
         self.critic = nn.Sequential(self.norms[spaces.critic_key], value.to(self.device))
         self._target = copy.deepcopy(self.critic[1]).requires_grad_(False)
-        parts = {"actor": self.actor, "learner": self._learner, "critic": self.critic, "target": self._target}
+        actors = {"actor": self.actor, "learner": self._learner, "collector": self._collector}
+        parts = {**actors, "critic": self.critic, "target": self._target}
         self.networks, self._rounds = nn.ModuleDict(parts), 0
         self._actor_optimizers = self._optimizers_of("actor", self._mean)
         self._critic_optimizers = [self.make_optimizer("critic", value.parameters())]
@@ -118,6 +119,8 @@ class SVG(Algorithm):
             if isinstance(layer, nn.Linear):  # as autocast has them, but once a round
                 layer.bfloat16()
         self._model_optimizers = self._optimizers_of("model", self.model.net)
+        steps = torch.zeros(config.horizon, config.minibatch_size, 1, device=self.device)
+        self._noise, self._units = (steps.repeat(1, 1, count) for count in (self.spaces.action, self._imagined.drawn))
         sizes = {"state": self._imagined.size, "observation": self.spaces.observation}
         self._replay = Replay(config, m, sizes, self.generator)
         self._move, self._dream = fused(self._moved, "the model"), fused(self._dreamt, "the actor")
@@ -133,16 +136,6 @@ class SVG(Algorithm):
     def actors(self) -> list[ProbabilisticActor]:
         """The actor that is kept, the one that learns and the one that collects."""
         return [self.actor, self._learner, self._collector]
-
-    def load_networks(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Copies the parameters of networks."""
-        super().load_networks(state)
-        self._show()
-
-    @torch.no_grad()
-    def _show(self) -> None:
-        """Lets the actor collect that learns."""
-        torch._foreach_copy_(list(self._shown.state_dict().values()), list(self._mean.state_dict().values()))
 
     def prepare(self, batch: TensorDictBase) -> NoReturn:
         """Refuses: it remembers batches instead."""
@@ -167,13 +160,17 @@ class SVG(Algorithm):
         steps = self._replay.keep(batch)
         self.learn_moments(batch)
         self.model.learn_moments(*steps)
-        self._show()
+        self._imagined.refresh()
+        with torch.no_grad():
+            torch._foreach_copy_(list(self._shown.state_dict().values()), list(self._mean.state_dict().values()))
         self.began = torch.cuda.current_stream(self.device).record_event() if self.device.type == "cuda" else None
         self._totals.zero_()
         rounds = self.config.epochs if self._replay.has_window else 0
         for _ in range(rounds):
             self._replay.draw_window()
             self._replay.draw_starts()
+            self._noise.normal_(generator=self.generator)  # graphs that run at once share the state of torch's own
+            self._units.uniform_(generator=self.generator)
             self._learn()
         self._rounds += rounds
         return self._totals / max(rounds, 1)
@@ -281,9 +278,9 @@ class SVG(Algorithm):
         for start in (qpos, qvel, observation, *rest):
             start.requires_grad_(start.is_floating_point())  # as in later steps, so that one kernel does
         judged, over = [], torch.zeros_like(rows[:, 0], dtype=torch.bool)
-        for noise in torch.randn(config.horizon, len(rows), self.spaces.action, device=self.device):
+        for noise, units in zip(self._noise, self._units, strict=True):
             action, qpos, qvel = self._dream(observation, qpos, qvel, noise, *rest)
-            said = imagined.judge(qpos, qvel, action, rest, rows, over)
+            said = imagined.judge(qpos, qvel, action, rest, rows, over, units)
             qpos, qvel, rest, over, observation = said.qpos, said.qvel, said.rest, said.over, said.observation
             judged.append(said)
         earned, cut = imagined.earned(judged), torch.stack([said.truncated for said in judged])

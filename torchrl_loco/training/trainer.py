@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import logging
 import math
 import sys
@@ -130,9 +131,7 @@ class Trainer:
         self._source = source_of(run.task)
         self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
-        on_cuda = self.algorithm.device.type == "cuda"
-        self._beside = torch.cuda.Stream(self.algorithm.device) if on_cuda else None
-        self._ahead: TensorDictBase | None = None
+        self._ahead: tuple[TensorDictBase, torch.Tensor] | None = None
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
         self._non_finite, self._said = 0, set[str]()
         self._alike: float | None = None  # the reward of the last batch, if there was only one
@@ -267,13 +266,12 @@ class Trainer:
             ValueError: no step of it was finite.
         """
         config, algorithm, start = self.config, self.algorithm, time.perf_counter()
-        batch = self.collector.rollout() if self._ahead is None else self._ahead
+        batch, ended = self._collect() if self._ahead is None else self._ahead
+        self._ahead = None
         for name, kept in self._summed.items():
             distributed.add_changes(self._base.world.shared[name], kept)
         after = batch["next"]
         reward = after["reward"].mean() / config.action_repeat
-        flags = (after[name].squeeze(-1) for name in ("done", "terminated"))
-        ended = self.episodes.add(after["reward"].squeeze(-1), *flags)
         spread, ends = after["reward"].max() - after["reward"].min(), after["done"].float().mean()
         of_env = {f"reward/{name}": after["reward_terms", name].mean() / config.action_repeat for name in self._terms}
         of_env |= {f"metric/{name}": after["metrics", name].nanmean() for name in self._base.metric_names}
@@ -307,16 +305,28 @@ class Trainer:
             **{name: round(value, 6) for name, value in zip(names, means, strict=True)},
         }
 
-    def _collected_ahead(self) -> TensorDictBase | None:
+    def _collect(self) -> tuple[TensorDictBase, torch.Tensor]:
+        """Returns a batch, and what :meth:`Episodes.add` says of it."""
+        batch = self.collector.rollout()
+        after = batch["next"]
+        flags = (after[name].squeeze(-1) for name in ("done", "terminated"))
+        return batch, self.episodes.add(after["reward"].squeeze(-1), *flags)
+
+    def _collected_ahead(self) -> tuple[TensorDictBase, torch.Tensor] | None:
         """Returns the next batch if the algorithm lets it be collected while it still updates on the last one."""
         began, is_last = self.algorithm.began, self.last_frame - self.frames <= self.frames_per_iteration
-        if self._beside is None or began is None or is_last or not self.collector.replays or distributed.ranks() > 1:
+        if began is None or is_last or not self.collector.replays or distributed.ranks() > 1:
             return None
+        now = torch.cuda.current_stream(self.algorithm.device)
         with torch.cuda.stream(self._beside):
             began.wait()
-            batch = self.collector.rollout()
-        torch.cuda.current_stream(self.algorithm.device).wait_stream(self._beside)
-        return batch
+            collected = self._collect()
+        now.wait_stream(self._beside)
+        return collected
+
+    @functools.cached_property
+    def _beside(self) -> torch.cuda.Stream:
+        return torch.cuda.Stream(self.algorithm.device)
 
     def evaluate(self) -> dict[str, float]:
         """Returns the summary of an evaluation of the current policy, which is saved if it is the best so far."""
