@@ -118,7 +118,7 @@ class Imagined:
     """Worlds whose states are predicted: the hooks of their task are called on them as on simulated ones.
 
     Contacts and sensors of forces are zeros there; what events do to positions and velocities does not happen, nothing
-    is added to ``shared``, which is what it was at the last :meth:`refresh`, no time limit ends an episode, and random
+    is added to ``shared``, which is what it was at the last ``refresh()``, no time limit ends an episode, and random
     numbers are given.
 
     Args:

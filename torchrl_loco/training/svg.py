@@ -226,7 +226,7 @@ class SVG(Algorithm):
         """Makes a gradient step of the actor, in steps that are imagined from remembered states on.
 
         Returns:
-            What the critic learns from it: what it read, the returns of it, how much each counts, and when they exist.
+            What the critic reads of steps, what returns it had, how much each counts, and when these exist.
         """
         rewards, ended, cut, seen = self._imagine()
         values = self._target_value(seen.flatten(0, 1)).view_as(rewards)
