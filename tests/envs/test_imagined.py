@@ -216,11 +216,8 @@ def test_a_task_says_of_predicted_states_what_it_says_in_its_worlds(task):
         assert not earned.observations["privileged"].any()
         assert not gone.observation.any()
         assert not gone.qpos.any()
-        endless = [
-            *said.rest[:-2],
-            said.rest[-2] + float("inf"),
-            said.rest[-1],
-        ]  # updates, which reward and critic read
+        *rest, updates, ends = said.rest
+        endless = [*rest, updates + float("inf"), ends]  # reward and critic read it, the actor does not
         said = imagined.judge(said.qpos, said.qvel, torch.zeros(4, 1), endless, start, said.over & False, none)
         earned = imagined.earned([said])
         assert earned.terminated.all()

@@ -51,8 +51,8 @@ class Algorithm(ABC):
     """The norms of what networks read, by entry; ``observation`` is the actor's."""
     networks: nn.Module
     began: torch.cuda.Event | None = None
-    """Behind this event an update reads neither the batch nor the environment, so that the next batch is collected from
-    there on, on one rank; ``None`` if it is collected behind the update."""
+    """Event of an update after which it reads neither the batch nor the environment: on one rank, the next batch is
+    collected from there on. ``None``: after the update."""
 
     def __init__(self, config: TrainingConfig, spaces: Spaces, network: Network | None = None) -> None:
         self.config, self.spaces, self.network = config, spaces, network
@@ -63,7 +63,8 @@ class Algorithm(ABC):
         self._totals = torch.zeros(len(self.metric_names), device=config.device)
         self._data: Packed | None = None
         on_cuda = self.device.type == "cuda"
-        self._stream = torch.cuda.Stream(self.device, priority=-1) if on_cuda else None  # what is put there is longer
+        # The longer of two branches goes there (svg's actor), and its kernels first.
+        self._stream = torch.cuda.Stream(self.device, priority=-1) if on_cuda else None
         self._epoch = TorchGraph(self._gradient_steps, self.device, warmup=WARMUP) if on_cuda else self._gradient_steps
 
     @abstractmethod

@@ -275,7 +275,7 @@ class Trainer:
         spread, ends = after["reward"].max() - after["reward"].min(), after["done"].float().mean()
         of_env = {f"reward/{name}": after["reward_terms", name].mean() / config.action_repeat for name in self._terms}
         of_env |= {f"metric/{name}": after["metrics", name].nanmean() for name in self._base.metric_names}
-        non_finite = self._base.health()["total", "non_finite"]
+        non_finite = self._base.health()["total", "non_finite"]  # before a batch that is collected ahead changes it
         numbers = torch.cat([ended, torch.stack([non_finite, spread, ends, reward, *of_env.values()])])
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
         self._ahead = self._collected_ahead()
