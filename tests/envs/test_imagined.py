@@ -216,10 +216,11 @@ def test_a_task_says_of_predicted_states_what_it_says_in_its_worlds(task):
         assert not earned.observations["privileged"].any()
         assert not gone.observation.any()
         assert not gone.qpos.any()
-        *rest, updates, ends = said.rest
-        endless = [*rest, updates + float("inf"), ends]  # reward and critic read it, the actor does not
+        *rest, count, odd, updates, ends = said.rest
+        endless = [*rest, 0 * count, odd, updates + float("inf"), ends]  # reward and critic read it, the actor does not
         said = imagined.judge(said.qpos, said.qvel, torch.zeros(4, 1), endless, start, said.over & False, none)
         earned = imagined.earned([said])
+        assert not said.terminated.any()
         assert earned.terminated.all()
         assert not earned.reward.any()
         assert not earned.observations["privileged"].any()
