@@ -36,20 +36,20 @@ def draw_svg(ppo: dict[str, list[dict[str, str]]], svg: dict[str, list[dict[str,
     """Draws how 59 motions are learned by svg and by PPO."""
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     episodes, returns = figure.subplots(1, 2)
-    of_preset, quick = (
-        {n: rows for n, rows in svg.items() if n.startswith(start)} for start in ("seed", "in a minute")
+    before, preset = ({n: rows for n, rows in svg.items() if n.startswith(start)} for start in ("seed", "2048"))
+    groups = (
+        ("tab:orange", "PPO", "PPO", ppo),
+        ("tab:blue", "svg, seed", "svg, rounds of 4096", before),
+        ("tab:green", "svg, 2048", "svg, rounds of 2048", preset),
     )
-    groups = ("tab:orange", "PPO", ppo), ("tab:blue", "svg", of_preset), ("tab:green", "svg in a minute", quick)
-    for color, label, some in groups:
+    for color, _, label, some in groups:
         for name, rows in some.items():
             columns = ([float(row[key]) for row in rows] for key in ("seconds", "episode_length"))
             dashes = ":" if "anew" in name else "-"
             episodes.plot(*columns, dashes, color=color, lw=1.2, label=label + ", compiled anew" * (dashes == ":"))
     for name, rows in read(OF_SVG / "evaluations.csv").items():
-        if name.startswith("svg, horizon"):  # settings of before
-            continue
         seconds, reached = ([float(row[key]) for row in rows] for key in ("seconds", "return"))
-        color = next(color for color, label, _ in reversed(groups) if name.startswith(label))
+        color = next(color for color, start, *_ in groups if name.startswith(start))
         dashes = ":" if "anew" in name else "-"
         returns.plot(seconds, reached, "o" + dashes, color=color, ms=4, lw=1.2)
         returns.annotate(rows[-1]["lost"], (seconds[-1], reached[-1]), (5, -3), textcoords="offset points", size=7)
