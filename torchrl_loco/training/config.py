@@ -256,7 +256,7 @@ class PPOConfig(TrainingConfig):
     presets: ClassVar[dict[str, Settings]] = {
         "cpu": {
             "num_envs": 128,
-            "total_frames": 3_000_000,
+            "total_frames": 2_000_000,
             "action_repeat": 2,
             "epochs": 6,
             "minibatch_size": 1024,
