@@ -4,6 +4,7 @@ import copy
 import functools
 import signal
 
+import mujoco
 import pytest
 import torch
 from for_each import for_each
@@ -16,7 +17,7 @@ from torchrl_loco.envs.imagined import STATE
 from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.algorithm import begin_from
 from torchrl_loco.training.config import preset
-from torchrl_loco.training.dynamics import Dynamics
+from torchrl_loco.training.dynamics import Dynamics, unpredictable
 from torchrl_loco.training.muon import Muon, orthogonal
 from torchrl_loco.training.replay import Replay
 from torchrl_loco.training.run_folder import RunFolder
@@ -83,6 +84,23 @@ def test_the_model_can_say_any_step_exactly():
         assert model.errors(*before, after) > 1e-3
 
 
+@for_each(
+    ("world", "why"),
+    [
+        ("<geom type='plane' size='1 1 1' euler='0 0 30'/>", ""),
+        ("<body euler='0 90 0'><geom type='plane' size='1 1 1' euler='0 -90 0'/></body>", ""),
+        ("<geom type='box' size='1 1 1' pos='0 0 -2' contype='0' conaffinity='0'/>", ""),
+        ("<geom type='box' size='1 1 1' pos='0 0 -2'/>", "level plane"),
+        ("<body><geom type='box' size='1 1 1' pos='0 0 -2'/></body>", "level plane"),
+        ("<body euler='20 0 0'><geom type='plane' size='1 1 1'/></body>", "level plane"),
+        ("<body mocap='true'><geom type='plane' size='1 1 1'/></body>", "mocap"),
+    ],
+)
+def test_robots_on_level_ground_have_a_model(world, why):
+    m = mujoco.MjModel.from_xml_string(MODEL.replace("<worldbody>", f"<worldbody>{world}"))
+    assert why in unpredictable(m) if why else not unpredictable(m)
+
+
 def test_only_robots_that_float_have_a_model():
     with pytest.raises(ValueError, match="base must float"):
         Dynamics(loco.make("walker_walk", num_envs=1, **PLAIN).mj_model, 0.02, 4, (8,))
@@ -125,7 +143,10 @@ def test_windows_go_across_batches_and_no_further_than_episodes(what, behind):
     assert (qpos[::4] == 8.0).all()
     assert (qvel[::4] == 8.0).all()
     assert (ctrl[::4] == -8.0).all()
-    assert (after[1::4] == (9.0 if what == "lost" else 9.25)).all()
+    nobody_moves = what == "lost"
+    assert (after[1::4, :8] == (9.0 if nobody_moves else 9.25)).all()
+    assert (after[1::4, 8:] == (0.0 if nobody_moves else 9.25)).all()
+    assert (qvel[1::4] == (0.0 if nobody_moves else 9.0)).all()
     seen = set()
     for _ in range(20):
         replay.draw_window()
@@ -279,6 +300,24 @@ def test_muon_steps_along_all_directions(shape):
         moved = before - matrix.detach()
         assert (moved * gradient).sum() > 0.0
         assert 0.1 * rate < moved.square().mean().sqrt() < 0.25 * rate
+
+
+def test_hooks_are_called_in_single_precision(svg, monkeypatch):
+    rows, observation = svg._replay.starts
+    qpos, qvel, rest = svg._imagined.unpacked(rows)
+    found = []
+    monkeypatch.setattr(svg._imagined, "control", lambda q, v, action, _: found.append(action.T @ action) or action)
+    with torch.autocast("cpu", torch.bfloat16):
+        svg._dreamt(observation, qpos, qvel, svg._noise[0], *rest)
+    assert found[0].dtype == torch.float32
+
+
+def test_a_matrix_that_layers_share_is_stepped_once(svg, monkeypatch):
+    monkeypatch.setattr(svg, "optimizers", {})
+    layers = [torch.nn.Linear(4, 4) for _ in range(4)]
+    layers[1].weight, layers[2].weight = layers[0].weight, layers[3].weight
+    _, muon = svg._optimizers_of("shared", torch.nn.Sequential(*layers))
+    assert [id(each) for each in muon.param_groups[0]["params"]] == [id(layers[0].weight)]
 
 
 def learned(run):

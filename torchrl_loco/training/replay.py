@@ -70,19 +70,20 @@ class Replay:
         """Remembers a batch ``(num_envs, num_steps)`` in place of the oldest.
 
         Returns:
-            Positions, velocities, controls, and what came after them, of all its steps; nothing where a world was not
-            finite.
+            Positions, velocities, controls, and what came after them, of all its steps; nobody moves where a world was
+            not finite.
         """
         nq, nv, nu = self._parts
         before, later = batch[STATE], batch["next", STATE]
         found = later[..., -nq - nv - nu :]
         lost = ~later[..., :nq].any(-1)  # the observation of a world that is not finite is zero
+        still = torch.cat([before[..., :nq], torch.zeros_like(before[..., :nv])], dim=-1)
         leaps = (later[..., :nq] - found[..., :nq]).abs().amax(-1) > LEAP
         new = {
             "state": before[..., : self._sizes["state"]],
             "observation": batch["observation"],
             "ctrl": found[..., nq + nv :],
-            "after": torch.where(lost.unsqueeze(-1), before[..., : nq + nv], found[..., : nq + nv]),
+            "after": torch.where(lost.unsqueeze(-1), still, found[..., : nq + nv]),
             "event": later[..., nq : nq + nv] - found[..., nq : nq + nv],
             "end": batch["next", "done"].squeeze(-1) | leaps | lost,
             "lost": lost,
@@ -94,8 +95,9 @@ class Replay:
                 self._kept[name] = by_time.new_zeros(self._size, *by_time.shape[1:])
             self._kept[name][self._at : self._at + steps].copy_(by_time)
         self._at, self._filled = (self._at + steps) % self._size, min(self._filled + steps, self._size)
-        state, ctrl, after = (new[name].flatten(0, 1) for name in ("state", "ctrl", "after"))
-        return state[:, :nq], state[:, nq : nq + nv], ctrl, after
+        ctrl, after = (new[name].flatten(0, 1) for name in ("ctrl", "after"))
+        state = torch.where(lost.unsqueeze(-1), still, before[..., : nq + nv]).flatten(0, 1)
+        return state[:, :nq], state[:, nq:], ctrl, after
 
     def _drawn(self, steps: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns where so many consecutive steps begin: at which times, and of which worlds, ``(n,)``."""

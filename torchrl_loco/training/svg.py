@@ -301,7 +301,9 @@ class SVG(Algorithm):
         """Returns the actions that standard normal noise makes, and the positions and velocities they lead to."""
         action = self._mean(self.norms["observation"](observation)).float() + self.config.init_std * noise
         action = action.tanh() if self.spaces.bounded else action
-        return action, *self._known(qpos, qvel, self._imagined.control(qpos, qvel, action, rest))
+        with torch.autocast(self.device.type, enabled=False):  # a hook
+            ctrl = self._imagined.control(qpos, qvel, action, rest)
+        return action, *self._known(qpos, qvel, ctrl)
 
     def _valued(self, rows: torch.Tensor) -> torch.Tensor:
         """Returns the values that returns are made with, ``(n, 1)``."""
@@ -311,7 +313,8 @@ class SVG(Algorithm):
 
     def _optimizers_of(self, name: str, network: nn.Module) -> list[Any]:
         """Returns those of a network: Muon for its matrices but the last, Adam for the rest."""
-        matrices: list[Any] = [part.weight for part in network.modules() if isinstance(part, nn.Linear)][:-1]
+        weights: list[Any] = [part.weight for part in network.modules() if isinstance(part, nn.Linear)]
+        matrices = list({id(each): each for each in weights if each is not weights[-1]}.values())  # some may be shared
         taken = set(map(id, matrices))
         rest = self.make_optimizer(name, (each for each in network.parameters() if id(each) not in taken))
         if not matrices:

@@ -200,9 +200,8 @@ class Trainer:
                 bar.update(self.frames_per_iteration)
                 if first:
                     self._say_once(row)
-                trial_is_over, of_trial = self.trials.is_over(self.frames), self.trials.own_frames(self.frames)
-                is_due = config.eval_interval and of_trial % config.eval_interval < self.frames_per_iteration
-                if trial_is_over or self.frames >= self.last_frame or is_due:
+                trial_is_over = self.trials.is_over(self.frames)
+                if trial_is_over or self.frames >= self.last_frame or self._evaluates_after(self.frames):
                     mean = None
                     if loggers is not None:
                         mean = self.evaluate()["mean"]
@@ -220,6 +219,11 @@ class Trainer:
                     if first:
                         plot_runs([self.run], self.run.path / "learning_curve.png")
                     raise KeyboardInterrupt
+
+    def _evaluates_after(self, frames: int) -> bool:
+        """Returns whether an evaluation is due after so many frames, beside those at an end."""
+        interval = self.config.eval_interval
+        return bool(interval) and self.trials.own_frames(frames) % interval < self.frames_per_iteration
 
     def _say_once(self, row: dict[str, float]) -> None:
         """Prints what a user should know after a batch with these metrics, each thing once in a run."""
@@ -313,9 +317,14 @@ class Trainer:
         return batch, self.episodes.add(after["reward"].squeeze(-1), *flags)
 
     def _collected_ahead(self) -> tuple[TensorDictBase, torch.Tensor] | None:
-        """Returns the next batch if the algorithm lets it be collected while it still updates on the last one."""
-        began, is_last = self.algorithm.began, self.last_frame - self.frames <= self.frames_per_iteration
-        if began is None or is_last or not self.collector.replays or distributed.ranks() > 1:
+        """Returns the next batch if the algorithm lets it be collected while it still updates on the last one.
+
+        None is before an evaluation, which begins at the stage of what was learned from.
+        """
+        began, frames = self.algorithm.began, self.frames + self.frames_per_iteration
+        if began is None or frames >= self.last_frame or self._evaluates_after(frames):
+            return None
+        if not self.collector.replays or distributed.ranks() > 1:
             return None
         now = torch.cuda.current_stream(self.algorithm.device)
         with torch.cuda.stream(self._beside):
