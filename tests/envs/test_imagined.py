@@ -298,7 +298,7 @@ class LeavesTorch(Rich):
     """Its reward is computed in NumPy."""
 
     def reward(self, s):
-        return torch.from_numpy(np.sin(s.qvel[:, 6].detach().numpy()))
+        return torch.from_numpy(np.sin(np.from_dlpack(s.qvel[:, 6].detach())))
 
 
 class Drawing(Rich):

@@ -310,7 +310,10 @@ class WorldAccess(EnvBase):
             of_task = known[check_choice("stage", group, known)]
             for name, values in entries.items():
                 target = of_task[check_choice(f"{group} of the stage", name, of_task)]
-                new = torch.as_tensor(values, device=self.device).to(target.dtype)
+                given = torch.as_tensor(values, device=self.device)
+                new = torch.atleast_1d(given.to(target.dtype)) if group == "memory" else given.to(target.dtype)
+                if (new != given).any():
+                    raise ValueError(f"{group} {name!r} of a stage must be numbers of {target.dtype}, got {values}")
                 if group == "memory" and len(new):
                     new = new[torch.arange(self.num_envs, device=self.device) % len(new)]
                 if new.shape != target.shape:

@@ -123,16 +123,20 @@ class Hooks:
         view = self.view(self.catalog, arrays, hook, steps) if view is None else view
         if self.catalog.complete:
             returned = getattr(env, hook)(view, *args)
-            if view.lost:
-                self._count_lost(arrays, view.lost, masked=hook in ("begin", "observation") and steps == 0)
+            if view._lost:
+                self._count_lost(arrays, view._lost, masked=hook in ("begin", "observation") and steps == 0)
             return returned
-        shown = {**arrays, **self.catalog.constants}
+        shown = {**arrays, **self.catalog.constants, "home": self.catalog.home}
         before, own = {name: rows._version for name, rows in shown.items()}, dict(vars(env))
+        of_model = {name: rows._version for name, rows in self.catalog.of_model.items()}
         with reads_of(env) as self.read[hook]:
             returned = getattr(env, hook)(view, *args)
         for name, version in before.items():
             if shown[name]._version != version:
                 raise ValueError(f"{self._title}.{hook} writes to s.{name.rpartition('.')[2]}: work on a clone")
+        for name, rows in self.catalog.of_model.items():
+            if rows._version != of_model.get(name, 0):
+                raise ValueError(f"{self._title}.{hook} writes to {name!r} of the model: work on a clone")
         for name, value in vars(env).items():
             if own.get(name, own) is not value:
                 raise ValueError(
@@ -277,6 +281,8 @@ class Hooks:
         """Returns a group of the observation: the tensor that a hook returned, or its terms in their order."""
         terms = values if isinstance(values, Mapping) else {group: values}
         if not self.catalog.complete:
+            if not terms:
+                raise ValueError(f"{self._title}.observation: {group!r} has no terms")
             for term, rows in terms.items():
                 self._check_term(group, term, rows)
                 self._shapes[group, term] = tuple(rows.shape[1:])

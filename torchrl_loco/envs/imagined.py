@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple, NoReturn
 import torch
 
 from torchrl_loco.envs.base import LocoEnv
-from torchrl_loco.envs.fusion.trace import Tracer
+from torchrl_loco.envs.fusion.trace import NumbersTaken, NumberTakenError, Tracer
 from torchrl_loco.envs.hooks import ENDS, beyond, by_world
 from torchrl_loco.envs.kinematics import Kinematics
 from torchrl_loco.envs.tables import Entry, entries
@@ -252,7 +252,11 @@ class Imagined:
 
     def _checked(self, function: Callable[..., Sequence[torch.Tensor]], inputs: Sequence[torch.Tensor]) -> Any:
         """Returns what :func:`traced` makes of a function, if it does the same with other numbers."""
-        module, generator = traced(function, inputs), torch.Generator().manual_seed(0)
+        try:
+            module = traced(function, inputs, self._hooks.catalog.fixed())
+        except NumberTakenError as error:
+            self._refuse(str(error))
+        generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
             others = [
                 each + 0.1 * torch.randn(each.shape, generator=generator).to(each.device) * each.is_floating_point()
@@ -357,13 +361,15 @@ class WithUnits(View):
         return units[:, first : first + count] if units.shape[1] else units.new_zeros(self.num_envs, count)
 
 
-def traced(function: Callable[..., Sequence[torch.Tensor]], inputs: Sequence[torch.Tensor]) -> torch.fx.GraphModule:
+def traced(
+    function: Callable[..., Sequence[torch.Tensor]], inputs: Sequence[torch.Tensor], fixed: Sequence[torch.Tensor] = ()
+) -> torch.fx.GraphModule:
     """Returns a function of tensors as a module of torch's operators, through which gradients flow.
 
     Products of matrices of at most 4 x 4 become sums, which join the kernels around them.
     """
-    tracer = Tracer({str(i): each.detach() for i, each in enumerate(inputs)})
-    with torch.no_grad(), tracer:
+    tracer = Tracer({str(i): each.detach() for i, each in enumerate(inputs)}, fixed)
+    with torch.no_grad(), NumbersTaken(tracer), tracer:
         results = function(*tracer.arrays)
     graph = tracer.graph
     graph.output(tuple(tracer.argument(result) for result in results))

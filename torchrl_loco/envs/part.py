@@ -70,7 +70,7 @@ class Part:
         """
         try:
             with no_collection():  # an environment that is dropped meanwhile computes, which would be traced too
-                self._traced = trace(self._work, self._arrays)
+                self._traced = trace(self._work, self._arrays, self._fixed)
         except Exception as error:  # whatever hooks and tracing raise
             self._stays_plain(error)
             return False

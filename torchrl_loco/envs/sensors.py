@@ -54,12 +54,15 @@ class Frames:
 
     def _there(self, what: str) -> torch.Tensor:
         """Returns where they are in the frames of their bodies, their ``"pos"`` or their axes by ``"quat"``."""
-        field = getattr(self._s._catalog.mj_model, f"{'body_i' if self._kind == 'inertia' else f'{self._kind}_'}{what}")
+        catalog, name = self._s._catalog, f"{'body_i' if self._kind == 'inertia' else f'{self._kind}_'}{what}"
+        if what == "pos" and catalog.variation is not None and name in catalog.variation.places:
+            return catalog.pick(self._s.model(name), self._ids, self._one)
+        field = getattr(catalog.mj_model, name)
 
         def numbers() -> Any:
             return field[self._ids] if what == "pos" else [axes_of(field[i]) for i in self._ids]
 
-        there = self._s._catalog.derived((self._kind, what, tuple(self._ids)), numbers)
+        there = catalog.derived((self._kind, what, tuple(self._ids)), numbers)
         return there[0] if self._one else there
 
     def _lever(self) -> torch.Tensor:

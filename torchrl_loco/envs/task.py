@@ -5,6 +5,7 @@ import logging
 import math
 import sys
 from collections.abc import Mapping, Sequence
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
@@ -188,7 +189,8 @@ class Task:
         """Returns rows that begin an episode, by name: qpos, qvel, and of :attr:`memory`.
 
         What is not returned begins as zero, ``qpos`` as ``s.home``. The worlds are at rest; ``s`` shows the memory that
-        the last episode left. By default a Warp function or table of the class begins it, if it has one.
+        the last episode left, and neither poses nor sensors, which are updated after it. By default a Warp function or
+        table of the class begins it, if it has one.
         """
         return s._begun_by_warp()
 
@@ -425,12 +427,20 @@ def check_commands(cls: type[Task], memory: Mapping[str, Entry]) -> None:
 
 def check_options(cls: type[Task]) -> None:
     """Checks the options that a class declares."""
+    packages = "torchrl_loco.envs.", "torchrl.", "torch."
+    of_environments = [_names_of(base) for base in cls.__mro__ if base.__module__.startswith(packages)]
     for name, entry in cls.options.items():
         if not (isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[1], str)):
             raise TypeError(f"{cls.__name__}.options[{name!r}] must be a value and what it is for, got {entry!r}")
-        taken = hasattr(Task, name) or name in SimConfig.__dataclass_fields__
+        taken = name in SimConfig.__dataclass_fields__ or any(name in names for names in of_environments)
         if taken or not str(name).isidentifier() or str(name).startswith("_"):
             raise ValueError(f"{cls.__name__}.options: {name!r} is no name that an option can have")
+
+
+def _names_of(cls: type) -> set[str]:
+    """Returns the names of a class's attributes, and of what makes an instance."""
+    begins = vars(cls).get("__init__")
+    return {*vars(cls), *vars(cls).get("__annotations__", {}), *(signature(begins).parameters if begins else ())}
 
 
 def _warn_of_misspelt_names(cls: type[Task]) -> None:

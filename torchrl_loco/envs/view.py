@@ -22,6 +22,11 @@ from torchrl_loco.sim.simulation import check_memory
 
 OF_A_STEP = frozenset({"action", "ctrl"})
 """What belongs to a step: an observation is also made after a reset, where there was none."""
+OF_THE_LAST_EPISODE = frozenset(
+    {"xpos", "xmat", "cvel", "subtree_com", "sensordata", "contact_force", "in_contact"}
+    | {"contact_force_history", "in_contact_history"}
+)
+"""What ``begin`` must not read: poses and sensors are updated after it."""
 CONTACT_HISTORY = ("contact_force_history", "in_contact_history")  # arrays of contacts with a row for each substep
 COPIES_IN_HOOKS = 2  # how often what eyes see lies in memory: where it is found, and in what a hook makes of it
 
@@ -88,6 +93,9 @@ class Catalog(Elements):
         """Returns a field in all worlds, ``(num_envs, *shape)``; one that varies, by their ``numbers()``."""
         if self.variation is not None and name in self.variation.places:
             return self.variation.field(name, numbers())
+        if name == "body_subtreemass" and self.variation is not None and "body_mass" in self.variation.places:
+            masses = self.variation.field("body_mass", numbers())
+            return (masses.unsqueeze(-1) * self.derived("subtrees", lambda: subtrees(self.mj_model))).sum(1)
         values = self.constant(name)
         return values.expand(self.num_envs, *values.shape)
 
@@ -95,6 +103,11 @@ class Catalog(Elements):
         """Returns tensors that never change: of indices, and the task's tables."""
         variation = self.variation.fixed() if self.variation else []
         return [*self._index.values(), *self.constants.values(), *self._tables.values(), *variation]
+
+    @property
+    def of_model(self) -> Mapping[Any, torch.Tensor]:
+        """The numbers of the model that were asked for."""
+        return self._constants
 
     def places(self, first: int, count: int) -> torch.Tensor:
         """Returns places of random streams, which torch.compile would compute wrongly: they wrap around 64 bits."""
@@ -130,14 +143,14 @@ class View:
         steps: control steps that the worlds have taken beyond those that are counted.
 
     Attributes:
-        lost: in which worlds an index of a table was out of range, by whether that gave NaN.
+        _lost: in which worlds an index of a table was out of range, by whether that gave NaN.
     """
 
     def __init__(self, catalog: Catalog, arrays: Mapping[str, torch.Tensor], hook: str, steps: int = 0) -> None:
         self._catalog, self._arrays, self._hook, self._steps = catalog, arrays, hook, steps
         self._stream: torch.Tensor | None = None
         self._drawn = 0
-        self.lost: dict[bool, torch.Tensor] = {}
+        self._lost: dict[bool, torch.Tensor] = {}
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuses to set what a hook sees.
@@ -159,10 +172,19 @@ class View:
                 f"s.{name} belongs to a step, and {self._hook}() is also called after a reset: "
                 f"keep what you need of it in memory, by returning it from events()"
             )
+        if name in OF_THE_LAST_EPISODE:
+            self._refuse_in_begin(name)
         self._catalog.arrays.add(name)
         if name not in self._arrays:
             raise ValueError(f"{name} was not asked for when the hooks were first called, so it is not computed")
         return self._arrays[name]
+
+    def _refuse_in_begin(self, what: str) -> None:
+        if self._hook == "begin":
+            raise ValueError(
+                f"begin() is called before poses and sensors are updated, so {what} would be of the last episode: "
+                "begin from s.home, and keep what you need of an episode in memory, by returning it from events()"
+            )
 
     @property
     def qpos(self) -> torch.Tensor:
@@ -264,7 +286,7 @@ class View:
     def _note(self, lost: torch.Tensor, gave_nan: bool) -> None:
         if lost.shape[0] not in (1, self.num_envs):  # of an index that is the same in all worlds
             lost = lost.any().reshape(1)
-        self.lost[gave_nan] = self.lost[gave_nan] | lost if gave_nan in self.lost else lost
+        self._lost[gave_nan] = self._lost[gave_nan] | lost if gave_nan in self._lost else lost
 
     def _by_warp(self, name: str) -> torch.Tensor:
         """Returns what the Warp function of the class has made in this step, its ``observation`` or ``reward``."""
@@ -412,6 +434,7 @@ class View:
         Raises:
             ValueError: the hook did not ask for it at its first call.
         """
+        self._refuse_in_begin("what is seen of the ground")
         scans = self._catalog.scans
         name = next((name for name, other in scans.items() if other == asked), f"scan.{len(scans)}")
         if not self._catalog.complete:
@@ -520,10 +543,12 @@ class View:
 
         The same numbers come for any number of worlds and at every run; on another device up to rounding.
         """
+        shape = torch.Size(*shape) if shape and not isinstance(shape[0], int) else shape  # a tuple, as torch takes it
         return low + (high - low) * draws.to_unit(self._draw(math.prod(shape))).view(self.num_envs, *shape)
 
     def normal(self, *shape: int) -> torch.Tensor:
         """Returns draws from the standard normal distribution, ``(num_envs, *shape)``; see :meth:`uniform`."""
+        shape = torch.Size(*shape) if shape and not isinstance(shape[0], int) else shape
         count = math.prod(shape)
         first, second = self._draw(2 * count).split(count, dim=1)
         return draws.to_normal(first, second).view(self.num_envs, *shape)
@@ -536,6 +561,14 @@ class View:
             )
         first, self._drawn = self._drawn, self._drawn + count
         return draws.mix(self._stream + self._catalog.places(first, count))
+
+
+def subtrees(m: mujoco.MjModel) -> np.ndarray:
+    """Returns which bodies are in whose subtree, ``(nbody, nbody)``, with a column for each subtree."""
+    found = np.eye(m.nbody)
+    for body in range(m.nbody - 1, 0, -1):  # children come after their parents
+        found[:, m.body_parentid[body]] += found[:, body]
+    return found
 
 
 def usable(action: torch.Tensor, bounded: bool) -> torch.Tensor:

@@ -5,12 +5,14 @@
 
 import contextlib
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 from torch._decomp import decomposition_table
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from torchrl_loco.envs.fusion.rules import RULES
 
@@ -42,16 +44,25 @@ def _decomposed(func: Any) -> Callable[..., Any] | None:
     return new and (lambda target, *args, **kwargs: target.copy_(new(target, *args, **kwargs)))
 
 
+class NumberTakenError(RuntimeError):
+    """What a hook does depends on a number that it reads out of a tensor."""
+
+
 class Tracer(TorchDispatchMode):
     """Notes each operator while it runs.
 
     A result bears its node as an attribute, which is dropped with it: all results together may not fit in memory.
+
+    Args:
+        arrays: what differs in each run, by name.
+        fixed: further tensors that never change; numbers of others must not be read, as they would stay what they are.
     """
 
-    def __init__(self, arrays: dict[str, torch.Tensor]) -> None:
+    def __init__(self, arrays: dict[str, torch.Tensor], fixed: Iterable[torch.Tensor] = ()) -> None:
         super().__init__()
         self.graph, self.constants = torch.fx.Graph(), torch.nn.Module()
         self._device = next(iter(arrays.values())).device
+        self._fixed = {tensor.data_ptr() for tensor in fixed}
         self._known: set[torch.fx.Node] = set()  # whose numbers are the same in each run
         self.arrays = list(arrays.values())
         self._kept = list(self.arrays)  # arrays and constants: no other tensor gets their ids meanwhile
@@ -70,7 +81,7 @@ class Tracer(TorchDispatchMode):
             with self, contextlib.suppress(Exception):  # what it refuses is noted as it is, or refused by torch
                 return decomposed(*args, **kwargs)
         if torch.Tag.data_dependent_output in func.tags:
-            self._check_known(args)
+            self.check_known(args, "if, .item(), float()")
             return func(*args, **kwargs)
         if func in COPIES and args[0].device != self._device:
             source = self._noted(args[0])
@@ -116,20 +127,43 @@ class Tracer(TorchDispatchMode):
         if self._noted(result) is None:  # else it was changed in place
             result._node = node  # type: ignore[attr-defined]
 
-    def _check_known(self, args: Any) -> None:
-        for node in filter(None, (self._noted(arg) for arg in args if isinstance(arg, torch.Tensor))):
-            if node.op != "get_attr" and node not in self._known:
-                raise RuntimeError("a hook reads a number out of a tensor (if, .item(), float())")
+    def check_known(self, args: Any, by: str) -> None:
+        """Raises ``NumberTakenError`` if a number of a tensor is read that may be another one in the next run."""
+        for arg in args:
+            if isinstance(arg, torch.Tensor) and self._noted(arg) not in self._known:
+                if arg.data_ptr() not in self._fixed:
+                    raise NumberTakenError(f"a hook reads a number out of a tensor ({by})")
 
 
-def trace(work: Callable[[dict[str, torch.Tensor]], None], arrays: dict[str, torch.Tensor]) -> torch.fx.GraphModule:
+class NumbersTaken(TorchFunctionMode):
+    """Notices what no operator does."""
+
+    TAKE = torch.Tensor.numpy, torch.Tensor.tolist, torch.Tensor.__array__
+
+    def __init__(self, tracer: Tracer) -> None:
+        super().__init__()
+        self._tracer = tracer
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in self.TAKE:
+            self._tracer.check_known(args[:1], "numpy, tolist")
+        elif func is torch.tensor and args and isinstance(args[0], list | tuple):
+            self._tracer.check_known(tree_leaves(args[0]), "torch.tensor")
+        return func(*args, **(kwargs or {}))
+
+
+def trace(
+    work: Callable[[dict[str, torch.Tensor]], None],
+    arrays: dict[str, torch.Tensor],
+    fixed: Iterable[torch.Tensor] = (),
+) -> torch.fx.GraphModule:
     """Returns what a function, called once, does to arrays in place: a module that takes them one after another.
 
     Raises:
-        RuntimeError: what it does depends on a number of an array.
+        NumberTakenError: what it does depends on a number of an array, or of a tensor that is not among ``fixed``.
     """
-    tracer = Tracer(arrays)
-    with tracer:
+    tracer = Tracer(arrays, fixed)
+    with NumbersTaken(tracer), tracer:
         work(arrays)
     tracer.graph.output(None)
     tracer.graph.eliminate_dead_code()
