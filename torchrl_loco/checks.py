@@ -21,6 +21,13 @@ if TYPE_CHECKING:
     import torch
 
 
+class UnknownNameError(KeyError):
+    """A model or a task has nothing by this name; the message is one sentence, without KeyError's quotes."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 class Interval(NamedTuple):
     """Numbers between two bounds, of which each may belong to them: by default ``low``, but not ``high``."""
 

@@ -7,6 +7,7 @@ import torch
 from for_each import for_each
 
 from torchrl_loco import LocoEnv, SimConfig, Vary
+from torchrl_loco.cli.errors import user_errors
 
 
 class Pendulum(LocoEnv):
@@ -156,6 +157,18 @@ def test_a_stage_has_the_type_of_its_entry():
     assert env.get_state()["memory", "level"].tolist() == [3, 3]
     with pytest.raises(ValueError, match=r"'level' of a stage must be numbers of torch\.int32"):
         env.set_stage({"memory": {"level": [1.5]}})
+
+
+def test_the_command_line_says_what_a_model_has_none_of(capsys):
+    class Sites(Pendulum):
+        model = Pendulum.model.replace('<site name="tip" pos="0 0 0.5"/>', "")
+
+        def reward(self, s):
+            return s.site_xpos("tip")[:, 2]
+
+    with pytest.raises(SystemExit), user_errors():
+        Sites(num_envs=1, device="cpu", seed=0)
+    assert "torchrl-loco: the model has no site 'tip': it has none" in capsys.readouterr().err
 
 
 def test_a_group_without_terms_is_said():

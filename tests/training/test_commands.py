@@ -13,6 +13,7 @@ from torchrl_loco import cli, training
 from torchrl_loco.policy import Policy, load_policy
 from torchrl_loco.training import RunFolder
 from torchrl_loco.training.algorithm import Algorithm
+from torchrl_loco.training.trainer import NothingToLearnError
 
 
 @pytest.mark.slow
@@ -173,10 +174,11 @@ def test_errors_while_training(tmp_path, monkeypatch, capsys):
         return update
 
     command = ["train", "walker_walk", "--device", "cpu", "--out", str(tmp_path)]
-    for error, ended in ((OSError("no space left"), SystemExit), (TypeError("a bug"), TypeError)):
+    full = OSError("no space left")
+    for error, ended in ((full, SystemExit), (NothingToLearnError("none"), SystemExit), (TypeError("bug"), TypeError)):
         monkeypatch.setattr(Algorithm, "update", fail(error))
         with pytest.raises(ended):
             cli.main(command)
         said = capsys.readouterr().err
-        assert ("torchrl-loco: no space left" in said) == (ended is SystemExit)
+        assert (f"torchrl-loco: {error}" in said) == (ended is SystemExit)
         assert "to continue" not in said  # there is no checkpoint

@@ -155,6 +155,7 @@ def test_what_several_ranks_cannot_do(tmp_path, monkeypatch):
 def test_the_way_to_resume_keeps_the_number_of_ranks(monkeypatch):
     way = Given().way_to_resume
     assert way("runs/a", 1) == "torchrl-loco resume runs/a"
+    assert way("my runs/a", 1) == "torchrl-loco resume 'my runs/a'"
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
     assert way("runs/a", 2) == "torchrl-loco resume runs/a --gpus 2"
     assert way("runs/a", 4).startswith("torchrun, with the options of this launch")  # several machines

@@ -91,6 +91,8 @@ def test_actions_are_held_in_evaluations_and_videos(tmp_path):
     calls.clear()
     record(policy, env, tmp_path / "video.mp4", 0.05, action_repeat=2)
     assert len(calls) == 1  # of 2
+    record(policy, env, tmp_path / "short.mp4", 1e-9, action_repeat=2)  # a picture at least
+    assert (tmp_path / "short.mp4").stat().st_size
 
 
 def test_a_video_that_is_cut_off_leaves_no_file(tmp_path):

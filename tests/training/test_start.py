@@ -5,6 +5,7 @@ import multiprocessing
 import re
 import shutil
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,10 +17,11 @@ from torch import nn
 from torchrl.envs import ObservationNorm, StepCounter, VecNormV2
 
 import torchrl_loco
-from torchrl_loco import cli, registry
+from torchrl_loco import cli, known_files, registry
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import PPO, Given, RunFolder, Trainer, begin, evaluate_policy, preset, train
 from torchrl_loco.training.algorithm import Algorithm
+from torchrl_loco.training.environments import content_of
 
 QUICK = {**SMALL, "logger": ("csv",)}
 
@@ -189,6 +191,29 @@ def test_a_class_that_cannot_be_made_leaves_no_folder(tmp_path):
         assert list((tmp_path / "runs").iterdir()) == []
 
 
+def test_what_an_edit_changes_is_noticed(tmp_path):
+    files = {"task.py": "import torchrl_loco, helper\nclass A(torchrl_loco.LocoEnv):\n    model = 'robot.xml'\n"}
+    files |= {"helper.py": "K = 1\n", "robot.xml": "<mujoco><worldbody/></mujoco>", "other.py": "\n"}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    frames = {"place": torch.zeros(3, 2)}
+    env = SimpleNamespace(reference=lambda: frames)
+
+    def content():
+        known_files.remember(tmp_path / "task.py")
+        return content_of(f"{tmp_path / 'task.py'}:A", env)
+
+    seen = {content()}
+    (tmp_path / "other.py").write_text("# nobody imports it\n")
+    assert {content()} == seen
+    for name in ("task.py", "helper.py", "robot.xml"):
+        (tmp_path / name).write_text(files[name] + "\n")
+        seen.add(content())
+    frames["place"][2, 1] = 1.0
+    seen.add(content())
+    assert len(seen) == 5
+
+
 TASK = '''
 import torch, torchrl_loco
 
@@ -220,10 +245,22 @@ def test_a_class_in_a_file(tmp_path, monkeypatch, capsys):
     assert "reward/height" in run.read_metrics()
     assert cli.main(["resume", str(path), "--total_frames=384"]) == 0
     assert "was edited" not in capsys.readouterr().err
-    file.write_text(TASK + "# edited")
+
+    def rewrite(text):
+        file.write_text(text)
+        sys.modules.pop(registry._name_of(file))  # as in another process
+
+    edited = TASK.replace("- 1.0", "- 9.0")  # so that no policy earns what one did
+    rewrite(edited)
     for frames, said in ((512, True), (640, False)):  # by the second time the checkpoint is of the new one
         assert cli.main(["resume", str(path), f"--total_frames={frames}"]) == 0
-        assert (f"{file}:StandShaky was edited since the checkpoint" in capsys.readouterr().err) == said
+        assert ("StandShaky (a file of it, its model or a motion) was edited since" in capsys.readouterr().err) == said
+    assert run.load_policy("cpu").info["frames"] >= 512  # the best of those that were evaluated in this task
+    rewrite(edited + "\n    def observation(self, s):\n        return s.qpos\n")
+    with pytest.raises(SystemExit):
+        cli.main(["resume", str(path), "--total_frames=768"])
+    assert "networks were made for other sizes (observation 24, now 9): train anew" in capsys.readouterr().err
+    rewrite(edited)
     assert cli.main(["eval", str(path), "--device=cpu"]) == 0
     capsys.readouterr()
     for command in (

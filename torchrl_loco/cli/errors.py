@@ -5,6 +5,8 @@ import os
 import sys
 from collections.abc import Iterator
 
+from torchrl_loco.checks import UnknownNameError
+
 
 def process_name() -> str:
     """Returns what the lines of this process begin with."""
@@ -14,7 +16,7 @@ def process_name() -> str:
 @contextlib.contextmanager
 def user_errors(*kinds: type[Exception]) -> Iterator[None]:
     """Prints errors of the user, or errors of the given kinds, in one line and exits with status 2."""
-    kinds = kinds or (ValueError, TypeError, OSError, ImportError, MemoryError)
+    kinds = kinds or (ValueError, TypeError, OSError, ImportError, MemoryError, UnknownNameError)
     try:
         yield
     except kinds as error:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ def train(options: Any, args: list[str]) -> None:
         return
     runs = [_trained(dataclasses.replace(config, seed=seed)) for seed in seeds or (config.seed,)]
     if seeds:
-        print(f"all seeds in one picture: torchrl-loco plot {' '.join(runs)}")
+        print(f"all seeds in one picture: torchrl-loco plot {shlex.join(runs)}")
 
 
 def resume(

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import mujoco
 
-from torchrl_loco.checks import suggestion
+from torchrl_loco.checks import UnknownNameError, suggestion
 
 Names = str | Sequence[str]  # a name, several names, or a regular expression that matches whole names
 
@@ -56,8 +56,10 @@ class Elements:
         try:
             found = [i for i, name in enumerate(known) if name and re.fullmatch(pattern, name)]
         except re.error as error:
-            raise KeyError(f"{pattern!r} is neither the name of a {kind} nor a regular expression: {error}") from None
+            why = f"{pattern!r} is neither the name of a {kind} nor a regular expression: {error}"
+            raise UnknownNameError(why) from None
         if not found:
             hint = suggestion(pattern, known)
-            raise KeyError(f"the model has no {kind} {pattern!r}{hint}: it has {', '.join(filter(None, known))}")
+            names = ", ".join(filter(None, known)) or "none"
+            raise UnknownNameError(f"the model has no {kind} {pattern!r}{hint}: it has {names}")
         return found

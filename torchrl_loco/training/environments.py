@@ -5,19 +5,23 @@ import dataclasses
 import hashlib
 import inspect
 import os
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 
+from torchrl_loco import known_files
 from torchrl_loco.config import arguments_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.imagined import showing_states
+from torchrl_loco.envs.task import folder_of
 from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv, named_transforms, unwrap
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
+from torchrl_loco.sim import models
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
@@ -69,8 +73,8 @@ class Given:
         if self.names:
             return _call_to_resume(run, self.names)
         if ranks > 1 and os.environ.get("LOCAL_WORLD_SIZE") != str(ranks):
-            return f"torchrun, with the options of this launch, -m torchrl_loco resume {run}"
-        return f"torchrl-loco resume {run}" + (f" --gpus {ranks}" if ranks > 1 else "")
+            return f"torchrun, with the options of this launch, -m torchrl_loco resume {shlex.quote(str(run))}"
+        return f"torchrl-loco resume {shlex.quote(str(run))}" + (f" --gpus {ranks}" if ranks > 1 else "")
 
 
 def _call_to_resume(run: Path, given: tuple[str, ...]) -> str:
@@ -183,15 +187,21 @@ def _refuse_further_arguments(cls: type[LocoEnv]) -> None:
         )
 
 
-def source_of(task: str) -> str:
-    """Returns a hash of the file that the class of a task is in; an empty string for an id, or if there is no file."""
-    if ":" not in task:
-        return ""
-    try:
-        file = inspect.getsourcefile(resolve(task))
-    except (TypeError, OSError):  # of a notebook
-        file = None
-    return "" if file is None or not Path(file).is_file() else hashlib.sha256(Path(file).read_bytes()).hexdigest()
+def content_of(task: str, env: LocoEnv) -> str:
+    """Returns a hash of what a user may edit of a task: files of its class and model, and what it follows."""
+    digest = hashlib.sha256()
+    if ":" in task:
+        cls = resolve(task)
+        try:
+            file = inspect.getsourcefile(cls)
+        except (TypeError, OSError):  # of a notebook
+            file = None
+        if file is not None and Path(file).is_file():
+            for each in [*known_files.with_imports(Path(file)), *models.files(cls.model, folder_of(cls))]:
+                digest.update(each.read_bytes())
+    for table in env.reference().values():
+        digest.update(table.cpu().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def unwrapped(env: EnvBase) -> tuple[LocoEnv, tuple[Transform, ...]]:

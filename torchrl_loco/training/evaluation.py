@@ -211,7 +211,7 @@ def record(
         camera: name of one of the model's cameras.
     """
     frame_rate = round(1 / env.config.ctrl_dt)
-    steps = play(policy, env, action_repeat, round(seconds * frame_rate), "video")
+    steps = play(policy, env, action_repeat, max(round(seconds * frame_rate), 1), "video")
     with settings_for_small_networks():
         write_video(path, (env.render(camera, *SIZE, worlds=1)[0] for _ in steps), frame_rate)
 

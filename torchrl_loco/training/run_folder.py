@@ -312,7 +312,8 @@ class RunFolder:
             entries = torch.load(path, map_location=device, weights_only=True)
             version = entries["version"]
         except _UNREADABLE as error:
-            raise ValueError(f"{path} cannot be read as a checkpoint: {error}") from error
+            why, *_ = str(error).splitlines() or [type(error).__name__]
+            raise ValueError(f"{path} cannot be read as a checkpoint, it may be cut off or damaged: {why}") from error
         if version != CHECKPOINT_VERSION:
             raise ValueError(f"{path} has version {version}, this release reads {CHECKPOINT_VERSION}")
         return entries

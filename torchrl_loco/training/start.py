@@ -18,7 +18,7 @@ from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.config import CONFIGS, OF_PIXELS, TrainingConfig, check_setting, preset, tuning_note
 from torchrl_loco.training.environments import Given, unwrapped
 from torchrl_loco.training.run_folder import RunFolder
-from torchrl_loco.training.trainer import Trainer
+from torchrl_loco.training.trainer import NothingToLearnError, Trainer
 
 
 def train(
@@ -148,8 +148,13 @@ def resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
     return RunFolder(run.path, named)
 
 
+def as_they_are(*kinds: type[Exception]) -> Any:
+    """Returns a context that tells no errors."""
+    return contextlib.nullcontext()
+
+
 def run_to_end(
-    what: TrainingConfig | RunFolder, given: Given, errors: Callable[..., Any] = contextlib.nullcontext, **changes: Any
+    what: TrainingConfig | RunFolder, given: Given, errors: Callable[..., Any] = as_they_are, **changes: Any
 ) -> RunFolder:
     """Returns the folder of a run that it trains: a new one of these settings, or one whose settings it changes.
 
@@ -165,7 +170,7 @@ def run_to_end(
         return trainer.run
 
 
-def train_to_end(trainer: Trainer, given: Given, errors: Callable[..., Any] = contextlib.nullcontext) -> None:
+def train_to_end(trainer: Trainer, given: Given, errors: Callable[..., Any] = as_they_are) -> None:
     """Trains to the last frame; prints how to continue a run that has a checkpoint, if it is interrupted.
 
     Raises:
@@ -174,7 +179,7 @@ def train_to_end(trainer: Trainer, given: Given, errors: Callable[..., Any] = co
     """
     first, ranks = distributed.is_first(), distributed.ranks()
     try:
-        with errors(OSError):
+        with errors(OSError, NothingToLearnError):
             trainer.train()
     except (KeyboardInterrupt, SystemExit):
         if first and trainer.run.has_checkpoint:

@@ -24,7 +24,7 @@ from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Spaces, deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, begin_from, settings_for_small_networks, start_compiler
 from torchrl_loco.training.config import check_packages_of
-from torchrl_loco.training.environments import Environments, Given, source_of, unwrapped
+from torchrl_loco.training.environments import Environments, Given, content_of, unwrapped
 from torchrl_loco.training.episodes import Episodes
 from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, record, shipped_return, summarize
 from torchrl_loco.training.loggers import Loggers
@@ -39,6 +39,10 @@ from torchrl_loco.training.trials import Trials
 COPIES_IN_BATCH = 8
 """How often the pixels of a batch lie in memory: before and after a step, collected, stacked, packed and shuffled."""
 ALGORITHMS: dict[str, type[Algorithm]] = {cls.config_type.algorithm: cls for cls in (PPO, REPPO, SVG)}
+
+
+class NothingToLearnError(ValueError):
+    """No step of a batch was finite."""
 
 
 class Trainer:
@@ -128,7 +132,7 @@ class Trainer:
         self.episodes = Episodes(config.num_envs, config.device, config.action_repeat, length, from_start)
         terms = self.env.observation_spec.get("reward_terms", None)
         self._terms = () if terms is None else tuple(terms.keys())
-        self._source = source_of(run.task)
+        self._content = content_of(run.task, self._base)
         self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
         self._ahead: tuple[TensorDictBase, torch.Tensor] | None = None
@@ -267,7 +271,7 @@ class Trainer:
         """Returns the metrics of collecting a batch and updating on it; reads from the device once.
 
         Raises:
-            ValueError: no step of it was finite.
+            NothingToLearnError: no step of it was finite.
         """
         config, algorithm, start = self.config, self.algorithm, time.perf_counter()
         batch, ended = self._collect() if self._ahead is None else self._ahead
@@ -289,7 +293,7 @@ class Trainer:
         non_finite, spread, ends, mean_reward, *means = means[3:]
         before, self._non_finite = self._non_finite, round(non_finite * distributed.ranks())
         if ends == 1.0 and self._non_finite - before >= config.frames_per_batch * distributed.ranks():
-            raise ValueError(
+            raise NothingToLearnError(
                 f"there is nothing to learn from: in all steps of a batch of {self.run.path} a state, observation or "
                 "reward was not finite. torchrl-loco inspect shows the first, which its nan_dump.safetensors holds"
             )
@@ -398,7 +402,7 @@ class Trainer:
             of = {
                 "settings": self._identity(),
                 "cases": list(self._base.cases().items()),
-                "source": self._source,
+                "content": self._content,
                 "spaces": dataclasses.asdict(self.algorithm.spaces),
                 "algorithm": self.algorithm.state_dict(),
                 "trials": self.trials.state_dict(),
@@ -429,8 +433,19 @@ class Trainer:
             raise ValueError(
                 f"{self.run.path} is complete: it has all of its {self.frames} frames. Pass --total_frames to train on"
             )
-        if checkpoint.get("source", self._source) != self._source and distributed.is_first():
-            print(f"{self.run.task} was edited since the checkpoint: the run goes on as it is now", file=sys.stderr)
+        was_edited = checkpoint.get("content", self._content) != self._content
+        if was_edited and distributed.is_first():
+            print(
+                f"{self.run.task} (a file of it, its model or a motion) was edited since the checkpoint: the run goes "
+                "on as it is now, and its best policy is selected anew",
+                file=sys.stderr,
+            )
+        sizes, now = checkpoint.get("spaces", {}), dataclasses.asdict(self.algorithm.spaces)
+        if changed := [f"{key} {size}, now {now[key]}" for key, size in sizes.items() if now.get(key, size) != size]:
+            raise ValueError(
+                f"{self.run.path} cannot go on, since its networks were made for other sizes ({'; '.join(changed)}): "
+                "train anew"
+            )
         cases = list(self._base.cases().items())
         if (old := checkpoint.get("cases", cases)) != cases:  # the state of the worlds points into other tables
             of = [f"{', '.join(name for name, _ in each[:3])}{' ...' * (len(each) > 3)}" for each in (old, cases)]
@@ -451,7 +466,9 @@ class Trainer:
         self.trials.load_state_dict(checkpoint["trials"])
         if distributed.is_first():
             means = [row["mean"] for row in self.run.read_evaluations() if row["frames"] <= self.frames]
-            if self.run.policy.is_file():  # maybe of an evaluation after the checkpoint, which is repeated inexactly
+            if was_edited:
+                means = []
+            elif self.run.policy.is_file():  # maybe of an evaluation after the checkpoint, which is repeated inexactly
                 means.append(Policy.load(self.run.policy, "cpu").info.get("selected_by", -math.inf))
             self._best = max(means, default=-math.inf)
         if not same_kind and distributed.is_first():
