@@ -209,6 +209,11 @@ def test_the_command_prints_films_and_mends(tmp_path, capsys, rows):
     cli.main(["motion", str(path), "--fps", "25", "--ground", "--out", str(tmp_path / "mended.npz")])
     cli.main(["motion", str(tmp_path / "mended.npz")])
     assert "floats" not in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        cli.main(
+            ["motion", str(path), str(tmp_path / "mended.npz"), "--fps", "25", "--out", str(tmp_path / "both.npz")]
+        )
+    assert "a copy is of one motion, and there are 2" in capsys.readouterr().err
     cli.main(["motion", str(path), "--fps", "25", "--out", str(tmp_path / "clip.mp4")])
     import imageio.v3 as imageio
 

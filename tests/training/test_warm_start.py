@@ -20,7 +20,9 @@ def test_a_run_begins_with_the_weights_of_another_or_of_a_policy(algorithm, tmp_
         run = made(tmp_path / "second", algorithm, init=str(first.path))
         begun = Trainer(run).algorithm
         assert_same(begun.networks.state_dict(), networks(first))
-        with pytest.raises(ValueError, match=r"init: the networks of .* do not fit this run"):
+        again = Trainer(made(tmp_path / "again", algorithm, init=str(first.checkpoint))).algorithm
+        assert_same(again.networks.state_dict(), networks(first))
+        with pytest.raises(ValueError, match=r"do not fit this run: hidden \(16,\), here \(8,\)$"):
             Trainer(made(tmp_path / "third", algorithm, init=str(first.path), hidden=(8,)))
         begun = Trainer(made(tmp_path / "fourth", algorithm, init=str(first.policy))).algorithm
         policy = Policy.load(first.policy, "cpu")

@@ -63,7 +63,7 @@ def inspect(
     """Inspect a NaN dump: step its world again, substep by substep, in Warp and in C MuJoCo. Or the ground of a task.
 
     Args:
-        what: the file that make(..., nan_dump=FILE) or a training run wrote; with --terrain, a task.
+        what: the file that make(..., nan_dump=FILE) wrote, or the folder of a run; with --terrain, a task.
         task: the task that the file is of.
         device: where Warp computes; default: CUDA if there is any.
         terrain: a picture of the task's ground from above, which is written instead.
@@ -77,7 +77,7 @@ def inspect(
             cls.ground.picture(terrain)
         print(terrain)
         return
-    file = Path(what)
+    file = Path(what, "nan_dump.safetensors") if Path(what).is_dir() else Path(what)
     with user_errors():
         from torchrl_loco import nan_dump
 

@@ -49,7 +49,7 @@ def motion(
     ground: bool = False,
     out: Annotated[
         Path | None,
-        tyro.conf.arg(help="a new file: .mp4 for a video of the first motion, .npz for a copy of it, as mjlab's."),
+        tyro.conf.arg(help="a new file: .mp4 for a video of the first motion, .npz for a copy of one, as mjlab's."),
     ] = None,
     camera: str = "side",
 ) -> None:
@@ -61,7 +61,7 @@ def motion(
         task: a task that follows motions, whose robot it is.
         clip: put joints that are beyond their limits at them.
         ground: shift motions so that their lowest points touch the ground.
-        out: a video of the first, or a copy of it, also with joints clipped and shifted.
+        out: a video of the first, or a copy of the only one, also with joints clipped and shifted.
         camera: name of one of the model's cameras, for the video.
     """
     with user_errors():
@@ -97,6 +97,8 @@ def motion(
         print(f"{len(found)} motions of {seconds:.1f} s in all, for {task}")
         if wrong:
             raise ValueError(f"{wrong} of {len(named)} files hold no motion for {task}")
+        if out is not None and out.suffix == ".npz" and len(found) > 1:
+            raise ValueError(f"out: a copy is of one motion, and there are {len(found)}: name one file")
         if out is not None and first is not None:
             q = first
             if out.suffix == ".npz":

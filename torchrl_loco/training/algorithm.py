@@ -327,20 +327,32 @@ class Packed:
         return TensorDict(entries, batch_size=len(rows), device=rows.device)
 
 
+NAMES_OF_SIZES = "algorithm", "task", "hidden", "critic_hidden", "model_hidden"
+"""Settings from which the sizes of networks follow."""
+
+
 def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
     """Gives networks the weights of a run's checkpoint, actor and critic, or the actor those of a policy file.
 
-    A run without a checkpoint has a policy.
+    A run without a checkpoint has a policy. A checkpoint may be named by its file.
 
     Raises:
         FileNotFoundError: there is no such run or file.
         ValueError: the weights do not fit: other sizes, or another algorithm.
     """
-    if source.is_dir() and (run := RunFolder(source)).has_checkpoint:
+    is_checkpoint = source.is_file() and source.suffix == ".pt"
+    folder = source.parent if is_checkpoint else source
+    if folder.is_dir() and (is_checkpoint or RunFolder(folder).has_checkpoint):
+        run = RunFolder(folder)
+        networks = run.load_checkpoint(device, source if is_checkpoint else None)["algorithm"]["networks"]
         try:
-            algorithm.load_networks(run.load_checkpoint(device)["algorithm"]["networks"])
+            algorithm.load_networks(networks)
         except (RuntimeError, KeyError) as error:
-            raise ValueError(f"init: the networks of {source} do not fit this run: {error}") from error
+            settings = run.load_config(), algorithm.config
+            pairs = {name: [getattr(each, name, None) for each in settings] for name in NAMES_OF_SIZES}
+            differing = [f"{name} {old}, here {new}" for name, (old, new) in pairs.items() if old != new]
+            why = ", ".join(differing) or str(error).splitlines()[-1].strip()
+            raise ValueError(f"init: the networks of {source} do not fit this run: {why}") from error
         return
     policy = RunFolder(source).load_policy(device) if source.is_dir() else Policy.load(source, device)
     for mine in map(layers_of_actor, algorithm.actors):

@@ -271,7 +271,7 @@ class Trainer:
         """Returns the metrics of collecting a batch and updating on it; reads from the device once.
 
         Raises:
-            NothingToLearnError: no step of it was finite.
+            torchrl_loco.training.trainer.NothingToLearnError: no step of it was finite.
         """
         config, algorithm, start = self.config, self.algorithm, time.perf_counter()
         batch, ended = self._collect() if self._ahead is None else self._ahead
