@@ -235,7 +235,7 @@ def test_what_is_wrong_with_the_name_of_a_class(file):
             ValueError,
             r"did you mean 'walker_walk'.*a class of your own as path/to/file\.py:Class",
         ),
-        ("no_such.py:Slowly", FileNotFoundError, "there is no file .*no_such.py"),
+        ("no_such.py:Slowly", FileNotFoundError, r"there is no file .*no_such\.py$"),
         (f"{file}:Slow", ValueError, "has no class 'Slow', did you mean 'Slowly'.*: choose one of Base, Slowly"),
         (str(file), ValueError, "names no class: choose one of Base, Slowly"),
         (f"{others}:Fly", ValueError, "choose one of Other, Slow$"),

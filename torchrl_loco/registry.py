@@ -275,7 +275,8 @@ def _run(source: str, name: str, by_user: bool) -> ModuleType:
     """Returns a file or a module, which is run, if the user has named it, now or before."""
     path = Path(source).expanduser().resolve() if source.endswith(".py") else None
     if path is not None and not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}: where its class is now is told by --task FILE.py:CLASS")
+        way = "" if by_user else ": where its class is now is told by --task FILE.py:CLASS"
+        raise FileNotFoundError(f"there is no file {path}{way}")
     if not by_user:
         file = path or _file_of(source)
         if file is None or not known_files.is_known(file):
