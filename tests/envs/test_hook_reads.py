@@ -1,5 +1,7 @@
 """What hooks must not do, or may do, with numbers that change: those of tensors, of the last episode, of the model."""
 
+import math
+
 import mujoco
 import numpy as np
 import pytest
@@ -134,7 +136,8 @@ def test_shapes_of_draws_come_as_torch_takes_them_and_memory_may_be_called_lost(
         memory = {"lost": 2}
 
         def begin(self, s):
-            assert s.normal((2, 3)).shape == (s.num_envs, 2, 3)
+            assert s.normal((2, 3)).shape == (s.num_envs, np.int64(2), 3)
+            s.normal(np.int64(2))
             return {"lost": s.uniform(1.0, 2.0, (2,))}
 
         def reward(self, s):
@@ -146,15 +149,16 @@ def test_shapes_of_draws_come_as_torch_takes_them_and_memory_may_be_called_lost(
 
 def test_a_stage_has_the_type_of_its_entry():
     class Levels(Pendulum):
-        memory = {"level": torch.int32}
+        memory = {"level": torch.int32, "height": ()}
 
         def begin(self, s):
-            return {"level": s.level}
+            return {"level": s.level, "height": s.height}
 
     env = Levels(num_envs=2, device="cpu", seed=0)
     env.set_stage({"memory": {"level": 3}})
     env.reset()
     assert env.get_state()["memory", "level"].tolist() == [3, 3]
+    env.set_stage({"memory": {"height": np.array([0.1, math.nan])}})  # of double precision
     with pytest.raises(ValueError, match=r"'level' of a stage must be numbers of torch\.int32"):
         env.set_stage({"memory": {"level": [1.5]}})
 

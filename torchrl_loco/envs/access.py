@@ -311,8 +311,9 @@ class WorldAccess(EnvBase):
             for name, values in entries.items():
                 target = of_task[check_choice(f"{group} of the stage", name, of_task)]
                 given = torch.as_tensor(values, device=self.device)
-                new = torch.atleast_1d(given.to(target.dtype)) if group == "memory" else given.to(target.dtype)
-                if (new != given).any():
+                given = torch.atleast_1d(given) if group == "memory" else given
+                new = given.to(target.dtype)
+                if not target.is_floating_point() and (new != given).any():
                     raise ValueError(f"{group} {name!r} of a stage must be numbers of {target.dtype}, got {values}")
                 if group == "memory" and len(new):
                     new = new[torch.arange(self.num_envs, device=self.device) % len(new)]

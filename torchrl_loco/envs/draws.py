@@ -50,6 +50,6 @@ def to_unit(bits: torch.Tensor) -> torch.Tensor:
 
 
 def to_normal(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Returns normal numbers of two independent draws (Box and Muller)."""
-    radius = (-2.0 * (1.0 - to_unit(first)).log()).sqrt()
-    return radius * (2.0 * math.pi * to_unit(second)).cos()
+    """Returns normal numbers of two independent draws from [0, 1) (Box and Muller)."""
+    radius = (-2.0 * (1.0 - first).log()).sqrt()
+    return radius * (2.0 * math.pi * second).cos()

@@ -345,17 +345,7 @@ class WithUnits(View):
     drawn: ClassVar[int] = 0
     """How many numbers of each world the hooks have drawn, in their order."""
 
-    def uniform(self, low: float | torch.Tensor, high: float | torch.Tensor, *shape: int) -> torch.Tensor:
-        """Returns draws from [low, high), ``(num_envs, *shape)``."""
-        return low + (high - low) * self._given(math.prod(shape)).view(self.num_envs, *shape)
-
-    def normal(self, *shape: int) -> torch.Tensor:
-        """Returns draws from the standard normal distribution, ``(num_envs, *shape)`` (Box and Muller)."""
-        first, second = self._given(2 * math.prod(shape)).chunk(2, dim=1)
-        drawn = (-2.0 * (1.0 - first).log()).sqrt() * (2.0 * math.pi * second).cos()
-        return drawn.view(self.num_envs, *shape)
-
-    def _given(self, count: int) -> torch.Tensor:
+    def _units(self, count: int) -> torch.Tensor:
         first, units = WithUnits.drawn, self._arrays["units"]
         WithUnits.drawn += count
         return units[:, first : first + count] if units.shape[1] else units.new_zeros(self.num_envs, count)

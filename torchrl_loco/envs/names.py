@@ -35,11 +35,11 @@ class Elements:
         """Returns the ids of elements, and whether one was named, so that results need no dimension for several.
 
         Raises:
-            KeyError: a name or pattern matches none; the message names the nearest.
+            torchrl_loco.checks.UnknownNameError: a name or pattern matches none; the message names the nearest.
         """
         key = kind, names if isinstance(names, str) else tuple(names)
         if not key[1]:
-            raise KeyError(f"name a {kind}, several, or a regular expression, got {names!r}")
+            raise UnknownNameError(f"name a {kind}, several, or a regular expression, got {names!r}")
         if key not in self._found:
             known = self.names(kind)
             if isinstance(names, str) and names in known:

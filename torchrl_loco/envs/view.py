@@ -3,7 +3,7 @@
 import difflib
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -22,12 +22,11 @@ from torchrl_loco.sim.simulation import check_memory
 
 OF_A_STEP = frozenset({"action", "ctrl"})
 """What belongs to a step: an observation is also made after a reset, where there was none."""
+CONTACT_HISTORY = ("contact_force_history", "in_contact_history")  # arrays of contacts with a row for each substep
 OF_THE_LAST_EPISODE = frozenset(
-    {"xpos", "xmat", "cvel", "subtree_com", "sensordata", "contact_force", "in_contact"}
-    | {"contact_force_history", "in_contact_history"}
+    ("xpos", "xmat", "cvel", "subtree_com", "sensordata", "contact_force", "in_contact", *CONTACT_HISTORY)
 )
 """What ``begin`` must not read: poses and sensors are updated after it."""
-CONTACT_HISTORY = ("contact_force_history", "in_contact_history")  # arrays of contacts with a row for each substep
 COPIES_IN_HOOKS = 2  # how often what eyes see lies in memory: where it is found, and in what a hook makes of it
 
 
@@ -543,15 +542,22 @@ class View:
 
         The same numbers come for any number of worlds and at every run; on another device up to rounding.
         """
-        shape = torch.Size(*shape) if shape and not isinstance(shape[0], int) else shape  # a tuple, as torch takes it
-        return low + (high - low) * draws.to_unit(self._draw(math.prod(shape))).view(self.num_envs, *shape)
+        return low + (high - low) * self._units_in(shape, 1)[0]
 
     def normal(self, *shape: int) -> torch.Tensor:
         """Returns draws from the standard normal distribution, ``(num_envs, *shape)``; see :meth:`uniform`."""
-        shape = torch.Size(*shape) if shape and not isinstance(shape[0], int) else shape
-        count = math.prod(shape)
-        first, second = self._draw(2 * count).split(count, dim=1)
-        return draws.to_normal(first, second).view(self.num_envs, *shape)
+        return draws.to_normal(*self._units_in(shape, 2))
+
+    def _units_in(self, shape: Sequence[Any], count: int) -> list[torch.Tensor]:
+        """Returns ``count`` draws from [0, 1) in a shape of each world: sizes, or one tuple of them."""
+        if len(shape) == 1 and isinstance(shape[0], tuple | list):
+            (shape,) = shape
+        size = int(math.prod(shape))
+        return [rows.view(self.num_envs, *shape) for rows in self._units(count * size).split(size, dim=1)]
+
+    def _units(self, count: int) -> torch.Tensor:
+        """Returns draws from [0, 1), ``(num_envs, count)``."""
+        return draws.to_unit(self._draw(count))
 
     def _draw(self, count: int) -> torch.Tensor:
         if self._stream is None:

@@ -130,9 +130,9 @@ class Tracer(TorchDispatchMode):
     def check_known(self, args: Any, by: str) -> None:
         """Raises ``NumberTakenError`` if a number of a tensor is read that may be another one in the next run."""
         for arg in args:
-            if isinstance(arg, torch.Tensor) and self._noted(arg) not in self._known:
-                if arg.data_ptr() not in self._fixed:
-                    raise NumberTakenError(f"a hook reads a number out of a tensor ({by})")
+            if not isinstance(arg, torch.Tensor) or self._noted(arg) in self._known or arg.data_ptr() in self._fixed:
+                continue
+            raise NumberTakenError(f"a hook reads a number out of a tensor ({by})")
 
 
 class NumbersTaken(TorchFunctionMode):
