@@ -197,7 +197,7 @@ def test_what_an_edit_changes_is_noticed(tmp_path):
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     frames = {"place": torch.zeros(3, 2)}
-    env = SimpleNamespace(reference=lambda: frames)
+    env = SimpleNamespace(hooks=SimpleNamespace(catalog=SimpleNamespace(constants=frames)))
 
     def content():
         known_files.remember(tmp_path / "task.py")

@@ -327,10 +327,6 @@ class Packed:
         return TensorDict(entries, batch_size=len(rows), device=rows.device)
 
 
-NAMES_OF_SIZES = "algorithm", "task", "hidden", "critic_hidden", "model_hidden"
-"""Settings from which the sizes of networks follow."""
-
-
 def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
     """Gives networks the weights of a run's checkpoint, actor and critic, or the actor those of a policy file.
 
@@ -349,7 +345,8 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
             algorithm.load_networks(networks)
         except (RuntimeError, KeyError) as error:
             settings = run.load_config(), algorithm.config
-            pairs = {name: [getattr(each, name, None) for each in settings] for name in NAMES_OF_SIZES}
+            names = "algorithm", "task", *algorithm.config.widths
+            pairs = {name: [getattr(each, name, None) for each in settings] for name in names}
             differing = [f"{name} {old}, here {new}" for name, (old, new) in pairs.items() if old != new]
             why = ", ".join(differing) or str(error).splitlines()[-1].strip()
             raise ValueError(f"init: the networks of {source} do not fit this run: {why}") from error

@@ -12,21 +12,18 @@ from typing import Any
 
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 
-from torchrl_loco import known_files
 from torchrl_loco.config import arguments_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.imagined import showing_states
-from torchrl_loco.envs.task import folder_of
 from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv, named_transforms, unwrap
 from torchrl_loco.policy import Policy
 from torchrl_loco.registry import make, resolve
-from torchrl_loco.sim import models
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.config import TrainingConfig, is_runner
-from torchrl_loco.training.run_folder import RunFolder
+from torchrl_loco.training.run_folder import RunFolder, files_of
 
 KEPT = ("play", "reward_terms", "observation_terms", "noise_scale", "compile_hooks", "on_overflow")
 """Arguments of an environment that was handed in which its evaluations keep, besides those of physics and pixels."""
@@ -188,7 +185,7 @@ def _refuse_further_arguments(cls: type[LocoEnv]) -> None:
 
 
 def content_of(task: str, env: LocoEnv) -> str:
-    """Returns a hash of what a user may edit of a task: files of its class and model, and what it follows."""
+    """Returns a hash of what a user may edit of a task: files of its class and model, and its tables, as of motions."""
     digest = hashlib.sha256()
     if ":" in task:
         cls = resolve(task)
@@ -197,9 +194,10 @@ def content_of(task: str, env: LocoEnv) -> str:
         except (TypeError, OSError):  # of a notebook
             file = None
         if file is not None and Path(file).is_file():
-            for each in [*known_files.with_imports(Path(file)), *models.files(cls.model, folder_of(cls))]:
+            for each in files_of(cls, Path(file)):
                 digest.update(each.read_bytes())
-    for table in env.reference().values():
+    assert env.hooks is not None
+    for table in env.hooks.catalog.constants.values():
         digest.update(table.cpu().numpy().tobytes())
     return digest.hexdigest()
 

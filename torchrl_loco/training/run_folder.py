@@ -52,6 +52,11 @@ def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, An
     storage.replace_file(path, text.getvalue().encode())
 
 
+def files_of(cls: Any, path: Path) -> list[Path]:
+    """Returns the file of a task's class, the modules beside it that it imports, and the files of its model."""
+    return [*known_files.with_imports(path), *models.files(cls.model, folder_of(cls))]
+
+
 class RunFolder:
     """A run on disk.
 
@@ -161,7 +166,7 @@ class RunFolder:
         cls, package, folder = resolve(self.task), Path(known_files.__file__).parent, self.path / known_files.KEPT
         cls.check_class()
         copies = {}
-        for file in [*known_files.with_imports(path), *models.files(cls.model, folder_of(cls))]:
+        for file in files_of(cls, path):
             if file.is_relative_to(path.parent) and not file.is_relative_to(package):
                 copies[folder / file.relative_to(path.parent)] = file
         if copies.pop(folder / path.name, None):

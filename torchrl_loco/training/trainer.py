@@ -465,10 +465,9 @@ class Trainer:
         self.algorithm.load_state_dict(checkpoint["algorithm"], **same)
         self.trials.load_state_dict(checkpoint["trials"])
         if distributed.is_first():
-            means = [row["mean"] for row in self.run.read_evaluations() if row["frames"] <= self.frames]
-            if was_edited:
-                means = []
-            elif self.run.policy.is_file():  # maybe of an evaluation after the checkpoint, which is repeated inexactly
+            evaluations = [] if was_edited else self.run.read_evaluations()
+            means = [row["mean"] for row in evaluations if row["frames"] <= self.frames]
+            if self.run.policy.is_file() and not was_edited:  # maybe of a later evaluation, which is repeated inexactly
                 means.append(Policy.load(self.run.policy, "cpu").info.get("selected_by", -math.inf))
             self._best = max(means, default=-math.inf)
         if not same_kind and distributed.is_first():
