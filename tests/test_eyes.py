@@ -17,8 +17,10 @@ from torchrl_loco.eyes.tracer import Eye
 from torchrl_loco.sim import simulation
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
-WIDTH, HEIGHT = 40, 30
-SHAPES = """
+WIDTH, HEIGHT = 42, 30  # no multiples of a tile of threads
+BALLS = "".join(f'<geom type="sphere" size="0.07" pos="{0.1 * k - 1.5} 0.2 {1.1 + 0.2 * (k % 2)}"/>' for k in range(30))
+"""More shapes than a warp has threads, with the others."""
+SHAPES = f"""
 <mujoco>
   <asset>
     <hfield name="field" nrow="9" ncol="12" size="2 1.5 0.4 0.1"/>
@@ -46,6 +48,7 @@ SHAPES = """
     </body>
     <body pos="-1.3 -0.9 0.2" euler="0 0 20"><geom type="hfield" hfield="small"/></body>
     <body name="target" pos="0.2 0.1 0.7"><geom type="sphere" size="0.01"/></body>
+    {BALLS}
     <camera name="fixed" pos="2 2 1.5" xyaxes="-1 1 0 -0.4 -0.4 1"/>
     <camera name="at_body" pos="-1.5 -1 1.2" mode="targetbody" target="target"/>
     <camera name="at_com" pos="-1.5 1.5 0.9" mode="targetbodycom" target="target"/>
@@ -83,7 +86,7 @@ def test_depth_and_geoms_are_those_of_rays_of_c_mujoco(camera, device):
     m, device = shapes(), wp.get_device(device)
     eye = Eye(m, device, camera, WIDTH, HEIGHT, 2, ("rgb", "depth", "geoms"), far=1e3)
     eye.depth.fill_(torch.nan)
-    assert 2 * bytes_placed(m) == sum(each.capacity for each in (*eye._placed.placed, eye._placed.bounds))
+    assert 2 * bytes_placed(m) == sum(each.capacity for each in (eye._placed.poses, eye._placed.bounds))
     data, rng = mujoco.MjData(m), np.random.default_rng(1)
     poses = []
     for _ in range(2):

@@ -1,5 +1,7 @@
 """Where cameras, lights and shapes are in each world: shapes before the camera, and where in its picture."""
 
+from typing import Any
+
 import mujoco
 import warp as wp
 
@@ -9,6 +11,38 @@ from torchrl_loco.sim.compiled.collision.kinds import CAPSULE, CYLINDER, PLANE
 
 WHOLE = wp.constant(wp.float32(1.0e6))  # bound of a picture on the plane in front of the camera
 NEAR = wp.constant(wp.float32(1.0e-4))  # depth from which a sphere is wholly in front of the camera (m)
+Pose: Any = wp.types.matrix(shape=(3, 4), dtype=float)
+"""Axes of the camera in the frame of a shape, then its place there, as columns."""
+
+
+@wp.func_native("""
+#ifdef __CUDA_ARCH__
+const float4* const from = reinterpret_cast<const float4*>(poses.data + size_t(world) * poses.shape[1] + shape);
+wp::mat_t<3, 4, float> pose;
+for (int i = 0; i < 3; ++i) {  // a read each
+  const float4 row = from[i];
+  pose.data[i][0] = row.x, pose.data[i][1] = row.y, pose.data[i][2] = row.z, pose.data[i][3] = row.w;
+}
+return pose;
+#else
+return poses.data[size_t(world) * poses.shape[1] + shape];
+#endif
+""")
+def pose_of(poses: wp.array2d[Pose], world: int, shape: int) -> Pose:
+    """Returns how a camera lies before a shape."""
+
+
+@wp.func
+def axes_of(pose: Pose) -> wp.mat33:
+    """Returns the axes of the camera alone."""
+    x, y, z = pose[0], pose[1], pose[2]
+    return wp.mat33(x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2])
+
+
+@wp.func
+def origin_of(pose: Pose) -> wp.vec3:
+    """Returns where the camera is."""
+    return wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
 
 
 @wp.func
@@ -91,8 +125,7 @@ def place(
     camera_pos: wp.array[wp.vec3],
     camera_mat: wp.array[wp.mat33],
     # Out:
-    origin_out: wp.array2d[wp.vec3],
-    turn_out: wp.array2d[wp.mat33],
+    poses_out: wp.array2d[Pose],
     bounds_out: wp.array2d[wp.vec4],
 ):
     world, k = wp.tid()
@@ -102,8 +135,14 @@ def place(
     pos = xpos[world, body] + xmat[world, body] @ shapes.pos[k]
     mat = xmat[world, body] @ shapes.mat[k]
     camera = camera_mat[world]
-    origin_out[world, k] = wp.transpose(mat) @ (camera_pos[world] - pos)
-    turn_out[world, k] = wp.transpose(mat) @ camera
+    origin = wp.transpose(mat) @ (camera_pos[world] - pos)
+    turn = wp.transpose(mat) @ camera
+    pose = Pose()
+    for i in range(3):
+        for j in range(3):
+            pose[i, j] = turn[i, j]
+        pose[i, 3] = origin[i]
+    poses_out[world, k] = pose
     at = wp.transpose(camera) @ (pos - camera_pos[world])
     found = wp.vec4(-WHOLE, -WHOLE, WHOLE, WHOLE)
     if kind == CAPSULE or kind == CYLINDER:  # noqa: SIM109 (Warp has no "in")
@@ -123,7 +162,7 @@ def place(
 def bytes_placed(m: mujoco.MjModel) -> int:
     """Returns the memory that :class:`Placed` takes in a world (bytes), but for a few of the camera and lights."""
     alone, of_ground = geoms_seen(m)
-    return (len(alone) + bool(of_ground)) * 4 * (3 + 9 + 4)
+    return (len(alone) + bool(of_ground)) * 4 * (12 + 4)
 
 
 class Placed:
@@ -141,9 +180,8 @@ class Placed:
             self._pos, self.camera = wp.empty(worlds, dtype=wp.vec3), wp.empty(worlds, dtype=wp.mat33)
             # Where they are, and against what they shine, in the camera's frame.
             self.lights = [wp.empty((worlds, mounts.mode.shape[0] - 1), dtype=wp.vec3) for _ in range(2)]
-            # Origin and axes of the camera in the frame of each shape; from where to where each can be in the picture.
-            self.placed = [wp.empty(size, dtype=kind) for kind in (wp.vec3, wp.mat33)]
-            self.bounds = wp.empty(size, dtype=wp.vec4)
+            self.poses = wp.empty(size, dtype=Pose)
+            self.bounds = wp.empty(size, dtype=wp.vec4)  # from where to where each can be in the picture
 
     def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array | None) -> None:
         """Launches what places them in the worlds of a mask, ``None`` for all, on Warp's current stream.
@@ -153,6 +191,6 @@ class Placed:
         here, camera = [mask, xpos, xmat], [self._pos, self.camera]
         for kernel, dim, inputs, outputs in (
             (mount, self.camera.shape, [self._mounts, *here], [*camera, *self.lights]),
-            (place, self.bounds.shape, [self.shapes, *here, *camera], [*self.placed, self.bounds]),
+            (place, self.bounds.shape, [self.shapes, *here, *camera], [self.poses, self.bounds]),
         ):
             wp.launch(kernel, dim, inputs, outputs, device=self._device)

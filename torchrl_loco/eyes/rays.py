@@ -4,12 +4,11 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from torchrl_loco.eyes.placing import Placed
+from torchrl_loco.eyes.placing import Placed, Pose, axes_of, origin_of, pose_of
 from torchrl_loco.eyes.scene import Shapes, mounts_at, to_the_horizon
 from torchrl_loco.eyes.shapes import to_mesh, to_shape
-from torchrl_loco.sim import EXCLUSIVE, Buffer
+from torchrl_loco.sim import EXCLUSIVE, Buffer, corners
 from torchrl_loco.sim.compiled.collision.kinds import MESH
-from torchrl_loco.sim.corners import axes_of
 
 
 @wp.kernel(enable_backward=False)
@@ -19,8 +18,7 @@ def cast(
     mask: wp.array[bool],
     directions: wp.array[wp.vec3],
     far: float,
-    origin: wp.array2d[wp.vec3],
-    turn: wp.array2d[wp.mat33],
+    poses: wp.array2d[Pose],
     # Out:
     distance_out: wp.array2d[float],
 ):
@@ -29,7 +27,8 @@ def cast(
         return
     nearest = float(far)
     for k in range(shapes.kind.shape[0]):
-        o, d, kind = origin[world, k], turn[world, k] @ directions[ray], shapes.kind[k]
+        pose, kind = pose_of(poses, world, k), shapes.kind[k]
+        o, d = origin_of(pose), axes_of(pose) @ directions[ray]
         t = to_shape(kind, o, d, shapes.size[k])
         if kind == MESH:
             t, _n, _f = to_mesh(shapes.mesh[k], o, d, nearest)
@@ -47,7 +46,11 @@ class Rays:
     def __init__(
         self, m: mujoco.MjModel, device: wp.Device, site: int, directions: np.ndarray, worlds: int, far: float
     ) -> None:
-        place = {"body": m.site_bodyid[[site]], "pos": m.site_pos[[site]], "mat": axes_of(m.site_quat[site])[None]}
+        place = {
+            "body": m.site_bodyid[[site]],
+            "pos": m.site_pos[[site]],
+            "mat": corners.axes_of(m.site_quat[site])[None],
+        }
         mounts = mounts_at(m, device, **place, mode=np.zeros(1), target=-np.ones(1))
         self._placed, self._device, self._far = Placed(to_the_horizon(m), device, mounts, worlds), device, far
         with EXCLUSIVE, wp.ScopedDevice(device):
@@ -59,5 +62,5 @@ class Rays:
         """Launches the kernels, on Warp's current stream; arguments as of :meth:`Placed.launch`."""
         placed, out = self._placed, self._out.warp
         placed.launch(xpos, xmat, mask)
-        inputs = [placed.shapes, mask, self._directions, self._far, *placed.placed]
+        inputs = [placed.shapes, mask, self._directions, self._far, placed.poses]
         wp.launch(cast, out.shape, inputs, [out], device=self._device)

@@ -20,6 +20,7 @@ TRACKS = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK))
 OF_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
 AT_BODY = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY))
 AT_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM))  # modes of cameras and lights
+SPOT, DIRECTIONAL, OWN = wp.constant(0), wp.constant(1), wp.constant(2)  # kinds of lights: the last is the camera's
 EDGES = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 """Corners of a box, and of its sides, seen from outside."""
@@ -56,20 +57,34 @@ class Shapes:
 
 
 @wp.struct
-class Looks:
-    """Of each geom, then the lights after the camera's own, textures by level of detail, and the sky."""
+class Look:
+    """What a geom looks like."""
 
-    color: wp.array[wp.vec3]
-    shine: wp.array[wp.vec3]  # emission, specular, exponent
-    texture: wp.array[int]
-    repeat: wp.array[wp.vec2]
-    offset: wp.array[wp.vec2]
-    light_kind: wp.array[int]  # 0 spot, 1 directional
-    shadow: wp.array[bool]
-    diffuse: wp.array[wp.vec3]
-    specular: wp.array[wp.vec3]
-    attenuation: wp.array[wp.vec3]
-    cone: wp.array[wp.vec2]  # cosine of the cutoff, exponent
+    color: wp.vec3
+    shine: wp.vec3  # emission, specular, exponent
+    texture: int
+    repeat: wp.vec2
+    offset: wp.vec2
+
+
+@wp.struct
+class Light:
+    """What lights geoms."""
+
+    kind: int  # SPOT, DIRECTIONAL or OWN
+    shadow: bool
+    diffuse: wp.vec3
+    specular: wp.vec3
+    attenuation: wp.vec3
+    cone: wp.vec2  # cosine of the cutoff, exponent
+
+
+@wp.struct
+class Looks:
+    """Of geoms, of the camera's own light and the others, of textures by level of detail, and of the sky."""
+
+    geom: wp.array[Look]
+    light: wp.array[Light]
     ambient: wp.vec3
     levels: wp.array2d[wp.vec3i]  # first texel, width, height
     texels: wp.array[wp.vec3]
@@ -240,31 +255,30 @@ def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
     ):
         if names:
             logging.getLogger("torchrl_loco").info("cameras do not see %s: geoms %s", what, ", ".join(names[:8]))
+    look, light = rows_of(Look, m.ngeom), rows_of(Light, 1 + len(lights))
+    look["color"] = np.reshape([color_of(m, g)[:3] for g in range(m.ngeom)], (-1, 3))
+    look["shine"], look["texture"], look["repeat"], look["offset"] = shine, texture, repeat, offset
+    light["kind"][0] = OWN
+    if head.active:
+        light["diffuse"][0], light["specular"][0] = head.diffuse, head.specular
+    is_directional = m.light_type == int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    for name, of in (
+        ("kind", np.where(is_directional, DIRECTIONAL, SPOT)),
+        ("shadow", m.light_castshadow),
+        ("diffuse", m.light_diffuse),
+        ("specular", m.light_specular),
+        ("attenuation", m.light_attenuation),
+        ("cone", np.column_stack([np.cos(np.deg2rad(m.light_cutoff)), m.light_exponent])),
+    ):
+        light[name][1:] = of[lights]
     levels, texels, sky = textures(m, flat)
-    return fill_from_numbers(
-        Looks,
-        device,
-        color=np.array([color_of(m, g)[:3] for g in range(m.ngeom)]),
-        shine=shine,
-        texture=texture,
-        repeat=repeat,
-        offset=offset,
-        light_kind=m.light_type[lights] == int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL),
-        shadow=m.light_castshadow[lights],
-        diffuse=of_head(head, head.diffuse, m.light_diffuse[lights]),
-        specular=of_head(head, head.specular, m.light_specular[lights]),
-        attenuation=m.light_attenuation[lights],
-        cone=np.column_stack([np.cos(np.deg2rad(m.light_cutoff)), m.light_exponent])[lights],
-        ambient=wp.vec3(*map(float, ambient)),
-        levels=levels,
-        texels=texels,
-        sky=wp.vec2i(*sky),
-    )
+    numbers = {"geom": look, "light": light, "levels": levels, "texels": texels}
+    return fill_from_numbers(Looks, device, **numbers, ambient=wp.vec3(*map(float, ambient)), sky=wp.vec2i(*sky))
 
 
-def of_head(head: Any, own: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Returns a color of the light that the camera carries, then those of the other lights."""
-    return np.concatenate([[own if head.active else np.zeros(3)], others])
+def rows_of(struct: Any, count: int) -> Any:
+    """Returns so many structs of zeros, whose fields are columns."""
+    return np.zeros(count, dtype=struct.numpy_dtype())
 
 
 def textures(m: mujoco.MjModel, flat: list[int]) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:

@@ -1,4 +1,4 @@
-"""What cameras see in all worlds: a thread a pixel tries the shapes that can be there, and shades the nearest."""
+"""What cameras see in all worlds: of each pixel, the shapes that can be there are tried, and the nearest is shaded."""
 
 import functools
 import math
@@ -7,25 +7,63 @@ from typing import Any
 import mujoco
 import warp as wp
 
-from torchrl_loco.eyes.placing import Placed
-from torchrl_loco.eyes.scene import Looks, Shapes, looks_of, mounts_of, to_the_horizon
+from torchrl_loco.eyes.placing import Placed, Pose, axes_of, origin_of, pose_of
+from torchrl_loco.eyes.scene import OWN, SPOT, Looks, Shapes, looks_of, mounts_of, to_the_horizon
 from torchrl_loco.eyes.shapes import MISS, normal_of, to_mesh, to_shape
 from torchrl_loco.sim import EXCLUSIVE, Buffer, current_stream
 from torchrl_loco.sim.compiled.collision.kinds import MESH, PLANE
 
 KINDS = ("rgb", "depth", "geoms")  # what a camera tells of each pixel
+TILES = {"cuda": (8, 4, 16), "cpu": (1, 1, 1)}
+"""Pixels that neighbouring threads draw at once, to the right and down; and how often, from the top down. On CUDA these
+threads are a warp, which looks together for the shapes that can be there: one shape a thread."""
 Color = wp.types.vector(length=3, dtype=wp.uint8)
 
 
 @wp.struct
 class View:
-    """A camera's picture: half its height and width on the plane at distance 1, in pixels its size, and its options."""
+    """A camera's picture: half its width and height on the plane at distance 1, there a pixel's, and its size."""
 
     half: wp.vec2
+    pixel: wp.vec2
     width: int
     height: int
-    samples: int
     far: float
+
+
+@wp.func_native("""
+#ifdef __CUDA_ARCH__
+const int shape = first + threadIdx.x % 32;
+bool meets = false;
+if (shape < bounds.shape[1]) {
+  const float4 at = reinterpret_cast<const float4*>(bounds.data)[size_t(world) * bounds.shape[1] + shape];
+  meets = x1 >= at.x && y1 >= at.y && x0 <= at.z && y0 <= at.w;
+}
+return __ballot_sync(0xffffffffu, meets);
+#else
+const wp::vec_t<4, float>* const at = bounds.data + size_t(world) * bounds.shape[1] + first;
+unsigned found = 0;
+for (int k = 0; k < 32 && first + k < bounds.shape[1]; ++k) {
+  found |= unsigned(x1 >= at[k].c[0] && y1 >= at[k].c[1] && x0 <= at[k].c[2] && y0 <= at[k].c[3]) << k;
+}
+return found;
+#endif
+""")
+def candidates(
+    bounds: wp.array2d[wp.vec4], world: int, first: int, x0: float, y0: float, x1: float, y1: float
+) -> wp.uint32:
+    """Returns which of 32 shapes can be in a rectangle of the picture, a bit each; all threads of a warp must ask."""
+
+
+@wp.func_native("""
+#ifdef __CUDA_ARCH__
+return __ffs(bits) - 1;
+#else
+return __builtin_ctz(bits);
+#endif
+""")
+def lowest(bits: wp.uint32) -> wp.int32:
+    """Returns the number of the lowest bit that is set."""
 
 
 @wp.func
@@ -68,33 +106,35 @@ def sky(looks: Looks, d: wp.vec3) -> wp.vec3:
 @wp.func
 def painted(looks: Looks, geom: int, at: wp.vec3, spread: float) -> wp.vec3:
     """Returns the color of a geom at a place in its own frame, over which a pixel spreads so far (m)."""
-    color, texture = 1.0 * looks.color[geom], looks.texture[geom]
-    if texture >= 0:
-        repeat, offset = looks.repeat[geom], looks.offset[geom]
+    look = looks.geom[geom]
+    color, repeat, offset = 1.0 * look.color, look.repeat, look.offset
+    if look.texture >= 0:
         u, v = repeat[0] * at[0] + offset[0], offset[1] - repeat[1] * at[1]
-        color = wp.cw_mul(color, texel(looks, texture, u, v, spread * repeat[0]))
+        color = wp.cw_mul(color, texel(looks, look.texture, u, v, spread * repeat[0]))
     return color
 
 
 @wp.func
-def of_spot(looks: Looks, light: int, distance: float, inner: float) -> float:
+def of_spot(fade: wp.vec3, cone: wp.vec2, distance: float, inner: float) -> float:
     """Returns how strong a light is that is so far, at an angle to its axis with such a cosine."""
-    fade, cone = looks.attenuation[light], looks.cone[light]
     strength = 1.0 / (fade[0] + distance * (fade[1] + distance * fade[2]))
     return wp.where(inner >= cone[0], strength * wp.pow(wp.max(inner, 0.0), cone[1]), 0.0)
 
 
 @functools.cache
-def tracer(rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool) -> wp.Kernel:
-    """Returns the kernel that traces the rays of a pixel, for what is asked for."""
+def tracer(
+    rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool, samples: int, tile: tuple[int, int, int]
+) -> wp.Kernel:
+    """Returns the kernel that draws pictures of what is asked for, its threads in tiles as ``TILES`` says."""
+    across, down, times = tile
+    share = 1.0 / samples
 
     @wp.func
-    def lit(
-        shapes: Shapes, origin: wp.array[wp.vec3], turn: wp.array[wp.mat33], p: wp.vec3, to: wp.vec3, most: float
-    ) -> bool:
+    def lit(shapes: Shapes, poses: wp.array2d[Pose], world: int, p: wp.vec3, to: wp.vec3, most: float) -> bool:
         """Returns whether nothing lies between a point and a light."""
         for k in range(shapes.kind.shape[0]):
-            kind, o, d = shapes.kind[k], origin[k] + turn[k] @ p, turn[k] @ to
+            kind, pose = shapes.kind[k], pose_of(poses, world, k)
+            o, d = origin_of(pose) + axes_of(pose) @ p, axes_of(pose) @ to
             if kind != PLANE:
                 # The nearest that it comes to the shape's middle is within the sphere around it.
                 along = -wp.dot(o, d) / wp.dot(d, d)
@@ -114,33 +154,33 @@ def tracer(rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool) -> 
         looks: Looks,
         light_pos: wp.array[wp.vec3],
         light_axis: wp.array[wp.vec3],
-        origin: wp.array[wp.vec3],
-        turn: wp.array[wp.mat33],
+        poses: wp.array2d[Pose],
+        world: int,
         p: wp.vec3,
         n: wp.vec3,
         eye: wp.vec3,
         base: wp.vec3,
         shine: wp.vec3,
     ) -> wp.vec3:
-        """Returns the color of a point that faces along ``n``, seen from ``eye``; the camera has the first light."""
+        """Returns the color of a point that faces along ``n``, seen from ``eye``."""
         light, gloss = looks.ambient + wp.vec3(shine[0], shine[0], shine[0]), wp.vec3()
-        for k in range(looks.diffuse.shape[0]):
+        for k in range(looks.light.shape[0]):
+            one = looks.light[k]
             to, strength, most = eye, float(1.0), float(0.0)
-            if k > 0:
+            if one.kind != OWN:
                 to, most = 1.0 * light_axis[k - 1], MISS
-                if looks.light_kind[k - 1] == 0:
+                if one.kind == SPOT:
                     way = light_pos[k - 1] - p
                     most = wp.length(way)
-                    strength = of_spot(looks, k - 1, most, wp.dot(way, to) / most)
+                    strength = of_spot(one.attenuation, one.cone, most, wp.dot(way, to) / most)
                     to = way / most
             toward = wp.dot(n, to)
             if toward > 0.0 and strength > 0.0:
                 if wp.static(shadows):
-                    if k > 0 and looks.shadow[k - 1]:
-                        if not lit(shapes, origin, turn, p + 1.0e-3 * n, to, most):
-                            strength = 0.0
-                light += strength * toward * looks.diffuse[k]
-                mirrored = shine[1] * looks.specular[k]
+                    if one.shadow and not lit(shapes, poses, world, p + 1.0e-3 * n, to, most):
+                        strength = 0.0
+                light += strength * toward * one.diffuse
+                mirrored = shine[1] * one.specular
                 if wp.dot(mirrored, mirrored) > 0.0:  # the camera's own light has seldom any
                     half = wp.max(wp.dot(n, wp.normalize(to + eye)), 0.0)
                     gloss += strength * wp.pow(half, wp.max(shine[2], 1.0)) * mirrored
@@ -157,80 +197,91 @@ def tracer(rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool) -> 
         camera_mat: wp.array[wp.mat33],
         light_pos: wp.array2d[wp.vec3],
         light_axis: wp.array2d[wp.vec3],
-        origin: wp.array2d[wp.vec3],
-        turn: wp.array2d[wp.mat33],
-        bound: wp.array2d[wp.vec4],
+        poses: wp.array2d[Pose],
+        bounds: wp.array2d[wp.vec4],
         # Out:
         rgb_out: wp.array3d[Color],
         depth_out: wp.array3d[float],
         geoms_out: wp.array3d[int],
     ):
-        world, row, column = wp.tid()
+        world, thread = wp.tid()
         if mask and not mask[world]:
             return
-        color, share = wp.vec3(), 1.0 / float(view.samples)
-        for sample in range(view.samples * view.samples):
-            i, j = float(sample // view.samples), float(sample % view.samples)
-            x = view.half[0] * (2.0 * (float(column) + (j + 0.5) * share) / float(view.width) - 1.0)
-            y = view.half[1] * (1.0 - 2.0 * (float(row) + (i + 0.5) * share) / float(view.height))
-            d = wp.vec3(x, y, -1.0)
-            nearest, found, n, owner = float(MISS), int(-1), wp.vec3(), int(-1)
-            for k in range(shapes.kind.shape[0]):
-                at = bound[world, k]
-                if x >= at[0] and y >= at[1] and x <= at[2] and y <= at[3]:
-                    o, own, kind = origin[world, k], turn[world, k] @ d, shapes.kind[k]
-                    t = to_shape(kind, o, own, shapes.size[k])
-                    if wp.static(meshes):
-                        if kind == MESH:
-                            normal, face = wp.vec3(), int(0)
-                            t, normal, face = to_mesh(shapes.mesh[k], o, own, nearest)
-                            if t < nearest:
-                                n, owner = normal, face
-                    if t < nearest:
-                        nearest, found = t, k
-            geom = int(-1)
-            if found >= 0:
-                geom = shapes.geom[found]
-                if geom < 0:
-                    geom = shapes.owner[owner]
-            if wp.static(depth):
-                depth_out[world, row, column] = wp.min(nearest, view.far)
-            if wp.static(geoms):
-                geoms_out[world, row, column] = geom
-            if wp.static(rgb):
-                if found < 0:
-                    color += sky(looks, camera_mat[world] @ d)
-                else:
-                    p, back = nearest * d, turn[world, found]
-                    inside = origin[world, found] + back @ p
-                    if shapes.kind[found] != MESH:
-                        n = normal_of(shapes.kind[found], inside, shapes.size[found])
-                    n = wp.transpose(back) @ n
-                    n = wp.where(wp.dot(n, d) > 0.0, -n, n)
-                    eye = -wp.normalize(d)
-                    slant = wp.max(wp.abs(wp.dot(n, eye)), 0.02)
-                    spread = 2.0 * view.half[1] / float(view.height * view.samples) * wp.length(p) / slant
-                    base = painted(looks, geom, inside, spread)
-                    color += shaded(
-                        shapes,
-                        looks,
-                        light_pos[world],
-                        light_axis[world],
-                        origin[world],
-                        turn[world],
-                        p,
-                        n,
-                        eye,
-                        base,
-                        looks.shine[geom],
+        number, lane = thread // (across * down), thread % (across * down)
+        beside = (view.width + across - 1) // across
+        left, top = (number % beside) * across, (number // beside) * (down * times)
+        column, right = left + lane % across, view.pixel[0] * float(left + across) - view.half[0]
+        for upper in range(top, wp.min(top + down * times, view.height), down):
+            row, lower = upper + lane // across, view.half[1] - view.pixel[1] * float(upper + down)
+            color, nearest, geom = wp.vec3(), float(MISS), int(-1)
+            for sample in range(int(wp.static(samples * samples))):
+                x = view.pixel[0] * (float(column) + (float(sample % samples) + 0.5) * share) - view.half[0]
+                y = view.half[1] - view.pixel[1] * (float(row) + (float(sample // samples) + 0.5) * share)
+                d = wp.vec3(x, y, -1.0)
+                found, n, owner = int(-1), wp.vec3(), int(-1)
+                nearest = MISS
+                for first in range(0, bounds.shape[1], 32):
+                    x0, y1 = right - view.pixel[0] * float(across), lower + view.pixel[1] * float(down)
+                    bits = candidates(bounds, world, first, x0, lower, right, y1)
+                    while bits != wp.uint32(0):
+                        k = first + lowest(bits)
+                        bits = bits & (bits - wp.uint32(1))
+                        pose, kind = pose_of(poses, world, k), shapes.kind[k]
+                        o, own = origin_of(pose), axes_of(pose) @ d
+                        t = to_shape(kind, o, own, shapes.size[k])
+                        if wp.static(meshes):
+                            if kind == MESH:
+                                normal, face = wp.vec3(), int(0)
+                                t, normal, face = to_mesh(shapes.mesh[k], o, own, nearest)
+                                if t < nearest:
+                                    n, owner = normal, face
+                        if t < nearest:
+                            nearest, found = t, k
+                geom = int(-1)
+                if found >= 0:
+                    geom = shapes.geom[found]
+                    if geom < 0:
+                        geom = shapes.owner[owner]
+                if wp.static(rgb):
+                    if found < 0:
+                        color += sky(looks, camera_mat[world] @ d)
+                    else:
+                        p, pose = nearest * d, pose_of(poses, world, found)
+                        inside = origin_of(pose) + axes_of(pose) @ p
+                        if shapes.kind[found] != MESH:
+                            n = normal_of(shapes.kind[found], inside, shapes.size[found])
+                        n = wp.transpose(axes_of(pose)) @ n
+                        n = wp.where(wp.dot(n, d) > 0.0, -n, n)
+                        length = wp.length(d)
+                        eye = d / -length
+                        slant = wp.max(wp.abs(wp.dot(n, eye)), 0.02)
+                        spread = share * view.pixel[1] * nearest * length / slant
+                        base = painted(looks, geom, inside, spread)
+                        color += shaded(
+                            shapes,
+                            looks,
+                            light_pos[world],
+                            light_axis[world],
+                            poses,
+                            world,
+                            p,
+                            n,
+                            eye,
+                            base,
+                            looks.geom[geom].shine,
+                        )
+            if row < view.height and column < view.width:
+                if wp.static(depth):
+                    depth_out[world, row, column] = wp.min(nearest, view.far)
+                if wp.static(geoms):
+                    geoms_out[world, row, column] = geom
+                if wp.static(rgb):
+                    color *= 255.0 * share * share
+                    rgb_out[world, row, column] = Color(
+                        wp.uint8(wp.clamp(color[0] + 0.5, 0.0, 255.0)),
+                        wp.uint8(wp.clamp(color[1] + 0.5, 0.0, 255.0)),
+                        wp.uint8(wp.clamp(color[2] + 0.5, 0.0, 255.0)),
                     )
-        if wp.static(rgb):
-            scale = 255.0 * share * share
-            rgb_out[world, row, column] = Color(
-                wp.uint8(wp.clamp(scale * color[0] + 0.5, 0.0, 255.0)),
-                wp.uint8(wp.clamp(scale * color[1] + 0.5, 0.0, 255.0)),
-                wp.uint8(wp.clamp(scale * color[2] + 0.5, 0.0, 255.0)),
-            )
 
     return trace
 
@@ -272,9 +323,13 @@ class Eye:
         with EXCLUSIVE, wp.ScopedDevice(device):
             self._placed = Placed(m, device, mounts_of(m, which, device), worlds)
             self._looks, self._view = looks_of(m, device), View()
-            self._view.half, self._view.far = wp.vec2(half * width / height, half), far
-            self._view.width, self._view.height, self._view.samples = width, height, samples
-            self._trace = tracer(*(kind in kinds for kind in KINDS), shadows, self._placed.has_meshes)
+            self._view.half, self._view.pixel = wp.vec2(half * width / height, half), wp.vec2(2.0 * half / height)
+            self._view.width, self._view.height, self._view.far = width, height, far
+            tile = across, down, times = TILES["cuda" if device.is_cuda else "cpu"]
+            tiles = math.ceil(width / across) * math.ceil(height / (down * times))
+            self._threads = worlds, tiles * across * down
+            asked = (kind in kinds for kind in KINDS)
+            self._trace = tracer(*asked, shadows, self._placed.has_meshes, samples, tile)
 
             def pixels(kind: str, dtype: Any) -> Buffer:
                 return Buffer((worlds, height, width) if kind in kinds else (0, 0, 0), dtype, device)
@@ -286,9 +341,9 @@ class Eye:
         """Launches the kernels, on Warp's current stream; arguments as of :meth:`Placed.launch`."""
         placed, out = self._placed, [one.warp for one in self._out]
         placed.launch(xpos, xmat, mask)
-        size = next(one.shape for one in out if one.size)
-        where = [mask, placed.camera, *placed.lights, *placed.placed, placed.bounds]
-        wp.launch(self._trace, size, [self._view, placed.shapes, self._looks, *where], out, device=self._device)
+        where = [mask, placed.camera, *placed.lights, placed.poses, placed.bounds]
+        inputs = [self._view, placed.shapes, self._looks, *where]
+        wp.launch(self._trace, self._threads, inputs, out, device=self._device)
 
     def look(self, xpos: wp.array, xmat: wp.array) -> None:
         """Launches the kernels on torch's stream; arguments as of :meth:`launch`."""
