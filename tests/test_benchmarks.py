@@ -148,7 +148,7 @@ def test_soak_compares_the_counters_with_what_happened(monkeypatch):
         soak.soak(["walker"], 32, 40 * 32, torch.device("cpu"))
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_all_seconds_of_a_start_are_in_a_phase(tmp_path, monkeypatch):
     settings = ["num_envs=4", "num_steps=8", "minibatch_size=16", "eval_episodes=2", "episode_length=40"]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
