@@ -14,7 +14,7 @@ from torchrl_loco.sim import EXCLUSIVE, Buffer, current_stream
 from torchrl_loco.sim.compiled.collision.kinds import MESH, PLANE
 
 KINDS = ("rgb", "depth", "geoms")  # what a camera tells of each pixel
-TILES = {"cuda": (8, 4, 16), "cpu": (1, 1, 1)}
+TILES = {"cuda": (8, 4, 16), "cpu": (1, 1, 16)}
 """Pixels that neighbouring threads draw at once, to the right and down; and how often, from the top down. On CUDA these
 threads are a warp, which looks together for the shapes that can be there: one shape a thread."""
 Color = wp.types.vector(length=3, dtype=wp.uint8)
@@ -44,7 +44,7 @@ return __ballot_sync(0xffffffffu, meets);
 const wp::vec_t<4, float>* const at = bounds.data + size_t(world) * bounds.shape[1] + first;
 unsigned found = 0;
 for (int k = 0; k < 32 && first + k < bounds.shape[1]; ++k) {
-  found |= unsigned(x1 >= at[k].c[0] && y1 >= at[k].c[1] && x0 <= at[k].c[2] && y0 <= at[k].c[3]) << k;
+  if (x1 >= at[k].c[0] && y1 >= at[k].c[1] && x0 <= at[k].c[2] && y0 <= at[k].c[3]) found |= 1u << k;
 }
 return found;
 #endif
