@@ -33,7 +33,7 @@ def pose_of(poses: wp.array2d[Pose], world: int, shape: int) -> Pose:
 
 
 @wp.func
-def axes_of(pose: Pose) -> wp.mat33:
+def turn_of(pose: Pose) -> wp.mat33:
     """Returns the axes of the camera alone."""
     x, y, z = pose[0], pose[1], pose[2]
     return wp.mat33(x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2])

@@ -4,11 +4,12 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from torchrl_loco.eyes.placing import Placed, Pose, axes_of, origin_of, pose_of
+from torchrl_loco.eyes.placing import Placed, Pose, origin_of, pose_of, turn_of
 from torchrl_loco.eyes.scene import Shapes, mounts_at, to_the_horizon
 from torchrl_loco.eyes.shapes import to_mesh, to_shape
-from torchrl_loco.sim import EXCLUSIVE, Buffer, corners
+from torchrl_loco.sim import EXCLUSIVE, Buffer
 from torchrl_loco.sim.compiled.collision.kinds import MESH
+from torchrl_loco.sim.corners import axes_of
 
 
 @wp.kernel(enable_backward=False)
@@ -28,7 +29,7 @@ def cast(
     nearest = float(far)
     for k in range(shapes.kind.shape[0]):
         pose, kind = pose_of(poses, world, k), shapes.kind[k]
-        o, d = origin_of(pose), axes_of(pose) @ directions[ray]
+        o, d = origin_of(pose), turn_of(pose) @ directions[ray]
         t = to_shape(kind, o, d, shapes.size[k])
         if kind == MESH:
             t, _n, _f = to_mesh(shapes.mesh[k], o, d, nearest)
@@ -46,11 +47,7 @@ class Rays:
     def __init__(
         self, m: mujoco.MjModel, device: wp.Device, site: int, directions: np.ndarray, worlds: int, far: float
     ) -> None:
-        place = {
-            "body": m.site_bodyid[[site]],
-            "pos": m.site_pos[[site]],
-            "mat": corners.axes_of(m.site_quat[site])[None],
-        }
+        place = {"body": m.site_bodyid[[site]], "pos": m.site_pos[[site]], "mat": axes_of(m.site_quat[site])[None]}
         mounts = mounts_at(m, device, **place, mode=np.zeros(1), target=-np.ones(1))
         self._placed, self._device, self._far = Placed(to_the_horizon(m), device, mounts, worlds), device, far
         with EXCLUSIVE, wp.ScopedDevice(device):

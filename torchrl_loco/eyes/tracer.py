@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import warp as wp
 
-from torchrl_loco.eyes.placing import Placed, Pose, axes_of, origin_of, pose_of
+from torchrl_loco.eyes.placing import Placed, Pose, origin_of, pose_of, turn_of
 from torchrl_loco.eyes.scene import OWN, SPOT, Looks, Shapes, looks_of, mounts_of, to_the_horizon
 from torchrl_loco.eyes.shapes import MISS, normal_of, to_mesh, to_shape
 from torchrl_loco.sim import EXCLUSIVE, Buffer, current_stream
@@ -15,17 +15,17 @@ from torchrl_loco.sim.compiled.collision.kinds import MESH, PLANE
 
 KINDS = ("rgb", "depth", "geoms")  # what a camera tells of each pixel
 TILES = {"cuda": (8, 4, 16), "cpu": (1, 1, 16)}
-"""Pixels that neighbouring threads draw at once, to the right and down; and how often, from the top down. On CUDA these
-threads are a warp, which looks together for the shapes that can be there: one shape a thread."""
+"""Width and height of the tile that neighbouring threads draw at once, a pixel each, and how many tiles they draw, one
+below the other. On CUDA they are a warp, which finds the shapes that can be in a tile together, a thread for each."""
 Color = wp.types.vector(length=3, dtype=wp.uint8)
 
 
 @wp.struct
 class View:
-    """A camera's picture: half its width and height on the plane at distance 1, there a pixel's, and its size."""
+    """A camera's picture: half its size and the side of a pixel, on the plane at distance 1; and its size in pixels."""
 
     half: wp.vec2
-    pixel: wp.vec2
+    pixel: float
     width: int
     height: int
     far: float
@@ -123,18 +123,45 @@ def of_spot(fade: wp.vec3, cone: wp.vec2, distance: float, inner: float) -> floa
 
 @functools.cache
 def tracer(
-    rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool, samples: int, tile: tuple[int, int, int]
+    rgb: bool, depth: bool, geoms: bool, shadows: bool, meshes: bool, samples: int, tiles: tuple[int, int, int]
 ) -> wp.Kernel:
-    """Returns the kernel that draws pictures of what is asked for, its threads in tiles as ``TILES`` says."""
-    across, down, times = tile
+    """Returns the kernel that draws what is asked for; ``tiles`` are some of ``TILES``."""
+    across, down, times = tiles
     share = 1.0 / samples
+
+    @wp.func
+    def met(
+        shapes: Shapes, poses: wp.array2d[Pose], bounds: wp.array2d[wp.vec4], world: int, tile: wp.vec4, d: wp.vec3
+    ):
+        """Returns how far the nearest shape in a direction is, and which; of a mesh, its normal there and the triangle.
+
+        ``tile`` is the part of the picture that the threads draw at once: least x and y, greatest x and y.
+        """
+        nearest, found, n, owner = float(MISS), int(-1), wp.vec3(), int(-1)
+        for first in range(0, bounds.shape[1], 32):
+            bits = candidates(bounds, world, first, tile[0], tile[1], tile[2], tile[3])
+            while bits != wp.uint32(0):
+                k = first + lowest(bits)
+                bits = bits & (bits - wp.uint32(1))
+                pose, kind = pose_of(poses, world, k), shapes.kind[k]
+                o, own = origin_of(pose), turn_of(pose) @ d
+                t = to_shape(kind, o, own, shapes.size[k])
+                if wp.static(meshes):
+                    if kind == MESH:
+                        normal, face = wp.vec3(), int(0)
+                        t, normal, face = to_mesh(shapes.mesh[k], o, own, nearest)
+                        if t < nearest:
+                            n, owner = normal, face
+                if t < nearest:
+                    nearest, found = t, k
+        return nearest, found, n, owner
 
     @wp.func
     def lit(shapes: Shapes, poses: wp.array2d[Pose], world: int, p: wp.vec3, to: wp.vec3, most: float) -> bool:
         """Returns whether nothing lies between a point and a light."""
         for k in range(shapes.kind.shape[0]):
             kind, pose = shapes.kind[k], pose_of(poses, world, k)
-            o, d = origin_of(pose) + axes_of(pose) @ p, axes_of(pose) @ to
+            o, d = origin_of(pose) + turn_of(pose) @ p, turn_of(pose) @ to
             if kind != PLANE:
                 # The nearest that it comes to the shape's middle is within the sphere around it.
                 along = -wp.dot(o, d) / wp.dot(d, d)
@@ -207,36 +234,19 @@ def tracer(
         world, thread = wp.tid()
         if mask and not mask[world]:
             return
-        number, lane = thread // (across * down), thread % (across * down)
-        beside = (view.width + across - 1) // across
-        left, top = (number % beside) * across, (number // beside) * (down * times)
-        column, right = left + lane % across, view.pixel[0] * float(left + across) - view.half[0]
+        tile, lane = thread // (across * down), thread % (across * down)
+        per_row = (view.width + across - 1) // across
+        left, top = (tile % per_row) * across, (tile // per_row) * (down * times)
+        column, x0 = left + lane % across, view.pixel * float(left) - view.half[0]
         for upper in range(top, wp.min(top + down * times, view.height), down):
-            row, lower = upper + lane // across, view.half[1] - view.pixel[1] * float(upper + down)
+            row, y1 = upper + lane // across, view.half[1] - view.pixel * float(upper)
+            corners = wp.vec4(x0, y1 - view.pixel * float(down), x0 + view.pixel * float(across), y1)
             color, nearest, geom = wp.vec3(), float(MISS), int(-1)
             for sample in range(int(wp.static(samples * samples))):
-                x = view.pixel[0] * (float(column) + (float(sample % samples) + 0.5) * share) - view.half[0]
-                y = view.half[1] - view.pixel[1] * (float(row) + (float(sample // samples) + 0.5) * share)
+                x = view.pixel * (float(column) + (float(sample % samples) + 0.5) * share) - view.half[0]
+                y = view.half[1] - view.pixel * (float(row) + (float(sample // samples) + 0.5) * share)
                 d = wp.vec3(x, y, -1.0)
-                found, n, owner = int(-1), wp.vec3(), int(-1)
-                nearest = MISS
-                for first in range(0, bounds.shape[1], 32):
-                    x0, y1 = right - view.pixel[0] * float(across), lower + view.pixel[1] * float(down)
-                    bits = candidates(bounds, world, first, x0, lower, right, y1)
-                    while bits != wp.uint32(0):
-                        k = first + lowest(bits)
-                        bits = bits & (bits - wp.uint32(1))
-                        pose, kind = pose_of(poses, world, k), shapes.kind[k]
-                        o, own = origin_of(pose), axes_of(pose) @ d
-                        t = to_shape(kind, o, own, shapes.size[k])
-                        if wp.static(meshes):
-                            if kind == MESH:
-                                normal, face = wp.vec3(), int(0)
-                                t, normal, face = to_mesh(shapes.mesh[k], o, own, nearest)
-                                if t < nearest:
-                                    n, owner = normal, face
-                        if t < nearest:
-                            nearest, found = t, k
+                nearest, found, n, owner = met(shapes, poses, bounds, world, corners, d)
                 geom = int(-1)
                 if found >= 0:
                     geom = shapes.geom[found]
@@ -247,15 +257,15 @@ def tracer(
                         color += sky(looks, camera_mat[world] @ d)
                     else:
                         p, pose = nearest * d, pose_of(poses, world, found)
-                        inside = origin_of(pose) + axes_of(pose) @ p
+                        inside = origin_of(pose) + turn_of(pose) @ p
                         if shapes.kind[found] != MESH:
                             n = normal_of(shapes.kind[found], inside, shapes.size[found])
-                        n = wp.transpose(axes_of(pose)) @ n
+                        n = wp.transpose(turn_of(pose)) @ n
                         n = wp.where(wp.dot(n, d) > 0.0, -n, n)
                         length = wp.length(d)
                         eye = d / -length
                         slant = wp.max(wp.abs(wp.dot(n, eye)), 0.02)
-                        spread = share * view.pixel[1] * nearest * length / slant
+                        spread = share * view.pixel * nearest * length / slant
                         base = painted(looks, geom, inside, spread)
                         color += shaded(
                             shapes,
@@ -323,13 +333,12 @@ class Eye:
         with EXCLUSIVE, wp.ScopedDevice(device):
             self._placed = Placed(m, device, mounts_of(m, which, device), worlds)
             self._looks, self._view = looks_of(m, device), View()
-            self._view.half, self._view.pixel = wp.vec2(half * width / height, half), wp.vec2(2.0 * half / height)
+            self._view.half, self._view.pixel = wp.vec2(half * width / height, half), 2.0 * half / height
             self._view.width, self._view.height, self._view.far = width, height, far
-            tile = across, down, times = TILES["cuda" if device.is_cuda else "cpu"]
-            tiles = math.ceil(width / across) * math.ceil(height / (down * times))
-            self._threads = worlds, tiles * across * down
+            tiles = across, down, times = TILES["cuda" if device.is_cuda else "cpu"]
+            self._threads = worlds, math.ceil(width / across) * across * math.ceil(height / (down * times)) * down
             asked = (kind in kinds for kind in KINDS)
-            self._trace = tracer(*asked, shadows, self._placed.has_meshes, samples, tile)
+            self._trace = tracer(*asked, shadows, self._placed.has_meshes, samples, tiles)
 
             def pixels(kind: str, dtype: Any) -> Buffer:
                 return Buffer((worlds, height, width) if kind in kinds else (0, 0, 0), dtype, device)
