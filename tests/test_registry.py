@@ -157,6 +157,7 @@ count = globals().get("count", 0) + 1
 
 @pytest.fixture
 def file(tmp_path, nothing_added, monkeypatch):
+    torchrl_loco.make("walker_stand", 1, "cpu").close()  # torch imports modules for it that must stay
     monkeypatch.setattr(sys, "path", sys.path.copy())
     monkeypatch.setattr(sys, "modules", sys.modules.copy())
     (tmp_path / "numbers_beside.py").write_text("SPEED = 0.25")

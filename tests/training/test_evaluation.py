@@ -124,7 +124,7 @@ def test_a_run_from_another_device(ppo_run, tmp_path):
 
 def test_a_run_without_a_policy(tmp_path):
     run = made(tmp_path)
-    for way in ("start a new run", "continue it with torchrl-loco resume"):
+    for way in ("wait for one if it is being trained, else start a new run", "continue it with torchrl-loco resume"):
         with pytest.raises(FileNotFoundError, match=f"has no policy yet: {way}"):
             evaluate_run(run)
         run.save_checkpoint({})

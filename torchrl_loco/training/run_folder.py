@@ -24,6 +24,7 @@ from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig, check_packages_of, config_from_json
 
 CHECKPOINT_VERSION = 7
+WITHOUT_CHECKPOINT = "wait for one if it is being trained, else start a new run"
 
 _UNREADABLE = (pickle.UnpicklingError, RuntimeError, OSError, EOFError, LookupError, TypeError, ValueError)
 """Errors that reading a damaged checkpoint may raise."""
@@ -195,7 +196,7 @@ class RunFolder:
             ValueError: it cannot be read, or is of another task.
         """
         if not self.policy.is_file():
-            way = "continue it with torchrl-loco resume" if self.has_checkpoint else "start a new run"
+            way = "continue it with torchrl-loco resume" if self.has_checkpoint else WITHOUT_CHECKPOINT
             raise FileNotFoundError(f"{self.path} has no policy yet: {way}")
         policy, task = Policy.load(self.policy, device), self.load_config().task
         if policy.info["task"] != task:
@@ -312,7 +313,7 @@ class RunFolder:
         """
         path = self.checkpoint if path is None else path
         if not path.is_file():
-            raise FileNotFoundError(f"{self.path} has no {path.name}: start a new run")
+            raise FileNotFoundError(f"{self.path} has no {path.name} yet: {WITHOUT_CHECKPOINT}")
         try:
             entries = torch.load(path, map_location=device, weights_only=True)
             version = entries["version"]
