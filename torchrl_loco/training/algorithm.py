@@ -189,6 +189,7 @@ class Algorithm(ABC):
                 group["lr"].fill_(lr)
 
     def _gradient_steps(self) -> None:
+        """Does what is recorded on CUDA: an epoch, by itself."""
         assert self._data is not None
         for minibatch in self._data[self._order].split(self.config.minibatch_size):
             self._totals += torch.stack([metric.detach() for metric in self.gradient_step(minibatch)])

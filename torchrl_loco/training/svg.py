@@ -22,10 +22,9 @@ from torchrl.modules import MLP, ProbabilisticActor
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.imagined import FOUND, Imagined
 from torchrl_loco.policy import ObservationNorm
-from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, make_actor, network_of, normed_layers
-from torchrl_loco.training.algorithm import WARMUP, Algorithm, clip_and_step, compiled
+from torchrl_loco.training.algorithm import Algorithm, clip_and_step, compiled
 from torchrl_loco.training.config import SVGConfig
 from torchrl_loco.training.dynamics import Dynamics
 from torchrl_loco.training.muon import Muon
@@ -126,7 +125,6 @@ class SVG(Algorithm):
         self._move, self._dream = fused(self._moved, "the model"), fused(self._dreamt, "the actor")
         self._value, self._target_value = fused(self.critic, "the critic"), fused(self._valued, "the critic")
         self._returns = fused(self._returned)
-        self._learn = TorchGraph(self._round, self.device, warmup=WARMUP) if on_cuda else self._round
 
     def acting(self) -> nn.Module:
         """Returns the actor that learns, as it was before the last update, as a policy for collectors."""
@@ -146,15 +144,7 @@ class SVG(Algorithm):
         raise NotImplementedError("svg learns from windows of several batches")
 
     def update(self, batch: TensorDictBase, progress: float) -> torch.Tensor:
-        """Updates on what is remembered, a batch more, without synchronising with the device.
-
-        Args:
-            batch: experience of shape ``(num_envs, num_steps)``; each rank passes its own.
-            progress: fraction of the training that is done, in [0, 1], which sets the learning rates.
-
-        Returns:
-            The means of the metrics over all rounds, ``(len(metric_names),)``; zeros until a window is remembered.
-        """
+        """Returns the means of the metrics over all rounds of an update, zeros until a window is remembered."""
         self.adopt()
         self.schedule(progress)
         steps = self._replay.keep(batch)
@@ -171,12 +161,12 @@ class SVG(Algorithm):
             self._replay.draw_starts()
             self._noise.normal_(generator=self.generator)  # graphs that run at once share the state of torch's own
             self._units.uniform_(generator=self.generator)
-            self._learn()
+            self._epoch()
         self._rounds += rounds
         return self._totals / max(rounds, 1)
 
-    def _round(self) -> None:
-        """Fits the model, and then the critic, while the actor imagines and learns by what they were."""
+    def _gradient_steps(self) -> None:
+        """Makes a round: fits the model, and then the critic, while the actor imagines and learns by what they were."""
         with torch.no_grad():
             torch._foreach_copy_(list(self._known.state_dict().values()), list(self.model.state_dict().values()))
         alone = distributed.ranks() == 1  # several meet in one order
@@ -366,11 +356,6 @@ class SVG(Algorithm):
         self._rounds = state["rounds"]
         if distributed.is_first():
             print("svg remembers steps anew: the run differs from one that was not stopped", file=sys.stderr)
-
-    def release(self) -> None:
-        """Forgets what was recorded."""
-        if isinstance(self._learn, TorchGraph):
-            self._learn.release()
 
 
 def lambda_returns(
