@@ -6,8 +6,7 @@ actor minimises the KL divergence from the policy that collected the data wherev
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -21,7 +20,7 @@ from torchrl_loco.encoder import PixelEncoder
 from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of, normed_layers
-from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step, compiled
+from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
 from torchrl_loco.training.config import REPPOConfig
 
 
@@ -62,37 +61,18 @@ class REPPO(Algorithm):
         # The gradient of a dual variable's logarithm shrinks with the variable: an eps of 1e-5 would keep it small.
         groups = [{"params": list(self.actor.parameters())}, {"params": list(self.dual.parameters()), "eps": 1e-8}]
         self.actor_optimizer = self.make_optimizer("actor", groups)
-        self._compiled_values = self._fused(self._values, config.bf16)
-        self._compiled_critic_losses = self._fused(self._critic_losses, config.bf16)
-        self._compiled_actor_losses = self._fused(self._actor_losses, config.bf16)
+        self._compiled_values = self.fused(self._values, "actor and critic", config.bf16)
+        self._compiled_critic_losses = self.fused(self._critic_losses, "the critic", config.bf16)
+        self._compiled_actor_losses = self.fused(self._actor_losses, "the actor", config.bf16)
 
     def acting(self) -> nn.Module:
         """Returns the actor as a policy for collectors, compiled on CUDA if the settings ask for that."""
-        return Acting(self.actor, self._fused(self.actor))
+        return Acting(self.actor, self.fused(self.actor, "the actor"))
 
     def _read(self, td: TensorDictBase) -> dict[str, torch.Tensor]:
         """Returns what networks read of a batch, by entry: rows of numbers normalised, pixels as they are."""
         rows = {key: norm(td[key]) for key, norm in self.norms.items()}
         return rows | ({"pixels": td["pixels"]} if self.spaces.pixels else {})
-
-    def _fused(self, function: Callable[..., Any], bf16: bool = False) -> Callable[..., Any]:
-        """Returns a function of tensors as kernels of torch.compile on CUDA, if the settings ask for that.
-
-        Between the matrix products of small networks, torch spends most of a step reading and writing activations.
-        """
-
-        def in_bf16(*args: Any) -> Any:
-            with torch.autocast("cuda", torch.bfloat16):
-                return function(*args)
-
-        if self.device.type != "cuda":
-            return function
-        chosen = in_bf16 if bf16 else function
-        if not self.config.compile:
-            return chosen
-        # Rows whose length is no multiple of 8 are slow to multiply: those that a Go1's critic reads have 73 numbers.
-        what = getattr(function, "__name__", type(function).__name__)
-        return compiled(chosen, what, options={"force_shape_pad": True})
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns soft lambda-returns, ``(num_envs, num_steps)``, the features to predict, and normalised observations.

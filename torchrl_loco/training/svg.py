@@ -24,7 +24,7 @@ from torchrl_loco.envs.imagined import FOUND, Imagined
 from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, make_actor, network_of, normed_layers
-from torchrl_loco.training.algorithm import Algorithm, clip_and_step, compiled
+from torchrl_loco.training.algorithm import Algorithm, clip_and_step
 from torchrl_loco.training.config import SVGConfig
 from torchrl_loco.training.dynamics import Dynamics
 from torchrl_loco.training.muon import Muon
@@ -97,13 +97,8 @@ class SVG(Algorithm):
             raise ValueError("svg needs a task that shows its states: train with the task's id or class, not in an env")
 
         def fused(function: Callable[..., Any], what: str = "") -> Callable[..., Any]:
-            def in_bf16(*args: Any) -> Any:
-                with torch.autocast("cuda", torch.bfloat16):
-                    return function(*args)
-
-            chosen = in_bf16 if config.bf16 and what else function  # hooks are none of networks
-            settings = {"options": {"force_shape_pad": True, "combo_kernels": True}}
-            return compiled(chosen, what or "a hook", **settings) if config.compile and on_cuda else chosen
+            bf16 = config.bf16 and bool(what)  # hooks are none of networks
+            return self.fused(function, what or "a hook", bf16, combo_kernels=True)
 
         self._imagined = Imagined(env, config.minibatch_size, config.horizon, fused)
         if (unknown := self._imagined.unknown) and distributed.is_first():
