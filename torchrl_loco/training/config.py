@@ -292,12 +292,9 @@ class REPPOConfig(TrainingConfig):
     algorithm: ClassVar[str] = "reppo"
     presets: ClassVar[dict[str, Settings]] = {
         "cpu": {
-            "num_steps": 32,
             "action_repeat": 2,
             "episode_length": 1000,
-            "total_frames": 1_228_800,
             "reward_scale": 0.5,
-            "gamma": 0.98,
             "lr": 3e-4,
             "final_lr_fraction": 1.0,
             "epochs": 4,
@@ -394,7 +391,6 @@ class SVGConfig(TrainingConfig):
             "total_frames": 46_000_000,
             "epochs": 14,
             "minibatch_size": 2048,
-            "lr": 1e-3,
             "final_lr_fraction": 0.1,
             "average_rate": 0.005,
             "hidden": (1024, 512, 256),
