@@ -31,8 +31,8 @@ ROW_ALIGNED = 16  # bytes at a multiple of which each entry of a row of steps be
 class Algorithm(ABC):
     """Improves an actor on one batch after another.
 
-    A subclass sets ``config_type`` and ``metric_names``, and in ``__init__`` ``actor``, ``norms`` and ``networks``; it
-    turns a batch into what gradient steps need (:meth:`prepare`) and makes one gradient step (:meth:`gradient_step`).
+    A subclass sets ``config_type`` and ``metric_names``, and in ``__init__`` ``actor`` and ``networks``; it turns a
+    batch into what gradient steps need (:meth:`prepare`) and makes one gradient step (:meth:`gradient_step`).
 
     Args:
         config: the run's settings, of type ``config_type``.
@@ -57,6 +57,7 @@ class Algorithm(ABC):
     def __init__(self, config: TrainingConfig, spaces: Spaces, network: Network | None = None) -> None:
         self.config, self.spaces, self.network = config, spaces, network
         self.device = torch.device(config.device)
+        self.norms = {key: ObservationNorm(size).to(self.device) for key, size in spaces.rows.items()}
         self.optimizers: dict[str, FlatAdam | torch.optim.Optimizer] = {}
         self.generator = torch.Generator(config.device).manual_seed(distributed.own_seed(config.seed))
         self._order = torch.zeros(0, dtype=torch.long, device=config.device)

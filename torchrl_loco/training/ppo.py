@@ -57,7 +57,6 @@ class PPO(Algorithm):
             encoder = PixelEncoder(spaces.pixels)
             return encoder, make(encoder.features, outputs)
 
-        self.norms = {key: ObservationNorm(size) for key, size in spaces.rows.items()}
         first, mean = after_first(spaces.actor_key, spaces.action)
         if network is None:
             nn.init.orthogonal_(mean[-1].weight, gain=0.01)  # the first actions are near zero, whatever is observed

@@ -17,7 +17,7 @@ from torchrl.objectives.utils import hold_out_net
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from torchrl_loco.encoder import PixelEncoder
-from torchrl_loco.policy import ObservationNorm, layers_of
+from torchrl_loco.policy import layers_of
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of, normed_layers
 from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
@@ -38,7 +38,6 @@ class REPPO(Algorithm):
     def __init__(self, config: REPPOConfig, spaces: Spaces, network: Network | None = None) -> None:
         super().__init__(config, spaces, network)
         self.action_bound = 1.0 if spaces.bounded else config.action_bound
-        self.norms = {key: ObservationNorm(size).to(config.device) for key, size in spaces.rows.items()}
         encoder = PixelEncoder(spaces.pixels) if spaces.pixels else None
         sight = PixelEncoder(spaces.pixels) if spaces.pixels and spaces.critic_sees else None
         inputs, outputs = encoder.features if encoder else spaces.observation, 2 * spaces.action

@@ -21,7 +21,6 @@ from torchrl.modules import MLP, ProbabilisticActor
 
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.imagined import FOUND, Imagined
-from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, make_actor, network_of, normed_layers
 from torchrl_loco.training.algorithm import Algorithm, clip_and_step
@@ -60,7 +59,6 @@ class SVG(Algorithm):
         super().__init__(config, spaces, network)
         if spaces.pixels:
             raise ValueError("svg imagines no pixels: train with algorithm='ppo' or 'reppo' from pixels")
-        self.norms = {key: ObservationNorm(size).to(self.device) for key, size in spaces.rows.items()}
         if network is None:
             self._mean: nn.Module = MLP(
                 spaces.observation, spaces.action, num_cells=config.hidden, activation_class=nn.SiLU
