@@ -25,10 +25,7 @@ class RslRlVecEnv(VecEnv):
       same as the observations in the others;
     - ``log``, with ``reward_terms=True``: the mean of each term of the reward, which RSL-RL logs.
 
-    Args:
-        env: an id, a class, or an environment that is made already, with TorchRL's transforms or without.
-        num_envs: number of worlds of an id or a class; ``None`` means 1.
-        settings: arguments of :func:`torchrl_loco.make`, for an id or a class.
+    Arguments and errors are those of :class:`.GymnasiumVectorEnv`, but for what it says of arrays and pictures.
 
     Attributes:
         env: the environment.
@@ -37,10 +34,6 @@ class RslRlVecEnv(VecEnv):
         max_episode_length: the time limit, in control steps.
         device: where the worlds are.
         cfg: all settings, a :class:`torchrl_loco.SimConfig`.
-
-    Raises:
-        ValueError: an argument is out of range or unknown, or the environment has no batch of worlds.
-        TypeError: ``env`` is no environment of this package, or has settings though it is made already.
     """
 
     def __init__(self, env: str | type[LocoEnv] | EnvBase, num_envs: int | None = None, **settings: Any) -> None:
