@@ -56,11 +56,7 @@ class PixelEncoder(nn.Module):
         self.mean.lerp_(mean, count / self.count)
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Returns features ``(..., features)`` of pixels, uint8 ``(..., height, width, channels)``.
-
-        Raises:
-            ValueError: they have another shape or type.
-        """
+        """Returns features ``(..., features)`` of pixels, uint8 ``(..., height, width, channels)``."""
         if tuple(pixels.shape[-3:]) != self.shape or pixels.dtype != torch.uint8:
             raise ValueError(
                 f"this policy sees uint8 pixels of shape {self.shape}, got {pixels.dtype} of shape "

@@ -48,11 +48,7 @@ class ObservationNorm(nn.Module):
         return ((observation - self.mean) * torch.rsqrt(self.var + 1e-6)).clamp(-self.limit, self.limit)
 
     def check(self, observation: torch.Tensor) -> None:
-        """Checks the size of observations of shape ``(..., size)``.
-
-        Raises:
-            ValueError: it is another one.
-        """
+        """Checks the size of observations of shape ``(..., size)``."""
         if observation.shape[-1] != len(self.mean):
             raise ValueError(
                 f"this policy takes observations of size {len(self.mean)}, got size {observation.shape[-1]}: was it "

@@ -57,12 +57,7 @@ def _keep_name(path: Path) -> None:
 
 
 def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Returns the tensors, on the CPU, and the settings that :func:`save` wrote, read without executing code.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it holds something else, is damaged, or of another version.
-    """
+    """Returns the tensors, on the CPU, and the settings that :func:`save` wrote, read without executing code."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no {kind} at {path}")
     try:

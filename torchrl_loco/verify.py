@@ -259,11 +259,7 @@ class Outcome:
 
 
 def check_alone(cls: type[LocoEnv], conditions: Conditions) -> None:
-    """Checks that C MuJoCo alone can tell whether a policy holds.
-
-    Raises:
-        ValueError: it is held to its return in the training simulator.
-    """
+    """Checks that C MuJoCo alone can tell whether a policy holds."""
     if conditions.min_return is None and not {"falls", "return"} & cls.holds.keys():
         raise ValueError(f"{cls.__name__} is held to its return in the training simulator: it cannot be played alone")
 

@@ -24,11 +24,7 @@ class Motions:
     """Frames per second of those in CSV files."""
 
     def given(self, task: str) -> dict[str, object]:
-        """Returns the options of a task that are given.
-
-        Raises:
-            ValueError: the task follows no motions.
-        """
+        """Returns the options of a task that are given."""
         if not (self.motion or self.fps):
             return {}
         given = {"motion": list(self.motion), "fps": self.fps} if self.motion else {"fps": self.fps}

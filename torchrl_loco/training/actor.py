@@ -145,12 +145,7 @@ def log_slope(u: torch.Tensor) -> torch.Tensor:
 
 
 def network_of(make: Network, inputs: int, outputs: int) -> nn.Module:
-    """Returns the network that a function of a user makes.
-
-    Raises:
-        TypeError: ``make`` is no such function, or does not return a module.
-        ValueError: what it returns does not take so many inputs, or give so many outputs.
-    """
+    """Returns the network that a function of a user makes."""
     wanted = "a function of the numbers of inputs and outputs that returns an nn.Sequential"
     if isinstance(make, nn.Module) or not callable(make):
         raise TypeError(f"network must be {wanted}, got {type(make).__name__}")
@@ -209,10 +204,6 @@ def deterministic_policy(actor: ProbabilisticActor, config: TrainingConfig, info
     """Returns the policy that takes the mode of an actor's distribution, without the parts that only training needs.
 
     Its info holds the settings of the training, and ``info`` on top.
-
-    Raises:
-        TypeError: the network has a part that a policy's file cannot hold.
-        RuntimeError: what can be held acts differently from the actor.
     """
     *layers, last = map(copied, layers_of_actor(actor))
     if not any(isinstance(part, AddStateIndependentNormalScale) for part in actor[0].module):

@@ -133,11 +133,7 @@ class Vectors:
 
     @torch.no_grad()
     def adopt(self) -> None:
-        """Makes parameters views, with the values that they have, where they are not.
-
-        Raises:
-            RuntimeError: that would be recorded as part of a step.
-        """
+        """Makes parameters views, with the values that they have, where they are not."""
         if [part.data_ptr() for part in self._parts] == self._addresses:
             return
         views = self._views(self.whole)

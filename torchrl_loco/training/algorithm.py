@@ -239,11 +239,7 @@ class Algorithm(ABC):
                     value.copy_(kept[index][key]) if index in kept else value.zero_()
 
     def load_networks(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Copies the parameters of networks, also of runs whose networks in bfloat16 were one level deeper.
-
-        Raises:
-            RuntimeError: they are of other networks.
-        """
+        """Copies the parameters of networks, also of runs whose networks in bfloat16 were one level deeper."""
         if state.keys() != self.networks.state_dict().keys():
             state = {re.sub(r"(module\.1)\.0\.(?=\d+\.)", r"\1.", name): value for name, value in state.items()}
         self.networks.load_state_dict(state)
@@ -348,14 +344,8 @@ class Packed:
 
 
 def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
-    """Gives networks the weights of a run's checkpoint, actor and critic, or the actor those of a policy file.
-
-    A run without a checkpoint has a policy. A checkpoint may be named by its file.
-
-    Raises:
-        FileNotFoundError: there is no such run or file.
-        ValueError: the weights do not fit: other sizes, or another algorithm.
-    """
+    """Gives networks the weights of a run's checkpoint, actor and critic, or the actor those of a policy file."""
+    # A run without a checkpoint has a policy. A checkpoint may be named by its file.
     is_checkpoint = source.is_file() and source.suffix == ".pt"
     folder = source.parent if is_checkpoint else source
     if folder.is_dir() and (is_checkpoint or RunFolder(folder).has_checkpoint):

@@ -451,13 +451,8 @@ def _checked_widths(name: str, widths: Any) -> tuple[int, ...]:
 
 
 def _stored_name(task: Any) -> str:
-    """Returns the name of a task; of one that says where its class is, with the whole path of its file.
-
-    The class is looked up where it is needed: settings come from files too, whose curve is plotted without it.
-
-    Raises:
-        ValueError: there is no such id, or no class is named.
-    """
+    """Returns the name of a task; of one that says where its class is, with the whole path of its file."""
+    # The class is looked up where it is needed: settings come from files too, whose curve is plotted without it.
     if not (isinstance(task, str) and is_place(task)):
         return task_name(task)
     source, _, name = task.rpartition(":")
@@ -467,11 +462,7 @@ def _stored_name(task: Any) -> str:
 
 
 def check_packages_of(config: TrainingConfig) -> None:
-    """Checks that what writes a training's video and logs is installed: a video is drawn at its end.
-
-    Raises:
-        ImportError: one is not; the message says how to install it.
-    """
+    """Checks that what writes a training's video and logs is installed: a video is drawn at its end."""
     if config.video_seconds > 0:
         check_packages("a video (none with video_seconds=0)", VIDEO, "train")
     for name in config.logger:
@@ -483,13 +474,7 @@ CONFIGS: dict[str, type[TrainingConfig]] = {config.algorithm: config for config 
 
 
 def config_from_json(values: dict[str, Any]) -> TrainingConfig:
-    """Returns the settings that :meth:`TrainingConfig.to_json` has turned into ``values``.
-
-    Raises:
-        ValueError: a field is out of range, or there is no such algorithm.
-        TypeError: a field is unknown, or has the wrong type.
-        LookupError: a field is missing.
-    """
+    """Returns the settings that :meth:`TrainingConfig.to_json` has turned into ``values``."""
     algorithm = check_choice("algorithm", values.get("algorithm"), CONFIGS)
     own = {field.name for field in dataclasses.fields(CONFIGS[algorithm])}
     retired = {"compile"} - own  # a setting of earlier revisions
@@ -553,11 +538,7 @@ def preset(
 
 
 def check_setting(what: str, name: str, kind: type[TrainingConfig]) -> None:
-    """Checks that a name is that of a setting.
-
-    Raises:
-        ValueError: it is not; the message names the settings.
-    """
+    """Checks that a name is that of a setting; the message names the settings."""
     check_choice(what, name, [field.name for field in dataclasses.fields(kind) if field.name != "task"])
 
 

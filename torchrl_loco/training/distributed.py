@@ -66,11 +66,7 @@ def is_restart() -> bool:
 
 
 def own_device(device: str) -> str:
-    """Returns the device of this rank: on CUDA, the GPU that has the number of the rank on its machine.
-
-    Raises:
-        ValueError: ``device`` names another GPU than the first for several ranks.
-    """
+    """Returns the device of this rank: on CUDA, the GPU that has the number of the rank on its machine."""
     if ranks() == 1 or device == "cpu":
         return device
     if device not in ("cuda", "cuda:0"):

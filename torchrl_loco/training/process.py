@@ -13,11 +13,7 @@ _held: dict[Path, int] = {}  # file descriptors of the locks of this process, by
 
 
 def lock(folder: Path) -> bool:
-    """Returns whether it takes the lock of a folder, which this process may have. The system frees it when that ends.
-
-    Raises:
-        BlockingIOError: another process has it.
-    """
+    """Returns whether it takes the lock of a folder: this process may have it. The system frees it when that ends."""
     folder = folder.resolve()
     file = folder / "lock"
     if folder in _held:

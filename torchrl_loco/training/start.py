@@ -135,11 +135,7 @@ def _check_same(run: RunFolder, env: EnvBase) -> None:
 
 
 def resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
-    """Returns the folder of a run whose task is somewhere else now.
-
-    Raises:
-        ValueError: the run is of another task.
-    """
+    """Returns the folder of a run whose task is somewhere else now."""
     run = resume if isinstance(resume, RunFolder) else RunFolder(Path(resume))
     named, of = task_name(task, by_user=True), run.load_config().task
     moved = is_place(named) and is_place(of) and named.rpartition(":")[2] == of.rpartition(":")[2]
@@ -171,12 +167,7 @@ def run_to_end(
 
 
 def train_to_end(trainer: Trainer, given: Given, errors: Callable[..., Any] = as_they_are) -> None:
-    """Trains to the last frame; prints how to continue a run that has a checkpoint, if it is interrupted.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C or SIGTERM.
-        SystemExit: an error, which was printed.
-    """
+    """Trains to the last frame; prints how to continue a run that has a checkpoint, if it is interrupted."""
     first, ranks = distributed.is_first(), distributed.ranks()
     try:
         with errors(OSError, NothingToLearnError):

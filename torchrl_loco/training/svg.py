@@ -85,11 +85,7 @@ class SVG(Algorithm):
         self._critic_optimizers = [self.make_optimizer("critic", value.parameters())]
 
     def attach(self, env: LocoEnv) -> None:
-        """Makes the model of the robot of an environment, and what imagines its task.
-
-        Raises:
-            ValueError: the environment was handed in, or its task or robot cannot be imagined.
-        """
+        """Makes the model of the robot of an environment, and what imagines its task."""
         config, on_cuda = self.config, self.device.type == "cuda"
         if FOUND not in env.hooks.catalog.memory:
             raise ValueError("svg needs a task that shows its states: train with the task's id or class, not in an env")

@@ -29,11 +29,7 @@ class Watched:
         self._seen = 0
 
     def newer(self) -> Policy | None:
-        """Returns the newest policy, or ``None`` if there is none that this has not returned before.
-
-        Raises:
-            ValueError: a file cannot be read, or the policy was trained behind transforms.
-        """
+        """Returns the newest policy, or ``None`` if there is none that this has not returned before."""
         written = [(file.stat().st_mtime_ns, file) for file in self._files if file.is_file()]
         when, newest = max(written, default=(0, None))
         if newest is None or when <= self._seen:

@@ -33,11 +33,7 @@ _SERVING = threading.Lock()
 
 @contextlib.contextmanager
 def _for_own_page() -> Iterator[None]:
-    """Lets the server that viser starts meanwhile refuse requests of other sites' pages; viser has no setting for it.
-
-    Raises:
-        RuntimeError: viser has started none.
-    """
+    """Lets the server that viser starts meanwhile refuse requests of other sites' pages: viser has no such setting."""
     module: Any = websockets.asyncio.server
     serve, served = module.serve, list[int]()
 

@@ -18,15 +18,10 @@ def check_viewer() -> None:
 
 
 def check_host(host: str) -> str:
-    """Returns the address to listen on of what a person wrote, who may call this machine ``localhost``.
-
-    Raises:
-        ValueError: it is no address.
-        OSError: this machine does not have it; viser would wait for ever.
-    """
+    """Returns the address to listen on of what a person wrote, who may call this machine ``localhost``."""
     address = ipaddress.ip_address(LOOPBACK if host == "localhost" else host)
     with socket.socket(socket.AF_INET if address.version == 4 else socket.AF_INET6) as probe:
-        probe.bind((str(address), 0))
+        probe.bind((str(address), 0))  # an error if this machine does not have it: viser would wait for ever
     return str(address)
 
 

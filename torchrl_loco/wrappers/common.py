@@ -17,12 +17,7 @@ RENDER_MODES = ("rgb_array",)
 
 
 def made(env: str | type[LocoEnv] | EnvBase, num_envs: int | None, settings: dict[str, Any]) -> EnvBase:
-    """Returns the environment that is to be wrapped.
-
-    Raises:
-        TypeError: it is no environment of this package, or is made already and has settings.
-        ValueError: it has no batch of worlds.
-    """
+    """Returns the environment that is to be wrapped."""
     if not isinstance(env, EnvBase):
         return make(env, 1 if num_envs is None else num_envs, **settings)
     if not isinstance(base_of(env), LocoEnv):
