@@ -61,13 +61,7 @@ class ObservationNorm(nn.Module):
 
     @torch.no_grad()
     def merge(self, count: float | torch.Tensor, mean: torch.Tensor, var: torch.Tensor) -> None:
-        """Updates mean and variance with those of further observations (Chan's parallel formula).
-
-        Args:
-            count: number of the observations.
-            mean: their mean, shape ``(size,)``.
-            var: their variance, without Bessel's correction, shape ``(size,)``.
-        """
+        """Updates mean and variance (without Bessel's correction) with those of ``count`` rows (Chan's formula)."""
         total = self.count + count
         share = count / total
         delta = mean - self.mean

@@ -119,12 +119,7 @@ class SquashedNormal(TransformedDistribution):
     """Independent normal variables under tanh, times a bound.
 
     TorchRL's ``TanhNormal`` is the same, but reads its bounds at every construction: on CUDA the host would wait for
-    that at every step, and gradient steps could not be recorded.
-
-    Args:
-        loc: means before tanh, shape ``(..., n)``.
-        scale: standard deviations before tanh, of the same shape.
-        bound: of all entries.
+    that at every step, and gradient steps could not be recorded. Means and standard deviations are those before tanh.
     """
 
     def __init__(self, loc: torch.Tensor, scale: torch.Tensor, bound: float = 1.0) -> None:

@@ -38,12 +38,7 @@ class Episodes:
 
     @torch.no_grad()
     def add(self, reward: torch.Tensor, done: torch.Tensor, terminated: torch.Tensor) -> torch.Tensor:
-        """Adds a batch, without synchronising with the device.
-
-        Args:
-            reward: the rewards, shape ``(num_envs, steps)``.
-            done: where an episode ended, of the same shape.
-            terminated: where it did so by termination, of the same shape.
+        """Adds a batch, ``(num_envs, steps)`` each, without synchronising with the device.
 
         Returns:
             Number of the whole episodes that ended, sum of their returns, and sum of their lengths in control steps:

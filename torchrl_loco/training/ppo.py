@@ -237,13 +237,9 @@ def draw_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
 
 @torch.no_grad()
 def drawn(mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor, bounded: bool) -> tuple[torch.Tensor, ...]:
-    """Returns actions and their log-probabilities; and if they are bounded, what they were before tanh.
+    """Returns actions and their log-probabilities; and if tanh bounds them, what they were before it.
 
-    Args:
-        mean: of the variables, shape ``(n, nu)``.
-        std: their standard deviations, shape ``(nu,)``.
-        noise: from which they are made, standard normal, shape ``(n, nu)``.
-        bounded: whether actions are bounded by tanh.
+    Means and standard normal noise have shape ``(n, nu)``, standard deviations ``(nu,)``.
     """
     normal, log_prob = torch.empty_like(noise), noise.new_empty(len(noise))
     action = torch.empty_like(noise) if bounded else normal

@@ -34,16 +34,8 @@ LEAP = 1e-4  # change of a position by events (m, rad) behind which a window doe
 class Replay:
     """A ring of the last steps of all worlds, on their device; windows go across batches.
 
-    What is drawn lies at addresses that stay, so that what learns from it can be recorded.
-
-    Args:
-        config: the settings.
-        m: the model.
-        sizes: lengths of a state without what events found, and of an observation.
-        generator: by which steps are drawn.
-
-    Raises:
-        MemoryError: the device has no room for so many steps.
+    What is drawn lies at addresses that stay, so that what learns from it can be recorded. ``sizes`` are those of a
+    state, without what events found, and of an observation.
     """
 
     def __init__(

@@ -228,12 +228,8 @@ class DualVariables(nn.Module):
 def sample(loc: torch.Tensor, scale: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns actions ``tanh(u)``, u = loc + scale * noise, and their log-probabilities, shape ``(...)``.
 
-    The log-probability is computed from u, not from the action, so it stays exact where tanh saturates.
-
-    Args:
-        loc: means before tanh, shape ``(..., nu)``.
-        scale: standard deviations before tanh, of the same shape.
-        noise: standard normal numbers, of the same shape.
+    Standard normal noise, means and standard deviations have shape ``(..., nu)``. The log-probability is computed from
+    u, not from the action, so it stays exact where tanh saturates.
     """
     u = loc + scale * noise
     log_prob = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2.0 * math.pi) - log_slope(u)
@@ -255,23 +251,13 @@ def kl(old_loc: torch.Tensor, old_scale: torch.Tensor, loc: torch.Tensor, scale:
 class ValueBins(nn.Module):
     """Returns as distributions over evenly spaced bins (HL-Gauss: Imani and White, 2018; Farebrother et al., 2024).
 
-    A return below the first bin's center counts as one at it, and so does one above the last.
-
-    Args:
-        low: return at the center of the first bin.
-        high: return at the center of the last bin, more than ``low``.
-        count: number of bins.
-
-    Attributes:
-        centers: returns at the centers of the bins, shape ``(count,)``.
-        edges: returns at the edges of the bins, shape ``(count + 1,)``.
+    A return below ``low``, the center of the first bin, counts as one at it, and so does one above that of the last.
     """
 
-    SPREAD = 0.75
-    """Standard deviation of a target, in widths of a bin."""
+    SPREAD = 0.75  # standard deviation of a target, in widths of a bin
 
-    centers: torch.Tensor
-    edges: torch.Tensor
+    centers: torch.Tensor  # of the bins, (count,)
+    edges: torch.Tensor  # (count + 1,)
 
     def __init__(self, low: float, high: float, count: int) -> None:
         super().__init__()
@@ -295,13 +281,8 @@ class ValueBins(nn.Module):
 class DistributionalQ(nn.Module):
     """Critic Q(s, a) whose output is a distribution over returns, with a second head that predicts its next features.
 
-    It reads normalised observations, or pixels.
-
-    Args:
-        sizes: length of what it observes and of an action.
-        hidden: widths of the encoder's layers; the heads have one hidden layer of the last width.
-        bins: the bins of the distribution.
-        sight: what makes features of pixels, if it reads those.
+    It reads normalised observations, or pixels, of which ``sight`` makes features. ``sizes`` are those of what it
+    observes and of an action. The heads have one hidden layer of the encoder's last width.
     """
 
     def __init__(

@@ -352,13 +352,7 @@ def lambda_returns(
 ) -> torch.Tensor:
     """Returns lambda-returns from each step on, ``(steps, n)`` as all arguments, through which gradients flow.
 
-    Args:
-        rewards: of steps.
-        values: of the states after them.
-        ended: whether the episode ended there, so that nothing follows.
-        cut: whether it was cut off, so that what follows is the value.
-        gamma: discount.
-        lmbda: share of the return in what follows, instead of the value.
+    Values are of the states after steps. Nothing follows where an episode ended; where it was cut off, the value does.
     """
     follows, returns = values[-1], []
     for t in range(len(rewards) - 1, -1, -1):
