@@ -182,11 +182,7 @@ _NAMES = {kind: name for name, (kind, _) in KINDS.items()}
 
 
 def layers_of(network: nn.Module) -> list[nn.Module]:
-    """Returns the layers of a network that computes one after the other, in their order.
-
-    Raises:
-        TypeError: a part of it is of another kind than a policy's file can hold.
-    """
+    """Returns the layers of a network that computes one after the other, in their order."""
     if type(network) in _NAMES:
         shape = network.normalized_shape if isinstance(network, nn.LayerNorm) else (1,)
         if len(shape) > 1:

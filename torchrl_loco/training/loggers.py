@@ -21,9 +21,6 @@ class Loggers:
 
     A logger that fails later is reported and left out: a run does not end because a server is away. What loggers store
     on this machine lies in the run's folder.
-
-    Raises:
-        OSError: one cannot be opened, for example because it needs a login.
     """
 
     def __init__(self, run: RunFolder, frames: int) -> None:
