@@ -414,12 +414,10 @@ def _lines_by_case(found: dict[str, dict[str, Any]], metrics: tuple[str, ...]) -
     """Returns how each case was played in C MuJoCo, the one with the most falls first."""
     if not found:
         return []
-    width = max(map(len, found))
-    rows = [(f"{'':<{width}}{'falls':>12}", list(metrics))]
+    rows = [("", ["falls", *metrics])]
     for name, row in sorted(found.items(), key=lambda pair: -pair[1]["falls"] / pair[1]["episodes"]):
-        falls = f"{row['falls']} of {row['episodes']}"
-        rows.append((f"{name:<{width}}{falls:>12}", [_rounded(row[metric]) for metric in metrics]))
-    return _table(rows, 0, 16)
+        rows.append((name, [f"{row['falls']} of {row['episodes']}", *(_rounded(row[metric]) for metric in metrics)]))
+    return _table(rows, max(map(len, found)), 16)
 
 
 def _lines(table: dict[str, dict[str, dict[str, Any]]], metrics: tuple[str, ...]) -> list[str]:
