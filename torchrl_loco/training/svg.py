@@ -39,19 +39,9 @@ class SVG(Algorithm):
 
     config_type = SVGConfig
     metric_names = (
-        "loss_model",
-        "error_first",
-        "error_last",
-        "grad_norm_model",
-        "lost_of_model",
-        "imagined_return",
-        "imagined_length",
-        "value",
-        "loss_critic",
-        "grad_norm_actor",
-        "lost_of_actor",
-        "grad_norm_critic",
-        "lost_of_critic",
+        *("loss_model", "error_first", "error_last", "grad_norm_model", "lost_of_model"),
+        *("imagined_return", "imagined_length", "value", "loss_critic"),
+        *("grad_norm_actor", "lost_of_actor", "grad_norm_critic", "lost_of_critic"),
     )
     config: SVGConfig
 
