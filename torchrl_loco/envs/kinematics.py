@@ -8,8 +8,10 @@ import numpy as np
 import torch
 import warp as wp
 
+from torchrl_loco.sim.corners import axes_of
 from torchrl_loco.sim.graph import EXCLUSIVE, current_stream
 from torchrl_loco.sim.warp_init import init_warp
+from torchrl_loco.sim.world_func import fill_from_numbers
 
 FREE, SLIDE, HINGE = (
     wp.constant(int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}"))) for kind in ("FREE", "SLIDE", "HINGE")
@@ -26,33 +28,19 @@ class Links:
     threads need not wait for each other: it is a link of its own there.
     """
 
-    first: wp.array[int]
-    """Where each chain begins in ``order``, and where the last one ends."""
-    order: wp.array[int]
-    """The links of the chains, one chain after the other, parents first."""
+    first: wp.array[int]  # where each chain begins in order, and where the last one ends
+    order: wp.array[int]  # the links of the chains, one chain after the other, parents first
     parent: wp.array[int]
     kind: wp.array[int]
-    offset: wp.array[wp.vec3]
-    turn: wp.array[wp.mat33]
-    anchor: wp.array[wp.vec3]
+    offset: wp.array[wp.vec3]  # place in the parent (m)
+    turn: wp.array[wp.mat33]  # orientation in the parent, at rest
+    anchor: wp.array[wp.vec3]  # point about which the joint turns (m)
     axis: wp.array[wp.vec3]
-    q: wp.array[int]
-    v: wp.array[int]
-    rest: wp.array[float]
+    q: wp.array[int]  # where positions of the joint are
+    v: wp.array[int]  # where its velocities are
+    rest: wp.array[float]  # its position at rest
 
 
-COLUMNS: dict[str, Any] = {
-    "parent": int,
-    "kind": int,
-    "offset": wp.vec3,  # place in the parent (m)
-    "turn": wp.mat33,  # orientation in the parent, at rest
-    "anchor": wp.vec3,  # point about which the joint turns (m)
-    "axis": wp.vec3,
-    "q": int,  # where positions of the joint are
-    "v": int,  # where its velocities are
-    "rest": float,  # its position at rest
-}
-"""What is known of a link, and its type."""
 SHAPES = (3,), (3, 3), (3,), (3,)  # of what is found of a link: place, orientation, velocities
 TYPES = wp.float32, wp.float32, *2 * (wp.vec3, wp.mat33, wp.vec3, wp.vec3)  # of what the kernel reads and writes
 
@@ -144,25 +132,21 @@ def place_links(
 
 
 def links_of(m: mujoco.MjModel) -> dict[int, dict[str, Any]]:
-    """Returns what :data:`COLUMNS` names of the links of a model by their numbers, parents first."""
+    """Returns what :class:`Links` has of each link of a model by their numbers, parents first."""
     rows, further = dict[int, dict[str, Any]](), int(m.nbody)
     for body in range(m.nbody):
         first, count, parent = int(m.body_jntadr[body]), int(m.body_jntnum[body]), int(m.body_parentid[body])
+        offset, turn = m.body_pos[body], axes_of(m.body_quat[body])
         for at in range(max(count, 1)):
-            row: dict[str, Any] = {"parent": parent, "kind": -1}
-            row |= {"offset": np.zeros(3), "turn": np.eye(3), "anchor": np.zeros(3), "axis": np.zeros(3)}
-            row |= {"q": 0, "v": 0, "rest": 0.0}
-            if at == 0:
-                turn = np.zeros(9)
-                mujoco.mju_quat2Mat(turn, m.body_quat[body])
-                row |= {"offset": m.body_pos[body], "turn": turn.reshape(3, 3)}
+            row: dict[str, Any] = {"parent": parent, "kind": -1, "offset": offset, "turn": turn}
+            row |= {"anchor": np.zeros(3), "axis": np.zeros(3), "q": 0, "v": 0, "rest": 0.0}
             if count:
                 joint, q = first + at, int(m.jnt_qposadr[first + at])
                 row |= {"kind": int(m.jnt_type[joint]), "anchor": m.jnt_pos[joint], "axis": m.jnt_axis[joint]}
                 row |= {"q": q, "v": int(m.jnt_dofadr[joint]), "rest": float(m.qpos0[q])}
             is_last = at + 1 >= count
             parent, further = (body, further) if is_last else (further, further + 1)
-            rows[parent] = row
+            rows[parent], offset, turn = row, np.zeros(3), np.eye(3)
     return rows
 
 
@@ -196,13 +180,9 @@ class Kinematics:
         rows = links_of(m)
         chains = chains_of(rows)
         self.count, self.chains = len(rows), len(chains)  # of links, and of chains
-        self._links = Links()
-        ends = np.cumsum([0, *map(len, chains)])
-        self._links.first = wp.array(ends, dtype=int, device=self._device)
-        self._links.order = wp.array([link for chain in chains for link in chain], dtype=int, device=self._device)
-        for name, kind in COLUMNS.items():
-            values = np.array([rows[link][name] for link in range(self.count)])
-            setattr(self._links, name, wp.array(values, dtype=kind, device=self._device))
+        columns = {name: [rows[link][name] for link in range(self.count)] for name in rows[0]}
+        ends, order = np.cumsum([0, *map(len, chains)]), [link for chain in chains for link in chain]
+        self._links = fill_from_numbers(Links, self._device, first=ends, order=order, **columns)
         self._root = torch.tensor(m.body_rootid, device=device).long()
 
     def __call__(self, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[torch.Tensor, ...]:
