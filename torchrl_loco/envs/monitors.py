@@ -7,6 +7,7 @@ import logging
 import multiprocessing
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,7 @@ from tensordict import TensorDict
 
 from torchrl_loco import known_files, storage
 from torchrl_loco.envs.state import State
-from torchrl_loco.sim import Buffer, Overflow, Simulation, WorldFunc, fill
-from torchrl_loco.sim.world_func import copy_row
+from torchrl_loco.sim import Buffer, Overflow, Simulation
 
 INTERVAL = 100  # control steps between two reads
 
@@ -46,7 +46,7 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
 
 
 class Monitor(ABC):
-    """Adds functions to each control step, reads ``count`` of their numbers every 100 steps, and reports."""
+    """Reads ``count`` numbers of what control steps have noted every 100 steps, and reports."""
 
     def __init__(self, count: int, device: torch.device) -> None:
         self._device = device
@@ -54,14 +54,6 @@ class Monitor(ABC):
         self._host = torch.zeros(count, dtype=torch.long, device="cpu", pin_memory=on_cuda)
         self._copied = torch.cuda.Event() if on_cuda else None
         self._steps, self._pending = 0, False
-
-    def first_of_step(self, action: wp.array) -> list[WorldFunc]:
-        """Returns what each world does before any of them is stepped under ``action`` ``(nworld, nu)``."""
-        return []
-
-    def last_of_step(self) -> list[WorldFunc]:
-        """Returns what each world does after all of them were stepped."""
-        return []
 
     @abstractmethod
     def numbers(self) -> torch.Tensor:
@@ -180,106 +172,59 @@ class Health(Monitor):
         return TensorDict({"worlds": worlds, "total": total, "peak": self._peaks()}, batch_size=[], **kept)
 
 
-# NaN guard: keeps the inputs of the last control step until a world becomes non-finite.
+# NaN guard: keeps the inputs of the last control step of each world until it becomes non-finite.
 
-
-@wp.struct
-class StepInputs:
-    """What a control step begins with, or where it is kept."""
-
-    action: wp.array2d[float]
-    episode: wp.array[int]
-    elapsed_steps: wp.array[int]
-    qpos: wp.array2d[float]
-    qvel: wp.array2d[float]
-    qacc_warmstart: wp.array2d[float]
-    act: wp.array2d[float]
-    numbers: wp.array2d[float]
-
-
-@wp.struct
-class Guarded:
-    """What a step begins with, and where it is kept until a world was found that is not finite: ``first``."""
-
-    first: wp.array[int]
-    found: wp.array[bool]
-    non_finite: wp.array[bool]
-    present: StepInputs
-    kept: StepInputs
-
-
-@wp.func
-def keep_inputs(world: int, args: Guarded):
-    """Copies what a control step begins with, until a world that is not finite was found."""
-    found = args.first[0] < args.present.episode.shape[0]
-    if world == 0:
-        args.found[0] = found
-    if found:
-        return
-    args.kept.episode[world] = args.present.episode[world]
-    args.kept.elapsed_steps[world] = args.present.elapsed_steps[world]
-    copy_row(args.present.action[world], args.kept.action[world])
-    copy_row(args.present.qpos[world], args.kept.qpos[world])
-    copy_row(args.present.qvel[world], args.kept.qvel[world])
-    copy_row(args.present.qacc_warmstart[world], args.kept.qacc_warmstart[world])
-    copy_row(args.present.act[world], args.kept.act[world])
-    copy_row(args.present.numbers[world], args.kept.numbers[world])
-
-
-@wp.func
-def find_first(world: int, args: Guarded):
-    """Notes the first world that is not finite, unless an earlier step had one."""
-    if args.non_finite[world] and not args.found[0]:
-        wp.atomic_min(args.first, 0, world)
+NEVER = torch.iinfo(torch.long).max  # where no world was lost
 
 
 class NanGuard(Monitor):
     """Writes the state and action before the first step that made a world non-finite to a file, a NaN dump.
 
     The file is never overwritten; no reference to the :class:`.world.World` is kept.
+
+    Attributes:
+        arrays: what :meth:`keep` reads and writes, by name.
     """
 
     def __init__(self, path: Path, world: Any, settings: dict[str, Any]) -> None:
         self._path, self._settings = path, settings
         self._sim, self._seed = world.sim, world.seed
-        sim, data = self._sim, self._sim.data
-        physics = {name: getattr(data, name) for name in State.PHYSICS}
-        clock = {"episode": world.episode.warp, "elapsed_steps": world.elapsed_steps.warp}
-        self._inputs = {**clock, **physics, "numbers": wp.from_torch(sim.numbers)}
-        self._kept = {name: wp.zeros_like(array) for name, array in {"action": data.ctrl, **self._inputs}.items()}
-        self._first = Buffer(1, int, sim.device)
-        self._found = Buffer(1, bool, sim.device)
-        self._guarded = {"first": self._first.warp, "found": self._found.warp, "non_finite": world.non_finite.warp}
-        self._guarded["kept"] = fill(StepInputs, **self._kept)
-        super().__init__(1, self._first.torch.device)
+        clock = {name: getattr(world, name).torch for name in ("episode", "elapsed_steps")}
+        held = {name: getattr(self._sim, name) for name in State.PHYSICS if name != "act" or self._sim.mj_model.na}
+        held |= {"numbers": self._sim.numbers} if self._sim.varied is not None else {}
+        present = {"action": world.action.torch, **clock, **held}
+        self._kept = {name: torch.zeros_like(rows) for name, rows in present.items()}
+        self._lost = world.health.counts.torch[:, -1]  # steps that ended non-finite
+        self._passed = torch.zeros_like(self._lost)  # those that were kept
+        kept = {f"kept.{name}": rows for name, rows in self._kept.items()}
+        self.arrays = {**present, **kept, "lost": self._lost, "steps": self._passed}
+        super().__init__(1, self._lost.device)
         self._reported = False
 
-    def first_of_step(self, action: wp.array) -> list[WorldFunc]:
-        """Returns what keeps what a control step under ``action`` ``(nworld, nu)`` begins with."""
-        present = fill(StepInputs, action=action, **self._inputs)
-        return [WorldFunc(keep_inputs, fill(Guarded, present=present, **self._guarded))]
-
-    def last_of_step(self) -> list[WorldFunc]:
-        """Returns what looks for a non-finite world."""
-        return [WorldFunc(find_first, fill(Guarded, present=self._guarded["kept"], **self._guarded))]
+    def keep(self, a: Mapping[str, torch.Tensor]) -> None:
+        """Before a step: copies what it begins with, in worlds in which no step has ended non-finite."""
+        goes_on = a["lost"] == 0
+        for name in self._kept:
+            kept = a[f"kept.{name}"]
+            kept.copy_(torch.where(goes_on.view(-1, *[1] * (kept.ndim - 1)), a[name], kept))
+        a["steps"].add_(goes_on)
 
     def numbers(self) -> torch.Tensor:
-        """Returns the index of the world that was found, or the number of worlds if none was, shape ``(1,)``."""
-        return self._first.torch.long()
+        """Returns the step in which a world was lost first, times the number of worlds, and its index added."""
+        worlds = torch.arange(len(self._passed), device=self._passed.device)
+        order = self._passed.long() * len(worlds) + worlds
+        return torch.where(self._lost > 0, order, NEVER).min().view(1)
 
     def clear(self) -> None:
-        """Forgets the world that was found."""
-        self._first.torch.fill_(self._sim.num_envs)
-        self._found.torch.zero_()
+        """Starts to count steps."""
+        self._passed.zero_()
 
     def report(self, numbers: list[int]) -> None:
         """Writes the file and warns, once, if a world was found."""
-        (world,) = numbers
-        if self._reported or world == self._sim.num_envs:
+        if self._reported or numbers == [NEVER]:
             return
-        self._reported = True
-        arrays = self._kept.items()
-        kept = {name: wp.to_torch(array)[world].clone() for name, array in arrays if array.size}  # act may be empty
+        self._reported, world = True, numbers[0] % self._sim.num_envs
+        kept = {name: rows[world].clone() for name, rows in self._kept.items()}
         counters = {name: int(kept.pop(name)) for name in ("episode", "elapsed_steps")}
         if self._sim.varied is not None:
             row, columns = kept.pop("numbers"), self._sim.varied.columns

@@ -114,9 +114,8 @@ class World:
             self.seen = task.pixels.seen(self.sim, self.mask) if task.pixels else None
 
             self.health = Health(self.sim, task.on_overflow)
-            self._monitors: list[Monitor] = [self.health]
-            if task.nan_dump is not None:
-                self._monitors.append(NanGuard(task.nan_dump, self, task.settings()))
+            self._guard = None if task.nan_dump is None else NanGuard(task.nan_dump, self, task.settings())
+            self._monitors: list[Monitor] = [self.health, *([self._guard] if self._guard else [])]
 
             with reads_of(task) as self.fixed:
                 self._make_funcs(task)
@@ -138,6 +137,7 @@ class World:
 
     def _take_step(self, *action: wp.array) -> None:
         """The control step: under the actions in the buffer, unless torch records it with others."""
+        self._keep()  # what the step begins with, for the NaN guard
         self._control()  # own control(): actions to controls
         self._physics(*action)  # default control; the substeps; fused reward and observation
         self._judge()  # update(), reward(), terminated(), truncated(), metrics(), events()
@@ -218,19 +218,11 @@ class World:
         sim, action = self.sim, self.action.warp if action is None else action
         control = {"ctrlrange": sim.model.actuator_ctrlrange, "ctrl": sim.data.ctrl, "non_finite": self.non_finite.warp}
         apply = [WorldFunc(episode.apply_action, fill(episode.Control, action=action, **control))]
-        around = Around(
-            first=[func for monitor in self._monitors for func in monitor.first_of_step(action)],
-            before=[] if "control" in self._own else apply,
-            after=[*self._fused, *self._check_finite, *([] if self._own else [self._finish])],
-            last=[] if self._own else self._last_of_step(),
-        )
-        sim.step(around)
+        after = [*self._fused, *self._check_finite, *([] if self._own else [self._finish])]
+        sim.step(Around(before=[] if "control" in self._own else apply, after=after))
 
     def _launch_conclude(self) -> None:
-        self.sim.apart([self._finish, *self._last_of_step()])
-
-    def _last_of_step(self) -> list[WorldFunc]:
-        return [func for monitor in self._monitors for func in monitor.last_of_step()]
+        self.sim.apart([self._finish])
 
     def _launch_rest(self) -> None:
         self.sim.rest(self.mask.warp, self._start)
@@ -276,6 +268,11 @@ class World:
             parts.append(Part(variation.vary, streams, f"{self._title}: randomize", variation.fixed()))
             read.append(set())
             self._vary = parts[-1]
+        self._keep: Callable[[], None] = _nothing
+        if self._guard:
+            parts.append(Part(self._guard.keep, self._guard.arrays, f"{self._title}: NaN guard"))
+            read.append(set())
+            self._keep = parts[-1]
 
         self._control, self._judge = part("control"), part("judge", own if hooks.commands else None)
         self._adapt = part("adapt")
@@ -307,7 +304,7 @@ class World:
         self._move = self._keeping_what_was(sim.capture(self._launch_move)) if hooks.moves else _nothing
         if self.seen:
             self._draw, self._draw_begun = map(sim.capture, self._everywhere_and_begun(self.seen))
-        self._run_step = self._as_graph("_take_step", several=bool(own or self.seen))
+        self._run_step = self._as_graph("_take_step", several=bool(own or self.seen or self._guard))
         self._run_reset = self._as_graph("_begin_masked", several=bool(own or self.seen) or variation is not None)
 
     def _scan_first(self, scanning: Collection[str]) -> None:
@@ -401,7 +398,7 @@ class World:
         """Steps all worlds under actions of shape ``(nworld, nu)``."""
         action = action.detach()  # else the buffer would keep every past policy's autograd graph
         if torch_is_recording(self.sim.device):
-            if self._own:  # hooks read the buffer
+            if self._own or self._guard:  # which read the buffer
                 self.action.torch.copy_(action)
                 self._take_step()
             else:
