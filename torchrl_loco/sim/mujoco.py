@@ -131,7 +131,7 @@ class MujocoEngine(Engine):
 
     @override
     def step(self, around: Around = ALONE) -> None:
-        self._kernels.launch([*around.first, *around.before], self._all)
+        self._kernels.launch(around.before, self._all)
         shown, substeps, rows = self.data.shown(), self._substeps, self._rows
         changed = {
             name: (rows != self._written[name]).reshape(len(rows), -1).any(1) for name, rows in self._state.items()
@@ -157,7 +157,7 @@ class MujocoEngine(Engine):
 
         self._each(np.arange(len(self._worlds)), advance)
         self._keep_written(np.arange(len(self._worlds)))
-        self._kernels.launch([*around.after, *around.last], self._all)
+        self._kernels.launch(around.after, self._all)
 
     @override
     def forward(self, mask: wp.array, update: Update) -> None:

@@ -171,7 +171,7 @@ class MujocoWarpEngine(Engine):
         # dm_control updates poses, velocities and sensors by the first half of the next step. Here only what an
         # observation can read is computed, so a reset has nothing else to update.
         d = self.data
-        self._kernels.launch([*around.first, *around.before], self._all)
+        self._kernels.launch(around.before, self._all)
         for i in range(self._substeps):
             with self._substep_only(sensors=self._has_force_sensors and i == self._substeps - 1):
                 self._substep()
@@ -181,7 +181,7 @@ class MujocoWarpEngine(Engine):
                 row = i - self._substeps + self.contact_forces.rows
                 self.contact_forces.update(self.model, self.data, self._all, row)
         self._evaluate()
-        self._kernels.launch([*around.after, *around.last], self._all)
+        self._kernels.launch(around.after, self._all)
 
     def _substep(self) -> None:
         if self._row_order is None:

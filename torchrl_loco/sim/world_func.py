@@ -84,16 +84,12 @@ class Around(NamedTuple):
     """What each world does around the physics of a control step.
 
     Attributes:
-        first: what it does first, in a kernel before the physics.
-        before: what it does after that.
+        before: what it does before the physics.
         after: what it does once the physics has stepped.
-        last: what it does at the end, in a kernel after the physics.
     """
 
-    first: Sequence[WorldFunc] = ()
     before: Sequence[WorldFunc] = ()
     after: Sequence[WorldFunc] = ()
-    last: Sequence[WorldFunc] = ()
 
 
 ALONE = Around()  # the physics and nothing else

@@ -215,12 +215,12 @@ class CompiledEngine(Engine):
 
     @override
     def step(self, around: Around = ALONE) -> None:
-        first, before, after, last = around
-        if not self._launch_size.one_kernel:
-            first, before, after, last = [*first, *before], (), (), [*after, *last]
-        self._kernels.launch(first, self._all)
-        self._launch(self._substeps, self._all, before, after, self._contact_geoms)
-        self._kernels.launch(last, self._all)
+        if self._launch_size.one_kernel:
+            self._launch(self._substeps, self._all, *around, self._contact_geoms)
+            return
+        self._kernels.launch(around.before, self._all)
+        self._launch(self._substeps, self._all, (), (), self._contact_geoms)
+        self._kernels.launch(around.after, self._all)
 
     @override
     def forward(self, mask: wp.array, update: Update) -> None:
