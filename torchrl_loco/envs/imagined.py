@@ -94,16 +94,6 @@ class Judgement(NamedTuple):
     """In which worlds the step does not count, and what hooks were called on."""
 
 
-class Called(NamedTuple):
-    """What hooks return in a step."""
-
-    reward: torch.Tensor
-    terminated: torch.Tensor
-    truncated: torch.Tensor
-    groups: dict[str, torch.Tensor]
-    rest: list[torch.Tensor]
-
-
 class Earned(NamedTuple):
     """What steps have earned, ``(steps, worlds, ...)`` each; it does not count in worlds that were over before."""
 
@@ -274,10 +264,7 @@ class Imagined:
         """Returns the controls, in a list."""
         hooks, WithUnits.drawn = self._hooks, 0
         action = usable(action, hooks.catalog.bounded)
-        if "control" in hooks.own:
-            return [hooks._call("control", {**self._arrays(qpos, qvel, rest), "action": action}, args=(action,))]
-        low, high = hooks.catalog.constant("actuator_ctrlrange").unbind(-1)
-        return [0.5 * (low + high) + 0.5 * (high - low) * action]
+        return [hooks._call("control", {**self._arrays(qpos, qvel, rest), "action": action}, args=(action,))]
 
     def _arrays(self, qpos: torch.Tensor, qvel: torch.Tensor, rest: Sequence[torch.Tensor]) -> dict[str, torch.Tensor]:
         """Returns the arrays that hooks read of states and what is the same for all."""
@@ -294,8 +281,8 @@ class Imagined:
         a = {**zeros, **flags, **shared, "qpos": qpos, "qvel": qvel, **dict(zip(self._rest, rest, strict=True))}
         return a | {name: a[name].long() for name in ("elapsed_steps", "world")}
 
-    def _called(self, qpos: torch.Tensor, qvel: torch.Tensor, *others: torch.Tensor) -> Called:
-        """Calls the hooks as in a control step."""
+    def _called(self, qpos: torch.Tensor, qvel: torch.Tensor, *others: torch.Tensor) -> tuple[Any, ...]:
+        """Returns reward, both ends, groups of the observation and what is the rest after a control step's hooks."""
         hooks, bodies, (action, units, *rest) = self._hooks, others[:4], others[4:]
         a = {**self._arrays(qpos, qvel, rest), **self.kinematics.named(bodies), "action": action, "units": units}
         if "ctrl" in hooks.catalog.arrays:
@@ -313,7 +300,7 @@ class Imagined:
         a["ended"] = ended
         remember(hooks._rows("events", a, {**hooks.catalog.memory, **hooks._pose}))
         after = [rest[0] + 1.0, *(a[name] for name in self._rest if name != "elapsed_steps")]
-        return Called(reward, ended, cut, hooks._groups(a, steps=1), after)
+        return reward, ended, cut, hooks._groups(a, steps=1), after
 
     def _going_on(
         self, over: torch.Tensor, start: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor, *others: torch.Tensor
