@@ -1,5 +1,6 @@
 """The numbers of a world as nodes of a graph, and the C++ of operators on them."""
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -18,22 +19,18 @@ class CannotFuse(Exception):  # noqa: N818
     """A graph that is no straight-line code of each world; the message tells which operator or shape."""
 
 
+@dataclass(slots=True, eq=False)
 class Node:
-    """A number of a world.
+    """A number of a world."""
 
-    Args:
-        text: C++ of it, in which ``{0}`` is its first part; of a constant, a literal.
-        dtype: its type.
-        args: its parts.
-        varies: whether it may differ from world to world.
-        number: value of a constant.
-        place: of what is read from memory, the index of the tensor, and how many elements the world's begins later
-            than that of the first (``None`` where the world looks it up), and how many each world's later than that of
-            the last.
-    """
+    text: str  # C++ of it, in which {0} is its first part; of a constant, a literal
+    dtype: torch.dtype
+    args: tuple["Node", ...]  # its parts
+    number: Any  # value of a constant
+    place: Any
+    """Of what is read from memory, the index of the tensor, and how many elements the world's begins later than that of
+    the first (``None`` where the world looks it up), and how many each world's later than that of the last."""
+    varies: bool = field(init=False)  # whether it may differ from world to world
 
-    __slots__ = ("args", "dtype", "number", "place", "text", "varies")
-
-    def __init__(self, text: str, dtype: torch.dtype, args: tuple["Node", ...], number: Any, place: Any) -> None:
-        self.text, self.dtype, self.args, self.number, self.place = text, dtype, args, number, place
-        self.varies: bool = any(arg.varies for arg in args) or bool(place and place[2])
+    def __post_init__(self) -> None:
+        self.varies = any(arg.varies for arg in self.args) or bool(self.place and self.place[2])
