@@ -18,7 +18,7 @@ import warp as wp
 
 from torchrl_loco.envs import episode
 from torchrl_loco.envs.body_funcs import check_pair, check_rows, of_package
-from torchrl_loco.envs.hooks import PARTS, Hooks, reads_of
+from torchrl_loco.envs.hooks import PARTS, Arrays, Hooks, reads_of
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.pixels import Seen
@@ -249,31 +249,25 @@ class World:
         streams = self._streams(task)
         arrays = {**streams, **self._arrays(hooks), **self._scans.arrays}
 
-        parts: list[Part] = []
-        read: list[set[str]] = []  # by part, attributes of the task
+        parts: dict[Part, set[str]] = {}  # and what attributes of the task each reads
         of_hook: dict[str, Part] = {}
+
+        def made(work: Callable[[Arrays], None], arrays: dict[str, torch.Tensor], title: str, fixed: Any = ()) -> Part:
+            one = Part(work, arrays, f"{self._title}: {title}", fixed)
+            parts[one] = set()
+            return one
 
         def part(name: str, needed: Collection[str] | None = None) -> Callable[[], None]:
             if not own & set(PARTS[name] if needed is None else needed):
                 return _nothing
             called = [hook for hook in PARTS[name] if hook in own] or [name]
-            title = f"{self._title}: {', '.join(called)}"
-            parts.append(Part(getattr(hooks, name), arrays, title, hooks.catalog.fixed()))
-            read.append(set().union(*(hooks.read.get(hook, ()) for hook in called)))
-            of_hook.update({hook: parts[-1] for hook in called if hook in own and hook not in of_hook})
-            return parts[-1]
+            one = made(getattr(hooks, name), arrays, ", ".join(called), hooks.catalog.fixed())
+            parts[one] = set().union(*(hooks.read.get(hook, ()) for hook in called))
+            of_hook.update({hook: one for hook in called if hook in own and hook not in of_hook})
+            return one
 
-        self._vary: Callable[[], None] = _nothing
-        if variation is not None:
-            parts.append(Part(variation.vary, streams, f"{self._title}: randomize", variation.fixed()))
-            read.append(set())
-            self._vary = parts[-1]
-        self._keep: Callable[[], None] = _nothing
-        if self._guard:
-            parts.append(Part(self._guard.keep, self._guard.arrays, f"{self._title}: NaN guard"))
-            read.append(set())
-            self._keep = parts[-1]
-
+        self._vary = made(variation.vary, streams, "randomize", variation.fixed()) if variation else _nothing
+        self._keep = made(self._guard.keep, self._guard.arrays, "NaN guard") if self._guard else _nothing
         self._control, self._judge = part("control"), part("judge", own if hooks.commands else None)
         self._adapt = part("adapt")
         self._observe = part("observe", own)  # it looks for what is not finite, too
@@ -293,7 +287,7 @@ class World:
         for each in kernels:
             each.record(sim)
         self.kinds = {hook: part.kind for hook, part in of_hook.items()}
-        for each, names in zip(parts, read, strict=True):
+        for each, names in parts.items():
             if each.kind != "plain torch" or sim.device.is_cuda:  # where the step is recorded as a graph
                 self.fixed |= names
         if self._scans.arrays:
