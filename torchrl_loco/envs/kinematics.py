@@ -42,7 +42,7 @@ class Links:
 
 
 SHAPES = (3,), (3, 3), (3,), (3,)  # of what is found of a link: place, orientation, velocities
-TYPES = wp.float32, wp.float32, *2 * (wp.vec3, wp.mat33, wp.vec3, wp.vec3)  # of what the kernel reads and writes
+TYPES = wp.float32, wp.float32, wp.vec3, wp.mat33, wp.vec3, wp.vec3  # of what the kernel reads and writes
 
 
 @wp.kernel(module="unique")
@@ -54,12 +54,8 @@ def place_links(
     mat: wp.array2d[wp.mat33],
     lin: wp.array2d[wp.vec3],
     ang: wp.array2d[wp.vec3],
-    body_pos: wp.array2d[wp.vec3],
-    body_mat: wp.array2d[wp.mat33],
-    body_lin: wp.array2d[wp.vec3],
-    body_ang: wp.array2d[wp.vec3],
 ):
-    """Places links, as a chain goes on from them ``(links, worlds)``, and bodies ``(worlds, bodies)``.
+    """Places links ``(links, worlds)``, of which those of bodies are the first.
 
     Threads of neighbouring worlds read and write neighbouring numbers of a link.
     """
@@ -68,10 +64,6 @@ def place_links(
     mat[0, w] = wp.identity(n=3, dtype=float)
     lin[0, w] = wp.vec3()
     ang[0, w] = wp.vec3()
-    body_pos[w, 0] = wp.vec3()
-    body_mat[w, 0] = wp.identity(n=3, dtype=float)
-    body_lin[w, 0] = wp.vec3()
-    body_ang[w, 0] = wp.vec3()
     for i in range(links.first[c], links.first[c + 1]):
         k = links.order[i]
         p = links.parent[k]
@@ -124,11 +116,6 @@ def place_links(
         mat[k, w] = frame
         lin[k, w] = speed
         ang[k, w] = spin
-        if k < body_pos.shape[1]:
-            body_pos[w, k] = place
-            body_mat[w, k] = frame
-            body_lin[w, k] = speed
-            body_ang[w, k] = spin
 
 
 def links_of(m: mujoco.MjModel) -> dict[int, dict[str, Any]]:
@@ -205,8 +192,8 @@ class Kinematics:
         """Launches the kernel on torch's current stream; with ``slopes``, its adjoint.
 
         Args:
-            tensors: qpos and qvel, for each chain, ``(worlds, chains, ...)``, and what is found of links and bodies.
-            slopes: the gradients with regard to them; those of bodies are read, others are added to.
+            tensors: qpos and qvel, for each chain, ``(worlds, chains, ...)``, and what is found of links.
+            slopes: the gradients with regard to them, which are added to.
         """
         arrays, gradients = (
             [wp.from_torch(each.detach(), dtype=kind) for each, kind in zip(every, TYPES, strict=False)]
@@ -227,17 +214,17 @@ class _Placed(torch.autograd.Function):
     def forward(ctx: Any, of: Kinematics, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[torch.Tensor, ...]:
         inputs = [each.contiguous().unsqueeze(1).expand(-1, of.chains, -1) for each in (qpos, qvel)]
         links = [qpos.new_empty(of.count, len(qpos), *shape) for shape in SHAPES]
-        bodies = [qpos.new_empty(len(qpos), of.bodies, *shape) for shape in SHAPES]
-        of.launch([*inputs, *links, *bodies])
-        ctx.save_for_backward(*inputs, *links, *bodies)
+        of.launch([*inputs, *links])
+        ctx.save_for_backward(*inputs, *links)
         ctx.of = of
-        return tuple(bodies)
+        return tuple(each[: of.bodies].transpose(0, 1).contiguous() for each in links)
 
     @staticmethod
     def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        tensors, bodies = ctx.saved_tensors, [slope.contiguous() for slope in slopes]
-        before = tensors[: -len(bodies)]
-        parts = before[0].new_zeros(sum(each.numel() for each in before)).split([each.numel() for each in before])
-        of_qpos, of_qvel, *links = [part.view(each.shape) for part, each in zip(parts, before, strict=True)]
-        ctx.of.launch(tensors, [of_qpos, of_qvel, *links, *bodies])
+        tensors, sizes = ctx.saved_tensors, [each.numel() for each in ctx.saved_tensors]
+        parts = tensors[0].new_zeros(sum(sizes)).split(sizes)
+        of_qpos, of_qvel, *links = [part.view(each.shape) for part, each in zip(parts, tensors, strict=True)]
+        for link, slope in zip(links, slopes, strict=True):
+            link[: ctx.of.bodies] = slope.transpose(0, 1)
+        ctx.of.launch(tensors, [of_qpos, of_qvel, *links])
         return None, of_qpos.sum(1), of_qvel.sum(1)
