@@ -154,12 +154,7 @@ def chains_of(rows: dict[int, dict[str, Any]]) -> list[list[int]]:
 
 
 class Kinematics:
-    """Where bodies are and how they move, as a differentiable function of positions and velocities.
-
-    Args:
-        m: the model.
-        device: where the tensors live.
-    """
+    """Where bodies are and how they move, as a differentiable function of positions and velocities."""
 
     def __init__(self, m: mujoco.MjModel, device: torch.device) -> None:
         init_warp()

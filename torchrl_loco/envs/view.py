@@ -134,21 +134,14 @@ class View:
     """All worlds, as a hook sees them. The first dimension of every tensor is the world; hooks must not write to it.
 
     Names are those of the model; several names, or a regular expression, add a dimension behind the world's.
-
-    Args:
-        catalog: the model's names and numbers.
-        arrays: the arrays of all worlds, by name.
-        hook: name of the hook that sees it, from which its random numbers depend.
-        steps: control steps that the worlds have taken beyond those that are counted.
-
-    Attributes:
-        _lost: in which worlds an index of a table was out of range, by whether that gave NaN.
     """
 
     def __init__(self, catalog: Catalog, arrays: Mapping[str, torch.Tensor], hook: str, steps: int = 0) -> None:
-        self._catalog, self._arrays, self._hook, self._steps = catalog, arrays, hook, steps
+        self._catalog, self._arrays, self._hook = catalog, arrays, hook  # random numbers depend on the hook's name
+        self._steps = steps  # that the worlds have taken beyond those that are counted
         self._stream: torch.Tensor | None = None
         self._drawn = 0
+        # In which worlds an index of a table was out of range, by whether that gave NaN.
         self._lost: dict[bool, torch.Tensor] = {}
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -157,7 +150,7 @@ class View:
         Raises:
             AttributeError: always, but for the view's own.
         """
-        if not name.startswith("_") and name != "lost":
+        if not name.startswith("_"):
             raise AttributeError(
                 f"s.{name} cannot be set: return {{{name!r}: ...}} from update, events, adapt or begin"
             )
