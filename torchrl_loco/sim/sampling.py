@@ -73,22 +73,7 @@ def positive_quaternion(stream: wp.uint32):
 @wp.func
 def segment_distance(p: wp.vec3, u: wp.vec3, q: wp.vec3, v: wp.vec3) -> float:
     """Distance of the segments ``p + s u`` and ``q + t v``, s and t in [-1, 1]; points have ``u`` or ``v`` zero."""
-    d = p - q
-    uu = wp.dot(u, u)
-    vv = wp.dot(v, v)
-    uv = wp.dot(u, v)
-    ud = wp.dot(u, d)
-    vd = wp.dot(v, d)
-    s = float(0.0)
-    t = float(0.0)
-    determinant = uu * vv - uv * uv
-    if determinant > 1.0e-12:
-        s = wp.clamp((uv * vd - vv * ud) / determinant, -1.0, 1.0)
-    if vv > 0.0:
-        t = wp.clamp((uv * s + vd) / vv, -1.0, 1.0)
-    if uu > 0.0:
-        s = wp.clamp((uv * t - ud) / uu, -1.0, 1.0)
-    return wp.length(d + s * u - t * v)
+    return wp.closest_point_edge_edge(p - u, p + u, q - v, q + v, 1.0e-12)[2]
 
 
 @wp.struct
