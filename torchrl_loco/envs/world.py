@@ -35,7 +35,6 @@ from torchrl_loco.sim import (
     TorchGraph,
     WorldFunc,
     fill,
-    holds,
     joined_to_torch,
     torch_is_recording,
 )
@@ -192,12 +191,10 @@ class World:
         self._finish = WorldFunc(episode.finish_step, fill(episode.StepEnd, of_world, **counted))
         first = {"world_offset": task.world_offset or 0, "stagger": self._stagger.warp}
         self._start = [WorldFunc(episode.begin_episode, fill(episode.EpisodeStart, of_world, **first))]
-        self._starts_at_rest = True
         pose = task.pose_func(self) if "begin" not in self._own or "warp.begin" in asked else None
         if pose is not None:
             func, inputs = check_pair("pose_func", pose)
             self._start.append(episode.poser(func, inputs, self.stream.warp))
-            self._starts_at_rest = not holds(inputs, data.qvel)
 
     def _fused_outputs(self, task: "LocoEnv") -> tuple[Any, int, int]:
         """Returns where a fused function writes, and the sizes of its rows; what a hook returns instead is not used."""
@@ -232,7 +229,7 @@ class World:
         if self._own or self._variation is not None:
             self.sim.forward(self.mask.warp, after=self._fused)
         else:
-            self.sim.reset(self.mask.warp, before=self._start, after=self._fused, at_rest=self._starts_at_rest)
+            self.sim.reset(self.mask.warp, before=self._start, after=self._fused)
 
     def _launch_move(self) -> None:
         self.sim.forward(self._moved.warp, after=self._fused, contacts=False)  # which belong to the step

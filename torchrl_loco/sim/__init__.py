@@ -16,7 +16,6 @@ from torchrl_loco.sim.world_func import Around as Around
 from torchrl_loco.sim.world_func import WorldFunc as WorldFunc
 from torchrl_loco.sim.world_func import fill as fill
 from torchrl_loco.sim.world_func import fill_from_numbers as fill_from_numbers
-from torchrl_loco.sim.world_func import holds as holds
 
 # At its default level Warp prints a line for each of a hundred kernels that it loads. Set another level to see them.
 if wp.config.log_level == wp.LOG_INFO:

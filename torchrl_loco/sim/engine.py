@@ -32,14 +32,10 @@ class Setup:
 
 
 class Update(NamedTuple):
-    """How poses and sensors of worlds are updated: as arguments of ``Simulation.reset`` and ``forward`` say.
-
-    To know that worlds are at rest may save work.
-    """
+    """How poses and sensors of worlds are updated: as arguments of ``Simulation.reset`` and ``forward`` say."""
 
     before: Sequence[WorldFunc] = ()
     after: Sequence[WorldFunc] = ()
-    at_rest: bool = False
     contacts: bool = True
 
 
@@ -80,10 +76,6 @@ class Engine(abc.ABC):
     @abc.abstractmethod
     def remedy(self, dropped: str, most: int) -> str:
         """Returns advice for the warning about dropped constraints or contacts, of which a substep needed ``most``."""
-
-    def subtree_com(self) -> wp.array:
-        """Returns ``data.subtree_com``, which from now on is up to date."""
-        return self.data.subtree_com
 
     @abc.abstractmethod
     def step(self, around: Around = ALONE) -> None:

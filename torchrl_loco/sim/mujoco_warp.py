@@ -17,7 +17,7 @@ from torchrl_loco.sim.engine import Engine, Setup, Update
 from torchrl_loco.sim.graph import torch_is_recording
 from torchrl_loco.sim.models import FORCE_SENSORS
 from torchrl_loco.sim.row_order import RowOrder
-from torchrl_loco.sim.world_func import ALONE, Around, holds
+from torchrl_loco.sim.world_func import ALONE, Around
 
 SCRATCH, DETERMINISTIC_SCRATCH = 1.4, 11.0
 """Memory of a simulation as a multiple of its ``mjData``; the rest is scratch memory (measured: 1.3 to 1.4). The second
@@ -44,18 +44,6 @@ def clear_constraints(
             efc_J_out[world, row, i] = 0.0
         if row < efc_D_out.shape[1]:
             efc_D_out[world, row] = 0.0
-
-
-@wp.kernel(enable_backward=False)
-def rest(mask_in: wp.array[bool], cvel_out: wp.array2d[wp.spatial_vector], sensordata_out: wp.array2d[float]):
-    """Zeroes what is not evaluated in a world at rest."""
-    world = wp.tid()
-    if not mask_in[world]:
-        return
-    for i in range(cvel_out.shape[1]):
-        cvel_out[world, i] = wp.spatial_vector()
-    for i in range(sensordata_out.shape[1]):
-        sensordata_out[world, i] = 0.0
 
 
 @wp.kernel(enable_backward=False)
@@ -110,7 +98,6 @@ class MujocoWarpEngine(Engine):
 
     Attributes:
         contact_forces: what is computed of them, if any were asked for.
-        with_subtree_com: whether ``data.subtree_com`` is up to date in a world at rest too.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -143,7 +130,6 @@ class MujocoWarpEngine(Engine):
         if setup.contact_geoms:
             self.contact_forces = forces = ContactForces(mj_model, setup.contact_geoms, self.data, setup.contact_rows)
             self.contact_arrays = forces.force, forces.in_contact
-        self.with_subtree_com = False
         self._has_force_sensors = not FORCE_SENSORS.isdisjoint(mj_model.sensor_type)
         self._kept_sensors: tuple[wp.array, wp.array] | None = None
         if self._has_force_sensors or self.contact_forces is not None:
@@ -160,11 +146,6 @@ class MujocoWarpEngine(Engine):
     @override
     def remedy(self, dropped: str, most: int) -> str:
         return f"a physics step needed up to {most}: pass {ROOM[dropped]}={with_margin(most)}"
-
-    @override
-    def subtree_com(self) -> wp.array:
-        self.with_subtree_com = True
-        return self.data.subtree_com
 
     @override
     def step(self, around: Around = ALONE) -> None:
@@ -222,13 +203,8 @@ class MujocoWarpEngine(Engine):
             if self._batched is not None:
                 self._batched.update(mask)
             self._launch(clear_constraints, [mask], [data.efc.J, data.efc.D], LANES)
-            if forces is not None:  # they act at rest too
+            if forces is not None:
                 self._evaluate_forces(mask, *forces, contacts=update.contacts)
-            elif update.at_rest:
-                self._launch(rest, [mask], [data.cvel, data.sensordata])
-                mjw.kinematics(self.model, self.data)
-                if self.with_subtree_com or any(holds(args, self.data.subtree_com) for _, args in update.after):
-                    mjw.com_pos(self.model, self.data)
             else:
                 self._evaluate()
             self._kernels.launch(update.after, mask)

@@ -178,7 +178,7 @@ class Simulation:
         A point ``p`` of a body whose tree has the root ``mj_model.body_rootid[body]`` moves with
         ``cvel[:, body, 3:] + cross(cvel[:, body, :3], p - subtree_com[:, root])``.
         """
-        return wp.to_torch(self.engine.subtree_com())
+        return wp.to_torch(self.data.subtree_com)
 
     def step(self, around: Around = ALONE) -> None:
         """Advances every world by one control step under ``ctrl``, with what it does around the physics.
@@ -192,23 +192,15 @@ class Simulation:
             raise TypeError(f"around must be a torchrl_loco.sim.Around, got {type(around).__name__}")
         self.engine.step(around)
 
-    def reset(
-        self,
-        mask: wp.array,
-        before: Sequence[WorldFunc] = (),
-        after: Sequence[WorldFunc] = (),
-        *,
-        at_rest: bool = True,
-    ) -> None:
+    def reset(self, mask: wp.array, before: Sequence[WorldFunc] = (), after: Sequence[WorldFunc] = ()) -> None:
         """Puts worlds at rest in the default pose, and updates their poses and sensors; the others stay.
 
         Args:
             mask: the worlds, bool ``(nworld,)``.
-            before: what each of them does once it is at rest; it may write ``qpos``.
+            before: what each of them does once it is at rest; it may write ``qpos`` and ``qvel``.
             after: what it does at the end.
-            at_rest: whether they still are then; ``before`` may write ``qvel`` too if not.
         """
-        self.engine.forward(mask, Update([self._at_rest(), *before], after, at_rest))
+        self.engine.forward(mask, Update([self._at_rest(), *before], after))
 
     def rest(self, mask: wp.array, then: Sequence[WorldFunc]) -> None:
         """Puts worlds of a mask, bool ``(nworld,)``, at rest in the default pose, without updating poses and sensors.

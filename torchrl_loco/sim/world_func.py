@@ -74,12 +74,6 @@ def mujoco_warp_arrays() -> set[str]:
     return {field.name for field in dataclasses.fields(mjw.Data)}
 
 
-def holds(args: Any, array: wp.array) -> bool:
-    """Returns whether an instance of a ``wp.struct`` has an array among its fields, or among those of its structs."""
-    fields = [getattr(args, name) for name in args._cls.vars]
-    return any(field is array or (hasattr(field, "_cls") and holds(field, array)) for field in fields)
-
-
 class Around(NamedTuple):
     """What each world does around the physics of a control step.
 
