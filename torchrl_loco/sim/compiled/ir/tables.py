@@ -74,13 +74,6 @@ class Tables:
         for name, value in values.items():
             self.function("float", name, [f"return {literal(value)};"], parameter="")
 
-    def vector(self, name: str, value: ArrayLike) -> None:
-        """Adds a function that returns a vector."""
-        if any(map(varies, np.asarray(value))):
-            self._read("Vec", name, list(np.asarray(value)), parameter="")
-            return
-        self.function("Vec", name, [f"return {{{', '.join(map(literal, np.asarray(value, float)))}}};"], parameter="")
-
     def floats(self, name: str, values: Sequence[Number] | np.ndarray) -> None:
         """Adds a function from an index to a number."""
         if any(map(varies, values)):
@@ -137,7 +130,7 @@ class Tables:
         else:
             self.lines += [head, *(f"    {s}" for s in statements), "  }"]
 
-    def _read(self, type_: str, name: str, values: list[Number], parameter: str = "int i") -> None:
+    def _read(self, type_: str, name: str, values: list[Number]) -> None:
         """Adds a function that reads the row of a world."""
         count = self.COMPONENTS.get(type_, 1)
         changing = [k // count for k, x in enumerate(values) if varies(x)]
@@ -149,7 +142,7 @@ class Tables:
             statements, at = self._side_by_side(values, count, changing[0], changing[-1])
         parts = ", ".join(f"at[{k}]" for k in range(count))
         statements += [f"const Row at = {{{at}}};", f"return {parts if type_ == 'float' else f'{{{parts}}}'};"]
-        self._varied[name] = f"  INLINE {type_} {name}({parameter}) const {{ {' '.join(statements)} }}"
+        self._varied[name] = f"  INLINE {type_} {name}(int i) const {{ {' '.join(statements)} }}"
 
     def _side_by_side(self, values: list[Number], count: int, first: int, last: int) -> tuple[list[str], str]:
         """Returns statements, and a pointer to element ``i``: in the row, where lanes read neighbours together.

@@ -40,7 +40,7 @@ INLINE void subtrees() {
     if (b >= Model::LINKS) continue;
     const Motion velocity = w.velocity[b];
     Motion acceleration = accelerations[slot];
-    acceleration.linear = acceleration.linear - Model::gravity();
+    acceleration.linear = acceleration.linear - Model::gravity(0);
     const Pose pose = w.pose[b];
     const float mass = Model::link_mass(b);
     const Vec offset = center_of_mass(b, pose) - w.com[Model::tree(b)];

@@ -52,7 +52,7 @@ def members(d: Description, substeps: int, asked: Asked) -> Tables:
     )
     add_options(tables, m, DELICATE=is_delicate(nominal(m)), BY_SLOPES=False)
     tables.constant(timestep=m.opt.timestep, least_aligned=LEAST_ALIGNED, least_pivot=LEAST_PIVOT)
-    tables.vector("gravity", m.opt.gravity)
+    tables.structs("Vec", "gravity", [m.opt.gravity])
     _add_links(tables, d)
     _add_joints(tables, d)
     _add_limbs(tables, d)

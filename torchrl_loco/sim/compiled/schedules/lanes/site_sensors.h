@@ -60,7 +60,7 @@ INLINE void write_accelerations(float* sensordata) {
   OWN_LINKS(slot, b) {
     if (b >= Model::LINKS) continue;
     w.momentum[b] = accelerations[slot];  // in memory that is free now
-    w.momentum[b].linear = w.momentum[b].linear - Model::gravity();
+    w.momentum[b].linear = w.momentum[b].linear - Model::gravity(0);
   }
   sync();
   SHARED_LOOP(i, Model::ACCELEROMETERS) {
