@@ -1,13 +1,16 @@
 // Poses and velocities of the links.
 
-// What each link has, from its owner.
-INLINE float of_link(const float* own, const int stride, int link) const {
-  float value = read(own[0], (unsigned)link % LANES);
-  UNROLLED_FOR(int i = 1; i < LINK_SLOTS; ++i) {
-    const float other = read(own[stride * i], (unsigned)link % LANES);
-    if (link / LANES == i) value = other;
+// What each link, or degree of freedom, has, from its owner: a number in each of its slots, which lie a stride apart.
+INLINE float of_owner(const float* own, const int stride, const int slots, int i) const {
+  float value = read(own[0], (unsigned)i % LANES);
+  UNROLLED_FOR(int slot = 1; slot < slots; ++slot) {
+    const float other = read(own[stride * slot], (unsigned)i % LANES);
+    if (i / LANES == slot) value = other;
   }
   return value;
+}
+INLINE float of_link(const float* own, const int stride, int link) const {
+  return of_owner(own, stride, LINK_SLOTS, link);
 }
 
 INLINE Vec of_link(const Vec* own, const int stride, int link) const {

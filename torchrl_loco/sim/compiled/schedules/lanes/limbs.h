@@ -26,16 +26,6 @@ struct Factors {
 static INLINE int dof_of_row(int row) { return Model::limb_row_dof(row < LIMB_ROWS + TRUNK ? row : 0); }
 static INLINE int limb_columns(int row) { return Model::limb_row_end(row < LIMB_ROWS ? row : 0) - LIMB; }
 
-// A number of each degree of freedom, from its owner.
-INLINE float of_dof(const float* x, int d) const {
-  float value = read(x[0], d % LANES);
-  UNROLLED_FOR(int slot = 1; slot < SLOTS; ++slot) {
-    const float other = read(x[slot], d % LANES);
-    if (d / LANES == slot) value = other;
-  }
-  return value;
-}
-
 static INLINE void read_trunk(const float* row, float* columns) {
   UNROLLED_FOR(int i = 0; i < QUADS; ++i) {
     bool some = false;
@@ -69,8 +59,8 @@ INLINE void assemble(Branches& h, const bool with_contacts, const float* diagona
     read_trunk(mass, h.trunk[hold]);
     if (hold == 0)
       UNROLLED_FOR(int j = 0; j < LIMB; ++j) h.limb[j] = mass[limb_columns(row) + j];
-    h.diagonal[hold] = mass[d] + of_dof(diagonal, d);
-    h.gradient[hold] = of_dof(gradient, d);
+    h.diagonal[hold] = mass[d] + of_owner(diagonal, 1, SLOTS, d);
+    h.gradient[hold] = of_owner(gradient, 1, SLOTS, d);
   }
   if (!with_contacts) return;
   Factors factors[HOLDS];
