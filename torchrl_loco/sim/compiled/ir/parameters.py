@@ -90,12 +90,6 @@ def nominal(m: Any) -> mujoco.MjModel:
     return m.nominal if isinstance(m, VariedModel) else m
 
 
-def is_of_model(x: Scalar) -> bool:
-    """Returns whether an expression is made of numbers of the model alone, and not of the state."""
-    parts = [arg for arg in x.args if isinstance(arg, Scalar)]
-    return x.op in ("const", "number") if not parts else all(map(is_of_model, parts))
-
-
 def evaluate(x: Scalar, row: Sequence[float] | np.ndarray) -> float:
     """Returns the value of an expression of numbers of the model for a row of them."""
     a = [evaluate(arg, row) for arg in x.args if isinstance(arg, Scalar)]

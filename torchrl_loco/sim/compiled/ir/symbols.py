@@ -212,15 +212,15 @@ def sincos(x: Any) -> tuple[Scalar, Scalar]:
     return sine, Scalar("cos", sine)
 
 
-def leaves(expressions: Iterable[Scalar], op: str) -> set[Scalar]:
-    """Returns the leaves of a kind, of :data:`LEAVES`, that some expressions read."""
+def leaves(expressions: Iterable[Scalar], *ops: str) -> set[Scalar]:
+    """Returns the leaves of some kinds, of :data:`LEAVES`, that some expressions read."""
     seen, stack = set(), list(expressions)
     while stack:
         node = stack.pop()
         if node not in seen:
             seen.add(node)
             stack += [arg for arg in node.args if isinstance(arg, Scalar)]
-    return {node for node in seen if node.op == op}
+    return {node for node in seen if node.op in ops}
 
 
 def select(left: Any, comparison: str, right: Any, if_true: Any, if_false: Any) -> Scalar:

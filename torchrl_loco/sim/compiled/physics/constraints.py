@@ -15,14 +15,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled.ir.parameters import Number, constant, varies
+from torchrl_loco.sim.compiled.ir.parameters import Number, varies
 from torchrl_loco.sim.compiled.ir.symbols import (
     Block,
     Scalar,
     absolute,
     call,
     cell,
-    literal,
     maximum,
     minimum,
     name,
@@ -285,7 +284,7 @@ class DryFriction:
         """Returns a C++ loop over the rows, each a ``row``."""
         if not self.count:
             return ""
-        listed = [", ".join(map(constant_text, values)) for values in (self.weight, self.bound)]
+        listed = [", ".join(map(Block().value, values)) for values in (self.weight, self.bound)]  # constants, or names
         row = "const ConstraintRow row = {friction_x[i], friction_v[i], friction_D[i], friction_bound[i], true};"
         return (
             f"{{ {self._kept} float friction_D[] = {{{listed[0]}}}, friction_bound[] = {{{listed[1]}}};\n"
@@ -296,8 +295,3 @@ class DryFriction:
         """Returns C++ that does ``first``, moves residuals along the direction, and notes if a row changed sides."""
         moves = "changed |= row.crosses(next); friction_x[i] = next;"
         return self.loop(f"{first}const float next = row.after(alpha); {moves}")
-
-
-def constant_text(x: Number) -> str:
-    """Returns the C++ of a constant, or of a name."""
-    return x.args[0] if varies(x) else literal(constant(x))

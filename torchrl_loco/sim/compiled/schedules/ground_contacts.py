@@ -7,7 +7,6 @@ import numpy as np
 
 from torchrl_loco.sim.compiled.collision.pairs import Pair, contact_weight, least_regularisation
 from torchrl_loco.sim.compiled.collision.planes import Corner, corners
-from torchrl_loco.sim.compiled.ir.parameters import is_of_model
 from torchrl_loco.sim.compiled.ir.symbols import (
     Block,
     Scalar,
@@ -70,8 +69,8 @@ class GroundContacts:
 
         def component(i: int) -> Scalar:
             values = {scalar(vector[i]) for vector in vectors}
-            agreed = values.pop() if len(values) == 1 else None
-            return agreed if agreed is not None and is_of_model(agreed) else cell(f"contact[k].{title}{i}")
+            agree = len(values) == 1 and not leaves(values, "name", "cell")
+            return values.pop() if agree else cell(f"contact[k].{title}{i}")
 
         return np.array([component(i) for i in range(3)], dtype=object)
 
