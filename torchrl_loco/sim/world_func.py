@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from torchrl_loco.sim import mjw
+
 BLOCK_DIM = 64
 """Threads of a block where a thread has a world: few, so that a thousand worlds keep all multiprocessors busy."""
 
@@ -43,7 +45,7 @@ def fill(struct: Any, source: Any = None, /, **fields: Any) -> Any:
                 given[name] = getattr(source, name)
     missing, unknown = sorted(struct.vars.keys() - given.keys()), sorted(given.keys() - struct.vars.keys())
     if missing or unknown:
-        others = mujoco_warp_arrays() if missing and source is not None else set()
+        others = {field.name for field in dataclasses.fields(mjw.Data)} if missing and source is not None else set()
         hints = {name: ', which engine="mujoco_warp" has' for name in missing if name in others}
         wrong = [f"{name} is missing{hints.get(name, '')}" for name in missing]
         wrong += [f"there is no {name}" for name in unknown]
@@ -65,13 +67,6 @@ def fill_from_numbers(struct: Any, device: wp.Device, source: Any = None, /, **f
             values, like = np.asarray(values), {"dtype": kind.dtype, "device": device}
             fields[name] = wp.array(values, **like) if values.size else wp.empty((0,) * kind.ndim, **like)
     return fill(struct, source, **fields)
-
-
-def mujoco_warp_arrays() -> set[str]:
-    """Returns the names of what ``world.sim.data`` has with ``engine="mujoco_warp"``."""
-    import mujoco_warp as mjw  # takes a second, and the engine "compiled" does without it
-
-    return {field.name for field in dataclasses.fields(mjw.Data)}
 
 
 class Around(NamedTuple):
