@@ -101,11 +101,3 @@ class ContactForces:
         wp.launch(add_contacts, dim=data.naconmax, inputs=inputs, outputs=sums, device=device)
         inputs = [mask, *((0, self.rows) if row is None else (row, row + 1)), *sums]
         wp.launch(read_sums, dim=shape, inputs=inputs, outputs=[self.force, self.in_contact], device=device)
-
-
-def contact_forces_bytes(m: mujoco.MjModel, geoms: int, num_envs: int, naconmax: int, rows: int = 1) -> int:
-    """Returns the memory of :class:`ContactForces` of so many geoms, contacts and rows (bytes)."""
-    if not geoms:
-        return 0
-    per_geom, per_contact = rows * (12 + 1) + 24 + 1, 4 + 24
-    return num_envs * geoms * per_geom + naconmax * per_contact + 4 * m.ngeom

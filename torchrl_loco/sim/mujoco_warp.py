@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.batched_model import BatchedModel, batched_bytes, nominal_numbers, with_every_row
-from torchrl_loco.sim.contact_forces import ContactForces, contact_forces_bytes
+from torchrl_loco.sim.contact_forces import ContactForces
 from torchrl_loco.sim.engine import Engine, Setup, Update
 from torchrl_loco.sim.graph import torch_is_recording
 from torchrl_loco.sim.models import FORCE_SENSORS
@@ -252,12 +252,14 @@ def data_bytes(setup: Setup) -> int:
 
     def size(worlds: int, contacts: int) -> int:
         with wp.ScopedDevice("cpu"):
-            return _array_bytes(mjw.make_data(with_rows, nworld=worlds, naconmax=contacts, njmax=config.njmax))
+            data = mjw.make_data(with_rows, nworld=worlds, naconmax=contacts, njmax=config.njmax)
+            geoms = setup.contact_geoms
+            forces = vars(ContactForces(mj_model, geoms, data, setup.contact_rows)).values() if geoms else ()
+            return sum(map(_array_bytes, (data, *forces)))
 
     base = size(1, 1)
-    forces = contact_forces_bytes(mj_model, len(setup.contact_geoms), num_envs, config.naconmax, setup.contact_rows)
     data = base + (num_envs - 1) * (size(2, 1) - base) + (config.naconmax - 1) * (size(1, 2) - base)
-    return data + forces + batched_bytes(mj_model, setup.varied, num_envs)
+    return data + batched_bytes(mj_model, setup.varied, num_envs)
 
 
 def _array_bytes(thing: Any) -> int:
