@@ -69,12 +69,7 @@ def load(
 
 
 def specification(source: Path | str | mujoco.MjSpec, folder: Path | None = None) -> mujoco.MjSpec:
-    """Returns what :func:`load` compiles, to be edited; of a ``mujoco.MjSpec`` a copy.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no valid MJCF.
-    """
+    """Returns what :func:`load` compiles, to be edited, or raises its errors; of a ``mujoco.MjSpec`` a copy."""
     if isinstance(source, mujoco.MjSpec):
         return source.copy()
     if isinstance(source, str) and source.lstrip().startswith("<"):
@@ -97,13 +92,7 @@ def _path(source: Path | str, folder: Path | None) -> Path:
 
 
 def files(source: Path | str | mujoco.MjSpec, folder: Path | None = None) -> list[Path]:
-    """Returns the files of a model, what it includes and its meshes among them; none for MJCF text and specs.
-
-    Arguments are those of :func:`load`.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-    """
+    """Returns the files of what :func:`load` takes, included ones and meshes too; none for MJCF text and specs."""
     if isinstance(source, mujoco.MjSpec) or (isinstance(source, str) and source.lstrip().startswith("<")):
         return []
     path = _path(source, folder).resolve()
@@ -137,13 +126,7 @@ def control(mj_model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
 
 
 def touch_ground_only(mj_model: mujoco.MjModel) -> None:
-    """Takes the contacts of moving bodies with each other out of a model.
-
-    What they touch of that which is fixed to the world stays as it is.
-
-    Raises:
-        ValueError: geoms that are fixed have so many different masks that bits do not suffice.
-    """
+    """Takes the contacts of moving bodies with each other out of a model; those with what is fixed stay as they are."""
     m = mj_model
     fixed = m.body_weldid[m.geom_bodyid] == 0
     # Each kind of fixed geoms has a bit of its own, which the moving geoms that touch it accept.

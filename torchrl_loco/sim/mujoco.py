@@ -44,11 +44,7 @@ class Data:
             self._all = mjw.make_data(m, nworld=num_envs, naconmax=1, njmax=1)
 
     def __getattr__(self, name: str) -> wp.array:
-        """Returns an array, which follows from then on.
-
-        Raises:
-            AttributeError: neither MuJoCo-Warp nor C MuJoCo has it.
-        """
+        """Returns an array, which follows from then on, if both MuJoCo-Warp and C MuJoCo have it."""
         if name.startswith("_"):
             raise AttributeError(name)
         if name not in self._arrays:

@@ -122,11 +122,7 @@ class RowOrder:
 
 
 def check_order(model: "mjw.Model") -> None:
-    """Checks that constraint rows are all that varies in order before the solver starts.
-
-    Raises:
-        ValueError: they are not.
-    """
+    """Raises ValueError if more than constraint rows varies in order before the solver starts."""
     most = model.block_dim.contact_jac_tiled
     others = {
         "a sparse Jacobian": model.is_sparse,

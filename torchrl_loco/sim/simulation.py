@@ -329,11 +329,7 @@ def say_what_is_only_seen(mj_model: mujoco.MjModel) -> None:
 
 
 def check_geoms(mj_model: mujoco.MjModel, geoms: Sequence[int]) -> tuple[int, ...]:
-    """Returns ids of geoms.
-
-    Raises:
-        ValueError: one is out of range or named twice.
-    """
+    """Returns ids of geoms, or raises ValueError: one is out of range or named twice."""
     ids = tuple(map(operator.index, geoms))
     wrong = [geom for geom in ids if not 0 <= geom < mj_model.ngeom]
     if wrong:
@@ -345,11 +341,7 @@ def check_geoms(mj_model: mujoco.MjModel, geoms: Sequence[int]) -> tuple[int, ..
 
 
 def choose_engine(mj_model: mujoco.MjModel, config: SimConfig, varied: Varied | None = None) -> tuple[str, str]:
-    """Returns the name of the engine that steps a model, and why.
-
-    Raises:
-        ValueError: ``config.engine`` is "compiled", and the model needs something that it does not have.
-    """
+    """Returns the name of the engine that steps a model, and why, or raises ValueError: that of ``config`` cannot."""
     if config.engine in ("mujoco_warp", "mujoco"):
         return config.engine, "as asked"
     missing = compiled.unsupported(mj_model, varied)
@@ -365,11 +357,7 @@ def choose_engine(mj_model: mujoco.MjModel, config: SimConfig, varied: Varied | 
 
 
 def check_memory(needed: int, num_envs: int, device: torch.device) -> None:
-    """Checks that the worlds fit into the memory that is free.
-
-    Raises:
-        MemoryError: they do not; the message names the figures and how many worlds would fit.
-    """
+    """Raises MemoryError, with the figures and how many worlds would fit, if more memory is needed than is free."""
     free = free_memory(device)
     if needed > free and device.type == "cuda":  # closed environments may have left memory to torch and Warp
         gc.collect()

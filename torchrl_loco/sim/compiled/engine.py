@@ -90,12 +90,7 @@ class Data:
         _fill_rows(self.xmat, start.xmat)
 
     def __getattr__(self, name: str) -> Any:
-        """Returns one of ``LATER``, which is made, and computed from then on.
-
-        Raises:
-            AttributeError: there is no such array.
-            RuntimeError: it is too late.
-        """
+        """Returns one of ``LATER``, which is made, and computed from then on, unless it is too late."""
         if name.startswith("_"):
             raise AttributeError(name)
         if name not in LATER:

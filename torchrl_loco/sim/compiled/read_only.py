@@ -14,11 +14,7 @@ REMEDY = (
 
 
 class ReadOnly:
-    """An object whose attributes can be read only, and so can the arrays and objects that they hold.
-
-    Raises:
-        AttributeError: an attribute is set.
-    """
+    """An object whose attributes can be read only, and so can the arrays and objects that they hold."""
 
     _source: Any
 
@@ -47,11 +43,7 @@ class ReadOnlyArray(wp.array):
     """
 
     def assign(self, *args: Any) -> NoReturn:
-        """Writes nothing.
-
-        Raises:
-            TypeError: always.
-        """
+        """Writes nothing, and raises TypeError."""
         raise TypeError(f"this array cannot be written: {REMEDY}")
 
     fill_ = zero_ = assign

@@ -53,11 +53,7 @@ def structure_of_arrays(m: mujoco.MjModel, device: wp.Device) -> bool:
 
 
 def check_worlds(m: mujoco.MjModel, num_envs: int, device: wp.Device) -> None:
-    """Checks that 32 bits, with which Warp counts threads and the bytes from a row to the next, are enough.
-
-    Raises:
-        ValueError: there are too many worlds.
-    """
+    """Raises ValueError if 32 bits, with which Warp counts threads and bytes from a row to the next, are too few."""
     if not device.is_cuda:
         return
     most = (2**31 - 1) // (wp.types.type_size_in_bytes(wp.mat33) if structure_of_arrays(m, device) else WARP)
