@@ -34,8 +34,9 @@ class Pyramid:
         """Returns how much of the weight of a contact an edge gets."""
         return 1.0 if condim > 1 else 1.0 / sum(count for *_, count in self.edges)
 
-    def response(self, weight: Scalar, x: Sequence[Scalar]) -> tuple[list[Scalar], dict[tuple[int, int], Scalar]]:
-        """Returns gradient and Hessian of the cost by the directions, from an edge's weight and their residuals."""
+    def response(self) -> tuple[list[Scalar], dict[tuple[int, int], Scalar]]:
+        """Returns gradient and Hessian of the cost of contact ``k`` with respect to the directions."""
+        weight, x = cell("contact[k].D"), [cell(f"contact[k].x{d}") for d in self.directions]
         gradient = [scalar(0) for _ in self.directions]
         hessian = {(0, 0): scalar(0)}
         for sign, direction, count in self.edges:
@@ -52,7 +53,7 @@ class Pyramid:
 
     def normal_force(self) -> Scalar:
         """Returns the normal force of contact ``k`` (N)."""
-        return -self._gradient()[0]
+        return -self.response()[0][0]
 
     def force(self, axes: Sequence[np.ndarray]) -> np.ndarray:
         """Returns the force of contact ``k`` on its second geom, ``(3,)`` (N).
@@ -60,11 +61,7 @@ class Pyramid:
         Args:
             axes: the directions in the world's frame, ``(3,)`` each: the normal, and the tangents times friction.
         """
-        return -total(g * axis for g, axis in zip(self._gradient(), axes, strict=False))
-
-    def _gradient(self) -> list[Scalar]:
-        """Returns the gradient of the cost of contact ``k`` with respect to the directions."""
-        return self.response(cell("contact[k].D"), [cell(f"contact[k].x{d}") for d in self.directions])[0]
+        return -total(g * axis for g, axis in zip(self.response()[0], axes, strict=False))
 
     def rows(self, body: str) -> list[str]:
         """Returns C++ statements that run ``body`` for each edge of contact ``k``, ``row``."""

@@ -230,8 +230,7 @@ class DenseContacts:
         nv, directions = self.tree.m.nv, self.pyramid.directions
         block("int modes = 0;")
         with block.scope("for (int k = ground; k < contacts; ++k)") as contact:
-            x = [cell(f"contact[k].x{d}") for d in directions]
-            gradient, hessian = self.pyramid.response(cell("contact[k].D"), x)
+            gradient, hessian = self.pyramid.response()
             gradient = [contact.keep(entry) for entry in gradient]
             hessian = {key: contact.keep(entry) for key, entry in hessian.items()}
             jacobian = [[cell(f"dense_J{d}[(k - ground) * {nv} + {i}]") for i in range(nv)] for d in directions]

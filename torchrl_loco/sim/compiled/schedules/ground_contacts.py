@@ -52,11 +52,11 @@ class GroundContacts:
         self.directions = [normal, tangent, cross(normal, tangent)]
         if all(corner.pair.condim == 1 for corner in self.corners):
             self.pyramid = FRICTIONLESS
-        elif self._velocity(self._stored_twist())[2].constant == 0:
+        elif self._velocity()[2].constant == 0:
             self.pyramid = FLAT
         else:
             self.pyramid = FULL
-        read = [*self._velocity(self._stored_twist()), *(np.concatenate(self.directions) if with_frames else ())]
+        read = [*self._velocity(), *(np.concatenate(self.directions) if with_frames else ())]
         titles = [f"{title}{i}" for title in ("lever", "normal", "tangent") for i in range(3)]
         read_cells = {leaf.args[0] for leaf in leaves(map(scalar, read), "cell")}
         self._stored = [title for title in titles if f"contact[k].{title}" in read_cells]
@@ -74,15 +74,11 @@ class GroundContacts:
 
         return np.array([component(i) for i in range(3)], dtype=object)
 
-    def _stored_twist(self) -> np.ndarray:
-        """Returns the twist of the body of contact ``k``, ``(6,)``."""
+    def _velocity(self) -> list[Scalar]:
+        """Returns the velocity at contact ``k`` along the normal and the scaled tangents, for the twist of its body."""
         twist = zeros(6)
         for i, component in enumerate(self.live):
             twist[component] = cell(f"link[contact[k].body][place].twist[{i}]")
-        return twist
-
-    def _velocity(self, twist: np.ndarray) -> list[Scalar]:
-        """Returns the velocity at contact ``k`` along the normal and the scaled tangents."""
         linear = twist[3:] + cross(twist[:3], self._lever)
         return [dot(direction, linear) for direction in self.directions]
 
@@ -147,7 +143,7 @@ class GroundContacts:
                 block.set(f"link[{b}][place].twist[{i}]", twists[body][component])
 
     def _set(self, block: Block, field: str, residual: Scalar | float = 0.0) -> None:
-        velocity = self._velocity(self._stored_twist())
+        velocity = self._velocity()
         for d in self.pyramid.directions:
             block.set(f"contact[k].{field}{d}", velocity[d] if d else residual + velocity[d])
 
@@ -176,8 +172,7 @@ class GroundContacts:
             for title in ("gradient", "stiffness"):
                 each(f"for (float& x : link[b][place].{title}) x = 0.0f;")
         with block.loop("k", "ground") as contact:
-            x = [cell(f"contact[k].x{d}") for d in pyramid.directions]
-            gradient, hessian = pyramid.response(cell("contact[k].D"), x)
+            gradient, hessian = pyramid.response()
             wrenches = [
                 np.concatenate([cross(self._lever, self.directions[d]), self.directions[d]]) for d in pyramid.directions
             ]
