@@ -56,18 +56,10 @@ Arrays: Any = wp.struct(type("Arrays", (), {"__annotations__": WORLD_ARRAYS}))
 class Data:
     """The state of all worlds, and what an observation reads.
 
-    Names, shapes and units are those of ``mjData``, with a row for each world: ``(nworld, ...)``.
-
-    Attributes:
-        xmat: orientations of the bodies, ``(nworld, nbody)`` mat33.
-        cvel: velocities of the bodies about the center of mass of their tree (rad/s, m/s), ``(nworld, nbody)``.
-        subtree_com: centers of mass of the trees (m), ``(nworld, nbody)`` vec3, in the rows of their roots; other rows
-            are zero. Both are computed if they were asked for before the first step, as an environment's
-            ``observation_func`` does.
-        contact_force: net force of the contacts on each of the geoms that were asked for, in the world's frame (N),
-            ``(nworld, contacts)`` vec3, substep by substep.
-        in_contact: whether they have any, ``(nworld, contacts)`` bool.
-        overflow: ``Overflow`` bits, ``(nworld,)``.
+    Names and units are those of the views of :class:`torchrl_loco.sim.Simulation`, types those of ``ROWS``, with a
+    row for each world. ``cvel`` and ``subtree_com`` are computed if they were asked for before the first step, as an
+    environment's ``observation_func`` does; rows of ``subtree_com`` but those of roots are zero. ``contact_force`` and
+    ``in_contact`` are of the geoms that were asked for, substep by substep.
     """
 
     def __init__(self, setup: Setup) -> None:
