@@ -129,11 +129,6 @@ def _shape(setup: Setup, name: str) -> tuple[int, ...]:
 class Model(ReadOnly):
     """The model on the device: what ``mujoco_warp.Model`` has, under the same names, to be read only.
 
-    Its numbers are constants of the compiled step: to write them would change nothing. So setting an attribute raises
-    ``AttributeError``, writing an array ``TypeError`` (``fill_``, ``zero_``, ``assign``, views for torch) or
-    ``ValueError`` (what ``numpy()`` returns). Kernels and structs take the arrays like any other. ``wp.copy`` into an
-    array and kernels that write to it cannot be caught.
-
     Only what environments read when they are made is copied here. Anything else makes the model of MuJoCo-Warp, which
     imports it and takes a second or two.
     """
