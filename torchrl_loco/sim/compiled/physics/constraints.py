@@ -112,12 +112,9 @@ class Softness:
         return self.dmin + select(x, "<=", self.midpoint, self.lower * power, 1 - self.upper * power) * self.rise
 
     def row(self, weight: float | Scalar, position: Scalar, least: float | Scalar = MINVAL) -> tuple[Scalar, Scalar]:
-        """Returns D, and the part of the residual that the position makes.
+        """Returns D, at most one over ``least``, and the part of the residual that the position makes.
 
-        Args:
-            weight: approximate inverse inertia along the row.
-            position: distance, negative if violated (m or rad).
-            least: least regularisation, one over the largest D.
+        The weight is the approximate inverse inertia along the row; a position (m or rad) that violates it is negative.
         """
         impedance = self.impedance(position)
         regularisation = maximum(scalar(weight) * (1 - impedance), least * impedance)  # times impedance

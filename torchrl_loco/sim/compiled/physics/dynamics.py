@@ -111,13 +111,7 @@ def kinematics(m: mujoco.MjModel, qpos: list[Scalar]) -> Poses:
 
 
 class Dynamics:
-    """Inertias, motion subspaces and smooth forces of a model at a state.
-
-    Args:
-        m: the model.
-        qpos: positions, ``nq`` of them.
-        qvel: velocities, ``nv``.
-        ctrl: controls, ``nu``; without them there is no actuation.
+    """Inertias, motion subspaces and smooth forces of a model at a state; without controls there is no actuation.
 
     Attributes:
         poses: where everything is.
@@ -263,12 +257,8 @@ class ArticulatedFactor:
     """Factor of M + K by articulated-body inertias (Featherstone chapter 7), from the leaves to the root.
 
     A force of stiffness A at a body acts in H = M + J'AJ as if it added A to the inertia of the body, so contacts with
-    the world cost no more than inertia does, and neither M nor H is formed.
-
-    Args:
-        tree: the dynamics.
-        stiffness: symmetric matrix ``(6, 6)`` at each body.
-        diagonal: number added to the diagonal for each degree of freedom.
+    the world cost no more than inertia does, and neither M nor H is formed. K is a ``stiffness``, symmetric ``(6, 6)``,
+    at each body, and what is added to the ``diagonal``.
 
     Attributes:
         projected: articulated inertia times the motion subspace of each degree of freedom, ``(6,)`` each.

@@ -56,11 +56,7 @@ class Pyramid:
         return -self.response()[0][0]
 
     def force(self, axes: Sequence[np.ndarray]) -> np.ndarray:
-        """Returns the force of contact ``k`` on its second geom, ``(3,)`` (N).
-
-        Args:
-            axes: the directions in the world's frame, ``(3,)`` each: the normal, and the tangents times friction.
-        """
+        """Returns the force of contact ``k`` on its second geom (N), from normal and tangents times friction."""
         return -total(g * axis for g, axis in zip(self.response()[0], axes, strict=False))
 
     def rows(self, body: str) -> list[str]:

@@ -91,10 +91,6 @@ class ContactForces:
 
     C++ variables: ``contact_corner``, the place of the geoms of contact ``k`` in ``pairs``; behind its end for what is
     no contact. The results are added up where they are read from, in ``row`` of ``contact_force`` and ``in_contact``.
-
-    Args:
-        geoms: the geoms.
-        pairs: geoms that may touch, in the order that ``contact_corner`` counts.
     """
 
     def __init__(self, geoms: Sequence[int], pairs: Sequence[tuple[int, int]]) -> None:

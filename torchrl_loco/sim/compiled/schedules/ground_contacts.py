@@ -158,11 +158,7 @@ class GroundContacts:
                         contact(line)
 
     def gather(self, block: Block) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Adds up gradient and Hessian of the cost at each body.
-
-        Returns:
-            forces ``(6,)`` and stiffnesses ``(6, 6)``, one of each for every body of the model.
-        """
+        """Returns gradient ``(6,)`` and Hessian ``(6, 6)`` of the cost at each body: forces and stiffnesses."""
         m, live, pyramid = self.tree.m, self.live, self.pyramid
         forces, stiffness = [zeros(6) for _ in range(m.nbody)], [zeros(6, 6) for _ in range(m.nbody)]
         if not self.count:

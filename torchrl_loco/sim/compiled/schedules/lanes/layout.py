@@ -92,11 +92,7 @@ class Limbs:
 
     @classmethod
     def of(cls, parents: Sequence[int]) -> "Limbs | None":
-        """Returns them, or ``None`` where rows of the whole Hessian are as good, or all that fits.
-
-        Args:
-            parents: the parent of each degree of freedom, or -1.
-        """
+        """Returns them, by parents of degrees of freedom, or ``None`` if whole rows are as good, or all that fits."""
         ends = [0] * len(parents)
         for d in reversed(range(len(parents))):
             ends[d] = ends[d] or 1
