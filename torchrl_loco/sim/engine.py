@@ -2,8 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import warp as wp
@@ -11,7 +10,7 @@ import warp as wp
 from torchrl_loco.config import SimConfig
 from torchrl_loco.sim.buffer import Buffer
 from torchrl_loco.sim.varied import Varied
-from torchrl_loco.sim.world_func import ALONE, Around, WorldFunc, WorldKernels
+from torchrl_loco.sim.world_func import ALONE, Around, WorldKernels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,14 +28,6 @@ class Setup:
     contact_geoms: tuple[int, ...] = ()
     varied: Varied | None = None
     contact_rows: int = 1
-
-
-class Update(NamedTuple):
-    """How poses and sensors of worlds are updated: as arguments of ``Simulation.reset`` and ``forward`` say."""
-
-    before: Sequence[WorldFunc] = ()
-    after: Sequence[WorldFunc] = ()
-    contacts: bool = True
 
 
 class Engine(abc.ABC):
@@ -85,7 +76,7 @@ class Engine(abc.ABC):
         """
 
     @abc.abstractmethod
-    def forward(self, mask: wp.array, update: Update) -> None:
+    def forward(self, mask: wp.array, around: Around, *, contacts: bool = True) -> None:
         """Updates poses and sensors where ``mask`` ``(nworld,)`` is set, those of forces without control.
 
         Numbers of the model that were changed there count from now on.

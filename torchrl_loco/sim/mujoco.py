@@ -15,7 +15,7 @@ from typing_extensions import override
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.batched_model import nominal_numbers
 from torchrl_loco.sim.compiled.engine import Model
-from torchrl_loco.sim.engine import Engine, Setup, Update
+from torchrl_loco.sim.engine import Engine, Setup
 from torchrl_loco.sim.overflow import Overflow
 from torchrl_loco.sim.world_func import ALONE, Around
 
@@ -156,8 +156,8 @@ class MujocoEngine(Engine):
         self._kernels.launch(around.after, self._all)
 
     @override
-    def forward(self, mask: wp.array, update: Update) -> None:
-        self._kernels.launch(update.before, mask)
+    def forward(self, mask: wp.array, around: Around, *, contacts: bool = True) -> None:
+        self._kernels.launch(around.before, mask)
         shown = self.data.shown()
 
         def evaluate(i: int) -> None:
@@ -169,7 +169,7 @@ class MujocoEngine(Engine):
             self._load(i, self._state)
             mujoco.mj_forward(self._passive if self._varied is None else _without_actuation(m), d)
             d.qacc_warmstart[:] = self._state["qacc_warmstart"][i]
-            if update.contacts and self._geoms:
+            if contacts and self._geoms:
                 for row in range(self._rows):
                     self._add_up_forces(i, row)
             self._write(i, shown)
@@ -177,7 +177,7 @@ class MujocoEngine(Engine):
         worlds = np.flatnonzero(mask.numpy())
         self._each(worlds, evaluate)
         self._keep_written(worlds)
-        self._kernels.launch(update.after, mask)
+        self._kernels.launch(around.after, mask)
 
     def _each(self, worlds: np.ndarray, work: Callable[[int], None]) -> None:
         """Does something in worlds, a share of them in each thread; MuJoCo computes without Python's lock."""

@@ -13,7 +13,7 @@ from typing_extensions import override
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.batched_model import BatchedModel, batched_bytes, nominal_numbers, with_every_row
 from torchrl_loco.sim.contact_forces import ContactForces
-from torchrl_loco.sim.engine import Engine, Setup, Update
+from torchrl_loco.sim.engine import Engine, Setup
 from torchrl_loco.sim.graph import torch_is_recording
 from torchrl_loco.sim.models import FORCE_SENSORS
 from torchrl_loco.sim.row_order import RowOrder
@@ -194,20 +194,20 @@ class MujocoWarpEngine(Engine):
             model.opt.disableflags, model.ncam, model.nlight = kept
 
     @override
-    def forward(self, mask: wp.array, update: Update) -> None:
+    def forward(self, mask: wp.array, around: Around, *, contacts: bool = True) -> None:
         data = self.data
-        forces = self._kept_sensors if update.contacts or self._has_force_sensors else None
+        forces = self._kept_sensors if contacts or self._has_force_sensors else None
 
         def evaluate() -> None:
-            self._kernels.launch(update.before, mask)
+            self._kernels.launch(around.before, mask)
             if self._batched is not None:
                 self._batched.update(mask)
             self._launch(clear_constraints, [mask], [data.efc.J, data.efc.D], LANES)
             if forces is not None:
-                self._evaluate_forces(mask, *forces, contacts=update.contacts)
+                self._evaluate_forces(mask, *forces, contacts=contacts)
             else:
                 self._evaluate()
-            self._kernels.launch(update.after, mask)
+            self._kernels.launch(around.after, mask)
 
         if torch_is_recording(self._device):
             evaluate()

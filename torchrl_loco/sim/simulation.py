@@ -17,7 +17,7 @@ from torchrl_loco.sim import compiled, mjw, models, mujoco_warp
 from torchrl_loco.sim import mujoco as c_mujoco
 from torchrl_loco.sim.batched_model import BatchedModel, with_every_row
 from torchrl_loco.sim.compilation import compile_kernels
-from torchrl_loco.sim.engine import Engine, Setup, Update
+from torchrl_loco.sim.engine import Engine, Setup
 from torchrl_loco.sim.graph import Graph, ScratchPool
 from torchrl_loco.sim.varied import Varied
 from torchrl_loco.sim.warp_init import init_warp
@@ -200,7 +200,7 @@ class Simulation:
             before: what each of them does once it is at rest; it may write ``qpos`` and ``qvel``.
             after: what it does at the end.
         """
-        self.engine.forward(mask, Update([self._at_rest(), *before], after))
+        self.engine.forward(mask, Around([self._at_rest(), *before], after))
 
     def rest(self, mask: wp.array, then: Sequence[WorldFunc]) -> None:
         """Puts worlds of a mask, bool ``(nworld,)``, at rest in the default pose, without updating poses and sensors.
@@ -225,7 +225,7 @@ class Simulation:
             contacts: whether the forces of ``contact_geoms`` are found, too, which takes a part of a physics step;
                 else they stay as they are.
         """
-        self.engine.forward(mask, Update(after=after, contacts=contacts))
+        self.engine.forward(mask, Around(after=after), contacts=contacts)
 
     def mujoco_data(self, *, contacts: bool = False) -> "mjw.Data":
         """Returns the present state as ``mjData`` of MuJoCo-Warp, with poses of geoms, sites and cameras.

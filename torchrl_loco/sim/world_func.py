@@ -70,12 +70,7 @@ def fill_from_numbers(struct: Any, device: wp.Device, source: Any = None, /, **f
 
 
 class Around(NamedTuple):
-    """What each world does around the physics of a control step.
-
-    Attributes:
-        before: what it does before the physics.
-        after: what it does once the physics has stepped.
-    """
+    """What each world does around the physics: of a control step, or of an update of poses and sensors."""
 
     before: Sequence[WorldFunc] = ()
     after: Sequence[WorldFunc] = ()

@@ -18,7 +18,7 @@ from torchrl_loco.sim.compiled.collision.pairs import stand_ins
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel
 from torchrl_loco.sim.compiled.read_only import ReadOnly, read_only
 from torchrl_loco.sim.compiled.schedules.shared import Asked
-from torchrl_loco.sim.engine import Engine, Setup, Update
+from torchrl_loco.sim.engine import Engine, Setup
 from torchrl_loco.sim.world_func import ALONE, Around, Chain, WorldFunc, fill
 
 ROWS = {
@@ -205,8 +205,8 @@ class CompiledEngine(Engine):
         self._kernels.launch(around.after, self._all)
 
     @override
-    def forward(self, mask: wp.array, update: Update) -> None:
-        self._launch(0, mask, update.before, update.after, self._contact_geoms if update.contacts else ())
+    def forward(self, mask: wp.array, around: Around, *, contacts: bool = True) -> None:
+        self._launch(0, mask, *around, self._contact_geoms if contacts else ())
 
     def _launch(
         self,
