@@ -62,6 +62,14 @@ def played(env, actions, td=None):
 ACTIONS = 2 * torch.rand(80, 5, 6, generator=torch.Generator().manual_seed(0)) - 1
 
 
+def test_worlds_that_share_what_they_adapt_are_stepped_together():
+    env = Looks(2, "cpu", 0)
+    td = env.rand_action(env.reset()).set("_step", torch.tensor([[True], [False]]))
+    with pytest.raises(ValueError, match="Looks cannot step some worlds alone"):
+        env.step(td)
+    assert not env.world.shared["falls"].any()
+
+
 def test_hooks_with_tables_are_kernels_and_equal_plain_torch():
     env, plain = (Looks(5, "cpu", 0, metrics=True, compile_hooks=kernels) for kernels in (True, False))
     assert {part.kind for part in (env.world._judge, env.world._observe, env.world._begin)} == {"kernel"}

@@ -306,7 +306,15 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         """Returns the results of a step of the worlds of a mask ``(num_envs,)``; of the others, what they began with.
 
         The worlds cannot be stepped apart: the others are stepped too, without control, and put back.
+
+        Raises:
+            ValueError: the task adapts what all worlds share.
         """
+        if "adapt" in self.hooks.own:
+            raise ValueError(
+                f"{type(self).__name__} cannot step some worlds alone ('_step'): what all share would adapt to "
+                "the others too, as if they had stepped"
+            )
         before, held = self.get_state(), ~part.to(self.device)
         self.world.step(action.masked_fill(held.unsqueeze(-1), 0.0))
         after = self._outputs(with_reward=True)
