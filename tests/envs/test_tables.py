@@ -234,6 +234,27 @@ def test_what_is_shared_may_be_long_and_lists_are_indices():
         type("Masked", (Long,), {"observation": lambda self, s: s.grid[s.i, s.qpos[:, 0] > 0]})(3, "cpu", 0)
 
 
+def test_an_integer_chosen_beyond_the_end_shows_where_it_is_an_index():
+    class Chooses(WalkerWalk):
+        constants = {"table": [1.0, 2.0, 3.0]}
+        memory = {"which": torch.int64, "ids": ((3,), torch.int64), "short": ((3,), torch.int32)}
+
+        def events(self, s):
+            return {"which": s.which + 1, "ids": s.ids % 3, "short": s.short % 3}
+
+        def reward(self, s):
+            chosen = s.ids.gather(1, s.which[:, None])[:, 0]
+            return s.table[chosen] + s.table[s.short[torch.arange(s.num_envs), s.which].long()]
+
+    env = Chooses(2, "cpu", 0)
+    assert env.world._judge.kind == "kernel"
+    td = env.reset()
+    for beyond in (False, False, False, True):
+        td = env.rand_step(td.exclude("next"))
+        assert td["next", "terminated"].all() == beyond
+        assert (env.health()["total", "index_error"] > 0) == beyond
+
+
 class Forms(WalkerWalk):
     """Looks numbers up in every form that torch has for it."""
 

@@ -216,7 +216,8 @@ def _pick(p: Program, columns: Sequence[Any], index: Value) -> Value:
     if len(columns) > LONG:
         raise CannotFuse(f"{{op}} chooses among {len(columns)} numbers")
     index, first = p.cast(index, torch.int64), p.value(columns[0])
-    found = p.value(math.nan) if first.dtype == torch.float32 else first  # out of range
+    nothing = {torch.float32: math.nan, torch.bool: False}  # out of range: what shows, also where it is an index itself
+    found = p.value(nothing[first.dtype] if first.dtype in nothing else torch.iinfo(first.dtype).min)
     for i, column in enumerate(columns):
         chosen = p.apply(f"{{0}} == {i} || {{0}} == {i - len(columns)}", torch.bool, index, of=torch.int64)
         found = p.where(chosen, column, found)
