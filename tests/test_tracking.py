@@ -279,8 +279,9 @@ def test_from_a_clip_to_a_file_that_plays_without_torch(tmp_path, short, capsys)
         cli.main(["eval", str(run), "--episodes", "2"])
     with pytest.raises(SystemExit):  # its worlds are in the midst of other tables
         cli.main(["resume", str(run), "--total_frames", "512", "--motion", str(tmp_path / "a.csv"), "--fps", "25"])
-    assert "is a run of 2 cases, a, b, and not of 1, a" in capsys.readouterr().err
-    there = ["--motion", str(tmp_path / "a.csv"), str(tmp_path / "b.csv"), "--fps", "25"]
+    assert "is a run of 2 case(s), a, b, and not of 1, a" in capsys.readouterr().err
+    (tmp_path / "b.csv").rename(tmp_path / "renamed.csv")
+    there = ["--motion", str(tmp_path / "a.csv"), str(tmp_path / "renamed.csv"), "--fps", "25"]
     cli.main(["resume", str(run), "--total_frames", "512", *there])
     header, *_ = (run / "metrics.csv").read_text().splitlines()
     assert "metric/body_error" in header
@@ -288,14 +289,14 @@ def test_from_a_clip_to_a_file_that_plays_without_torch(tmp_path, short, capsys)
     printed = capsys.readouterr().out
     assert "2 in all" in printed
     figures = json.loads((run / "verify.json").read_text())["cases"]
-    for name in ("a", "b"):
+    for name in ("a", "renamed"):
         ours, theirs = (figures[engine][name]["return"] for engine in ("training simulator", "C MuJoCo"))
         assert ours == pytest.approx(theirs, abs=0.02)
     cli.main(["export", str(run), "--out", str(tmp_path / "h1.onnx")])
     done = subprocess.run(
-        [sys.executable, EXAMPLE, tmp_path / "h1.onnx", "--clip", "b"], capture_output=True, text=True, check=True
+        [sys.executable, EXAMPLE, tmp_path / "h1.onnx", "--clip", "renamed"], capture_output=True, text=True, check=True
     )
-    assert "b: bodies were 0." in done.stdout
+    assert "renamed: bodies were 0." in done.stdout
 
 
 def test_tables_of_the_package_are_those_of_its_models():

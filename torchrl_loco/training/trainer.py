@@ -447,10 +447,11 @@ class Trainer:
                 "train anew"
             )
         cases = list(self._base.cases().items())
-        if (old := checkpoint.get("cases", cases)) != cases:  # the state of the worlds points into other tables
+        old = checkpoint.get("cases", cases)
+        if [steps for _, steps in old] != [steps for _, steps in cases]:  # the worlds' state points into other tables
             of = [f"{', '.join(name for name, _ in each[:3])}{' ...' * (len(each) > 3)}" for each in (old, cases)]
             raise ValueError(
-                f"{self.run.path} is a run of {len(old)} cases, {of[0]}, and not of {len(cases)}, {of[1]}: train "
+                f"{self.run.path} is a run of {len(old)} case(s), {of[0]}, and not of {len(cases)}, {of[1]}: train "
                 "anew, with its weights by --init"
             )
         terms = checkpoint.get("terms", self._terms)
