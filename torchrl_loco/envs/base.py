@@ -305,18 +305,11 @@ class LocoEnv(Task, WorldAccess, QuickResets):
     def _step_part(self, tensordict: TensorDictBase, action: torch.Tensor, part: torch.Tensor) -> TensorDictBase:
         """Returns the results of a step of the worlds of a mask ``(num_envs,)``; of the others, what they began with.
 
-        The worlds cannot be stepped apart: the others are stepped too, without control, and put back.
-
-        Raises:
-            ValueError: the task adapts what all worlds share.
+        The worlds cannot be stepped apart: the others are stepped too, without control, and put back. What all share
+        stays, unless all are stepped.
         """
-        if "adapt" in self.hooks.own:
-            raise ValueError(
-                f"{type(self).__name__} cannot step some worlds alone ('_step'): what all share would adapt to "
-                "the others too, as if they had stepped"
-            )
         before, held = self.get_state(), ~part.to(self.device)
-        self.world.step(action.masked_fill(held.unsqueeze(-1), 0.0))
+        self.world.step(action.masked_fill(held.unsqueeze(-1), 0.0), adapts=not held.any())
         after = self._outputs(with_reward=True)
         self._set_state(before, held)
         stay = self._skip_tensordict(tensordict.select(*self.full_done_spec, *self.full_observation_spec, strict=False))

@@ -170,7 +170,8 @@ class Task:
     def adapt(self, s: View) -> Mapping[str, torch.Tensor]:
         """Returns new values of :attr:`shared` by name, after the events; it alone may sum over worlds.
 
-        ``s.terminated`` tells whose episode has ended. Sums of floats have a fixed order, so that runs repeat.
+        ``s.terminated`` tells whose episode has ended. Sums of floats have a fixed order, so that runs repeat. A step
+        of some worlds alone (TorchRL's ``"_step"``) does not call it: the others have not stepped.
         """
         return {}
 

@@ -79,7 +79,7 @@ class World:
     """
 
     def __init__(self, task: "LocoEnv", mj_model: mujoco.MjModel) -> None:
-        self._closed = True  # until it is made in full
+        self._closed, self._adapts = True, True  # closed until it is made in full
         n, nu, hooks = task.num_envs, mj_model.nu, task.hooks
         self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own
         self._title, self._variation = type(task).__name__, task.variation
@@ -140,7 +140,8 @@ class World:
         self._control()  # own control(): actions to controls
         self._physics(*action)  # default control; the substeps; fused reward and observation
         self._judge()  # update(), reward(), terminated(), truncated(), metrics(), events()
-        self._adapt()  # adapt(): what worlds share
+        if self._adapts:
+            self._adapt()  # adapt(): what worlds share
         self._move()  # poses and velocities again, if events() changed the state
         self._observe()  # observation(); worlds that are not finite
         self._conclude()  # time limit, flags, counters
@@ -295,7 +296,7 @@ class World:
         self._move = self._keeping_what_was(sim.capture(self._launch_move)) if hooks.moves else _nothing
         if self.seen:
             self._draw, self._draw_begun = map(sim.capture, self._everywhere_and_begun(self.seen))
-        self._run_step = self._as_graph("_take_step", several=bool(own or self.seen or self._guard))
+        self._run_step = self._as_graph("_take_step", several=bool(own or self.seen))
         self._run_reset = self._as_graph("_begin_masked", several=bool(own or self.seen) or variation is not None)
 
     def _scan_first(self, scanning: Collection[str]) -> None:
@@ -385,8 +386,8 @@ class World:
 
     # What the environment calls. Nothing waits for the device but the first refresh, which is recorded then.
 
-    def step(self, action: torch.Tensor) -> None:
-        """Steps all worlds under actions of shape ``(nworld, nu)``."""
+    def step(self, action: torch.Tensor, *, adapts: bool = True) -> None:
+        """Steps all worlds under actions of shape ``(nworld, nu)``; ``adapts`` tells if what they share follows."""
         action = action.detach()  # else the buffer would keep every past policy's autograd graph
         if torch_is_recording(self.sim.device):
             if self._own or self._guard:  # which read the buffer
@@ -396,7 +397,14 @@ class World:
                 self._take_step(wp.from_torch(action.float().contiguous()))
             return
         self.action.torch.copy_(action)
-        self._run_step()
+        if adapts:
+            self._run_step()
+        else:  # as it is recorded, it adapts
+            self._adapts = False
+            try:
+                self._take_step()
+            finally:
+                self._adapts = True
         self.poll()
 
     def reset(self, mask: torch.Tensor | None, stagger: bool) -> None:

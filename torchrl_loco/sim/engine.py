@@ -79,5 +79,6 @@ class Engine(abc.ABC):
     def forward(self, mask: wp.array, around: Around, *, contacts: bool = True) -> None:
         """Updates poses and sensors where ``mask`` ``(nworld,)`` is set, those of forces without control.
 
-        Numbers of the model that were changed there count from now on.
+        Numbers of the model that were changed there count from now on. Without ``contacts`` the forces of the geoms
+        that were asked for stay as they are.
         """

@@ -31,7 +31,8 @@ ROW_ALIGNED = 16  # bytes at a multiple of which each entry of a row of steps be
 class Algorithm(ABC):
     """Improves an actor on one batch after another.
 
-    A subclass sets ``config_type`` and ``metric_names``, and in ``__init__`` ``actor`` and ``networks``; it turns a
+    A subclass sets ``config_type`` and ``metric_names``, and in ``__init__`` ``actor`` and ``networks``, which are
+    saved: of ``norms``, which follow the observations, those belong there that the actor does not hold. It turns a
     batch into what gradient steps need (:meth:`prepare`) and makes one gradient step (:meth:`gradient_step`).
 
     Args:
@@ -149,6 +150,12 @@ class Algorithm(ABC):
         """Returns a function of tensors as kernels of torch.compile on CUDA, if the settings ask for that.
 
         Between the matrix products of small networks, torch spends most of a step reading and writing activations.
+
+        Args:
+            function: takes and returns tensors.
+            what: what it is, for the error that says that torch.compile cannot trace it.
+            bf16: whether it computes in bfloat16 on CUDA, compiled or not.
+            options: further ones of torch.compile.
         """
 
         def in_bf16(*args: Any) -> Any:

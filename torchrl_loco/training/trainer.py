@@ -447,9 +447,11 @@ class Trainer:
                 "train anew"
             )
         cases = list(self._base.cases().items())
-        old = checkpoint.get("cases", cases)
-        if [steps for _, steps in old] != [steps for _, steps in cases]:  # the worlds' state points into other tables
-            of = [f"{', '.join(name for name, _ in each[:3])}{' ...' * (len(each) > 3)}" for each in (old, cases)]
+        old = [(name, steps) for name, steps in checkpoint.get("cases", cases)]
+        renamed = [steps for _, steps in old] == [steps for _, steps in cases] and not was_edited
+        if old != cases and not renamed:  # the state of the worlds points into other tables
+            named = [[f"{name} ({steps} steps)" for name, steps in each] for each in (old, cases)]
+            of = [f"{', '.join(each[:3])}{' ...' * (len(each) > 3)}" for each in named]
             raise ValueError(
                 f"{self.run.path} is a run of {len(old)} case(s), {of[0]}, and not of {len(cases)}, {of[1]}: train "
                 "anew, with its weights by --init"

@@ -68,7 +68,15 @@ class GymnasiumEnv(common.Wrapped, Env):
         self._td: TensorDictBase | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begins a new episode, as that of :class:`GymnasiumVectorEnv` does; there are no options."""
+        """Begins a new episode.
+
+        Args:
+            seed: decides all later draws too; ``None`` goes on with the random stream.
+            options: ignored.
+
+        Returns:
+            The observation, and an empty dictionary.
+        """
         super().reset(seed=seed)
         if seed is not None:
             self.env.set_seed(seed)
@@ -212,7 +220,11 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
         return data if self._torch else common.to_numpy(data)
 
     def render(self) -> tuple[np.ndarray, ...]:
-        """Returns the current picture of each world, uint8 ``(height, width, 3)``; worlds that were done are new."""
+        """Returns the current picture of each world, uint8 ``(height, width, 3)``; worlds that were done are new.
+
+        Raises:
+            ValueError: the environment was made without ``render_mode="rgb_array"``.
+        """
         if self.render_mode is None:
             raise ValueError('nothing can be rendered: make the environment with render_mode="rgb_array"')
         return tuple(self._pictures())

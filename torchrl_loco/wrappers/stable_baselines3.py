@@ -83,11 +83,11 @@ class StableBaselines3VecEnv(common.Wrapped, VecEnv):
         return [getattr(self, attr_name) for _ in worlds]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuses."""
+        """Raises NotImplementedError."""
         raise NotImplementedError(f"{attr_name!r} cannot be set in single worlds, which are no objects: set it in .env")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Refuses."""
+        """Raises NotImplementedError."""
         raise NotImplementedError(f"{method_name}() cannot be called in single worlds, which are no objects: use .env")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:

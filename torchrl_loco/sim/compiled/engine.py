@@ -56,10 +56,11 @@ Arrays: Any = wp.struct(type("Arrays", (), {"__annotations__": WORLD_ARRAYS}))
 class Data:
     """The state of all worlds, and what an observation reads.
 
-    Names and units are those of the views of :class:`torchrl_loco.sim.Simulation`, types those of ``ROWS``, with a
-    row for each world. ``cvel`` and ``subtree_com`` are computed if they were asked for before the first step, as an
-    environment's ``observation_func`` does; rows of ``subtree_com`` but those of roots are zero. ``contact_force`` and
-    ``in_contact`` are of the geoms that were asked for, substep by substep.
+    Names and units are those of the views of :class:`torchrl_loco.sim.Simulation`, with a row for each world: vec3 for
+    points and forces, mat33 for ``xmat``, spatial_vector for ``cvel``. ``cvel`` and ``subtree_com`` are computed if
+    they were asked for before the first step, as an environment's ``observation_func`` does; rows of ``subtree_com``
+    but those of roots are zero. ``contact_force`` and ``in_contact`` are ``(nworld, contact_rows * geoms)``, of the
+    geoms that were asked for, substep by substep.
     """
 
     def __init__(self, setup: Setup) -> None:
