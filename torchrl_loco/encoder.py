@@ -12,7 +12,7 @@ ALIGNED = 8
 
 
 class PixelEncoder(nn.Module):
-    """Makes features of pixels of a shape, height, width and channels, on CUDA in bfloat16.
+    """Makes features of pixels ``(height, width, channels)``, on CUDA in bfloat16.
 
     It sees what differs from the mean picture: what is the same in all of them would drown the rest, and actors would
     act alike in all states.

@@ -97,7 +97,7 @@ def test_a_network_that_cannot_be_saved_is_refused_before_the_first_frame(tmp_pa
 
 
 @for_each("algorithm", ["ppo", "reppo"])
-def test_a_wrong_network(algorithm, tmp_path):
+def test_a_wrong_network(algorithm, tmp_path, capsys):
     cases = [
         (elu(24, 6), TypeError, "must be a function of the numbers of inputs and outputs .* got Sequential"),
         (lambda inputs: elu(inputs, 6), TypeError, "cannot be called with two numbers: too many"),
@@ -113,6 +113,7 @@ def test_a_wrong_network(algorithm, tmp_path):
         with pytest.raises(error, match=message):
             train("walker_stand", network=network, algorithm=algorithm, device="cpu", out=tmp_path, **QUICK)
     assert list(tmp_path.iterdir()) == []
+    assert "run folder" not in capsys.readouterr().out  # which would name one that is gone
 
 
 def test_objects_are_handed_in_again_where_a_run_goes_on(tmp_path, capsys):

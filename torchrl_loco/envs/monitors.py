@@ -210,7 +210,7 @@ class NanGuard(Monitor):
         a["steps"].add_(goes_on)
 
     def numbers(self) -> torch.Tensor:
-        """Returns the step in which a world was lost first, times the number of worlds, and its index added."""
+        """Returns ``step * num_envs + world`` of the first loss, ``NEVER`` if there was none, shape ``(1,)``."""
         worlds = torch.arange(len(self._passed), device=self._passed.device)
         order = self._passed.long() * len(worlds) + worlds
         return torch.where(self._lost > 0, order, NEVER).min().view(1)

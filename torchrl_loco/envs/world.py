@@ -79,7 +79,7 @@ class World:
     """
 
     def __init__(self, task: "LocoEnv", mj_model: mujoco.MjModel) -> None:
-        self._closed, self._adapts = True, True  # closed until it is made in full
+        self._closed = True  # until it is made in full
         n, nu, hooks = task.num_envs, mj_model.nu, task.hooks
         self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own
         self._title, self._variation = type(task).__name__, task.variation
@@ -134,13 +134,13 @@ class World:
 
     # The control step and the reset, from top to bottom. Each line is a recorded launch, a part of hooks, or nothing.
 
-    def _take_step(self, *action: wp.array) -> None:
+    def _take_step(self, *action: wp.array, adapts: bool = True) -> None:
         """The control step: under the actions in the buffer, unless torch records it with others."""
         self._keep()  # what the step begins with, for the NaN guard
         self._control()  # own control(): actions to controls
         self._physics(*action)  # default control; the substeps; fused reward and observation
         self._judge()  # update(), reward(), terminated(), truncated(), metrics(), events()
-        if self._adapts:
+        if adapts:
             self._adapt()  # adapt(): what worlds share
         self._move()  # poses and velocities again, if events() changed the state
         self._observe()  # observation(); worlds that are not finite
@@ -387,24 +387,20 @@ class World:
     # What the environment calls. Nothing waits for the device but the first refresh, which is recorded then.
 
     def step(self, action: torch.Tensor, *, adapts: bool = True) -> None:
-        """Steps all worlds under actions of shape ``(nworld, nu)``; ``adapts`` tells if what they share follows."""
+        """Steps all worlds under actions of shape ``(nworld, nu)``; ``adapts`` tells whether ``adapt`` is called."""
         action = action.detach()  # else the buffer would keep every past policy's autograd graph
         if torch_is_recording(self.sim.device):
             if self._own or self._guard:  # which read the buffer
                 self.action.torch.copy_(action)
-                self._take_step()
+                self._take_step(adapts=adapts)
             else:
                 self._take_step(wp.from_torch(action.float().contiguous()))
             return
         self.action.torch.copy_(action)
         if adapts:
             self._run_step()
-        else:  # as it is recorded, it adapts
-            self._adapts = False
-            try:
-                self._take_step()
-            finally:
-                self._adapts = True
+        else:  # the recording adapts
+            self._take_step(adapts=False)
         self.poll()
 
     def reset(self, mask: torch.Tensor | None, stagger: bool) -> None:

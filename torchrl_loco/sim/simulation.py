@@ -329,7 +329,7 @@ def say_what_is_only_seen(mj_model: mujoco.MjModel) -> None:
 
 
 def check_geoms(mj_model: mujoco.MjModel, geoms: Sequence[int]) -> tuple[int, ...]:
-    """Returns ids of geoms, or raises ValueError: one is out of range or named twice."""
+    """Returns ids of geoms; raises ValueError if one is out of range or named twice."""
     ids = tuple(map(operator.index, geoms))
     wrong = [geom for geom in ids if not 0 <= geom < mj_model.ngeom]
     if wrong:
@@ -341,7 +341,7 @@ def check_geoms(mj_model: mujoco.MjModel, geoms: Sequence[int]) -> tuple[int, ..
 
 
 def choose_engine(mj_model: mujoco.MjModel, config: SimConfig, varied: Varied | None = None) -> tuple[str, str]:
-    """Returns the name of the engine that steps a model, and why, or raises ValueError: that of ``config`` cannot."""
+    """Returns the name of the engine that steps a model, and why; raises ValueError if that of ``config`` cannot."""
     if config.engine in ("mujoco_warp", "mujoco"):
         return config.engine, "as asked"
     missing = compiled.unsupported(mj_model, varied)

@@ -538,7 +538,7 @@ def preset(
 
 
 def check_setting(what: str, name: str, kind: type[TrainingConfig]) -> None:
-    """Checks that a name is that of a setting; the message names the settings."""
+    """Checks that a name is that of a setting; the error names the settings."""
     check_choice(what, name, [field.name for field in dataclasses.fields(kind) if field.name != "task"])
 
 

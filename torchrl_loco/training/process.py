@@ -13,7 +13,7 @@ _held: dict[Path, int] = {}  # file descriptors of the locks of this process, by
 
 
 def lock(folder: Path) -> bool:
-    """Returns whether it takes the lock of a folder: this process may have it. The system frees it when that ends."""
+    """Takes the lock of a folder, which the system frees when this process ends; returns False if it has it already."""
     folder = folder.resolve()
     file = folder / "lock"
     if folder in _held:

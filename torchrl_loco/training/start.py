@@ -192,21 +192,21 @@ def begin(config: TrainingConfig, given: "Given | None" = None) -> Trainer:
         The trainer, which has collected nothing yet. Where it cannot be made, no folder is left.
     """
     given = given or Given()
-    path, note_on_path = Path(), ""
+    path, continues = Path(), ""
     if distributed.is_first():
         began = RunFolder.of_launch(config) if distributed.is_restart() else None
         if began is None and given.env is None and (note := tuning_note(config)):
             print(note)
         path = (began or RunFolder.create(config, given.names)).path
-        note_on_path = ", which torchrun continues after a failure" if began else ""
+        continues = ", which torchrun continues after a failure" if began else ""
     run = RunFolder(distributed.from_first(path))
     had_checkpoint = run.has_checkpoint
     try:
-        trainer = Trainer(run, resume=had_checkpoint, given=given)
+        return Trainer(run, resume=had_checkpoint, given=given)
     except BaseException:
         if distributed.ranks() == 1 and not had_checkpoint:  # an empty run folder is of no use
             shutil.rmtree(run.path)
         raise
-    if distributed.is_first():
-        print(f"run folder: {run.path}{note_on_path}", flush=True)
-    return trainer
+    finally:
+        if distributed.is_first() and run.path.exists():
+            print(f"run folder: {run.path}{continues}", flush=True)

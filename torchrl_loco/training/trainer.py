@@ -447,7 +447,7 @@ class Trainer:
                 "train anew"
             )
         cases = list(self._base.cases().items())
-        old = [(name, steps) for name, steps in checkpoint.get("cases", cases)]
+        old = checkpoint.get("cases", cases)
         renamed = [steps for _, steps in old] == [steps for _, steps in cases] and not was_edited
         if old != cases and not renamed:  # the state of the worlds points into other tables
             named = [[f"{name} ({steps} steps)" for name, steps in each] for each in (old, cases)]
