@@ -6,6 +6,7 @@ import pytest
 import torch
 import warp as wp
 from for_each import for_each
+from tensordict import TensorDict
 from torchrl.envs import CatFrames, Compose, ToTensorImage
 from torchrl.envs.utils import check_env_specs
 
@@ -86,7 +87,7 @@ def test_depth_and_geoms_are_those_of_rays_of_c_mujoco(camera, device):
     m, device = shapes(), wp.get_device(device)
     eye = Eye(m, device, camera, WIDTH, HEIGHT, 2, ("rgb", "depth", "geoms"), far=1e3)
     eye.depth.fill_(torch.nan)
-    assert 2 * bytes_placed(m) == sum(each.capacity for each in (eye._placed.poses, eye._placed.bounds))
+    assert 2 * bytes_placed(m) == sum(each.capacity for each in (eye.placed.poses, eye.placed.bounds))
     data, rng = mujoco.MjData(m), np.random.default_rng(1)
     poses = []
     for _ in range(2):
@@ -223,6 +224,37 @@ def test_pixels_are_entries_that_hold_what_they_held(device):
     check_env_specs(alone)
     assert torch.equal(other["pixels"][0], kept[0])
     assert other["depth"].max() == 8.0
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@for_each("stack", [1, 2])
+def test_what_is_written_into_pixels_is_seen_nowhere_else(device, stack):
+    """Into those of a step, of what the next begins with, of resets and states; masked worlds are drawn onto others."""
+    options = {"from_pixels": True, "depth": 8.0, "size": (24, 16), "episode_length": 3, "frame_stack": stack}
+    env, plain = (loco.make("walker_walk", 3, device, 0, **options) for _ in range(2))
+    generator = torch.Generator().manual_seed(0)
+
+    def alike(ours, expected):
+        for key in {"pixels", "depth", "pictures"} & set(ours.keys()):
+            assert torch.equal(ours[key], expected[key])
+            ours[key].fill_(7)
+
+    rows = torch.tensor([[True], [False], [True]], device=env.device)
+    reset = TensorDict({"_reset": rows}, batch_size=[3])
+    td, other = env.reset(), plain.reset()
+    for i in range(8):
+        alike(td, other)
+        action = (torch.rand(3, 6, generator=generator) * 2 - 1).to(env.device)
+        if i % 4 == 2:
+            ours, theirs = (each.step(now.set("action", action)) for each, now in ((env, td), (plain, other)))
+            alike(ours["next"], theirs["next"])
+            td, other = env._reset(reset.clone()), plain._reset(reset.clone())
+        else:
+            ours, td = env.step_and_maybe_reset(td.set("action", action))
+            theirs, other = plain.step_and_maybe_reset(other.set("action", action))
+            alike(ours["next"], theirs["next"])
+        alike(env.get_state(), plain.get_state())
+    alike(env.reset(env.get_state(), set_state=True), other)
 
 
 def test_transforms_of_torchrl_stack_and_turn_them():

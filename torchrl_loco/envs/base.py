@@ -1,13 +1,14 @@
 """LocoEnv, the base of all environments: TorchRL's specs, step, reset, seeding and state."""
 
 import dataclasses
+import functools
 import inspect
 import logging
 import math
 import multiprocessing
 import os
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from torchrl_loco.config import sim_config
 from torchrl_loco.envs.access import WorldAccess
 from torchrl_loco.envs.hooks import Hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
-from torchrl_loco.envs.pixels import Pixels
+from torchrl_loco.envs.pixels import Pictures, Pixels, Seen
 from torchrl_loco.envs.resets import QuickResets, rows_of
 from torchrl_loco.envs.state import without_state
 from torchrl_loco.envs.task import BOUNDED, Task, folder_of, replaced_options
@@ -190,7 +191,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         self.action_range = check_pair("action_range", self.action_range)  # a class may have a list or an array
         self.on_overflow, self.nan_dump = on_overflow, nan_dump
         self._action_shape = torch.Size([*self.batch_size, mj_model.nu])
-        replaceable = ("step", "_reset", "maybe_reset")
+        replaceable = ("step", "_step", "_reset", "maybe_reset")
         self._steps_as_base = all(getattr(type(self), name) is getattr(LocoEnv, name) for name in replaceable)
         self._pid = os.getpid()
         self._world, self._episodes, self._stage = None, None, {}
@@ -300,7 +301,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         if part is not None:
             return self._step_part(tensordict, action, part.reshape(self.num_envs))
         self.world.step(action)
-        return self._outputs(with_reward=True)
+        return self._outputs(Seen.step, with_reward=True)
 
     def _step_part(self, tensordict: TensorDictBase, action: torch.Tensor, part: torch.Tensor) -> TensorDictBase:
         """Returns the results of a step of the worlds of a mask ``(num_envs,)``; of the others, what they began with.
@@ -310,12 +311,15 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         """
         before, held = self.get_state(), ~part.to(self.device)
         self.world.step(action.masked_fill(held.unsqueeze(-1), 0.0), adapts=not held.any())
-        after = self._outputs(with_reward=True)
+        after = self._outputs(Seen.step, with_reward=True)
         self._set_state(before, held)
         stay = self._skip_tensordict(tensordict.select(*self.full_done_spec, *self.full_observation_spec, strict=False))
         return after.apply(lambda new, old: torch.where(rows_of(held.view(*self.batch_size, 1), new), old, new), stay)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, others: bool = True
+    ) -> TensorDictBase:
+        """Returns what follows a reset; without ``others``, with the pixels of the worlds of the mask alone."""
         self._refuse_after_fork()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is not None:
@@ -333,10 +337,13 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         else:
             self.world.reset(mask, stagger=self.stagger and mask is None)
         everywhere = torch.ones((*self.batch_size, 1), dtype=torch.bool, device=self.device)
-        return self._outputs(unrewarded=everywhere)
+        look = functools.partial(Seen.begin, last=None if others else {}, restored=set_state)
+        return self._outputs(look, unrewarded=everywhere)
 
-    def _outputs(self, *, with_reward: bool = False, unrewarded: torch.Tensor | None = None) -> TensorDict:
-        """Returns a copy of what the kernels wrote: the buffers themselves change at the next step.
+    def _outputs(
+        self, look: Callable[[Seen], Pictures], *, with_reward: bool = False, unrewarded: torch.Tensor | None = None
+    ) -> TensorDict:
+        """Returns a copy of what the kernels wrote, as the buffers themselves change at the next step, and pixels.
 
         Terms of the reward, and metrics, are zero in the worlds ``unrewarded``, ``(*batch, 1)``.
         """
@@ -344,8 +351,8 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         *groups, reward, terms, metrics, flags = outputs.parts(outputs.memory.clone())
         done, terminated, truncated = flags.view(3, *batch, 1).unbind()
         entries = {"done": done, "terminated": terminated, "truncated": truncated}
-        if self.pixels:
-            entries |= self.pixels.entries(self.world.seen, batch)
+        if seen := self.world.seen:
+            entries |= {key: image.view(*batch, *image.shape[1:]) for key, image in look(seen).items()}
         if not (self.pixels and self.pixels.only):
             for (name, shape), group in zip(self.groups.items(), groups, strict=True):
                 entries[name] = group.view(*batch, *shape)

@@ -7,19 +7,21 @@ from typing import Any
 import mujoco
 import torch
 import warp as wp
+from tensordict import TensorDictBase
 from torchrl.data import Bounded
 
 from torchrl_loco.checks import Interval, check_bool, check_choice, check_float, check_int, checked_size
 from torchrl_loco.eyes.placing import bytes_placed
-from torchrl_loco.eyes.tracer import Eye
-from torchrl_loco.sim import Buffer, Simulation
+from torchrl_loco.eyes.tracer import Color, Eye
+from torchrl_loco.sim import EXCLUSIVE, Simulation, current_stream
 from torchrl_loco.sim.simulation import check_memory
 
 SIZE = (84, 84)  # width and height of pixels, those of dm_control's benchmarks from pixels
 KEYS = {"rgb": "pixels", "depth": "depth"}  # keys of what is drawn
 COPIES_IN_STEP = 3
-"""How often pixels lie in memory: where they are drawn, in what a step returns, and in what the next begins with."""
+"""How often pixels lie in memory: in what a step begins with, in what it returns, and in what the next begins with."""
 DEPTHS = Interval(0, float("inf"))
+Pictures = dict[str, torch.Tensor]  # what is seen in all worlds by key, (worlds, height, width, ...)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,8 +54,9 @@ class Pixels:
         if given["frame_stack"] is not None and not with_rgb:
             raise ValueError("frame_stack needs from_pixels=True: depth is not stacked")
         stack = 1 if given["frame_stack"] is None else check_int("frame_stack", given["frame_stack"])
-        of_pixel = sum({"rgb": 3 * stack, "depth": 4}[kind] for kind in kinds)
-        check_memory(num_envs * (COPIES_IN_STEP * width * height * of_pixel + bytes_placed(m)), num_envs, device)
+        of_pixel = COPIES_IN_STEP * sum({"rgb": 3 * stack, "depth": 4}[kind] for kind in kinds)
+        of_pixel += 3 * stack * (stack > 1)  # Seen.stack
+        check_memory(num_envs * (width * height * of_pixel + bytes_placed(m)), num_envs, device)
         return cls(camera, width, height, kinds, far, stack, only)
 
     @property
@@ -70,10 +73,12 @@ class Pixels:
         seen = {"camera": name, "size": (self.width, self.height), "frame_stack": self.stack}
         return {**seen, **({"critic_from_pixels": True} if self.only else {})}
 
-    def seen(self, sim: Simulation, mask: Buffer) -> "Seen":
-        """Returns what draws them, and keeps them; ``mask`` tells in which worlds episodes begin."""
-        size = self.width, self.height, sim.num_envs, self.kinds
-        return Seen(sim, mask, Eye(sim.mj_model, sim.device, self.camera, *size, far=self.far), self.stack)
+    def seen(self, sim: Simulation, mask: torch.Tensor) -> "Seen":
+        """Returns what draws them; ``mask`` tells in which worlds episodes begin."""
+        n, size = sim.num_envs, (self.width, self.height)
+        eye = Eye(sim.mj_model, sim.device, self.camera, *size, n, self.kinds, far=self.far, keeps=False)
+        specs = dataclasses.replace(self, stack=1).specs(torch.Size([n]), sim.qpos.device)
+        return Seen(sim, mask, eye, specs, self.stack)
 
     def specs(self, batch: torch.Size, device: torch.device) -> dict[str, Bounded]:
         """Returns the specs of the entries by key."""
@@ -81,15 +86,6 @@ class Pixels:
         rgb = Bounded(0, 255, (*batch, *size, 3 * self.stack), dtype=torch.uint8, device=device)
         depth = Bounded(0.0, self.far, (*batch, *size), dtype=torch.float32, device=device)
         return {KEYS[kind]: {"rgb": rgb, "depth": depth}[kind] for kind in self.kinds}
-
-    def entries(self, seen: "Seen | None", batch: torch.Size) -> dict[str, torch.Tensor]:
-        """Returns copies of what is drawn, by key."""
-        assert seen is not None
-        return {
-            KEYS[kind]: image.clone().view(*batch, *image.shape[1:])
-            for kind, image in (("rgb", seen.stack), ("depth", seen.eye.depth))
-            if kind in self.kinds
-        }
 
 
 def checked_camera(m: mujoco.MjModel, camera: str | int | None) -> int:
@@ -103,29 +99,59 @@ def checked_camera(m: mujoco.MjModel, camera: str | int | None) -> int:
 
 
 class Seen:
-    """What ``eye`` draws in all worlds: ``stack`` has the last ``count`` pictures, the newest last.
+    """What ``eye`` sees in all worlds: entries of an environment by key, drawn into new memory at each call.
 
-    It is uint8 ``(worlds, height, width, 3 * count)``; after a reset all are the first one.
+    ``specs`` are those of one picture. ``stack`` keeps the last ``count`` of them, if they are several: uint8
+    ``(worlds, height, width, 3 * count)``, the newest last; after a reset all are the first one.
     """
 
-    def __init__(self, sim: Simulation, mask: Buffer, eye: Eye, count: int) -> None:
-        self._sim, self._mask, self.eye, self.count = sim, mask, eye, count
-        self.stack = eye.rgb if count == 1 else eye.rgb.repeat(1, 1, 1, count)
+    def __init__(self, sim: Simulation, mask: torch.Tensor, eye: Eye, specs: Mapping[str, Bounded], count: int) -> None:
+        self._sim, self._mask, self.eye, self._specs, self._count = sim, mask, eye, specs, count
+        self.stack = specs["pixels"].zero().repeat(1, 1, 1, count) if count > 1 else None
 
     def launch(self, mask: wp.array | None = None) -> None:
-        """Launches what draws the worlds of a mask, all of them for ``None``."""
-        self.eye.launch(self._sim.data.xpos, self._sim.data.xmat, mask)
+        """Launches what comes before drawing in the worlds of a mask, in all of them for ``None``."""
+        self.eye.placed.launch(self._sim.data.xpos, self._sim.data.xmat, mask)
 
-    def append(self) -> None:
-        """Adds what was drawn of all worlds."""
-        if self.count > 1:
-            self.stack.copy_(torch.cat([self.stack[..., 3:], self.eye.rgb], dim=-1))
+    def step(self) -> Pictures:
+        """Returns what is seen after a step."""
+        new = {key: torch.empty(one.shape, dtype=one.dtype, device=one.device) for key, one in self._specs.items()}
+        self._draw(new)
+        if self.stack is not None:
+            new["pixels"] = torch.cat([self.stack[..., 3:], new["pixels"]], dim=-1)
+            self.stack.copy_(new["pixels"])
+        return new
 
-    def begin(self, kept: bool = False) -> None:
-        """Begins anew in the worlds of the mask with what was drawn; ``kept`` leaves earlier pictures, if any."""
-        if self.count > 1:
-            masked, begun = self._mask.torch.view(-1, 1, 1, 1), self.eye.rgb.repeat(1, 1, 1, self.count)
-            if kept:  # but the newest, as the state may have been changed
-                has = (self.stack != 0).flatten(1).any(dim=1).view(-1, 1, 1, 1)
-                begun = torch.where(has, torch.cat([self.stack[..., :-3], self.eye.rgb], dim=-1), begun)
-            self.stack.copy_(torch.where(masked, begun, self.stack))
+    def begin(self, last: Pictures | TensorDictBase | None, *, restored: bool = False) -> Pictures:
+        """Returns what is seen after a reset of the worlds of the mask.
+
+        The others are as in ``last``, what the step before it returned; without that all are drawn, and where it is
+        empty nobody reads them. ``restored`` leaves earlier pictures, if there are any, but the newest: the state may
+        have been changed.
+        """
+        onto = {} if last is None else {**last}
+        if self.stack is not None:
+            onto.pop("pixels", None)
+        new = {
+            key: onto[key].view(one.shape).clone() if key in onto else one.zero() for key, one in self._specs.items()
+        }
+        self._draw(new, None if last is None else self._mask)
+        if self.stack is not None:
+            new["pixels"] = self._begun(self.stack, new["pixels"], restored)
+            self.stack.copy_(new["pixels"])
+        return new
+
+    def _begun(self, stack: torch.Tensor, newest: torch.Tensor, restored: bool) -> torch.Tensor:
+        """Returns a stack of pictures in which those of the worlds of the mask are ``newest``."""
+        places, begun = stack.unflatten(-1, (self._count, 3)), self._mask.view(-1, 1, 1, 1, 1)
+        if restored:
+            last = torch.arange(self._count, device=stack.device) == self._count - 1
+            begun = begun & (last.unsqueeze(-1) | (places == 0).flatten(1).all(dim=1).view_as(begun))
+        return torch.where(begun, newest.unsqueeze(-2), places).flatten(-2)
+
+    def _draw(self, new: Pictures, mask: torch.Tensor | None = None) -> None:
+        """Draws the worlds of a mask, all of them for ``None``."""
+        tensors = (new.get("pixels"), Color), (new.get("depth"), wp.float32), (mask, wp.bool)
+        *out, where = (None if one is None else wp.from_torch(one, kind, return_ctype=True) for one, kind in tensors)
+        with EXCLUSIVE:  # the kernel is loaded and allocates nothing: torch may be recording
+            self.eye.draw([*out, None], where, current_stream(self._sim.device))

@@ -29,7 +29,8 @@ class QuickResets(EnvBase):
         after = self._step(tensordict)
         self.world.reset_masked()
         done = after.get("done")
-        begin = self._outputs(unrewarded=done)  # in the worlds that go on, nothing has changed
+        # In the worlds that go on, nothing has changed.
+        begin = self._outputs(lambda seen: seen.begin(after), unrewarded=done)
         # As in TorchRL, the policy's outputs are zero where a world was reset.
         for key, value in tensordict.items():
             if key not in begin and key not in rewritten and key != "reward":
@@ -78,7 +79,7 @@ def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBas
     """
     mask, batch = tensordict.get("done").clone(), tensordict.batch_size
     request = TensorDict({"_reset": mask}, batch_size=batch, device=tensordict.device)
-    fresh = env._reset(request, set_state=False)
+    fresh = env._reset(request, set_state=False, others=False)
 
     def merge(old: torch.Tensor, new: torch.Tensor | None) -> torch.Tensor:
         rows = rows_of(mask, old)

@@ -72,7 +72,7 @@ class World:
         terminated: whether the episode ended by the task's hook, or because the world is not finite, ``(nworld,)``.
         truncated: whether the episode reached the time limit, or the task's hook cut it off, ``(nworld,)``.
         seed: seed of all random streams, ``(1,)``.
-        seen: the pixels, if the environment returns any.
+        seen: what draws the pixels, if the environment returns any.
         health: counts what went wrong in the physics.
         kinds: by hook of the task in torch, how it runs: see ``Part.kind`` in ``part.py``.
         fixed: attributes of the task that were read when this was made, and never again.
@@ -110,7 +110,7 @@ class World:
             self._seed_of_hooks = torch.zeros(1, dtype=torch.long, device=task.device)
             self._stagger = Buffer(1, bool, device)
             self.mask.warp.fill_(True)
-            self.seen = task.pixels.seen(self.sim, self.mask) if task.pixels else None
+            self.seen = task.pixels.seen(self.sim, self.mask.torch) if task.pixels else None
 
             self.health = Health(self.sim, task.on_overflow)
             self._guard = None if task.nan_dump is None else NanGuard(task.nan_dump, self, task.settings())
@@ -145,7 +145,7 @@ class World:
         self._move()  # poses and velocities again, if events() changed the state
         self._observe()  # observation(); worlds that are not finite
         self._conclude()  # time limit, flags, counters
-        self._look()  # pixels
+        self._place()  # what lies before the camera, for pixels
 
     def _begin_masked(self) -> None:
         """A new episode in the worlds of the mask."""
@@ -154,19 +154,7 @@ class World:
         self._begin()  # begin(): pose and memory
         self._settle()  # poses and sensors; fused observation
         self._observe_begun()  # observation()
-        self._look_begun()  # pixels
-
-    # Pixels.
-
-    def _look(self) -> None:
-        if self.seen:
-            self._draw()
-            self.seen.append()
-
-    def _look_begun(self, *, restored: bool = False) -> None:
-        if self.seen:
-            self._draw_begun()
-            self.seen.begin(kept=restored)
+        self._place_begun()  # what lies before the camera, for pixels
 
     # What each world does besides the physics, in Warp.
 
@@ -280,7 +268,8 @@ class World:
         launches += [self._launch_rest] if own or variation else []
         launches += [self._launch_conclude] if own else []
         launches += self._everywhere_and_begun(self._scans) if self._scans.arrays else []
-        launches += self._everywhere_and_begun(self.seen) if self.seen else []
+        if self.seen:
+            launches += [*self._everywhere_and_begun(self.seen), functools.partial(self.seen.eye.draw, [None] * 3)]
         sim.compile(*launches, *([self._launch_move] if hooks.moves else []))
         for each in kernels:
             each.record(sim)
@@ -294,8 +283,9 @@ class World:
         self._rest = sim.capture(self._launch_rest) if own or variation else _nothing
         self._conclude = sim.capture(self._launch_conclude) if own else _nothing
         self._move = self._keeping_what_was(sim.capture(self._launch_move)) if hooks.moves else _nothing
+        self._place = self._place_begun = _nothing
         if self.seen:
-            self._draw, self._draw_begun = map(sim.capture, self._everywhere_and_begun(self.seen))
+            self._place, self._place_begun = map(sim.capture, self._everywhere_and_begun(self.seen))
         self._run_step = self._as_graph("_take_step", several=bool(own or self.seen))
         self._run_reset = self._as_graph("_begin_masked", several=bool(own or self.seen) or variation is not None)
 
@@ -308,7 +298,7 @@ class World:
                 part.before = begun if name in ("begin", "observe_begun", "observe_restored") else everywhere
 
     def _everywhere_and_begun(self, what: Scans | Seen) -> list[Callable[[], None]]:
-        """Returns the launches of scans or pixels in all worlds, and in those in which episodes begin."""
+        """Returns launches of scans, or of what pixels need, in all worlds, and in those in which episodes begin."""
         return [what.launch, functools.partial(what.launch, self.mask.warp)]
 
     def _streams(self, task: "LocoEnv") -> dict[str, torch.Tensor]:
@@ -438,7 +428,7 @@ class World:
         if self._variation is not None:
             columns = self._variation.columns
             physics |= {("model", name): sim.numbers[:, which] for name, which in columns.items()}
-        if self.seen and self.seen.count > 1:
+        if self.seen and self.seen.stack is not None:
             physics["pictures"] = self.seen.stack
         return {**physics, "elapsed_steps": self.elapsed_steps.torch, "episode": self.episode.torch}
 
@@ -455,7 +445,7 @@ class World:
         else:
             self._refresh_graph.replay()
         self._observe_restored()
-        self._look_begun(restored=True)
+        self._place_begun()
 
     @functools.cached_property
     def _refresh_graph(self) -> Graph:

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -304,6 +305,7 @@ class Eye:
         shadows: whether lights cast shadows.
         samples: rays along each side of a pixel, whose colors are averaged; depth and geoms are of the last.
         far: greatest depth (m).
+        keeps: whether it has memory for what :meth:`launch` and :meth:`look` draw; :meth:`draw` needs none.
 
     Attributes:
         rgb: colors, uint8 ``(worlds, height, width, 3)``.
@@ -327,32 +329,41 @@ class Eye:
         shadows: bool = False,
         samples: int = 1,
         far: float = 1.0e10,
+        keeps: bool = True,
     ) -> None:
         m, which = to_the_horizon(m), m.camera(camera).id
         self._device, half = device, math.tan(math.radians(m.cam_fovy[which] / 2.0))
         with EXCLUSIVE, wp.ScopedDevice(device):
-            self._placed = Placed(m, device, mounts_of(m, which, device), worlds)
+            self.placed = Placed(m, device, mounts_of(m, which, device), worlds)
             self._looks, self._view = looks_of(m, device), View()
             self._view.half, self._view.pixel = wp.vec2(half * width / height, half), 2.0 * half / height
             self._view.width, self._view.height, self._view.far = width, height, far
             tiles = across, down, times = TILES["cuda" if device.is_cuda else "cpu"]
             self._threads = worlds, math.ceil(width / across) * across * math.ceil(height / (down * times)) * down
             asked = (kind in kinds for kind in KINDS)
-            self._trace = tracer(*asked, shadows, self._placed.has_meshes, samples, tiles)
+            self._trace = tracer(*asked, shadows, self.placed.has_meshes, samples, tiles)
 
             def pixels(kind: str, dtype: Any) -> Buffer:
-                return Buffer((worlds, height, width) if kind in kinds else (0, 0, 0), dtype, device)
+                kept = keeps and kind in kinds
+                return Buffer((worlds, height, width) if kept else (0, 0, 0), dtype, device)
 
             self._out = [pixels(*one) for one in zip(KINDS, (Color, float, int), strict=True)]
         self.rgb, self.depth, self.geoms = (one.torch for one in self._out)
 
     def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array | None = None) -> None:
         """Launches the kernels, on Warp's current stream; arguments as of :meth:`Placed.launch`."""
-        placed, out = self._placed, [one.warp for one in self._out]
-        placed.launch(xpos, xmat, mask)
+        self.placed.launch(xpos, xmat, mask)
+        self.draw([one.warp for one in self._out], mask)
+
+    def draw(self, out: Sequence[Any], mask: wp.array | None = None, stream: wp.Stream | None = None) -> None:
+        """Launches what draws the shapes as ``placed`` has them, on a stream, ``None`` for Warp's current one.
+
+        ``out`` are arrays of all ``KINDS``, ``(worlds, height, width)``, ``None`` for those that are not told.
+        """
+        placed = self.placed
         where = [mask, placed.camera, *placed.lights, placed.poses, placed.bounds]
         inputs = [self._view, placed.shapes, self._looks, *where]
-        wp.launch(self._trace, self._threads, inputs, out, device=self._device)
+        wp.launch(self._trace, self._threads, inputs, out, device=self._device, stream=stream)
 
     def look(self, xpos: wp.array, xmat: wp.array) -> None:
         """Launches the kernels on torch's stream; arguments as of :meth:`launch`."""
