@@ -369,7 +369,8 @@ class World:
             except RuntimeError as error:
                 recorded = False
                 message = str(error).strip().split("\n")[0]
-                logging.getLogger("torchrl_loco").warning("a hook cannot be recorded as a CUDA graph: %s", message)
+                said = "a step or reset cannot be recorded as one CUDA graph, and takes longer: %s"
+                logging.getLogger("torchrl_loco").warning(said, message)
                 work()
 
         return run
