@@ -12,17 +12,6 @@ from pathlib import Path
 import torch
 import warp as wp
 
-
-def headers(runtime):
-    """Returns the folder of Warp's parsed header, one for all: parsing takes 1.5 s, by default in every thread.
-
-    Clang names it by the options that it depends on, and puts it there when it is complete.
-    """
-    folder = Path(wp.config.kernel_cache_dir, "headers")
-    folder.mkdir(parents=True, exist_ok=True)
-    return str(folder)
-
-
 plain = wp._src.build.build_cpu
 LONG = "wp_tracer", "wp_torchrl_loco.training.adam"
 """What is optimised: without, a picture takes 40 times as long, and so does a step of Adam."""
@@ -40,7 +29,7 @@ def build(obj_path, cpp_path, *args, **options):
     key = options["optimization_level"], options["block_dim"]
     if key in parsed:
         return plain(obj_path, cpp_path, *args, **options)
-    with Path(headers(None), "lock").open("a") as lock:
+    with Path(wp.config.kernel_cache_dir, "header.lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         try:
             plain(obj_path, cpp_path, *args, **options)
@@ -51,7 +40,6 @@ def build(obj_path, cpp_path, *args, **options):
 
 if not torch.cuda.is_available():
     wp._src.build.build_cpu = build
-    wp._src.context.Runtime.get_clang_pch_dir = headers
     wp._src.codegen.cpu_linear_contiguous_specialization_candidate = lambda adj, block_dim: False  # a second body each
     wp.config.optimization_level = 0
 

@@ -1,6 +1,8 @@
 """Warp starts without a word where there is no CUDA, unless something is wrong."""
 
 import os
+import threading
+from pathlib import Path
 
 import torch
 import warp as wp
@@ -15,3 +17,28 @@ def test_of_what_warp_says_only_the_missing_driver_is_left_out(monkeypatch, capf
     init_warp.__wrapped__()
     os.write(2, b"after\n")
     assert capfd.readouterr().err == "Warp error: no compiler\nafter\n"
+
+
+def test_threads_have_one_precompiled_header_beside_the_kernels():
+    init_warp()
+    folders = []
+
+    def compiled(value):
+        @wp.kernel(enable_backward=False, module="unique")
+        def fill(out: wp.array[int]):
+            out[wp.tid()] = wp.static(value)
+
+        out = wp.zeros(1, dtype=int, device="cpu")
+        wp.launch(fill, 1, outputs=[out], device="cpu")
+        assert out.numpy() == value
+        folders.append(wp._src.context.runtime.get_clang_pch_dir())
+
+    threads = [threading.Thread(target=compiled, args=[value]) for value in (3, 4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(folders) == 2
+    assert len({*folders}) == 1
+    assert [*Path(folders[0]).glob("*.pch")]
+    assert Path(folders[0]).parent == Path(wp.config.kernel_cache_dir)

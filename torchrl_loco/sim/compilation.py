@@ -2,7 +2,6 @@
 
 import contextlib
 import fcntl
-import functools
 import os
 import threading
 import zlib
@@ -29,24 +28,17 @@ def compile_kernels(launches: Iterable[Callable[[], None]], device: wp.Device) -
     with wp.ScopedDevice(device), _collecting() as variants:
         for launch in launches:
             launch()
-    pool = _threads(os.getpid())
+    pool = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="compile")
     with tqdm(total=len(variants), desc=f"compiling for {device}", unit="module", delay=SHOW_AFTER, leave=False) as bar:
-        for loaded in as_completed([pool.submit(_load, module, device, block_dim) for module, block_dim in variants]):
-            loaded.result()
-            bar.update()
+        try:
+            for loaded in as_completed([pool.submit(_load, *variant, device) for variant in variants]):
+                loaded.result()
+                bar.update()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
-@functools.cache
-def _threads(process: int) -> ThreadPoolExecutor:
-    """Returns the threads that compile in a process; a child that was forked has none of its parent's.
-
-    They are kept, because Warp parses its own header anew in each thread: on a CPU that takes as long as compiling a
-    small kernel ten times.
-    """
-    return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="compile")
-
-
-def _load(module: wp.Module, device: wp.Device, block_dim: int) -> None:
+def _load(module: wp.Module, block_dim: int, device: wp.Device) -> None:
     with one_process(module.name):
         module.load(device, block_dim)
 
