@@ -22,8 +22,10 @@ parsed = set()
 def build(obj_path, cpp_path, *args, **options):
     """Compiles a kernel.
 
-    The first that needs the header with its options lets all others wait, in this process and in others.
+    The first that needs the header with its options lets all others wait, in this process and in others. It
+    instantiates the templates that the header uses itself: by default each kernel does, 0.06 s long, for the same code.
     """
+    options["extra_flags"] += " -fpch-instantiate-templates"
     if Path(cpp_path).name.startswith(LONG):
         options["optimization_level"] = 2
     key = options["optimization_level"], options["block_dim"]
