@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cases import ENGINES, KINDS, TASKS
+from cases import ENGINES, KINDS, TASKS, coarse
 from compare import assert_repeats
 from for_each import for_each
 from hook_tasks import WalkBackwards
@@ -110,7 +110,7 @@ def test_a_fallen_body_goes_on_until_1000_steps(shared):
 def test_batches(kind):
     task, protocol, engine = kind
     for num_envs in (1, 300):
-        env = torchrl_loco.make(task, num_envs, "cpu", 0, protocol, engine=engine)
+        env = torchrl_loco.make(task, num_envs, "cpu", 0, protocol, engine=engine, **coarse(task))
         td = env.rollout(3)
         assert td.shape == (num_envs, 3)
         assert td["next", "observation"].isfinite().all()
