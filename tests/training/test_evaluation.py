@@ -52,17 +52,20 @@ def test_evaluation_plays_full_episodes():
         torch.testing.assert_close(returns, expected.squeeze(-1), rtol=1e-4, atol=0)
 
     def policy(td):
-        """Ends the first world at its first step."""
+        """Ends some worlds at the first step."""
         assert exploration_type() is ExplorationType.DETERMINISTIC
         action = torch.zeros(2, 6)
-        action[0] = math.nan if calls == [] else 0.0
+        action[:ended] = math.nan if calls == [] else 0.0
         calls.append(1)
         return td.set("action", action)
 
-    calls = []
+    ended, calls = 1, []
     returns = evaluated(policy)
     assert returns[0] == 0.0
     torch.testing.assert_close(returns[1], expected[1, 0], rtol=1e-4, atol=0)
+    ended, calls = 2, []
+    assert (evaluated(policy) == 0.0).all()
+    assert len(calls) < EPISODE / 7  # it does not go on when all have ended
 
 
 @for_each("action_repeat", [1, 2])

@@ -35,7 +35,7 @@ SIZE = 480, 360  # width and height of videos
 
 
 class Evaluator:
-    """Plays full episodes without exploration, for the same seed the same ones.
+    """Plays full episodes without exploration, for the same seed the same ones, until the last one has ended.
 
     On CUDA the steps are recorded in the first evaluation, and then replayed: for another policy of the same kind, load
     its weights into this one. There is a world for each episode.
@@ -62,26 +62,26 @@ class Evaluator:
 
     def returns(self, seed: int) -> torch.Tensor:
         """Returns the return of each episode, shape ``(episodes,)``; ``seed`` decides their initial states."""
-        env = self.env
-        env.set_seed(seed)
+        self.env.set_seed(seed)
         self._collector.load_state_dict({})
-        returns = torch.zeros(env.num_envs, 1, device=env.device)
+        returns = torch.zeros(self.env.num_envs, 1, device=self.env.device)
         alive = torch.ones_like(returns, dtype=torch.bool)
         sums, counts, earned = dict[str, torch.Tensor](), dict[str, torch.Tensor](), dict[str, torch.Tensor]()
-        pieces = math.ceil(env.config.episode_length / self._frames)
+        pieces = math.ceil(self.env.config.episode_length / self._frames)
         for _ in trange(pieces, desc="evaluation", leave=False, disable=None):  # no bar in logs
             self._held.begin()
             after = self._collector.rollout()["next"]
-            metrics, terms = after.get("metrics", {}), after.get("reward_terms", {})
             for t, (reward, done) in enumerate(zip(after["reward"].unbind(1), after["done"].unbind(1), strict=True)):
                 returns += reward * alive
-                for name, values in metrics.items():
+                for name, values in after.get("metrics", {}).items():
                     counted = alive & ~values[:, t].isnan()
                     sums[name] = sums.get(name, 0.0) + torch.where(counted, values[:, t], 0.0)
                     counts[name] = counts.get(name, 0.0) + counted
-                for name, values in terms.items():
+                for name, values in after.get("reward_terms", {}).items():
                     earned[name] = earned.get(name, 0.0) + values[:, t] * alive
                 alive &= ~done
+            if not alive.any():
+                break
         self.metrics = {f"reward/{name}": total.mean().item() for name, total in earned.items()}
         self.metrics |= {f"metric/{name}": (total / counts[name]).nanmean().item() for name, total in sums.items()}
         return returns.squeeze(-1)
