@@ -64,6 +64,13 @@ def test_a_body_that_fails_does_not_hide_the_others(monkeypatch):
     assert not findings["humanoid on cpu"].problem
 
 
+def test_episodes_that_begin_in_the_floor_are_told():
+    env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0, engine="mujoco")
+    assert not doctor.begins_in(env)
+    env.sim.qpos[1, 0] -= 0.5
+    assert "mm in each other" in doctor.begins_in(env)
+
+
 @pytest.mark.slow
 def test_size():
     """What is advised is enough for the same run, and a good deal less drops constraints."""

@@ -25,7 +25,7 @@ class Conditions:
     """Least and greatest delay of an action (control steps); each has as many episodes."""
     friction: tuple[float, float] | None = None
     """Least and greatest sliding friction, drawn for each episode, of all geoms; of those of the robot alone where the
-    ground is a :class:`torchrl_loco.terrain.Terrain`, so that its feet need the priority, as those of ``go1_rough``."""
+    ground is a torchrl_loco.terrain.Terrain, so that its feet need the priority, as those of ``go1_rough``."""
     noise: float = 1.0
     """What the task's noise of the observation is multiplied by."""
     pushes: float | None = None

@@ -10,6 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import torch
 import warp as wp
 from tqdm.auto import trange
@@ -22,6 +23,7 @@ from torchrl_loco.sim.simulation import free_memory
 from torchrl_loco.sim.warp_init import init_warp
 
 PACKAGES = ("torch", "torchrl", "tensordict", "warp-lang", "mujoco-warp", "mujoco")
+DEEP = 5e-3  # from how deep on a contact in which an episode begins is told (m)
 TOLERANCE = 1e-4  # largest median error of qpos (m, rad) after a control step that counts as correct
 
 
@@ -138,6 +140,8 @@ def random_actions(env: torchrl_loco.LocoEnv, steps: Iterable[int]) -> Iterator[
 def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, str]:
     """Returns the seconds that making the environment took, the error of ``steps`` random control steps, the engine.
 
+    The last has what :func:`begins_in` says, too.
+
     The error is the median over worlds and steps of the largest deviation of qpos from C MuJoCo (m, rad); NaN if
     anything was not finite.
     """
@@ -147,11 +151,26 @@ def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, st
     seconds = time.perf_counter() - start
     engine = env.engine if env.engine == "compiled" else f"{env.engine}: {env.engine_reason}"
     oracle, td, errors = make(task, 4, "cpu", engine="mujoco", **settings), env.reset(), []
+    engine += begins_in(env)
     for action in random_actions(env, range(steps)):
-        begin = oracle.reset(env.get_state().to("cpu"), set_state=True)
-        oracle.step(begin.set("action", action))
+        state = oracle.reset(env.get_state().to("cpu"), set_state=True)
+        oracle.step(state.set("action", action))
         td = env.step(td.set("action", action.to(env.device)))["next"]
         if env.world.non_finite.torch.any():
             return seconds, float("nan"), engine
         errors.append((env.sim.qpos.cpu() - oracle.sim.qpos).abs().amax(1))
     return seconds, float(torch.cat(errors).median()), engine
+
+
+def begins_in(env: torchrl_loco.LocoEnv) -> str:
+    """Returns the deepest contact of the present poses, if it is deeper than ``DEEP``: it pushes bodies apart."""
+    m, deepest = env.mj_model, (-DEEP, "")
+    d = mujoco.MjData(m)
+    for pose in env.sim.qpos.cpu().numpy():
+        d.qpos[:] = pose
+        mujoco.mj_forward(m, d)
+        for contact in d.contact:
+            first, second = (m.geom(geom).name or m.body(m.geom_bodyid[geom]).name for geom in contact.geom)
+            words = f"; its episodes begin with {first} and {second} {-1e3 * contact.dist:.0f} mm in each other"
+            deepest = min(deepest, (float(contact.dist), words))
+    return deepest[1]

@@ -41,7 +41,7 @@ class Motion:
         path: the file.
         fps: frames per second; needed for CSV. An npz file says it, and another number is refused.
         clip: whether joints beyond the limits of the model are put at them.
-        ground: whether the motion is shifted so that its lowest point touches the ground.
+        ground: whether the motion is shifted so that its lowest point lies 5 mm in the ground, as where a robot stands.
         weight: how often it is practised, by the time it takes, relative to others.
 
     Attributes:
@@ -75,7 +75,7 @@ class Motion:
             hint = ": a pickle can run code, so it is not read" if suffix in (".pkl", ".pt", ".npy") else ""
             raise ValueError(f"{self.path} must be one of {', '.join(SUFFIXES)}{hint}")
         if suffix == ".csv" and fps is None:
-            raise ValueError(f"{self.path}: a CSV file does not say its rate: pass fps, often 30, 50, 60 or 120")
+            raise ValueError(f"{self.path}: a CSV file does not say its rate: pass fps (--fps), as 30, 50, 60 or 120")
         self.fps, self.qpos = (fps or 0.0, self._from_csv()) if suffix == ".csv" else self._from_npz(fps)
         self._check()
         self.qpos.setflags(write=False)  # what is made of it is read from the file again

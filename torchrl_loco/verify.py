@@ -382,7 +382,8 @@ def _report(
         if conditions == dataclasses.replace(asked, episodes=conditions.episodes, seed=conditions.seed):
             trained = max(trained, exported.facts.get("info", {}).get("mean", trained))  # when its training ended
         least = trained - (1.0 - kept) * abs(trained)
-        bounds.append((there["return"] >= least, f"return {there['return']:.1f}, at least {least:.1f} is asked for"))
+        words = f"return {there['return']:.1f}, at least {least:.1f} is asked for"
+        bounds.append((there["return"] >= least, f"{words}, {kept:.0%} of that in training"))
     holds = all(met for met, _ in bounds)
     words = "; ".join(text for met, text in bounds if met == holds)
     task, n, metrics = exported.facts["task"], there["episodes"], outcomes[ENGINES[0]].metrics

@@ -73,7 +73,8 @@ def inspect(
             cls = resolve(what, by_user=True)
             if not hasattr(cls, "ground"):
                 rough = ", ".join(name for name in list_envs() if name.endswith("_rough"))
-                raise ValueError(f"{what} has no attribute ground, a torchrl_loco.terrain.Terrain, as {rough} have")
+                words = f"{what} has no attribute ground, a torchrl_loco.terrain.Terrain, as {rough} have"
+                raise ValueError(f"{words}: add ground = ... to a class of yours")
             cls.ground.picture(terrain)
         print(terrain)
         return

@@ -56,7 +56,7 @@ def motion(
         fps: frames per second of CSV files.
         task: a task that follows motions, whose robot it is.
         clip: put joints that are beyond their limits at them.
-        ground: shift motions so that their lowest points touch the ground.
+        ground: shift motions so that their lowest points lie 5 mm in the ground, as those of a robot that stands.
         out: a video of the first, or a copy of the only one, also with joints clipped and shifted.
         camera: name of one of the model's cameras, for the video.
     """
@@ -119,8 +119,10 @@ def _film(m: Any, q: np.ndarray, out: Path, camera: str) -> None:
     from tqdm.auto import tqdm
 
     from torchrl_loco.eyes.pictures import Poses
+    from torchrl_loco.sim.warp_init import init_warp
     from torchrl_loco.training.evaluation import SIZE, write_video
 
+    init_warp()
     print(f"rendering {len(q)} frames; on a CPU this takes a while", file=sys.stderr)
     renderer = Poses(m, wp.get_device("cuda" if torch.cuda.is_available() else "cpu"), camera, *SIZE, 1)
     shown = tqdm(torch.from_numpy(q), desc="video", leave=False, disable=None)

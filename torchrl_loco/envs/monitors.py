@@ -144,9 +144,9 @@ class Health(Monitor):
         dropped, needed = numbers[: len(DROPPED)], numbers[len(DROPPED) :]
         if self._on_overflow == "ignore" or sum(dropped) <= self._reported:
             return
-        self._reported = sum(dropped)
+        self._reported, steps = sum(dropped), self._steps * self._sim.num_envs
         messages = [
-            f"{what} were dropped in {count} world-steps; {self._sim.engine.remedy(what, most)}"
+            f"{what} were dropped in {count} of {steps} world-steps; {self._sim.engine.remedy(what, most)}"
             for what, count, most in zip(DROPPED, dropped, needed, strict=True)
             if count
         ]

@@ -485,7 +485,8 @@ def replaced_options(cls: type[Task], m: mujoco.MjModel, config: SimConfig) -> d
     if said := {name: text for name, text in replaced.items() if name != "integrator"}:  # of which Simulation tells
         listed = ", ".join(f"{name} {text}" for name, text in said.items())
         logging.getLogger("torchrl_loco").warning(
-            "%s: config replaces options of the model: %s; without config, or by SimConfig.of(model), they stay",
+            "%s: config replaces options of the model: %s. To keep one, name it in config; without config, or by "
+            "SimConfig.of(model), all stay",
             cls.__name__,
             listed,
         )

@@ -553,4 +553,6 @@ def tuning_note(config: TrainingConfig) -> str:
     tuned = config.algorithm == "ppo" and config.task in ("walker_stand", "walker_walk") and not config.from_pixels
     if config.device != "cpu" or tuned:
         return ""
+    if config.from_pixels:
+        return "On a CPU training from pixels was not tuned, and sees some hundred frames a second: it needs a GPU."
     return "On a CPU only walker_stand and walker_walk by ppo were tuned: other tasks need a GPU, or many more frames."
