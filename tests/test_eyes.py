@@ -410,3 +410,66 @@ def test_what_hooks_ask_for_must_be_there(seen, error, match):
 
     with pytest.raises(error, match=match):
         Blind(2, "cpu", seed=0)
+
+
+HELD = """
+<mujoco>
+  <asset>
+    <mesh name="head" vertex="-.1 -.1 -.1 .1 -.1 -.1 .1 .1 -.1 -.1 .1 -.1 -.1 -.1 .1 .1 -.1 .1 .1 .1 .1 -.1 .1 .1"/>
+  </asset>
+  <worldbody>
+    <geom type="box" pos="0 3 .5" size=".5 .5 .5"/>
+    <geom type="box" pos="0 6 1" size="5 .1 5"/>
+    <camera name="in crate" pos="0 3 .5" xyaxes="1 0 0 0 0 1"/>
+    <camera name="above" pos="0 0 3" mode="targetbody" target="b"/>
+    <body name="b" pos="0 0 1.2">
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <geom type="mesh" mesh="head" contype="0" conaffinity="0"/>
+      <camera name="in head" xyaxes="1 0 0 0 0 1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@for_each(("camera", "expected"), [("in head", 5.9), ("in crate", 2.9)])
+def test_cameras_see_through_meshes_and_boxes_that_they_are_in(camera, expected, device):
+    m, device = mujoco.MjModel.from_xml_string(HELD), wp.get_device(device)
+    eye, data = Eye(m, device, camera, 3, 3, 1, ("depth",)), mujoco.MjData(m)
+    mujoco.mj_forward(m, data)
+    eye.look(wp.array([data.xpos], dtype=wp.vec3, device=device), wp.array([data.xmat], dtype=wp.mat33, device=device))
+    assert eye.depth[0, 1, 1].item() == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_camera_above_what_it_looks_at_has_the_axes_of_c_mujoco():
+    m, device = mujoco.MjModel.from_xml_string(HELD), wp.get_device("cpu")
+    eye, data = Eye(m, device, "above", 3, 3, 1, ("depth",)), mujoco.MjData(m)
+    mujoco.mj_forward(m, data)
+    eye.look(wp.array([data.xpos], dtype=wp.vec3, device=device), wp.array([data.xmat], dtype=wp.mat33, device=device))
+    expected = data.cam("above").xmat.reshape(3, 3)
+    np.testing.assert_allclose(eye.placed.camera.numpy()[0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_cameras_follow_the_center_of_mass_that_a_world_has(device):
+    vary = [
+        loco.Vary("body_mass", 0.0, 10.0, of="torso", how="add"),
+        loco.Vary("body_ipos", -0.2, 0.2, of="torso", how="add"),
+    ]
+    env = loco.make("walker_walk", 2, device, 0, randomize=vary, from_pixels=True, size=(4, 4))
+    env.reset()
+    seen = env.world.seen.eye.placed._pos.numpy()
+    for world, pos in enumerate(seen):
+        m = env.mujoco_model(world)
+        data = mujoco.MjData(m)
+        data.qpos[:] = env.sim.qpos[world].numpy(force=True)
+        mujoco.mj_forward(m, data)
+        np.testing.assert_allclose(pos, data.cam_xpos[0], atol=1e-5)
+    assert abs(seen[0] - seen[1]).max() > 1e-2
+
+
+def test_pictures_that_do_not_fit_are_refused_with_the_figures():
+    env = loco.make("walker_walk", 1, "cpu", 0)
+    with pytest.raises(MemoryError, match="GiB"):
+        env.camera(width=200_000, height=200_000)

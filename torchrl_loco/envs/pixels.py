@@ -12,6 +12,7 @@ from torchrl.data import Bounded
 
 from torchrl_loco.checks import Interval, check_bool, check_choice, check_float, check_int, checked_size
 from torchrl_loco.eyes.placing import bytes_placed
+from torchrl_loco.eyes.shapes import MISS
 from torchrl_loco.eyes.tracer import Color, Eye
 from torchrl_loco.sim import EXCLUSIVE, Simulation, current_stream
 from torchrl_loco.sim.simulation import check_memory
@@ -20,7 +21,7 @@ SIZE = (84, 84)  # width and height of pixels, those of dm_control's benchmarks 
 KEYS = {"rgb": "pixels", "depth": "depth"}  # keys of what is drawn
 COPIES_IN_STEP = 3
 """How often pixels lie in memory: in what a step begins with, in what it returns, and in what the next begins with."""
-DEPTHS = Interval(0, float("inf"))
+DEPTHS = Interval(0, float(MISS))  # what is not met is farther
 Pictures = dict[str, torch.Tensor]  # what is seen in all worlds by key, (worlds, height, width, ...)
 
 
@@ -75,8 +76,8 @@ class Pixels:
 
     def seen(self, sim: Simulation, mask: torch.Tensor) -> "Seen":
         """Returns what draws them; ``mask`` tells in which worlds episodes begin."""
-        n, size = sim.num_envs, (self.width, self.height)
-        eye = Eye(sim.mj_model, sim.device, self.camera, *size, n, self.kinds, far=self.far, keeps=False)
+        n, picture = sim.num_envs, (self.camera, self.width, self.height)
+        eye = Eye(sim.mj_model, sim.device, *picture, n, self.kinds, far=self.far, keeps=False, varied=sim.rows)
         specs = dataclasses.replace(self, stack=1).specs(torch.Size([n]), sim.qpos.device)
         return Seen(sim, mask, eye, specs, self.stack)
 

@@ -153,7 +153,8 @@ def eye_of(sim: Simulation, asked: DepthRequest | RayRequest) -> Eye | Rays:
     """Returns what sees for hooks."""
     m, n = sim.mj_model, sim.num_envs
     if isinstance(asked, DepthRequest):
-        return Eye(m, sim.device, asked.camera, asked.width, asked.height, n, ("depth",), far=asked.far)
+        size = asked.width, asked.height
+        return Eye(m, sim.device, asked.camera, *size, n, ("depth",), far=asked.far, varied=sim.rows)
     return Rays(m, sim.device, asked.site, np.array(asked.directions), n, asked.far)
 
 

@@ -10,16 +10,18 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_loco.checks import POSITIVE, check_float, check_int
+from torchrl_loco.checks import Interval, check_float, check_int
 from torchrl_loco.envs import draws, heights, sensors
 from torchrl_loco.envs.names import Elements, Names
 from torchrl_loco.envs.scan import DepthRequest, RayRequest, Request, ScanRequest
 from torchrl_loco.envs.tables import Entry, Table
 from torchrl_loco.envs.variation import Variation, constant_of
 from torchrl_loco.eyes.placing import bytes_placed
+from torchrl_loco.eyes.shapes import MISS
 from torchrl_loco.sim import models
 from torchrl_loco.sim.simulation import check_memory
 
+DISTANCES = Interval(0, float(MISS), with_low=False)  # that can be seen (m): what is not met is farther
 OF_A_STEP = frozenset({"action", "ctrl"})
 """What belongs to a step: an observation is also made after a reset, where there was none."""
 CONTACT_HISTORY = ("contact_force_history", "in_contact_history")  # arrays of contacts with a row for each substep
@@ -378,13 +380,13 @@ class View:
 
         Raises:
             KeyError: the model has no such camera.
-            ValueError: several cameras match, a number is not positive, or ``fovy`` alone does not tell the camera's
-                perspective.
+            ValueError: several cameras match, a number is not positive, ``far`` is not less than 1e10, or ``fovy``
+                alone does not tell the camera's perspective.
             MemoryError: the device has no room for them.
         """
         which = self._id("camera", camera)
         size = check_int("height", height), check_int("width", width)
-        return self._scanned(DepthRequest(which, size[1], size[0], check_float("far", far, POSITIVE)), size)
+        return self._scanned(DepthRequest(which, size[1], size[0], check_float("far", far, DISTANCES)), size)
 
     def ray(self, site: str, directions: Any, far: float = 10.0) -> torch.Tensor:
         """Returns how far from a site lies what rays meet, shapes of all kinds and meshes among it.
@@ -399,16 +401,17 @@ class View:
 
         Raises:
             KeyError: the model has no such site.
-            ValueError: several sites match, ``far`` is not positive, or the directions have another shape, or one is
-                no direction.
+            ValueError: several sites match, ``far`` is not positive and less than 1e10, or the directions have another
+                shape, or one is no direction.
             MemoryError: the device has no room for them.
         """
         which = self._id("site", site)
         rows = np.array(directions, dtype=float)
         if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all() or not rows.any(1).all():
             raise ValueError(f"directions must be rows of 3 finite numbers that are not all 0, (rays, 3), got {rows!r}")
+        rows /= np.abs(rows).max(axis=1, keepdims=True)  # first, as squares of small ones are 0
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-        asked = RayRequest(which, tuple(map(tuple, rows.tolist())), check_float("far", far, POSITIVE))
+        asked = RayRequest(which, tuple(map(tuple, rows.tolist())), check_float("far", far, DISTANCES))
         return self._scanned(asked, (len(rows),))
 
     def _id(self, kind: str, name: str) -> int:

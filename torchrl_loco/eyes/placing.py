@@ -46,12 +46,25 @@ def origin_of(pose: Pose) -> wp.vec3:
 
 
 @wp.func
-def center(mounts: Mounts, xpos: wp.array[wp.vec3], xmat: wp.array[wp.mat33], body: int) -> wp.vec3:
+def inertial(mounts: Mounts, numbers: wp.array[float], k: int) -> float:
+    """Returns one of the masses and centers of mass of a world, whose ``numbers`` are those that are its own."""
+    column = mounts.column[k]
+    if column >= 0:
+        return numbers[column]
+    return mounts.inertial[k]
+
+
+@wp.func
+def center(
+    mounts: Mounts, numbers: wp.array[float], xpos: wp.array[wp.vec3], xmat: wp.array[wp.mat33], body: int
+) -> wp.vec3:
     """Returns the center of mass of a subtree."""
-    whole, found = float(0.0), wp.vec3()
+    whole, found, bodies = float(0.0), wp.vec3(), mounts.subtree.shape[0]
     for b in range(body, body + mounts.subtree[body]):
-        whole += mounts.body_mass[b]
-        found += mounts.body_mass[b] * (xpos[b] + xmat[b] @ mounts.body_ipos[b])
+        mass, at = inertial(mounts, numbers, b), bodies + 3 * b
+        x, y, z = inertial(mounts, numbers, at), inertial(mounts, numbers, at + 1), inertial(mounts, numbers, at + 2)
+        whole += mass
+        found += mass * (xpos[b] + xmat[b] @ wp.vec3(x, y, z))
     return wp.where(whole > 0.0, found / wp.max(whole, 1.0e-9), xpos[body])
 
 
@@ -59,6 +72,7 @@ def center(mounts: Mounts, xpos: wp.array[wp.vec3], xmat: wp.array[wp.mat33], bo
 def mount(
     # In:
     mounts: Mounts,
+    numbers: wp.array2d[float],
     mask: wp.array[bool],
     xpos: wp.array2d[wp.vec3],
     xmat: wp.array2d[wp.mat33],
@@ -78,16 +92,17 @@ def mount(
         if mode == TRACKS:
             pos = xpos[world, body] + pos
         elif mode == OF_COM:
-            pos = center(mounts, xpos[world], xmat[world], body) + pos
+            pos = center(mounts, numbers[world], xpos[world], xmat[world], body) + pos
         else:
             pos = xpos[world, body] + xmat[world, body] @ pos
             mat = xmat[world, body] @ mat
             if mode >= AT_BODY and mounts.target[k] >= 0:
                 target = 1.0 * xpos[world, mounts.target[k]]
                 if mode == AT_COM:
-                    target = center(mounts, xpos[world], xmat[world], mounts.target[k])
+                    target = center(mounts, numbers[world], xpos[world], xmat[world], mounts.target[k])
                 z = wp.normalize(pos - target)
-                x = wp.normalize(wp.cross(wp.vec3(0.0, 0.0, 1.0), z))
+                x = wp.cross(wp.vec3(0.0, 0.0, 1.0), z)
+                x = wp.where(wp.length(x) > 0.0, wp.normalize(x), wp.vec3(1.0, 0.0, 0.0))  # as MuJoCo's does
                 mat = wp.matrix_from_cols(x, wp.cross(z, x), z)
         if k == 0:
             camera_pos_out[world] = pos
@@ -168,14 +183,17 @@ def bytes_placed(m: mujoco.MjModel) -> int:
 class Placed:
     """The shapes of a model as they lie before a camera, or before where rays begin, in each of several worlds.
 
-    ``mounts`` tells what holds the camera and the lights.
+    ``mounts`` tells what holds the camera and the lights, ``numbers`` are rows of what varies of the model.
     """
 
-    def __init__(self, m: mujoco.MjModel, device: wp.Device, mounts: Mounts, worlds: int) -> None:
+    def __init__(
+        self, m: mujoco.MjModel, device: wp.Device, mounts: Mounts, worlds: int, numbers: wp.array | None = None
+    ) -> None:
         self._mounts, self._device = mounts, device
         with EXCLUSIVE, wp.ScopedDevice(device):
             self.shapes, self._meshes = shapes_of(m, device)
             self.has_meshes = bool(self._meshes)
+            self._numbers = wp.empty((worlds, 0), dtype=float) if numbers is None else numbers
             size = worlds, self.shapes.kind.shape[0]
             self._pos, self.camera = wp.empty(worlds, dtype=wp.vec3), wp.empty(worlds, dtype=wp.mat33)
             # Where they are, and against what they shine, in the camera's frame.
@@ -190,7 +208,7 @@ class Placed:
         """
         here, camera = [mask, xpos, xmat], [self._pos, self.camera]
         for kernel, dim, inputs, outputs in (
-            (mount, self.camera.shape, [self._mounts, *here], [*camera, *self.lights]),
+            (mount, self.camera.shape, [self._mounts, self._numbers, *here], [*camera, *self.lights]),
             (place, self.bounds.shape, [self.shapes, *here, *camera], [self.poses, self.bounds]),
         ):
             wp.launch(kernel, dim, inputs, outputs, device=self._device)

@@ -11,6 +11,7 @@ import warp as wp
 from torchrl_loco.sim import fill_from_numbers
 from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, CYLINDER, ELLIPSOID, FIELD, MESH, PLANE, SPHERE
 from torchrl_loco.sim.corners import axes_of
+from torchrl_loco.sim.varied import Varied
 
 KINDS = (PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)  # types of geoms that are seen
 GROUPS = 3  # groups of geoms that are seen, from 0 on, as in MuJoCo's viewer
@@ -35,10 +36,9 @@ class Mounts:
     target: wp.array[int]
     pos: wp.array[wp.vec3]
     mat: wp.array[wp.mat33]
-    # Of bodies: how many are in its subtree, its mass, and where its center of mass is.
-    subtree: wp.array[int]
-    body_mass: wp.array[float]
-    body_ipos: wp.array[wp.vec3]
+    subtree: wp.array[int]  # how many bodies are in that of each
+    inertial: wp.array[float]  # masses of the bodies, then where the center of mass of each is
+    column: wp.array[int]  # of these: where a world's numbers have its own, or -1
 
 
 @wp.struct
@@ -98,8 +98,8 @@ def to_the_horizon(mj_model: mujoco.MjModel) -> mujoco.MjModel:
     return seen
 
 
-def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device) -> Mounts:
-    """Returns what holds a camera and the lights that are on."""
+def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device, varied: Varied | None = None) -> Mounts:
+    """Returns what holds a camera and the lights that are on; ``varied`` are the numbers of which worlds have rows."""
     name = m.camera(camera).name or camera
     if m.cam_projection[camera] != int(mujoco.mjtProjection.mjPROJ_PERSPECTIVE) or m.cam_sensorsize[camera].any():
         raise ValueError(f"camera {name!r} must have a perspective that fovy alone tells, to be drawn from")
@@ -116,15 +116,20 @@ def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device) -> Mounts:
     pos = np.where(of_com[:, None], of(m.cam_poscom0, m.light_poscom0), pos)
     mat = np.where((tracks | of_com)[:, None, None], np.array(whole), np.array(fixed))
     bodies, targets = of(m.cam_bodyid, m.light_bodyid), of(m.cam_targetbodyid, m.light_targetbodyid)
-    return mounts_at(m, device, mode=mode, body=bodies, target=targets, pos=pos, mat=mat)
+    return mounts_at(m, device, varied, mode=mode, body=bodies, target=targets, pos=pos, mat=mat)
 
 
-def mounts_at(m: mujoco.MjModel, device: wp.Device, **mounted: np.ndarray) -> Mounts:
+def mounts_at(m: mujoco.MjModel, device: wp.Device, varied: Varied | None = None, **mounted: np.ndarray) -> Mounts:
     """Returns what holds what is mounted, of which the fields of :class:`Mounts` are given up to ``mat``."""
     count = np.ones(m.nbody, dtype=np.int32)
     for b in range(m.nbody - 1, 0, -1):  # numbered along the tree: a subtree is a row of bodies
         count[m.body_parentid[b]] += count[b]
-    return fill_from_numbers(Mounts, device, m, **mounted, subtree=count)
+    column = np.full(4 * m.nbody, -1)
+    for first, name in ((0, "body_mass"), (m.nbody, "body_ipos")):
+        if varied is not None and name in varied.places:
+            column[first + varied.places[name]] = np.arange(varied.count)[varied.columns[name]]
+    inertial = np.concatenate([m.body_mass, m.body_ipos.ravel()])
+    return fill_from_numbers(Mounts, device, m, **mounted, subtree=count, inertial=inertial, column=column)
 
 
 def facing(direction: np.ndarray) -> np.ndarray:

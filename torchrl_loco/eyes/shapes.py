@@ -9,6 +9,7 @@ from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, CYLINDER, EL
 
 MISS = wp.constant(wp.float32(1.0e10))  # the distance of what is not met
 TINY = wp.constant(wp.float32(1.0e-12))
+PAST = wp.constant(wp.float32(1.0e-5))  # how far behind a triangle a ray goes on, for each metre: more than rounding
 
 
 @wp.func
@@ -84,10 +85,14 @@ def to_shape(kind: int, o: wp.vec3, d: wp.vec3, size: wp.vec3) -> float:
 
 @wp.func
 def to_mesh(mesh: wp.uint64, o: wp.vec3, d: wp.vec3, most: float):
-    """Returns distance, normal and triangle; a miss is far away."""
-    length = wp.length(d)
-    met = wp.mesh_query_ray(mesh, o, d / length, most * length)
-    return wp.where(met.result, met.t / length, MISS), met.normal, met.face
+    """Returns distance, normal and triangle; a miss is far away. A ray leaves a mesh that it begins in unhindered."""
+    length, gone = wp.length(d), float(0.0)
+    way = d / length
+    met = wp.mesh_query_ray(mesh, o, way, most * length)
+    while met.result and wp.dot(met.normal, way) > 0.0:
+        gone += met.t + PAST * (1.0 + gone + wp.length(o))
+        met = wp.mesh_query_ray(mesh, o + gone * way, way, most * length - gone)
+    return wp.where(met.result, (gone + met.t) / length, MISS), met.normal, met.face
 
 
 @wp.func

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import mujoco
+import torch
 import warp as wp
 
 from torchrl_loco.eyes.placing import Placed, Pose, origin_of, pose_of, turn_of
@@ -13,8 +14,11 @@ from torchrl_loco.eyes.scene import OWN, SPOT, Looks, Shapes, looks_of, mounts_o
 from torchrl_loco.eyes.shapes import MISS, normal_of, to_mesh, to_shape
 from torchrl_loco.sim import EXCLUSIVE, Buffer, current_stream
 from torchrl_loco.sim.compiled.collision.kinds import MESH, PLANE
+from torchrl_loco.sim.simulation import check_memory
+from torchrl_loco.sim.varied import Varied
 
-KINDS = ("rgb", "depth", "geoms")  # what a camera tells of each pixel
+BYTES = {"rgb": 3, "depth": 4, "geoms": 4}
+KINDS = tuple(BYTES)  # what a camera tells of each pixel
 TILES = {"cuda": (8, 4, 16), "cpu": (1, 1, 16)}
 """Width and height of the tile that neighbouring threads draw at once, a pixel each, and how many tiles they draw, one
 below the other. On CUDA they are a warp, which finds the shapes that can be in a tile together, a thread for each."""
@@ -74,8 +78,8 @@ def texel(looks: Looks, texture: int, u: float, v: float, spread: float) -> wp.v
     base = looks.levels[texture, 0]
     level = wp.clamp(int(wp.log2(wp.max(spread * float(base[1]), 1.0))), 0, last)
     at = looks.levels[texture, level]
-    x = wp.min(int((u - wp.floor(u)) * float(at[1])), at[1] - 1)
-    y = wp.min(int((v - wp.floor(v)) * float(at[2])), at[2] - 1)
+    x = wp.clamp(int((u - wp.floor(u)) * float(at[1])), 0, at[1] - 1)  # from below, too: far away u is not finite
+    y = wp.clamp(int((v - wp.floor(v)) * float(at[2])), 0, at[2] - 1)
     return looks.texels[at[0] + y * at[1] + x]
 
 
@@ -306,6 +310,7 @@ class Eye:
         samples: rays along each side of a pixel, whose colors are averaged; depth and geoms are of the last.
         far: greatest depth (m).
         keeps: whether it has memory for what :meth:`launch` and :meth:`look` draw; :meth:`draw` needs none.
+        varied: which numbers of the model vary, and their rows ``(worlds or more, count)``.
 
     Attributes:
         rgb: colors, uint8 ``(worlds, height, width, 3)``.
@@ -314,6 +319,7 @@ class Eye:
 
     Raises:
         ValueError: the camera has no perspective that ``fovy`` tells.
+        MemoryError: the device has no room for what it tells.
     """
 
     def __init__(
@@ -330,11 +336,16 @@ class Eye:
         samples: int = 1,
         far: float = 1.0e10,
         keeps: bool = True,
+        varied: tuple[Varied, wp.array] | None = None,
     ) -> None:
         m, which = to_the_horizon(m), m.camera(camera).id
         self._device, half = device, math.tan(math.radians(m.cam_fovy[which] / 2.0))
+        if keeps:
+            needed = worlds * width * height * sum(BYTES[kind] for kind in kinds)
+            check_memory(needed, worlds, torch.device(wp.device_to_torch(device)))
         with EXCLUSIVE, wp.ScopedDevice(device):
-            self.placed = Placed(m, device, mounts_of(m, which, device), worlds)
+            names, rows = varied or (None, None)
+            self.placed = Placed(m, device, mounts_of(m, which, device, names), worlds, rows)
             self._looks, self._view = looks_of(m, device), View()
             self._view.half, self._view.pixel = wp.vec2(half * width / height, half), 2.0 * half / height
             self._view.width, self._view.height, self._view.far = width, height, far

@@ -227,6 +227,11 @@ class Simulation:
         """
         self.engine.forward(mask, Around(after=after), contacts=contacts)
 
+    @property
+    def rows(self) -> tuple[Varied, wp.array] | None:
+        """Which numbers of the model differ from world to world, and those of each; ``None`` if none do."""
+        return None if self.varied is None or not self.varied.count else (self.varied, self.engine.numbers)
+
     def mujoco_data(self, *, contacts: bool = False) -> "mjw.Data":
         """Returns the present state as ``mjData`` of MuJoCo-Warp, with poses of geoms, sites and cameras.
 
