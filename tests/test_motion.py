@@ -69,6 +69,7 @@ def test_what_is_no_motion_is_refused(tmp_path, g1, rows):
         table[frame, column] = value
         return written(tmp_path, table)
 
+    joints = [g1.joint(i).name for i in range(1, g1.njnt)]
     for file, words in (
         (lambda: changed(7, 12, np.nan), "frame 7 .* not finite"),
         (lambda: changed(9, slice(3, 7), 0.1), "frame 9 must be a unit quaternion"),
@@ -80,17 +81,24 @@ def test_what_is_no_motion_is_refused(tmp_path, g1, rows):
         (lambda: written(tmp_path, rows[:, :6]), "rows of 6"),
         (lambda: written(tmp_path, rows[:, :20]), "13 joints, the robot has 29"),
         (lambda: written(tmp_path, rows, header=",".join(["x"] * 7 + ["knee"] * 29)), "no joint 'knee'"),
+        (lambda: written(tmp_path, rows, header=",".join(["x"] * 7 + joints + joints[-1:])), "name each joint once"),
     ):
         with pytest.raises(ValueError, match=words):
             Motion(file(), fps=50.0).on(g1)
     (tmp_path / "ragged.csv").write_text("1,2,3,0,0,0,1,4\n1,2,3,0,0,0,1\n")
     with pytest.raises(ValueError, match="rows of 7 to 8 numbers"):
         Motion(tmp_path / "ragged.csv", fps=50.0)
-    (tmp_path / "words.csv").write_text("1,2,3,0,0,0,1,4\n1,2,3,0,0,0,1,what\n")
-    with pytest.raises(ValueError, match="in row 1"):
-        Motion(tmp_path / "words.csv", fps=50.0)
+    for row in ("1,2,3,0,0,0,1,what", "#1,2,3,0,0,0,1,4"):
+        (tmp_path / "words.csv").write_text(f"1,2,3,0,0,0,1,4\n{row}\n1,2,3,0,0,0,1,4\n")
+        with pytest.raises(ValueError, match="in row 1"):
+            Motion(tmp_path / "words.csv", fps=50.0)
     with pytest.raises(ValueError, match="pass fps"):
         Motion(PUNCHES)
+    with pytest.raises(TypeError, match="ground must be True or False"):
+        Motion(PUNCHES, fps=50.0, ground="false")
+    for wrong in ({"fps": 50.0}, {"path": PUNCHES, "clips": True}):
+        with pytest.raises(ValueError, match="must have a path, and of fps, clip, ground, weight"):
+            motions.read(wrong)
     (tmp_path / "clip.pkl").write_bytes(b"")
     with pytest.raises(ValueError, match="a pickle can run code"):
         Motion(tmp_path / "clip.pkl")

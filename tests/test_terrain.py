@@ -166,6 +166,7 @@ def test_a_kind_of_ones_own():
             {},
             "reach beyond their patch of 8 m",
         ),
+        ({"a": terrain.flat}, {"size": 1.0, "border": 0.2}, "must be at least 0.8 m"),
     ],
 )
 def test_bad_input(kinds, settings, message):

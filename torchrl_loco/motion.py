@@ -2,6 +2,7 @@
 
 import dataclasses
 import glob
+import inspect
 import io
 import logging
 import math
@@ -14,7 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_loco.checks import check_float, suggestion
+from torchrl_loco.checks import check_bool, check_float, suggestion
 from torchrl_loco.storage import replace_file
 
 SUFFIXES = (".csv", ".npz")  # of files that motions are read from
@@ -63,7 +64,8 @@ class Motion:
         ground: bool = False,
         weight: float = 1.0,
     ) -> None:
-        self.path, self.clip, self.ground = Path(path).expanduser(), clip, ground
+        self.path = Path(path).expanduser()
+        self.clip, self.ground = check_bool("clip", clip), check_bool("ground", ground)
         self.name, self.weight = self.path.stem, check_float("weight", weight)
         if not self.path.is_file():
             raise FileNotFoundError(f"there is no file {self.path}")
@@ -106,7 +108,7 @@ class Motion:
                     f"{self.path} has {', '.join(names[3:7])}: the quaternion must be in the order x, y, z, w"
                 )
         try:
-            table = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.empty((0, 0))
+            table = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None) if lines else np.empty((0, 0))
         except ValueError:
             widths = sorted({line.count(",") + 1 for line in lines})
             wrong = [f"{line[:60]!r} in row {k}" for k, line in enumerate(lines) if not _is_row(line)]
@@ -182,7 +184,7 @@ class Motion:
             for name in self._joints:
                 if name not in joints:
                     raise ValueError(f"{self.path}: the robot has no joint {name!r}{suggestion(name, joints)}")
-            if len(set(self._joints)) != len(joints):
+            if sorted(self._joints) != sorted(joints):
                 raise ValueError(f"{self.path} must name each joint once, it names {', '.join(sorted(self._joints))}")
             q[:, 7:] = q[:, 7:][:, [self._joints.index(name) for name in joints]]
         said = self._compare_bodies(m, q)
@@ -281,6 +283,9 @@ def named(motion: Any, fps: float = 0.0) -> list[Motion | dict[str, Any]]:
         if isinstance(one, Motion):
             found.append(one)
         elif isinstance(one, Mapping):
+            known = list(inspect.signature(Motion).parameters)
+            if "path" not in one or not {*known} >= one.keys():
+                raise ValueError(f"a motion must have a path, and of {', '.join(known[1:])} what differs; got {one}")
             found.append(dict(one))
         elif isinstance(one, str | Path):
             found += [{"path": file, "fps": fps if file.suffix.lower() == ".csv" else 0.0} for file in expand(one)]

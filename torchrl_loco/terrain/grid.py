@@ -20,7 +20,7 @@ OF_PLANE = (
 """What the ground has of the plane that it replaces."""
 CLEAR = 0.8  # half a side of the square about the middle of a patch over which a robot may begin (m)
 SEAM = 1e-5  # by how much boxes are wider, so that points between two that meet are on one of them (m)
-LEAST = 1e-3  # range of a height field at least (m), which MuJoCo needs to be positive
+LEAST = 1e-3  # range of a height field that is flat (m), which MuJoCo needs to be positive
 
 
 class Terrain:
@@ -64,6 +64,9 @@ class Terrain:
         self.rows, self.columns = check_int("rows", rows), check_int("columns", columns)
         self.size, self.cell = check_float("size", size, POSITIVE), check_float("cell", cell, POSITIVE)
         self.border = check_float("border", border, POSITIVE)
+        if size / 2 + border < CLEAR:
+            words = f"size / 2 + border ({size:g} / 2 + {border:g}) must be at least {CLEAR:g} m"
+            raise ValueError(f"{words}, as robots begin so far from the middle of a patch")
         if not kinds or len(kinds) > columns:
             raise ValueError(f"kinds must be 1 to {columns}, the number of columns, got {len(kinds)}")
         if abs(size / cell - round(size / cell)) > 1e-6:
@@ -194,7 +197,7 @@ class Terrain:
             raise ValueError(f"there is no plane {floor!r} to replace: choose one of {', '.join(map(repr, planes))}")
         like = {name: copy.copy(getattr(plane, name)) for name in OF_PLANE}
         spec.delete(plane)
-        low, extent = float(self.heights.min()), max(float(np.ptp(self.heights)), LEAST)
+        low, extent = float(self.heights.min()), float(np.ptp(self.heights)) or LEAST  # to which MuJoCo stretches them
         field = spec.add_hfield(name="terrain", nrow=self.heights.shape[0], ncol=self.heights.shape[1])
         field.size = [*self.half, extent, DEEP]
         field.userdata = ((self.heights - low) / extent).astype(np.float32).ravel().tolist()

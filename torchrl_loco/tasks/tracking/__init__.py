@@ -425,6 +425,8 @@ class Tracking(Robot):
         f = self.frames
         steps = (f.last - f.first).tolist()
         names = [name if f.names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(f.names)]
+        if len({*names}) < len(names):  # one is called as if it were one of several
+            names = [f"{name} {k}" for k, name in enumerate(f.names)]
         return dict(zip(names, steps, strict=True))
 
     def reference(self) -> dict[str, torch.Tensor]:
