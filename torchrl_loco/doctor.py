@@ -122,7 +122,7 @@ def size(task: str, num_envs: int, device: str | None = None, steps: int = 300) 
     env = make(task, num_envs, device, seed=0, world_offset=0, on_overflow="raise", engine="mujoco_warp", **limits)
     with torch.no_grad():
         td = env.reset()
-        for action in random_actions(env, trange(steps, desc=f"{task}, {num_envs} worlds", leave=False)):
+        for action in random_actions(env, trange(steps, desc=f"{task}, {num_envs} worlds", leave=False, disable=None)):
             _, td = env.step_and_maybe_reset(td.set("action", action.to(env.device)))
     env.world.health.check()
     peak = env.health()["peak"]

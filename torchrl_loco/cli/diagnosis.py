@@ -6,6 +6,7 @@ import io
 import tempfile
 import time
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -24,7 +25,7 @@ def list_tasks() -> None:
 
 
 def diagnose(
-    body: tyro.conf.Positional[str] = "walker",
+    body: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[BODY|TASK|FILE.py:CLASS|all]")] = "walker",
     /,
     size: str | None = None,
     num_envs: int = 2048,
@@ -58,7 +59,11 @@ def diagnose(
 
 
 def inspect(
-    what: tyro.conf.Positional[str], /, task: OtherTask = None, device: str | None = None, terrain: Path | None = None
+    what: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE|TASK")],
+    /,
+    task: OtherTask = None,
+    device: str | None = None,
+    terrain: Path | None = None,
 ) -> None:
     """Inspect a NaN dump: step its world again, substep by substep, in Warp and in C MuJoCo. Or the ground of a task.
 
@@ -88,7 +93,10 @@ def inspect(
 
 
 def warm(
-    tasks: tyro.conf.Positional[tuple[str, ...]], /, algorithm: str | None = None, device: str | None = None
+    tasks: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK...")],
+    /,
+    algorithm: str | None = None,
+    device: str | None = None,
 ) -> None:
     """Compile ahead what trainings of tasks need, for images and CI: two iterations of each, which leave no run.
 

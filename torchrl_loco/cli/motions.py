@@ -37,7 +37,7 @@ FRAME_RATE = 25  # frames per second of videos
 
 
 def motion(
-    files: tyro.conf.Positional[tuple[str, ...]],
+    files: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="FILE...")],
     /,
     fps: float | None = None,
     task: str = "g1_tracking",
