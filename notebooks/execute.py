@@ -11,8 +11,8 @@ from nbclient import NotebookClient
 KERNEL = "python3"
 TIMEOUT = 600
 """Seconds that a cell may take: with cold kernels, the first waits for the compiler."""
-NO_DRIVER = "Warp CUDA warning: Could not find or load the NVIDIA CUDA driver."
-"""What Warp writes to stderr where there is no GPU: about the machine, not about the notebook."""
+ASIDE = "Warp CUDA warning: Could not find or load the NVIDIA CUDA driver.", "stopping after this update"
+"""What begins a line on stderr that is left out: of a machine without a GPU, and for who sits before the training."""
 WIDGET = "application/vnd.jupyter.widget-view+json"
 """Type of an output that shows nothing without its kernel, such as a progress bar."""
 
@@ -48,7 +48,7 @@ def execute(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookN
 def is_worth_keeping(output: nbformat.NotebookNode) -> bool:
     """Returns whether an output is the notebook's own, and shows something when it is read."""
     if output.output_type == "stream":
-        return not output.text.startswith(NO_DRIVER)
+        return not output.text.lstrip().startswith(ASIDE)
     return WIDGET not in output.get("data", {})
 
 

@@ -696,7 +696,7 @@ def test_options_of_a_model_that_config_replaces_are_said(caplog):
     own = {"config": SimConfig(ctrl_dt=0.02, sim_dt=0.005)}
     env = type("Replacing", (LocoEnv,), {**entries, **own})(1, "cpu", 0)
     said = "sim_dt 0.004 -> 0.005, iterations 7 -> 100, euler_damping True -> False"
-    assert any(f"Replacing: config replaces options of the model: {said};" in message for message in caplog.messages)
+    assert any(f"Replacing: config replaces options of the model: {said}. " in message for message in caplog.messages)
     assert "'integrator': 'implicitfast -> euler'" in repr(env)
     explicit = DAMPED.replace("/><worldbody>", '><flag eulerdamp="disable"/></option><worldbody>', 1)
     config = SimConfig(ctrl_dt=0.02, sim_dt=0.004, euler_damping=True)
