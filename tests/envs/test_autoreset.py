@@ -132,3 +132,16 @@ def test_no_synchronisation_over_100_steps_with_resets(task, wrap):
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert (ended >= 2).all()
+
+
+def test_worlds_go_on_beside_one_that_is_not_finite():
+    """Which is held as it is, until it is reset."""
+    env = torchrl_loco.make("walker_walk", 3, "cpu", 0)
+    td = env.reset()
+    env.sim.qvel[1] = torch.inf
+    after = env.step(td.set("action", torch.zeros(3, 6)))["next"]
+    assert after["done"].flatten().tolist() == [False, True, False]
+    part = after.exclude("reward").set("action", torch.zeros(3, 6)).set("_step", ~after["done"])
+    held = env.step(part)["next"]
+    assert held["done"].flatten().tolist() == [False, True, False]
+    assert not torch.equal(held["observation"][0], after["observation"][0])

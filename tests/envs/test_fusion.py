@@ -143,6 +143,7 @@ OPERATORS = {
         torch.fmod(i, 3),
         i % -4,
         i // -4,
+        (i.long() * 2**61) // 10**18,
         torch.div(x, 0.3, rounding_mode="trunc"),
     ),
     "comparisons": lambda x, y, i, b: (x < y, x <= 0.1, x > y, x >= y, x == x, x != y, i == 2, i > 1.5, b == (i > 0)),

@@ -8,7 +8,7 @@ import pytest
 import torch
 from for_each import for_each
 
-from torchrl_loco import LocoEnv, SimConfig, Vary
+from torchrl_loco import HumanoidStand, LocoEnv, SimConfig, Vary, WalkerWalk
 from torchrl_loco.cli.errors import user_errors
 
 
@@ -182,3 +182,24 @@ def test_a_group_without_terms_is_said():
 
     with pytest.raises(ValueError, match="'observation' has no terms"):
         Blind(num_envs=1, device="cpu", seed=0)
+
+
+def test_gravity_is_seen_where_it_points():
+    class Leaning(WalkerWalk):
+        randomize = [Vary("gravity", (3.0, 0.0, -4.0), (3.0, 0.0, -4.0), how="set")]
+
+        def observation(self, s):
+            return torch.cat([s.projected_gravity("torso"), s.to_body("torso", s.model("gravity"))], dim=-1)
+
+    seen = Leaning(2, "cpu", 0).reset()["observation"]
+    torch.testing.assert_close(5.0 * seen[:, :3], seen[:, 3:])
+
+
+def test_a_pose_that_begins_with_a_quaternion_of_zeros_is_not_turned():
+    class Begins(HumanoidStand):
+        def begin(self, s):
+            return {"qpos": torch.cat([s.home[:, :3], torch.zeros_like(s.home[:, 3:])], dim=-1)}
+
+    env = Begins(2, "cpu", 0)
+    assert env.reset()["observation"].isfinite().all()
+    assert env.sim.qpos[:, 3:7].tolist() == [[1.0, 0.0, 0.0, 0.0]] * 2

@@ -216,9 +216,13 @@ def test_a_task_says_of_predicted_states_what_it_says_in_its_worlds(task):
         assert not earned.observations["privileged"].any()
         assert not gone.observation.any()
         assert not gone.qpos.any()
-        *rest, count, odd, updates, ends = said.rest
-        endless = [*rest, 0 * count, odd, updates + float("inf"), ends]  # reward and critic read it, the actor does not
-        said = imagined.judge(said.qpos, said.qvel, torch.zeros(4, 1), endless, start, said.over & False, none)
+        *clock, numbers, last, count, odd, updates, ends = said.rest
+        going = [*clock, numbers, last, 0 * count, odd]
+        endless = [*going, updates + float("inf"), ends]  # memory, as where it is simulated
+        over = imagined.judge(said.qpos, said.qvel, torch.zeros(4, 1), endless, start, said.over & False, none)
+        assert over.terminated.all()
+        heavy = [*clock, numbers + float("inf"), *going[-3:], updates, ends]  # the reward reads it, the actor does not
+        said = imagined.judge(said.qpos, said.qvel, torch.zeros(4, 1), heavy, start, said.over & False, none)
         earned = imagined.earned([said])
         assert not said.terminated.any()
         assert earned.terminated.all()

@@ -72,6 +72,26 @@ def test_a_step_of_some_worlds_adapts_nothing():
         assert all(stays) == (not all(part))
 
 
+class Averages(WalkerWalk):
+    shared = {"mean": ()}
+
+    def adapt(self, s):
+        return {"mean": 0.9 * s.mean + 0.1 * s.qvel[:, 0].mean()}
+
+    def reward(self, s):
+        return s.qvel[:, 0] - s.mean
+
+
+def test_a_world_that_is_not_finite_leaves_what_worlds_share():
+    env = Averages(3, "cpu", 0)
+    td = env.reset()
+    env.sim.qvel[1] = torch.inf
+    for ended in ([False, True, False], [False] * 3):
+        step, td = env.step_and_maybe_reset(td.set("action", torch.zeros(3, 6)))
+        assert step["next", "terminated"].flatten().tolist() == ended
+    assert env.world.shared["mean"].isfinite()
+
+
 def test_hooks_with_tables_are_kernels_and_equal_plain_torch():
     env, plain = (Looks(5, "cpu", 0, metrics=True, compile_hooks=kernels) for kernels in (True, False))
     assert {part.kind for part in (env.world._judge, env.world._observe, env.world._begin)} == {"kernel"}

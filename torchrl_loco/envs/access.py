@@ -331,12 +331,12 @@ class WorldAccess(EnvBase):
             state.set(key, self._batched(value))
         return state
 
-    def _set_state(self, state: TensorDictBase | None, mask: torch.Tensor | None) -> None:
+    def _set_state(self, state: TensorDictBase | None, mask: torch.Tensor | None, *, finite: bool = True) -> None:
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if state is not None and not self.batch_size:
             state = TensorDict({key: state[key].unsqueeze(0) for key in State.KEYS if key in state}, batch_size=[1])
-        write_state(state, self.world.state(), mask)
+        write_state(state, self.world.state(), mask, finite=finite)
         self.world.refresh(mask)
 
     def settings(self) -> dict[str, Any]:

@@ -312,7 +312,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         before, held = self.get_state(), ~part.to(self.device)
         self.world.step(action.masked_fill(held.unsqueeze(-1), 0.0), adapts=not held.any())
         after = self._outputs(Seen.step, with_reward=True)
-        self._set_state(before, held)
+        self._set_state(before, held, finite=False)  # one of them may have been not finite
         stay = self._skip_tensordict(tensordict.select(*self.full_done_spec, *self.full_observation_spec, strict=False))
         return after.apply(lambda new, old: torch.where(rows_of(held.view(*self.batch_size, 1), new), old, new), stay)
 

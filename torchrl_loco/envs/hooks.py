@@ -386,10 +386,11 @@ class Hooks:
         self._remember(a, self._commanded(a))
 
     def adapt(self, a: Arrays) -> None:
-        """After the events: writes what worlds share."""
+        """After the events: writes what worlds share; numbers that are not finite, which would end all worlds, stay."""
         new = {name: value.clone() for name, value in self._adapted(a).items()}  # one may be another's old one
         for name, value in new.items():
-            a[f"shared.{name}"].copy_(value)
+            old = a[f"shared.{name}"]
+            old.copy_(torch.where(value.isfinite(), value, old))
 
     def observe(self, a: Arrays) -> None:
         """At the end of a step: writes the observation, and marks and zeroes worlds that are not finite."""
@@ -483,10 +484,11 @@ def by_world(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
 
 
 def unit_quaternions(m: mujoco.MjModel, qpos: torch.Tensor) -> torch.Tensor:
-    """Returns poses ``(num_envs, nq)`` with the quaternions of free and ball joints normalised."""
+    """Returns poses ``(num_envs, nq)`` with the quaternions of free and ball joints normalised; 0 is no turn."""
     starts = [int(m.jnt_qposadr[j]) + 3 * (m.jnt_type[j] == 0) for j in range(m.njnt) if m.jnt_type[j] in (0, 1)]
     for q in starts:
-        unit = torch.nn.functional.normalize(qpos[:, q : q + 4], dim=-1)
+        none = ~qpos[:, q : q + 4].any(dim=-1, keepdim=True)
+        unit = torch.nn.functional.normalize(torch.cat([qpos[:, q : q + 1] + none, qpos[:, q + 1 : q + 4]], -1), dim=-1)
         qpos = torch.cat([qpos[:, :q], unit, qpos[:, q + 4 :]], dim=-1)
     return qpos
 

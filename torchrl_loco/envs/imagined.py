@@ -307,7 +307,9 @@ class Imagined:
     ) -> list[torch.Tensor]:
         """Returns the parts of a judgement, and whether it says nothing of a world."""
         _, ended, cut, groups, rest = self._called(qpos, qvel, *others)
-        wrong = beyond(qpos, qvel, seen := groups[OBSERVATION])
+        rows, kinds = dict(zip(self._rest, rest, strict=True)), self._hooks.catalog.memory
+        memory = [rows[key] for name in kinds if (key := f"memory.{name}") in rows and rows[key].is_floating_point()]
+        wrong = beyond(qpos, qvel, *memory, seen := groups[OBSERVATION])
         gone, ended = over | wrong, ended | wrong
         over = over | ended | cut
         first, fast, then = self.unpacked(start)

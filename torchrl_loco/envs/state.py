@@ -76,11 +76,16 @@ def without_state(tensordict: TensorDictBase | None, device: torch.device | None
 
 
 def write_state(
-    state: TensorDictBase | None, targets: Mapping[str | tuple[str, str], torch.Tensor], mask: torch.Tensor
+    state: TensorDictBase | None,
+    targets: Mapping[str | tuple[str, str], torch.Tensor],
+    mask: torch.Tensor,
+    *,
+    finite: bool = True,
 ) -> None:
     """Writes a state into the worlds of a mask. Missing entries become zero, but episode, model and shared stay.
 
     What worlds share is written where all of them are. Targets are the tensors of all worlds by key of :class:`State`.
+    ``finite`` tells whether numbers must be finite.
 
     Raises:
         ValueError: qpos or qvel is missing, a shape is wrong, or a value is not finite. Then nothing is written.
@@ -106,7 +111,7 @@ def write_state(
         if key[0] == "shared" and not (value == value[:1]).all():
             raise ValueError(f"{key} must be the same in all worlds, which share it")
         if targets[key].dtype.is_floating_point:
-            if not value[mask].to(targets[key].dtype).isfinite().all():
+            if finite and not value[mask].to(targets[key].dtype).isfinite().all():
                 raise ValueError(f"{key} must be finite")
         elif (
             key in ("elapsed_steps", "episode")

@@ -481,8 +481,15 @@ class View:
         return sensors.into_frame(self.xmat(body), vectors)
 
     def projected_gravity(self, body: str) -> torch.Tensor:
-        """Returns the direction of gravity in the frame of a body, ``(num_envs, 3)``: (0, 0, -1) if it is upright."""
-        return -self.xmat(body)[:, 2]
+        """Returns the direction of gravity in the frame of a body, ``(num_envs, 3)``: (0, 0, -1) if it is upright.
+
+        Where the model has no gravity, or one along z, that is where -z is.
+        """
+        catalog = self._catalog
+        varies = catalog.variation is not None and "gravity" in catalog.variation.places
+        if not varies and not catalog.mj_model.opt.gravity[:2].any():
+            return -self.xmat(body)[:, 2]
+        return self.to_body(body, torch.nn.functional.normalize(self.model("gravity"), dim=-1))
 
     # Sensors and contacts.
 

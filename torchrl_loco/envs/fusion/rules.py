@@ -82,8 +82,8 @@ def _div(p: Program, a: Any, b: Any, rounding_mode: str | None = None) -> Value:
     if rounding_mode is None:
         return p.apply(DIV, dtype, a, b)
     if dtype != torch.float32:
-        a = a if rounding_mode == "trunc" else p.apply(SUB, dtype, a, _remainder(p, a, b))
-        return p.apply("{1} == 0 ? 0 : {0} / {1}", dtype, a, b)
+        below = "" if rounding_mode == "trunc" else " - ({0} % {1} != 0 && ({0} < 0) != ({1} < 0))"
+        return p.apply(f"{{1}} == 0 ? 0 : {{0}} / {{1}}{below}", dtype, a, b)
     if rounding_mode == "trunc":
         return p.apply("truncf({0} / {1})", dtype, a, b)
     return p.apply("{1} == 0 ? {2} / {1} : rintf({0} / {1})", dtype, p.apply(SUB, dtype, a, _remainder(p, a, b)), b, a)
