@@ -483,11 +483,12 @@ class View:
     def projected_gravity(self, body: str) -> torch.Tensor:
         """Returns the direction of gravity in the frame of a body, ``(num_envs, 3)``: (0, 0, -1) if it is upright.
 
-        Where the model has no gravity, or one along z, that is where -z is.
+        Where the model has no gravity, it is that of -z.
         """
         catalog = self._catalog
+        x, y, z = catalog.mj_model.opt.gravity
         varies = catalog.variation is not None and "gravity" in catalog.variation.places
-        if not varies and not catalog.mj_model.opt.gravity[:2].any():
+        if not varies and x == y == 0.0 and z <= 0.0:
             return -self.xmat(body)[:, 2]
         return self.to_body(body, torch.nn.functional.normalize(self.model("gravity"), dim=-1))
 
