@@ -157,9 +157,8 @@ class TorchGraph:
                     with torch.cuda.graph(torch.cuda.CUDAGraph(), stream=side):
                         torch.zeros(1, device=self._device)
                     # Warp keeps the error of a call that failed in it, which its next strided copy would raise.
-                    column = wp.zeros((2, 2), dtype=float, device=wp.device_from_torch(self._device))[:, 0]
                     with contextlib.suppress(RuntimeError):
-                        wp.clone(column)
+                        wp.clone(wp.zeros((2, 2), dtype=float, device=wp.device_from_torch(self._device))[:, 0])
                     raise
             self._graph = graph
         self._graph.replay()
