@@ -206,6 +206,7 @@ def test_files_folders_globs_and_motions(tmp_path, g1, rows):
         motions.read(3)
 
 
+@pytest.mark.slow
 def test_the_command_prints_films_and_mends(tmp_path, capsys, rows):
     table = rows[:6].copy()
     table[:, 2] += 0.2

@@ -156,6 +156,7 @@ def wrapped(angle):
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
+@pytest.mark.slow
 @for_each("name", ["go1", "g1"])
 def test_random_steps_stay_finite_and_have_the_shapes_of_the_specs(robot, name, caplog):
     env, joints, feet = robot(name), JOINTS[name], FEET[name]

@@ -284,6 +284,7 @@ sys.stdin.readline()
 """
 
 
+@pytest.mark.slow
 def test_a_process_ends_quietly_while_a_page_is_open():
     assert_it_ends_quietly(0.2)
 

@@ -52,6 +52,7 @@ def test_shifted_pictures_repeat_their_edges():
     assert len(set(found)) > 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 @for_each("algorithm, critic_sees", list(itertools.product(("ppo", "reppo"), (False, True))))
 def test_actors_that_see(algorithm, critic_sees, device, tmp_path):

@@ -468,6 +468,7 @@ def test_what_transforms_have_learned_is_in_the_checkpoint(tmp_path):
     assert_same(networks(train(env(), resume=trainer.run)), networks(whole))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:world 0 became non-finite")
 def test_what_cannot_teach_anything_is_said(tmp_path, capsys):
     """Rewards that are all NaN end a training; the same reward everywhere, and episodes of one step, are said once."""

@@ -336,6 +336,7 @@ def test_the_policy_of_before_an_update_collects(svg, made_once):
         assert collects.data_ptr() in kept
 
 
+@pytest.mark.slow
 def test_it_learns_in_a_minute_of_experience(tmp_path):
     few = {"total_frames": 32 * 8 * 25, "eval_interval": 32 * 8 * 5}
     run = training.train(Spin, algorithm="svg", device="cpu", out=tmp_path, **FEW, **few)
@@ -375,6 +376,7 @@ def lengths(rows):
     return {length for length, count in zip(rows["episode_length"], rows["episodes"], strict=True) if count}
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_without_what_it_remembered(tmp_path, capsys, monkeypatch):
     """Nor does it learn from a batch that was collected ahead, in which the episodes have gone on."""
 
