@@ -12,7 +12,7 @@ KERNEL = "python3"
 TIMEOUT = 600
 """Seconds that a cell may take: with cold kernels, the first waits for the compiler."""
 ASIDE = "Warp CUDA warning: Could not find or load the NVIDIA CUDA driver.", "stopping after this update"
-"""What begins a line on stderr that is left out: of a machine without a GPU, and for who sits before the training."""
+"""Beginnings of messages on stderr that are left out: about a machine without a GPU, and on Ctrl-C."""
 WIDGET = "application/vnd.jupyter.widget-view+json"
 """Type of an output that shows nothing without its kernel, such as a progress bar."""
 

@@ -66,9 +66,9 @@ def test_a_body_that_fails_does_not_hide_the_others(monkeypatch):
 
 def test_episodes_that_begin_in_the_floor_are_told():
     env = torchrl_loco.make("walker_walk", 2, "cpu", seed=0, engine="mujoco")
-    assert not doctor.begins_in(env)
+    assert not doctor.starting_contact(env)
     env.sim.qpos[1, 0] -= 0.5
-    assert "mm in each other" in doctor.begins_in(env)
+    assert "mm in each other" in doctor.starting_contact(env)
 
 
 @pytest.mark.slow

@@ -186,3 +186,13 @@ def test_seams_of_boxes_have_no_width():
         center, seams = ground.center(row, 1), np.array([1.5 + 0.3 * k for k in range(6)])
         for points in (np.stack([seams, 0 * seams + 0.1], -1), np.stack([0.1 + 0 * seams, -seams], -1)):
             assert (ground.height(points + center) > -0.1).all()
+
+
+def test_low_relief_is_as_high_in_the_model():
+    def gravel(difficulty, rng, size, cell):
+        return terrain.Patch(heights=np.pad(np.full((2, 2), 1e-4), (4, round(size / cell) - 5)))
+
+    ground = terrain.Terrain({"gravel": gravel}, rows=1, columns=1, size=2.0)
+    m = ground.under('<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/></worldbody></mujoco>').compile()
+    assert m.hfield_size[0, 2] == pytest.approx(np.ptp(ground.heights))
+    assert np.ptp(ground.heights) == pytest.approx(1e-4)

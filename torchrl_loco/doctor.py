@@ -23,7 +23,7 @@ from torchrl_loco.sim.simulation import free_memory
 from torchrl_loco.sim.warp_init import init_warp
 
 PACKAGES = ("torch", "torchrl", "tensordict", "warp-lang", "mujoco-warp", "mujoco")
-DEEP = 5e-3  # from how deep on a contact in which an episode begins is told (m)
+DEEP = 5e-3  # depth from which a contact at the start of an episode is told (m)
 TOLERANCE = 1e-4  # largest median error of qpos (m, rad) after a control step that counts as correct
 
 
@@ -138,10 +138,9 @@ def random_actions(env: torchrl_loco.LocoEnv, steps: Iterable[int]) -> Iterator[
 
 
 def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, str]:
-    """Returns the seconds that making the environment took, the error of ``steps`` random control steps, the engine.
+    """Returns the seconds that making the environment took, the error of ``steps`` control steps, and the engine.
 
-    The last has what :func:`begins_in` says, too.
-
+    The engine is in words, with a deep contact at the start if there is one. Actions are random.
     The error is the median over worlds and steps of the largest deviation of qpos from C MuJoCo (m, rad); NaN if
     anything was not finite.
     """
@@ -151,7 +150,7 @@ def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, st
     seconds = time.perf_counter() - start
     engine = env.engine if env.engine == "compiled" else f"{env.engine}: {env.engine_reason}"
     oracle, td, errors = make(task, 4, "cpu", engine="mujoco", **settings), env.reset(), []
-    engine += begins_in(env)
+    engine += starting_contact(env)
     for action in random_actions(env, range(steps)):
         state = oracle.reset(env.get_state().to("cpu"), set_state=True)
         oracle.step(state.set("action", action))
@@ -162,8 +161,8 @@ def self_test(task: str, device: str, steps: int = 20) -> tuple[float, float, st
     return seconds, float(torch.cat(errors).median()), engine
 
 
-def begins_in(env: torchrl_loco.LocoEnv) -> str:
-    """Returns the deepest contact of the present poses, if it is deeper than ``DEEP``: it pushes bodies apart."""
+def starting_contact(env: torchrl_loco.LocoEnv) -> str:
+    """Returns in words the deepest contact of the present poses, if it is deeper than ``DEEP``, else nothing."""
     m, deepest = env.mj_model, (-DEEP, "")
     d = mujoco.MjData(m)
     for pose in env.sim.qpos.cpu().numpy():

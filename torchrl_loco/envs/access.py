@@ -159,7 +159,7 @@ class WorldAccess(EnvBase):
         check_choice("camera", camera, [model.camera(i).name for i in range(model.ncam)])
         size = check_int("width", width), check_int("height", height)
         worlds = self.num_envs if worlds is None else check_int("worlds", worlds, Interval(1, self.num_envs + 1))
-        make = functools.partial(Eye, **LOOKS_WELL, varied=self.sim.rows)
+        make = functools.partial(Eye, **LOOKS_WELL, varied=self.sim.varied_numbers)
         eye = self.world.renderer(make, model, camera, *size, worlds)
         eye.look(self.sim.data.xpos, self.sim.data.xmat)
         pixels, ghost = eye.rgb.clone(), self.ghost()
@@ -193,7 +193,7 @@ class WorldAccess(EnvBase):
         asked = tuple(check_choice("kind", kind, KINDS) for kind in ([kinds] if isinstance(kinds, str) else kinds))
         if not asked:
             raise ValueError(f"kinds must name at least one of {', '.join(KINDS)}, got {kinds!r}")
-        make = functools.partial(Eye, varied=self.sim.rows)
+        make = functools.partial(Eye, varied=self.sim.varied_numbers)
         eye = self.world.renderer(make, self.mj_model, which, *size, self.num_envs, asked)
         eye.look(self.sim.data.xpos, self.sim.data.xmat)
         return {kind: self._batched(getattr(eye, kind)) for kind in asked}

@@ -386,7 +386,7 @@ class Hooks:
         self._remember(a, self._commanded(a))
 
     def adapt(self, a: Arrays) -> None:
-        """After the events: writes what worlds share; numbers that are not finite, which would end all worlds, stay."""
+        """After the events: writes what worlds share, but numbers that are not finite: they would end all worlds."""
         new = {name: value.clone() for name, value in self._adapted(a).items()}  # one may be another's old one
         for name, value in new.items():
             old = a[f"shared.{name}"]

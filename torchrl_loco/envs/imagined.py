@@ -307,8 +307,8 @@ class Imagined:
     ) -> list[torch.Tensor]:
         """Returns the parts of a judgement, and whether it says nothing of a world."""
         _, ended, cut, groups, rest = self._called(qpos, qvel, *others)
-        rows, kinds = dict(zip(self._rest, rest, strict=True)), self._hooks.catalog.memory
-        memory = [rows[key] for name in kinds if (key := f"memory.{name}") in rows and rows[key].is_floating_point()]
+        of_memory = (row for name, row in zip(self._rest, rest, strict=True) if name.startswith("memory."))
+        memory = [row for row in of_memory if row.is_floating_point()]
         wrong = beyond(qpos, qvel, *memory, seen := groups[OBSERVATION])
         gone, ended = over | wrong, ended | wrong
         over = over | ended | cut

@@ -77,7 +77,9 @@ class Pixels:
     def seen(self, sim: Simulation, mask: torch.Tensor) -> "Seen":
         """Returns what draws them; ``mask`` tells in which worlds episodes begin."""
         n, picture = sim.num_envs, (self.camera, self.width, self.height)
-        eye = Eye(sim.mj_model, sim.device, *picture, n, self.kinds, far=self.far, keeps=False, varied=sim.rows)
+        eye = Eye(
+            sim.mj_model, sim.device, *picture, n, self.kinds, far=self.far, keeps=False, varied=sim.varied_numbers
+        )
         specs = dataclasses.replace(self, stack=1).specs(torch.Size([n]), sim.qpos.device)
         return Seen(sim, mask, eye, specs, self.stack)
 

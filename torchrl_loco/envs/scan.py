@@ -154,7 +154,7 @@ def eye_of(sim: Simulation, asked: DepthRequest | RayRequest) -> Eye | Rays:
     m, n = sim.mj_model, sim.num_envs
     if isinstance(asked, DepthRequest):
         size = asked.width, asked.height
-        return Eye(m, sim.device, asked.camera, *size, n, ("depth",), far=asked.far, varied=sim.rows)
+        return Eye(m, sim.device, asked.camera, *size, n, ("depth",), far=asked.far, varied=sim.varied_numbers)
     return Rays(m, sim.device, asked.site, np.array(asked.directions), n, asked.far)
 
 

@@ -171,7 +171,8 @@ class Task:
         """Returns new values of :attr:`shared` by name, after the events; it alone may sum over worlds.
 
         ``s.terminated`` tells whose episode has ended. Sums of floats have a fixed order, so that runs repeat. A step
-        of some worlds alone (TorchRL's ``"_step"``) does not call it: the others have not stepped.
+        of some worlds alone (TorchRL's ``"_step"``) does not call it: the others have not stepped. Where a new number
+        is not finite, the old one stays.
         """
         return {}
 

@@ -17,8 +17,8 @@ from torchrl_loco.sim.compiled.collision.kinds import MESH, PLANE
 from torchrl_loco.sim.simulation import check_memory
 from torchrl_loco.sim.varied import Varied
 
-BYTES = {"rgb": 3, "depth": 4, "geoms": 4}
-KINDS = tuple(BYTES)  # what a camera tells of each pixel
+BYTES = {"rgb": 3, "depth": 4, "geoms": 4}  # of what a camera tells of each pixel
+KINDS = tuple(BYTES)
 TILES = {"cuda": (8, 4, 16), "cpu": (1, 1, 16)}
 """Width and height of the tile that neighbouring threads draw at once, a pixel each, and how many tiles they draw, one
 below the other. On CUDA they are a warp, which finds the shapes that can be in a tile together, a thread for each."""
@@ -344,8 +344,8 @@ class Eye:
             needed = worlds * width * height * sum(BYTES[kind] for kind in kinds)
             check_memory(needed, worlds, torch.device(wp.device_to_torch(device)))
         with EXCLUSIVE, wp.ScopedDevice(device):
-            names, rows = varied or (None, None)
-            self.placed = Placed(m, device, mounts_of(m, which, device, names), worlds, rows)
+            differing, numbers = varied or (None, None)
+            self.placed = Placed(m, device, mounts_of(m, which, device, differing), worlds, numbers)
             self._looks, self._view = looks_of(m, device), View()
             self._view.half, self._view.pixel = wp.vec2(half * width / height, half), 2.0 * half / height
             self._view.width, self._view.height, self._view.far = width, height, far

@@ -228,8 +228,8 @@ class Simulation:
         self.engine.forward(mask, Around(after=after), contacts=contacts)
 
     @property
-    def rows(self) -> tuple[Varied, wp.array] | None:
-        """Which numbers of the model differ from world to world, and those of each; ``None`` if none do."""
+    def varied_numbers(self) -> tuple[Varied, wp.array] | None:
+        """Which numbers of the model differ from world to world, and these ``(nworld, count)``; ``None`` for none."""
         return None if self.varied is None or not self.varied.count else (self.varied, self.engine.numbers)
 
     def mujoco_data(self, *, contacts: bool = False) -> "mjw.Data":

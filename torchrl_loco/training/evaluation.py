@@ -71,13 +71,14 @@ class Evaluator:
         for _ in trange(pieces, desc="evaluation", leave=False, disable=None):  # no bar in logs
             self._held.begin()
             after = self._collector.rollout()["next"]
+            metrics, terms = after.get("metrics", {}), after.get("reward_terms", {})
             for t, (reward, done) in enumerate(zip(after["reward"].unbind(1), after["done"].unbind(1), strict=True)):
                 returns += reward * alive
-                for name, values in after.get("metrics", {}).items():
+                for name, values in metrics.items():
                     counted = alive & ~values[:, t].isnan()
                     sums[name] = sums.get(name, 0.0) + torch.where(counted, values[:, t], 0.0)
                     counts[name] = counts.get(name, 0.0) + counted
-                for name, values in after.get("reward_terms", {}).items():
+                for name, values in terms.items():
                     earned[name] = earned.get(name, 0.0) + values[:, t] * alive
                 alive &= ~done
             if not alive.any():
