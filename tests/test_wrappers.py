@@ -435,6 +435,8 @@ def test_rsl_rl_trains_and_bootstraps_from_the_final_observation(rsl_rl, tmp_pat
 def test_stable_baselines3(stable_baselines3, steps, make_env):
     env = wrappers.StableBaselines3VecEnv(make_env(stagger=True))
     assert isinstance(env, stable_baselines3.common.vec_env.VecEnv)
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step(steps[0][0]["action"].numpy())
 
     def arrays(observation):
         return list(observation.values()) if make_env is make_with_groups else [observation]

@@ -723,6 +723,9 @@ def test_a_body_without_a_floor_or_actuators_is_told_of(caplog):
     type("Floating", (LocoEnv,), entries)(1, "cpu", 0)
     assert "bodies fall for ever" in caplog.text
     assert "no actuators" in caplog.text
+    entries["control"] = lambda self, s, action: s.time.unsqueeze(-1)
+    with pytest.raises(ValueError, match=r"control must return shape \(1, 0\)"):
+        type("Moved", (LocoEnv,), entries)(1, "cpu", 0)
 
 
 def test_torchs_own_random_numbers_are_told_of(caplog):

@@ -131,6 +131,34 @@ def test_a_wrong_state_is_refused_and_changes_nothing(shared):
         assert_same(env.get_state(), before)
 
 
+def test_a_quaternion_of_zeros_is_refused(shared):
+    env = shared("humanoid_run", 2, **coarse("humanoid_run"))
+    env.reset()
+    before, state = env.get_state(), env.get_state()
+    state["qpos"][1, 3:7] = 0
+    with pytest.raises(ValueError, match=r"the quaternion of joint root, qpos\[:, 3:7\], must not be zeros"):
+        env.reset(state, set_state=True)
+    assert_same(env.get_state(), before)
+
+
+def test_a_state_dict_has_worlds_that_are_not_finite(shared):
+    """Between a step and the reset that follows, as a collector's checkpoint may have them."""
+    first, second = (shared("walker_run", 3, copy=copy) for copy in (0, 1))
+    td = first.reset()
+    first.sim.qpos[1] = torch.nan
+    td = first.step(td.set("action", first.action_spec.zero()))["next"]
+    assert td["terminated"].flatten().tolist() == [False, True, False]
+    second.load_state_dict(first.state_dict())
+    request = TensorDict({"_reset": td["terminated"]}, batch_size=[3])
+    one, other = (env.reset(request.clone()) for env in (first, second))
+    assert (one == other).all()
+    one, other = (
+        env.step(td.set("action", env.action_spec.one()))["next"] for env, td in ((first, one), (second, other))
+    )
+    assert one["observation"].isfinite().all()
+    assert (one == other).all()
+
+
 def test_torchrls_transformed_env_never_drops_a_state_silently(shared):
     env = TransformedEnv(shared(), InitTracker())
     entries = {"qpos": torch.zeros(4, 9), "qvel": torch.zeros(4, 9)}

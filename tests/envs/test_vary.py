@@ -329,6 +329,12 @@ def test_what_a_state_does_to_them(tmp_path, varied):
         made().reset(state, set_state=True)
     with pytest.raises(ValueError, match=r"body_mass.*must have shape"):
         env.reset(loco.State({**state, "model": {"body_mass": torch.ones(4, 2)}}, batch_size=[4]), set_state=True)
+    light = loco.State({"qpos": state["qpos"], "qvel": state["qvel"]}, batch_size=[4])
+    light["model", "body_mass"] = torch.tensor([[1.0], [1.0], [-2.0], [1.0]])
+    before = env.get_state()
+    with pytest.raises(ValueError, match=r"the state's body_mass of \w+ is -2, but it must be positive"):
+        env.reset(light, set_state=True)
+    assert (env.get_state() == before).all()
 
 
 class Seen(loco.WalkerWalk):

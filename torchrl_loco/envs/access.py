@@ -18,7 +18,8 @@ from torchrl_loco.checks import ANY, Interval, check_choice, check_int
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.hooks import Hooks
 from torchrl_loco.envs.pixels import checked_camera
-from torchrl_loco.envs.state import State, write_state
+from torchrl_loco.envs.rotations import check_quaternions
+from torchrl_loco.envs.state import State, checked_state, write_state
 from torchrl_loco.envs.task import folder_of
 from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.vary import Vary
@@ -336,7 +337,13 @@ class WorldAccess(EnvBase):
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if state is not None and not self.batch_size:
             state = TensorDict({key: state[key].unsqueeze(0) for key in State.KEYS if key in state}, batch_size=[1])
-        write_state(state, self.world.state(), mask, finite=finite)
+        targets = self.world.state()
+        new = checked_state(state, targets, mask, finite=finite)
+        if finite:
+            check_quaternions(self.mj_model, new["qpos"][mask])
+            if self.variation is not None:
+                self.variation.check({key[1]: rows[mask] for key, rows in new.items() if key[0] == "model"})
+        write_state(new, targets, mask)
         self.world.refresh(mask)
 
     def settings(self) -> dict[str, Any]:
@@ -367,7 +374,8 @@ class WorldAccess(EnvBase):
         for name, value in self._identity().items():
             if state.get(name) != value:
                 raise ValueError(f"the state has {name}={state.get(name)!r}, this environment has {value!r}")
-        self.reset(State(state["worlds"], batch_size=self.batch_size, device=self.device), set_state=True)
+        worlds = State(state["worlds"], batch_size=self.batch_size, device=self.device)
+        self._reset(worlds, set_state=True, finite=False)  # a world that is to be reset may be not finite
         self.seed = state["seed"]
         self.world.write_seed(self.seed)
 

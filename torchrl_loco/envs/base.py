@@ -317,9 +317,14 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         return after.apply(lambda new, old: torch.where(rows_of(held.view(*self.batch_size, 1), new), old, new), stay)
 
     def _reset(
-        self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, others: bool = True
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        set_state: bool = False,
+        finite: bool = True,
+        others: bool = True,
     ) -> TensorDictBase:
-        """Returns what follows a reset; without ``others``, with the pixels of the worlds of the mask alone."""
+        """Returns what follows a reset; a state must be ``finite``; without ``others``, only the mask's pixels."""
         self._refuse_after_fork()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is not None:
@@ -333,7 +338,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
                 raise ValueError("this environment is closed: reset all worlds to open it again")
             self._open()
         if set_state:
-            self._set_state(tensordict, mask)
+            self._set_state(tensordict, mask, finite=finite)
         else:
             self.world.reset(mask, stagger=self.stagger and mask is None)
         everywhere = torch.ones((*self.batch_size, 1), dtype=torch.bool, device=self.device)

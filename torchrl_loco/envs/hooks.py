@@ -12,6 +12,7 @@ from torchrl_loco.checks import Interval, check_choice, check_float, check_int, 
 from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.fixed_order import fixed_order
 from torchrl_loco.envs.resets import NESTED
+from torchrl_loco.envs.rotations import unit_quaternions
 from torchrl_loco.envs.state import State
 from torchrl_loco.envs.tables import Entry, constants
 from torchrl_loco.envs.task import Task, declared, draws_by_warp, draws_states, own_hooks
@@ -483,19 +484,10 @@ def by_world(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     return mask.view(-1, *[1] * (values.ndim - 1))
 
 
-def unit_quaternions(m: mujoco.MjModel, qpos: torch.Tensor) -> torch.Tensor:
-    """Returns poses ``(num_envs, nq)`` with the quaternions of free and ball joints normalised; 0 is no turn."""
-    starts = [int(m.jnt_qposadr[j]) + 3 * (m.jnt_type[j] == 0) for j in range(m.njnt) if m.jnt_type[j] in (0, 1)]
-    for q in starts:
-        none = ~qpos[:, q : q + 4].any(dim=-1, keepdim=True)
-        unit = torch.nn.functional.normalize(torch.cat([qpos[:, q : q + 1] + none, qpos[:, q + 1 : q + 4]], -1), dim=-1)
-        qpos = torch.cat([qpos[:, :q], unit, qpos[:, q + 4 :]], dim=-1)
-    return qpos
-
-
 def _broadcasts(shape: torch.Size, target: tuple[int, ...]) -> bool:
-    """Returns whether rows have the dimensions that they must, each of the right size or 1."""
-    return len(shape) == len(target) and all(one in (1, other) for one, other in zip(shape, target, strict=True))
+    """Returns whether rows have the dimensions that they must, each of the right size or, but for 0, 1."""
+    pairs = list(zip(shape, target, strict=False))
+    return len(shape) == len(target) and all(one == other or (one == 1 and other > 0) for one, other in pairs)
 
 
 def _kind(value: Any) -> str:

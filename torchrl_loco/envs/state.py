@@ -75,20 +75,19 @@ def without_state(tensordict: TensorDictBase | None, device: torch.device | None
     return TensorDict(kept, batch_size=tensordict.batch_size, device=device)
 
 
-def write_state(
+def checked_state(
     state: TensorDictBase | None,
     targets: Mapping[str | tuple[str, str], torch.Tensor],
     mask: torch.Tensor,
     *,
     finite: bool = True,
-) -> None:
-    """Writes a state into the worlds of a mask. Missing entries become zero, but episode, model and shared stay.
+) -> dict[Any, torch.Tensor]:
+    """Returns the entries of a state that can be written into the worlds of a mask.
 
-    What worlds share is written where all of them are. Targets are the tensors of all worlds by key of :class:`State`.
-    ``finite`` tells whether numbers must be finite.
+    Targets are the tensors of all worlds by key of :class:`State`. ``finite`` tells whether numbers must be finite.
 
     Raises:
-        ValueError: qpos or qvel is missing, a shape is wrong, or a value is not finite. Then nothing is written.
+        ValueError: qpos or qvel is missing, a shape is wrong, or a value is not finite.
     """
     given: dict[Any, Any] = {key: None if state is None else state.get(key, None) for key in targets}
     for group, owner in (("memory", "the task"), ("shared", "the task"), ("model", "randomize")):
@@ -118,6 +117,16 @@ def write_state(
             and not ((value[mask].long() >= 0) & (value[mask].long() < 2**31 - 1)).all()
         ):  # it will be counted up
             raise ValueError(f"{key} must lie in [0, 2**31 - 1)")
+    return new
+
+
+def write_state(
+    new: Mapping[Any, torch.Tensor], targets: Mapping[str | tuple[str, str], torch.Tensor], mask: torch.Tensor
+) -> None:
+    """Writes what :func:`checked_state` returned. Missing entries become zero, but episode, model and shared stay.
+
+    What worlds share is written where all of them are.
+    """
     for key, target in targets.items():
         if (key == "episode" or key[0] in ("model", "shared")) and key not in new:
             continue  # the world's random stream goes on, and its numbers stay

@@ -209,14 +209,32 @@ class Variation(Varied):
         corners = torch.tensor(np.arange(2**count)[:, None] >> np.arange(count) & 1, dtype=torch.float32)
         numbers = self._numbers([corners[:, b].to(self._device) for b in bits]).cpu().double().numpy()
         for change in self._changes:
-            self._check_change(change, numbers)
+            if wrong := self._impossible(change, numbers):
+                what, numbers_of_it, rule = wrong
+                raise ValueError(
+                    f"{change.vary}: {what} could become {numbers_of_it}, but it {rule}: choose other low and high"
+                )
 
     def _touched(self, change: Change) -> set[tuple[str, int]]:
         """Returns the elements that a change is about; gain and bias of an actuator belong together."""
         return {(name.replace("biasprm", "gainprm"), index // FIELDS[name].size) for name, index in change.places}
 
-    def _check_change(self, change: Change, numbers: np.ndarray) -> None:
-        """Checks the numbers ``(combinations, count)`` of what a Vary changes."""
+    def check(self, given: Mapping[str, torch.Tensor]) -> None:
+        """Raises ValueError for numbers of worlds ``(n, columns of a field)`` that are impossible; others may lack."""
+        n = max((len(rows) for rows in given.values()), default=0)
+        numbers = np.repeat(self.nominal()[None], n, axis=0)
+        for name, rows in given.items():
+            numbers[:, self.columns[name]] = rows.cpu().numpy()
+        for change in self._changes:
+            if n and (wrong := self._impossible(change, numbers)):
+                what, numbers_of_it, rule = wrong
+                raise ValueError(f"the state's {what} is {numbers_of_it}, but it {rule}")
+
+    def _impossible(self, change: Change, numbers: np.ndarray) -> tuple[str, str, str] | None:
+        """Returns what is impossible among the numbers ``(rows, count)`` of what a Vary changes, if anything is.
+
+        It is the element's field, its first impossible numbers, and what must be true of them.
+        """
         valid = FIELDS[change.vary.field].valid
         if valid in ("rising", "inertia"):
             name = change.vary.field
@@ -228,13 +246,16 @@ class Variation(Varied):
                 else:
                     had = self._mj_model.body_inertia[element] > 0
                     wrong = ((rows < 0) | (rows == 0) & had).any(1) | (2 * rows.max(1) > rows.sum(1) * (1 + 1e-6))
-                self._refuse(change, name, element, rows, wrong)
+                if wrong.any():
+                    return self._described(change, name, element, rows[wrong][0])
         elif valid != "finite":
             for (name, index), sign in zip(change.places, change.signs, strict=True):
                 rows, positive = sign * self._column(numbers, name, index), valid == "positive"
                 had = sign * float(array_of(self._mj_model, name).flat[index]) > 0
                 wrong = rows <= 0 if positive and had else rows < 0
-                self._refuse(change, name, index // FIELDS[name].size, rows, wrong)
+                if wrong.any():
+                    return self._described(change, name, index // FIELDS[name].size, rows[wrong][:1])
+        return None
 
     def _column(self, numbers: np.ndarray, name: str, index: int) -> np.ndarray:
         """Returns a number of the model in all rows."""
@@ -242,17 +263,11 @@ class Variation(Varied):
             return numbers[:, self._columns[name, index]]
         return np.full(len(numbers), array_of(self._mj_model, name).flat[index])
 
-    def _refuse(self, change: Change, name: str, element: int, rows: np.ndarray, wrong: np.ndarray) -> None:
-        if not wrong.any():
-            return
-        vary = change.vary
-        kind = FIELDS[vary.field].of
+    def _described(self, change: Change, name: str, element: int, numbers: np.ndarray) -> tuple[str, str, str]:
+        field = FIELDS[change.vary.field]
         element = int(self._mj_model.dof_jntid[element]) if name.startswith("dof_") else element
-        values = ", ".join(f"{value:.3g}" for value in np.atleast_1d(rows[np.flatnonzero(wrong)[0]]))
-        raise ValueError(
-            f"{vary}: {vary.field} of {self._elements.names(kind)[element] or f'{kind} {element}'} could become "
-            f"{values}, but it {VALID[FIELDS[vary.field].valid]}: choose other low and high"
-        )
+        of = self._elements.names(field.of)[element] or f"{field.of} {element}"
+        return f"{change.vary.field} of {of}", ", ".join(f"{number:.3g}" for number in numbers), VALID[field.valid]
 
     # What is shown of them.
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_loco.envs import LocoEnv
@@ -37,6 +38,7 @@ class StableBaselines3VecEnv(common.Wrapped, VecEnv):
         **settings: Any,
     ) -> None:
         self._wrap(env, num_envs, settings, render_mode, (camera, width, height))
+        self._td: TensorDictBase | None = None
         self.num_envs = self.env.batch_size[0]
         super().__init__(self.num_envs, observation_space(self.env), box(self.env.action_spec))
         self.metadata = self._render_metadata()
@@ -59,7 +61,12 @@ class StableBaselines3VecEnv(common.Wrapped, VecEnv):
         Returns:
             The observations after the resets; rewards and dones of the step, ``(num_envs,)`` each; and the infos of
             each world.
+
+        Raises:
+            RuntimeError: ``reset()`` was never called.
         """
+        if self._td is None:
+            raise RuntimeError("reset() must be called before step()")
         after, self._td = common.step_worlds(self.env, self._td, self._actions)
         rewards, dones, terminated = (
             common.to_numpy(after[key].squeeze(-1)) for key in ("reward", "done", "terminated")
