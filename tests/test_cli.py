@@ -47,7 +47,7 @@ def test_help_and_wrong_options_wait_for_nothing():
     assert said.count("Walk at 1 m/s or faster, in any direction.") == 2  # in the list and among what can be trained
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_settings_of_a_task_wait_for_torch_alone(tmp_path):
     """It knows whether there is CUDA, which decides on the preset."""
     (tmp_path / "config.json").write_text("{}")

@@ -32,8 +32,6 @@ DOCS = ROOT / "docs"
 HIDDEN = {"_build", "generated"}
 PAGES = sorted(path for path in DOCS.rglob("*.md") if not HIDDEN & set(path.relative_to(DOCS).parts))
 WITH_CODE = [path for path in [ROOT / "README.md", *PAGES] if "```python" in path.read_text()]
-LONG = {"docs/guides/training.md", "docs/api/wrappers.md"}
-"""Pages whose code trains."""
 NEEDS = {
     "docs/api/wrappers.md": ("gymnasium", "moviepy", "rsl_rl", "stable_baselines3"),
     "docs/guides/viewer.md": ("mjviser",),
@@ -70,7 +68,7 @@ PARSER = Sybil([CodeBlockParser("python", run_block), CodeBlockParser("text", co
 
 def page(path):
     name = str(path.relative_to(ROOT))
-    return pytest.param(path, id=name, marks=pytest.mark.ci if name in LONG else pytest.mark.slow)
+    return pytest.param(path, id=name, marks=pytest.mark.slow if name == "README.md" else pytest.mark.ci)
 
 
 @pytest.mark.filterwarnings("ignore:.*autoreset mode is same-step")  # Gymnasium's, as the page says

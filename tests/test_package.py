@@ -48,7 +48,7 @@ def test_imports_go_one_way():
             assert not later, f"{path} imports {later}"
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_in_a_fresh_interpreter_without_the_extras(tmp_path):
     """A worker that unpickles imports the module that it needs before the rest."""
     code = """
@@ -88,7 +88,7 @@ main(["train", "walker_stand", "--device=cpu", "--out", sys.argv[1]])
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_torchs_compiler_is_imported_when_somebody_compiles(tmp_path):
     """Not by a training with PPO or by hooks; what tensordict and TorchRL asked of it at their import is done then."""
     code = """

@@ -261,7 +261,7 @@ def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_p
         loco.WalkerStand.checked_options({"motion": 1})
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_from_a_clip_to_a_file_that_plays_without_torch(tmp_path, short, capsys):
     settings = {"num_envs": 16, "num_steps": 8, "total_frames": 256, "minibatch_size": 64, "eval_episodes": 2}
     arguments = [f"--{name}={value}" for name, value in {**settings, "video_seconds": 0}.items()]

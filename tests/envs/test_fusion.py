@@ -443,7 +443,7 @@ torchrl_loco.make("go1_velocity", 2, "cpu", seed=0)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_kernels_are_found_in_the_cache_by_every_process():
     """Whatever the order of Python's sets in it."""
     texts = set()
