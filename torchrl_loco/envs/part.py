@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 import torchrl_loco
-from torchrl_loco.envs.fusion import fuse, trace
+from torchrl_loco.envs.fusion import CannotFuse, ReachedError, fuse, trace
 from torchrl_loco.envs.hooks import Arrays
 from torchrl_loco.garbage import no_collection
 from torchrl_loco.sim import Simulation
@@ -161,15 +161,31 @@ class Part:
 
     def _stays_plain(self, error: Exception) -> None:
         message = " ".join(str(error).split("\n")[:3]).strip()
+        of_operator = error.operator if isinstance(error, CannotFuse) else None
+        line = _line_of_user(self._where(of_operator) if of_operator else error)
         logging.getLogger("torchrl_loco").warning(
-            "%s: not compiled, runs as plain torch: %s%s", self._title, message, _line_of_user(error)
+            "%s: not compiled, runs as plain torch: %s%s", self._title, message, line
         )
 
+    def _where(self, operator: str) -> BaseException | None:
+        """Returns what is raised where the hooks call an operator of the graph, by the name of its node."""
+        try:
+            trace(self._work, {name: rows.clone() for name, rows in self._arrays.items()}, self._fixed, operator)
+        except ReachedError as reached:
+            return reached
+        except Exception:  # a hook that does something else at each call
+            return None
+        return None
 
-def _line_of_user(error: Exception) -> str:
+
+def _line_of_user(error: BaseException | None) -> str:
     """Returns where in the task's own code an error comes from, if it does."""
     packages = tuple(path for module in (torch, torchrl_loco) for path in module.__path__)
-    frames = [each for each in traceback.extract_tb(error.__traceback__) if not each.filename.startswith(packages)]
+    frames = (
+        []
+        if error is None
+        else [each for each in traceback.extract_tb(error.__traceback__) if not each.filename.startswith(packages)]
+    )
     return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
 

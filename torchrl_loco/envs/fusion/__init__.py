@@ -16,6 +16,7 @@ import warp as wp
 from torchrl_loco.envs.fusion.nodes import CannotFuse as CannotFuse
 from torchrl_loco.envs.fusion.program import LONG, Program
 from torchrl_loco.envs.fusion.rules import RULES
+from torchrl_loco.envs.fusion.trace import ReachedError as ReachedError
 from torchrl_loco.envs.fusion.trace import trace as trace
 from torchrl_loco.sim.world_func import BLOCK_DIM, fill
 

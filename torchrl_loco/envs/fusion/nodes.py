@@ -16,7 +16,14 @@ OF_INTEGERS = {LEAST: "{0} < {1} ? {0} : {1}", MOST: "{0} > {1} ? {0} : {1}"}
 
 
 class CannotFuse(Exception):  # noqa: N818
-    """A graph that is no straight-line code of each world; the message tells which operator or shape."""
+    """A graph that is no straight-line code of each world; the message tells which operator or shape.
+
+    ``operator`` is the name of its node in the graph, if it is one.
+    """
+
+    def __init__(self, message: str, operator: str | None = None) -> None:
+        super().__init__(message)
+        self.operator = operator
 
 
 @dataclass(slots=True, eq=False)

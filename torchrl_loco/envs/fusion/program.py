@@ -306,9 +306,9 @@ class Program:
                 try:
                     found[node] = self._call(node, found)
                 except CannotFuse as error:
-                    raise CannotFuse(str(error).replace("{op}", str(node.target))) from None
+                    raise CannotFuse(str(error).replace("{op}", str(node.target)), node.name) from None
                 except Exception as error:  # operands that its rule did not foresee
-                    raise CannotFuse(f"the rule of {node.target} fails: {error}") from error
+                    raise CannotFuse(f"the rule of {node.target} fails: {error}", node.name) from error
         return self._source()
 
     def _constant(self, node: torch.fx.Node, tensor: torch.Tensor) -> Any:

@@ -44,6 +44,10 @@ def _decomposed(func: Any) -> Callable[..., Any] | None:
     return new and (lambda target, *args, **kwargs: target.copy_(new(target, *args, **kwargs)))
 
 
+class ReachedError(BaseException):
+    """The operator at which to stop is reached."""
+
+
 class NumberTakenError(RuntimeError):
     """What a hook does depends on a number that it reads out of a tensor."""
 
@@ -56,10 +60,14 @@ class Tracer(TorchDispatchMode):
     Args:
         arrays: what differs in each run, by name.
         fixed: further tensors that never change; numbers of others must not be read, as they would stay what they are.
+        stop: name of the operator's node at which to raise ``ReachedError``.
     """
 
-    def __init__(self, arrays: dict[str, torch.Tensor], fixed: Iterable[torch.Tensor] = ()) -> None:
+    def __init__(
+        self, arrays: dict[str, torch.Tensor], fixed: Iterable[torch.Tensor] = (), stop: str | None = None
+    ) -> None:
         super().__init__()
+        self._stop = stop
         self.graph, self.constants = torch.fx.Graph(), torch.nn.Module()
         self._device = next(iter(arrays.values())).device
         self._fixed = {tensor.data_ptr() for tensor in fixed}
@@ -90,6 +98,8 @@ class Tracer(TorchDispatchMode):
                 self._note(result, self._constant(result.to(self._device)))
                 return result
         node = self.graph.call_function(func, *torch.fx.node.map_aggregate((args, kwargs), self.argument))
+        if node.name == self._stop:
+            raise ReachedError
         operands = node.all_input_nodes
         if func is aten.lift_fresh_copy.default or (operands and self._known.issuperset(operands)):
             self._known.add(node)
@@ -156,13 +166,15 @@ def trace(
     work: Callable[[dict[str, torch.Tensor]], None],
     arrays: dict[str, torch.Tensor],
     fixed: Iterable[torch.Tensor] = (),
+    stop: str | None = None,
 ) -> torch.fx.GraphModule:
     """Returns what a function, called once, does to arrays in place: a module that takes them one after another.
 
     Raises:
+        ReachedError: the function calls the operator whose node has the name ``stop``.
         NumberTakenError: what it does depends on a number of an array, or of a tensor that is not among ``fixed``.
     """
-    tracer = Tracer(arrays, fixed)
+    tracer = Tracer(arrays, fixed, stop)
     with NumbersTaken(tracer), tracer:
         work(arrays)
     tracer.graph.output(None)
