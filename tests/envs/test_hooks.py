@@ -402,7 +402,7 @@ def test_a_hook_that_leaves_torch_is_not_frozen(caplog):
         assert torch.equal(td["next", "reward"][:, -1, 0], env.sim.qvel[:, 0])
         assert torch.equal(td["next", "observation"][:, -1], env.sim.qpos)
         assert f"{task.__name__}: reward, terminated: not compiled" in caplog.text
-        assert f"{task.__name__}: observation: not compiled" in caplog.text
+        assert caplog.text.count(f"{task.__name__}: observation: not compiled") == 1
 
 
 def sine(self, s):

@@ -33,7 +33,8 @@ class Part:
     :meth:`compile` runs it once on the present worlds to trace it. Whatever Python hooks use is evaluated then: what
     shall change later must be a tensor that is changed in place.
 
-    The arrays stay at their addresses, and the tensors ``fixed`` as they are; ``title`` is for messages.
+    The arrays stay at their addresses, and the tensors ``fixed`` as they are; ``title`` is for messages, which are not
+    repeated if they are among those that parts beside it ``said``.
     """
 
     def __init__(
@@ -42,8 +43,9 @@ class Part:
         arrays: dict[str, torch.Tensor],
         title: str,
         fixed: Sequence[torch.Tensor] = (),
+        said: set[str] | None = None,
     ) -> None:
-        self._fixed = fixed
+        self._fixed, self._said = fixed, set[str]() if said is None else said
         self._work, self._arrays, self._title = work, arrays, title
         self._launch: Callable[[], None] | None = None
         self._traced: torch.fx.GraphModule | None = None  # until its kernel is compared
@@ -163,9 +165,10 @@ class Part:
         message = " ".join(str(error).split("\n")[:3]).strip()
         of_operator = error.operator if isinstance(error, CannotFuse) else None
         line = _line_of_user(self._where(of_operator) if of_operator else error)
-        logging.getLogger("torchrl_loco").warning(
-            "%s: not compiled, runs as plain torch: %s%s", self._title, message, line
-        )
+        verdict = f"{self._title}: not compiled, runs as plain torch: {message}{line}"
+        if verdict not in self._said:
+            self._said.add(verdict)
+            logging.getLogger("torchrl_loco").warning(verdict)
 
     def _where(self, operator: str) -> BaseException | None:
         """Returns what is raised where the hooks call an operator of the graph, by the name of its node."""

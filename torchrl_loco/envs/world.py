@@ -237,9 +237,10 @@ class World:
 
         parts: dict[Part, set[str]] = {}  # and what attributes of the task each reads
         of_hook: dict[str, Part] = {}
+        said: set[str] = set()  # an observation is part of a step and of a reset
 
         def made(work: Callable[[Arrays], None], arrays: dict[str, torch.Tensor], title: str, fixed: Any = ()) -> Part:
-            one = Part(work, arrays, f"{self._title}: {title}", fixed)
+            one = Part(work, arrays, f"{self._title}: {title}", fixed, said)
             parts[one] = set()
             return one
 
