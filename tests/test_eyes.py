@@ -345,10 +345,12 @@ def test_rays_from_a_body_meet_what_those_of_c_mujoco_meet(device):
         wp.array(data.xpos[None], dtype=wp.vec3, device=device),
         wp.array(data.xmat.reshape(1, -1, 3, 3), dtype=wp.mat33, device=device),
     )
-    found, groups = rays.distance[0].cpu().numpy(), np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)
+    found, hidden = rays.distance[0].cpu().numpy(), 0
     for direction, distance in zip(directions @ axes.T, found, strict=True):
-        met = mujoco.mj_ray(m, data, start, direction, groups, 1, -1, geom)
+        met = mujoco.mj_ray(m, data, start, direction, None, 1, -1, geom)
         assert distance == pytest.approx(50.0 if met < 0 else min(met, 50.0), rel=1e-4)
+        hidden += met > 0 and m.geom_group[geom[0]] >= 3
+    assert hidden > 0  # geoms that pictures do not show
     assert (found < 50.0).mean() > 0.3
 
 

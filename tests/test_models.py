@@ -112,6 +112,7 @@ def test_a_model_that_would_go_wrong_in_silence_is_refused():
         ({"option": clampctrl}, "must be clipped"),
         ({"option": '<option actuatorgroupdisable="3"/>', "actuator": MOTOR.replace("/>", ' group="3"/>')}, "disabled"),
         ({"actuator": MOTOR.replace("/>", ' delay="0.1" nsample="4"/>')}, "delays"),
+        ({"option": '<default><joint frictionloss="-1"/></default>'}, "frictionloss must not be negative"),
         ({"sensor": from_camera}, "sensor 'seen' is not evaluated"),
         ({"sensor": '<framepos name="place" objtype="body" objname="ant"/>'}, "sensor 'place' is not evaluated"),
         ({"sensor": '<actuatorfrc name="force" actuator="a"/>'}, "sensor 'force' is not evaluated"),

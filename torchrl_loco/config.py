@@ -102,15 +102,22 @@ class SimConfig:
             others: further fields.
 
         Raises:
-            ValueError: the model's integrator is none of those of :attr:`integrator`.
+            ValueError: the model's integrator is none of those of :attr:`integrator`, or its time step is not positive.
         """
         import mujoco
 
         if not isinstance(model, mujoco.MjModel | mujoco.MjSpec):
             model = read_mjcf(model)
-        fields = options_of(model.opt if isinstance(model, mujoco.MjModel) else model.option)
+        fields = options_of(model.opt if isinstance(model, mujoco.MjModel) else model.option) | others
+        if not fields["sim_dt"] > 0:
+            raise ValueError(f"the model's timestep must be greater than 0, got {fields['sim_dt']:g}")
+        if fields["integrator"] not in INTEGRATORS:
+            raise ValueError(
+                f"the model's integrator is {fields['integrator']!r}, which no engine has: name one of "
+                f"{', '.join(INTEGRATORS)} in the model, or by SimConfig.of(model, integrator=...)"
+            )
         steps = max(1, round(0.02 / fields["sim_dt"]))
-        return cls(**{"ctrl_dt": steps * fields["sim_dt"] if ctrl_dt is None else ctrl_dt, **fields, **others})
+        return cls(**{"ctrl_dt": steps * fields["sim_dt"] if ctrl_dt is None else ctrl_dt, **fields})
 
     @property
     def substeps(self) -> int:

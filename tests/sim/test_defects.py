@@ -561,3 +561,22 @@ def test_a_small_gain_is_found_beside_a_large_cost(form):
     states = [np.full((count, 1), x, dtype=np.float32) for x in (0, 0, 0, -1000)]
     states[1][:, 0] = speeds
     assert (errors(model, states) / model.opt.timestep).max() < 1.0
+
+
+@in_both_forms
+def test_ends_of_ranges_may_be_infinite_and_numbers_odd_as_in_c_mujoco(form):
+    """Damping that is negative everywhere is explicit; the ratio of impedances has a lower bound."""
+    odd = LIMBS.replace(" iterations=", ' impratio="0" iterations=').replace(
+        'damping=".2"', 'damping="-.3" range="-inf 1"'
+    )
+    odd = odd.replace('damping=".1"', 'damping="-.1" limited="true" range="-.2 inf"')
+    odd = odd.replace('gear="2"', 'gear="2" forcerange="-inf 1e300"')
+    m = mujoco.MjModel.from_xml_string(odd)
+    rng, n = np.random.default_rng(0), 20
+    states = [np.zeros((n, size), dtype=np.float32) for size in (m.nq, m.nv, m.nv, m.nu)]
+    states[0][:] = m.qpos0
+    states[0][:, 2] = rng.uniform(0.09, 0.2, n)  # some touch the floor
+    states[0][:, 7:] = rng.uniform(-0.5, 1.2, (n, 2))
+    states[1][:], states[3][:] = rng.normal(size=(n, m.nv)), rng.uniform(-1, 1, (n, m.nu))
+    expected = np.array([c_step(m, *state) for state in zip(*states, strict=True)])
+    np.testing.assert_allclose(compiled_step(m, states).qvel.numpy(), expected, rtol=1e-4, atol=1e-4)

@@ -17,6 +17,7 @@ from torchrl_loco.envs.scan import DepthRequest, RayRequest, Request, ScanReques
 from torchrl_loco.envs.tables import Entry, Table
 from torchrl_loco.envs.variation import Variation, constant_of
 from torchrl_loco.eyes.placing import bytes_placed
+from torchrl_loco.eyes.scene import GROUPS
 from torchrl_loco.eyes.shapes import MISS
 from torchrl_loco.sim import models
 from torchrl_loco.sim.simulation import check_memory
@@ -435,7 +436,8 @@ class View:
         if not self._catalog.complete:
             if name not in scans:
                 scans[name], catalog = asked, self._catalog
-                of_eyes = 0 if isinstance(asked, ScanRequest) else bytes_placed(catalog.mj_model)
+                groups = mujoco.mjNGROUP if isinstance(asked, RayRequest) else GROUPS
+                of_eyes = 0 if isinstance(asked, ScanRequest) else bytes_placed(catalog.mj_model, groups)
                 catalog.bytes_scanned += 4 * COPIES_IN_HOOKS * math.prod(shape) + of_eyes
                 check_memory(catalog.num_envs * catalog.bytes_scanned, catalog.num_envs, catalog.device)
             self._catalog.scanning.setdefault(self._hook, set()).add(name)

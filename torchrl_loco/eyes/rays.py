@@ -40,8 +40,9 @@ def cast(
 class Rays:
     """Rays from a site, in each of several worlds of a model.
 
-    Their directions are in the frame of the site, of length 1, ``(count, 3)``. ``distance`` tells how far what they
-    meet lies, or ``far`` (m), ``(worlds, count)``.
+    They meet geoms of all groups, also of those that pictures do not show. Their directions are in the frame of the
+    site, of length 1, ``(count, 3)``. ``distance`` tells how far what they meet lies, or ``far`` (m), ``(worlds,
+    count)``.
     """
 
     def __init__(
@@ -49,7 +50,8 @@ class Rays:
     ) -> None:
         place = {"body": m.site_bodyid[[site]], "pos": m.site_pos[[site]], "mat": axes_of(m.site_quat[site])[None]}
         mounts = mounts_at(m, device, **place, mode=np.zeros(1), target=-np.ones(1))
-        self._placed, self._device, self._far = Placed(to_the_horizon(m), device, mounts, worlds), device, far
+        self._placed = Placed(to_the_horizon(m), device, mounts, worlds, groups=mujoco.mjNGROUP)
+        self._device, self._far = device, far
         with EXCLUSIVE, wp.ScopedDevice(device):
             self._directions = wp.array(directions, wp.vec3, device=device)
             self._out = Buffer((worlds, len(directions)), float, device)

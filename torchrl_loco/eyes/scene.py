@@ -14,7 +14,7 @@ from torchrl_loco.sim.corners import axes_of
 from torchrl_loco.sim.varied import Varied
 
 KINDS = (PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)  # types of geoms that are seen
-GROUPS = 3  # groups of geoms that are seen, from 0 on, as in MuJoCo's viewer
+GROUPS = 3  # groups of geoms that pictures show, from 0 on, as in MuJoCo's viewer
 FULL_SHINE = 128.0  # exponent of a highlight where a material's shininess is 1
 HIDDEN = 1e-3  # opacity up to which a geom is not seen
 TRACKS = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK))
@@ -140,16 +140,16 @@ def facing(direction: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def geoms_seen(m: mujoco.MjModel) -> tuple[list[int], list[int]]:
+def geoms_seen(m: mujoco.MjModel, groups: int = GROUPS) -> tuple[list[int], list[int]]:
     """Returns which geoms are seen: those that are shapes of their own, and those that are one shape, the ground."""
-    seen = [g for g in range(m.ngeom) if m.geom_group[g] < GROUPS and color_of(m, g)[3] > HIDDEN]
+    seen = [g for g in range(m.ngeom) if m.geom_group[g] < groups and color_of(m, g)[3] > HIDDEN]
     of_ground = [g for g in seen if m.geom_bodyid[g] == 0 and m.geom_type[g] in (BOX, FIELD)]
     return [g for g in seen if g not in set(of_ground)], of_ground
 
 
-def shapes_of(m: mujoco.MjModel, device: wp.Device) -> tuple[Shapes, list[wp.Mesh]]:
+def shapes_of(m: mujoco.MjModel, device: wp.Device, groups: int = GROUPS) -> tuple[Shapes, list[wp.Mesh]]:
     """Returns the shapes of a model that are seen, and the meshes among them, which must be kept."""
-    alone, of_ground = geoms_seen(m)
+    alone, of_ground = geoms_seen(m, groups)
     kinds = [int(m.geom_type[g]) for g in alone]
     meshes: dict[tuple[int, int], wp.Mesh] = {}
     ids = []

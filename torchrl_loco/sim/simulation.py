@@ -354,6 +354,8 @@ def choose_engine(mj_model: mujoco.MjModel, config: SimConfig, varied: Varied | 
         return "compiled", "it has all that the model needs"
     if config.engine == "compiled":
         raise ValueError(f"engine='compiled' does not have: {'; '.join(missing)}. Pass engine='auto' or 'mujoco_warp'")
+    if mj_model.nflex:  # MuJoCo-Warp 4.0 ends in an error of its sorting
+        raise ValueError("flexes are stepped by C MuJoCo alone: pass engine='mujoco'")
     more = f" and {len(missing) - 1} more: see env.engine_reason" if len(missing) > 1 else ""
     logging.getLogger("torchrl_loco").warning(
         "stepping with MuJoCo-Warp: engine 'compiled' does not have: %s%s", missing[0], more

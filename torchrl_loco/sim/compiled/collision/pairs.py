@@ -149,7 +149,12 @@ def contact_weight(m: mujoco.MjModel, pair: Pair) -> Number:
     if pair.condim == 1 or is_elliptic(m):
         return pair.weight
     squared = pair.friction * pair.friction
-    return pair.weight * (1 + squared) * 2 * squared / m.opt.impratio
+    return pair.weight * (1 + squared) * 2 * squared / impratio(m)
+
+
+def impratio(m: mujoco.MjModel) -> float:
+    """Returns how many times as stiff as the normal friction is, as C MuJoCo bounds it."""
+    return max(MINVAL, m.opt.impratio)
 
 
 def least_regularisation(pair: Pair) -> Number:

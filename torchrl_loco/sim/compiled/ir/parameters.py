@@ -80,6 +80,11 @@ def present(values: np.ndarray) -> bool:
     return any(varies(x) or constant(x) != 0 for x in values.flat)
 
 
+def positive(values: np.ndarray) -> bool:
+    """Returns whether any number is greater than zero, or varies."""
+    return any(varies(x) or constant(x) > 0 for x in values.flat)
+
+
 def largest(a: Number, b: Number) -> Number:
     """Returns the larger of two numbers of a model."""
     return maximum(a, b) if varies(a) or varies(b) else max(constant(a), constant(b))

@@ -394,9 +394,12 @@ def cpp_function(head: str, *results: Any) -> str:
     return f"{head} {{\n{block.text()}\nreturn {value};\n}}"
 
 
+LARGEST = float(np.finfo(np.float32).max)
+
+
 def literal(x: float) -> str:
-    """Returns a float32 literal of C++."""
-    number = np.float32(x)
+    """Returns a float32 literal of C++: C++ has none of infinity, so the largest number stands for it."""
+    number = np.float32(np.clip(x, -LARGEST, LARGEST))
     plain = number == 0 or 1e-4 <= abs(number) < 1e7
     text = np.format_float_positional(number, trim="0") if plain else f"{number:.9g}"
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import mujoco
 
 from torchrl_loco.sim.compiled.collision.pairs import pairs
-from torchrl_loco.sim.compiled.ir.parameters import VariedModel, number, present
+from torchrl_loco.sim.compiled.ir.parameters import VariedModel, number, positive
 from torchrl_loco.sim.compiled.ir.symbols import Block, Scalar, cells, literal, names, scalar, zeros
 from torchrl_loco.sim.compiled.ir.tables import Tables
 from torchrl_loco.sim.compiled.physics import sensors
@@ -121,7 +121,7 @@ def _integrate(block: Block, m: mujoco.MjModel, tree: Dynamics) -> None:
     """
     h, qacc = m.opt.timestep, cells("qacc", m.nv)
     implicit = not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-    if implicit and present(m.dof_damping):
+    if implicit and positive(m.dof_damping):
         diagonal = [scalar(h * damping) for damping in m.dof_damping]
         factor = ArticulatedFactor(tree, [zeros(6, 6) for _ in range(m.nbody)], diagonal)
         qacc = [block.keep(a) for a in factor.solve(cells("M_qacc", m.nv))]

@@ -11,10 +11,16 @@ import numpy as np
 
 from torchrl_loco.sim.compiled.collision.ground import BOX_NUMBERS
 from torchrl_loco.sim.compiled.collision.kinds import MESH, POINT_BITS, SHAPES, SOLID
-from torchrl_loco.sim.compiled.collision.pairs import Pair, contact_weight, half_length, least_regularisation
+from torchrl_loco.sim.compiled.collision.pairs import (
+    Pair,
+    contact_weight,
+    half_length,
+    impratio,
+    least_regularisation,
+)
 from torchrl_loco.sim.compiled.collision.planes import LEAST_ALIGNED
 from torchrl_loco.sim.compiled.ir import symbols
-from torchrl_loco.sim.compiled.ir.parameters import Number, VariedModel, nominal, present, varies
+from torchrl_loco.sim.compiled.ir.parameters import Number, VariedModel, nominal, positive, present, varies
 from torchrl_loco.sim.compiled.ir.tables import Tables
 from torchrl_loco.sim.compiled.physics.actuators import activation_flow
 from torchrl_loco.sim.compiled.physics.delicate import LEAST_PIVOT, is_delicate
@@ -153,8 +159,8 @@ def _add_limbs(tables: Tables, d: Description) -> None:
 def _add_forces(tables: Tables, d: Description) -> None:
     m = d.m
     stiffness, damping = m.jnt_stiffness[m.dof_jntid], m.dof_damping
-    explicit = m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP) and not is_implicitfast(m)
-    implicit = present(damping) and not explicit
+    explicit = m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    implicit = present(damping) if is_implicitfast(m) else positive(damping) and not explicit
     tables.size(HAS_SPRINGS=present(stiffness), IMPLICIT_DAMPING=implicit or d.implicit_actuators)
     tables.floats("stiffness", stiffness)
     tables.floats("spring", m.qpos_spring)
@@ -332,7 +338,7 @@ def _add_friction(tables: Tables, d: Description) -> None:
     with the normal as it is, by factors that are the coefficients over ``mu``; the ratio of impedances makes it
     less steep than sliding friction.
     """
-    found, ratio = d.pairs, math.sqrt(d.m.opt.impratio)
+    found, ratio = d.pairs, math.sqrt(impratio(d.m))
     tables.size(ELLIPTIC=d.elliptic)
     slopes: list[Number] = [p.friction / ratio if d.elliptic and p.condim > 1 else 1.0 for p in found]
     tables.floats("mu", slopes)
