@@ -94,6 +94,11 @@ def test_actions(env):
 
 def test_masks(env):
     td = env.reset()
+    part = td.clone().set("action", torch.zeros(3, 6))
+    with pytest.raises(TypeError, match=r"'_step' must be .* bool, got torch\.float32"):
+        env._step(part.set("_step", torch.ones(3, 1)))
+    with pytest.raises(ValueError, match=r"'_step' must have shape \(3, 1\), got \(2,\)"):
+        env._step(TensorDict({"action": torch.zeros(3, 6), "_step": torch.ones(2, dtype=torch.bool)}))
     before = env.get_state()
     with pytest.raises(TypeError, match=r"'_reset' must be .* bool, got torch\.float32"):
         env.reset(td.set("_reset", torch.ones(3, 1)))

@@ -116,6 +116,16 @@ def test_its_state_goes_on_in_another_collector(make):
     assert (first.rollout() == second.rollout()).all()
 
 
+def test_its_state_has_the_seed(shared):
+    """On which the next episodes depend: where none is given, each process draws another."""
+    envs = [shared("walker_run", 3, copy=copy, seed=7 + copy, episode_length=5) for copy in (0, 1)]
+    first, second = (RolloutCollector(env, policy(env), frames_per_batch=30) for env in envs)
+    first.rollout()
+    second.load_state_dict(first.state_dict())
+    assert (first.rollout() == second.rollout()).all()
+    assert envs[1].seed == 7
+
+
 class Noisy(torch.nn.Module):
     """Writes a stochastic action, its mean, and a count of the steps that the world has been alive."""
 

@@ -172,6 +172,7 @@ class RolloutCollector:
             worlds = self._base.get_state()
             again = ["pixels"] if "pictures" in worlds.keys() else []  # noqa: SIM118, the state holds them
             state |= {"carried": self._carried.exclude(*again).clone().to_dict(), "env": worlds.to_dict()}
+            state["seed"] = self._base.seed
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -189,6 +190,9 @@ class RolloutCollector:
             remembered = set(getattr(self._policy, "in_keys", carried.keys())) - set(begin.keys())
             kept = carried.select(*begin.keys(True, True), *remembered, strict=False)
             self._carried = begin.update(kept)
+            if "seed" in state:  # on which later episodes depend
+                self._base.seed = state["seed"]
+                self._base.world.write_seed(state["seed"])
         if "transforms" in state:  # after the reset, from which some learn
             load_transforms(self._env, state["transforms"])
 

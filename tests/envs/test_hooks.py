@@ -734,6 +734,43 @@ def test_a_body_without_a_floor_or_actuators_is_told_of(caplog):
         type("Moved", (LocoEnv,), entries)(1, "cpu", 0)
 
 
+@for_each("compile_hooks", [True, False])
+def test_the_callers_autocast_is_for_the_callers_own_networks(compile_hooks, caplog):
+    """Neither where an environment is made in it nor where it is stepped; sorted numbers make no kernel."""
+
+    class Mixed(WalkerWalk):
+        def observation(self, s):
+            return {"observation": s.qpos.sort(-1).values @ s.uniform(0, 1, 9, 4)[0]}
+
+        def reward(self, s):
+            return (s.qpos @ s.qvel.T).diagonal()
+
+    seen = []
+    for made, stepped in ((False, False), (True, True)):
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=made):
+            env = Mixed(3, "cpu", 0, world_offset=0, compile_hooks=compile_hooks)
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=stepped):
+            seen.append(env.rollout(3, lambda td: td.set("action", torch.full((3, 6), 0.3))))
+    assert (seen[0] == seen[1]).all()
+    assert "bfloat16" not in caplog.text
+
+
+def test_a_group_of_what_warp_observes_is_a_kernel():
+    """Though reward and what Warp rewards are one memory where the reward is not the task's own."""
+    observe = lambda self, s: {"observation": {"all": super(WalkerWalk, self).observation(s)}}  # noqa: E731
+    env = type("Grouped", (WalkerWalk,), {"observation": observe})(2, "cpu", seed=0)
+    assert env.world._observe.kind == "kernel"
+    expected = WalkerWalk(2, "cpu", seed=0).rollout(3, lambda td: td.set("action", torch.full((2, 6), 0.3)))
+    td = env.rollout(3, lambda td: td.set("action", torch.full((2, 6), 0.3)))
+    assert (td == expected).all()
+
+
+def test_settings_that_change_after_construction_are_told_of():
+    env = WalkerWalk(2, "cpu", seed=0)
+    with pytest.warns(UserWarning, match=r"WalkerWalk\.noise_scale was read .*: make another with this setting"):
+        env.noise_scale = 0.0
+
+
 def test_torchs_own_random_numbers_are_told_of(caplog):
     type("Drawn", (WalkerWalk,), {"reward": lambda self, s: torch.rand(s.time.shape)})(2, "cpu", 0)
     assert "draws by torch.rand instead of s.uniform" in caplog.text

@@ -58,6 +58,16 @@ def test_rollout_and_collector(env):
     assert [batch.shape for batch in batches] == [(8,), (8,)]
 
 
+def test_what_a_policy_adds_may_have_no_dimensions(env):
+    """As the log-probability of an action has none; it is zero where an episode begins."""
+    td = env.reset().set("action", env.action_spec.zero()).set("log_prob", torch.tensor(1.0, device=env.device))
+    for _ in range(3):
+        after, td = env.step_and_maybe_reset(td.set("action", env.action_spec.zero()))
+        assert after["log_prob"].shape == td["log_prob"].shape == ()
+        assert td["log_prob"] == (0.0 if after["next", "done"] else 1.0)
+        td["log_prob"] = torch.tensor(1.0, device=env.device)
+
+
 def test_states_and_masks(env, made):
     td = env.rollout(2)[-1]["next"].exclude("reward", "reward_terms")
     state = env.get_state()

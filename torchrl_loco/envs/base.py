@@ -42,6 +42,9 @@ from torchrl_loco.envs.vary import Vary, check_randomize
 from torchrl_loco.sim import models
 from torchrl_loco.sim.simulation import set_options
 
+SETTINGS = ("history", "noise", "noise_scale", "observation_terms", "play", "protocol", "randomize")
+"""Attributes from which an environment is made."""
+
 
 class LocoEnv(Task, WorldAccess, QuickResets):
     """Base of the locomotion environments: batched worlds of one body on one device.
@@ -231,11 +234,13 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         return models.check(stepped, own_control="control" in own)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        fixed = getattr(self.__dict__.get("_world"), "fixed", ())
+        world = self.__dict__.get("_world")
+        fixed = {*SETTINGS, *world.fixed} if world else ()
         if name in fixed and name != "seed" and value is not getattr(self, name, None):  # set_seed() sets that
+            instead = "make it a tensor that you change in place, or close() and reset() the environment"
             warn(
-                f"{type(self).__name__}.{name} was read when the environment was made, and changes nothing now: make "
-                "it a tensor that you change in place, or close() and reset() the environment"
+                f"{type(self).__name__}.{name} was read when the environment was made, and changes nothing now: "
+                f"{'make another with this setting' if name in SETTINGS else instead}"
             )
         super().__setattr__(name, value)
 
@@ -297,9 +302,9 @@ class LocoEnv(Task, WorldAccess, QuickResets):
             raise KeyError(f"step needs an 'action' of shape {tuple(shape)} in its TensorDict")
         if action.shape != shape:
             raise ValueError(f"action must have shape {tuple(shape)}, got {tuple(action.shape)}")
-        action, part = action.reshape(self.num_envs, -1), tensordict.get("_step", None)
+        action, part = action.reshape(self.num_envs, -1), self._mask_of("_step", tensordict)
         if part is not None:
-            return self._step_part(tensordict, action, part.reshape(self.num_envs))
+            return self._step_part(tensordict, action, part)
         self.world.step(action)
         return self._outputs(Seen.step, with_reward=True)
 
@@ -309,7 +314,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         The worlds cannot be stepped apart: the others are stepped too, without control, and put back. What all share
         stays, unless all are stepped.
         """
-        before, held = self.get_state(), ~part.to(self.device)
+        before, held = self.get_state(), ~part
         self.world.step(action.masked_fill(held.unsqueeze(-1), 0.0), adapts=not held.any())
         after = self._outputs(Seen.step, with_reward=True)
         self._set_state(before, held, finite=False)  # one of them may have been not finite
@@ -326,13 +331,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
     ) -> TensorDictBase:
         """Returns what follows a reset; a state must be ``finite``; without ``others``, only the mask's pixels."""
         self._refuse_after_fork()
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is not None:
-            if mask.dtype != torch.bool:
-                raise TypeError(f"'_reset' must be a mask of dtype bool, got {mask.dtype}")
-            if mask.numel() != self.num_envs:
-                raise ValueError(f"'_reset' must have shape {(*self.batch_size, 1)}, got {tuple(mask.shape)}")
-            mask = mask.reshape(self.num_envs).to(self.device)
+        mask = self._mask_of("_reset", tensordict)
         if self._world is None:
             if mask is not None and not mask.all():
                 raise ValueError("this environment is closed: reset all worlds to open it again")
@@ -344,6 +343,17 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         everywhere = torch.ones((*self.batch_size, 1), dtype=torch.bool, device=self.device)
         look = functools.partial(Seen.begin, last=None if others else {}, restored=set_state)
         return self._outputs(look, unrewarded=everywhere)
+
+    def _mask_of(self, name: str, tensordict: TensorDictBase | None) -> torch.Tensor | None:
+        """Returns a mask of worlds, ``(num_envs,)``, if there is one."""
+        mask = None if tensordict is None else tensordict.get(name, None)
+        if mask is None:
+            return None
+        if mask.dtype != torch.bool:
+            raise TypeError(f"{name!r} must be a mask of dtype bool, got {mask.dtype}")
+        if mask.numel() != self.num_envs:
+            raise ValueError(f"{name!r} must have shape {(*self.batch_size, 1)}, got {tuple(mask.shape)}")
+        return mask.reshape(self.num_envs).to(self.device)
 
     def _outputs(
         self, look: Callable[[Seen], Pictures], *, with_reward: bool = False, unrewarded: torch.Tensor | None = None

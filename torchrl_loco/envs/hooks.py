@@ -112,7 +112,7 @@ class Hooks:
         self._pose = {"qpos": Entry((mj_model.nq,), torch.float32), "qvel": Entry((mj_model.nv,), torch.float32)}
         self.read: dict[str, set[str]] = {}  # by hook, the attributes of the environment that it reads
         if self.own:
-            with torch.no_grad():
+            with torch.no_grad(), torch.autocast(env.device.type, enabled=False):
                 self._probe(self._at_home())
         self.catalog.complete = True
 

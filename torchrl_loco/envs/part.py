@@ -6,6 +6,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 import warp as wp
@@ -46,12 +47,23 @@ class Part:
         said: set[str] | None = None,
     ) -> None:
         self._fixed, self._said = fixed, set[str]() if said is None else said
-        self._work, self._arrays, self._title = work, arrays, title
+        self._arrays, self._title = arrays, title
+        self._work = self._in_own_precision(work)
         self._launch: Callable[[], None] | None = None
         self._traced: torch.fx.GraphModule | None = None  # until its kernel is compared
-        self._run: Callable[[], None] = lambda: work(arrays)
+        self._run: Callable[[], None] = lambda: self._work(arrays)
         self.kind = "plain torch"  # how it runs, or "kernel" or "torch.compile"
         self.before: Callable[[], None] = lambda: None  # makes what it reads, such as scans of the ground
+
+    def _in_own_precision(self, work: Callable[..., None]) -> Callable[..., None]:
+        """Returns what does the same under the caller's autocast, which is for the caller's own networks."""
+        kind = next(iter(self._arrays.values())).device.type
+
+        def run(*args: Any) -> None:
+            with torch.autocast(kind, enabled=False):
+                work(*args)
+
+        return run
 
     @torch.no_grad()
     def __call__(self) -> None:
@@ -113,8 +125,12 @@ class Part:
                 for name, rows in self._arrays.items():
                     most = 2 if name.startswith(("memory.", "shared.")) else 10  # which may be an index
                     rows.copy_(changed(kept[name], generator, spread, flags, most))
-                # Only now, since some arrays are views of others.
-                ours = {name: rows.clone() for name, rows in self._arrays.items()}
+                # Only now, since some arrays are views of others; two names of one memory stay that.
+                copies: dict[Any, torch.Tensor] = {}
+                places = {name: (rows.data_ptr(), rows.shape, rows.stride()) for name, rows in self._arrays.items()}
+                for name, rows in self._arrays.items():
+                    copies.setdefault(places[name], rows.clone())
+                ours = {name: copies[place] for name, place in places.items()}
                 try:
                     self._work(ours)
                 except Exception as error:
@@ -159,7 +175,8 @@ class Part:
         except Exception as error:  # whatever the compiler raises
             self._stays_plain(error)
         else:
-            self._run, self.kind = lambda: compiled(*self._arrays.values()), "torch.compile"
+            run = self._in_own_precision(compiled)
+            self._run, self.kind = lambda: run(*self._arrays.values()), "torch.compile"
 
     def _stays_plain(self, error: Exception) -> None:
         message = " ".join(str(error).split("\n")[:3]).strip()

@@ -61,7 +61,7 @@ class QuickResets(EnvBase):
 
 def rows_of(mask: torch.Tensor, entry: torch.Tensor) -> torch.Tensor:
     """Returns a mask of worlds, ``(*batch, 1)``, in a shape that broadcasts with an entry, ``(*batch, ...)``."""
-    return mask.view(*mask.shape[:-1], *[1] * (entry.ndim - mask.ndim + 1))
+    return mask.view((*mask.shape[:-1], *[1] * (entry.ndim - mask.ndim + 1)))
 
 
 def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:

@@ -84,8 +84,8 @@ class World:
         self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own
         self._title, self._variation = type(task).__name__, task.variation
         # Buffers made in inference mode could not be written outside it; without the device, torch's views would be on
-        # the caller's default device.
-        with torch.inference_mode(False), EXCLUSIVE, task.device:
+        # the caller's default device. The caller's autocast is for the caller's own networks.
+        with torch.inference_mode(False), EXCLUSIVE, task.device, torch.autocast(task.device.type, enabled=False):
             asked: dict[str, Any] = {}
             if hooks.catalog.contact_geoms:
                 asked["contact_geoms"] = hooks.catalog.contact_geoms
