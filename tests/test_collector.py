@@ -104,6 +104,8 @@ def test_endless_and_wrong_sizes(make):
             RolloutCollector(made, policy(made), frames_per_batch=frames)
     with pytest.raises(TypeError, match="policy must be a function or module"):
         RolloutCollector(made, None, frames_per_batch=8)
+    with pytest.raises(TypeError, match="policy must return the TensorDict with an action, got NoneType"):
+        RolloutCollector(made, lambda td: None, frames_per_batch=8).rollout()
 
 
 def test_its_state_goes_on_in_another_collector(make):

@@ -108,6 +108,8 @@ class RolloutCollector:
         rewritten = frozenset(getattr(self._policy, "out_keys", ())) - set(getattr(self._policy, "in_keys", ()))
         for _ in range(self._steps):
             current = self._policy(td)
+            if not isinstance(current, TensorDictBase):
+                raise TypeError(f"policy must return the TensorDict with an action, got {type(current).__name__}")
             if steps_as_ours(self._env):
                 current, td = self._base._step_and_maybe_reset(current, rewritten)
             else:
@@ -266,7 +268,7 @@ class Recording:
 
 def what_forbids_recording(env: EnvBase, base: LocoEnv, policy: Any) -> str | None:
     """Returns why the rollouts of a policy in an environment are not recorded, or ``None`` if they can be."""
-    if base.device.type != "cuda":
+    if base.device is None or base.device.type != "cuda":
         return "only CUDA has graphs of torch's work"
     if base.engine != "compiled":
         return f"engine {base.engine!r} launches too many kernels to gain from it"

@@ -4,6 +4,7 @@ import pytest
 import torch
 from cases import STAGGERED, coarse
 from for_each import for_each
+from tensordict import LazyStackedTensorDict
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter, VecNormV2
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 
@@ -145,3 +146,16 @@ def test_worlds_go_on_beside_one_that_is_not_finite():
     held = env.step(part)["next"]
     assert held["done"].flatten().tolist() == [False, True, False]
     assert not torch.equal(held["observation"][0], after["observation"][0])
+
+
+def test_worlds_of_a_lazy_stack(shared):
+    """As TorchRL stacks TensorDicts of single worlds."""
+    ends = []
+    for stack in (torch.stack, LazyStackedTensorDict.lazy_stack):
+        env = shared("walker_run", 3, episode_length=2)
+        td = env.reset()
+        for _ in range(2):
+            td = stack(list(td.set("action", torch.full((3, 6), 0.3)).unbind(0)))
+            _, td = env.step_and_maybe_reset(td)
+        ends.append(td)
+    assert (ends[0].exclude("action") == ends[1].exclude("action")).all()

@@ -391,12 +391,14 @@ class WorldAccess(EnvBase):
         """Restores a ``state_dict``; see :meth:`set_extra_state`.
 
         With ``strict=False`` the worlds stay as they are: TorchRL's ``EnvCreator`` shares the state of transforms this
-        way with every environment that it makes, and each of them must keep its own worlds.
+        way with every environment that it makes, and each of them must keep its own worlds. So they do if it is empty:
+        TorchRL's ``Collector`` saves nothing else of an environment without transforms.
 
         Returns:
             The keys that were missing or not expected, as torch's own does.
         """
-        if not strict:
+        if not (strict and state_dict):
+            strict = False
             state_dict = {name: value for name, value in state_dict.items() if not name.endswith("_extra_state")}
         return super().load_state_dict(state_dict, strict=strict, **kwargs)
 

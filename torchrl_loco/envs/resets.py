@@ -6,7 +6,7 @@ TensorDict is not checked.
 """
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import LazyStackedTensorDict, TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 NESTED = ("reward_terms", "metrics", "observation_terms")  # entries of a step that are TensorDicts
@@ -77,6 +77,8 @@ def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBas
     Returns:
         The same, with the first observation of the next episode in the worlds that were done.
     """
+    if isinstance(tensordict, LazyStackedTensorDict):  # what follows is by entry, not by world
+        tensordict = tensordict.contiguous()
     mask, batch = tensordict.get("done").clone(), tensordict.batch_size
     request = TensorDict({"_reset": mask}, batch_size=batch, device=tensordict.device)
     fresh = env._reset(request, set_state=False, others=False)
