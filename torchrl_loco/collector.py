@@ -193,8 +193,7 @@ class RolloutCollector:
             kept = carried.select(*begin.keys(True, True), *remembered, strict=False)
             self._carried = begin.update(kept)
             if "seed" in state:  # on which later episodes depend
-                self._base.seed = state["seed"]
-                self._base.world.write_seed(state["seed"])
+                self._base.continue_with(state["seed"])
         if "transforms" in state:  # after the reset, from which some learn
             load_transforms(self._env, state["transforms"])
 

@@ -769,6 +769,10 @@ def test_settings_that_change_after_construction_are_told_of():
     env = WalkerWalk(2, "cpu", seed=0)
     with pytest.warns(UserWarning, match=r"WalkerWalk\.noise_scale was read .*: make another with this setting"):
         env.noise_scale = 0.0
+    with pytest.warns(UserWarning, match=r"WalkerWalk\.seed was read .*: call set_seed\(\)"):
+        env.seed = 7
+    env.set_seed(3)
+    assert env.seed == 3
 
 
 def test_torchs_own_random_numbers_are_told_of(caplog):

@@ -235,12 +235,14 @@ class LocoEnv(Task, WorldAccess, QuickResets):
 
     def __setattr__(self, name: str, value: Any) -> None:
         world = self.__dict__.get("_world")
-        fixed = {*SETTINGS, *world.fixed} if world else ()
-        if name in fixed and name != "seed" and value is not getattr(self, name, None):  # set_seed() sets that
-            instead = "make it a tensor that you change in place, or close() and reset() the environment"
+        fixed = {"seed", *SETTINGS, *world.fixed} if world else ()
+        if name in fixed and value is not getattr(self, name, None):
+            instead = {"seed": "call set_seed()", **dict.fromkeys(SETTINGS, "make another with this setting")}.get(
+                name, "make it a tensor that you change in place, or close() and reset() the environment"
+            )
             warn(
                 f"{type(self).__name__}.{name} was read when the environment was made, and changes nothing now: "
-                f"{'make another with this setting' if name in SETTINGS else instead}"
+                f"{instead}"
             )
         super().__setattr__(name, value)
 
@@ -397,7 +399,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
 
     def _set_seed(self, seed: int | None) -> None:
         """Starts the random streams of all worlds again, at their episode 0."""
-        self.seed = secrets.randbits(32) if seed is None else check_int("seed", seed, SEED)
+        self._keep_seed(secrets.randbits(32) if seed is None else check_int("seed", seed, SEED))
         if self._world is not None:
             self._world.set_seed(self.seed)
         elif self._episodes is not None:
