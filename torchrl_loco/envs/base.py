@@ -42,8 +42,14 @@ from torchrl_loco.envs.vary import Vary, check_randomize
 from torchrl_loco.sim import models
 from torchrl_loco.sim.simulation import set_options
 
-SETTINGS = ("history", "noise", "noise_scale", "observation_terms", "play", "protocol", "randomize")
-"""Attributes from which an environment is made."""
+READ_ONCE = {
+    "seed": "call set_seed()",
+    **dict.fromkeys(
+        ("history", "noise", "noise_scale", "observation_terms", "play", "protocol", "randomize"),
+        "make another with this setting",
+    ),
+}
+"""Attributes from which an environment is made, and what to do to change them."""
 
 
 class LocoEnv(Task, WorldAccess, QuickResets):
@@ -235,14 +241,12 @@ class LocoEnv(Task, WorldAccess, QuickResets):
 
     def __setattr__(self, name: str, value: Any) -> None:
         world = self.__dict__.get("_world")
-        fixed = {"seed", *SETTINGS, *world.fixed} if world else ()
-        if name in fixed and value is not getattr(self, name, None):
-            instead = {"seed": "call set_seed()", **dict.fromkeys(SETTINGS, "make another with this setting")}.get(
-                name, "make it a tensor that you change in place, or close() and reset() the environment"
-            )
+        read = world is not None and (name in READ_ONCE or name in world.fixed)
+        if read and value is not getattr(self, name, None):
+            in_place = "make it a tensor that you change in place, or close() and reset() the environment"
             warn(
                 f"{type(self).__name__}.{name} was read when the environment was made, and changes nothing now: "
-                f"{instead}"
+                f"{READ_ONCE.get(name, in_place)}"
             )
         super().__setattr__(name, value)
 

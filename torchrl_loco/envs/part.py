@@ -1,5 +1,6 @@
 """A part of the control step that hooks make: as one kernel, by torch.compile, or as plain torch."""
 
+import contextlib
 import itertools
 import logging
 import traceback
@@ -181,7 +182,8 @@ class Part:
     def _stays_plain(self, error: Exception) -> None:
         message = " ".join(str(error).split("\n")[:3]).strip()
         of_operator = error.operator if isinstance(error, CannotFuse) else None
-        line = _line_of_user(self._where(of_operator) if of_operator else error)
+        where = self._where(of_operator) if of_operator else error
+        line = _line_of_user(where) if where else ""
         verdict = f"{self._title}: not compiled, runs as plain torch: {message}{line}"
         if verdict not in self._said:
             self._said.add(verdict)
@@ -189,23 +191,18 @@ class Part:
 
     def _where(self, operator: str) -> BaseException | None:
         """Returns what is raised where the hooks call an operator of the graph, by the name of its node."""
-        try:
-            trace(self._work, {name: rows.clone() for name, rows in self._arrays.items()}, self._fixed, operator)
-        except ReachedError as reached:
-            return reached
-        except Exception:  # a hook that does something else at each call
-            return None
+        with contextlib.suppress(Exception):  # of a hook that does something else at each call
+            try:
+                trace(self._work, {name: rows.clone() for name, rows in self._arrays.items()}, self._fixed, operator)
+            except ReachedError as reached:
+                return reached
         return None
 
 
-def _line_of_user(error: BaseException | None) -> str:
+def _line_of_user(error: BaseException) -> str:
     """Returns where in the task's own code an error comes from, if it does."""
     packages = tuple(path for module in (torch, torchrl_loco) for path in module.__path__)
-    frames = (
-        []
-        if error is None
-        else [each for each in traceback.extract_tb(error.__traceback__) if not each.filename.startswith(packages)]
-    )
+    frames = [each for each in traceback.extract_tb(error.__traceback__) if not each.filename.startswith(packages)]
     return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
 
