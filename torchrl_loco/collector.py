@@ -180,6 +180,8 @@ class RolloutCollector:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from a ``state`` that :meth:`state_dict` returned, in an environment of the same settings.
 
+        The environment takes its seed from there.
+
         Without the entries of worlds they begin anew, with a reset of all; without that of transforms, those go on as
         they are. If the environment returns other entries by now, such as other terms of the reward, it is those that
         the next batch begins with.
@@ -193,7 +195,7 @@ class RolloutCollector:
             kept = carried.select(*begin.keys(True, True), *remembered, strict=False)
             self._carried = begin.update(kept)
             if "seed" in state:  # on which later episodes depend
-                self._base.continue_with(state["seed"])
+                self._base._continue_with(state["seed"])
         if "transforms" in state:  # after the reset, from which some learn
             load_transforms(self._env, state["transforms"])
 

@@ -110,8 +110,8 @@ class SimConfig:
             model = read_mjcf(model)
         fields = options_of(model.opt if isinstance(model, mujoco.MjModel) else model.option) | others
         if not fields["sim_dt"] > 0:
-            raise ValueError(f"the model's timestep must be greater than 0, got {fields['sim_dt']:g}")
-        if fields["integrator"] not in INTEGRATORS:
+            raise ValueError(f"sim_dt, by default the model's timestep, must be greater than 0, got {fields['sim_dt']}")
+        if "integrator" not in others and fields["integrator"] not in INTEGRATORS:
             raise ValueError(
                 f"the model's integrator is {fields['integrator']!r}, which no engine has: name one of "
                 f"{', '.join(INTEGRATORS)} in the model, or by SimConfig.of(model, integrator=...)"

@@ -376,15 +376,15 @@ class WorldAccess(EnvBase):
                 raise ValueError(f"the state has {name}={state.get(name)!r}, this environment has {value!r}")
         worlds = State(state["worlds"], batch_size=self.batch_size, device=self.device)
         self._reset(worlds, set_state=True, finite=False)  # a world that is to be reset may be not finite
-        self.continue_with(state["seed"])
+        self._continue_with(state["seed"])
 
-    def continue_with(self, seed: int) -> None:
+    def _continue_with(self, seed: int) -> None:
         """Changes the seed of all random streams, which go on."""
         self._keep_seed(seed)
         self.world.write_seed(seed)
 
     def _keep_seed(self, seed: int) -> None:
-        self.__dict__["seed"] = seed  # to set the attribute changes nothing, as is told of
+        self.__dict__["seed"] = seed  # past __setattr__, which warns that it has no effect
 
     def _identity(self) -> dict[str, Any]:
         """Returns what two environments must share to exchange their ``state_dict``."""

@@ -335,7 +335,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         finite: bool = True,
         others: bool = True,
     ) -> TensorDictBase:
-        """Returns what follows a reset; a state must be ``finite``; without ``others``, only the mask's pixels."""
+        """Returns what follows a reset; ``finite`` is for a state, ``others`` for pixels of worlds beyond the mask."""
         self._refuse_after_fork()
         mask = self._mask_of("_reset", tensordict)
         if self._world is None:

@@ -485,9 +485,10 @@ def by_world(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
 
 
 def _broadcasts(shape: torch.Size, target: tuple[int, ...]) -> bool:
-    """Returns whether rows have the dimensions that they must, each of the right size or, but for 0, 1."""
-    pairs = list(zip(shape, target, strict=False))
-    return len(shape) == len(target) and all(one == other or (one == 1 and other > 0) for one, other in pairs)
+    """Returns whether rows have the dimensions that they must: each of the right size, or 1 where that is not 0."""
+    return len(shape) == len(target) and all(
+        one == other or (one == 1 and other > 0) for one, other in zip(shape, target, strict=True)
+    )
 
 
 def _kind(value: Any) -> str:

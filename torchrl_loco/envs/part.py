@@ -35,8 +35,8 @@ class Part:
     :meth:`compile` runs it once on the present worlds to trace it. Whatever Python hooks use is evaluated then: what
     shall change later must be a tensor that is changed in place.
 
-    The arrays stay at their addresses, and the tensors ``fixed`` as they are; ``title`` is for messages, which are not
-    repeated if they are among those that parts beside it ``said``.
+    The arrays stay at their addresses, and the tensors ``fixed`` as they are; ``title`` is for messages. Those that
+    parts beside it have ``said`` are not repeated.
     """
 
     def __init__(
@@ -128,10 +128,10 @@ class Part:
                     rows.copy_(changed(kept[name], generator, spread, flags, most))
                 # Only now, since some arrays are views of others; two names of one memory stay that.
                 copies: dict[Any, torch.Tensor] = {}
-                places = {name: (rows.data_ptr(), rows.shape, rows.stride()) for name, rows in self._arrays.items()}
-                for name, rows in self._arrays.items():
-                    copies.setdefault(places[name], rows.clone())
-                ours = {name: copies[place] for name, place in places.items()}
+                ours = {
+                    name: copies.setdefault((rows.data_ptr(), rows.shape, rows.stride()), rows.clone())
+                    for name, rows in self._arrays.items()
+                }
                 try:
                     self._work(ours)
                 except Exception as error:
@@ -181,22 +181,21 @@ class Part:
 
     def _stays_plain(self, error: Exception) -> None:
         message = " ".join(str(error).split("\n")[:3]).strip()
-        of_operator = error.operator if isinstance(error, CannotFuse) else None
-        where = self._where(of_operator) if of_operator else error
-        line = _line_of_user(where) if where else ""
+        operator = error.operator if isinstance(error, CannotFuse) else None
+        line = self._line_of(operator) if operator else _line_of_user(error)
         verdict = f"{self._title}: not compiled, runs as plain torch: {message}{line}"
         if verdict not in self._said:
             self._said.add(verdict)
             logging.getLogger("torchrl_loco").warning(verdict)
 
-    def _where(self, operator: str) -> BaseException | None:
-        """Returns what is raised where the hooks call an operator of the graph, by the name of its node."""
+    def _line_of(self, operator: str) -> str:
+        """Returns where the task's own code calls an operator of the graph, by its node's name: traces again."""
         with contextlib.suppress(Exception):  # of a hook that does something else at each call
             try:
                 trace(self._work, {name: rows.clone() for name, rows in self._arrays.items()}, self._fixed, operator)
             except ReachedError as reached:
-                return reached
-        return None
+                return _line_of_user(reached)
+        return ""
 
 
 def _line_of_user(error: BaseException) -> str:

@@ -210,9 +210,9 @@ class Variation(Varied):
         numbers = self._numbers([corners[:, b].to(self._device) for b in bits]).cpu().double().numpy()
         for change in self._changes:
             if wrong := self._impossible(change, numbers):
-                what, numbers_of_it, rule = wrong
+                what, values, rule = wrong
                 raise ValueError(
-                    f"{change.vary}: {what} could become {numbers_of_it}, but it {rule}: choose other low and high"
+                    f"{change.vary}: {what} could become {values}, but it {rule}: choose other low and high"
                 )
 
     def _touched(self, change: Change) -> set[tuple[str, int]]:
@@ -220,15 +220,15 @@ class Variation(Varied):
         return {(name.replace("biasprm", "gainprm"), index // FIELDS[name].size) for name, index in change.places}
 
     def check(self, given: Mapping[str, torch.Tensor]) -> None:
-        """Raises ValueError for numbers of worlds ``(n, columns of a field)`` that are impossible; others may lack."""
+        """Raises ValueError for numbers of worlds by field, ``(n, columns of the field)``, that are impossible."""
         n = max((len(rows) for rows in given.values()), default=0)
         numbers = np.repeat(self.nominal()[None], n, axis=0)
         for name, rows in given.items():
             numbers[:, self.columns[name]] = rows.cpu().numpy()
         for change in self._changes:
             if n and (wrong := self._impossible(change, numbers)):
-                what, numbers_of_it, rule = wrong
-                raise ValueError(f"the state's {what} is {numbers_of_it}, but it {rule}")
+                what, values, rule = wrong
+                raise ValueError(f"the state's {what} is {values}, but it {rule}")
 
     def _impossible(self, change: Change, numbers: np.ndarray) -> tuple[str, str, str] | None:
         """Returns what is impossible among the numbers ``(rows, count)`` of what a Vary changes, if anything is.

@@ -17,7 +17,7 @@ from torchrl_loco.envs.scan import DepthRequest, RayRequest, Request, ScanReques
 from torchrl_loco.envs.tables import Entry, Table
 from torchrl_loco.envs.variation import Variation, constant_of
 from torchrl_loco.eyes.placing import bytes_placed
-from torchrl_loco.eyes.scene import GROUPS
+from torchrl_loco.eyes.scene import for_rays
 from torchrl_loco.eyes.shapes import MISS
 from torchrl_loco.sim import models
 from torchrl_loco.sim.simulation import check_memory
@@ -390,7 +390,7 @@ class View:
         return self._scanned(DepthRequest(which, size[1], size[0], check_float("far", far, DISTANCES)), size)
 
     def ray(self, site: str, directions: Any, far: float = 10.0) -> torch.Tensor:
-        """Returns how far from a site lies what rays meet, shapes of all kinds and meshes among it.
+        """Returns how far from a site lies what rays meet: shapes of all kinds, meshes among them, and of all groups.
 
         Args:
             site: name of a site. Rays leave a shape that it is in unhindered.
@@ -436,8 +436,8 @@ class View:
         if not self._catalog.complete:
             if name not in scans:
                 scans[name], catalog = asked, self._catalog
-                groups = mujoco.mjNGROUP if isinstance(asked, RayRequest) else GROUPS
-                of_eyes = 0 if isinstance(asked, ScanRequest) else bytes_placed(catalog.mj_model, groups)
+                seen = for_rays(catalog.mj_model) if isinstance(asked, RayRequest) else catalog.mj_model
+                of_eyes = 0 if isinstance(asked, ScanRequest) else bytes_placed(seen)
                 catalog.bytes_scanned += 4 * COPIES_IN_HOOKS * math.prod(shape) + of_eyes
                 check_memory(catalog.num_envs * catalog.bytes_scanned, catalog.num_envs, catalog.device)
             self._catalog.scanning.setdefault(self._hook, set()).add(name)

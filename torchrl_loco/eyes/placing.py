@@ -5,7 +5,7 @@ from typing import Any
 import mujoco
 import warp as wp
 
-from torchrl_loco.eyes.scene import AT_BODY, AT_COM, GROUPS, OF_COM, TRACKS, Mounts, Shapes, geoms_seen, shapes_of
+from torchrl_loco.eyes.scene import AT_BODY, AT_COM, OF_COM, TRACKS, Mounts, Shapes, geoms_seen, shapes_of
 from torchrl_loco.sim import EXCLUSIVE
 from torchrl_loco.sim.compiled.collision.kinds import CAPSULE, CYLINDER, PLANE
 
@@ -174,31 +174,24 @@ def place(
     bounds_out[world, k] = found
 
 
-def bytes_placed(m: mujoco.MjModel, groups: int = GROUPS) -> int:
+def bytes_placed(m: mujoco.MjModel) -> int:
     """Returns the memory that :class:`Placed` takes in a world (bytes), but for a few of the camera and lights."""
-    alone, of_ground = geoms_seen(m, groups)
+    alone, of_ground = geoms_seen(m)
     return (len(alone) + bool(of_ground)) * 4 * (12 + 4)
 
 
 class Placed:
     """The shapes of a model as they lie before a camera, or before where rays begin, in each of several worlds.
 
-    ``mounts`` tells what holds the camera and the lights, ``numbers`` are rows of what varies of the model. Geoms of
-    ``groups`` are there, from 0 on.
+    ``mounts`` tells what holds the camera and the lights, ``numbers`` are rows of what varies of the model.
     """
 
     def __init__(
-        self,
-        m: mujoco.MjModel,
-        device: wp.Device,
-        mounts: Mounts,
-        worlds: int,
-        numbers: wp.array | None = None,
-        groups: int = GROUPS,
+        self, m: mujoco.MjModel, device: wp.Device, mounts: Mounts, worlds: int, numbers: wp.array | None = None
     ) -> None:
         self._mounts, self._device = mounts, device
         with EXCLUSIVE, wp.ScopedDevice(device):
-            self.shapes, self._meshes = shapes_of(m, device, groups)
+            self.shapes, self._meshes = shapes_of(m, device)
             self.has_meshes = bool(self._meshes)
             self._numbers = wp.empty((worlds, 0), dtype=float) if numbers is None else numbers
             size = worlds, self.shapes.kind.shape[0]

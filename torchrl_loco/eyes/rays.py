@@ -5,7 +5,7 @@ import numpy as np
 import warp as wp
 
 from torchrl_loco.eyes.placing import Placed, Pose, origin_of, pose_of, turn_of
-from torchrl_loco.eyes.scene import Shapes, mounts_at, to_the_horizon
+from torchrl_loco.eyes.scene import Shapes, for_rays, mounts_at
 from torchrl_loco.eyes.shapes import to_mesh, to_shape
 from torchrl_loco.sim import EXCLUSIVE, Buffer
 from torchrl_loco.sim.compiled.collision.kinds import MESH
@@ -50,7 +50,7 @@ class Rays:
     ) -> None:
         place = {"body": m.site_bodyid[[site]], "pos": m.site_pos[[site]], "mat": axes_of(m.site_quat[site])[None]}
         mounts = mounts_at(m, device, **place, mode=np.zeros(1), target=-np.ones(1))
-        self._placed = Placed(to_the_horizon(m), device, mounts, worlds, groups=mujoco.mjNGROUP)
+        self._placed = Placed(for_rays(m), device, mounts, worlds)
         self._device, self._far = device, far
         with EXCLUSIVE, wp.ScopedDevice(device):
             self._directions = wp.array(directions, wp.vec3, device=device)

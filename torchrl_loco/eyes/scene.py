@@ -98,6 +98,13 @@ def to_the_horizon(mj_model: mujoco.MjModel) -> mujoco.MjModel:
     return seen
 
 
+def for_rays(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """Returns a copy of a model for rays, which meet geoms of all groups, and planes that have no end."""
+    met = to_the_horizon(mj_model)
+    met.geom_group[:] = 0
+    return met
+
+
 def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device, varied: Varied | None = None) -> Mounts:
     """Returns what holds a camera and the lights that are on; ``varied`` are the numbers of which worlds have rows."""
     name = m.camera(camera).name or camera
@@ -140,16 +147,16 @@ def facing(direction: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def geoms_seen(m: mujoco.MjModel, groups: int = GROUPS) -> tuple[list[int], list[int]]:
+def geoms_seen(m: mujoco.MjModel) -> tuple[list[int], list[int]]:
     """Returns which geoms are seen: those that are shapes of their own, and those that are one shape, the ground."""
-    seen = [g for g in range(m.ngeom) if m.geom_group[g] < groups and color_of(m, g)[3] > HIDDEN]
+    seen = [g for g in range(m.ngeom) if m.geom_group[g] < GROUPS and color_of(m, g)[3] > HIDDEN]
     of_ground = [g for g in seen if m.geom_bodyid[g] == 0 and m.geom_type[g] in (BOX, FIELD)]
     return [g for g in seen if g not in set(of_ground)], of_ground
 
 
-def shapes_of(m: mujoco.MjModel, device: wp.Device, groups: int = GROUPS) -> tuple[Shapes, list[wp.Mesh]]:
+def shapes_of(m: mujoco.MjModel, device: wp.Device) -> tuple[Shapes, list[wp.Mesh]]:
     """Returns the shapes of a model that are seen, and the meshes among them, which must be kept."""
-    alone, of_ground = geoms_seen(m, groups)
+    alone, of_ground = geoms_seen(m)
     kinds = [int(m.geom_type[g]) for g in alone]
     meshes: dict[tuple[int, int], wp.Mesh] = {}
     ids = []

@@ -172,7 +172,7 @@ def check(mj_model: mujoco.MjModel, *, own_control: bool = False) -> mujoco.MjMo
         wrong.append("delays of actuators are not supported: they are not part of the state that is reset")
     losses = mj_model.dof_frictionloss, mj_model.tendon_frictionloss
     if any((loss < 0).any() for loss in losses):
-        wrong.append("frictionloss must not be negative: C MuJoCo drives by it, the other engines leave it out")
+        wrong.append("frictionloss must not be negative: C MuJoCo would drive the joint by it, other engines ignore it")
     disabled = {group for group in range(31) if mj_model.opt.disableactuator >> group & 1}
     if disabled.intersection(mj_model.actuator_group.tolist()):
         wrong.append("groups of actuators cannot be disabled (actuatorgroupdisable): leave the actuators out")

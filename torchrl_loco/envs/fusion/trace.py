@@ -45,7 +45,7 @@ def _decomposed(func: Any) -> Callable[..., Any] | None:
 
 
 class ReachedError(BaseException):
-    """The operator at which to stop is reached."""
+    """The operator at which to stop is reached. It is no ``Exception``: those of decompositions are suppressed."""
 
 
 class NumberTakenError(RuntimeError):

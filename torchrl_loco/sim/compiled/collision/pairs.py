@@ -153,7 +153,7 @@ def contact_weight(m: mujoco.MjModel, pair: Pair) -> Number:
 
 
 def impratio(m: mujoco.MjModel) -> float:
-    """Returns how many times as stiff as the normal friction is, as C MuJoCo bounds it."""
+    """Returns the ratio of frictional to normal impedance, bounded from below as in C MuJoCo."""
     return max(MINVAL, m.opt.impratio)
 
 

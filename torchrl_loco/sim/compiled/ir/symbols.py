@@ -398,7 +398,7 @@ LARGEST = float(np.finfo(np.float32).max)
 
 
 def literal(x: float) -> str:
-    """Returns a float32 literal of C++: C++ has none of infinity, so the largest number stands for it."""
+    """Returns a float32 literal of C++, which has none for infinity: that becomes the largest number."""
     number = np.float32(np.clip(x, -LARGEST, LARGEST))
     plain = number == 0 or 1e-4 <= abs(number) < 1e7
     text = np.format_float_positional(number, trim="0") if plain else f"{number:.9g}"
