@@ -19,8 +19,9 @@ def test_of_what_warp_says_only_the_missing_driver_is_left_out(monkeypatch, capf
     assert capfd.readouterr().err == "Warp error: no compiler\nafter\n"
 
 
-def test_threads_have_one_precompiled_header_beside_the_kernels():
+def test_threads_have_one_precompiled_header_beside_the_kernels(monkeypatch, tmp_path):
     init_warp()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))  # where no kernel is cached
     folders = []
 
     def compiled(value):
@@ -41,4 +42,4 @@ def test_threads_have_one_precompiled_header_beside_the_kernels():
     assert len(folders) == 2
     assert len({*folders}) == 1
     assert [*Path(folders[0]).glob("*.pch")]
-    assert Path(folders[0]).parent == Path(wp.config.kernel_cache_dir)
+    assert Path(folders[0]).parent == tmp_path
