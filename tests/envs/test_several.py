@@ -98,7 +98,7 @@ def test_what_makes_an_environment_is_pickled_and_not_the_environment(shared):
         pickle.dumps(shared())
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_forks_and_the_end_of_a_program(tmp_path):
     """A forked child goes on by itself on the CPU, even if another thread held the lock when it was forked. A program
     may end without closing its environments: what a monitor has not reported yet is reported then, and by the parent.

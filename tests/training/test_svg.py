@@ -336,7 +336,7 @@ def test_the_policy_of_before_an_update_collects(svg, made_once):
         assert collects.data_ptr() in kept
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_it_learns_in_a_minute_of_experience(tmp_path):
     few = {"total_frames": 32 * 8 * 25, "eval_interval": 32 * 8 * 5}
     run = training.train(Spin, algorithm="svg", device="cpu", out=tmp_path, **FEW, **few)
