@@ -49,7 +49,7 @@ SOLIDS = {
     "ellipsoid": {"contype": 2, "conaffinity": 0},
     "mesh": {"contype": 2, "conaffinity": 0, "mesh": "wedge"},
 }
-"""Shapes that do not touch all others, and the masks that see to it."""
+"""Shapes of which some pairs are not compiled, and the masks that keep these apart."""
 WEDGE = (0, 0, 0, 0.2, 0, 0, 0.25, 0.1, 0, 0.1, 0.2, 0, 0, 0.1, 0, 0, 0, 0.1, 0.2, 0, 0.15)
 """Vertices of a mesh (m)."""
 RIGHT_ANGLES = st.lists(st.sampled_from([0, 90, 180]), min_size=3, max_size=3)

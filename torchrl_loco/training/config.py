@@ -55,6 +55,8 @@ class Options(dict[str, Any]):
 class TrainingConfig:
     """Settings of any training run.
 
+    Numbers must be positive where ``intervals.py`` says nothing else.
+
     A frame is a control step of one world. A step of the policy is an action that is held for ``action_repeat`` frames;
     ``frames_per_batch`` alone counts those, as collectors do.
 

@@ -144,8 +144,13 @@ class PPO(Algorithm):
             value = self._value(minibatch[self.spaces.critic_key], weights)
         outputs = self._mean(self.observed(minibatch), weights), self._std(), value
         self.join()
-        bounds = config.clip_epsilon, config.entropy_coeff, self.spaces.bounded
-        *slopes, metrics = clipped_loss(*outputs, minibatch, *bounds)
+        *slopes, metrics = clipped_loss(
+            *outputs,
+            minibatch,
+            clip_epsilon=config.clip_epsilon,
+            entropy_coeff=config.entropy_coeff,
+            bounded=self.spaces.bounded,
+        )
         self.optimizer.zero_grad()
         torch.autograd.backward(outputs, slopes)
         if config.target_kl:
@@ -323,6 +328,7 @@ def clipped_loss(
     std: torch.Tensor,
     value: torch.Tensor,
     data: Mapping[str, torch.Tensor],
+    *,
     clip_epsilon: float,
     entropy_coeff: float,
     bounded: bool,

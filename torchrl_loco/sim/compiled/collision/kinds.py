@@ -21,12 +21,15 @@ class Kind:
         function: the function of lanes that finds them, ``collide_...`` in ``schedules/lanes``.
         traced: whether the schedule of one thread a world has it too.
         searched: whether C MuJoCo finds the contacts by a general convex collider, which the flag nativeccd chooses.
+        on_boxes: the function that finds them where the box is one of many of the world; without one, such a pair is
+            not compiled.
     """
 
     points: int
     function: str
     traced: bool = False
     searched: bool = False
+    on_boxes: str = ""
 
 
 KINDS = {
@@ -45,24 +48,22 @@ KINDS = {
     (SPHERE, CYLINDER): Kind(1, "round_and_solid"),
     (CAPSULE, ELLIPSOID): Kind(1, "round_and_solid", searched=True),
     (CAPSULE, CYLINDER): Kind(2, "round_and_solid", searched=True),
-    (SPHERE, BOX): Kind(1, "round_and_box"),
-    (CAPSULE, BOX): Kind(2, "round_and_box"),
-    (BOX, BOX): Kind(8, "box_and_box"),
+    (SPHERE, BOX): Kind(1, "round_and_box", on_boxes="round_on_boxes"),
+    (CAPSULE, BOX): Kind(2, "round_and_box", on_boxes="round_on_boxes"),
+    (BOX, BOX): Kind(8, "box_and_box", on_boxes="box_on_boxes"),
 }
 """What is compiled, by the two shapes, the one of the smaller number first. Planes and fields belong to the world."""
 
 GROUND = (PLANE, FIELD)  # shapes that belong to the world, whose pairs are never listed
 
-ON_BOXES = {"round_and_box": "round_on_boxes", "box_and_box": "box_on_boxes"}
-"""What finds the contacts of a pair instead where the box is one of many of the world."""
-
 NOT_COMPILED = Kind(0, "")  # that of all other shapes
 
-FUNCTIONS = tuple(dict.fromkeys([*(kind.function for kind in KINDS.values()), *ON_BOXES.values()]))
+ON_BOXES = tuple(dict.fromkeys(kind.on_boxes for kind in KINDS.values() if kind.on_boxes))
+FUNCTIONS = tuple(dict.fromkeys([*(kind.function for kind in KINDS.values()), *ON_BOXES]))
 """The functions of lanes, in the order in which they look at their pairs."""
 
 ON_PLANES = {kind.function for (first, _), kind in KINDS.items() if first == PLANE}
-GROUND_FUNCTIONS = {kind.function for (first, _), kind in KINDS.items() if first in GROUND} | {*ON_BOXES.values()}
+GROUND_FUNCTIONS = {kind.function for (first, _), kind in KINDS.items() if first in GROUND} | {*ON_BOXES}
 """Those of contacts with planes, and with any ground. The others look at pairs whose bounding spheres are near."""
 
 POINT_BITS = max(kind.points - 1 for kind in KINDS.values()).bit_length()

@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, FIELD, KINDS, NOT_COMPILED, ON_BOXES, Kind
+from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, FIELD, KINDS, NOT_COMPILED, Kind
 from torchrl_loco.sim.compiled.ir.parameters import Number, largest
 from torchrl_loco.sim.compiled.ir.symbols import Scalar, select
 from torchrl_loco.sim.compiled.physics.dynamics import MINVAL
@@ -26,7 +26,7 @@ class Pair:
     """Two geoms that may touch, and the parameters of their contacts.
 
     Attributes:
-        geoms: their ids, the simpler shape first; the normal points from the first to the second.
+        geoms: their ids, by MuJoCo's number of their shapes; the normal points from the first to the second.
         condim: 1 (no friction), 3 (sliding), 4 (torsional friction too) or 6 (rolling friction too).
         friction: sliding friction coefficient, along the first tangent of the contact, 0 without friction.
         friction_ratio: that along the second tangent over the first; 1 unless an explicit pair says otherwise.
@@ -129,9 +129,9 @@ def kind(m: mujoco.MjModel, pair: Pair) -> Kind:
     """Returns how the shapes of a pair touch: that of no contacts, if it is not compiled."""
     first, second = m.geom_type[list(pair.geoms)].tolist()
     found = KINDS.get((first, second), NOT_COMPILED)
-    if found.function in ON_BOXES and looked_up(m)[list(pair.geoms)].any():
-        return dataclasses.replace(found, function=ON_BOXES[found.function], points=AT_ONCE)
-    return found
+    if BOX not in (first, second) or not looked_up(m)[list(pair.geoms)].any():
+        return found
+    return dataclasses.replace(found, function=found.on_boxes, points=AT_ONCE if found.on_boxes else 0)
 
 
 def needs_lanes(m: mujoco.MjModel) -> bool:
