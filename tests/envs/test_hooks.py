@@ -81,7 +81,7 @@ def random_state(env, seed=0):
     return State({"qpos": qpos, "qvel": draw(m.nv)}, batch_size=[env.num_envs])
 
 
-@pytest.fixture(scope="module", params=["compiled", "mujoco_warp"])
+@pytest.fixture(scope="module", params=["compiled", "mujoco_warp", "mujoco"])
 def everything(request):
     """The worlds, what they see of random states, and C MuJoCo's data of the same."""
     env = SeesEverything(24, "cpu", 0, "dm_control", engine=request.param)
