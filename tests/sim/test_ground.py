@@ -197,6 +197,14 @@ def test_steps_on_the_ground_are_those_of_c_mujoco(device):
         assert np.quantile(errors, 0.8) < 5e-3
 
 
+def test_contacts_that_mujoco_warp_leaves_out_are_said(caplog):
+    m = fields(np.random.default_rng(2))
+    warp, own = (Simulation(m, SimConfig.of(m, engine=e), 1, torch.device("cpu")) for e in ("mujoco_warp", "compiled"))
+    assert [record.name for record in caplog.records if "at most 4 contacts" in record.message] == ["torchrl_loco"]
+    assert "engine='mujoco'" in own.engine.remedy("contacts", 30)
+    assert "naconmax" in warp.engine.remedy("contacts", 30)
+
+
 def test_a_world_does_not_grow_with_the_ground():
     rng = np.random.default_rng(3)
     few, many = (Description(boxes(rng, count, ROUND)) for count in (10, 1000))

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import logging
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -104,6 +105,11 @@ class MujocoWarpEngine(Engine):
         super().__init__(setup)
         mj_model, config, varied, device = setup.mj_model, setup.config, setup.varied, setup.device
         self._num_envs = num_envs = setup.num_envs
+        if mujoco.mjtGeom.mjGEOM_HFIELD in mj_model.geom_type:
+            logging.getLogger("torchrl_loco").warning(
+                "MuJoCo-Warp has at most 4 contacts of a geom with a height field, where MuJoCo has one for each prism "
+                "that it touches: what lies on uneven ground moves otherwise"
+            )
         with wp.ScopedDevice(device):
             try:
                 self.model = mjw.put_model(mj_model)

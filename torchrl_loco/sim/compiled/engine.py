@@ -14,6 +14,7 @@ from typing_extensions import override
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.compiled import step
 from torchrl_loco.sim.compiled.collision.ground import Ground
+from torchrl_loco.sim.compiled.collision.kinds import FIELD
 from torchrl_loco.sim.compiled.collision.pairs import stand_ins
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel
 from torchrl_loco.sim.compiled.read_only import ReadOnly, read_only
@@ -194,7 +195,8 @@ class CompiledEngine(Engine):
 
     @override
     def remedy(self, dropped: str, most: int) -> str:
-        return f"a world of the compiled engine has no more places for {dropped}: pass engine='mujoco_warp'"
+        other = "mujoco" if FIELD in self._mj_model.geom_type else "mujoco_warp"  # which has fewer contacts with fields
+        return f"a world of the compiled engine has no more places for {dropped}: pass engine={other!r}"
 
     @override
     def step(self, around: Around = ALONE) -> None:
