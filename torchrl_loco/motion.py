@@ -19,6 +19,7 @@ from torchrl_loco.checks import check_bool, check_float, suggestion
 from torchrl_loco.storage import replace_file
 
 SUFFIXES = (".csv", ".npz")  # of files that motions are read from
+BASE = "xyzxyzw"  # the base's columns of a CSV file: its position, then its quaternion
 MAX_SPEED, MAX_TURN = 12.0, 40.0
 """Speed (m/s) and rate of turn (rad/s) of the base between two frames that no robot has: the motion jumps there."""
 QUICK = 40.0  # rate of a joint (rad/s) between two frames that is said
@@ -103,9 +104,11 @@ class Motion:
         if lines and not _is_row(lines[0]):
             names = [name.strip().strip('"') for name in lines.pop(0).split(",")]
             self._joints = names[7:]
-            if len(names) > 3 and names[3].lower().endswith("w"):
+            axes = [_axis(name) for name in names[:7]]
+            if sorted(axes) == sorted(BASE) and "".join(axes) != BASE:
                 raise ValueError(
-                    f"{self.path} has {', '.join(names[3:7])}: the quaternion must be in the order x, y, z, w"
+                    f"{self.path} has {', '.join(names[:7])}: the base must be in the order x, y, z and, of its "
+                    "quaternion, x, y, z, w"
                 )
         try:
             table = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None) if lines else np.empty((0, 0))
@@ -251,6 +254,13 @@ def _joints_of(m: mujoco.MjModel) -> list[str]:
 
 def _bodies_of(m: mujoco.MjModel) -> list[str]:
     return [m.body(i).name for i in range(1, m.nbody)]
+
+
+def _axis(column: str) -> str:
+    """Returns the axis that a column is named after, as that of ``"root_qx"`` or ``"w_quat"``; "" if none."""
+    name = column.lower()
+    first = name[:1] if not name[1:2].isalpha() else ""
+    return next((axis for axis in (name[-1:], first) if axis and axis in BASE), "")
 
 
 def _is_row(line: str) -> bool:
