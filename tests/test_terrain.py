@@ -161,6 +161,14 @@ def test_a_kind_of_ones_own():
         ({"a": lambda *args: terrain.Patch(heights=np.zeros((3, 3)))}, {}, "heights of a must be 81 x 81 finite"),
         ({"a": lambda *args: terrain.Patch(heights=np.full((81, 81), np.nan))}, {}, "81 x 81 finite"),
         ({"a": lambda *args: terrain.Patch(boxes=np.array([[0, 0, 0, 1, 1, -1]]))}, {}, "positive half sizes"),
+        ({"a": lambda *args: terrain.Patch(boxes=np.ones((2, 5)))}, {}, r"rows of 6, .*, got \(2, 5\)"),
+        ({"a": terrain.stairs}, {"size": 4.0}, r"stairs, and their platform \(5.6 m\) must fit into a patch of 4 m"),
+        ({"a": functools.partial(terrain.stairs, width=0.0)}, {}, "width of stairs must lie in"),
+        ({"a": functools.partial(terrain.slope, platform=9.0)}, {}, "platform of a slope"),
+        ({"a": functools.partial(terrain.obstacles, platform=9.0)}, {}, "free middle between obstacles"),
+        ({"a": terrain.stepping_stones}, {"size": 4.0}, "a stone, a gap and the edge"),
+        ({"a": terrain.gap}, {"size": 2.0}, "platform and the gap around it"),
+        ({"a": terrain.pit}, {"size": 2.0}, "floor of a pit"),
         (
             {"a": lambda *args: terrain.Patch(boxes=np.array([[4, 0, 0, 1, 1, 1]]))},
             {},
@@ -174,9 +182,23 @@ def test_bad_input(kinds, settings, message):
         terrain.Terrain(kinds, **settings)
 
 
-def test_there_must_be_a_floor():
+def test_there_must_be_a_level_floor():
+    ground = terrain.Terrain({"a": terrain.flat}, rows=1, columns=1)
     with pytest.raises(ValueError, match="no plane 'ground' to replace: choose one of 'floor'"):
-        terrain.Terrain({"a": terrain.flat}, rows=1, columns=1).under(MARBLE, floor="ground")
+        ground.under(MARBLE, floor="ground")
+    for where in ('pos="0 0 -.5"', 'euler="0 10 0"'):
+        with pytest.raises(ValueError, match="plane 'floor' must be level at height 0"):
+            ground.under(MARBLE.replace('name="floor"', f'name="floor" {where}'))
+
+
+def test_ground_may_be_as_low_as_one_says():
+    level = functools.partial(terrain.rough, height=(0.0, 0.02))
+    nothing = lambda *args: terrain.Patch(boxes=np.zeros((0, 6)))  # noqa: E731
+    listed = lambda difficulty, rng, size, cell: terrain.Patch(heights=np.zeros((41, 41)).tolist())  # noqa: E731
+    ground = terrain.Terrain({"rough": level, "nothing": nothing, "listed": listed}, rows=2, columns=3, size=4.0)
+    highest = ground.origins[..., 2]
+    assert (highest[0] == 0.0).all()
+    assert highest[1].tolist() == [pytest.approx(0.02), 0.0, 0.0]
 
 
 def test_seams_of_boxes_have_no_width():

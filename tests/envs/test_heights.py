@@ -43,7 +43,7 @@ def task(spec, states, scan=None, **settings):
 
 def test_scans_are_those_of_rays():
     """Of fields and boxes, for any orientation of the body, and beyond the border, where there is nothing."""
-    ground = terrain.Terrain(KINDS, rows=2, columns=4, size=5.0, border=2.0, seed=3)
+    ground = terrain.Terrain(KINDS, rows=2, columns=4, size=6.0, border=2.0, seed=3)
     spec, rng = ground.under(MODEL.format(more="")), np.random.default_rng(0)
     states = np.zeros((60, 7))
     states[:, :2] = rng.uniform(-1.0, 1.0, (60, 2)) * (np.array(ground.half) + 2.5)
@@ -81,8 +81,9 @@ def test_scans_are_those_of_rays():
     np.testing.assert_allclose(seen, expected, atol=5e-6)
 
 
-def test_a_plane_is_ground_too():
-    env = task(mujoco.MjSpec.from_string(MODEL.format(more="")), np.array([[1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]]))
+def test_a_plane_is_ground_too_but_not_a_ceiling():
+    ceiling = '<geom type="plane" size="1 1 1" pos="0 0 9" euler="180 0 0"/>'
+    env = task(mujoco.MjSpec.from_string(MODEL.format(more=ceiling)), np.array([[1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]]))
     torch.testing.assert_close(env.reset()["observation"], torch.tensor([[3.0] * len(GRID) + [0.0]]))
 
 

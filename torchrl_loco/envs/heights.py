@@ -35,7 +35,9 @@ class Ground:
         """Returns that of a model: what is fixed to the world and may be touched."""
         data = mujoco.MjData(m)
         mujoco.mj_kinematics(m, data)
-        geoms = [g for g in np.flatnonzero(of_ground(m)).tolist() if m.geom_type[g] in (PLANE, FIELD, BOX)]
+        ceiling = (m.geom_type == PLANE) & (data.geom_xmat[:, 8] < 1e-9 - 1)
+        ground = np.flatnonzero(of_ground(m) & ~ceiling).tolist()
+        geoms = [g for g in ground if m.geom_type[g] in (PLANE, FIELD, BOX)]
         if not geoms:
             raise ValueError("there is no ground below: no plane, height field or box is fixed to the world")
         axes = np.abs(data.geom_xmat[geoms].reshape(-1, 3, 3))

@@ -89,7 +89,7 @@ class Terrain:
                 if patch.heights is not None:
                     inner[:] = patch.heights[1:-1, 1:-1]
                 elif patch.boxes is not None:  # the field lies below them
-                    inner[:] = min(0.0, float((patch.boxes[:, 2] - patch.boxes[:, 5]).min()))
+                    inner[:] = (patch.boxes[:, 2] - patch.boxes[:, 5]).min(initial=0.0)
                 if patch.boxes is not None:
                     boxes.append(patch.boxes + np.array((*center, 0.0, 0.0, 0.0, 0.0)))
         self.boxes = np.concatenate([*boxes, self._border()])
@@ -115,14 +115,17 @@ class Terrain:
         side = round(self.size / self.cell) + 1
         if not isinstance(patch, Patch):
             raise TypeError(f"kind {name} must return a Patch, got {type(patch).__name__}")
-        if patch.heights is not None and (
-            np.shape(patch.heights) != (side, side) or not np.isfinite(patch.heights).all()
-        ):
-            raise ValueError(f"heights of {name} must be {side} x {side} finite numbers, got {np.shape(patch.heights)}")
+        if patch.heights is not None:
+            heights = np.asarray(patch.heights, dtype=float)
+            if heights.shape != (side, side) or not np.isfinite(heights).all():
+                raise ValueError(f"heights of {name} must be {side} x {side} finite numbers, got {heights.shape}")
+            patch = dataclasses.replace(patch, heights=heights)
         if patch.boxes is not None:
             boxes = np.asarray(patch.boxes, dtype=float)
-            if boxes.ndim != 2 or boxes.shape[1] != 6 or not np.isfinite(boxes).all() or (boxes[:, 3:] <= 0).any():
-                raise ValueError(f"boxes of {name} must be rows of a center and positive half sizes, got {boxes.shape}")
+            if boxes.ndim != 2 or boxes.shape[1] != 6:
+                raise ValueError(f"boxes of {name} must be rows of 6, a center and half sizes, got {boxes.shape}")
+            if (wrong := ~np.isfinite(boxes).all(axis=1) | (boxes[:, 3:] <= 0).any(axis=1)).any():
+                raise ValueError(f"boxes of {name} must be finite, with positive half sizes, got {boxes[wrong][0]}")
             if (np.abs(boxes[:, :2]) + boxes[:, 3:5] > self.size / 2 + 1e-6).any():
                 raise ValueError(f"boxes of {name} reach beyond their patch of {self.size:g} m")
             patch = dataclasses.replace(patch, boxes=boxes)
@@ -188,13 +191,14 @@ class Terrain:
             floor: name of the plane.
 
         Raises:
-            ValueError: there is no such plane.
+            ValueError: there is no such plane, or it is not level at height 0.
         """
         spec = source.copy() if isinstance(source, mujoco.MjSpec) else read_mjcf(source)
         plane = spec.geom(floor)
         if plane is None or plane.type != mujoco.mjtGeom.mjGEOM_PLANE:
             planes = [geom.name for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
             raise ValueError(f"there is no plane {floor!r} to replace: choose one of {', '.join(map(repr, planes))}")
+        _check_level(spec, floor)
         like = {name: copy.copy(getattr(plane, name)) for name in OF_PLANE}
         spec.delete(plane)
         low, extent = float(self.heights.min()), float(np.ptp(self.heights)) or LEAST  # to which MuJoCo stretches them
@@ -228,3 +232,16 @@ class Terrain:
         axes.set_xlabel("x (m), harder to the right")
         figure.colorbar(shown, label="height (m)", shrink=0.7)
         figure.savefig(path)
+
+
+def _check_level(spec: mujoco.MjSpec, floor: str) -> None:
+    """Raises ValueError if a plane is not where the ground of a terrain will be."""
+    m = spec.copy().compile()
+    data = mujoco.MjData(m)
+    mujoco.mj_kinematics(m, data)
+    z, up = data.geom(floor).xpos[2], data.geom(floor).xmat[8]
+    if abs(z) > 1e-6 or up < 1 - 1e-6:
+        raise ValueError(
+            f"the plane {floor!r} must be level at height 0, where the ground will be: it is at {z:g} m, and the z of "
+            f"its normal is {up:g}"
+        )

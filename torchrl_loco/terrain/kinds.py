@@ -7,6 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.random import Generator
 
+from torchrl_loco.checks import check_float
+
 DEEP = 1.0  # how far boxes reach below what lies deepest in a patch (m)
 
 
@@ -52,6 +54,12 @@ def block(half: float, top: float, bottom: float) -> list[list[float]]:
     return [[0.0, 0.0, (top + bottom) / 2, half, half, (top - bottom) / 2]]
 
 
+def check_room(needed: float, size: float, words: str) -> None:
+    """Raises ValueError if what a kind puts side by side, in words, is longer than a patch."""
+    if needed > size + 1e-9:
+        raise ValueError(f"{words} ({needed:g} m) must fit into a patch of {size:g} m")
+
+
 # Kinds. All begin with the same four arguments, which not each needs; what follows are its figures.
 
 
@@ -73,6 +81,7 @@ def slope(
 
     ``gradient`` is rise over run, ``platform`` a side of the middle (m).
     """
+    check_room(platform, size, "the platform of a slope")
     from_edge = np.minimum(size / 2 - np.abs(points(size, cell)), size / 2 - platform / 2)
     steep = between(gradient, difficulty) * (-1 if down else 1)
     return Patch(heights=steep * np.minimum(from_edge[:, None], from_edge[None]))
@@ -82,7 +91,7 @@ def rough(
     difficulty: float, rng: Generator, size: float, cell: float, height: Bounds = (0.02, 0.1), step: float = 0.01
 ) -> Patch:
     """Returns points of random heights: multiples of ``step`` (m), the largest of ``height`` (m)."""
-    most = max(1, round(between(height, difficulty) / step))
+    most = round(between(height, difficulty) / step)
     return Patch(heights=step * rng.integers(0, most + 1, (len(points(size, cell)),) * 2))
 
 
@@ -110,7 +119,9 @@ def stairs(
     Steps have a ``height`` and a ``width`` (m), the platform has a side of ``platform`` (m) at least, the level ground
     around a width of ``frame`` (m).
     """
-    rise, steps = between(height, difficulty), int((size / 2 - frame - platform / 2) / width)
+    width = check_float("width of stairs", width)
+    check_room(2 * frame + 2 * width + platform, size, "twice frame and width of stairs, and their platform")
+    rise, steps = between(height, difficulty), int((size / 2 - frame - platform / 2) / width + 1e-9)
     sign, bottom = (-1 if down else 1), -(steps + 1) * rise - DEEP
     boxes = ring(size / 2, frame, 0.0, bottom)
     for k in range(steps):
@@ -134,6 +145,7 @@ def obstacles(
     Of ``count`` boxes that are thrown, those that reach the middle or the edge are left out. Each is between half of
     ``height`` (m) and all of it high; ``length`` has the least and the greatest of its sides (m).
     """
+    check_room(platform, size, "the free middle between obstacles")
     top = between(height, difficulty) * rng.uniform(0.5, 1.0, count)
     half = rng.uniform(*length, (count, 2)) / 2
     center = rng.uniform(-1.0, 1.0, (count, 2)) * (size / 2 - half)
@@ -160,6 +172,7 @@ def stepping_stones(
     """
     side, apart, uneven = (between(bounds, difficulty) for bounds in (stone, gap, height))
     bottom = -depth - DEEP
+    check_room(platform + 2 * (side + apart + 0.25), size, "the platform, a stone, a gap and the edge on both sides")
     boxes = ring(size / 2, 0.25, 0.0, bottom) + block(size / 2 - 0.25, -depth, bottom)
     boxes += block(platform / 2, 0.0, bottom)
     places = np.arange(-size / 2 + 0.25 + apart + side / 2, size / 2 - 0.25 - side / 2 - apart, side + apart)
@@ -182,6 +195,7 @@ def gap(
 ) -> Patch:
     """Returns a platform, of side ``platform`` (m), with a gap of a ``width`` and a ``depth`` (m) around it."""
     far, bottom = platform / 2 + between(width, difficulty), -depth - DEEP
+    check_room(2 * far, size, "a platform and the gap around it")
     boxes = ring(size / 2, size / 2 - far, 0.0, bottom) + block(platform / 2, 0.0, bottom)
     return Patch(boxes=np.array(boxes + block(far, -depth, bottom)))
 
@@ -191,5 +205,6 @@ def pit(
 ) -> Patch:
     """Returns a pit of a ``depth`` (m) with upright walls; ``platform`` is a side of its floor (m)."""
     deep = between(depth, difficulty)
+    check_room(platform, size, "the floor of a pit")
     boxes = ring(size / 2, size / 2 - platform / 2, 0.0, -deep - DEEP) + block(platform / 2, -deep, -deep - DEEP)
     return Patch(boxes=np.array(boxes))
