@@ -354,7 +354,10 @@ def test_a_stage_is_where_episodes_go_on():
         other.set_stage({"memory": {"levels": [1.0]}})
     with pytest.raises(ValueError, match=r"'level' of a stage must have rows of shape \(\)"):
         other.set_stage({"memory": {"level": [[1.0]]}})
-    assert torchrl_loco.make("hopper_hop", 1, "cpu").get_stage() == {}
+    plain = torchrl_loco.make("hopper_hop", 1, "cpu")
+    assert plain.get_stage() == {}
+    with pytest.raises(ValueError, match="a stage with shared, of which the task has none"):
+        plain.set_stage(env.get_stage())
 
 
 def test_built_in_starts_and_controls_can_be_built_on():

@@ -130,6 +130,7 @@ def test_errors_of_the_user(ppo_run, tmp_path, capsys):
         "train walker_walk --device cpu --kl_bound 0.1": "--kl_bound is a setting of --algorithm reppo",
         "train walker_walk --task walker_run": "unknown setting 'task'",
         "eval no/such/run": "there is no run folder or policy file 'no/such/run', and unknown environment",
+        "eval {run} --policy {swapped}": "{run} is no task: with --policy, the first word is the task to play in",
         "eval {run} --episodes 0": "episodes must lie in [1, 2**31)",
         "resume {run} --task walker_run": "is a run of walker_stand, but task is walker_run",
         "resume {several}": "has no config.json; name one of those in it, such as one, two",

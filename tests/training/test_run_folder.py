@@ -69,9 +69,11 @@ def test_one_process_at_a_time_trains_a_run(tmp_path):
         other.kill()
     metrics.unlink()
     assert (run.path / "lock").exists()
-    (run.path / "checkpoint.pt.0123.part").write_text("what a killed process wrote")
+    parts = [f"{name}.{'0123abcd' * 4}.part" for name in ("checkpoint.pt", "checkpoint-128.pt", "config.json")]
+    for part in parts:
+        (run.path / part).write_text("what a killed process wrote")
     Trainer(run).train()
-    assert not {path.name for path in run.path.iterdir()} & {"lock", "checkpoint.pt.0123.part"}
+    assert not {path.name for path in run.path.iterdir()} & {"lock", *parts}
 
 
 def test_a_damaged_config_is_named(tmp_path):
@@ -97,16 +99,60 @@ def test_a_torn_line_does_not_keep_a_run_from_continuing(tmp_path):
     assert run.read_metrics()["frames"] == [128, 256, 384]
     path.write_text(path.read_text() + "12,1.2")
     assert run.read_metrics()["frames"] == [128, 256, 384]
-    run.forget_after(256)
+    run.forget_after(256, 2)
     assert path.read_text() == "iteration,frames,return\n1,128,1.5\n2,256,1.5\n"
     for frames in (256, 384):
         run.append_evaluation({"frames": frames, "mean": 1.5})
-    run.forget_after(256)
+    run.forget_after(256, 2)
     assert run.read_evaluations() == [{"frames": 256, "mean": 1.5}]
     (run.path / "evaluations.csv").write_text("")  # the disk was full when its first line was written
-    run.forget_after(256)
+    run.forget_after(256, 2)
     run.append_evaluation({"frames": 256, "mean": 3.0})
     assert run.read_evaluations() == [{"frames": 256, "mean": 3.0}]
+
+
+def test_lines_that_are_lost_are_said_and_damaged_ones_refused(ppo_run, tmp_path, caplog):
+    run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
+    path = run.path / "metrics.csv"
+    head, first, _ = path.read_text().splitlines(keepends=True)
+    Trainer(run, resume=True, total_frames=384)
+    assert "lines up to the checkpoint" not in caplog.text
+    path.write_text(head + first)
+    Trainer(run, resume=True, total_frames=512)
+    assert f"{path} has 1 of the 2 lines up to the checkpoint" in caplog.text
+    for text, why in ((head + first.replace(",", ",x", 1), "'x128' is no number"), ("a,b\n", "its head is 'a,b'")):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=re.escape(f"{path} is damaged, {why}")):
+            Trainer(run, resume=True, total_frames=640)
+
+
+def test_copies_of_checkpoints_stay(tmp_path):
+    run = made(tmp_path)
+    for name in ("best", "backup"):
+        (run.path / f"checkpoint-{name}.pt").write_text("the user's")
+    for frames in (64, 512, 128):
+        run.save_checkpoint({"frames": frames}, keep=2)
+    assert sorted(path.stem[11:] for path in run.path.glob("checkpoint-*.pt")) == ["128", "512", "backup", "best"]
+
+
+def test_an_extended_run_has_an_end_of_its_own(ppo_run, tmp_path):
+    """One that dies after its last frame is not taken for complete because it was so once."""
+    run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
+    assert run.is_finished
+    trainer = Trainer(run, resume=True, total_frames=384)
+    trainer._best = math.inf  # no later policy is better
+    trainer.iterate()
+    trainer.save()
+    assert not run.is_finished
+    Trainer(run, resume=True).train()
+    assert run.is_finished
+    with pytest.raises(ValueError, match="is complete: it has all of its 384 frames"):
+        Trainer(run, resume=True)
+    run.policy.write_bytes(b"damaged")
+    with pytest.raises(ValueError, match=r"Move it away: the run goes on without"):
+        Trainer(run, resume=True, total_frames=512)
+    run.policy.unlink()
+    Trainer(run, resume=True, total_frames=512)
 
 
 def test_a_run_needs_an_undamaged_checkpoint_of_this_version(ppo_run, tmp_path):
@@ -175,7 +221,7 @@ def test_columns_stay_right_where_a_row_has_others(tmp_path):
     run = made(tmp_path)
     for row in ({"frames": 128, "a": 1, "b": 2}, {"frames": 256, "b": 2, "a": 1}, {"frames": 384, "b": 2, "c": 3}):
         run.append_metrics(row)
-    run.forget_after(384)
+    run.forget_after(384, 3)
     path = run.path / "metrics.csv"
     assert path.read_text() == "frames,a,b,c\n128,1,2,\n256,1,2,\n384,,2,3\n"
     metrics = run.read_metrics()

@@ -108,6 +108,8 @@ def _task(name: str) -> str:
     try:
         return task_name(name, by_user=True)
     except ValueError as error:
+        if Path(name).exists():
+            raise ValueError(f"{name} is no task: with --policy, the first word is the task to play in") from None
         raise ValueError(f"there is no run folder or policy file {name!r}, and {error}") from None
 
 

@@ -41,7 +41,7 @@ def resume(
     task: OtherTask = None,
     motions: Flat[Motions] = THOSE_OF_TRAINING,
 ) -> None:
-    """Continue a run that was stopped, from its last checkpoint, as if it had not been stopped.
+    """Continue a run that was stopped, from its last checkpoint, as if it had not been stopped (but one of svg).
 
     Args:
         run: folder of the run.

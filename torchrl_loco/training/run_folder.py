@@ -5,6 +5,7 @@ import csv
 import dataclasses
 import io
 import json
+import logging
 import pickle
 import shutil
 from collections.abc import Collection, Sequence
@@ -35,13 +36,30 @@ def _as_json(config: TrainingConfig) -> bytes:
 
 
 def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
-    """Returns the columns of a CSV file and its rows, without those that a crash or a full disk has cut."""
+    """Returns the columns of a CSV file and its rows, without those that a crash or a full disk has cut.
+
+    Raises:
+        ValueError: it is damaged: there is something else than numbers, and frames among them.
+    """
     rows = csv.DictReader(path.read_text().split("\n")[:-1] if path.exists() else [])
     columns, found = list(rows.fieldnames or ()), [dict[Any, Any](row) for row in rows]
     if longer := [row for row in found if None in row]:
         count = len(columns) + len(longer[0][None])
         raise ValueError(f"{path} has a line of {count} columns, but its head names {len(columns)}")
-    return columns, [row for row in found if None not in row.values()]
+    found = [row for row in found if None not in row.values()]
+    wrong = [value for row in found for value in row.values() if value and not _is_number(value)]
+    if wrong or (columns and "frames" not in columns):
+        what = f"{wrong[0]!r} is no number" if wrong else f"its head is {','.join(columns)[:60]!r}"
+        raise ValueError(f"{path} is damaged, {what}: mend it, or move it away")
+    return columns, found
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
@@ -211,8 +229,11 @@ class RunFolder:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the trained policy had its last evaluation."""
-        return self.policy.is_file() and "mean" in Policy.load(self.policy, "cpu").info
+        """Whether the trained policy had its last evaluation, after all frames that the run has by now."""
+        if not self.policy.is_file():
+            return False
+        info, total = Policy.load(self.policy, "cpu").info, self.load_config().total_frames
+        return "mean" in info and info.get("total_frames", total) == total
 
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Adds ``row`` to ``metrics.csv``; what it has more than the rows before becomes a column, empty in those."""
@@ -247,8 +268,13 @@ class RunFolder:
         if ids:
             storage.replace_file(self.path / "loggers.json", f"{json.dumps(ids)}\n".encode())
 
-    def forget_after(self, frames: int) -> None:
-        """Removes the lines of metrics and evaluations after ``frames`` frames: a resumed run writes them again."""
+    def forget_after(self, frames: int, iteration: int) -> None:
+        """Removes the lines of metrics and evaluations after a checkpoint: a resumed run writes them again.
+
+        Args:
+            frames: those of the checkpoint.
+            iteration: its iteration, as many as there should be lines of metrics.
+        """
         for name in ("metrics.csv", "evaluations.csv"):
             path = self.path / name
             columns, rows = _read_table(path)
@@ -256,6 +282,13 @@ class RunFolder:
                 _write_table(path, columns, [row for row in rows if float(row["frames"]) <= frames])
             else:
                 path.unlink(missing_ok=True)  # the disk was full when its first line was written
+        if (count := len(self._read("metrics.csv"))) < iteration:
+            logging.getLogger("torchrl_loco").warning(
+                "%s has %d of the %d lines up to the checkpoint: the others are lost, and missing in its curve",
+                self.path / "metrics.csv",
+                count,
+                iteration,
+            )
 
     def _append(self, name: str, row: dict[str, Any]) -> None:
         path = self.path / name
@@ -287,15 +320,15 @@ class RunFolder:
         storage.replace_file(self.checkpoint, buffer.getbuffer())
         if keep > 1:
             storage.replace_file(self.path / f"checkpoint-{entries['frames']}.pt", buffer.getbuffer())
-            kept = sorted(self.path.glob("checkpoint-*.pt"), key=lambda path: int(path.stem.rpartition("-")[2]))
-            for old in kept[:-keep]:
+            own = {path: path.stem.rpartition("-")[2] for path in self.path.glob("checkpoint-*.pt")}
+            kept = sorted((path for path, of in own.items() if of.isdecimal()), key=lambda path: int(own[path]))
+            for old in kept[:-keep]:  # others are the user's copies
                 old.unlink()
 
     def remove_parts(self) -> None:
-        """Removes what a process that was killed had written of a checkpoint or a policy; the lock must be taken."""
-        for whole in (self.checkpoint, self.policy):
-            for part in self.path.glob(f"{whole.name}.*.part"):
-                part.unlink()
+        """Removes what a process that was killed had written of a file; the lock must be taken."""
+        for part in self.path.glob(f"*.{'[0-9a-f]' * 32}.part"):  # as storage.replace_file names them
+            part.unlink()
 
     def load_checkpoint(self, device: torch.device | str, path: Path | None = None) -> dict[str, Any]:
         """Reads the checkpoint without executing code.

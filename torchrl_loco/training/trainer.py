@@ -153,7 +153,9 @@ class Trainer:
                 run.store_config(stored)
             if resume:
                 run.keep_source()
-            run.forget_after(self.frames)  # of a process that was killed, or that torchrun has restarted
+            run.forget_after(
+                self.frames, self.iteration
+            )  # of a process that was killed, or that torchrun has restarted
         distributed.copy_from_first(self.algorithm.networks.state_dict().values())
         shared = self._base.world.shared
         self._summed = {name: shared[name].clone() for name in type(self._base).summed_over_ranks}
@@ -380,6 +382,7 @@ class Trainer:
             shown = self.environments.shown(config.eval_episodes, seed, policy.info)
             record(policy, shown, self.run.video, config.video_seconds, config.action_repeat)
         policy.info |= summary | ({"options": dict(config.options)} if config.options else {})  # files may have moved
+        policy.info["total_frames"] = config.total_frames
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
         print(f"best policy, in new episodes: {describe(summary)}")
         for note in filter(None, (shipped_return(config), self.algorithm.note(self.run.read_metrics()))):
@@ -434,12 +437,6 @@ class Trainer:
                 f"{self.run.path} is complete: it has all of its {self.frames} frames. Pass --total_frames to train on"
             )
         was_edited = checkpoint.get("content", self._content) != self._content
-        if was_edited and distributed.is_first():
-            print(
-                f"{self.run.task} (a file of it, its model or a motion) was edited since the checkpoint: the run goes "
-                "on as it is now, and its best policy is selected anew",
-                file=sys.stderr,
-            )
         sizes, now = checkpoint.get("spaces", {}), dataclasses.asdict(self.algorithm.spaces)
         if changed := [f"{key} {size}, now {now[key]}" for key, size in sizes.items() if now.get(key, size) != size]:
             raise ValueError(
@@ -456,6 +453,12 @@ class Trainer:
                 f"{self.run.path} is a run of {len(old)} case(s), {of[0]}, and not of {len(cases)}, {of[1]}: train "
                 "anew, with its weights by --init"
             )
+        if was_edited and distributed.is_first():
+            print(
+                f"{self.run.task} (a file of it, its model or a motion) was edited since the checkpoint: the run goes "
+                "on as it is now, and its best policy is selected anew",
+                file=sys.stderr,
+            )
         terms = checkpoint.get("terms", self._terms)
         if set(terms) != set(self._terms) and distributed.is_first():
             names = [", ".join(each) or "none" for each in (terms, self._terms)]
@@ -471,7 +474,10 @@ class Trainer:
             evaluations = [] if was_edited else self.run.read_evaluations()
             means = [row["mean"] for row in evaluations if row["frames"] <= self.frames]
             if self.run.policy.is_file() and not was_edited:  # maybe of a later evaluation, which is repeated inexactly
-                means.append(Policy.load(self.run.policy, "cpu").info.get("selected_by", -math.inf))
+                try:
+                    means.append(Policy.load(self.run.policy, "cpu").info.get("selected_by", -math.inf))
+                except ValueError as error:
+                    raise ValueError(f"{error}. Move it away: the run goes on without") from error
             self._best = max(means, default=-math.inf)
         if not same_kind and distributed.is_first():
             logging.getLogger("torchrl_loco").warning(
