@@ -1,5 +1,6 @@
 """Parts of a step as one kernel: the numbers of plain torch, for any number of worlds, or a refusal that says why."""
 
+import math
 import os
 import subprocess
 import sys
@@ -124,6 +125,23 @@ OPERATORS = {
         (x * 2).frac(),
     ),
     "atan2": lambda x, y, i, b: torch.atan2(x, y),
+    "signs and lengths": lambda x, y, i, b: (
+        torch.copysign(x, y),
+        x.copysign(-0.0),
+        torch.copysign(torch.full_like(x, 1.5), i),
+        (0 * torch.nan_to_num(x, 1.0, 1.0, -1.0)).signbit(),
+        i.signbit(),
+        torch.hypot(x, y),
+        torch.hypot(1e-25 * x, 0 * y),
+        torch.hypot(1e25 * x, 1e25 * y),
+        torch.fmax(x, y),
+        torch.fmin(x, torch.where(b, math.nan, y)),
+    ),
+    "diagonals": lambda x, y, i, b: (
+        (x[:, :4].reshape(-1, 2, 2) * 2).diagonal(dim1=1, dim2=2).sum(-1),
+        torch.diagonal(y.view(-1, 2, 3), 1, 1, 2),
+        (x + y).unfold(1, 3, 2).amax(-1),
+    ),
     "powers": lambda x, y, i, b: (x**2, x**3, x**7, x**-1, x**-2, x**0.5, x.abs() ** 1.5, x.abs() ** y, 2.0**x, i**2),
     "limits": lambda x, y, i, b: (
         x.clamp(-0.5, 0.5),

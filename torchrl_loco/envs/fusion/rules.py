@@ -28,6 +28,8 @@ POINTWISE: dict[str, str | tuple[str, str]] = {
     **{"rsqrt": "1.0f / sqrtf({0})", "reciprocal": "1.0f / {0}"},
     **{"sigmoid": "1.0f / (1.0f + expf(-{0}))", "relu": "{0} < 0 ? 0 : {0}", "neg": NEG, "mul": MUL},
     **{"abs": ("fabsf({0})", "{0} < 0 ? -{0} : {0}"), "square": "{0} * {0}"},
+    **{"copysign": "wp::copysign({0}, {1})", "fmax": "{0} >= {1} || {1} != {1} ? {0} : {1}"},
+    **{"fmin": "{0} <= {1} || {1} != {1} ? {0} : {1}"},
     **{"sign": "{0} > 0 ? 1 : {0} < 0 ? -1 : 0", "minimum": LEAST, "maximum": MOST},
     **{"clamp_min": MOST, "clamp_max": LEAST, "fmod": ("fmodf({0}, {1})", "{1} == 0 ? 0 : {0} % {1}")},
     **{"bitwise_and": AND, "bitwise_or": OR, "bitwise_xor": "{0} ^ {1}", "bitwise_not": "~{0}"},
@@ -40,10 +42,11 @@ TESTS = {
     **{"lt": "{0} < {1}", "le": "{0} <= {1}", "gt": "{0} > {1}", "ge": "{0} >= {1}", "eq": EQUAL, "ne": "{0} != {1}"},
     **{"logical_and": "{0} && {1}", "logical_or": "{0} || {1}", "logical_xor": "!{0} != !{1}", "logical_not": "!{0}"},
     **{"isnan": "{0} != {0}", "isfinite": "{0} - {0} == 0", "isinf": "{0} == {0} && {0} - {0} != 0"},
+    **{"signbit": "wp::copysign(1.0f, 1.0f * {0}) < 0"},
 }
 """Operators that are bool, on operands of a common type."""
 
-VIEWS = ("expand", "permute", "unsqueeze", "squeeze", "slice", "select", "split_with_sizes")
+VIEWS = ("expand", "permute", "unsqueeze", "squeeze", "slice", "select", "split_with_sizes", "diagonal", "unfold")
 """Operators that look at a tensor in another way."""
 FAR = 2**32  # how many numbers, for torch, a world begins behind the one before: more than any tensor has of one
 
@@ -113,6 +116,14 @@ def _round(p: Program, x: Value, decimals: int = 0) -> Value:
 def _clamp(p: Program, x: Value, min: Any = None, max: Any = None) -> Value:
     x = x if min is None else p.apply(MOST, p._meta.dtype, x, min)
     return x if max is None else p.apply(LEAST, p._meta.dtype, x, max)
+
+
+def _hypot(p: Program, a: Any, b: Any) -> Value:
+    kind = p._meta.dtype
+    a, b = (p.apply("fabsf({0})", kind, x) for x in (a, b))
+    far, near = p.apply(MOST, kind, a, b), p.apply(LEAST, kind, a, b)
+    ratio = p.apply(DIV, kind, near, far)
+    return p.apply("{0} == 0 || {0} - {0} != 0 ? {0} : {0} * sqrtf(1.0f + {1} * {1})", kind, far, ratio)
 
 
 def _filler(number: Any, p: Program, *args: Any, **kwargs: Any) -> Value:
@@ -387,7 +398,14 @@ RULES: dict[str, Callable[..., Any]] = {
     **{name: functools.partial(_fold, text) for name, text in FOLDS.items()},
     **{name: functools.partial(_filler, None if name.startswith("full") else 0) for name in FILLERS},
     **{"add": functools.partial(_add, ADD), "sub": functools.partial(_add, SUB), "remainder": _remainder, "div": _div},
-    **{"pow": _pow, "round": _round, "clamp": _clamp, "where": lambda p, *of: p.where(*of), "copy": _filled},
+    **{
+        "pow": _pow,
+        "hypot": _hypot,
+        "round": _round,
+        "clamp": _clamp,
+        "where": lambda p, *of: p.where(*of),
+        "copy": _filled,
+    },
     **{"var": _var, "mean": _mean, "cumsum": _cumsum, "mm": _matmul, "bmm": _matmul},
     **{name: functools.partial(_extreme, name) for name in BEATS},
     **{f"arg{name}": functools.partial(_place, name) for name in BEATS},
