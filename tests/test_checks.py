@@ -76,13 +76,13 @@ def test_choices():
 class Settings:
     count: int = 1
     rate: float = 1.0
-    share: float = 0.0
+    share: float = checks.within(checks.FRACTION, 0.0)
     flag: bool = False
     name: str = ""
 
 
 def test_fields():
-    checks.check_fields(Settings(), {"share": checks.FRACTION})
+    checks.check_fields(Settings())
     for values, error in [
         ({"count": 0}, ValueError),
         ({"count": 1.5}, TypeError),
@@ -91,7 +91,7 @@ def test_fields():
         ({"flag": 1}, TypeError),
     ]:
         with pytest.raises(error, match=f"{next(iter(values))} must"):
-            checks.check_fields(Settings(**values), {"share": checks.FRACTION})
+            checks.check_fields(Settings(**values))
 
 
 def test_multiples():

@@ -11,7 +11,7 @@ import math
 import numbers
 import operator
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -53,6 +53,7 @@ SEED = Interval(0, 2**32)
 POSITIVE = Interval(0, math.inf, with_low=False)
 NOT_NEGATIVE = Interval(0, math.inf)
 FRACTION = Interval(0, 1, with_high=True)
+POSITIVE_FRACTION = Interval(0, 1, with_low=False, with_high=True)
 ANY = Interval(-math.inf, math.inf, with_low=False)  # all finite numbers
 EXTENDED = Interval(-math.inf, math.inf, with_high=True)  # those, and the two infinities
 
@@ -112,21 +113,26 @@ def suggestion(word: str, choices: Collection[str]) -> str:
     return f", did you mean {near[0]!r}?" if near else ""
 
 
-def check_fields(config: Any, intervals: Mapping[str, Interval]) -> None:
+def within(interval: Interval, default: Any) -> Any:
+    """Returns a field of a dataclass whose numbers must lie in an interval, for :func:`check_fields`."""
+    return dataclasses.field(default=default, metadata={"interval": interval})
+
+
+def check_fields(config: Any) -> None:
     """Checks the fields of a dataclass that are numbers or flags, and stores them in their canonical type.
 
-    It may be frozen and just being made. Fields without an interval are positive.
+    It may be frozen and just being made. Fields that are not made by :func:`within` are positive.
     """
     for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
+        value, interval = getattr(config, field.name), field.metadata.values()
         if value is None and field.type == float | None:
             continue
         if field.type is bool:
             value = check_bool(field.name, value)
         elif field.type is int:
-            value = check_int(field.name, value, intervals.get(field.name, POSITIVE_INT))
+            value = check_int(field.name, value, *interval)
         elif field.type in (float, float | None):
-            value = check_float(field.name, value, intervals.get(field.name, POSITIVE))
+            value = check_float(field.name, value, *interval)
         object.__setattr__(config, field.name, value)
 
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from torchrl_loco.checks import COUNT, FRACTION, NOT_NEGATIVE, SEED, check_fields, check_float, check_int
+from torchrl_loco.checks import COUNT, FRACTION, NOT_NEGATIVE, SEED, check_fields, check_float, check_int, within
 
 PUSH = (0.5, 0.5, 0.4, 0.52, 0.52, 0.78)
 """Greatest change of a floating base's velocity by a push (m/s, rad/s), as mjlab 1.6 has it."""
@@ -19,20 +19,20 @@ class Conditions:
     """Number of episodes."""
     seconds: float | None = None
     """Length of an episode (s), at most that of the task."""
-    seed: int = 0
+    seed: int = within(SEED, 0)
     """Seed of the episodes."""
     delay: tuple[int, int] | None = None
     """Least and greatest delay of an action (control steps); each has as many episodes."""
     friction: tuple[float, float] | None = None
     """Least and greatest sliding friction, drawn for each episode, of all geoms; of those of the robot alone where the
     ground is a torchrl_loco.terrain.Terrain, so that its feet need the priority, as those of ``go1_rough``."""
-    noise: float = 1.0
+    noise: float = within(NOT_NEGATIVE, 1.0)
     """What the task's noise of the observation is multiplied by."""
-    pushes: float | None = None
+    pushes: float | None = within(NOT_NEGATIVE, None)
     """Changes of a floating base's velocity by pushes, as a multiple of mjlab's."""
-    max_falls: float | None = None
+    max_falls: float | None = within(FRACTION, None)
     """Greatest share of episodes that terminate."""
-    min_return: float | None = None
+    min_return: float | None = within(NOT_NEGATIVE, None)
     """Least return, as a share of that in the training simulator."""
 
     def check(self) -> None:
@@ -49,8 +49,7 @@ class Conditions:
                 least, most = (check(name, value, interval) for value in values)
                 if least > most:
                     raise ValueError(f"{name}: the least, {least}, must not be greater than the greatest, {most}")
-        others = dict.fromkeys(("noise", "pushes", "min_return"), NOT_NEGATIVE)
-        check_fields(self, {"seed": SEED, "max_falls": FRACTION, **others})
+        check_fields(self)
 
     def of(self, holds: Mapping[str, Any]) -> "Conditions":
         """Returns the conditions of a task: what is ``None`` here is as its ``holds`` says, else without."""

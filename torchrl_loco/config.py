@@ -82,7 +82,7 @@ class SimConfig:
     solids_on_terrain: str = "exact"
 
     def __post_init__(self) -> None:
-        check_fields(self, {})
+        check_fields(self)
         check_choice("engine", self.engine, ENGINES)
         check_choice("integrator", self.integrator, INTEGRATORS)
         check_choice("contacts", self.contacts, CONTACTS)

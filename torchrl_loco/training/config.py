@@ -10,16 +10,23 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 from torchrl_loco import tasks
 from torchrl_loco.checks import (
+    ANY,
+    COUNT,
+    FRACTION,
+    NOT_NEGATIVE,
+    POSITIVE_FRACTION,
+    SEED,
+    Interval,
     check_choice,
     check_device,
     check_fields,
     check_int,
     check_packages,
     checked_size,
+    within,
 )
 from torchrl_loco.config import PROTOCOLS, SimConfig, arguments_of
 from torchrl_loco.registry import is_place, label, resolve, task_name
-from torchrl_loco.training.intervals import INTERVALS
 
 if TYPE_CHECKING:
     import torch
@@ -55,7 +62,7 @@ class Options(dict[str, Any]):
 class TrainingConfig:
     """Settings of any training run.
 
-    Numbers must be positive where ``intervals.py`` says nothing else.
+    Numbers must be positive, but for those of which an interval is named.
 
     A frame is a control step of one world. A step of the policy is an action that is held for ``action_repeat`` frames;
     ``frames_per_batch`` alone counts those, as collectors do.
@@ -83,7 +90,7 @@ class TrainingConfig:
     """Settings of the solver and of the reset."""
     device: str = "cpu"
     """Where physics and networks live."""
-    seed: int = 0
+    seed: int = within(SEED, 0)
     """Decides every random draw of the run."""
     out: Path = Path("runs")
     """Folder in which the run's own folder is made."""
@@ -104,7 +111,7 @@ class TrainingConfig:
     """Width and height of the pixels."""
     frame_stack: int = 3
     """How many pictures the actor sees at once."""
-    random_shift: int = 0
+    random_shift: int = within(COUNT, 0)
     """Pixels by which pictures are moved at random in gradient steps, at most and either way."""
     critic_from_pixels: bool = False
     """Whether the critic sees pixels too, instead of the observation of the task."""
@@ -116,11 +123,11 @@ class TrainingConfig:
     trials: int = 1
     """Policies that are begun, one after the other. The one with the best evaluation is trained on, the others are
     dropped; their frames count as the run's."""
-    trial_fraction: float = 0.2
+    trial_fraction: float = within(Interval(0, 1, with_low=False), 0.2)
     """Fraction of total_frames that each trial takes, if there are several."""
     action_repeat: int = 4
     """Frames for which an action is held."""
-    episode_length: int = 400
+    episode_length: int = within(COUNT, 400)
     """Frames after which an episode is truncated in training, 0 for the task's own length, which evaluation always
     plays. Shorter episodes practise getting up more often."""
     num_steps: int = 32
@@ -128,13 +135,13 @@ class TrainingConfig:
 
     reward_scale: float = 0.05
     """Factor on the reward before returns are estimated. It keeps values in a range that the critic learns easily."""
-    gamma: float = 0.98
+    gamma: float = within(POSITIVE_FRACTION, 0.98)
     """Discount of a step."""
-    lmbda: float = 0.95
+    lmbda: float = within(FRACTION, 0.95)
     """Lambda of GAE and TD(lambda)."""
     lr: float = 1e-3
     """Learning rate of Adam at the start; it falls linearly to lr * final_lr_fraction at the end."""
-    final_lr_fraction: float = 0.0
+    final_lr_fraction: float = within(FRACTION, 0.0)
     """Learning rate at the end as a fraction of the one at the start."""
     epochs: int = 10
     """Passes over a batch."""
@@ -142,7 +149,7 @@ class TrainingConfig:
     """Steps in one gradient step."""
     max_grad_norm: float = 1.0
     """Norm to which gradients are clipped."""
-    norm_eps: float = 0.0
+    norm_eps: float = within(NOT_NEGATIVE, 0.0)
     """Standard deviation that every entry of an observation is taken to have besides its own when it is normalised.
     Entries in which there is little but noise stay small."""
     hidden: tuple[int, ...] = (128, 128)
@@ -150,13 +157,13 @@ class TrainingConfig:
     bf16: bool = False
     """Whether networks compute in bfloat16 on CUDA."""
 
-    eval_interval: int = 0
+    eval_interval: int = within(COUNT, 0)
     """Frames between two evaluations during training; 0 evaluates at the end only, and at that of each trial."""
     eval_episodes: int = 32
     """Episodes of an evaluation."""
-    video_seconds: float = 10.0
+    video_seconds: float = within(NOT_NEGATIVE, 10.0)
     """Length of the video of the trained policy (s); 0 makes none."""
-    checkpoint_seconds: float = 60.0
+    checkpoint_seconds: float = within(NOT_NEGATIVE, 60.0)
     """Time between two checkpoints (s)."""
     keep: int = 1
     """How many checkpoints stay. The last one does, and beside it, under the number of its frames, those before it."""
@@ -166,7 +173,7 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "task", _stored_name(self.task))
         check_choice("protocol", self.protocol, PROTOCOLS)
-        check_fields(self, INTERVALS)
+        check_fields(self)
         loggers = (self.logger,) if isinstance(self.logger, str) else tuple(self.logger)
         for name in loggers:
             check_choice("logger", name, get_args(LoggerName))
@@ -276,11 +283,11 @@ class PPOConfig(TrainingConfig):
         },
     }
 
-    clip_epsilon: float = 0.2
+    clip_epsilon: float = within(POSITIVE_FRACTION, 0.2)
     """Range of the probability ratio that is not clipped."""
-    entropy_coeff: float = 1e-3
+    entropy_coeff: float = within(NOT_NEGATIVE, 1e-3)
     """Weight of the entropy bonus."""
-    target_kl: float = 0.0
+    target_kl: float = within(NOT_NEGATIVE, 0.0)
     """KL divergence of a gradient step's policy from the one that collected (nats), beyond twice of which the learning
     rate falls by a third, and below half of which it rises by half (Rudin et al., 2022). 0 lets it fall with time."""
     init_std: float = 1.0
@@ -340,23 +347,23 @@ class REPPOConfig(TrainingConfig):
     """Lower bound of the divergence's weight; the default is as good as none. The weight falls with the slope of the
     value. Once it is very small (below 0.0024 in humanoid_walk), it rises too slowly to hold the policy when the slope
     grows."""
-    target_entropy: float = -0.5
+    target_entropy: float = within(ANY, -0.5)
     """Target of the policy's entropy for each entry of an action (nats)."""
     init_temperature: float = 0.01
     """Weight of the entropy at the start (its Lagrange multiplier, which is learned)."""
     min_temperature: float = 3e-4
     """Lower bound of the entropy's weight. A much smaller weight would recover too slowly when the entropy falls."""
-    num_bins: int = 151
+    num_bins: int = within(Interval(2, 2**31), 151)
     """Bins of the critic's distribution over returns."""
-    min_value: float = 0.0
+    min_value: float = within(ANY, 0.0)
     """Return at the center of the first bin. The critic cannot tell lower ones apart; rewards that may be negative need
     one below 0."""
-    max_value: float = 150.0
+    max_value: float = within(ANY, 150.0)
     """Return at the center of the last bin. Rewards in [0, 1] give returns of up to reward_scale * action_repeat /
     (1 - gamma): the critic cannot tell those above max_value apart."""
     action_bound: float = 4.0
     """Largest absolute value of an action where the task's actions are unbounded."""
-    aux_coeff: float = 1.0
+    aux_coeff: float = within(NOT_NEGATIVE, 1.0)
     """Weight of the critic's auxiliary loss, the prediction of its own features at the next step."""
 
     def __post_init__(self) -> None:
@@ -405,18 +412,18 @@ class SVGConfig(TrainingConfig):
     """Frames for which an action is held; no more than one."""
     reward_scale: float = 1.0
     """Factor on the reward before returns are estimated."""
-    gamma: float = 0.97
+    gamma: float = within(POSITIVE_FRACTION, 0.97)
     """Discount of a step."""
     compile: bool = True
     """Whether torch.compile makes kernels of what is imagined on CUDA; the first start on a machine takes a minute
     longer then."""
-    horizon: int = 8
+    horizon: int = within(Interval(2, 2**31), 8)
     """Steps that are imagined in a row, along which the actor's gradient flows."""
     window: int = 8
     """Steps that the model predicts in a row where it is fitted."""
     replay: int = 8
     """Batches that are remembered."""
-    warmup: int = 50
+    warmup: int = within(COUNT, 50)
     """Rounds at the start in which the actor stays, since what model and critic say at first would lead it astray."""
     model_hidden: tuple[int, ...] = (1024, 1024, 1024)
     """Widths of the model's layers."""
@@ -424,9 +431,9 @@ class SVGConfig(TrainingConfig):
     """Learning rate of the model at the start; it falls as the other does."""
     critic_hidden: tuple[int, ...] = (512, 512)
     """Widths of the critic's layers."""
-    target_rate: float = 0.02
+    target_rate: float = within(POSITIVE_FRACTION, 0.02)
     """Share by which the critic that returns are made with follows the one that learns, in a round."""
-    average_rate: float = 0.01
+    average_rate: float = within(POSITIVE_FRACTION, 0.01)
     """Share by which the policy that is kept follows the one that learns, in a round."""
     init_std: float = 0.3
     """Standard deviation of an action, which stays; before tanh, if actions are bounded."""
