@@ -358,6 +358,8 @@ def test_a_stage_is_where_episodes_go_on():
     assert plain.get_stage() == {}
     with pytest.raises(ValueError, match="a stage with shared, of which the task has none"):
         plain.set_stage(env.get_stage())
+    robot = torchrl_loco.make("go1_velocity", 2, "cpu", 0)  # it has rows that go on, and shares nothing
+    robot.set_stage(robot.get_stage())
 
 
 def test_built_in_starts_and_controls_can_be_built_on():

@@ -311,7 +311,7 @@ class WorldAccess(EnvBase):
         known = {"shared": self.world.shared, "memory": self.world.memory}
         for group, entries in stage.items():
             of_task = known[check_choice("stage", group, known)]
-            if not of_task:
+            if entries and not of_task:
                 raise ValueError(f"a stage with {group}, of which the task has none")
             for name, values in entries.items():
                 target = of_task[check_choice(f"{group} of the stage", name, of_task)]
