@@ -21,7 +21,7 @@ from benchmarks.results import save, show
 from benchmarks.throughput import phases
 from torchrl_loco.policy import ObservationNorm, Policy
 from torchrl_loco.registry import env_class
-from torchrl_loco.tasks.velocity import actuated
+from torchrl_loco.tasks.robots import actuated
 from torchrl_loco.training.reppo import REPPO
 
 

@@ -237,13 +237,15 @@ def test_the_command_prints_films_and_mends(tmp_path, capsys, rows):
     assert "1 of 1 files hold no motion" in printed.err
 
 
-@for_each("shape", ["box", "cylinder", "capsule", "ellipsoid", "sphere"])
+@for_each("shape", ["box", "cylinder", "capsule", "ellipsoid", "sphere", "mesh"])
 def test_the_lowest_point_is_as_far_from_a_floor_as_c_mujoco_says(shape):
+    of = 'mesh="wedge"' if shape == "mesh" else 'size="0.1 0.2 0.3"'
     m = mujoco.MjModel.from_xml_string(f"""
     <mujoco>
+      <asset><mesh name="wedge" vertex="0 0 0  .3 0 0  0 .4 0  .1 .1 .5"/></asset>
       <worldbody>
         <geom type="plane" size="0 0 1" pos="0 0 -5"/>
-        <body><freejoint/><geom type="{shape}" size="0.1 0.2 0.3" pos="0.1 0 0.2" euler="10 20 30"/></body>
+        <body><freejoint/><geom type="{shape}" {of} pos="0.1 0 0.2" euler="10 20 30"/></body>
         <body pos="0 0 -1"><freejoint/><geom type="sphere" size="0.1"/></body>
       </worldbody>
     </mujoco>""")

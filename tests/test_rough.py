@@ -9,7 +9,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 import torchrl_loco as loco
-from torchrl_loco import cli, terrain
+from torchrl_loco import cli, registry, terrain
 from torchrl_loco.conditions import Conditions
 from torchrl_loco.tasks import rough
 from torchrl_loco.verify import Exported, verify
@@ -219,6 +219,12 @@ def test_what_a_subclass_sets_stays_but_for_the_ground_under_its_robot():
     class Own(Hills):
         model = loco.Go1Velocity.model
 
+    class Long(loco.Go1Rough):
+        config = dataclasses.replace(loco.Go1Velocity.config, episode_length=88)
+
+    assert Long.config.solids_on_terrain == "spheres"
+    with pytest.raises(TypeError, match="Footless must set feet"):
+        type("Footless", (rough.Rough,), {"model": loco.Go1Velocity.model})
     assert Short.config.episode_length == 77
     assert Short.config.solids_on_terrain == "spheres"
     assert Short.model is Hills.model
@@ -226,6 +232,18 @@ def test_what_a_subclass_sets_stays_but_for_the_ground_under_its_robot():
     assert Other.model.geom("terrain") is not None
     assert Own.model.geom("terrain") is not None
     assert Other.command_ranges["patch"]["kind"] == (0.0, 1.0)
+
+
+def test_a_relative_model_lies_beside_its_class(tmp_path):
+    """Not in the package, where there is one of this name."""
+    text = loco.Go1Velocity.model.read_text().replace(
+        "</mujoco>", '<custom><text name="mine" data="1"/></custom></mujoco>'
+    )
+    (tmp_path / "go1.xml").write_text(text)
+    for name, sets in (("by_model.py", "model"), ("by_robot.py", "robot")):
+        file = tmp_path / name
+        file.write_text(f"import torchrl_loco\nclass Mine(torchrl_loco.Go1Rough):\n    {sets} = 'go1.xml'\n")
+        assert [each.name for each in registry.resolve(f"{file}:Mine", by_user=True).model.texts] == ["mine"]
 
 
 def test_evaluations_begin_on_all_levels(env):

@@ -12,6 +12,7 @@ import torch
 
 import torchrl_loco as loco
 from torchrl_loco import Motion, cli, motion
+from torchrl_loco.sim import models
 from torchrl_loco.tasks import tracking
 from torchrl_loco.tasks.tracking import FOLLOWED, PENALTIES, PIECES, G1Tracking, H1Tracking
 
@@ -227,6 +228,22 @@ def targets_of(env, action):
     """Returns the targets of the joints that actions mean (rad)."""
     facts = env.facts(env.mj_model, {})
     return torch.tensor(facts["action_offset"]) + torch.tensor(facts["action_scale"]) * action
+
+
+def test_a_robot_that_does_not_fit_is_refused():
+    spec = models.specification(H1Tracking.model)
+    spec.delete(spec.actuators[0])
+    unfit = [
+        ({"anchor": "left_knee"}, "must hold base, anchor and ends, but not left_knee"),
+        ({"bodies": H1Tracking.bodies[::-1]}, "the first of bodies of Other must be the base"),
+        ({"model": spec, "memory": tracking.memory(18)}, "an actuator for each joint, in their order: left_hip_yaw"),
+        ({"memory": tracking.memory(18)}, "memory is that of 18 joints, but it has 19 actuators"),
+    ]
+    for given, message in unfit:
+        with pytest.raises(ValueError, match=message):
+            type("Other", (H1Tracking,), given)(1, "cpu", **PLAIN)
+    with pytest.raises(TypeError, match="Bare must set base, anchor, bodies, ends, motion_folder"):
+        type("Bare", (tracking.Tracking,), {"model": H1Tracking.model})(1, "cpu", **PLAIN)
 
 
 def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_path, short):

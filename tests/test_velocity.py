@@ -18,6 +18,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_loco import registry
 from torchrl_loco.sim import Simulation, models
 from torchrl_loco.tasks import velocity
+from torchrl_loco.tasks.robots import actuated
 
 ROBOTS = {
     "go1": velocity.Go1Velocity,
@@ -539,17 +540,52 @@ def test_a_table_makes_a_task_of_a_users_robot(caplog):
     assert "meshes without contacts are drawn and touch nothing: shell" in caplog.text
     with pytest.raises(TypeError, match="Bare must set base, trunk, feet, stand, walk, run"):
         type("Bare", (velocity.Velocity,), {"model": Table.model})(1, "cpu")
-    for name, wrong in (("max_delay", 4), ("push_scale", -1.0), ("holds", {"delay": (0, 4)})):
+    of_number = {"max_delay": 4, "push_scale": -1.0, "step_height": 0.0, "action_scale": math.nan}
+    for name, wrong in (*of_number.items(), ("holds", {"delay": (0, 4)})):
         with pytest.raises(ValueError, match=rf"{name}.* of Slow must lie in"):
             type("Slow", (Table,), {name: wrong})(1, "cpu")
 
 
+UNFIT_TABLES = [
+    ({"feet": ["left_sole", "right_sole"]}, TypeError, "feet of Other must be a dict from sites to geoms"),
+    ({"feet": {"left_sole": ".*_foot", "right_sole": "right_foot"}}, ValueError, "'right_foot' is of several"),
+    ({"memory": velocity.memory(joints=5, feet=2)}, ValueError, "memory is that of 5 joints, but it has 4 actuators"),
+    ({"memory": velocity.memory(joints=4, feet=3)}, ValueError, "memory is that of 3 feet, but there are 2"),
+    ({"weights": {**Table.weights, "self_collision": -1.0}}, ValueError, "self_collision needs own_geoms of Other"),
+    ({"weights": {**Table.weights, "foot_slipp": -1.0}}, ValueError, "must name its terms, .*: see foot_slipp"),
+    ({"weights": {"upright": 1.0}}, ValueError, "must name its terms, .*: see action_rate, foot_clearance"),
+    ({"curriculum": {9: velocity.CURRICULUM[0]}}, ValueError, r"rise from 0, got \[9\]"),
+    ({"curriculum": {0: ((1.0, -1.0), (0.0, 0.0), (0.0, 0.0))}}, ValueError, "a least and a greatest value"),
+]
+
+
+def test_a_table_that_does_not_fit_is_refused():
+    for given, error, message in UNFIT_TABLES:
+        with pytest.raises(error, match=message):
+            type("Other", (Table,), given)(1, "cpu", engine="mujoco", compile_hooks=False)
+
+
+def test_commands_stay_within_a_curriculum_of_ones_own():
+    narrow = {0: ((-1.0, 0.2), (-0.1, 0.1), (-0.3, 0.0))}
+    env = type("Narrow", (Table,), {"curriculum": narrow})(500, "cpu", 0, engine="mujoco", compile_hooks=False)
+    env.reset()
+    commands = env.world.memory["command"]
+    for k, (name, (low, high)) in enumerate(zip(velocity.commands.NAMES, narrow[0], strict=True)):
+        assert ((commands[:, k] >= low) & (commands[:, k] <= high)).all()
+        assert env.command_ranges["command"][name] == (low, high)
+    assert (commands[:, 0] == 0.2).sum() > 50  # straight ahead
+
+
 UNFIT = [
     ("<freejoint/>", '<joint type="slide"/>', "first joint must be a free joint of the base 'trunk'"),
-    ('position joint="left_hip" kp="20" kv=".5"', 'motor name="m" joint="left_hip"', r"must be servos, .*: m"),
+    ('position joint="left_hip" kp="20" kv=".5"', 'motor name="m" joint="left_hip"', "must be servos of gear 1, .*: m"),
     (' forcerange="-10 10"', "", "actuators need a forcerange, or Table an action_scale"),
     ('range="-90 90"', "", "joints need a range: left_knee, right_knee"),
     ('name="home" ', "", "a keyframe 'home'"),
+    ('joint="left_hip" kp', 'joint="left_hip" gear="2" kp', "servos of gear 1, .*: number 0"),
+    ('position joint="left_hip" kp="20"', 'intvelocity joint="left_hip" kp="20" actrange="-1 1"', "must be servos"),
+    ('name="floor"', 'name="floor" pos="0 0 -.5"', "its floor must be at height 0"),
+    ("0 0 .33 1 0 0 0 .2", "0 0 .33 .7 0 .7 0 .2", "the base must be level in 'home'"),
 ]
 
 
@@ -586,7 +622,7 @@ def of_menagerie(folder, scene, base, trunk, feet):
         spec.body(body).add_site(name=f"{foot}_sole", pos=geoms[0].pos)
         found[f"{foot}_sole"] = rf"{foot}_\d+"
     table = {"model": spec, "base": base, "trunk": trunk, "feet": found, "action_scale": 0.25, "randomize": []}
-    joints = velocity.actuated(spec.compile())
+    joints = actuated(spec.compile())
     return type("Menagerie", (Table,), {**table, "memory": velocity.memory(len(joints), len(found))})
 
 

@@ -213,7 +213,9 @@ class Motion:
         every = 1 if self.ground else self._stride
         lowest = lowest_points(m, *poses(m, q[::every]))
         frame, least = every * int(lowest.argmin()), float(lowest.min())
-        if self.ground:
+        if not np.isfinite(least):
+            said.append("nothing of the robot can touch the ground")
+        elif self.ground:
             q[:, 2] -= least + PENETRATES
         elif least < -SUNK:
             said.append(f"the robot is {-least:.2f} m below the ground in frame {frame}")
@@ -411,7 +413,7 @@ def poses(m: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def lowest_points(
     m: mujoco.MjModel, pos: np.ndarray, mat: np.ndarray, geoms: Iterable[int] | None = None
 ) -> np.ndarray:
-    """Returns the height of the lowest point of what can touch the ground, in each frame (m), without meshes.
+    """Returns the height of the lowest point of what can touch the ground, in each frame (m); infinity if nothing can.
 
     Positions (m) and orientations of bodies are those of :func:`poses`; ``geoms`` count, all of them for ``None``.
     """
@@ -432,6 +434,10 @@ def lowest_points(
             half = np.hypot(axes[:, 0], axes[:, 1]) * size[0] + np.abs(axes[:, 2]) * size[1]
         elif kind == kinds.mjGEOM_ELLIPSOID:
             half = np.linalg.norm(axes * size, axis=1)
+        elif kind == kinds.mjGEOM_MESH:
+            mesh = m.mesh(int(m.geom_dataid[geom]))
+            first = int(mesh.vertadr[0])
+            half = -(axes @ m.mesh_vert[first : first + int(mesh.vertnum[0])].T).min(axis=1)
         else:
             continue
         lowest = np.minimum(lowest, pos[:, body, 2] + mat[:, body, 2] @ m.geom_pos[geom] - half)

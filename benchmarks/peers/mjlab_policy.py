@@ -22,7 +22,7 @@ from benchmarks.robots import KEPT, write_metrics
 from torchrl_loco.policy import ObservationNorm, Policy
 from torchrl_loco.registry import env_class
 from torchrl_loco.sim import models
-from torchrl_loco.tasks.velocity import actuated
+from torchrl_loco.tasks.robots import actuated
 
 TERMS = {
     "base_lin_vel": "linear_velocity",

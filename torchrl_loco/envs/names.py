@@ -37,24 +37,22 @@ class Elements:
         Raises:
             torchrl_loco.checks.UnknownNameError: a name or pattern matches none; the message names the nearest.
         """
+        several = [names] if isinstance(names, str) else names
         key = kind, names if isinstance(names, str) else tuple(names)
-        if not key[1]:
+        if not (key[1] and all(several)):
             raise UnknownNameError(f"name a {kind}, several, or a regular expression, got {names!r}")
         if key not in self._found:
             known = self.names(kind)
             if isinstance(names, str) and names in known:
                 self._found[key] = [known.index(names)], True
             else:
-                several = [names] if isinstance(names, str) else names
                 self._found[key] = [i for name in several for i in self._matches(kind, name)], False
         return self._found[key]
 
     def _matches(self, kind: str, pattern: str) -> list[int]:
         known = self.names(kind)
-        if pattern in known:
-            return [known.index(pattern)]
         try:
-            found = [i for i, name in enumerate(known) if name and re.fullmatch(pattern, name)]
+            found = matching(known, pattern)
         except re.error as error:
             why = f"{pattern!r} is neither the name of a {kind} nor a regular expression: {error}"
             raise UnknownNameError(why) from None
@@ -63,3 +61,10 @@ class Elements:
             names = ", ".join(filter(None, known)) or "none"
             raise UnknownNameError(f"the model has no {kind} {pattern!r}{hint}: it has {names}")
         return found
+
+
+def matching(names: Sequence[str], pattern: str) -> list[int]:
+    """Returns where a name is, or if there is none, those that a regular expression matches as a whole."""
+    if pattern in names:
+        return [names.index(pattern)]
+    return [i for i, name in enumerate(names) if name and re.fullmatch(pattern, name)]

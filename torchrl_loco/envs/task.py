@@ -458,9 +458,9 @@ def _warn_of_misspelt_names(cls: type[Task]) -> None:
                 warn(f"torchrl_loco: {base.__name__} defines {name}, which nothing reads: did you mean {near[0]}?")
 
 
-def folder_of(cls: type) -> Path | None:
+def folder_of(cls: type, attribute: str = "model") -> Path | None:
     """Returns the folder of the file that sets the model of a class, from which a relative path is meant."""
-    base = next(base for base in cls.__mro__ if "model" in vars(base))
+    base = next(base for base in cls.__mro__ if attribute in vars(base))
     file = getattr(sys.modules.get(base.__module__), "__file__", None)
     return Path(file).parent if file else None
 

@@ -8,13 +8,16 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_loco.checks import Interval, check_int
+from torchrl_loco.checks import Interval, check_float, check_int
 from torchrl_loco.conditions import PUSH_EVERY
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.vary import Vary
 from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
 
+FREE, JOINT = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtTrn.mjTRN_JOINT)
+FIXED, AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
+INTEGRATOR = int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
 HARD_CONTACT = 10.0  # force from which a contact of the robot with itself counts (N)
 
 
@@ -34,19 +37,67 @@ class Robot(LocoEnv):
     """Control steps by which :meth:`control` can hold an action back, as ``delay`` of :attr:`memory` says."""
     own_geoms: ClassVar[str] = ""
     """Regular expression of the geoms of which ``self_collision`` counts the contacts."""
+    table: ClassVar[Sequence[str]] = ("base",)
+    """Attributes that a robot must set beside what every task does."""
 
     @classmethod
     def check_class(cls) -> None:
-        """Checks the delay of ``holds`` beside what :meth:`torchrl_loco.LocoEnv.check_class` does.
+        """Checks the table of the robot beside what :meth:`torchrl_loco.LocoEnv.check_class` does.
 
         Raises:
-            ValueError: ``verify`` would ask for more than :attr:`longest_delay`.
+            TypeError: an attribute is missing, or has the wrong type.
+            ValueError: ``verify`` would ask for more than :attr:`longest_delay`; ``action_scale`` is not positive.
         """
+        if missing := [name for name in cls.table if not hasattr(cls, name)]:
+            of = next(base for base in cls.__mro__ if "table" in vars(base)).__name__
+            raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.{of})")
         super().check_class()
+        if cls.action_scale is not None:
+            check_float(f"action_scale of {cls.__name__}", cls.action_scale)
         for delay in cls.holds.get("delay", ()):
             check_int(
                 f"the delay that holds names of {cls.__name__}", delay, Interval(0, cls.longest_delay, with_high=True)
             )
+
+    @classmethod
+    def check_model(cls, mj_model: mujoco.MjModel) -> None:
+        """Checks what the formulas take for granted of a robot.
+
+        Raises:
+            ValueError: something of :meth:`faults`.
+        """
+        if wrong := cls.faults(mj_model):
+            raise ValueError(f"the model of {cls.__name__} does not do for this task: {'; '.join(wrong)}")
+
+    @classmethod
+    def faults(cls, m: mujoco.MjModel) -> list[str]:
+        """Returns what is wrong with a model.
+
+        The base does not float first, an actuator is no servo or has no greatest force, a joint has no range, there is
+        no home pose, or actions are of another number than :attr:`memory` says.
+        """
+        wrong = []
+        if m.njnt == 0 or m.jnt_type[0] != FREE or m.body(m.jnt_bodyid[0]).name != cls.base:
+            wrong.append(f"its first joint must be a free joint of the base {cls.base!r}")
+        of_joint = (m.actuator_trntype == JOINT) & (m.actuator_gaintype == FIXED) & (m.actuator_biastype == AFFINE)
+        gain, stiffness = m.actuator_gainprm[:, 0], -m.actuator_biasprm[:, 1]
+        servo = of_joint & (gain > 0) & np.isclose(gain, stiffness) & (m.actuator_biasprm[:, 0] == 0)
+        servo &= (m.actuator_gear[:, 0] == 1) & (m.actuator_dyntype != INTEGRATOR)
+        names = [m.actuator(i).name or f"number {i}" for i in range(m.nu)]
+        if not servo.all() or m.nu == 0:
+            of = some(names, ~servo)
+            wrong.append(f"actuators must be servos of gear 1, as a spec's set_to_position(kp) makes them{of}")
+        strong = m.actuator_forcelimited.astype(bool) & (m.actuator_forcerange[:, 1] > 0)
+        if cls.action_scale is None and not strong.all():
+            wrong.append(f"actuators need a forcerange, or {cls.__name__} an action_scale{some(names, ~strong)}")
+        if servo.all():
+            free = m.jnt_limited[m.actuator_trnid[:, 0]] == 0
+            wrong += [f"joints need a range{some(actuated(m), free)}"] if free.any() else []
+        if not models.has_home(m):
+            wrong.append("it needs a keyframe 'home', the pose around which actions move the joints")
+        if cls.memory.get("last_action") != m.nu:
+            wrong.append(f"memory is that of {cls.memory.get('last_action')} joints, but it has {m.nu} actuators")
+        return wrong
 
     @property
     def joints(self) -> list[str]:
@@ -84,6 +135,12 @@ class Robot(LocoEnv):
         return (
             self.home(s) + 0.25 * s.model("actuator_forcerange")[..., 1] / s.model("actuator_gainprm")[..., 0] * action
         )
+
+
+def some(names: Sequence[str], which: np.ndarray) -> str:
+    """Returns the names of the first elements of a mask, for a message."""
+    chosen = [name for name, yes in zip(names, which, strict=True) if yes]
+    return f": {', '.join(chosen[:3])}{f' and {len(chosen) - 3} more' if len(chosen) > 3 else ''}" if chosen else ""
 
 
 def actuated(m: mujoco.MjModel) -> list[str]:

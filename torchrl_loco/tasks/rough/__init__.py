@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,6 +12,8 @@ import numpy as np
 import torch
 
 from torchrl_loco import motion, terrain
+from torchrl_loco.envs.names import matching
+from torchrl_loco.envs.task import folder_of
 from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
 from torchrl_loco.tasks import velocity
@@ -112,21 +113,24 @@ class Rough(Velocity):
         super().__init_subclass__(**kwargs)
         given, above = vars(cls), [base for base in cls.__mro__[1:] if "model" in vars(base)]
         is_laid = any(issubclass(base, Rough) for base in above)
+        if "model" not in given and not above and not hasattr(cls, "robot"):
+            return  # what several robots share
+        if "config" in given or not is_laid:
+            cls.config = dataclasses.replace(cls.config, solids_on_terrain="spheres")
         if is_laid and given.keys().isdisjoint(("ground", "robot", "model", "feet")):
             return
+        if not hasattr(cls, "feet"):
+            raise TypeError(f"{cls.__name__} must set feet: see help(torchrl_loco.Velocity)")
         if "model" in given or not hasattr(cls, "robot"):
-            if "model" not in given and not above:
-                return  # what several robots share
-            cls.robot = cls.model
-        spec = cls.ground.under(models.specification(cls.robot, velocity.FOLDER))
-        for geom in spec.geoms:
-            if any(re.fullmatch(pattern, geom.name) for pattern in cls.feet.values()):
-                geom.priority = 1
+            cls.robot = models.specification(cls.model, folder_of(cls))
+        spec = cls.ground.under(models.specification(cls.robot, folder_of(cls, "robot")))
+        geoms = list(spec.geoms)
+        for pattern in cls.feet.values():
+            for g in matching([geom.name for geom in geoms], pattern):
+                geoms[g].priority = 1
         kinds = len(dict.fromkeys(cls.ground.kinds))
         patch = {"kind": (0.0, max(kinds - 1.0, 1.0)), "difficulty": (0.0, 1.0)}
         cls.model, cls.command_ranges = spec, {**cls.command_ranges, "patch": patch}
-        if not is_laid:
-            cls.config = dataclasses.replace(cls.config, solids_on_terrain="spheres")
 
     robot: ClassVar[Path | str | mujoco.MjSpec]
     """The robot on its floor."""
@@ -138,7 +142,8 @@ class Rough(Velocity):
         m, data = self.mj_model, mujoco.MjData(self.mj_model)
         data.qpos[:] = models.home_pose(m)
         mujoco.mj_kinematics(m, data)
-        geoms = [g for g in range(m.ngeom) if any(re.fullmatch(feet, m.geom(g).name) for feet in self.feet.values())]
+        known = [m.geom(g).name for g in range(m.ngeom)]
+        geoms = sorted({g for feet in self.feet.values() for g in matching(known, feet)})
         (lowest,) = motion.lowest_points(m, data.xpos[None], data.xmat.reshape(1, -1, 3, 3), geoms)
         return {
             "origins": self.ground.origins.reshape(-1, 3).astype(np.float32),
@@ -214,8 +219,9 @@ class Rough(Velocity):
         if self.leans:
             tilt = s.to_body(self.trunk, self.normal(s))[:, :2]
             terms["upright"] = torch.exp(-squares(tilt) / 0.2)
-        if self.scrapes:
-            terms["scrapes"] = torch.stack([hard_contacts(s, geoms) for geoms in self.scrapes]).sum(0)
+        if "scrapes" in self.weights or self.scrapes:
+            scraping = [hard_contacts(s, geoms) for geoms in self.scrapes]
+            terms["scrapes"] = torch.stack(scraping).sum(0) if scraping else torch.zeros_like(s.time)
         return terms
 
     def truncated(self, s: View) -> torch.Tensor:

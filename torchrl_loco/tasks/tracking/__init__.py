@@ -14,7 +14,7 @@ from torchrl_loco import motion as motions
 from torchrl_loco.checks import Interval, check_int
 from torchrl_loco.conditions import PUSH_EVERY
 from torchrl_loco.envs.rotations import product
-from torchrl_loco.tasks.robots import Robot, arriving, either, hard_contacts, pushed, squares
+from torchrl_loco.tasks.robots import Robot, actuated, arriving, either, hard_contacts, pushed, squares
 from torchrl_loco.tasks.velocity import G1Velocity, H1Velocity
 
 if TYPE_CHECKING:
@@ -142,6 +142,32 @@ class Tracking(Robot):
     """Motions of the package for this robot."""
     estimates: ClassVar[bool] = True
     """Whether the policy sees where the anchor is and how fast the base moves, which a robot must estimate."""
+
+    table = ("base", "anchor", "bodies", "ends", "motion_folder")
+
+    @classmethod
+    def check_class(cls) -> None:
+        """Checks the table of the robot beside what :meth:`torchrl_loco.LocoEnv.check_class` does.
+
+        Raises:
+            TypeError: an attribute is missing, or has the wrong type.
+            ValueError: the base is not the first of :attr:`bodies`, or the anchor or an end is not among them.
+        """
+        super().check_class()
+        bodies = list(cls.bodies)
+        if apart := [name for name in (cls.base, cls.anchor, *cls.ends) if name not in bodies]:
+            raise ValueError(f"bodies of {cls.__name__} must hold base, anchor and ends, but not {', '.join(apart)}")
+        if bodies[0] != cls.base:
+            raise ValueError(f"the first of bodies of {cls.__name__} must be the base, {cls.base!r}")
+
+    @classmethod
+    def faults(cls, m: mujoco.MjModel) -> list[str]:
+        """Returns what is wrong with a model: also actuators that do not drive all joints, in the joints' order."""
+        joints = [m.joint(j).name for j in range(1, m.njnt)]
+        wrong = super().faults(m)
+        if not wrong and actuated(m) != joints:
+            wrong.append(f"it must have an actuator for each joint, in their order: {', '.join(joints)}")
+        return wrong
 
     @classmethod
     def checked_options(cls, given: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,11 +14,12 @@ import torch
 from torchrl_loco.checks import NOT_NEGATIVE, Interval, check_float, check_int
 from torchrl_loco.conditions import PUSH, PUSH_EVERY
 from torchrl_loco.config import SimConfig
+from torchrl_loco.envs.names import matching
 from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
 from torchrl_loco.tasks.robots import (
+    FREE,
     Robot,
-    actuated,
     arriving,
     com,
     either,
@@ -32,9 +33,7 @@ from torchrl_loco.tasks.velocity import commands
 
 FOLDER = Path(__file__).parent
 LEGS = ("FR", "FL", "RR", "RL")
-FREE, JOINT = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtTrn.mjTRN_JOINT)
-FIXED, AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
-TABLE = ("base", "trunk", "feet", "stand", "walk", "run")  # what a robot sets beside what every task does
+MOMENTUM = int(mujoco.mjtSensor.mjSENS_SUBTREEANGMOM)
 
 CURRICULUM: dict[int, commands.Ranges] = {
     0: ((-1.0, 1.0), (-1.0, 1.0), (-0.5, 0.5)),
@@ -187,53 +186,54 @@ class Velocity(Robot):
     push_scale: ClassVar[float] = 1.0
     """Strength of the pushes in training, as a multiple of those of ``verify``."""
 
+    table = ("base", "trunk", "feet", "stand", "walk", "run")
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Lets sliders have the commands of its own curriculum."""
+        super().__init_subclass__(**kwargs)
+        if "curriculum" in vars(cls):
+            commands.check(cls.curriculum)
+            cls.command_ranges = {**cls.command_ranges, "command": commands.first(cls.curriculum)}
+
     @classmethod
     def check_class(cls) -> None:
         """Checks the table of the robot beside what :meth:`torchrl_loco.LocoEnv.check_class` does.
 
         Raises:
             TypeError: an attribute is missing, or has the wrong type.
-            ValueError: ``max_delay`` is not 0, 1, 2 or 3, or ``push_scale`` is negative or not finite.
+            ValueError: ``max_delay`` is not 0, 1, 2 or 3, ``push_scale`` is negative, ``action_scale`` or
+                ``step_height`` is not positive, or ``own_geoms`` are missing.
         """
-        missing = [name for name in TABLE if not hasattr(cls, name)]
-        if missing:
-            raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.Velocity)")
         super().check_class()
+        if not isinstance(cls.feet, Mapping):
+            raise TypeError(f"feet of {cls.__name__} must be a dict from sites to geoms, got {cls.feet!r}")
         check_int(f"max_delay of {cls.__name__}", cls.max_delay, Interval(0, cls.longest_delay, with_high=True))
         check_float(f"push_scale of {cls.__name__}", cls.push_scale, NOT_NEGATIVE)
+        check_float(f"step_height of {cls.__name__}", cls.step_height)
+        if "self_collision" in cls.weights and not cls.own_geoms:
+            raise ValueError(f"the weight of self_collision needs own_geoms of {cls.__name__}")
 
     @classmethod
-    def check_model(cls, mj_model: mujoco.MjModel) -> None:
-        """Checks what the formulas take for granted of a robot.
-
-        Raises:
-            ValueError: the base does not float first, an actuator is no servo or has no greatest force, a joint has no
-                range, a sensor is missing, or there is no home pose.
-        """
-        m, wrong = mj_model, []
-        if m.njnt == 0 or m.jnt_type[0] != FREE or m.body(m.jnt_bodyid[0]).name != cls.base:
-            wrong.append(f"its first joint must be a free joint of the base {cls.base!r}")
-        of_joint = (m.actuator_trntype == JOINT) & (m.actuator_gaintype == FIXED) & (m.actuator_biastype == AFFINE)
-        gain, stiffness = m.actuator_gainprm[:, 0], -m.actuator_biasprm[:, 1]
-        servo = of_joint & (gain > 0) & np.isclose(gain, stiffness)
-        names = [m.actuator(i).name for i in range(m.nu)]
-        if not servo.all() or m.nu == 0:
-            wrong.append(f"actuators must be servos, as a spec's set_to_position(kp) makes them{_some(names, ~servo)}")
-        strong = m.actuator_forcelimited.astype(bool) & (m.actuator_forcerange[:, 1] > 0)
-        if cls.action_scale is None and not strong.all():
-            wrong.append(f"actuators need a forcerange, or {cls.__name__} an action_scale{_some(names, ~strong)}")
-        if servo.all():
-            moved = m.actuator_trnid[:, 0]
-            free = m.jnt_limited[moved] == 0
-            wrong += [f"joints need a range{_some(actuated(m), free)}"] if free.any() else []
-        sensors = [m.sensor(i).name for i in range(m.nsensor)]
+    def faults(cls, m: mujoco.MjModel) -> list[str]:
+        """Returns what is wrong with a model: also a floor elsewhere, a base that is not level, or shared feet."""
+        wrong = super().faults(m)
+        sensors = [m.sensor(i).name for i in range(m.nsensor) if m.sensor_type[i] == MOMENTUM]
         if "angular_momentum" in cls.weights and "angular_momentum" not in sensors:
             sensor = f'<subtreeangmom name="angular_momentum" body="{cls.base}"/>'
             wrong.append(f"the weight of angular_momentum needs {sensor}")
-        if not models.has_home(m):
-            wrong.append("it needs a keyframe 'home', the pose around which actions move the joints")
-        if wrong:
-            raise ValueError(f"the model of {cls.__name__} does not do for this task: {'; '.join(wrong)}")
+        floors = (m.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (m.geom_bodyid == 0)
+        if (np.abs(m.geom_pos[floors, 2]) > 1e-6).any():
+            wrong.append("its floor must be at height 0, from which feet are measured")
+        floats = m.njnt > 0 and m.jnt_type[0] == FREE
+        if floats and models.has_home(m) and not np.allclose(models.home_pose(m)[3:7], (1, 0, 0, 0)):
+            wrong.append("the base must be level in 'home', with its x axis ahead: its quaternion must be 1 0 0 0")
+        geoms = [m.geom(g).name for g in range(m.ngeom)]
+        feet = [g for pattern in cls.feet.values() for g in matching(geoms, pattern)]
+        if twice := sorted({geoms[g] for g in feet if feet.count(g) > 1}):
+            wrong.append(f"each geom must be of one foot, but {twice[0]!r} is of several")
+        if cls.memory.get("air_time") != len(cls.feet):
+            wrong.append(f"memory is that of {cls.memory.get('air_time')} feet, but there are {len(cls.feet)}")
+        return wrong
 
     # What hooks share.
 
@@ -300,7 +300,11 @@ class Velocity(Robot):
 
     def reward(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the terms of the reward: :meth:`terms` times their weights and the control step."""
-        return {name: self.weights[name] * s.dt * term for name, term in self.terms(s).items()}
+        terms = self.terms(s)
+        if terms.keys() != self.weights.keys():
+            apart = ", ".join(sorted(terms.keys() ^ self.weights.keys()))
+            raise ValueError(f"weights of {type(self).__name__} must name its terms, {', '.join(terms)}: see {apart}")
+        return {name: self.weights[name] * s.dt * term for name, term in terms.items()}
 
     def terms(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the terms of the reward by name, each ``(num_envs,)``, before they are weighted."""
@@ -394,12 +398,6 @@ class Velocity(Robot):
 def steps_of_training(info: Mapping[str, Any]) -> int:
     """Returns after how many control steps of each world a policy was saved."""
     return int(info.get("frames", 0)) // int(info.get("num_envs", 1))
-
-
-def _some(names: list[str], which: np.ndarray) -> str:
-    """Returns the names of the first elements of a mask, for a message."""
-    chosen = [name for name, yes in zip(names, which, strict=True) if yes]
-    return f": {', '.join(chosen[:3])}{f' and {len(chosen) - 3} more' if len(chosen) > 3 else ''}" if chosen else ""
 
 
 def find(table: Mapping[str, float], name: str) -> float:

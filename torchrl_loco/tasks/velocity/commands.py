@@ -44,6 +44,15 @@ def limits(s: View, curriculum: dict[int, Ranges]) -> tuple[torch.Tensor, torch.
     return low, high
 
 
+def check(curriculum: dict[int, Ranges]) -> None:
+    """Raises ValueError if steps do not rise from 0, or a least velocity is above the greatest."""
+    if list(curriculum) != sorted({0, *curriculum}):
+        raise ValueError(f"curriculum must name control steps that rise from 0, got {list(curriculum)}")
+    for step, ranges in curriculum.items():
+        if len(ranges) != 3 or any(low > high for low, high in ranges):
+            raise ValueError(f"curriculum at {step} must have 3 pairs of a least and a greatest value, got {ranges}")
+
+
 def reached(curriculum: dict[int, Ranges], steps: int) -> tuple[list[float], list[float]]:
     """Returns least and greatest command after so many control steps of training."""
     ranges = [ranges for first, ranges in curriculum.items() if steps >= first][-1]
@@ -60,7 +69,7 @@ def draw(s: View, curriculum: dict[int, Ranges]) -> dict[str, torch.Tensor]:
     low, high = limits(s, curriculum)
     command, kind = low + (high - low) * s.uniform(0.0, 1.0, 3), s.uniform(0.0, 1.0, 3)
     stands, holds, ahead = kind[:, 0] < STAND, kind[:, 1] < TURN, kind[:, 2] < AHEAD
-    forward = command[:, :1].abs().clamp(min=SLOWEST)
+    forward = torch.minimum(command[:, :1].abs().clamp(min=SLOWEST), high[:, :1].clamp(min=0.0))
     straight = torch.cat([forward, torch.zeros_like(command[:, 1:])], dim=-1)
     command = torch.where(ahead.unsqueeze(-1), straight, command)
     return {
