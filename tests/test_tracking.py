@@ -230,7 +230,7 @@ def targets_of(env, action):
     return torch.tensor(facts["action_offset"]) + torch.tensor(facts["action_scale"]) * action
 
 
-def test_a_robot_that_does_not_fit_is_refused():
+def test_a_robot_that_does_not_fit_is_refused(short):
     spec = models.specification(H1Tracking.model)
     spec.delete(spec.actuators[0])
     unfit = [
@@ -242,8 +242,13 @@ def test_a_robot_that_does_not_fit_is_refused():
     for given, message in unfit:
         with pytest.raises(ValueError, match=message):
             type("Other", (H1Tracking,), given)(1, "cpu", **PLAIN)
-    with pytest.raises(TypeError, match="Bare must set base, anchor, bodies, ends, motion_folder"):
+    with pytest.raises(TypeError, match="Bare must set base, anchor, bodies, ends: see help"):
         type("Bare", (tracking.Tracking,), {"model": H1Tracking.model})(1, "cpu", **PLAIN)
+    table = {name: vars(H1Tracking)[name] for name in ("model", "config", "memory", "base", "anchor", "bodies", "ends")}
+    still = type("Still", (tracking.Tracking,), {**table, "action_scale": 0.25})
+    with pytest.raises(ValueError, match="Still has no motions of its own: pass motion, or set motion_folder"):
+        still(1, "cpu", **PLAIN)
+    assert still(1, "cpu", motion=short, fps=25, **PLAIN).frames.names == ("a", "b")
 
 
 def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_path, short):

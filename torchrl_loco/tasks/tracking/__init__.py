@@ -143,7 +143,7 @@ class Tracking(Robot):
     estimates: ClassVar[bool] = True
     """Whether the policy sees where the anchor is and how fast the base moves, which a robot must estimate."""
 
-    table = ("base", "anchor", "bodies", "ends", "motion_folder")
+    table = ("base", "anchor", "bodies", "ends")
 
     @classmethod
     def check_class(cls) -> None:
@@ -244,8 +244,11 @@ class Tracking(Robot):
 
         Raises:
             FileNotFoundError: a file is not there.
+            ValueError: no motion is named, and the robot has none.
         """
         paths, fps = (self.motion, self.fps) if "motion" in self.options_given else ([], OWN_RATE)
+        if not paths and not hasattr(self, "motion_folder"):
+            raise ValueError(f"{type(self).__name__} has no motions of its own: pass motion, or set motion_folder")
         key = type(self), json.dumps(paths), fps, self.config.ctrl_dt
         try:
             named = motions.named(paths or self.motion_folder, fps)
