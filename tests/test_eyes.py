@@ -138,6 +138,37 @@ def test_light_falls_off_and_casts_shadows():
     assert torch.equal(pixels[True][~dark], pixels[False][~dark])
 
 
+CHECKED = """<mujoco><asset>
+  <texture name="check" type="2d" builtin="checker" rgb1="1 1 1" rgb2="0 0 0" width="64" height="64"/>
+  <material name="check" texture="check" texrepeat="2 3" {uniform}/>
+  <hfield name="flat" nrow="2" ncol="2" size="2 3 1 1"/></asset>
+  <worldbody><geom {ground} material="check"/><camera name="above" pos="0 0 5" fovy="20"/>
+  <body pos="0 0 9"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
+SQUARES = {"": (2.0, 3.0, 1.0, 1.0), 'texuniform="true"': (2.0, 3.0, 0.5, 1 / 3)}
+"""Distances of a corner of the ground, and sides of a square, along x and y (m)."""
+
+
+def test_the_texture_of_ground_is_as_large_as_in_mujoco_and_begins_in_its_corner():
+    for ground in (
+        'type="plane" size="2 3 1"',
+        'type="box" size="2 3 .5" pos="0 0 -.5"',
+        'type="hfield" hfield="flat"',
+    ):
+        for uniform, (*corner, width, height) in SQUARES.items():
+            m = mujoco.MjModel.from_xml_string(CHECKED.format(ground=ground, uniform=uniform))
+            data, eye = mujoco.MjData(m), Eye(m, wp.get_device("cpu"), "above", 120, 120, 1)
+            mujoco.mj_kinematics(m, data)
+            rows = wp.array(data.xpos[None], wp.vec3), wp.array(data.xmat.reshape(1, -1, 3, 3), wp.mat33)
+            eye.look(*rows)
+            light = eye.rgb[0, :, :, 0].numpy() > 100
+            at = (np.arange(120) - 59.5) / 60 * 5 * np.tan(np.radians(10))
+            x, y = (at + corner[0]) / width, (-at + corner[1]) / height
+            inside = [(0.1 < each % 1) & (each % 1 < 0.9) for each in (x, y)]  # edges are soft
+            even = (np.floor(x)[None] + np.floor(y)[:, None]) % 2 == 0
+            kept = inside[1][:, None] & inside[0][None]
+            assert len({*(light == even)[kept].tolist()}) == 1, (ground, uniform)
+
+
 def test_a_camera_shows_what_is_there_now():
     """The same as the entries of steps; geoms are seen where something is near."""
     env = loco.make("walker_walk", 2, "cpu", 0, from_pixels=True, depth=50.0, size=(24, 16), camera="back")

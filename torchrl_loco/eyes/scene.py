@@ -252,8 +252,9 @@ def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
         is_ground = m.geom_bodyid[g] == 0 and m.geom_type[g] in (PLANE, BOX, FIELD)
         if used >= 0 and (not is_ground or used not in flat):
             left_out.append(m.geom(g).name or str(g))
-        elif used >= 0:  # texels are counted from a corner of a plane, or from the middle of ground without an end
-            size, times = m.geom_size[g, :2] * (m.geom_type[g] == PLANE), m.mat_texrepeat[material]
+        elif used >= 0:  # texels are counted from a corner, or from the middle of ground without an end
+            size, times = m.geom_size[g, :2], m.mat_texrepeat[material]
+            size = m.hfield_size[m.geom_dataid[g], :2] if m.geom_type[g] == FIELD else size
             ends = size > 0.0
             whole = ends & (not m.mat_texuniform[material])
             texture[g], repeat[g] = flat.index(used), np.where(whole, times / np.where(whole, 2 * size, 1), 0.5 * times)
