@@ -54,7 +54,7 @@ if "velocity" not in facts:
     parser.error(f"{args.file} holds no policy that follows a velocity command, such as one of go1_velocity")
 offset, scale = np.array(facts["action_offset"]), np.array(facts["action_scale"])
 low, high = (facts["velocity"][f"command_{end}"] for end in ("low", "high"))
-if (np.array(args.command) < low).any() or (np.array(args.command) > high).any():
+if not ((np.array(args.command) >= low) & (np.array(args.command) <= high)).all():  # nor is NaN
     parser.error(f"the policy was trained for commands from {low} to {high}, and may fall beyond")
 robot, action = Robot(facts), np.zeros(len(scale))
 for step in range(round(args.seconds / facts["control_timestep"])):

@@ -96,6 +96,7 @@ def test_a_player_does_what_a_rollout_does_and_remembers_it(shared):
 def test_actions_are_held_and_curves_keep_the_last_20_seconds_in_few_points(led):
     asked = []
     player = Player(led, lambda td: still(td).set("x", asked.append(1) or td["done"]), action_repeat=4)
+    asked.clear()  # it was tried once
     for _ in range(10):
         player.step()
     assert len(asked) == 3
@@ -326,6 +327,13 @@ def test_in_a_notebook_it_plays_beside_the_cells(led):
 def test_errors(led, tmp_path, capsys):
     with pytest.raises(ValueError, match=r"num_envs must lie in \[1, 64\]"):
         Viewer(loco.make("walker_walk", 65, "cpu"), still)
+    for wrong, match in (({"port": 70_000}, "port must lie in"), ({"action_repeat": 0}, "action_repeat must lie in")):
+        with pytest.raises(ValueError, match=match):
+            Viewer(led, still, **wrong)
+    with pytest.raises(ValueError, match="was it trained for another body"):
+        Viewer(led, loco.load_policy("hopper_hop", "cpu"))
+    with pytest.raises(OSError, match=r"host 1\.2\.3\.4 is no address of this machine"):
+        Viewer(led, still, host="1.2.3.4")
     for command, message in {
         "play walker_walk --viewer browser --num_envs 65": "num_envs must lie in [1, 64], got 65",
         "play walker_walk --viewer browser --port 0": "port must lie in [1, 65536)",

@@ -120,6 +120,10 @@ def test_what_is_wrapped(library):
         cls(torchrl_loco.make("walker_stand", None, "cpu"))
     with pytest.raises(ValueError, match="did you mean 'walker_stand'"):
         cls("walker_stnd", 2)
+    if library != "rsl_rl":
+        for wrong, match in (({"camera": "nope"}, "unknown camera 'nope'"), ({"width": 0}, "width must lie in")):
+            with pytest.raises(ValueError, match=match):
+                cls(own, render_mode="rgb_array", **wrong)
 
 
 # Gymnasium.
@@ -258,7 +262,17 @@ def test_gymnasium_resets_worlds_of_a_mask(gymnasium):
         env.step(np.zeros((NUM_ENVS, 6)))
     env.reset(seed=0)
     before, *_ = env.step(env.action_space.sample())
+    for wrong in (np.zeros((NUM_ENVS, 2)), np.zeros(6)):
+        with pytest.raises(ValueError, match=rf"actions must have shape \({NUM_ENVS}, 6\), got"):
+            env.step(wrong)
     mask = np.array([True, False, False, True])
+    for options, match in (
+        ({"mask": mask}, "unknown option of reset 'mask'"),
+        ({"reset_mask": mask[:2]}, "reset_mask must be bool of shape"),
+        ({"reset_mask": mask.astype(float)}, "reset_mask must be bool of shape"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            env.reset(options=options)
     after, _ = env.reset(options={"reset_mask": mask})
     assert np.array_equal((after == before).all(axis=1), ~mask)
     truncations = [env.step(env.action_space.sample())[3] for _ in range(LENGTH)]
@@ -332,6 +346,8 @@ def test_gymnasium_without_a_render_mode(gymnasium):
         env.render()
     with pytest.raises(ValueError, match="unknown render_mode 'human': choose one of rgb_array"):
         wrappers.GymnasiumVectorEnv(make(), render_mode="human")
+    with pytest.raises(TypeError, match="this is one world, take GymnasiumVectorEnv"):
+        wrappers.GymnasiumEnv("walker_stand", num_envs=1)
 
 
 # RSL-RL.
@@ -362,6 +378,15 @@ class FallAtTheEnd(torchrl_loco.WalkerStand):
 
     def terminated(self, s):
         return s.time > (LENGTH - 0.5) * 0.025
+
+
+@pytest.mark.ci
+def test_rsl_rl_loses_no_group(rsl_rl):
+    def observation(self, s):
+        return {"observation": s.qpos, "policy": s.qvel}
+
+    with pytest.raises(ValueError, match="'observation' is called 'policy' in RSL-RL"):
+        wrappers.RslRlVecEnv(type("Twice", (torchrl_loco.WalkerStand,), {"observation": observation}), 1, device="cpu")
 
 
 @pytest.mark.ci

@@ -96,6 +96,13 @@ def test_actions_are_held_in_evaluations_and_videos(tmp_path):
     assert len(calls) == 1  # of 2
     record(policy, env, tmp_path / "short.mp4", 1e-9, action_repeat=2)  # a picture at least
     assert (tmp_path / "short.mp4").stat().st_size
+    for wrong, match in (({"seconds": -1.0}, "seconds must"), ({"action_repeat": 0}, "action_repeat must")):
+        with pytest.raises(ValueError, match=match):
+            record(policy, env, **{"path": tmp_path / "no.mp4", "seconds": 1.0, **wrong})
+    with pytest.raises(ValueError, match="unknown camera 'nope'"):
+        record(policy, env, tmp_path / "no.mp4", 1.0, camera="nope")
+    with pytest.raises(ValueError, match="no batch of worlds"):
+        record(policy, torchrl_loco.make("walker_stand", None, "cpu"), tmp_path / "no.mp4", 1.0)
 
 
 def test_a_video_that_is_cut_off_leaves_no_file(tmp_path):

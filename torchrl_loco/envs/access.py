@@ -156,9 +156,7 @@ class WorldAccess(EnvBase):
             ValueError: the model has no such camera, a size is not positive, or there are not so many worlds.
             TypeError: a size or number is not an integer.
         """
-        model = self.mj_model
-        check_choice("camera", camera, [model.camera(i).name for i in range(model.ncam)])
-        size = check_int("width", width), check_int("height", height)
+        model, size = self.mj_model, self.check_picture(camera, width, height)
         worlds = self.num_envs if worlds is None else check_int("worlds", worlds, Interval(1, self.num_envs + 1))
         make = functools.partial(Eye, **LOOKS_WELL, varied=self.sim.varied_numbers)
         eye = self.world.renderer(make, model, camera, *size, worlds)
@@ -169,6 +167,11 @@ class WorldAccess(EnvBase):
             both = self.world.renderer(Poses, self.model_with_ghost, camera, *size, worlds).render(poses)
             pixels = torch.lerp(pixels.float(), both.float(), OPACITY).round().to(torch.uint8)
         return pixels if self.batch_size else pixels[0]
+
+    def check_picture(self, camera: str, width: int, height: int) -> tuple[int, int]:
+        """Returns the size of what :meth:`render` draws, or raises its errors, without drawing."""
+        check_choice("camera", camera, [self.mj_model.camera(i).name for i in range(self.mj_model.ncam)])
+        return check_int("width", width), check_int("height", height)
 
     def camera(
         self, camera: str | int | None = None, width: int = 84, height: int = 84, kinds: Sequence[str] = ("rgb",)

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase, step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import trange
 
-from torchrl_loco.checks import SEED, check_int, check_packages
+from torchrl_loco.checks import SEED, check_float, check_int, check_packages
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.eyes.scene import to_the_horizon
@@ -210,7 +210,15 @@ def record(
         seconds: length of the video (s).
         action_repeat: frames for which an action is held.
         camera: name of one of the model's cameras.
+
+    Raises:
+        ValueError: ``seconds`` or ``action_repeat`` is not positive, there is no such camera, or no batch of worlds.
+        TypeError: one of them is no number.
     """
+    seconds, action_repeat = check_float("seconds", seconds), check_int("action_repeat", action_repeat)
+    env.check_picture(camera, *SIZE)
+    if not env.batch_size:
+        raise ValueError("the environment has no batch of worlds: make it with num_envs=1")
     frame_rate = round(1 / env.config.ctrl_dt)
     steps = play(policy, env, action_repeat, max(round(seconds * frame_rate), 1), "video")
     with settings_for_small_networks():

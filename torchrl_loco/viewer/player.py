@@ -22,6 +22,9 @@ class Player:
         self.dt = env.config.ctrl_dt
         self._room = round(HISTORY / self.dt)
         self.reset()
+        if policy is not None:  # one of another task fails here, not in the viewer's thread
+            with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+                policy(self._td.clone())
 
     @property
     def action_repeat(self) -> int:

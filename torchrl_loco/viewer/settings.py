@@ -9,6 +9,7 @@ from torchrl_loco.checks import Interval, check_packages
 LOOPBACK = "127.0.0.1"  # address that this machine alone reaches
 PORT = 8080
 WORLDS = Interval(1, 64, with_high=True)  # how many worlds a page shows
+PORTS = Interval(1, 2**16)
 SHARE = Interval(0, 1, with_low=False, with_high=True)  # shares of the machine's CPU time that a viewer may take
 
 
@@ -21,7 +22,10 @@ def check_host(host: str) -> str:
     """Returns the address to listen on of what a person wrote, who may call this machine ``localhost``."""
     address = ipaddress.ip_address(LOOPBACK if host == "localhost" else host)
     with socket.socket(socket.AF_INET if address.version == 4 else socket.AF_INET6) as probe:
-        probe.bind((str(address), 0))  # an error if this machine does not have it: viser would wait for ever
+        try:
+            probe.bind((str(address), 0))
+        except OSError as error:  # viser would wait for ever
+            raise OSError(f"host {host} is no address of this machine: {error}") from None
     return str(address)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from torchrl_loco.checks import check_float, check_int
 from torchrl_loco.viewer.player import Player
-from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_host, check_viewer, url_of
+from torchrl_loco.viewer.settings import LOOPBACK, PORT, PORTS, SHARE, WORLDS, check_host, check_viewer, url_of
 
 SPEEDS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)  # of the simulation, by real time
 PICTURE, CURVES, LOOK_FOR_POLICY, IDLE = 1 / 30, 0.25, 1.0, 0.1
@@ -60,6 +60,9 @@ class Viewer:
         check_viewer()
         check_int("num_envs", env.num_envs, WORLDS)
         check_float("cpu_share", cpu_share, SHARE)
+        check_int("port", port, PORTS)
+        if action_repeat is not None:
+            check_int("action_repeat", action_repeat)
         from torchrl_loco.viewer.page import Page
 
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()

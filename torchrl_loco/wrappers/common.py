@@ -38,6 +38,8 @@ def base_of(env: EnvBase) -> Any:
 def step_worlds(env: EnvBase, td: TensorDictBase, actions: Any) -> tuple[TensorDictBase, TensorDictBase]:
     """Returns the results of a step of all worlds, and what the next begins with: those that are done are reset."""
     actions = torch.as_tensor(actions, device=env.device, dtype=env.action_spec.dtype)
+    if actions.shape != env.action_spec.shape:
+        raise ValueError(f"actions must have shape {tuple(env.action_spec.shape)}, got {tuple(actions.shape)}")
     step, begin = env.step_and_maybe_reset(td.set("action", actions))
     return step["next"], begin
 
@@ -69,6 +71,8 @@ class Wrapped:
         self.render_mode = None if mode is None else check_choice("render_mode", mode, RENDER_MODES)
         self.env, self._picture = made(env, num_envs, settings), picture
         self._groups = groups_of(self.env)
+        if mode is not None:
+            base_of(self.env).check_picture(*picture)
 
     def _render_metadata(self) -> dict[str, Any]:
         return {"render_modes": list(RENDER_MODES), "render_fps": round(1 / base_of(self.env).config.ctrl_dt)}

@@ -60,6 +60,8 @@ class GymnasiumEnv(common.Wrapped, Env):
         height: int = 240,
         **settings: Any,
     ) -> None:
+        if "num_envs" in settings:
+            raise TypeError("num_envs: this is one world, take GymnasiumVectorEnv for several")
         self._wrap(env, None, settings, render_mode, (camera, width, height))
         if self.env.batch_size[0] != 1:
             raise ValueError(f"the environment has {self.env.batch_size[0]} worlds: take GymnasiumVectorEnv")
@@ -180,15 +182,22 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
 
         Returns:
             The observations of all worlds, and an empty dictionary.
+
+        Raises:
+            ValueError: there is no such option, or the mask is none.
         """
         super().reset(seed=seed)
         if seed is not None:
             self.env.set_seed(seed)
+        for name in options or ():
+            check_choice("option of reset", name, ("reset_mask",))
         mask = None if options is None else options.get("reset_mask")
         if mask is None or self._td is None:
             self._td = self.env.reset()
         else:
             rows = torch.as_tensor(mask, device=self.env.device).unsqueeze(-1)
+            if rows.shape != (self.num_envs, 1) or rows.dtype != torch.bool:
+                raise ValueError(f"reset_mask must be bool of shape ({self.num_envs},), got {mask!r}")
             self._td = self.env.reset(self._td.copy().set("_reset", rows))
         return self._convert(self._seen(self._td)), {}
 

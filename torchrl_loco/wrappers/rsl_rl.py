@@ -42,6 +42,8 @@ class RslRlVecEnv(VecEnv):
         self.num_envs, self.num_actions = self.env.action_spec.shape
         self.max_episode_length = self.cfg.episode_length
         self._names = {key: "policy" if key == "observation" else key for key in groups_of(self.env)}
+        if len({*self._names.values()}) < len(self._names):
+            raise ValueError("the group 'observation' is called 'policy' in RSL-RL: no other may have that name")
         self._td = self.env.reset()
 
     @property
