@@ -206,7 +206,7 @@ def test_worlds_to_play_with_begin_on_each_patch_and_where_they_are_told(played)
     assert not stays["done"].any()
 
 
-def test_what_a_subclass_sets_stays_but_for_the_ground_under_its_robot():
+def test_what_a_subclass_sets_stays_but_for_the_ground_under_its_robot(tmp_path):
     class Short(Hills):
         config = dataclasses.replace(Hills.config, episode_length=77)
 
@@ -232,10 +232,7 @@ def test_what_a_subclass_sets_stays_but_for_the_ground_under_its_robot():
     assert Other.model.geom("terrain") is not None
     assert Own.model.geom("terrain") is not None
     assert Other.command_ranges["patch"]["kind"] == (0.0, 1.0)
-
-
-def test_a_relative_model_lies_beside_its_class(tmp_path):
-    """Not in the package, where there is one of this name."""
+    # A relative model lies beside its class, and not in the package, where there is one of this name.
     text = loco.Go1Velocity.model.read_text().replace(
         "</mujoco>", '<custom><text name="mine" data="1"/></custom></mujoco>'
     )

@@ -144,9 +144,16 @@ def one(difficulty, rng, size, cell):
     return terrain.Patch(boxes=np.array([[0.0, 0.0, -0.4, 1.0, 1.0, 0.5]]))
 
 
-def test_a_kind_of_ones_own():
+def test_a_kind_of_ones_own_may_be_as_low_as_one_says():
     ground = terrain.Terrain({"step": one}, rows=2, columns=1, size=4.0)
     assert ground.height(ground.origins[..., :2]).tolist() == [[pytest.approx(0.1)], [pytest.approx(0.1)]]
+    level = functools.partial(terrain.rough, height=(0.0, 0.02))
+    nothing = lambda *args: terrain.Patch(boxes=np.zeros((0, 6)))  # noqa: E731
+    listed = lambda difficulty, rng, size, cell: terrain.Patch(heights=np.zeros((41, 41)).tolist())  # noqa: E731
+    ground = terrain.Terrain({"rough": level, "nothing": nothing, "listed": listed}, rows=2, columns=3, size=4.0)
+    highest = ground.origins[..., 2]
+    assert (highest[0] == 0.0).all()
+    assert highest[1].tolist() == [pytest.approx(0.02), 0.0, 0.0]
 
 
 @for_each(
@@ -189,16 +196,6 @@ def test_there_must_be_a_level_floor():
     for where in ('pos="0 0 -.5"', 'euler="0 10 0"'):
         with pytest.raises(ValueError, match="plane 'floor' must be level at height 0"):
             ground.under(MARBLE.replace('name="floor"', f'name="floor" {where}'))
-
-
-def test_ground_may_be_as_low_as_one_says():
-    level = functools.partial(terrain.rough, height=(0.0, 0.02))
-    nothing = lambda *args: terrain.Patch(boxes=np.zeros((0, 6)))  # noqa: E731
-    listed = lambda difficulty, rng, size, cell: terrain.Patch(heights=np.zeros((41, 41)).tolist())  # noqa: E731
-    ground = terrain.Terrain({"rough": level, "nothing": nothing, "listed": listed}, rows=2, columns=3, size=4.0)
-    highest = ground.origins[..., 2]
-    assert (highest[0] == 0.0).all()
-    assert highest[1].tolist() == [pytest.approx(0.02), 0.0, 0.0]
 
 
 def test_seams_of_boxes_have_no_width():

@@ -546,25 +546,6 @@ def test_a_table_makes_a_task_of_a_users_robot(caplog):
             type("Slow", (Table,), {name: wrong})(1, "cpu")
 
 
-UNFIT_TABLES = [
-    ({"feet": ["left_sole", "right_sole"]}, TypeError, "feet of Other must be a dict from sites to geoms"),
-    ({"feet": {"left_sole": ".*_foot", "right_sole": "right_foot"}}, ValueError, "'right_foot' is of several"),
-    ({"memory": velocity.memory(joints=5, feet=2)}, ValueError, "memory is that of 5 joints, but it has 4 actuators"),
-    ({"memory": velocity.memory(joints=4, feet=3)}, ValueError, "memory is that of 3 feet, but there are 2"),
-    ({"weights": {**Table.weights, "self_collision": -1.0}}, ValueError, "self_collision needs own_geoms of Other"),
-    ({"weights": {**Table.weights, "foot_slipp": -1.0}}, ValueError, "must name its terms, .*: see foot_slipp"),
-    ({"weights": {"upright": 1.0}}, ValueError, "must name its terms, .*: see action_rate, foot_clearance"),
-    ({"curriculum": {9: velocity.CURRICULUM[0]}}, ValueError, r"rise from 0, got \[9\]"),
-    ({"curriculum": {0: ((1.0, -1.0), (0.0, 0.0), (0.0, 0.0))}}, ValueError, "a least and a greatest value"),
-]
-
-
-def test_a_table_that_does_not_fit_is_refused():
-    for given, error, message in UNFIT_TABLES:
-        with pytest.raises(error, match=message):
-            type("Other", (Table,), given)(1, "cpu", engine="mujoco", compile_hooks=False)
-
-
 def test_commands_stay_within_a_curriculum_of_ones_own():
     narrow = {0: ((-1.0, 0.2), (-0.1, 0.1), (-0.3, 0.0))}
     env = type("Narrow", (Table,), {"curriculum": narrow})(500, "cpu", 0, engine="mujoco", compile_hooks=False)
@@ -576,6 +557,17 @@ def test_commands_stay_within_a_curriculum_of_ones_own():
     assert (commands[:, 0] == 0.2).sum() > 50  # straight ahead
 
 
+UNFIT_TABLES = [
+    ({"feet": ["left_sole", "right_sole"]}, TypeError, "feet of Other must be a dict from sites to geoms"),
+    ({"feet": {"left_sole": ".*_foot", "right_sole": "right_foot"}}, ValueError, "'right_foot' is of several"),
+    ({"memory": velocity.memory(joints=5, feet=2)}, ValueError, "memory is that of 5 joints, but it has 4 actuators"),
+    ({"memory": velocity.memory(joints=4, feet=3)}, ValueError, "memory is that of 3 feet, but there are 2"),
+    ({"weights": {**Table.weights, "self_collision": -1.0}}, ValueError, "self_collision needs own_geoms of Other"),
+    ({"weights": {**Table.weights, "foot_slipp": -1.0}}, ValueError, "must name its terms, .*: see foot_slipp"),
+    ({"weights": {"upright": 1.0}}, ValueError, "must name its terms, .*: see action_rate, foot_clearance"),
+    ({"curriculum": {9: velocity.CURRICULUM[0]}}, ValueError, r"rise from 0, got \[9\]"),
+    ({"curriculum": {0: ((1.0, -1.0), (0.0, 0.0), (0.0, 0.0))}}, ValueError, "a least and a greatest value"),
+]
 UNFIT = [
     ("<freejoint/>", '<joint type="slide"/>', "first joint must be a free joint of the base 'trunk'"),
     ('position joint="left_hip" kp="20" kv=".5"', 'motor name="m" joint="left_hip"', "must be servos of gear 1, .*: m"),
@@ -589,7 +581,10 @@ UNFIT = [
 ]
 
 
-def test_a_model_that_the_formulas_do_not_fit_is_refused():
+def test_a_table_or_a_model_that_the_formulas_do_not_fit_is_refused():
+    for given, error, message in UNFIT_TABLES:
+        with pytest.raises(error, match=message):
+            type("Other", (Table,), given)(1, "cpu", engine="mujoco", compile_hooks=False)
     weights = {**Table.weights, "angular_momentum": -0.02}
     with pytest.raises(ValueError, match='needs <subtreeangmom name="angular_momentum" body="trunk"/>'):
         type("Table", (Table,), {"weights": weights})(1, "cpu")

@@ -90,7 +90,7 @@ def test_a_damaged_config_is_named(tmp_path):
     assert run.load_config(seed=5).seed == 5
 
 
-def test_a_torn_line_does_not_keep_a_run_from_continuing(tmp_path):
+def test_a_torn_line_is_left_out_lost_ones_are_said_and_damaged_ones_refused(ppo_run, tmp_path, caplog):
     run = made(tmp_path)
     for frames in (128, 256, 384):
         run.append_metrics({"iteration": frames // 128, "frames": frames, "return": 1.5})
@@ -109,9 +109,6 @@ def test_a_torn_line_does_not_keep_a_run_from_continuing(tmp_path):
     run.forget_after(256, 2)
     run.append_evaluation({"frames": 256, "mean": 3.0})
     assert run.read_evaluations() == [{"frames": 256, "mean": 3.0}]
-
-
-def test_lines_that_are_lost_are_said_and_damaged_ones_refused(ppo_run, tmp_path, caplog):
     run = RunFolder(shutil.copytree(ppo_run.path, tmp_path / "run"))
     path = run.path / "metrics.csv"
     head, first, _ = path.read_text().splitlines(keepends=True)
