@@ -548,7 +548,12 @@ def test_a_table_makes_a_task_of_a_users_robot(caplog):
 
 def test_commands_stay_within_a_curriculum_of_ones_own():
     narrow = {0: ((-1.0, 0.2), (-0.1, 0.1), (-0.3, 0.0))}
-    env = type("Narrow", (Table,), {"curriculum": narrow})(500, "cpu", 0, engine="mujoco", compile_hooks=False)
+    # A wall is no floor.
+    wall = '<geom type="plane" size="1 1 1" pos="9 0 1" euler="0 -90 0"/><body name="trunk"'
+    walled = Table.model.replace('<body name="trunk"', wall)
+    env = type("Narrow", (Table,), {"curriculum": narrow, "model": walled})(
+        500, "cpu", 0, engine="mujoco", compile_hooks=False
+    )
     env.reset()
     commands = env.world.memory["command"]
     for k, (name, (low, high)) in enumerate(zip(velocity.commands.NAMES, narrow[0], strict=True)):
@@ -560,6 +565,7 @@ def test_commands_stay_within_a_curriculum_of_ones_own():
 UNFIT_TABLES = [
     ({"feet": ["left_sole", "right_sole"]}, TypeError, "feet of Other must be a dict from sites to geoms"),
     ({"feet": {"left_sole": ".*_foot", "right_sole": "right_foot"}}, ValueError, "'right_foot' is of several"),
+    ({"feet": {"left_sole": "left_foot(", "right_sole": "right_foot"}}, KeyError, "nor a regular expression"),
     ({"memory": velocity.memory(joints=5, feet=2)}, ValueError, "memory is that of 5 joints, but it has 4 actuators"),
     ({"memory": velocity.memory(joints=4, feet=3)}, ValueError, "memory is that of 3 feet, but there are 2"),
     ({"weights": {**Table.weights, "self_collision": -1.0}}, ValueError, "self_collision needs own_geoms of Other"),

@@ -14,7 +14,7 @@ import torch
 from torchrl_loco.checks import NOT_NEGATIVE, Interval, check_float, check_int
 from torchrl_loco.conditions import PUSH, PUSH_EVERY
 from torchrl_loco.config import SimConfig
-from torchrl_loco.envs.names import matching
+from torchrl_loco.envs.names import Elements
 from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
 from torchrl_loco.tasks.robots import (
@@ -33,7 +33,7 @@ from torchrl_loco.tasks.velocity import commands
 
 FOLDER = Path(__file__).parent
 LEGS = ("FR", "FL", "RR", "RL")
-MOMENTUM = int(mujoco.mjtSensor.mjSENS_SUBTREEANGMOM)
+PLANE, MOMENTUM = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtSensor.mjSENS_SUBTREEANGMOM)
 
 CURRICULUM: dict[int, commands.Ranges] = {
     0: ((-1.0, 1.0), (-1.0, 1.0), (-0.5, 0.5)),
@@ -221,15 +221,15 @@ class Velocity(Robot):
         if "angular_momentum" in cls.weights and "angular_momentum" not in sensors:
             sensor = f'<subtreeangmom name="angular_momentum" body="{cls.base}"/>'
             wrong.append(f"the weight of angular_momentum needs {sensor}")
-        floors = (m.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (m.geom_bodyid == 0)
-        if (np.abs(m.geom_pos[floors, 2]) > 1e-6).any():
+        level = (m.geom_type == PLANE) & (m.geom_bodyid == 0) & (np.abs(m.geom_quat[:, 1:3]) < 0.1).all(axis=1)
+        if (np.abs(m.geom_pos[level, 2]) > 1e-6).any():
             wrong.append("its floor must be at height 0, from which feet are measured")
         floats = m.njnt > 0 and m.jnt_type[0] == FREE
         if floats and models.has_home(m) and not np.allclose(models.home_pose(m)[3:7], (1, 0, 0, 0)):
             wrong.append("the base must be level in 'home', with its x axis ahead: its quaternion must be 1 0 0 0")
-        geoms = [m.geom(g).name for g in range(m.ngeom)]
-        feet = [g for pattern in cls.feet.values() for g in matching(geoms, pattern)]
-        if twice := sorted({geoms[g] for g in feet if feet.count(g) > 1}):
+        elements = Elements(m)
+        feet = [geom for pattern in cls.feet.values() for geom in elements.ids("geom", pattern)[0]]
+        if twice := [m.geom(geom).name for geom in feet if feet.count(geom) > 1]:
             wrong.append(f"each geom must be of one foot, but {twice[0]!r} is of several")
         if cls.memory.get("air_time") != len(cls.feet):
             wrong.append(f"memory is that of {cls.memory.get('air_time')} feet, but there are {len(cls.feet)}")
