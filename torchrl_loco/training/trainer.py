@@ -153,9 +153,7 @@ class Trainer:
                 run.store_config(stored)
             if resume:
                 run.keep_source()
-            run.forget_after(
-                self.frames, self.iteration
-            )  # of a process that was killed, or that torchrun has restarted
+            run.forget_after(self.frames, self.iteration)  # of a process that was killed or restarted
         distributed.copy_from_first(self.algorithm.networks.state_dict().values())
         shared = self._base.world.shared
         self._summed = {name: shared[name].clone() for name in type(self._base).summed_over_ranks}
