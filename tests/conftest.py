@@ -6,6 +6,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads
 
 import gc
 import tempfile
+import types
 
 import pytest
 from cases import ENGINES, KINDS
@@ -30,6 +31,9 @@ def pytest_collectstart():
 
 def pytest_collection_finish():
     """Lets Python search for garbage again, but rarely, and not among what was imported, which takes it a second."""
+    import imageio.plugins.pyav
+
+    imageio.plugins.pyav.gc = types.SimpleNamespace(collect=lambda: None)  # after each video
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
     gc.enable()

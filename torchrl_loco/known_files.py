@@ -8,6 +8,7 @@ lines.
 """
 
 import ast
+import functools
 import hashlib
 import os
 import warnings
@@ -88,15 +89,21 @@ def with_imports(path: Path) -> list[Path]:
         if file in found:
             continue
         found[file] = None
-        try:
-            nodes = list(ast.walk(ast.parse(file.read_bytes())))
-        except (SyntaxError, ValueError):  # its import fails too
-            continue
-        names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-        names += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module and not node.level]
-        beside = {path.with_name(f"{name.partition('.')[0]}.py") for name in names}
+        beside = {path.with_name(f"{name}.py") for name in _imported(file.read_bytes())}
         left += sorted(each for each in beside if each.is_file())
     return list(found)
+
+
+@functools.lru_cache(maxsize=256)  # a start asks twice, a notebook at each run
+def _imported(source: bytes) -> frozenset[str]:
+    """Returns the top-level modules that a file imports by their names; none if it is not Python."""
+    try:
+        nodes = list(ast.walk(ast.parse(source)))
+    except (SyntaxError, ValueError):  # its import fails too
+        return frozenset()
+    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    names += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module and not node.level]
+    return frozenset(name.partition(".")[0] for name in names)
 
 
 def _sha256(file: Path) -> str:
