@@ -124,7 +124,8 @@ def check_fields(config: Any) -> None:
     It may be frozen and just being made. Fields that are not made by :func:`within` are positive.
     """
     for field in dataclasses.fields(config):
-        value, interval = getattr(config, field.name), field.metadata.values()
+        value = getattr(config, field.name)
+        interval = [field.metadata["interval"]] if "interval" in field.metadata else []  # else that of the check
         if value is None and field.type == float | None:
             continue
         if field.type is bool:

@@ -16,7 +16,6 @@ import torchrl_loco
 from torchrl_loco import training
 from torchrl_loco.checks import (
     SEED,
-    Interval,
     check_device,
     check_float,
     check_int,
@@ -31,7 +30,7 @@ from torchrl_loco.cli.options import Flat, OtherTask
 from torchrl_loco.conditions import DEFAULT, Conditions
 from torchrl_loco.known_files import place_of
 from torchrl_loco.registry import label, resolve, task_name
-from torchrl_loco.viewer.settings import LOOPBACK, PORT, SHARE, WORLDS, check_host, check_viewer
+from torchrl_loco.viewer.settings import LOOPBACK, PORT, PORTS, SHARE, WORLDS, check_host, check_viewer
 
 CONTAINERS = (".mp4", ".mkv", ".mov")  # suffixes of a video
 
@@ -70,7 +69,14 @@ class Which(Motions):
         if self.task is not None and (self.policy is not None or not Path(run_or_task).exists()):
             raise ValueError(f"{run_or_task} names the task already: leave --task out")
         if self.policy is not None:
-            policy, _ = _policy_at(self.policy, device, _task(run_or_task))
+            try:
+                named = _task(run_or_task)
+            except ValueError:
+                if not Path(run_or_task).exists():
+                    raise
+                why = "with --policy, the first word is the task to play in"
+                raise ValueError(f"{run_or_task} is no task: {why}") from None
+            policy, _ = _policy_at(self.policy, device, named)
             return policy, Path(label(policy.info["task"]))
         if Path(run_or_task).exists():
             return _policy_at(Path(run_or_task), device, None if self.task is None else _task(self.task))
@@ -108,8 +114,6 @@ def _task(name: str) -> str:
     try:
         return task_name(name, by_user=True)
     except ValueError as error:
-        if Path(name).exists():
-            raise ValueError(f"{name} is no task: with --policy, the first word is the task to play in") from None
         raise ValueError(f"there is no run folder or policy file {name!r}, and {error}") from None
 
 
@@ -195,7 +199,7 @@ class Browser:
         check_viewer()
         check_host(self.host)
         check_int("num_envs", self.num_envs, WORLDS)
-        check_int("port", self.port, Interval(1, 2**16))
+        check_int("port", self.port, PORTS)
 
     def show(
         self,

@@ -459,7 +459,7 @@ def _warn_of_misspelt_names(cls: type[Task]) -> None:
 
 
 def folder_of(cls: type, attribute: str = "model") -> Path | None:
-    """Returns the folder of the file that sets the model of a class, from which a relative path is meant."""
+    """Returns the folder of the file that sets a class's model, or another path: relative ones are meant from there."""
     base = next(base for base in cls.__mro__ if attribute in vars(base))
     file = getattr(sys.modules.get(base.__module__), "__file__", None)
     return Path(file).parent if file else None

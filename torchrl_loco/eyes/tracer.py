@@ -338,7 +338,7 @@ class Eye:
         keeps: bool = True,
         varied: tuple[Varied, wp.array] | None = None,
     ) -> None:
-        textured, m, which = m, to_the_horizon(m), m.camera(camera).id
+        given, m, which = m, to_the_horizon(m), m.camera(camera).id
         self._device, half = device, math.tan(math.radians(m.cam_fovy[which] / 2.0))
         if keeps:
             needed = worlds * width * height * sum(BYTES[kind] for kind in kinds)
@@ -346,7 +346,7 @@ class Eye:
         with EXCLUSIVE, wp.ScopedDevice(device):
             differing, numbers = varied or (None, None)
             self.placed = Placed(m, device, mounts_of(m, which, device, differing), worlds, numbers)
-            self._looks, self._view = looks_of(textured, device), View()
+            self._looks, self._view = looks_of(given, device), View()  # textures have the sizes of planes with an end
             self._view.half, self._view.pixel = wp.vec2(half * width / height, half), 2.0 * half / height
             self._view.width, self._view.height, self._view.far = width, height, far
             tiles = across, down, times = TILES["cuda" if device.is_cuda else "cpu"]

@@ -71,10 +71,10 @@ class Robot(LocoEnv):
 
     @classmethod
     def faults(cls, m: mujoco.MjModel) -> list[str]:
-        """Returns what is wrong with a model.
+        """Returns what is wrong with a model, in words; nothing if it will do.
 
-        The base does not float first, an actuator is no servo or has no greatest force, a joint has no range, there is
-        no home pose, or actions are of another number than :attr:`memory` says.
+        The base must float first, actuators must be servos with a greatest force, their joints must have a range, and
+        there must be a home pose and as many actuators as :attr:`memory` says.
         """
         wrong = []
         if m.njnt == 0 or m.jnt_type[0] != FREE or m.body(m.jnt_bodyid[0]).name != cls.base:

@@ -39,7 +39,7 @@ def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
     """Returns the columns of a CSV file and its rows, without those that a crash or a full disk has cut.
 
     Raises:
-        ValueError: it is damaged: there is something else than numbers, and frames among them.
+        ValueError: it is damaged: a value is no number, or no column is named frames.
     """
     rows = csv.DictReader(path.read_text().split("\n")[:-1] if path.exists() else [])
     columns, found = list(rows.fieldnames or ()), [dict[Any, Any](row) for row in rows]

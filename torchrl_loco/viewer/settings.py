@@ -4,13 +4,13 @@ import ipaddress
 import socket
 from urllib.parse import urlsplit
 
-from torchrl_loco.checks import Interval, check_packages
+from torchrl_loco.checks import POSITIVE_FRACTION, Interval, check_packages
 
 LOOPBACK = "127.0.0.1"  # address that this machine alone reaches
 PORT = 8080
 WORLDS = Interval(1, 64, with_high=True)  # how many worlds a page shows
-PORTS = Interval(1, 2**16)
-SHARE = Interval(0, 1, with_low=False, with_high=True)  # shares of the machine's CPU time that a viewer may take
+PORTS = Interval(1, 2**16)  # at which a page can be served
+SHARE = POSITIVE_FRACTION  # shares of the machine's CPU time that a viewer may take
 
 
 def check_viewer() -> None:

@@ -37,9 +37,10 @@ def base_of(env: EnvBase) -> Any:
 
 def step_worlds(env: EnvBase, td: TensorDictBase, actions: Any) -> tuple[TensorDictBase, TensorDictBase]:
     """Returns the results of a step of all worlds, and what the next begins with: those that are done are reset."""
-    actions = torch.as_tensor(actions, device=env.device, dtype=env.action_spec.dtype)
-    if actions.shape != env.action_spec.shape:
-        raise ValueError(f"actions must have shape {tuple(env.action_spec.shape)}, got {tuple(actions.shape)}")
+    spec = env.action_spec
+    actions = torch.as_tensor(actions, device=env.device, dtype=spec.dtype)
+    if actions.shape != spec.shape:
+        raise ValueError(f"actions must have shape {tuple(spec.shape)}, got {tuple(actions.shape)}")
     step, begin = env.step_and_maybe_reset(td.set("action", actions))
     return step["next"], begin
 

@@ -184,7 +184,7 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
             The observations of all worlds, and an empty dictionary.
 
         Raises:
-            ValueError: there is no such option, or the mask is none.
+            ValueError: there is no such option, or the mask has another shape or type.
         """
         super().reset(seed=seed)
         if seed is not None:

@@ -17,6 +17,7 @@ from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.names import Elements
 from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
+from torchrl_loco.sim.compiled.collision.kinds import PLANE
 from torchrl_loco.tasks.robots import (
     FREE,
     Robot,
@@ -33,7 +34,7 @@ from torchrl_loco.tasks.velocity import commands
 
 FOLDER = Path(__file__).parent
 LEGS = ("FR", "FL", "RR", "RL")
-PLANE, MOMENTUM = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtSensor.mjSENS_SUBTREEANGMOM)
+MOMENTUM = int(mujoco.mjtSensor.mjSENS_SUBTREEANGMOM)
 
 CURRICULUM: dict[int, commands.Ranges] = {
     0: ((-1.0, 1.0), (-1.0, 1.0), (-0.5, 0.5)),
