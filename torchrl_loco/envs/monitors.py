@@ -124,7 +124,7 @@ class Health(Monitor):
         self.counter_bits = wp.array([int(bits) for bits in COUNTERS.values()], dtype=int, device=sim.device)
         self.counts = Buffer((sim.num_envs, len(COUNTERS) + 1), int, sim.device)
         super().__init__(len(DROPPED) + 2, self.counts.torch.device)
-        self._reported = 0
+        self._next_report = 1  # world-steps in which something was dropped
 
     def numbers(self) -> torch.Tensor:
         """Returns the steps in which constraints and contacts were dropped, and the most of each needed, ``(4,)``."""
@@ -136,15 +136,15 @@ class Health(Monitor):
         return {"constraints": engine.peak_constraints.torch.max(), "contacts": engine.peak_contacts.torch.max()}
 
     def report(self, numbers: list[int]) -> None:
-        """Warns or raises if something was dropped since the last report.
+        """Warns or raises if something was dropped; warns again once it is ten times as much.
 
         Raises:
             PhysicsOverflowError: something was dropped and ``on_overflow`` is "raise".
         """
         dropped, needed = numbers[: len(DROPPED)], numbers[len(DROPPED) :]
-        if self._on_overflow == "ignore" or sum(dropped) <= self._reported:
+        if self._on_overflow == "ignore" or sum(dropped) < self._next_report:
             return
-        self._reported, steps = sum(dropped), self._steps * self._sim.num_envs
+        self._next_report, steps = 10 * sum(dropped), self._steps * self._sim.num_envs
         messages = [
             f"{what} were dropped in {count} of {steps} world-steps; {self._sim.engine.remedy(what, most)}"
             for what, count, most in zip(DROPPED, dropped, needed, strict=True)
@@ -161,7 +161,7 @@ class Health(Monitor):
         for counter in (self.counts, engine.peak_constraints, engine.peak_contacts):
             counter.torch.zero_()
         self._sim.overflow.zero_()
-        self._reported = 0
+        self._next_report = 1
 
     def summary(self) -> TensorDict:
         """Returns the counters, without waiting for the device; see :meth:`torchrl_loco.LocoEnv.health`."""
