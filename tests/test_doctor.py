@@ -74,7 +74,7 @@ def test_episodes_that_begin_in_the_floor_are_told():
 @pytest.mark.slow
 def test_size():
     """What is advised is enough for the same run, and a good deal less drops constraints."""
-    sizes = doctor.size("walker_run", 4, "cpu", steps=40)
+    sizes = doctor.size("walker_run", 4, "cpu", steps=20)
     assert all(needed < advised < 2 * needed for needed, advised in sizes.values())
     dropped = []
     for share in (1, 3):
@@ -82,7 +82,7 @@ def test_size():
         settings |= {"engine": "mujoco_warp", "on_overflow": "ignore"}
         env = torchrl_loco.make("walker_run", 4, "cpu", seed=0, world_offset=0, **settings)
         td = env.reset()
-        for action in doctor.random_actions(env, range(40)):
+        for action in doctor.random_actions(env, range(20)):
             td = env.step(td.set("action", action))["next"]
         dropped.append(int(env.health()["total", "constraint_overflow"] + env.health()["total", "contact_overflow"]))
     assert dropped[0] == 0 < dropped[1]

@@ -84,9 +84,9 @@ def interpolated_states(task):
 
 
 @for_each("task", "tasks")
-def test_reward_agrees_with_numpy(shared, task, engine, device):
+def test_reward_agrees_with_numpy(shared, task, device):
     record = interpolated_states(task)
-    env = shared(task, 192, device, protocol="dm_control", engine=engine)
+    env = shared(task, 192, device, protocol="dm_control")
     td = env.reset(state(record).to(device), set_state=True)
     action = torch.as_tensor(actions_of(env, record), dtype=torch.float32, device=device)
     rewards = env.step(td.set("action", action))["next", "reward"].squeeze(-1).cpu().numpy()

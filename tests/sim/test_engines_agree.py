@@ -63,7 +63,8 @@ def assert_agree(ours, theirs):
 
 @pytest.mark.parametrize("states", ["walker_run", "humanoid_run"], indirect=True)
 def test_both_engines_agree(shared, states):
-    task, state, action = states[0], states[1][::4], states[2][::4]
+    few = slice(None, None, 4 if states[0] == "walker_run" else 8)
+    task, state, action = states[0], states[1][few], states[2][few]
     for protocol in PROTOCOLS:
         envs = {engine: shared(task, len(state), protocol=protocol, engine=engine) for engine in ENGINES}
         found = {engine: after(env, state, action) for engine, env in envs.items()}

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch._decomp import decomposition_table
+from torch.fx._lazy_graph_module import _make_graph_module, _use_lazy_graph_module
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -179,4 +180,5 @@ def trace(
         work(arrays)
     tracer.graph.output(None)
     tracer.graph.eliminate_dead_code()
-    return torch.fx.GraphModule(tracer.constants, tracer.graph)
+    with _use_lazy_graph_module(True):  # its Python is written when it is called, which it seldom is
+        return _make_graph_module(tracer.constants, tracer.graph)

@@ -4,6 +4,7 @@ The physics is written once, in NumPy on arrays of these scalars. Numbers of the
 constants fold, and an expression that occurs twice is computed once, so that a planar body costs planar arithmetic.
 """
 
+import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar
@@ -399,6 +400,11 @@ LARGEST = float(np.finfo(np.float32).max)
 
 def literal(x: float) -> str:
     """Returns a float32 literal of C++, which has none for infinity: that becomes the largest number."""
+    return _literal(x) if x else f"{float(x)}f"  # a cache takes 0.0 and -0.0 for one
+
+
+@functools.lru_cache(100_000)
+def _literal(x: float) -> str:
     number = np.float32(np.clip(x, -LARGEST, LARGEST))
     plain = number == 0 or 1e-4 <= abs(number) < 1e7
     text = np.format_float_positional(number, trim="0") if plain else f"{number:.9g}"

@@ -1,6 +1,5 @@
-// Contacts of spheres and capsules with ellipsoids and cylinders, in the frame of the solid.
+// Ellipsoids and cylinders, in their own frame, and contacts of spheres and capsules with them.
 
-#if WITH_ROUND_AND_SOLID
 struct Surface {
   float distance;  // of a point, negative inside
   Vec normal;      // outwards, where the surface is nearest
@@ -81,6 +80,7 @@ static INLINE float nearest_on_segment(int shape, Vec size, Vec center, Vec half
   return t;
 }
 
+#if WITH_ROUND_AND_SOLID
 // Where a capsule lies along a cap of a cylinder, at most 5 degrees off, both ends of what is above the cap touch it, as
 // in C MuJoCo, to which the cap has 16 corners, and an end that it cuts off counts twice if the other one is clear.
 struct OnCap {
