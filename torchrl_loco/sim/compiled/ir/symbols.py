@@ -25,9 +25,10 @@ class Scalar:
         args: numbers, names or other scalars.
     """
 
-    __slots__ = ("__weakref__", "args", "op")
+    __slots__ = ("__weakref__", "args", "constant", "op")
     op: str
     args: tuple[Any, ...]
+    constant: float | None  # the value of a constant, ``None`` for any other expression
 
     _unique: ClassVar["WeakValueDictionary[tuple, Scalar]"] = WeakValueDictionary()
 
@@ -37,14 +38,9 @@ class Scalar:
         node = cls._unique.get(key)
         if node is None:
             node = object.__new__(cls)
-            node.op, node.args = op, args
+            node.op, node.args, node.constant = op, args, args[0] if op == "const" else None
             cls._unique[key] = node
         return node
-
-    @property
-    def constant(self) -> float | None:
-        """The value of a constant, ``None`` for any other expression."""
-        return self.args[0] if self.op == "const" else None
 
     def __add__(self, other: Any) -> Any:
         if isinstance(other, np.ndarray):

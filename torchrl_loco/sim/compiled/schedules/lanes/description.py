@@ -290,7 +290,7 @@ class Description:
 
     def softness(self, solref: Sequence[float], solimp: Sequence[float]) -> list[float]:
         """Returns the members of struct Softness."""
-        return list(dataclasses.astuple(Softness.make(self.m, solref, solimp)))
+        return list(vars(Softness.make(self.m, solref, solimp)).values())
 
     def parts_below(self, body: int) -> list[tuple[int, Mass]]:
         """Returns links of a subtree, and what of each belongs to it."""
