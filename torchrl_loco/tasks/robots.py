@@ -73,8 +73,8 @@ class Robot(LocoEnv):
     def faults(cls, m: mujoco.MjModel) -> list[str]:
         """Returns what is wrong with a model, in words; nothing if it will do.
 
-        The base must float first, actuators must be servos with a greatest force, their joints must have a range, and
-        there must be a home pose and as many actuators as :attr:`memory` says.
+        The base must float first, actuators must be servos with a greatest force, their joints must have a range with
+        the home pose in it, and there must be as many actuators as :attr:`memory` says.
         """
         wrong = []
         if m.njnt == 0 or m.jnt_type[0] != FREE or m.body(m.jnt_bodyid[0]).name != cls.base:
@@ -91,8 +91,12 @@ class Robot(LocoEnv):
         if cls.action_scale is None and not strong.all():
             wrong.append(f"actuators need a forcerange, or {cls.__name__} an action_scale{some(names, ~strong)}")
         if servo.all():
-            free = m.jnt_limited[m.actuator_trnid[:, 0]] == 0
+            joints = m.actuator_trnid[:, 0]
+            home, (low, high) = models.home_pose(m)[m.jnt_qposadr[joints]], m.jnt_range[joints].T
+            free = m.jnt_limited[joints] == 0
+            outside = ~free & ((home < low) | (home > high))
             wrong += [f"joints need a range{some(actuated(m), free)}"] if free.any() else []
+            wrong += [f"the home pose is beyond the range of joints{some(actuated(m), outside)}"] if outside.any() else []
         if not models.has_home(m):
             wrong.append("it needs a keyframe 'home', the pose around which actions move the joints")
         if cls.memory.get("last_action") != m.nu:
