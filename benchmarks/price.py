@@ -36,7 +36,7 @@ def price(names: Sequence[str], worlds: Sequence[int], device: torch.device) -> 
     for name, n in until_interrupted([(name, n) for name in names for n in worlds], "price"):
         m, config = _model(name, n)
         variation = Variation(varied(m, device), m, device)
-        drawn = torch.zeros(n, variation.count, device=device)
+        drawn = torch.zeros(n, variation.varied.count, device=device)
         stream = {"seed": torch.ones(1, dtype=torch.long, device=device), "world": torch.arange(n, device=device)}
         episode, mask = (torch.ones(n, dtype=kind, device=device) for kind in (torch.int32, torch.bool))
         variation.vary({"numbers": drawn, **stream, "episode": episode, "mask": mask})

@@ -584,7 +584,7 @@ UNFIT = [
     ('position joint="left_hip" kp="20"', 'intvelocity joint="left_hip" kp="20" actrange="-1 1"', "must be servos"),
     ('name="floor"', 'name="floor" pos="0 0 -.5"', "its floor must be at height 0"),
     ("0 0 .33 1 0 0 0 .2", "0 0 .33 .7 0 .7 0 .2", "the base must be level in 'home'"),
-    (".2 -.4 .2 -.4\"", ".2 -.4 2. -.4\"", "the home pose is beyond the range of joints: right_hip"),
+    ('.2 -.4 .2 -.4"', '.2 -.4 2. -.4"', "'home' is beyond the range of joints: right_hip"),
 ]
 
 

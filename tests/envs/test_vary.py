@@ -57,7 +57,7 @@ def drawn(model, *varys, worlds=2, episode=1, seed=0, offset=0, mask=None):
     """Returns what the fields are in all worlds, ``fields(name)``, of a draw in plain torch."""
     variation = Variation(varys, model, torch.device("cpu"))
     arrays = {
-        "numbers": torch.zeros(worlds, variation.count),
+        "numbers": torch.zeros(worlds, variation.varied.count),
         "seed": torch.tensor([seed]),
         "world": torch.arange(offset, offset + worlds),
         "episode": torch.full((worlds,), episode, dtype=torch.int32),
@@ -166,7 +166,7 @@ def test_numbers_of_an_element(arm):
 
 def test_gravity_and_what_is_zero(arm):
     gravity = Variation([loco.Vary("gravity", 0.5, 1.0)], arm, torch.device("cpu"))
-    assert gravity.places["gravity"].tolist() == [2]  # the zeros stay constants
+    assert gravity.varied.places["gravity"].tolist() == [2]  # the zeros stay constants
     x, y, z = drawn(arm, exactly("gravity", (0.1, 0.0, -5.0), how="set"))("gravity")[0].tolist()
     assert (round(x, 6), y, z) == (0.1, 0.0, -5.0)
 

@@ -7,6 +7,8 @@ from torchrl_loco.sim.compiled import step
 def texts_anew(monkeypatch):
     """Tests here change constants of the compiled step."""
     monkeypatch.setattr(step, "TRACED_DOFS", step.TRACED_DOFS)  # to be restored
-    step.kept.clear()
+    step.texts.clear()
+    step.rows.clear()
     yield
-    step.kept.clear()
+    step.texts.clear()
+    step.rows.clear()

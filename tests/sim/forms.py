@@ -18,7 +18,7 @@ def in_both_forms(test):
     def in_form(form, **fixtures):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(step, "TRACED_DOFS", FORMS[form])
-            step.kept.clear()
+            step.texts.clear()
             test(form=form, **fixtures)
 
     return for_each("form", FORMS)(in_form)

@@ -414,7 +414,7 @@ ROW = "".join(f'<body name="{i or "root"}" pos="0 0 {0.19 * i}">{SLIDE}</body>' 
 
 def column(places, monkeypatch, qpos, qvel):
     """Returns the simulation after a control step, with so many places for contacts between moving bodies."""
-    step.kept.clear()
+    step.texts.clear()
     with monkeypatch.context() as patched:
         patched.setattr(dense_contacts, "MAX_DENSE", places)
         patched.setattr(description, "ENOUGH_FRICTIONAL", places)

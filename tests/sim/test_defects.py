@@ -218,7 +218,7 @@ def test_limits_of_ball_joints_have_places_beside_any_number_of_contacts(form, m
     mujoco.mj_step(model, data)
     assert (data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)).sum() == 6
     for standing, tolerance in ((description.STANDING, 1e-6), (0.0, 0.1)):  # with it, places for half of the contacts
-        step.kept.clear()
+        step.texts.clear()
         with monkeypatch.context() as patch:
             patch.setattr(description, "STANDING", standing)
             sim = compiled_step(model, state)

@@ -285,7 +285,7 @@ class WorldAccess(EnvBase):
             raise IndexError(f"there is no world {world}: these are the worlds 0 to {self.num_envs - 1}")
         if self.variation is None:
             return copy.copy(self.mj_model)
-        return self.variation.edited(self.sim.numbers[world].cpu().numpy())
+        return self.variation.varied.edited(self.sim.numbers[world].cpu().numpy())
 
     # State.
 

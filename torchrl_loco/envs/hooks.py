@@ -167,7 +167,7 @@ class Hooks:
         rows |= {"xmat": data.xmat.reshape(-1, 3, 3), "subtree_com": data.subtree_com, "sensordata": data.sensordata}
         rows |= {"contact_force": [[0.0] * 3], "in_contact": [0.0], "action": [0.0] * m.nu}
         rows |= {name: [rows[name.removesuffix("_history")]] * self._substeps for name in CONTACT_HISTORY}
-        rows |= {"numbers": catalog.variation.nominal()} if catalog.variation else {}
+        rows |= {"numbers": catalog.variation.varied.nominal()} if catalog.variation else {}
         if catalog.warp_outputs is not None:
             rows |= {"warp.observation": [0.0] * catalog.warp_outputs, "warp.reward": 0.0}
         arrays = {name: torch.as_tensor(row, dtype=torch.float32).to(device) for name, row in rows.items()}

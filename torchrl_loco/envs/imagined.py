@@ -142,7 +142,7 @@ class Imagined:
         self._shared = {name: values.clone() for name, values in self._live.items()}
         self.kinematics = Kinematics(m, env.device)
         self.unknown = [name for name in UNKNOWN if name in asked.arrays or f"{name}_history" in asked.arrays]
-        numbers = {} if env.variation is None else {"numbers": Entry((env.variation.count,), torch.float32)}
+        numbers = {} if env.variation is None else {"numbers": Entry((env.variation.varied.count,), torch.float32)}
         clock = {name: Entry((), torch.float32) for name in ("elapsed_steps", "world")}
         memory = {f"memory.{name}": entry for name, entry in catalog.memory.items() if name != FOUND}
         self._rest = {**clock, **numbers, **memory}

@@ -55,7 +55,7 @@ class Frames:
     def _there(self, what: str) -> torch.Tensor:
         """Returns where they are in the frames of their bodies, their ``"pos"`` or their axes by ``"quat"``."""
         catalog, name = self._s._catalog, f"{'body_i' if self._kind == 'inertia' else f'{self._kind}_'}{what}"
-        if what == "pos" and catalog.variation is not None and name in catalog.variation.places:
+        if what == "pos" and catalog.variation is not None and name in catalog.variation.varied.places:
             return catalog.pick(self._s.model(name), self._ids, self._one)
         field = getattr(catalog.mj_model, name)
 

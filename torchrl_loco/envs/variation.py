@@ -109,8 +109,10 @@ def _places(name: str, m: mujoco.MjModel, i: int) -> list[list[tuple[str, int, f
     return [[(name, size * i + component, 1.0)] for component in range(size)]
 
 
-class Variation(Varied):
+class Variation:
     """The numbers of a model that differ from world to world, one Vary after another, and their draws.
+
+    ``varied`` says which they are, and where they are in the row of a world.
 
     Raises:
         ValueError: a name is not in the model, nothing is left that varies, or a number could become impossible.
@@ -127,10 +129,11 @@ class Variation(Varied):
         for change in self._changes:
             for name, index in change.places:
                 places.setdefault(name, set()).add(index)
-        super().__init__(mj_model, {name: sorted(indices) for name, indices in places.items()})
+        self._mj_model = mj_model
+        self.varied = Varied(mj_model, {name: sorted(indices) for name, indices in places.items()})
         self._columns = {
-            (name, int(index)): self.columns[name].start + i
-            for name, indices in self.places.items()
+            (name, int(index)): self.varied.columns[name].start + i
+            for name, indices in self.varied.places.items()
             for i, index in enumerate(indices)
         }
         self._indices: list[torch.Tensor] = []
@@ -145,10 +148,10 @@ class Variation(Varied):
 
         They have a first dimension of 1: a row for each world would be taken for the worlds' when it is fused.
         """
-        self._nominal = torch.tensor(self.nominal()[None], dtype=torch.float32, device=device)
+        self._nominal = torch.tensor(self.varied.nominal()[None], dtype=torch.float32, device=device)
         self._steps: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]] = []
-        latest = list(range(self.count))  # where each number is among those that were made so far
-        made = self.count
+        latest = list(range(self.varied.count))  # where each number is among those that were made so far
+        made = self.varied.count
         for change in self._changes:
             columns = [self._columns[place] for place in change.places]
             bounds = [change.vary.bounds[group] for group in change.group_of]
@@ -222,9 +225,9 @@ class Variation(Varied):
     def check(self, given: Mapping[str, torch.Tensor]) -> None:
         """Raises ValueError for numbers of worlds by field, ``(n, columns of the field)``, that are impossible."""
         n = max((len(rows) for rows in given.values()), default=0)
-        numbers = np.repeat(self.nominal()[None], n, axis=0)
+        numbers = np.repeat(self.varied.nominal()[None], n, axis=0)
         for name, rows in given.items():
-            numbers[:, self.columns[name]] = rows.cpu().numpy()
+            numbers[:, self.varied.columns[name]] = rows.cpu().numpy()
         for change in self._changes:
             if n and (wrong := self._impossible(change, numbers)):
                 what, values, rule = wrong
@@ -275,7 +278,7 @@ class Variation(Varied):
         """Returns a field that varies in all worlds, ``(n, *shape)``, from their numbers ``(n, count)``."""
         nominal = array_of(self._mj_model, name)
         if name not in self._shown:
-            where = [self._columns.get((name, i), self.count + i) for i in range(nominal.size)]
+            where = [self._columns.get((name, i), self.varied.count + i) for i in range(nominal.size)]
             constants = torch.tensor(np.ravel(nominal)[None], dtype=torch.float32, device=self._device)
             self._shown[name] = self._index(where), constants
         columns, constants = self._shown[name]

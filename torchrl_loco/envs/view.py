@@ -93,9 +93,9 @@ class Catalog(Elements):
 
     def field(self, name: str, numbers: Callable[[], torch.Tensor]) -> torch.Tensor:
         """Returns a field in all worlds, ``(num_envs, *shape)``; one that varies, by their ``numbers()``."""
-        if self.variation is not None and name in self.variation.places:
+        if self.variation is not None and name in self.variation.varied.places:
             return self.variation.field(name, numbers())
-        if name == "body_subtreemass" and self.variation is not None and "body_mass" in self.variation.places:
+        if name == "body_subtreemass" and self.variation is not None and "body_mass" in self.variation.varied.places:
             masses = self.variation.field("body_mass", numbers())
             return (masses.unsqueeze(-1) * self.derived("subtrees", lambda: subtrees(self.mj_model))).sum(1)
         values = self.constant(name)
@@ -489,7 +489,7 @@ class View:
         """
         catalog = self._catalog
         x, y, z = catalog.mj_model.opt.gravity
-        varies = catalog.variation is not None and "gravity" in catalog.variation.places
+        varies = catalog.variation is not None and "gravity" in catalog.variation.varied.places
         if not varies and x == y == 0.0 and z <= 0.0:
             return -self.xmat(body)[:, 2]
         return self.to_body(body, torch.nn.functional.normalize(self.model("gravity"), dim=-1))

@@ -95,8 +95,8 @@ class Robot(LocoEnv):
             home, (low, high) = models.home_pose(m)[m.jnt_qposadr[joints]], m.jnt_range[joints].T
             free = m.jnt_limited[joints] == 0
             outside = ~free & ((home < low) | (home > high))
-            wrong += [f"joints need a range{some(actuated(m), free)}"] if free.any() else []
-            wrong += [f"the home pose is beyond the range of joints{some(actuated(m), outside)}"] if outside.any() else []
+            for said, which in (("joints need a range", free), ("'home' is beyond the range of joints", outside)):
+                wrong += [f"{said}{some(actuated(m), which)}"] if which.any() else []
         if not models.has_home(m):
             wrong.append("it needs a keyframe 'home', the pose around which actions move the joints")
         if cls.memory.get("last_action") != m.nu:

@@ -30,7 +30,8 @@ they wait for memory, and the registers of the physics leave too few warps to hi
 
 MOST_KEPT = 64  # texts of steps that a process keeps, and rows of nominal numbers
 
-kept: dict[tuple, Any] = {}  # those that were made last, by all that they depend on but the constants of this package
+texts: dict[tuple, str] = {}  # those that were made last, by all that they depend on but the constants of this package
+rows: dict[tuple, np.ndarray] = {}  # likewise
 
 
 def is_traced(m: mujoco.MjModel) -> bool:
@@ -78,10 +79,10 @@ def kept_source(m: mujoco.MjModel, substeps: int, asked: Asked = NO_MORE) -> str
     What is asked for must be hashable.
     """
     key = is_traced(m), _fingerprint(m), substeps, asked
-    return _kept(key, lambda: source(m, substeps, **asked._asdict()))
+    return _kept(texts, key, lambda: source(m, substeps, **asked._asdict()))
 
 
-def _kept(key: tuple, make: Callable[[], Any]) -> Any:
+def _kept(kept: dict[tuple, Any], key: tuple, make: Callable[[], Any]) -> Any:
     """Returns what is kept under a key, made if it is not; the oldest is dropped where there are too many."""
     if key not in kept:
         kept[key] = make()
@@ -106,7 +107,7 @@ def nominal_row(m: VariedModel) -> np.ndarray:
     It is found once for environments of the same model: for a robot it takes a tenth of a second.
     """
     key = is_traced(m), _fingerprint(m)
-    row = _kept(key, lambda: m.varied.nominal() if is_traced(m) else lanes.nominal_row(m))
+    row = _kept(rows, key, lambda: m.varied.nominal() if is_traced(m) else lanes.nominal_row(m))
     row.flags.writeable = False
     return row
 

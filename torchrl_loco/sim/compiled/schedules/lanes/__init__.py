@@ -16,10 +16,10 @@ from torchrl_loco.sim.compiled.collision.kinds import FUNCTIONS
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel
 from torchrl_loco.sim.compiled.physics import spatial
 from torchrl_loco.sim.compiled.physics.constraints import Softness
-from torchrl_loco.sim.compiled.schedules import shared
 from torchrl_loco.sim.compiled.schedules.lanes.description import Description as Description
 from torchrl_loco.sim.compiled.schedules.lanes.description import is_implicitfast as is_implicitfast
 from torchrl_loco.sim.compiled.schedules.lanes.members import members
+from torchrl_loco.sim.compiled.schedules.shared import LAWS, LINE_SEARCH, NEWTON, NO_MORE, Asked
 
 MEMBERS = (
     *("group", "kinematics", "welds", "dynamics"),
@@ -29,14 +29,17 @@ MEMBERS = (
 """The headers that are members of struct ``Step``: what the lanes of a world keep and do."""
 
 
+TEMPLATE = pathlib.Path(__file__).with_name("step.h")  # a step of a world, by struct Step
+
+
 def _read(*names: str) -> str:
-    return "\n".join(pathlib.Path(__file__).with_name(f"{name}.h").read_text() for name in names)
+    return "\n".join(TEMPLATE.with_name(f"{name}.h").read_text() for name in names)
 
 
-HEADERS = "\n".join([_read("world", "friction"), "struct Step : Math {", _read(*MEMBERS), "};", _read("step")])
+HEADERS = "\n".join([_read("world", "friction"), "struct Step : Math {", _read(*MEMBERS), "};", TEMPLATE.read_text()])
 
 
-def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked = shared.NO_MORE) -> str:
+def source(m: mujoco.MjModel, substeps: int, asked: Asked = NO_MORE) -> str:
     """Returns the C++ of a control step of one world, by the arguments of :func:`.step.source`."""
     d = Description(m)
     tables = members(d, substeps, asked)
@@ -51,11 +54,11 @@ def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked = shared.NO_MOR
     text = "\n".join([*defined, HEADERS, *(f"#undef WITH_{part}" for part in parts), ""])
     text = tables.use(text.replace("//ACTUATOR", d.actuator().as_cpp()))
     for mark, value in {
-        "SHARED": shared.LAWS,
+        "SHARED": LAWS,
         "SOFTNESS": Softness.as_cpp(),
         "SPATIAL": spatial.as_cpp(),
-        "LINE_SEARCH": shared.LINE_SEARCH,
-        "NEWTON": shared.NEWTON,
+        "LINE_SEARCH": LINE_SEARCH,
+        "NEWTON": NEWTON,
         "MODEL": tables.text(),
         "COLLIDE": d.collide(),
         "ELIMINATE": d.elimination(),
@@ -68,4 +71,4 @@ def source(m: mujoco.MjModel, substeps: int, asked: shared.Asked = shared.NO_MOR
 
 def nominal_row(m: VariedModel) -> np.ndarray:
     """Returns what the lanes read of the model itself: its numbers, then what follows from them."""
-    return members(Description(m), 0, shared.NO_MORE).row.nominal(m.varied)
+    return members(Description(m), 0, NO_MORE).row.nominal(m.varied)
