@@ -8,7 +8,7 @@ import torch
 from cases import STAGGERED, coarse
 from for_each import for_each
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch._subclasses import FakeTensorMode
 from torchrl.collectors import Collector
 from torchrl.envs import (
@@ -147,12 +147,43 @@ class Noisy(torch.nn.Module):
         return td.set("loc", loc).set("action", (loc + noise).clamp(-1, 1))
 
 
-def test_what_the_policy_carries_along_starts_anew_with_an_episode(make):
+class Counting(TensorDictModule):
+    """Reads what it wrote a step before, and does not say so, as TorchRL's noise that is correlated in time."""
+
+    def forward(self, td):
+        before = td.get("count", None)
+        return td.set("count", torch.ones(4, 1) if before is None else before + 1)
+
+
+def test_what_the_policy_carries_along_starts_anew_with_an_episode_and_all_else_stays(make):
     made = make("walker_run", False)
     batch = RolloutCollector(made, Noisy(made), frames_per_batch=4 * 20).rollout()
     begins = torch.cat([torch.ones(4, 1, 1, dtype=torch.bool), batch["next", "done"][:, :-1]], dim=1)
     assert begins.sum() > 8
     assert ((batch["steps"] == 1) == begins).all()
+
+    made.set_seed(0)
+    counting = TensorDictSequential(Counting(torch.nn.Identity(), in_keys=[], out_keys=["count"]), policy(made))
+    collector, other = (RolloutCollector(made, counting, frames_per_batch=4 * 20) for _ in range(2))
+    batch = collector.rollout()
+    assert ((batch["count"] == 1) == begins).all()
+    state = collector.state_dict()
+    expected = collector.rollout()["count"]
+    assert (expected[:, 0] > 1).any()
+    other.load_state_dict(state)
+    assert torch.equal(other.rollout()["count"], expected)
+
+    # Another returns the action alone.
+    for wrap in (False, True):
+        made = make("walker_run", wrap)
+        act = policy(made)
+        made.set_seed(0)
+        expected = RolloutCollector(made, act, frames_per_batch=4 * 10).rollout()
+        made.set_seed(0)
+        alone = RolloutCollector(made, lambda td: act(td.clone()).select("action"), frames_per_batch=4 * 10)  # noqa: B023
+        found = alone.rollout()
+        assert set(found.keys(True, True)) == set(expected.keys(True, True))
+        assert (found == expected).all()
 
 
 def test_why_batches_are_not_recorded(make):

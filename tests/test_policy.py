@@ -30,9 +30,12 @@ def policy():
 def test_observations_are_normalised_by_all_that_were_seen():
     batches = [torch.randn(n, 3, 2) * scale + 5 for n, scale in ((1, 1.0), (50, 3.0), (20, 0.1))]
     norm = ObservationNorm(2, limit=2.0)
+    norm.update(batches[0][:0])
     for batch in batches:
         norm.update(batch)
     seen = torch.cat(batches).flatten(0, 1)
+    norm.update(one := torch.tensor([7.0, -3.0]))
+    seen = torch.cat([seen, one[None]])
     torch.testing.assert_close(norm.mean, seen.mean(0))
     torch.testing.assert_close(norm.var, seen.var(0, correction=0))
     assert norm.count == len(seen)

@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 import torch
 from for_each import for_each
-from torchrl.envs import CatTensors, SerialEnv
+from torchrl.envs import (
+    ActionDiscretizer,
+    CatTensors,
+    FrameSkipTransform,
+    InitTracker,
+    RenameTransform,
+    SerialEnv,
+)
 
 import torchrl_loco
 from torchrl_loco import wrappers
@@ -253,6 +260,13 @@ def test_spaces(gymnasium, stable_baselines3):
     env = wrappers.GymnasiumVectorEnv(make())
     assert env.single_observation_space == Box(-np.inf, np.inf, (24,))
     assert env.single_action_space == Box(-1, 1, (6,))
+    transformed = lambda transform: wrappers.GymnasiumVectorEnv(torchrl_loco.TransformedEnv(make(), transform))  # noqa: E731
+    assert transformed(InitTracker()).single_observation_space["is_init"] == Box(0, 1, (1,), bool)
+    assert transformed(FrameSkipTransform(4)).metadata["render_fps"] == 10
+    with pytest.raises(ValueError, match="makes MultiCategorical of it: these wrappers take numbers"):
+        transformed(ActionDiscretizer(num_intervals=3))
+    with pytest.raises(ValueError, match="observations in agent are nested"):
+        transformed(RenameTransform(["observation"], [("agent", "observation")]))
 
 
 @pytest.mark.ci
@@ -273,8 +287,10 @@ def test_gymnasium_resets_worlds_of_a_mask(gymnasium):
     ):
         with pytest.raises(ValueError, match=match):
             env.reset(options=options)
+    kept = before.copy()
+    before -= 100.0  # what was returned is the caller's
     after, _ = env.reset(options={"reset_mask": mask})
-    assert np.array_equal((after == before).all(axis=1), ~mask)
+    assert np.array_equal((after == kept).all(axis=1), ~mask)
     truncations = [env.step(env.action_space.sample())[3] for _ in range(LENGTH)]
     assert np.array_equal(truncations[-2], ~mask)
     assert np.array_equal(truncations[-1], mask)
@@ -358,6 +374,7 @@ def test_rsl_rl(rsl_rl, steps):
     env = wrappers.RslRlVecEnv(make_with_groups(stagger=True))
     assert isinstance(env, rsl_rl.env.VecEnv)
     assert set(env.get_observations().keys()) == {"policy", "privileged"}
+    env.get_observations()["policy"].fill_(100.0)  # what was returned is the caller's
     assert torch.equal(env.get_observations()["policy"], steps[0][0]["observation"])
     for step, td in steps:
         after = step["next"]

@@ -9,6 +9,14 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
@@ -76,6 +84,7 @@ class RolloutCollector:
         self._carried: TensorDictBase | None = None
         self._recording: Recording | None = None
         self._warm = False
+        self._rewritten = rewritten_by(policy)  # need not be zeroed where a world is reset
         self.step_by_step = what_forbids_recording(env, self._base, policy)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
@@ -104,14 +113,14 @@ class RolloutCollector:
     def _take_steps(self, td: TensorDictBase) -> tuple[list[TensorDictBase], TensorDictBase]:
         """Returns the steps of a batch that begins with ``td``, and what the next one begins with."""
         steps = []
-        # What the policy writes anew at every step need not be zeroed where a world is reset.
-        rewritten = frozenset(getattr(self._policy, "out_keys", ())) - set(getattr(self._policy, "in_keys", ()))
         for _ in range(self._steps):
             current = self._policy(td)
             if not isinstance(current, TensorDictBase):
                 raise TypeError(f"policy must return the TensorDict with an action, got {type(current).__name__}")
+            if current is not td:  # perhaps with the action alone
+                current = td.update(current)
             if steps_as_ours(self._env):
-                current, td = self._base._step_and_maybe_reset(current, rewritten)
+                current, td = self._base._step_and_maybe_reset(current, self._rewritten)
             else:
                 current, td = self._env.step_and_maybe_reset(current)
             steps.append(current)
@@ -174,6 +183,8 @@ class RolloutCollector:
             worlds = self._base.get_state()
             again = ["pixels"] if "pictures" in worlds.keys() else []  # noqa: SIM118, the state holds them
             state |= {"carried": self._carried.exclude(*again).clone().to_dict(), "env": worlds.to_dict()}
+            of_env = {*self._env.observation_spec, *self._env.done_spec, *self._env.state_spec}
+            state["remembered"] = [key for key in self._carried.keys() if key not in of_env]  # noqa: SIM118, no dict
             state["seed"] = self._base.seed
         return state
 
@@ -191,8 +202,7 @@ class RolloutCollector:
             size, device = self._env.batch_size, self._env.device
             begin = self._env.reset(State(state["env"], batch_size=size, device=device), set_state=True)
             carried = TensorDict(state["carried"], batch_size=size, device=device)
-            remembered = set(getattr(self._policy, "in_keys", carried.keys())) - set(begin.keys())
-            kept = carried.select(*begin.keys(True, True), *remembered, strict=False)
+            kept = carried.select(*begin.keys(True, True), *state.get("remembered", ()), strict=False)
             self._carried = begin.update(kept)
             if "seed" in state:  # on which later episodes depend
                 self._base._continue_with(state["seed"])
@@ -201,6 +211,27 @@ class RolloutCollector:
 
     def shutdown(self) -> None:
         """Does nothing: TorchRL's ``Collector`` has this method."""
+
+
+FORWARDS = {
+    *(TensorDictModule.forward, TensorDictSequential.forward),
+    *(ProbabilisticTensorDictModule.forward, ProbabilisticTensorDictSequential.forward),
+}
+"""Of modules that read nothing but their ``in_keys``."""
+
+
+def rewritten_by(policy: Any) -> frozenset[NestedKey]:
+    """Returns the entries that a policy writes anew at each step, if no part of it reads others than ``in_keys``.
+
+    Others may remember something there, such as noise that is correlated in time.
+    """
+    if not isinstance(policy, TensorDictModuleBase):
+        return frozenset()
+    for part in policy.modules():
+        plain = type(part).forward in FORWARDS or getattr(part, "reads_in_keys_alone", False)
+        if isinstance(part, TensorDictModuleBase) and not plain:
+            return frozenset()
+    return frozenset(policy.out_keys) - set(policy.in_keys)
 
 
 def steps_as_ours(env: EnvBase) -> bool:

@@ -56,8 +56,9 @@ class ObservationNorm(nn.Module):
             )
 
     def update(self, observation: torch.Tensor) -> None:
-        """Updates mean and variance with observations of shape ``(..., size)``."""
-        self.merge(*moments(observation))
+        """Updates mean and variance with observations of shape ``(..., size)``; nothing, if there are none."""
+        if observation.numel():
+            self.merge(*moments(observation))
 
     @torch.no_grad()
     def merge(self, count: float | torch.Tensor, mean: torch.Tensor, var: torch.Tensor) -> None:
@@ -73,7 +74,7 @@ class ObservationNorm(nn.Module):
 @torch.no_grad()
 def moments(observation: torch.Tensor) -> tuple[int, torch.Tensor, torch.Tensor]:
     """Returns the number of observations of shape ``(..., size)``, their mean and variance, each ``(size,)``."""
-    batch = observation.flatten(0, -2)
+    batch = observation.reshape(-1, observation.shape[-1])
     var, mean = torch.var_mean(batch, dim=0, correction=0)
     return len(batch), mean, var
 

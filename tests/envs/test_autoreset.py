@@ -85,13 +85,18 @@ def test_hooks_of_torchrl_are_called():
     assert called == [1]
 
 
-def test_a_step_of_no_world_changes_nothing(shared):
+def test_a_step_of_no_world_changes_nothing_and_done_may_be_missing(shared):
     env = shared("walker_run", 2, **coarse("walker_run"))
     td = env.rand_action(env.reset()).set("_step", torch.zeros(2, dtype=torch.bool))
     before = env.get_state()
     current, _ = env.step_and_maybe_reset(td)
     assert (env.get_state() == before).all()
     assert torch.equal(current["next", "observation"], td["observation"])
+
+    # What a rollout goes on from need not say what is done.
+    for each in (env, torchrl_loco.TransformedEnv(env)):
+        begin = each.reset().select("observation")
+        assert each.rollout(3, auto_reset=False, tensordict=begin, break_when_any_done=False).shape == (2, 3)
 
 
 def test_a_step_begins_without_the_last_reward(shared):

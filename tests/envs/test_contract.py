@@ -152,6 +152,7 @@ def test_the_callers_default_device_does_not_matter(elsewhere, shared):
         env.reset(env.get_state().branch(1), set_state=True)
         env.load_state_dict(env.state_dict())
         assert env.render(width=8, height=8).device == env.health()["total"].device == torch.device("cpu")
+        torchrl_loco.make("go1_velocity", 1, "cpu", engine="mujoco", compile_hooks=False)
 
 
 def test_making_an_environment_leaves_no_overflow_behind():

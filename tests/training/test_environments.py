@@ -77,6 +77,10 @@ def test_a_held_action_ends_where_the_world_does():
     assert (after["reward"] == 3.0).all()
     assert (after["reward_terms", "one"] == 3.0).all()
     assert torch.equal(after["observation"], expected["observation"])
+    short = torchrl_loco.TransformedEnv(Stumble(2, "cpu", seed=0, episode_length=2, reward_terms=True), ActionRepeat(4))
+    after = short.step(short.reset().set("action", torch.full((2, 6), 0.3)))["next"]
+    assert (after["truncated"] & ~after["terminated"]).all()
+    assert (after["reward"] == 2.0).all()
 
 
 def test_lengths_of_episodes(tmp_path):

@@ -170,7 +170,7 @@ class Hooks:
         rows |= {"numbers": catalog.variation.varied.nominal()} if catalog.variation else {}
         if catalog.warp_outputs is not None:
             rows |= {"warp.observation": [0.0] * catalog.warp_outputs, "warp.reward": 0.0}
-        arrays = {name: torch.as_tensor(row, dtype=torch.float32).to(device) for name, row in rows.items()}
+        arrays = {name: torch.as_tensor(row, dtype=torch.float32, device=device) for name, row in rows.items()}
         arrays = {name: row.repeat(n, *[1] * row.ndim) for name, row in arrays.items()}
         memory, shared = catalog.zeros()
         arrays |= {f"memory.{name}": rows for name, rows in memory.items()}

@@ -56,6 +56,8 @@ class QuickResets(EnvBase):
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns what :func:`reset_done_worlds` does, without reading from the device."""
+        if "done" not in tensordict.keys():  # noqa: SIM118, no dict; it may have other signals
+            return super().maybe_reset(tensordict)
         return reset_done_worlds(self, tensordict)
 
 

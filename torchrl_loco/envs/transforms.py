@@ -16,9 +16,9 @@ from torchrl_loco.envs.state import without_state
 
 
 class ActionRepeat(FrameSkipTransform):
-    """Holds an action for several control steps and sums their rewards, up to the step that terminates a world.
+    """Holds an action for several control steps and sums their rewards, up to the step that ends a world's episode.
 
-    TorchRL's FrameSkipTransform goes on stepping a world that has terminated, and loses the termination and the true
+    TorchRL's FrameSkipTransform goes on stepping a world whose episode has ended, and loses the end and the true
     terminal observation.
     """
 
@@ -26,7 +26,7 @@ class ActionRepeat(FrameSkipTransform):
         parent: Any = self.parent
         for _ in range(self.frame_skip - 1):
             before, after = next_tensordict, parent._step(tensordict)
-            over = before.get("terminated")
+            over = before.get("done")
             for key in after.keys(True, True):
                 if key == "reward" or key[0] == "reward_terms":
                     after.set(key, before.get(key) + after.get(key))
@@ -126,7 +126,7 @@ class TransformedEnv(TorchRLTransformedEnv):
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns what ``step_mdp`` makes of a step, with new episodes in the worlds that were done."""
-        if not all(map(resets_by_mask, unwrap(self)[1])):
+        if "done" not in tensordict.keys() or not all(map(resets_by_mask, unwrap(self)[1])):  # noqa: SIM118, no dict
             return super().maybe_reset(tensordict)
         return reset_done_worlds(self, tensordict)
 

@@ -209,8 +209,9 @@ class Variation:
         count = max(max(b) for b in bits) + 1
         if count > MOST_BITS:
             raise ValueError(f"randomize names the same elements too often: {count} draws for one, {MOST_BITS} at most")
-        corners = torch.tensor(np.arange(2**count)[:, None] >> np.arange(count) & 1, dtype=torch.float32)
-        numbers = self._numbers([corners[:, b].to(self._device) for b in bits]).cpu().double().numpy()
+        combinations = np.arange(2**count)[:, None] >> np.arange(count) & 1
+        corners = torch.tensor(combinations, dtype=torch.float32, device=self._device)
+        numbers = self._numbers([corners[:, b] for b in bits]).cpu().double().numpy()
         for change in self._changes:
             if wrong := self._impossible(change, numbers):
                 what, values, rule = wrong

@@ -276,6 +276,8 @@ class Algorithm(ABC):
 class Acting(TensorDictModuleBase):
     """An actor that is called through a faster function, which may write other entries."""
 
+    reads_in_keys_alone = True
+
     def __init__(
         self,
         actor: ProbabilisticActor,

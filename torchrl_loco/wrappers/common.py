@@ -1,16 +1,18 @@
 """What all wrappers share: the environment that is wrapped, its spaces, its steps."""
 
+import math
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, FrameSkipTransform
 
 from torchrl_loco.checks import check_choice
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.envs.transforms import unwrap
+from torchrl_loco.envs.resets import NESTED
+from torchrl_loco.envs.transforms import named_transforms, unwrap
 from torchrl_loco.registry import make
 
 RENDER_MODES = ("rgb_array",)
@@ -46,13 +48,24 @@ def step_worlds(env: EnvBase, td: TensorDictBase, actions: Any) -> tuple[TensorD
 
 
 def groups_of(env: EnvBase) -> list[str]:
-    """Returns the groups of observations; what is nested is none of them: the terms of the reward."""
-    return [key for key, spec in env.observation_spec.items() if not isinstance(spec, Composite)]
+    """Returns the groups of observations; terms of rewards and observations and metrics, which are nested, are none.
+
+    Raises:
+        ValueError: others are nested.
+    """
+    groups = [key for key in env.observation_spec if key not in NESTED]
+    if nested := [key for key in groups if isinstance(env.observation_spec[key], Composite)]:
+        raise ValueError(
+            f"observations in {', '.join(nested)} are nested: give them keys of their own by RenameTransform"
+        )
+    return groups
 
 
 def to_numpy(data: Any) -> Any:
-    """Returns a tensor, or those of a dictionary, as arrays on the host."""
-    return {key: x.numpy(force=True) for key, x in data.items()} if isinstance(data, dict) else data.numpy(force=True)
+    """Returns copies of a tensor, or of those of a dictionary, as arrays on the host."""
+    if isinstance(data, dict):
+        return {key: to_numpy(x) for key, x in data.items()}
+    return data.detach().to("cpu", copy=True).numpy()
 
 
 def rows_as_objects(data: Any, mask: np.ndarray) -> np.ndarray:
@@ -76,7 +89,9 @@ class Wrapped:
             base_of(self.env).check_picture(*picture)
 
     def _render_metadata(self) -> dict[str, Any]:
-        return {"render_modes": list(RENDER_MODES), "render_fps": round(1 / base_of(self.env).config.ctrl_dt)}
+        skipping = [part for part in named_transforms(self.env).values() if isinstance(part, FrameSkipTransform)]
+        seconds = base_of(self.env).config.ctrl_dt * math.prod(part.frame_skip for part in skipping)
+        return {"render_modes": list(RENDER_MODES), "render_fps": round(1 / seconds)}
 
     def _seen(self, td: TensorDictBase) -> Any:
         """Returns the tensor of the policy, or a dictionary where there are further groups."""

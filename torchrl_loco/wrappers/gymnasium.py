@@ -34,9 +34,11 @@ def box(spec: TensorSpec) -> Box:
     """Returns the space of one world."""
     shape, dtype = tuple(spec.shape[1:]), torch.empty(0, dtype=spec.dtype).numpy().dtype
     if dtype.kind == "b":
-        return Box(False, True, shape, np.bool_)
+        return Box(0, 1, shape, np.bool_)
     if dtype.kind == "f" and not isinstance(spec, Bounded):  # TorchRL says the largest float
         return Box(-np.inf, np.inf, shape, dtype.type)
+    if not hasattr(spec.space, "low"):
+        raise ValueError(f"a transform makes {type(spec).__name__} of it: these wrappers take numbers between bounds")
     low, high = (bound[0].numpy(force=True) for bound in (spec.space.low, spec.space.high))
     return Box(low, high, shape, dtype.type)
 
@@ -226,7 +228,10 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
         return self._convert(self._seen(self._td)), rewards, terminations, truncations, infos
 
     def _convert(self, data: Any) -> Any:
-        return data if self._torch else common.to_numpy(data)
+        """Returns copies, which the caller may change."""
+        if not self._torch:
+            return common.to_numpy(data)
+        return {key: x.clone() for key, x in data.items()} if isinstance(data, dict) else data.clone()
 
     def render(self) -> tuple[np.ndarray, ...]:
         """Returns the current picture of each world, uint8 ``(height, width, 3)``; worlds that were done are new.

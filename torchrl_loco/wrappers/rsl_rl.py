@@ -61,7 +61,7 @@ class RslRlVecEnv(VecEnv):
         return self._observations(self._td)
 
     def _observations(self, td: TensorDictBase) -> TensorDict:
-        groups = {name: td[key] for key, name in self._names.items()}
+        groups = {name: td[key].clone() for key, name in self._names.items()}
         return TensorDict(groups, batch_size=td.batch_size, device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
