@@ -1,5 +1,7 @@
 """The command line answers at once where it can, and refuses wrong options before it prints or makes anything."""
 
+import contextlib
+import os
 import subprocess
 import sys
 
@@ -7,6 +9,7 @@ import pytest
 import tyro
 
 from torchrl_loco import __version__, cli, garbage
+from torchrl_loco.cli.errors import outlive_streams
 from torchrl_loco.cli.options import VALUES
 
 FRESH = """
@@ -62,15 +65,12 @@ def test_settings_of_a_task_wait_for_torch_alone(tmp_path):
     assert "pip install 'torchrl-loco[train]'" in said
 
 
-def test_an_unknown_command_names_the_nearest(capsys):
+def test_the_version_and_an_unknown_command(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"{__version__}\n"
     with pytest.raises(SystemExit, match="2"):
         cli.main(["tain"])
     assert "did you mean 'train'?" in capsys.readouterr().err
-
-
-def test_the_version(capsys):
-    assert cli.main(["--version"]) == 0
-    assert capsys.readouterr().out == f"{__version__}\n"
 
 
 def test_ctrl_c_while_a_command_starts(monkeypatch, capsys):
@@ -80,6 +80,21 @@ def test_ctrl_c_while_a_command_starts(monkeypatch, capsys):
     monkeypatch.setattr("torchrl_loco.cli.options.preset", interrupted)  # importing torch takes the longest in it
     assert cli.main(["train", "walker_walk"]) == 130
     assert capsys.readouterr().err == "torchrl-loco: interrupted\n"
+
+
+def test_a_training_outlives_who_reads_what_it_says(monkeypatch):
+    reads, writes = os.pipe()
+    os.close(reads)
+    pipe = os.fdopen(writes, "w", buffering=1)
+    monkeypatch.setattr(sys, "stdout", pipe)
+    monkeypatch.setattr(sys, "stderr", None)  # as where it is closed
+    outlive_streams()
+    for stream in (sys.stdout, sys.stderr):
+        print("a line", file=stream, flush=True)
+    assert sys.stdout.fileno() == writes
+    with contextlib.suppress(OSError):
+        pipe.close()
+    sys.stderr.close()
 
 
 def test_integers(capsys):

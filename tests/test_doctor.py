@@ -72,7 +72,7 @@ def test_episodes_that_begin_in_the_floor_are_told():
 
 
 @pytest.mark.slow
-def test_size():
+def test_size(capsys):
     """What is advised is enough for the same run, and a good deal less drops constraints."""
     sizes = doctor.size("walker_run", 4, "cpu", steps=20)
     assert all(needed < advised < 2 * needed for needed, advised in sizes.values())
@@ -86,3 +86,6 @@ def test_size():
             td = env.step(td.set("action", action))["next"]
         dropped.append(int(env.health()["total", "constraint_overflow"] + env.health()["total", "contact_overflow"]))
     assert dropped[0] == 0 < dropped[1]
+    with pytest.raises(SystemExit):
+        cli.main(["doctor", "--device", "nosuch"])
+    assert "--num_envs and --device are for --size" in capsys.readouterr().err

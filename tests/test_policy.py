@@ -141,6 +141,11 @@ def test_files_that_are_no_policy(policy, tmp_path):
         storage.save(path, "policy", tensors, {"layers": layers, "info": {}})
         with pytest.raises(ValueError, match=f"(?s){message}"):
             Policy.load(path, "cpu")
+    policy.save(path)
+    good = path.read_bytes()
+    path.write_bytes(good[:-3] + bytes([good[-3] ^ 1]) + good[-2:])
+    with pytest.raises(ValueError, match="it is damaged, as its checksum says"):
+        Policy.load(path, "cpu")
 
 
 SHIPPED = [(name, protocol) for protocol in PROTOCOLS for name in shipped_policies(protocol)]

@@ -1,6 +1,7 @@
 """Tensors and settings in a file without code; files that are replaced whole, and that replace none."""
 
 import contextlib
+import hashlib
 import itertools
 import json
 import os
@@ -19,7 +20,7 @@ def save(path: Path, kind: str, tensors: dict[str, torch.Tensor], settings: dict
     """Writes tensors of any device, and settings for JSON, as a safetensors file of a kind such as "policy"."""
     metadata = {"format": _format(kind), **{name: json.dumps(value) for name, value in settings.items()}}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    replace_file(Path(path), serialize(tensors, metadata))
+    replace_file(Path(path), serialize(tensors, {**metadata, "sha256": _sha256(tensors, metadata)}))
 
 
 def replace_file(path: Path, content: bytes | memoryview) -> None:
@@ -66,10 +67,20 @@ def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if metadata.get("format") != _format(kind):
             raise ValueError(f"its format is {metadata.get('format')!r}, this release reads {_format(kind)!r}")
-        settings = {name: value for name, value in metadata.items() if name not in ("format", "sha256")}
+        kept = metadata.pop("sha256", None)  # early files have none
+        if kept not in (None, _sha256(tensors, metadata)):
+            raise ValueError("it is damaged, as its checksum says")
+        settings = {name: value for name, value in metadata.items() if name != "format"}
         return tensors, {name: json.loads(value) for name, value in settings.items()}
     except (SafetensorError, ValueError, RuntimeError, OSError) as error:
         raise ValueError(f"{path} cannot be read as a {kind}: {error}") from error
+
+
+def _sha256(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> str:
+    digest = hashlib.sha256(json.dumps(sorted(metadata.items())).encode())
+    for name in sorted(tensors):
+        digest.update(tensors[name].reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def _format(kind: str) -> str:

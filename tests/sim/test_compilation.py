@@ -4,6 +4,7 @@ import os
 import select
 import threading
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -91,7 +92,7 @@ def test_a_module_that_another_process_compiles_is_waited_for():
     os.waitpid(child, 0)
 
 
-def test_an_error_leaves_warp_as_it_was():
+def test_an_error_leaves_warp_as_it_was_and_a_damaged_cache_is_named():
     before = wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size
 
     def launch():
@@ -100,6 +101,23 @@ def test_an_error_leaves_warp_as_it_was():
     with pytest.raises(ZeroDivisionError):
         compile_kernels([launch], wp.get_device("cpu"))
     assert before == (wp.Module.load, wp.capture_if, wp.capture_while, wp.get_suggested_block_size)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def damaged(out: wp.array[int]):
+        out[wp.tid()] = 7
+
+    total, device = wp.zeros(1, dtype=int, device="cpu"), wp.get_device("cpu")
+    launch = lambda: wp.launch(damaged, 1, outputs=[total], device="cpu")  # noqa: E731
+    compile_kernels([launch], device)
+    (meta,) = Path(wp.config.kernel_cache_dir).glob(f"wp_{damaged.module.name}_*/*.meta")
+    kept = meta.read_bytes()
+    damaged.module.unload()
+    try:
+        meta.write_bytes(b"")
+        with pytest.raises(OSError, match=r"cache .* is damaged: delete that folder"):
+            compile_kernels([launch], device)
+    finally:
+        meta.write_bytes(kept)
 
 
 def test_two_threads_may_compile_at_once():

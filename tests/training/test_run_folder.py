@@ -10,6 +10,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -161,7 +162,11 @@ def test_a_run_needs_an_undamaged_checkpoint_of_this_version(ppo_run, tmp_path):
         with pytest.raises(error, match=message):
             Trainer(run, resume=True)
 
-    for bad in (b"no checkpoint at all", good[: len(good) // 2]):
+    with zipfile.ZipFile(path) as file:
+        largest = max(file.infolist(), key=lambda part: part.file_size)
+        middle = largest.header_offset + largest.file_size // 2
+    flipped = good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :]
+    for bad in (b"no checkpoint at all", good[: len(good) // 2], flipped):
         path.write_bytes(bad)
         refused(ValueError, "checkpoint.pt cannot be read as a checkpoint")
     torch.save({"version": 0}, path)

@@ -16,7 +16,7 @@ import torchrl_loco
 from torchrl_loco.checks import check_choice
 from torchrl_loco.cli import runs
 from torchrl_loco.cli.diagnosis import diagnose, inspect, list_tasks, warm
-from torchrl_loco.cli.errors import process_name, user_errors
+from torchrl_loco.cli.errors import outlive_streams, process_name, user_errors
 from torchrl_loco.cli.motions import motion
 from torchrl_loco.cli.options import VALUES, task_options
 from torchrl_loco.cli.policies import evaluate, export, play, record, verify, watch
@@ -28,6 +28,8 @@ def main(args: Sequence[str] | None = None) -> int:
     if args is None:  # the process ends: collecting garbage among all that was imported would take seconds
         atexit.register(gc.freeze)
         OWN_PROCESS.set()
+        if sys.stderr is None or sys.argv[1:2] in (["train"], ["resume"]):
+            outlive_streams()
     try:
         _run(sys.argv[1:] if args is None else list(args))
     except KeyboardInterrupt:

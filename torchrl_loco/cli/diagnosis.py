@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from torchrl_loco import training
-from torchrl_loco.checks import check_device
+from torchrl_loco.checks import check_device, check_output_file
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.options import OtherTask, summaries
 from torchrl_loco.registry import list_envs, resolve
@@ -28,7 +28,7 @@ def diagnose(
     body: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[BODY|TASK|FILE.py:CLASS|all]")] = "walker",
     /,
     size: str | None = None,
-    num_envs: int = 2048,
+    num_envs: int | None = None,
     device: str | None = None,
 ) -> None:
     """Print versions, devices and the kernel cache, and test the physics of each device against C MuJoCo.
@@ -36,18 +36,20 @@ def diagnose(
     Args:
         body: the body whose physics is compiled and tested, or a task; all for every body.
         size: a task: measure its njmax and naconmax instead.
-        num_envs: number of worlds to measure with.
-        device: where to measure; default: CUDA if there is any.
+        num_envs: number of worlds to measure with; default: 2048.
+        device: where to measure; default: CUDA if there is any. The physics is tested on all devices.
     """
     from torchrl_loco import doctor
 
     if size is not None:
         with user_errors():
-            for name, (needed, advised) in doctor.size(size, num_envs, device).items():
+            for name, (needed, advised) in doctor.size(size, 2048 if num_envs is None else num_envs, device).items():
                 print(f"{name:<9} up to {needed} needed under random actions, {advised} advised")
         return
     problems = []
     with user_errors(ValueError):
+        if (num_envs, device) != (None, None):
+            raise ValueError("--num_envs and --device are for --size: without it all devices are tested")
         for finding in doctor.diagnose(body):
             print(f"{finding.subject:<20} {finding.text}", flush=True)
             if finding.problem:
@@ -80,6 +82,7 @@ def inspect(
                 rough = ", ".join(name for name in list_envs() if name.endswith("_rough"))
                 words = f"{what} has no attribute ground, a torchrl_loco.terrain.Terrain, as {rough} have"
                 raise ValueError(f"{words}: add ground = ... to a class of yours")
+            check_output_file("terrain", terrain)
             cls.ground.picture(terrain)
         print(terrain)
         return

@@ -1,9 +1,10 @@
-"""How the command line tells errors of the user: in one line, with status 2."""
+"""How the command line tells errors of the user, in one line, with status 2; and where nobody hears it."""
 
 import contextlib
 import os
 import sys
 from collections.abc import Iterator
+from typing import Any, TextIO
 
 from torchrl_loco.checks import UnknownNameError
 
@@ -11,6 +12,34 @@ from torchrl_loco.checks import UnknownNameError
 def process_name() -> str:
     """Returns what the lines of this process begin with."""
     return f"torchrl-loco, rank {os.environ['RANK']}" if "RANK" in os.environ else "torchrl-loco"
+
+
+class Outlived:
+    """A stream that a training outlives: what nobody reads any more, or a full disk does not take, is lost."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Writes, if it can."""
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flushes, if it can."""
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def outlive_streams() -> None:
+    """Lets this process go on where its standard output or error is closed, or breaks."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name) or open(os.devnull, "w")  # noqa: SIM115, until the process ends
+        setattr(sys, name, Outlived(stream))
 
 
 @contextlib.contextmanager

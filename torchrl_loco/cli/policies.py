@@ -416,7 +416,7 @@ def verify(
         report = verification.verify(path, conditions, device, alone=alone, task=named, options=which.given)
         print(*report.lines, sep="\n")
         if out is not None:
-            out.write_text(f"{json.dumps(report.figures, indent=2)}\n")
+            storage.replace_file(out, f"{json.dumps(report.figures, indent=2)}\n".encode())
             print(out)
     if not report.holds:
         raise SystemExit(1)

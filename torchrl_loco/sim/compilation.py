@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import json
 import os
 import threading
 import zlib
@@ -40,7 +41,13 @@ def compile_kernels(launches: Iterable[Callable[[], None]], device: wp.Device) -
 
 def _load(module: wp.Module, block_dim: int, device: wp.Device) -> None:
     with one_process(module.name):
-        module.load(device, block_dim)
+        try:
+            module.load(device, block_dim)
+        except Exception as error:
+            if isinstance(error, json.JSONDecodeError) or "Failed to load" in str(error):  # no more than Warp tells
+                where = f"Warp's kernel cache {wp.config.kernel_cache_dir} is damaged"
+                raise OSError(f"{where}: delete that folder, its kernels are compiled anew ({error})") from error
+            raise
 
 
 @contextlib.contextmanager

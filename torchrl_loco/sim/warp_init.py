@@ -1,5 +1,6 @@
 """Warp's start: without the warning that a machine without a GPU would see at every command, its header parsed once."""
 
+import contextlib
 import functools
 import os
 import sys
@@ -18,7 +19,7 @@ NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 def init_warp() -> None:
     """Initializes Warp. Where there is no CUDA, its line about the missing driver is left out, and no other."""
     _share_header()
-    if torch.cuda.is_available():
+    if torch.cuda.is_available() or sys.stderr is None:
         wp.init()
         return
     sys.stderr.flush()
@@ -31,7 +32,8 @@ def init_warp() -> None:
             finally:
                 os.dup2(stderr, 2)
                 said.seek(0)
-                os.write(2, b"".join(line for line in said if NO_DRIVER not in line))
+                with contextlib.suppress(OSError):  # of a full disk
+                    os.write(2, b"".join(line for line in said if NO_DRIVER not in line))
     finally:
         os.close(stderr)
 

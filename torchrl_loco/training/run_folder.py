@@ -8,6 +8,7 @@ import json
 import logging
 import pickle
 import shutil
+import zipfile
 from collections.abc import Collection, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -27,7 +28,16 @@ from torchrl_loco.training.config import TrainingConfig, check_packages_of, conf
 CHECKPOINT_VERSION = 7
 WITHOUT_CHECKPOINT = "wait for one if it is being trained, else start a new run"
 
-_UNREADABLE = (pickle.UnpicklingError, RuntimeError, OSError, EOFError, LookupError, TypeError, ValueError)
+_UNREADABLE = (
+    pickle.UnpicklingError,
+    zipfile.BadZipFile,
+    RuntimeError,
+    OSError,
+    EOFError,
+    LookupError,
+    TypeError,
+    ValueError,
+)
 """Errors that reading a damaged checkpoint may raise."""
 
 
@@ -41,7 +51,7 @@ def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
     Raises:
         ValueError: it is damaged: a value is no number, or no column is named frames.
     """
-    rows = csv.DictReader(path.read_text().split("\n")[:-1] if path.exists() else [])
+    rows = csv.DictReader(path.read_text(errors="replace").split("\n")[:-1] if path.exists() else [])
     columns, found = list(rows.fieldnames or ()), [dict[Any, Any](row) for row in rows]
     if longer := [row for row in found if None in row]:
         count = len(columns) + len(longer[0][None])
@@ -348,6 +358,8 @@ class RunFolder:
         if not path.is_file():
             raise FileNotFoundError(f"{self.path} has no {path.name} yet: {WITHOUT_CHECKPOINT}")
         try:
+            if part := zipfile.ZipFile(path).testzip():  # which torch.load does not ask
+                raise ValueError(f"the checksum of {part} is wrong")
             entries = torch.load(path, map_location=device, weights_only=True)
             version = entries["version"]
         except _UNREADABLE as error:
