@@ -21,6 +21,7 @@ from torch import nn
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import SafeProbabilisticModule
 
 from torchrl_loco.checks import ANY, Interval, check_int
 from torchrl_loco.envs import LocoEnv
@@ -216,6 +217,7 @@ class RolloutCollector:
 FORWARDS = {
     *(TensorDictModule.forward, TensorDictSequential.forward),
     *(ProbabilisticTensorDictModule.forward, ProbabilisticTensorDictSequential.forward),
+    SafeProbabilisticModule.forward,
 }
 """Of modules that read nothing but their ``in_keys``."""
 

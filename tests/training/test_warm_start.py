@@ -8,6 +8,7 @@ from hook_tasks import Unsteady
 from small_runs import SMALL, made, networks, small_walker, trained
 
 from torchrl_loco import Go1Velocity, cli
+from torchrl_loco.collector import rewritten_by
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import Trainer, preset, train
 from torchrl_loco.training.environments import Environments, make_for
@@ -22,6 +23,7 @@ def test_a_run_begins_with_the_weights_of_another_or_of_a_policy(algorithm, tmp_
         assert_same(begun.networks.state_dict(), networks(first))
         again = Trainer(made(tmp_path / "again", algorithm, init=str(first.checkpoint))).algorithm
         assert_same(again.networks.state_dict(), networks(first))
+        assert "action" in rewritten_by(again.acting())  # which collectors need not zero
         with pytest.raises(ValueError, match=r"do not fit this run: hidden \(16,\), here \(8,\)$"):
             Trainer(made(tmp_path / "third", algorithm, init=str(first.path), hidden=(8,)))
         begun = Trainer(made(tmp_path / "fourth", algorithm, init=str(first.policy))).algorithm
