@@ -9,7 +9,7 @@ import pytest
 import tyro
 
 from torchrl_loco import __version__, cli, garbage
-from torchrl_loco.cli.errors import outlive_streams
+from torchrl_loco.cli.errors import tolerate_broken_streams
 from torchrl_loco.cli.options import VALUES
 
 FRESH = """
@@ -88,7 +88,7 @@ def test_a_training_outlives_who_reads_what_it_says(monkeypatch):
     pipe = os.fdopen(writes, "w", buffering=1)
     monkeypatch.setattr(sys, "stdout", pipe)
     monkeypatch.setattr(sys, "stderr", None)  # as where it is closed
-    outlive_streams()
+    tolerate_broken_streams()
     for stream in (sys.stdout, sys.stderr):
         print("a line", file=stream, flush=True)
     assert sys.stdout.fileno() == writes

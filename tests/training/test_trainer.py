@@ -367,8 +367,8 @@ def test_metrics_are_logged_and_a_curriculum_is_judged_where_it_is(tmp_path):
         run = train(Levels, out=tmp_path, device="cpu", eval_interval=128, logger=("csv",), **SMALL)
         rows, evaluations, policy = run.read_metrics(), run.read_evaluations(), run.load_policy("cpu")
         steps = 2 * 8 * SMALL["action_repeat"]
-        # In the last of the four frames of each action, or that in which an episode ended.
-        assert rows["metric/steps"] == pytest.approx([17.0, 49.0], abs=0.1)
+        # In the last of the four frames of each action: means of 32, of which 3 and 1 are missing where episodes ended.
+        assert rows["metric/steps"] == [16.90625, 48.96875]
         assert rows["metric/level"][0] < rows["metric/level"][1]
         reached = policy.info["stage"]["memory"]["level"]
         assert len(reached) == SMALL["num_envs"]
@@ -378,4 +378,4 @@ def test_metrics_are_logged_and_a_curriculum_is_judged_where_it_is(tmp_path):
         assert 2.0 <= least[0] <= least[1]
         assert evaluations[1]["metric/steps"] == pytest.approx(steps + (EPISODE - 1) / 2)
         longer = train(Levels, resume=run, total_frames=512)
-        assert longer.read_metrics()["metric/steps"][2] == pytest.approx(81.0, abs=0.1)
+        assert longer.read_metrics()["metric/steps"][2] == 81.0

@@ -16,7 +16,7 @@ import torchrl_loco
 from torchrl_loco.checks import check_choice
 from torchrl_loco.cli import runs
 from torchrl_loco.cli.diagnosis import diagnose, inspect, list_tasks, warm
-from torchrl_loco.cli.errors import outlive_streams, process_name, user_errors
+from torchrl_loco.cli.errors import process_name, tolerate_broken_streams, user_errors
 from torchrl_loco.cli.motions import motion
 from torchrl_loco.cli.options import VALUES, task_options
 from torchrl_loco.cli.policies import evaluate, export, play, record, verify, watch
@@ -29,7 +29,7 @@ def main(args: Sequence[str] | None = None) -> int:
         atexit.register(gc.freeze)
         OWN_PROCESS.set()
         if sys.stderr is None or sys.argv[1:2] in (["train"], ["resume"]):
-            outlive_streams()
+            tolerate_broken_streams()
     try:
         _run(sys.argv[1:] if args is None else list(args))
     except KeyboardInterrupt:

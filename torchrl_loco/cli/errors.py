@@ -1,4 +1,4 @@
-"""How the command line tells errors of the user, in one line, with status 2; and where nobody hears it."""
+"""How the command line tells errors of the user, in one line, with status 2; and what it does where output breaks."""
 
 import contextlib
 import os
@@ -14,8 +14,8 @@ def process_name() -> str:
     return f"torchrl-loco, rank {os.environ['RANK']}" if "RANK" in os.environ else "torchrl-loco"
 
 
-class Outlived:
-    """A stream that a training outlives: what nobody reads any more, or a full disk does not take, is lost."""
+class BestEffortStream:
+    """A text stream whose errors are ignored: what a closed pipe or a full disk does not take is lost."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -35,11 +35,11 @@ class Outlived:
         return getattr(self._stream, name)
 
 
-def outlive_streams() -> None:
-    """Lets this process go on where its standard output or error is closed, or breaks."""
+def tolerate_broken_streams() -> None:
+    """Lets this process go on if its standard output or error is closed or breaks."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name) or open(os.devnull, "w")  # noqa: SIM115, until the process ends
-        setattr(sys, name, Outlived(stream))
+        setattr(sys, name, BestEffortStream(stream))
 
 
 @contextlib.contextmanager

@@ -82,7 +82,7 @@ class World:
         self._closed = True  # until it is made in full
         n, nu, hooks = task.num_envs, mj_model.nu, task.hooks
         self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own
-        self._title, self._variation = type(task).__name__, (variation := task.variation)
+        self._title, self._variation = type(task).__name__, task.variation
         # Buffers made in inference mode could not be written outside it; without the device, torch's views would be on
         # the caller's default device. The caller's autocast is for the caller's own networks.
         with torch.inference_mode(False), EXCLUSIVE, task.device, torch.autocast(task.device.type, enabled=False):
@@ -90,9 +90,8 @@ class World:
             if hooks.catalog.contact_geoms:
                 asked["contact_geoms"] = hooks.catalog.contact_geoms
                 asked["contact_history"] = not hooks.catalog.arrays.isdisjoint(CONTACT_HISTORY)
-            self.sim = Simulation(
-                mj_model, task.config, n, task.device, varied=variation.varied if variation else None, **asked
-            )
+            varied = task.variation.varied if task.variation else None
+            self.sim = Simulation(mj_model, task.config, n, task.device, varied=varied, **asked)
             nominal = self.sim.numbers.clone()
             device = self.sim.device
             self.action = Buffer((n, nu), float, device)

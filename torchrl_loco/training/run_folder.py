@@ -29,14 +29,8 @@ CHECKPOINT_VERSION = 7
 WITHOUT_CHECKPOINT = "wait for one if it is being trained, else start a new run"
 
 _UNREADABLE = (
-    pickle.UnpicklingError,
-    zipfile.BadZipFile,
-    RuntimeError,
-    OSError,
-    EOFError,
-    LookupError,
-    TypeError,
-    ValueError,
+    *(pickle.UnpicklingError, zipfile.BadZipFile, RuntimeError),
+    *(OSError, EOFError, LookupError, TypeError, ValueError),
 )
 """Errors that reading a damaged checkpoint may raise."""
 
@@ -358,8 +352,9 @@ class RunFolder:
         if not path.is_file():
             raise FileNotFoundError(f"{self.path} has no {path.name} yet: {WITHOUT_CHECKPOINT}")
         try:
-            if part := zipfile.ZipFile(path).testzip():  # which torch.load does not ask
-                raise ValueError(f"the checksum of {part} is wrong")
+            with zipfile.ZipFile(path) as file:
+                if part := file.testzip():  # torch.load does not check
+                    raise ValueError(f"the checksum of {part} is wrong")
             entries = torch.load(path, map_location=device, weights_only=True)
             version = entries["version"]
         except _UNREADABLE as error:
