@@ -106,6 +106,7 @@ begin.add_argument("--out", type=Path, help="file for the results as JSON")
 begin.add_argument("--picture", type=Path, help="file for a plot")
 spread = commands.add_parser("scaling", help="several GPUs beside one, with the same worlds on each")
 spread.add_argument("--tasks", nargs="+", choices=list_envs(), default=["walker_walk"])
+spread.add_argument("--algorithms", nargs="+", choices=["ppo", "reppo"], default=["ppo", "reppo"])
 spread.add_argument("--gpus", type=int, nargs="+", default=[1, 2], help="numbers of GPUs, or of processes on the CPU")
 spread.add_argument("--device", type=torch.device, default=torch.device(DEVICE))
 spread.add_argument("--out", type=Path, help="file for the results as JSON")
@@ -172,7 +173,7 @@ elif args.command == "robots":
 elif args.command == "scaling":
     from benchmarks.scaling import COLUMNS, scaling
 
-    rows = scaling(args.tasks, args.gpus, args.device)
+    rows = scaling(args.tasks, args.gpus, args.device, args.algorithms)
 elif args.command == "variation":
     from benchmarks.variation import COLUMNS, GRID, plot_variation, variation
 

@@ -30,14 +30,19 @@ COLUMNS = {
 
 
 def scaling(
-    tasks: Sequence[str], gpus: Sequence[int], device: torch.device, settings: Mapping[str, Any] | None = None
+    tasks: Sequence[str],
+    gpus: Sequence[int],
+    device: torch.device,
+    algorithms: Sequence[str] = ("ppo", "reppo"),
+    settings: Mapping[str, Any] | None = None,
 ) -> list[Row]:
-    """Measures each task with PPO and REPPO on so many GPUs, or in so many processes on the CPU.
+    """Measures each task with each algorithm on so many GPUs, or in so many processes on the CPU.
 
     Args:
         tasks: ids of environments.
         gpus: numbers of ranks; the ratios are those to the first.
         device: its kind says where the ranks compute.
+        algorithms: by name.
         settings: training settings on top of the presets.
     """
     rows: list[Row] = []
@@ -45,7 +50,8 @@ def scaling(
         first: dict[str, Row] = {}
         for count in gpus:
             launcher = ["torch.distributed.run", "--standalone", "--nproc-per-node", count, "-m"] if count > 1 else []
-            arguments = [*launcher, "benchmarks.scaling_rank", task, device.type, json.dumps(settings or {})]
+            what = task, device.type, json.dumps(settings or {}), *algorithms
+            arguments = [*launcher, "benchmarks.scaling_rank", *what]
             try:
                 found = run_json(arguments, os.environ)
             except MeasurementError as error:

@@ -188,7 +188,7 @@ def test_rollouts_count_what_lies_and_how_much_it_moves():
 @pytest.mark.ci
 def test_ranks_are_measured_beside_one_process(tmp_path):
     settings = {"num_envs": 8, "num_steps": 4, "minibatch_size": 16, "epochs": 1, "hidden": [16]}
-    found = scaling.scaling(["walker_walk"], [1, 2], torch.device("cpu"), settings)
+    found = scaling.scaling(["walker_walk"], [1, 2], torch.device("cpu"), settings=settings)
     assert [(row["algorithm"], row["gpus"]) for row in found] == [("ppo", 1), ("reppo", 1), ("ppo", 2), ("reppo", 2)]
     for row in found:
         assert row["gradient_steps"] == 2
