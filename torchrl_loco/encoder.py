@@ -1,4 +1,4 @@
-"""The network that reads pixels: four convolutions, as DrQ-v2 has them (Yarats et al., 2021, arXiv 2107.09645)."""
+"""The network that reads pixels: convolutions and features, after DrQ-v2 (Yarats et al., 2021, arXiv 2107.09645)."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,9 @@ import torch
 from torch import nn
 from torch.nn.functional import conv2d, pad
 
-KERNEL, FIRST_STRIDE, LAYERS = 3, 2, 4
+KERNEL = 3
+DRQ = (2, 1, 1, 1)
+"""Strides of DrQ-v2's convolutions."""
 ALIGNED = 8
 """Channels at a multiple of which tensor cores convolve: with zeros up to that a first layer takes half the time."""
 
@@ -21,16 +23,20 @@ class PixelEncoder(nn.Module):
     mean: torch.Tensor
     count: torch.Tensor
 
-    def __init__(self, shape: Sequence[int], channels: int = 32, features: int = 50) -> None:
+    def __init__(
+        self, shape: Sequence[int], channels: int = 32, features: int = 50, strides: Sequence[int] = DRQ
+    ) -> None:
         super().__init__()
-        self.shape, self.channels, self.features = tuple(shape), channels, features
-        height, width, depth = self.shape
-        sides = [(side - KERNEL) // FIRST_STRIDE + 1 - (LAYERS - 1) * (KERNEL - 1) for side in (height, width)]
-        if min(sides) < 1:
-            least = FIRST_STRIDE * (LAYERS - 1) * (KERNEL - 1) + KERNEL
+        self.shape, self.channels, self.features, self.strides = tuple(shape), channels, features, tuple(strides)
+        sides, least, (height, width, depth) = [*self.shape[:2]], 1, self.shape
+        for stride in self.strides:
+            sides = [(side - KERNEL) // stride + 1 for side in sides]
+        for stride in reversed(self.strides):
+            least = stride * (least - 1) + KERNEL
+        if min(height, width) < least:
             raise ValueError(f"pixels to learn from must be at least {least} x {least}, got {width} x {height}")
-        self.first = nn.Conv2d(depth, channels, KERNEL, FIRST_STRIDE)
-        others = [nn.Conv2d(channels, channels, KERNEL) for _ in range(LAYERS - 1)]
+        self.first = nn.Conv2d(depth, channels, KERNEL, self.strides[0])
+        others = [nn.Conv2d(channels, channels, KERNEL, stride) for stride in self.strides[1:]]
         self.others = nn.Sequential(nn.ReLU(), *(layer for each in others for layer in (each, nn.ReLU())))
         last = nn.Linear(channels * sides[0] * sides[1], features)
         self.head = nn.Sequential(last, nn.LayerNorm(features), nn.Tanh())
@@ -58,7 +64,7 @@ class PixelEncoder(nn.Module):
         gap = -self.shape[-1] % ALIGNED
         rows, weight = pad(rows, (0, gap)), pad(self.first.weight, (0, 0, 0, 0, 0, gap))
         with torch.autocast(pixels.device.type, torch.bfloat16, enabled=pixels.is_cuda):
-            found = conv2d(rows.movedim(-1, 1), weight, self.first.bias, FIRST_STRIDE)  # channels_last in memory
+            found = conv2d(rows.movedim(-1, 1), weight, self.first.bias, self.strides[0])  # channels_last in memory
             found = self.head(self.others(found).flatten(1))
         return found.float().view(*pixels.shape[:-3], self.features)
 

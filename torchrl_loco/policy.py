@@ -164,7 +164,7 @@ def _in_8_bits(name: str, weight: torch.Tensor) -> dict[str, torch.Tensor]:
 
 KINDS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
     "observation_norm": (ObservationNorm, ("limit",)),
-    "pixel_encoder": (PixelEncoder, ("shape", "channels", "features")),
+    "pixel_encoder": (PixelEncoder, ("shape", "channels", "features", "strides")),
     "linear": (nn.Linear, ()),
     "layer_norm": (nn.LayerNorm, ("eps",)),
     "silu": (nn.SiLU, ()),

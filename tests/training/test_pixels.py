@@ -18,7 +18,7 @@ from torchrl_loco.training.run_folder import RunFolder
 from torchrl_loco.training.trainer import Trainer
 
 SMALL = {"num_envs": 4, "num_steps": 4, "minibatch_size": 8, "total_frames": 64, "action_repeat": 1, "hidden": (16,)}
-SMALL |= {"video_seconds": 0, "eval_episodes": 2, "logger": "csv", "size": (24, 20), "camera": "back", "epochs": 2}
+SMALL |= {"video_seconds": 0, "eval_episodes": 2, "logger": "csv", "size": (28, 24), "camera": "back", "epochs": 2}
 
 
 def test_the_encoder_sees_what_differs_from_the_mean_picture():
@@ -35,8 +35,13 @@ def test_the_encoder_sees_what_differs_from_the_mean_picture():
     rows = (pictures.flatten(0, 1).float() - encoder.mean).movedim(-1, 1) / 255
     plain = encoder.head(encoder.others(encoder.first(rows)).flatten(1)).view(5, 3, 50)
     torch.testing.assert_close(features, plain, rtol=1e-4, atol=1e-5)
-    with pytest.raises(ValueError, match="at least 15 x 15, got 24 x 14"):
-        PixelEncoder((14, 24, 3))
+    coarse = PixelEncoder((20, 24, 6), strides=(3, 2))
+    assert coarse.head[0].in_features == 32 * 2 * 3
+    assert coarse(pictures).shape == (5, 3, 50)
+    for strides, least in (((2, 1, 1, 1), 15), ((2, 2, 1, 1), 23), ((3, 2), 9)):
+        PixelEncoder((least, 24, 3), strides=strides)
+        with pytest.raises(ValueError, match=f"at least {least} x {least}, got 24 x {least - 1}"):
+            PixelEncoder((least - 1, 24, 3), strides=strides)
     for wrong in (pictures.view(15, 10, 48, 6), pictures[..., :3], pictures.float()):
         with pytest.raises(ValueError, match=r"uint8 pixels of shape \(20, 24, 6\), got"):
             encoder(wrong)
@@ -58,6 +63,7 @@ def test_shifted_pictures_repeat_their_edges():
 def test_actors_that_see(algorithm, critic_sees, device, tmp_path):
     """They learn, the run is resumed exactly, and its policy acts and is exported as the actor."""
     settings = {**SMALL, "from_pixels": True, "critic_from_pixels": critic_sees, "random_shift": 2}
+    settings |= {"strides": (2, 2, 1)} if critic_sees else {}
     settings |= {"compile": False} if algorithm == "reppo" else {}
     out = tmp_path / f"{algorithm}-{critic_sees}"
     run = RunFolder.create(preset("walker_walk", device, algorithm, out=out, **settings))
@@ -79,7 +85,7 @@ def test_actors_that_see(algorithm, critic_sees, device, tmp_path):
     policy = run.load_policy()
     assert policy.in_keys == ["pixels"]
     td = make_for(policy, 3, device, 0).rollout(3, policy)
-    assert td["pixels"].shape == (3, 3, 20, 24, 9)
+    assert td["pixels"].shape == (3, 3, 24, 28, 9)
     assert td["action"].abs().max() <= 1.0
     assert export_policy(policy, out / "policy.pt2") < 1e-5
 

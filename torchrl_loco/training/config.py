@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from torchrl_loco.envs import LocoEnv
 
 LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow"]
-OF_PIXELS = ("camera", "size", "frame_stack", "random_shift", "critic_from_pixels")  # settings that need from_pixels
+OF_PIXELS = ("camera", "size", "frame_stack", "strides", "random_shift", "critic_from_pixels")
+"""Settings that need from_pixels."""
 
 
 Settings = dict[str, Any]  # fields of a config, by name
@@ -111,6 +112,8 @@ class TrainingConfig:
     """Width and height of the pixels."""
     frame_stack: int = 3
     """How many pictures the actor sees at once."""
+    strides: tuple[int, ...] = (2, 1, 1, 1)
+    """Stride of each convolution of the pixels."""
     random_shift: int = within(COUNT, 0)
     """Pixels by which pictures are moved at random in gradient steps, at most and either way."""
     critic_from_pixels: bool = False
@@ -180,8 +183,9 @@ class TrainingConfig:
         object.__setattr__(self, "logger", tuple(dict.fromkeys(loggers)))
         object.__setattr__(self, "device", str(self.device))
         object.__setattr__(self, "out", Path(self.out))
-        for field in self.widths:
-            object.__setattr__(self, field, _checked_widths(field, getattr(self, field)))
+        for field in (*self.widths, "strides"):
+            what = "stride" if field == "strides" else "width"
+            object.__setattr__(self, field, _checked_layers(field, getattr(self, field), what))
         object.__setattr__(self, "size", checked_size(self.size))
         if not isinstance(self.sim, Sim):
             if not isinstance(self.sim, Mapping):
@@ -333,7 +337,16 @@ class REPPOConfig(TrainingConfig):
     of_others: ClassVar[Settings] = {**TrainingConfig.of_others, "num_bins": 301}
     of_pixels: ClassVar[dict[str, Settings]] = {
         "cpu": {},
-        "cuda": {"num_envs": 4096, "minibatch_size": 4096, "lr": 1e-3, "trials": 1, "bf16": True, "eval_episodes": 32},
+        "cuda": {
+            "num_envs": 4096,
+            "minibatch_size": 4096,
+            "lr": 1e-3,
+            "trials": 1,
+            "bf16": True,
+            "eval_episodes": 32,
+            "strides": (2, 2, 1, 1),
+            "kl_bound": 0.4,
+        },
     }
 
     compile: bool = True
@@ -451,12 +464,12 @@ class SVGConfig(TrainingConfig):
             raise ValueError("action_repeat must be 1: svg imagines single control steps")
 
 
-def _checked_widths(name: str, widths: Any) -> tuple[int, ...]:
-    """Returns the widths of layers."""
-    several = tuple(widths) if isinstance(widths, list | tuple) else (widths,)
+def _checked_layers(name: str, values: Any, what: str) -> tuple[int, ...]:
+    """Returns a width or a stride for each layer."""
+    several = tuple(values) if isinstance(values, list | tuple) else (values,)
     if not several:
-        raise ValueError(f"{name} must name the width of at least one layer")
-    return tuple(check_int(f"each width of {name}", width) for width in several)
+        raise ValueError(f"{name} must name the {what} of at least one layer")
+    return tuple(check_int(f"each {what} of {name}", value) for value in several)
 
 
 def _stored_name(task: Any) -> str:

@@ -54,7 +54,7 @@ class PPO(Algorithm):
             if key in self.norms:
                 return self.norms[key], make(spaces.rows[key], outputs)
             assert spaces.pixels is not None
-            encoder = PixelEncoder(spaces.pixels)
+            encoder = PixelEncoder(spaces.pixels, strides=config.strides)
             return encoder, make(encoder.features, outputs)
 
         first, mean = after_first(spaces.actor_key, spaces.action)

@@ -38,8 +38,8 @@ class REPPO(Algorithm):
     def __init__(self, config: REPPOConfig, spaces: Spaces, network: Network | None = None) -> None:
         super().__init__(config, spaces, network)
         self.action_bound = 1.0 if spaces.bounded else config.action_bound
-        encoder = PixelEncoder(spaces.pixels) if spaces.pixels else None
-        sight = PixelEncoder(spaces.pixels) if spaces.pixels and spaces.critic_sees else None
+        encoder = PixelEncoder(spaces.pixels, strides=config.strides) if spaces.pixels else None
+        sight = PixelEncoder(spaces.pixels, strides=config.strides) if spaces.pixels and spaces.critic_sees else None
         inputs, outputs = encoder.features if encoder else spaces.observation, 2 * spaces.action
         if network is None:
             head = nn.Linear(config.hidden[-1], outputs)
