@@ -63,7 +63,7 @@ def test_shifted_pictures_repeat_their_edges():
 def test_actors_that_see(algorithm, critic_sees, device, tmp_path):
     """They learn, the run is resumed exactly, and its policy acts and is exported as the actor."""
     settings = {**SMALL, "from_pixels": True, "critic_from_pixels": critic_sees, "random_shift": 2}
-    settings |= {"strides": (2, 2, 1)} if critic_sees else {}
+    settings["strides"] = (2, 2, 1) if critic_sees else (2, 1, 1, 1)
     settings |= {"compile": False} if algorithm == "reppo" else {}
     out = tmp_path / f"{algorithm}-{critic_sees}"
     run = RunFolder.create(preset("walker_walk", device, algorithm, out=out, **settings))
@@ -82,6 +82,10 @@ def test_actors_that_see(algorithm, critic_sees, device, tmp_path):
     close = {"rtol": 0, "atol": 0} if device == "cpu" else {"rtol": 0.05, "atol": 2e-3}  # cuDNN adds in any order
     torch.testing.assert_close(first.algorithm.networks.state_dict(), again.algorithm.networks.state_dict(), **close)
     again.train()
+    for init in (run.path, run.policy):
+        other = preset("walker_walk", device, algorithm, out=out, **settings | {"strides": (1, 2, 2), "init": init})
+        with pytest.raises(ValueError, match=rf"strides \({settings['strides'][0]}, .*\), here \(1, 2, 2\)"):
+            Trainer(RunFolder.create(other))
     policy = run.load_policy()
     assert policy.in_keys == ["pixels"]
     td = make_for(policy, 3, device, 0).rollout(3, policy)

@@ -359,11 +359,13 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
     folder = source.parent if is_checkpoint else source
     if folder.is_dir() and (is_checkpoint or RunFolder(folder).has_checkpoint):
         run = RunFolder(folder)
+        settings = run.load_config(), algorithm.config
+        if algorithm.spaces.pixels:
+            _check_strides(source, *(each.strides for each in settings))
         networks = run.load_checkpoint(device, source if is_checkpoint else None)["algorithm"]["networks"]
         try:
             algorithm.load_networks(networks)
         except (RuntimeError, KeyError) as error:
-            settings = run.load_config(), algorithm.config
             names = "algorithm", "task", *algorithm.config.widths
             pairs = {name: [getattr(each, name, None) for each in settings] for name in names}
             differing = [f"{name} {old}, here {new}" for name, (old, new) in pairs.items() if old != new]
@@ -376,8 +378,16 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
             _copy(own, other, source, last=own is mine[-1])
 
 
+def _check_strides(source: Path, theirs: tuple[int, ...], own: tuple[int, ...]) -> None:
+    """Checks that convolutions step alike: their weights do not tell."""
+    if theirs != own:
+        raise ValueError(f"init: the networks of {source} do not fit this run: strides {theirs}, here {own}")
+
+
 def _copy(own: nn.Module, other: nn.Module, source: Path, *, last: bool) -> None:
     """Copies the weights of a layer; the last of an actor also gives what a policy does not have: its deviations."""
+    if isinstance(own, PixelEncoder) and isinstance(other, PixelEncoder):
+        _check_strides(source, other.strides, own.strides)
     mine, theirs = own.state_dict(), other.state_dict()
     for name, values in theirs.items():
         fits = name in mine and mine[name].shape[1:] == values.shape[1:]

@@ -415,7 +415,7 @@ class Trainer:
 
     def _identity(self) -> dict[str, Any]:
         """Returns the settings that must not change while a run is stopped."""
-        names = "algorithm", "task", "protocol", "num_envs", "hidden", "action_bound"
+        names = "algorithm", "task", "protocol", "num_envs", "hidden", "strides", "action_bound"
         return {name: getattr(self.config, name) for name in names if hasattr(self.config, name)}
 
     def _load(self, checkpoint: dict[str, Any], total_frames: float) -> None:
