@@ -1,7 +1,9 @@
 """Ranks for tests: processes connected by gloo, and what they do."""
 
 import itertools
+import os
 import signal
+import time
 import uuid
 
 import torch
@@ -73,14 +75,20 @@ class Counts(Walker):
     def adapt(self, s):
         return {name: getattr(s, name) + s.num_envs for name in ("all_steps", "own_steps")}
 
+    def metrics(self, s):
+        return {"of_three": torch.where(s.env_index < 3, 1.0 + s.env_index, torch.nan)}  # of worlds of rank 0
+
 
 def counted(out):
-    """Returns what worlds share after two batches, by name."""
-    path = RunFolder.create(preset(Counts, "cpu", out=out, **SMALL)).path if distributed.is_first() else None
+    """Returns what worlds share after two batches, the mean of a metric, and the run, which has a checkpoint."""
+    settings = {**SMALL, "total_frames": 8 * BATCH}
+    path = RunFolder.create(preset(Counts, "cpu", out=out, **settings)).path if distributed.is_first() else None
     trainer = Trainer(RunFolder(distributed.from_first(path)))
     for _ in range(2):
-        trainer.iterate()
-    return {name: int(values) for name, values in trainer._base.world.shared.items()}
+        row = trainer.iterate()
+    trainer.save()
+    shared = {name: int(values) for name, values in trainer._base.world.shared.items()}
+    return {"shared": shared, "of_three": row["metric/of_three"], "run": trainer.run.path}
 
 
 def seen(out):
@@ -148,4 +156,8 @@ def of_ranks(out):
 def resumed_by_train(path, frames):
     """Resumes a run by ``train``, which connects the ranks itself; returns the frames of its last row."""
     with small_walker():
-        return train("walker_stand", resume=path, total_frames=frames).read_metrics()["frames"][-1]
+        found = train("walker_stand", resume=path, total_frames=frames).read_metrics()["frames"][-1]
+    if os.environ["RANK"] == "1":  # the other one must wait, and not look for it where it was
+        time.sleep(1.0)
+    with distributed.joined("cpu"):
+        return distributed.from_first(found)

@@ -113,7 +113,12 @@ def test_messages(ranks):
 
 def test_what_worlds_share_is_added_up_and_mean_pictures_are_of_all_ranks(ranks):
     steps = 2 * BATCH // SMALL["num_envs"] * SMALL["num_envs"]
-    assert [of["counted"] for of in ranks] == [{"all_steps": 2 * steps, "own_steps": steps}] * 2
+    counted, shared = [of["counted"] for of in ranks], {"all_steps": 2 * steps, "own_steps": steps}
+    assert [(of["shared"], of["of_three"]) for of in counted] == [(shared, 2.0)] * 2
+    with small_walker():  # another number of ranks goes on from there
+        alone = Trainer(RunFolder(counted[0]["run"]), resume=True)
+    assert {name: int(values) for name, values in alone._base.world.shared.items()} == shared
+    alone.env.close()
     pictures = torch.cat([of["seen"]["pictures"] for of in ranks])  # of worlds of each
     for of in ranks:
         assert of["seen"]["count"] == len(pictures)
@@ -185,7 +190,7 @@ def test_wrong_numbers_of_gpus(tmp_path, monkeypatch, capsys):
 
 
 def test_ranks_resume_by_train(ranks, tmp_path):
-    """Each calls it before they are connected."""
+    """Each calls it before they are connected; then they are connected anew."""
     path, frames = shutil.copytree(ranks[0]["ppo"]["whole"], tmp_path / "run"), 6 * 2 * BATCH
     assert in_ranks(resumed_by_train, path, frames, connected=False) == [frames, frames]
     assert RunFolder(path).load_config().total_frames == frames

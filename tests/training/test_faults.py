@@ -1,5 +1,6 @@
 """A rank that dies: what is said, and how the run goes on."""
 
+import dataclasses
 import os
 import re
 import signal
@@ -10,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_loco.training import RunFolder, distributed
+from torchrl_loco.training import Given, RunFolder, distributed
+from torchrl_loco.training.start import run_to_end
 
 SMALL = {
     "num_envs": 8,
@@ -74,7 +76,21 @@ def test_a_rank_that_dies_is_named(tmp_path):
     assert f"torchrl-loco: rank 1 (process {pid}) ended with signal SIGKILL" in said
     assert re.search(r"to continue: torchrl-loco resume \S+ --gpus 2", said)
     (path,) = tmp_path.iterdir()
-    assert len(RunFolder(path).load_checkpoint("cpu")["further_ranks"]) == 1
+    run = RunFolder(path)
+    assert len(run.load_checkpoint("cpu")["further_ranks"]) == 1
+    # Whoever starts them may be killed too: they end, with a checkpoint.
+    command = [sys.executable, "-m", "torchrl_loco", "resume", str(path), "--gpus=2"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    rows = len(run.read_metrics()["frames"])
+    until(lambda: len(run.read_metrics()["frames"]) > rows, process)
+    left = processes_of_ranks(process.pid).values()
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 60
+    while any(Path(f"/proc/{pid}").exists() for pid in left):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert run.load_checkpoint("cpu")["frames"] == run.read_metrics()["frames"][-1]
 
 
 @pytest.mark.ci
@@ -111,5 +127,8 @@ def test_the_run_of_a_launch(tmp_path, monkeypatch):
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
     assert RunFolder.of_launch(config).path == own.path
     assert not distributed.is_restart()
+    assert RunFolder.of_launch(dataclasses.replace(config, seed=config.seed + 1)) is None  # of a script with several
     monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
     assert distributed.is_restart()
+    monkeypatch.setattr(RunFolder, "is_finished", True)
+    assert run_to_end(config, Given()).path == own.path  # which is not trained again

@@ -99,7 +99,7 @@ def missing_processes(gpus: int | None, device: str) -> int:
     if gpus is None:
         return 0
     check_int("gpus", gpus)
-    if "RANK" in os.environ:  # of torchrun
+    if "RANK" in os.environ and "WORLD_SIZE" in os.environ:  # of torchrun
         if gpus != int(os.environ["WORLD_SIZE"]):
             raise ValueError(f"torchrun has started {os.environ['WORLD_SIZE']} processes: leave --gpus {gpus} out")
         return 0

@@ -26,6 +26,12 @@ TIMEOUT = datetime.timedelta(hours=2)
 GRACE = 5.0  # seconds for which a rank that lost another one stays alive, so that torchrun sees first which one died
 
 
+PATIENCE = 600  # seconds for which ranks that are asked to end may still update, evaluate and write a checkpoint
+
+_joins = 0  # how often this process joined others
+_parent = 0  # the process that had started it by then
+
+
 class RankLostError(ConnectionError):
     """Another rank ended while this one needed it."""
 
@@ -53,16 +59,24 @@ def _connected() -> bool:
 
 
 def launch_id() -> str | None:
-    """Returns a name of the launch by torchrun that stays the same when it restarts its processes, if there is one."""
+    """Returns a name of the launch by torchrun that stays the same when it restarts its processes, if there is one.
+
+    A script may train several times: the name is that of the training, too.
+    """
     of = os.environ.get("TORCHELASTIC_RUN_ID")
     if of == "none":  # torchrun's default; the process that starts and restarts this one is unique on its machine
-        return f"{socket.gethostname()} {os.getppid()}"
-    return of
+        of = f"{socket.gethostname()} {os.getppid()}"
+    return f"{of}, {_joins}" if of and _joins > 1 else of
 
 
 def is_restart() -> bool:
     """Returns whether torchrun started this process in place of one that failed."""
     return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+
+
+def is_orphan() -> bool:
+    """Returns whether the process that started this rank is gone, as by SIGKILL: nobody would end it then."""
+    return ranks() > 1 and os.getppid() != _parent
 
 
 def own_device(device: str) -> str:
@@ -114,9 +128,12 @@ def joined(device: str) -> Iterator[None]:
             raise ValueError(f"no GPU for local rank {index}, this machine has {count}: start one process a GPU")
         own = torch.device("cuda", index)
         torch.cuda.set_device(own)
+    global _joins, _parent
+    _joins, _parent = _joins + 1, os.getppid()
     store, number, count = next(rendezvous("env://", timeout=TIMEOUT))
-    # torchrun keeps its store when it restarts the ranks: they must not find the addresses of those that are gone.
-    attempt = dist.PrefixStore(f"attempt {os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
+    # torchrun keeps its store when it restarts the ranks, and from one training to the next: they must not find the
+    # addresses of those that are gone.
+    attempt = dist.PrefixStore(f"attempt {os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}, {_joins}", store)
     backend = "nccl" if on_cuda else "gloo"
     dist.init_process_group(backend, store=attempt, rank=number, world_size=count, timeout=TIMEOUT, device_id=own)
     yield
@@ -135,6 +152,7 @@ def launch(count: int, args: Sequence[str]) -> None:
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
+    os.environ.setdefault("TORCH_ELASTIC_SHUTDOWN_TIMEOUT", str(PATIENCE))  # it kills them after 30 s otherwise
     config = LaunchConfig(
         min_nodes=1,
         max_nodes=1,

@@ -157,9 +157,10 @@ class RunFolder:
 
     @classmethod
     def of_launch(cls, config: TrainingConfig) -> "RunFolder | None":
-        """Returns the run in ``config.out`` that this launch by torchrun has begun, if any; the newest of several."""
+        """Returns the run of these settings that this launch by torchrun has begun, if any; the newest of several."""
         files = [file for file in config.out.glob("*/launch.txt") if file.read_text() == distributed.launch_id()]
-        return cls(max(files, key=lambda file: file.stat().st_mtime).parent) if files else None
+        newest = sorted(files, key=lambda file: file.stat().st_mtime, reverse=True)
+        return next((run for run in map(cls, (file.parent for file in newest)) if run.load_config() == config), None)
 
     def load_config(self, **overrides: Any) -> TrainingConfig:
         """Returns the settings of the run, with ``overrides`` on top, such as ``device="cpu"`` for a run from CUDA.

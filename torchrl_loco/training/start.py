@@ -161,9 +161,20 @@ def run_to_end(
         with errors():
             config = what.load_config(**changes) if isinstance(what, RunFolder) else what
             ranks.enter_context(distributed.joined(config.device))  # before it, each rank would be the first
+            if not isinstance(what, RunFolder) and (done := distributed.from_first(_finished_before(what))):
+                return RunFolder(done)
             trainer = Trainer(what, True, given, **changes) if isinstance(what, RunFolder) else begin(what, given)
         train_to_end(trainer, given, errors)
         return trainer.run
+
+
+def _finished_before(config: TrainingConfig) -> Path | None:
+    """Returns the folder of a run that was complete when torchrun started the ranks anew, of a script with several."""
+    began = RunFolder.of_launch(config) if distributed.is_first() and distributed.is_restart() else None
+    if began is None or not began.is_finished:
+        return None
+    print(f"run folder: {began.path}, which is complete", flush=True)
+    return began.path
 
 
 def train_to_end(trainer: Trainer, given: Given, errors: Callable[..., Any] = as_they_are) -> None:

@@ -215,7 +215,7 @@ class Trainer:
                         self.trials.end(self.frames, distributed.from_first(mean))
                         self.episodes.restart()
                 is_late = time.perf_counter() - saved > config.checkpoint_seconds
-                stop, is_late = distributed.any_rank(interrupted(), is_late)
+                stop, is_late = distributed.any_rank(interrupted() or distributed.is_orphan(), is_late)
                 if stop or is_late:
                     self.save()
                     saved = time.perf_counter()
@@ -282,15 +282,19 @@ class Trainer:
         reward = after["reward"].mean() / config.action_repeat
         spread, ends = after["reward"].max() - after["reward"].min(), after["done"].float().mean()
         of_env = {f"reward/{name}": after["reward_terms", name].mean() / config.action_repeat for name in self._terms}
-        of_env |= {f"metric/{name}": after["metrics", name].nanmean() for name in self._base.metric_names}
+        told = [after["metrics", name] for name in self._base.metric_names]
+        sums = [part for each in told for part in (each.nansum(), (~each.isnan()).float().sum())]
         non_finite = self._base.health()["total", "non_finite"]  # before a batch that is collected ahead changes it
-        numbers = torch.cat([ended, torch.stack([non_finite, spread, ends, reward, *of_env.values()])])
+        numbers = torch.cat([ended, torch.stack([non_finite, spread, ends, reward, *sums, *of_env.values()])])
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
         self._ahead = self._collected_ahead()
         numbers = torch.cat([numbers, metrics])
         means = distributed.mean_of_ranks(numbers).tolist()
         self.episodes.take(*(mean * distributed.ranks() for mean in means[:3]))
         non_finite, spread, ends, mean_reward, *means = means[3:]
+        parts, means = means[: len(sums)], means[len(sums) :]  # a mean of means would count some steps more than others
+        parts = [total / count if count else math.nan for total, count in zip(parts[::2], parts[1::2], strict=True)]
+        means[len(of_env) : len(of_env)] = parts
         before, self._non_finite = self._non_finite, round(non_finite * distributed.ranks())
         if ends == 1.0 and self._non_finite - before >= config.frames_per_batch * distributed.ranks():
             raise NothingToLearnError(
@@ -303,7 +307,8 @@ class Trainer:
         self.iteration += 1
         seconds = time.perf_counter() - start
         self.seconds += seconds
-        names = *of_env, *algorithm.metric_names, *algorithm.batch_metric_names
+        of_metrics = [f"metric/{name}" for name in self._base.metric_names]
+        names = *of_env, *of_metrics, *algorithm.metric_names, *algorithm.batch_metric_names
         return {
             "iteration": self.iteration,
             "frames": self.frames,
@@ -488,6 +493,10 @@ class Trainer:
             self.episodes.load_state_dict(checkpoint["episodes"], running=False)
             learnt = (checkpoint, *checkpoint.get("further_ranks", ()))[rank % before]
             self.collector.load_state_dict({"transforms": learnt["collector"].get("transforms", {})})
+            try:
+                self._base.set_stage(checkpoint.get("stage", {}))
+            except ValueError as error:  # of a task that was edited
+                logging.getLogger("torchrl_loco").warning("episodes begin at the curriculum's first stage: %s", error)
             return
         own = checkpoint if rank == 0 else checkpoint["further_ranks"][rank - 1]
         self.collector.load_state_dict(own["collector"])
@@ -511,7 +520,7 @@ class Trainer:
             print(
                 f"ranks: {ranks_before} so far, {distributed.ranks()} from here on, each with {self.config.num_envs} "
                 f"worlds and minibatches of {self.config.minibatch_size}. All worlds start anew; networks, optimizers, "
-                "transforms and counters continue",
+                "transforms, counters and the stage of a curriculum continue",
                 file=sys.stderr,
             )
 
