@@ -16,6 +16,7 @@ from torchrl_loco.eyes.placing import bytes_placed
 from torchrl_loco.eyes.rays import Rays
 from torchrl_loco.eyes.tracer import Eye
 from torchrl_loco.sim import simulation
+from torchrl_loco.sim.models import load
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 WIDTH, HEIGHT = 42, 30  # no multiples of a tile of threads
@@ -27,9 +28,12 @@ SHAPES = f"""
     <hfield name="field" nrow="9" ncol="12" size="2 1.5 0.4 0.1"/>
     <hfield name="small" nrow="4" ncol="5" size="0.5 0.4 0.5 0.1"/>
     <mesh name="wedge" vertex="0 0 0  0.4 0 0  0 0.4 0  0 0 0.5"/>
+    <material name="opaque"/>
+    <material name="clear" rgba="1 1 1 0"/>
   </asset>
   <worldbody>
     <geom type="plane" size="0 0 1" pos="0 0 -0.2"/>
+    <geom type="plane" size="0.3 0.4 1" pos="-0.9 -0.3 0.6" euler="30 20 0" contype="0" conaffinity="0"/>
     <geom type="hfield" hfield="field" pos="0.4 0.3 -0.1" euler="0 0 10"/>
     <geom type="box" size="0.3 0.2 0.1" pos="-0.6 0.5 0.3" euler="10 20 30"/>
     <body pos="0 0 0.6">
@@ -110,13 +114,14 @@ def test_depth_and_geoms_are_those_of_rays_of_c_mujoco(camera, device):
 
 
 def test_light_falls_off_and_casts_shadows():
-    """A lit floor, the shadow of a ball on it, and colors of materials."""
+    """A lit floor, the shadow of a ball on it, and colors of materials; a spot's ambient light is in its cone."""
     xml = """
     <mujoco>
       <visual><headlight active="0"/></visual>
       <worldbody>
         <light directional="true" pos="0 0 3" dir="0 0 -1" diffuse="0.8 0.8 0.8"
                ambient="0.1 0.1 0.1" specular="0 0 0"/>
+        <light pos="0 0 3" dir="0 0 1" cutoff="30" ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/>
         <geom type="plane" size="0 0 1" rgba="0 1 0 1"/>
         <geom type="sphere" size="0.2" pos="0 0 1" rgba="1 0 0 1"/>
         <camera name="above" pos="1 0 3" xyaxes="0 1 0 -1 0 0.5"/>
@@ -321,6 +326,11 @@ def test_a_camera_without_a_name_has_a_number():
     assert checked_camera(m, None) == 0
     with pytest.raises(ValueError, match=r"unknown camera '': choose one of b$"):
         checked_camera(m, "")
+    cart = """<mujoco><worldbody><body><joint/><geom size="0.1"/>
+      <body><camera name="eye"/><geom size="0.1"/></body></body></worldbody></mujoco>"""
+    m = load(cart)  # with a camera that MuJoCo numbers first
+    assert [m.camera(i).name for i in range(m.ncam)] == ["side", "eye"]
+    assert [m.camera(checked_camera(m, number)).name for number in (None, 0, 1)] == ["eye", "eye", "side"]
 
 
 def test_pixels_that_do_not_fit_are_refused():
@@ -364,6 +374,10 @@ def test_a_group_must_not_have_the_name_of_pixels():
 @pytest.mark.parametrize("device", DEVICES)
 def test_rays_from_a_body_meet_what_those_of_c_mujoco_meet(device):
     m, device, rng = shapes(), wp.get_device(device), np.random.default_rng(2)
+    for kind, material in ((mujoco.mjtGeom.mjGEOM_CAPSULE, "clear"), (mujoco.mjtGeom.mjGEOM_SPHERE, "opaque")):
+        of_kind = (m.geom_type == kind) & ((m.geom_rgba[:, 3] == 0.0) == (material == "opaque"))
+        m.geom_matid[of_kind] = m.material(material).id  # whose opacity counts, not the geom's
+        m.geom_rgba[of_kind, :3] = 0.9
     directions, site = rng.standard_normal((200, 3)), m.site("eye")
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     data, geom = mujoco.MjData(m), np.zeros(1, np.int32)

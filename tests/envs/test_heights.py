@@ -101,7 +101,11 @@ def test_what_has_no_height(more, grid, message):
         task(mujoco.MjSpec.from_string(MODEL.format(more=more)), np.zeros((1, 7)), grid)
 
 
-def test_there_must_be_ground():
+def test_there_must_be_ground(caplog):
     nothing = MODEL.format(more="").replace('<geom name="floor" type="plane" size="5 5 .1"/>', "")
     with pytest.raises(ValueError, match="there is no ground below"):
         task(mujoco.MjSpec.from_string(nothing), np.zeros((1, 7)))
+    task(
+        mujoco.MjSpec.from_string(MODEL.format(more='<geom name="pole" type="cylinder" size="1 1"/>')), np.zeros((1, 7))
+    )
+    assert "without geoms pole" in caplog.text

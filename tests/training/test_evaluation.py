@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 
+import imageio.v3 as imageio
 import pytest
 import torch
 from for_each import for_each
@@ -96,6 +97,11 @@ def test_actions_are_held_in_evaluations_and_videos(tmp_path):
     assert len(calls) == 1  # of 2
     record(policy, env, tmp_path / "short.mp4", 1e-9, action_repeat=2)  # a picture at least
     assert (tmp_path / "short.mp4").stat().st_size
+    slow = torchrl_loco.make("walker_stand", 1, "cpu", 0, ctrl_dt=0.4)
+    calls.clear()
+    record(policy, slow, tmp_path / "slow.mp4", 2.0)
+    assert len(calls) == 5
+    assert imageio.immeta(tmp_path / "slow.mp4", plugin="pyav")["duration"] == pytest.approx(2.0)
     for wrong, match in (({"seconds": -1.0}, "seconds must"), ({"action_repeat": 0}, "action_repeat must")):
         with pytest.raises(ValueError, match=match):
             record(policy, env, **{"path": tmp_path / "no.mp4", "seconds": 1.0, **wrong})

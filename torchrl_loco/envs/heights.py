@@ -4,6 +4,7 @@ They are looked up in tables, so that a hook that asks for them becomes a kernel
 """
 
 import dataclasses
+import logging
 from typing import Any
 
 import mujoco
@@ -40,6 +41,12 @@ class Ground:
         geoms = [g for g in ground if m.geom_type[g] in (PLANE, FIELD, BOX)]
         if not geoms:
             raise ValueError("there is no ground below: no plane, height field or box is fixed to the world")
+        if others := [m.geom(g).name or str(g) for g in ground if g not in geoms]:
+            logging.getLogger("torchrl_loco").warning(
+                "heights of the ground are those of planes, height fields and boxes, without geoms %s: rays of "
+                "s.ray meet them",
+                ", ".join(others[:8]),
+            )
         axes = np.abs(data.geom_xmat[geoms].reshape(-1, 3, 3))
         for g, own in zip(geoms, axes, strict=True):
             is_level = (

@@ -15,6 +15,7 @@ from torchrl_loco.eyes.placing import bytes_placed
 from torchrl_loco.eyes.shapes import MISS
 from torchrl_loco.eyes.tracer import Color, Eye
 from torchrl_loco.sim import EXCLUSIVE, Simulation, current_stream
+from torchrl_loco.sim.models import cameras
 from torchrl_loco.sim.simulation import check_memory
 
 SIZE = (84, 84)  # width and height of pixels, those of dm_control's benchmarks from pixels
@@ -29,7 +30,8 @@ Pictures = dict[str, torch.Tensor]  # what is seen in all worlds by key, (worlds
 class Pixels:
     """What an environment returns of a camera."""
 
-    camera: int  # its number
+    camera: int  # its id in MuJoCo
+    number: int  # as an argument
     width: int
     height: int
     kinds: tuple[str, ...]  # what is drawn, of torchrl_loco.eyes.tracer.KINDS
@@ -58,19 +60,19 @@ class Pixels:
         of_pixel = COPIES_IN_STEP * sum({"rgb": 3 * stack, "depth": 4}[kind] for kind in kinds)
         of_pixel += 3 * stack * (stack > 1)  # Seen.stack
         check_memory(num_envs * (width * height * of_pixel + bytes_placed(m)), num_envs, device)
-        return cls(camera, width, height, kinds, far, stack, only)
+        return cls(camera, cameras(m).index(camera), width, height, kinds, far, stack, only)
 
     @property
     def arguments(self) -> dict[str, Any]:
         """The arguments that ask for them."""
         rgb, size = "rgb" in self.kinds, (self.width, self.height)
-        seen = {"from_pixels": rgb, "depth": self.far, "camera": self.camera, "size": size, "pixels_only": self.only}
+        seen = {"from_pixels": rgb, "depth": self.far, "camera": self.number, "size": size, "pixels_only": self.only}
         return {**seen, "frame_stack": self.stack if rgb else None}
 
     def settings(self, m: mujoco.MjModel) -> dict[str, Any]:
         """Returns the settings of a training in which the same is seen."""
-        if not (name := m.camera(self.camera).name) and self.camera:
-            raise ValueError(f"camera {self.camera} needs a name to train with")
+        if not (name := m.camera(self.camera).name) and self.number:
+            raise ValueError(f"camera {self.number} needs a name to train with")
         seen = {"camera": name, "size": (self.width, self.height), "frame_stack": self.stack}
         return {**seen, **({"critic_from_pixels": True} if self.only else {})}
 
@@ -92,13 +94,13 @@ class Pixels:
 
 
 def checked_camera(m: mujoco.MjModel, camera: str | int | None) -> int:
-    """Returns the number of a camera; of the first for ``None``."""
-    if not m.ncam:
+    """Returns the id of a camera by its name or number, of the first for ``None``."""
+    if not (ids := cameras(m)):
         raise ValueError("pixels need a camera: the model has none")
     if isinstance(camera, str):
         check_choice("camera", camera, [name for i in range(m.ncam) if (name := m.camera(i).name)])
         return m.camera(camera).id
-    return 0 if camera is None else check_int("camera", camera, Interval(0, m.ncam))
+    return ids[0 if camera is None else check_int("camera", camera, Interval(0, m.ncam))]
 
 
 class Seen:

@@ -71,8 +71,8 @@ class Task:
     depends on its neighbours; in training on several GPUs each rank has its own, but for those in
     :attr:`summed_over_ranks`."""
     summed_over_ranks: ClassVar[Sequence[str]] = ()
-    """Names of entries of :attr:`shared`, counts that only grow, whose changes are added up over the ranks of a training,
-    after each batch."""
+    """Names of entries of :attr:`shared`, counts that only grow, whose changes are added up over the ranks of a
+    training, after each batch."""
     constants: ClassVar[Any] = {}
     """Tables that never change, tensors or arrays by name, or a method that returns them once. ``s.name`` reads them
     on the device. ``s.table[s.frame]`` looks up a row in each world; where an index is out of range it gives NaN, which

@@ -73,6 +73,7 @@ class Light:
 
     kind: int  # SPOT, DIRECTIONAL or OWN
     shadow: bool
+    ambient: wp.vec3  # of a spot; that of the others is the same everywhere
     diffuse: wp.vec3
     specular: wp.vec3
     attenuation: wp.vec3
@@ -92,16 +93,25 @@ class Looks:
 
 
 def to_the_horizon(mj_model: mujoco.MjModel) -> mujoco.MjModel:
-    """Returns a copy of a model for pictures: its planes have no end, as in the physics."""
+    """Returns a copy of a model for pictures: planes that may be touched have no end, as in the physics."""
     seen = copy.copy(mj_model)
-    seen.geom_size[seen.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = 0.0
+    touched = (seen.geom_contype | seen.geom_conaffinity) != 0
+    touched[[*seen.pair_geom1, *seen.pair_geom2]] = True
+    seen.geom_size[touched & (seen.geom_type == mujoco.mjtGeom.mjGEOM_PLANE), :2] = 0.0
     return seen
 
 
 def for_rays(mj_model: mujoco.MjModel) -> mujoco.MjModel:
-    """Returns a copy of a model for rays, which meet geoms of all groups, and planes that have no end."""
+    """Returns a copy of a model for rays, as ``mj_ray`` meets geoms: of all groups, unless their opacity is 0.
+
+    Of one with a material the material's counts. Planes that may be touched have no end.
+    """
     met = to_the_horizon(mj_model)
     met.geom_group[:] = 0
+    has_material = met.geom_matid >= 0
+    met.geom_rgba[has_material] = met.mat_rgba[met.geom_matid[has_material]]
+    met.geom_rgba[:, 3] = met.geom_rgba[:, 3] != 0.0
+    met.geom_matid[:] = -1
     return met
 
 
@@ -238,7 +248,8 @@ def color_of(m: mujoco.MjModel, geom: int) -> np.ndarray:
 def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
     """Returns what geoms look like, and what lights them. What is not drawn is said in the log."""
     head, lights = m.vis.headlight, np.flatnonzero(m.light_active)
-    ambient = m.light_ambient[lights].sum(0) + (head.ambient if head.active else 0.0)
+    is_spot = m.light_type != int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    ambient = m.light_ambient[lights][~is_spot[lights]].sum(0) + (head.ambient if head.active else 0.0)
     shine, texture = np.zeros((m.ngeom, 3)), np.full(m.ngeom, -1)
     repeat, offset, left_out = np.zeros((m.ngeom, 2)), np.zeros((m.ngeom, 2)), []
     shine[:, 1:] = 0.5, 0.5 * FULL_SHINE
@@ -274,9 +285,9 @@ def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
     light["kind"][0] = OWN
     if head.active:
         light["diffuse"][0], light["specular"][0] = head.diffuse, head.specular
-    is_directional = m.light_type == int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     for name, of in (
-        ("kind", np.where(is_directional, DIRECTIONAL, SPOT)),
+        ("kind", np.where(is_spot, SPOT, DIRECTIONAL)),
+        ("ambient", m.light_ambient * is_spot[:, None]),
         ("shadow", m.light_castshadow),
         ("diffuse", m.light_diffuse),
         ("specular", m.light_specular),

@@ -205,6 +205,7 @@ def tracer(
                     way = light_pos[k - 1] - p
                     most = wp.length(way)
                     strength = of_spot(one.attenuation, one.cone, most, wp.dot(way, to) / most)
+                    light += strength * one.ambient
                     to = way / most
             toward = wp.dot(n, to)
             if toward > 0.0 and strength > 0.0:

@@ -15,6 +15,8 @@ FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of MJCF's compiler
 
 NEVER = -1e10  # margin (m) of an explicit pair of geoms that does not touch: nothing is so deep
 
+ADDED = "torchrl_loco: added camera"  # a text of models whose camera ``side`` is not their own
+
 VELOCITY_SENSORS = {
     int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
     for name in (
@@ -62,10 +64,18 @@ def load(
     distance = 3.0 * max(np.linalg.norm(model.body_ipos, axis=1).max() + model.geom_rbound[1:].max(initial=0.1), 0.3)
     camera = spec.bodies[1].add_camera(name="side", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
     tilt = 0.5 * (0.5 * np.pi - np.arctan(0.25))  # it looks along y, and down to the body
+    if len(spec.cameras) > 1:
+        spec.add_text(name=ADDED, data="side")  # MuJoCo numbers cameras by body: it comes before those of later ones
     camera.pos, camera.quat = [0, -2 * distance, 0.5 * distance], [np.cos(tilt), np.sin(tilt), 0, 0]
     if model.nlight == 0:
         spec.worldbody.add_light(pos=[0, -distance, 4 * distance], dir=[0, 0.25, -1], diffuse=[0.8, 0.8, 0.8])
     return spec.compile()
+
+
+def cameras(m: mujoco.MjModel) -> list[int]:
+    """Returns the ids of a model's cameras in their order; one that :func:`load` added is the last."""
+    added = [m.camera("side").id] if mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_TEXT, ADDED) >= 0 else []
+    return [i for i in range(m.ncam) if i not in added] + added
 
 
 def specification(source: Path | str | mujoco.MjSpec, folder: Path | None = None) -> mujoco.MjSpec:

@@ -219,13 +219,13 @@ def record(
     env.check_picture(camera, *SIZE)
     if not env.batch_size:
         raise ValueError("the environment has no batch of worlds: make it with num_envs=1")
-    frame_rate = round(1 / env.config.ctrl_dt)
+    frame_rate = 1 / env.config.ctrl_dt
     steps = play(policy, env, action_repeat, max(round(seconds * frame_rate), 1), "video")
     with settings_for_small_networks():
         write_video(path, (env.render(camera, *SIZE, worlds=1)[0] for _ in steps), frame_rate)
 
 
-def write_video(path: Path | str, frames: Iterable[torch.Tensor], frame_rate: int) -> None:
+def write_video(path: Path | str, frames: Iterable[torch.Tensor], frame_rate: float) -> None:
     """Writes frames, uint8 ``(height, width, 3)``, as a video file, whole or not at all, as :func:`record` does."""
     check_packages("a video", VIDEO, "train")
     import imageio.v3 as imageio
