@@ -19,6 +19,7 @@ class Robot:
 
     def __init__(self, facts):
         self.model = mujoco.MjModel.from_xml_string(facts["mjcf"])
+        self.model.opt.timestep = facts["physics_timestep"]
         self.data, self.facts = mujoco.MjData(self.model), facts
         self.data.qpos[:] = facts["home"]
         mujoco.mj_forward(self.model, self.data)

@@ -45,6 +45,7 @@ def turned(quaternion):
 
 
 model = mujoco.MjModel.from_xml_string(facts["mjcf"])
+model.opt.timestep = facts["physics_timestep"]
 data, joints = mujoco.MjData(model), facts["joints"]
 first = sum(steps + 1 for steps in list(clips.values())[: list(clips).index(clip)])
 start = ask(np.zeros(size), first)

@@ -3,6 +3,7 @@
 import json
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -11,7 +12,7 @@ from torch import nn
 
 import torchrl_loco
 from torchrl_loco import cli
-from torchrl_loco.export import TOLERANCE, export_policy
+from torchrl_loco.export import TOLERANCE, export_policy, of_robot
 from torchrl_loco.policy import ObservationNorm, Policy
 
 INFO = {"task": "walker_stand", "protocol": "dm_control", "action_repeat": 2, "mean": 12.5}
@@ -74,8 +75,51 @@ def test_exported_policies_do_the_same(name, read, tmp_path):
     }
 
 
-def test_actions_without_bounds_have_none_in_the_file(tmp_path):
-    """The time between control steps is that of the training, so the class of the task need not be there."""
+class Pair(torchrl_loco.LocoEnv):
+    """Two bodies that would touch each other."""
+
+    model = """<mujoco><compiler autolimits="true"/><option timestep="0.004" integrator="implicitfast"/><worldbody>
+      <geom type="plane" size="0 0 1"/>
+      <body pos="0 0 0.5"><joint name="x" type="slide" axis="1 0 0" damping="1" actuatorfrcrange="-6 9"/>
+      <geom size="0.1"/></body>
+      <body pos="0.15 0 0.5"><joint name="y" type="slide" axis="1 0 0" damping="1"/><geom size="0.1"/></body>
+    </worldbody><actuator>
+      <motor joint="x" gear="3" ctrlrange="-1 1"/><position joint="y" kp="20" ctrlrange="-1 2" forcerange="-3 8"/>
+    </actuator></mujoco>"""
+    config = torchrl_loco.SimConfig(ctrl_dt=0.02, sim_dt=0.002, contacts="ground")
+
+    def observation(self, s):
+        return torch.cat([s.qpos, s.qvel], -1)
+
+    def reward(self, s):
+        return s.qpos[:, 0]
+
+
+class OtherWay(torchrl_loco.Go1Velocity):
+    """Its controls are not those of its facts, which are a class's above."""
+
+    def control(self, s, action):
+        return self.home(s) + 0.1 * action
+
+
+def test_facts_are_those_of_what_is_stepped(tmp_path):
+    """The time between control steps is that of the training, so the class of a task need not be there."""
+    info = {**INFO, "task": torchrl_loco.registry.task_name(Pair), "protocol": "playground"}
+    facts, _ = of_robot(Policy(nn.Sequential(ObservationNorm(4), nn.Linear(4, 2)), info))
+    assert (facts["force_limit"], facts["stiffness"]) == ([2.0, 3.0], [0.0, 20.0])
+    m = mujoco.MjModel.from_xml_string(facts["mjcf"])
+    data, env = mujoco.MjData(m), Pair(1, "cpu", seed=0, engine="mujoco")
+    td = env.reset()
+    data.qpos[:] = td["observation"][0, :2]
+    for _ in range(5):
+        td = env.step(td.set("action", torch.tensor([[1.0, -1.0]])))["next"]
+        data.ctrl[:] = facts["action_offset"] + np.array(facts["action_scale"]) * [1.0, -1.0]
+        mujoco.mj_step(m, data, 10)
+    np.testing.assert_allclose(data.qpos, td["observation"][0, :2], atol=1e-5)
+    size = sum(torchrl_loco.Go1Velocity(1, "cpu", seed=0).observation_layout["observation"].values())
+    info["task"] = torchrl_loco.registry.task_name(OtherWay)
+    facts, _ = of_robot(Policy(nn.Sequential(ObservationNorm(size), nn.Linear(size, 12)), info))
+    assert not {"action_offset", "action_scale"} & facts.keys()
     network = nn.Sequential(ObservationNorm(24), nn.Linear(24, 8), nn.ELU(0.5), nn.Linear(8, 6))
     with torch.no_grad():
         network[-1].bias.fill_(5.0)
@@ -106,6 +150,11 @@ def test_what_cannot_be_exported(tmp_path, monkeypatch):
     for name, message in {"x.tflite": "must end in one of .onnx, .pt2", "taken.pt2": "already exists"}.items():
         with pytest.raises(ValueError, match=message):
             export_policy(policy(), tmp_path / name)
+    narrow = Policy(nn.Sequential(ObservationNorm(23), nn.Linear(23, 6)), INFO)
+    with pytest.raises(
+        ValueError, match=r"observations of shape \(23,\) and 6 actions, walker_stand has \(24,\) and 6"
+    ):
+        export_policy(narrow, tmp_path / "x.pt2")
     with pytest.raises(TypeError, match="must begin with an ObservationNorm"):
         export_policy(Policy(nn.Sequential(nn.Linear(24, 6)), INFO), tmp_path / "x.pt2")
     monkeypatch.setitem(sys.modules, "onnx", None)

@@ -18,12 +18,14 @@ from torch import nn
 import torchrl_loco
 from torchrl_loco import storage
 from torchrl_loco.checks import check_output_file, check_packages
-from torchrl_loco.config import arguments_of
+from torchrl_loco.config import SimConfig, arguments_of
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.task import folder_of
 from torchrl_loco.policy import Policy, difference, random_observations
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
+from torchrl_loco.sim.corners import stand_on_corners
+from torchrl_loco.sim.simulation import integrator
 
 SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}  # formats and the suffixes of their files
 
@@ -56,7 +58,8 @@ def export_policy(policy: Policy, path: Path) -> float:
         The largest difference of an entry of an action from the policy's own, as a fraction of those above 1.
 
     Raises:
-        ValueError: the file exists, its folder does not, or its suffix is none of the valid ones.
+        ValueError: the file exists, its folder does not, its suffix is none of the valid ones, or the policy does not
+            fit its task.
         TypeError: the policy does not begin by normalising observations.
         ImportError: a package of the extra "onnx" is missing; the message says how to install it.
         RuntimeError: that is more than 1e-5, and than twice the policy's own rounding in float32; nothing is written.
@@ -204,23 +207,36 @@ def of_robot(policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
         The facts by name. ``observation``, names and sizes of its terms in their order, none where they have no names;
         ``history``, how many of the last ones are joined, the newest last; ``action_offset`` and ``action_scale``
         ``(nu,)``, by which the controls are ``offset + scale * action``, unless the task has another way;
-        ``actuators``, their names; ``joints``, those of the joints that they move, empty for a tendon; ``stiffness``,
-        ``damping`` and ``force_limit`` of position actuators, 0 and ``None`` for others; ``home``, the home pose
-        ``(nq,)``; ``physics_timestep`` of the training (s); ``mjcf``, the model as text, with six digits, unless it
-        needs further files; ``cases``, their control steps by name, if the task has any; and whatever else
-        :meth:`torchrl_loco.LocoEnv.facts` holds, such as ``velocity``. And the tables of the reference by name.
+        ``actuators``, their names; ``joints``, those of the joints that they move, empty for a tendon; ``stiffness``
+        and ``damping`` of position actuators, 0 for others, and ``force_limit`` of those that have one either way,
+        else ``None``, the lesser where they differ, all three before a gear; ``home``, the home pose ``(nq,)``;
+        ``physics_timestep`` of the training (s); ``mjcf``, the model as it is stepped, with its time step, integrator
+        and contacts, as text with six digits, unless it needs further files; ``cases``, their control steps by name, if
+        the task has any; and whatever else :meth:`torchrl_loco.LocoEnv.facts` holds, such as ``velocity``. And the
+        tables of the reference by name.
+
+    Raises:
+        ValueError: the task's observations or actions are not those of the policy.
     """
     if why_not(policy):
         return {}, {}
     cls = resolve(policy.info["task"])
-    spec = models.specification(cls.model, folder_of(cls))
-    m = spec.compile()
-    low, high = m.actuator_ctrlrange.T
     env = cls(
         1, "cpu", 0, policy.info["protocol"], **{**arguments_of(policy.info), "engine": "mujoco"}, compile_hooks=False
     )  # tells the terms
     terms, cases, reference = env.observation_layout.get(policy.in_keys[0], {}), env.cases(), dict(env.reference())
     env.close()
+    seen, layers = random_observations(policy.module, 1, 1.0), copy.deepcopy(policy.module).cpu()
+    sizes = tuple(seen.shape[1:]), layers(seen).shape[-1]
+    asked = tuple(env.observation_spec[policy.in_keys[0]].shape[1:]), env.action_spec.shape[-1]
+    if sizes != asked:
+        raise ValueError(
+            f"the policy has observations of shape {sizes[0]} and {sizes[1]} actions, {policy.info['task']} has "
+            f"{asked[0]} and {asked[1]}: it was edited since the training, or it is another task"
+        )
+    spec = _stepped(models.specification(cls.model, folder_of(cls)), env.config)
+    m = spec.compile()
+    low, high = m.actuator_ctrlrange.T
     scaled = {"action_offset": (0.5 * (low + high)).tolist(), "action_scale": (0.5 * (high - low)).tolist()}
     facts = {
         "observation": [{"term": name, "size": size} for name, size in terms.items()],
@@ -233,20 +249,42 @@ def of_robot(policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
         **({"cases": dict(cases)} if cases else {}),
         **cls.facts(m, policy.info),
     }
+    first = {name: next(k for k, kind in enumerate(cls.__mro__) if name in vars(kind)) for name in ("control", "facts")}
+    if first["control"] < first["facts"]:  # the facts are of the controls of a class above
+        facts = {name: fact for name, fact in facts.items() if name not in scaled}
     return facts, reference
+
+
+def _stepped(spec: mujoco.MjSpec, config: SimConfig) -> mujoco.MjSpec:
+    """Returns a model as an environment with these settings steps it."""
+    if config.solids_on_terrain == "spheres":
+        stand_on_corners(spec)
+    if config.contacts == "ground":
+        models.touch_ground_only(m := spec.compile())
+        for geom in spec.geoms:
+            geom.contype, geom.conaffinity = int(m.geom_contype[geom.id]), int(m.geom_conaffinity[geom.id])
+        for pair in spec.pairs:
+            pair.margin = float(m.pair_margin[pair.id])
+    spec.option.timestep, spec.option.integrator = config.sim_dt, integrator(config)
+    return spec
 
 
 def _actuators(m: mujoco.MjModel) -> dict[str, Any]:
     """Returns names, joints, gains (N m/rad, N m s/rad) and limits (N m) of a model's actuators."""
     of_joint = np.isin(m.actuator_trntype, (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)))
     servo = (m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)) & (m.actuator_biasprm[:, 1] < 0)
-    limited = m.actuator_forcelimited.astype(bool)
+    least = np.where(m.actuator_forcelimited[:, None], m.actuator_forcerange * [-1.0, 1.0], np.inf).min(axis=1)
+    for i in np.flatnonzero(of_joint):  # joints may have a limit, too
+        joint = m.joint(int(m.actuator_trnid[i, 0]))
+        if m.jnt_actfrclimited[joint.id] and m.actuator_gear[i, 0]:
+            of_gear = m.jnt_actfrcrange[joint.id] * [-1.0, 1.0] / abs(m.actuator_gear[i, 0])
+            least[i] = min(least[i], of_gear.min())
     return {
         "actuators": [m.actuator(i).name for i in range(m.nu)],
         "joints": [m.joint(int(m.actuator_trnid[i, 0])).name if of_joint[i] else "" for i in range(m.nu)],
         "stiffness": np.where(servo, -m.actuator_biasprm[:, 1], 0.0).tolist(),
-        "damping": np.where(servo, -m.actuator_biasprm[:, 2], 0.0).tolist(),
-        "force_limit": [float(m.actuator_forcerange[i, 1]) if limited[i] else None for i in range(m.nu)],
+        "damping": np.where(servo, 0.0 - m.actuator_biasprm[:, 2], 0.0).tolist(),
+        "force_limit": [float(limit) if np.isfinite(limit) else None for limit in least],
     }
 
 

@@ -20,8 +20,10 @@ from torchrl_loco.conditions import DEFAULT, PUSH, PUSH_EVERY, Conditions
 from torchrl_loco.config import arguments_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
+from torchrl_loco.envs.task import folder_of
 from torchrl_loco.envs.vary import Vary
 from torchrl_loco.registry import resolve
+from torchrl_loco.sim import models
 
 ENGINES = ("C MuJoCo", "training simulator")
 UNDISTURBED = Conditions(delay=(0, 0), noise=0.0, pushes=0.0)  # in which each case of a task is played once
@@ -185,6 +187,8 @@ def _worlds(
         ground = cls.model.geom("terrain") if isinstance(cls.model, mujoco.MjSpec) else None
         geoms = None if ground is None else r"(?!terrain(_\d+)?$).*"  # numbers of many boxes cannot vary
         settings["randomize"] = [Vary("geom_friction", *conditions.friction, of=geoms, how="set", once=True)]
+        if len(models.specification(cls.model, folder_of(cls)).pairs):  # which have a friction of their own
+            settings["randomize"].append(Vary("pair_friction", *conditions.friction, how="set", once=True))
     if engine == ENGINES[0]:
         device, settings["engine"] = "cpu", "mujoco"
     env = cls(
@@ -260,7 +264,9 @@ class Outcome:
 
 def check_alone(cls: type[LocoEnv], conditions: Conditions) -> None:
     """Checks that C MuJoCo alone can tell whether a policy holds."""
-    if conditions.min_return is None and not {"falls", "return"} & cls.holds.keys():
+    if conditions.min_return is not None:
+        raise ValueError("min_return is a share of the return in the training simulator: it cannot be asked for alone")
+    if conditions.max_falls is None and not {"falls", "return"} & cls.holds.keys():
         raise ValueError(f"{cls.__name__} is held to its return in the training simulator: it cannot be played alone")
 
 

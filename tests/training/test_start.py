@@ -144,7 +144,7 @@ def test_objects_are_handed_in_again_where_a_run_goes_on(tmp_path, capsys):
 
 def test_an_environment_that_is_made_already(tmp_path):
     """Its worlds, protocol, settings and transforms are used, and it stays open."""
-    base = torchrl_loco.make("walker_stand", 4, "cpu", seed=7, protocol="dm_control", episode_length=16)
+    base = torchrl_loco.make("walker_stand", 4, "cpu", seed=7, protocol="dm_control", episode_length=16, sim_dt=0.005)
     env = torchrl_loco.TransformedEnv(base, StepCounter())
     env.append_transform(ObservationNorm(loc=0.0, scale=0.5, in_keys=["observation"], standard_normal=False))
     settings = {name: value for name, value in QUICK.items() if name not in ("num_envs", "action_repeat")}
@@ -153,7 +153,10 @@ def test_an_environment_that_is_made_already(tmp_path):
     assert (config.task, config.seed, config.protocol) == ("walker_stand", 7, "dm_control")
     assert (config.num_envs, config.episode_length, config.action_repeat) == (4, 16, 1)
     assert run.given == ("env",)
+    assert config.of_env == {"sim_dt": 0.005}
     assert not env.is_closed
+    with pytest.raises(ValueError, match=r"was begun with sim=\{'sim_dt': 0.005\}, the environment has \{\}"):
+        train(torchrl_loco.make("walker_stand", 4, "cpu", seed=7, protocol="dm_control"), resume=run)
     metrics = run.read_metrics()
     assert metrics["episodes"][-1] == 4 * 64 // 16  # of worlds that begin together, the first counts too
     assert set(metrics["episode_length"][1:]) == {16.0}

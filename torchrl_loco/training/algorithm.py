@@ -360,7 +360,7 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
     if folder.is_dir() and (is_checkpoint or RunFolder(folder).has_checkpoint):
         run = RunFolder(folder)
         settings = run.load_config(), algorithm.config
-        if algorithm.spaces.pixels:
+        if all(each.from_pixels for each in settings):
             _check_strides(source, *(each.strides for each in settings))
         networks = run.load_checkpoint(device, source if is_checkpoint else None)["algorithm"]["networks"]
         try:

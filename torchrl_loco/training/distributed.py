@@ -76,7 +76,7 @@ def is_restart() -> bool:
 
 def is_orphan() -> bool:
     """Returns whether the process that started this rank is gone, as by SIGKILL: nobody would end it then."""
-    return ranks() > 1 and os.getppid() != _parent
+    return ranks() > 1 and _parent not in (0, os.getppid())
 
 
 def own_device(device: str) -> str:

@@ -10,12 +10,13 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
+from torchrl_loco.config import sim_config
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.registry import check_is_run, is_place, task_name
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
-from torchrl_loco.training.config import CONFIGS, OF_PIXELS, TrainingConfig, check_setting, preset, tuning_note
+from torchrl_loco.training.config import CONFIGS, OF_PIXELS, Sim, TrainingConfig, check_setting, preset, tuning_note
 from torchrl_loco.training.environments import Given, unwrapped
 from torchrl_loco.training.run_folder import RunFolder
 from torchrl_loco.training.trainer import NothingToLearnError, Trainer
@@ -112,6 +113,12 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
     if twice := [name for name in ("options", *base.options) if name in settings]:
         raise ValueError(f"{', '.join(twice)}: options are those of the environment, leave them out")
     own |= {"options": base.options_given} if base.options_given else {}
+    as_made = sim_config(type(base).config, base.protocol, base.num_envs, {})
+    names = {field.name for field in dataclasses.fields(Sim)} - {"naconmax"}  # which is for the number of its worlds
+    if sim := {name: new for name in sorted(names) if (new := getattr(base.config, name)) != getattr(as_made, name)}:
+        own["sim"] = sim
+    if type(base).randomize and not base.randomize:
+        own["randomize"] = False
     seen = base.pixels if "pixels" in env.observation_spec.keys() else None  # noqa: SIM118, else no network sees them
     if not seen and (needless := [name for name in ("from_pixels", *OF_PIXELS) if settings.get(name)]):
         raise ValueError(
@@ -128,8 +135,9 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
 def _check_same(run: RunFolder, env: EnvBase) -> None:
     """Checks that a run that is resumed goes on in an environment as that in which it was begun."""
     stored = dataclasses.asdict(run.load_config())
-    found = {"options": {}, **_settings_of(env, {})}
-    for name in ("protocol", "options", "from_pixels", "camera", "size", "frame_stack"):
+    stored["sim"] = {name: value for name, value in stored["sim"].items() if value is not None}
+    found = {"options": {}, "sim": {}, **_settings_of(env, {})}
+    for name in ("protocol", "options", "sim", "from_pixels", "camera", "size", "frame_stack"):
         if name in found and found[name] != stored[name]:
             raise ValueError(f"{run.path} was begun with {name}={stored[name]!r}, the environment has {found[name]!r}")
 

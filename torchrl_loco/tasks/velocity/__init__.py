@@ -397,7 +397,9 @@ class Velocity(Robot):
 
 
 def steps_of_training(info: Mapping[str, Any]) -> int:
-    """Returns after how many control steps of each world a policy was saved."""
+    """Returns after how many control steps of each world a policy was saved; of earlier revisions, on one GPU."""
+    if trained := info.get("stage", {}).get("memory", {}).get("trained"):
+        return int(min(trained))
     return int(info.get("frames", 0)) // int(info.get("num_envs", 1))
 
 
