@@ -344,6 +344,8 @@ def test_a_name_that_is_almost_a_hook_is_said():
 
     with pytest.warns(UserWarning, match="Falls defines terminate, which nothing reads: did you mean terminated?"):
         Falls.check_class()
+    with pytest.warns(UserWarning, match="Heavy defines weigths, which nothing reads: did you mean weights?"):
+        type("Heavy", (torchrl_loco.Go1Velocity,), {"weigths": {}}).check_class()
 
 
 def test_wrong_attributes_are_named(monkeypatch):

@@ -222,6 +222,11 @@ def test_what_a_subclass_sets_stays_but_for_the_ground_under_its_robot(tmp_path)
     class Long(loco.Go1Rough):
         config = dataclasses.replace(loco.Go1Velocity.config, episode_length=88)
 
+    class Wide:  # mixed in
+        ground = terrain.Terrain({"hill": rough.hill}, rows=2, columns=2, border=9.0)
+
+    mixed = type("Mixed", (Wide, Hills), {})
+    assert mixed.model.hfields[0].size[0] == max(Wide.ground.half) != max(Hills.ground.half)
     assert Long.config.solids_on_terrain == "spheres"
     with pytest.raises(TypeError, match="Footless must set feet"):
         type("Footless", (rough.Rough,), {"model": loco.Go1Velocity.model})

@@ -270,6 +270,8 @@ def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_p
     with pytest.raises(ValueError, match="unknown argument 'motions', did you mean 'motion'"):
         loco.make("h1_tracking", 1, "cpu", 0, motions=short)
     assert loco.make("h1_tracking", 1, "cpu", 0, future=3, **PLAIN).future == (3,)
+    sees = type("Sees", (loco.H1Tracking,), {"future": (1, 2)})  # as a class's attribute
+    assert (sees(1, "cpu", 0, **PLAIN).future, sees(1, "cpu", 0, future=(), **PLAIN).future) == ((1, 2), ())
     for future in ((-1,), (0,), ("a",), 1.5):
         with pytest.raises(ValueError, match="future must be whole numbers"):
             loco.make("h1_tracking", 1, "cpu", 0, future=future)

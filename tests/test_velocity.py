@@ -548,6 +548,8 @@ def test_a_table_makes_a_task_of_a_users_robot(caplog):
 
 def test_commands_stay_within_a_curriculum_of_ones_own():
     narrow = {0: ((-1.0, 0.2), (-0.1, 0.1), (-0.3, 0.0))}
+    mixed = type("Mixed", (type("Slow", (), {"curriculum": narrow}), Table), {})
+    assert [*mixed.command_ranges["command"].values()] == [*narrow[0]]
     # A wall is no floor.
     wall = '<geom type="plane" size="1 1 1" pos="9 0 1" euler="0 -90 0"/><body name="trunk"'
     walled = Table.model.replace('<body name="trunk"', wall)

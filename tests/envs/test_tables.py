@@ -434,6 +434,7 @@ def test_built_in_starts_and_controls_can_be_built_on():
         ),
         ({"update": lambda self, s: {"i": s.terminated}}, ValueError, r"s.terminated is not known in update\(\)"),
         ({"metrics": lambda self, s: {"m": s.qpos}}, ValueError, r"metrics\['m'\] must return shape \(3,\)"),
+        ({"events": lambda self, s: None}, TypeError, "events must return new rows by name, got None"),
         (
             {"constants": {"a": [1.0]}, "update": lambda self, s: s.a.add_(1.0) and {}},
             ValueError,

@@ -513,3 +513,7 @@ def test_as_the_design_has_it():
     gear = env.model_value("actuator_gear")[:, :, 0] / torch.tensor(env.mj_model.actuator_gear[:, 0]).float()
     assert len(gear.unique()) == 8 * 21
     assert (gear.min() >= 0.9, gear.max() <= 1.1001) == (True, True)
+    stiff = loco.Go1Velocity(3, "cpu", 0, play=True, randomize=[loco.Vary("kp", 0.5, 2.0)])
+    stiff.step(stiff.reset().set("action", torch.ones(3, 12)))
+    assert len(stiff.model_value("actuator_gainprm")[:, 0, 0].unique()) == 3
+    assert len(stiff.sim.ctrl[:, 0].unique()) == 1  # an action asks for the same position all the same

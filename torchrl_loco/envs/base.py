@@ -36,7 +36,7 @@ from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.pixels import Pictures, Pixels, Seen
 from torchrl_loco.envs.resets import QuickResets, rows_of
 from torchrl_loco.envs.state import without_state
-from torchrl_loco.envs.task import BOUNDED, Task, folder_of, replaced_options
+from torchrl_loco.envs.task import BOUNDED, Task, folder_of, options_of_class, replaced_options
 from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.vary import Vary, check_randomize
 from torchrl_loco.sim import models
@@ -155,7 +155,7 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         device = check_device(device)
         seed = None if seed is None else check_int("seed", seed, SEED)
         given = {name: config.pop(name) for name in self.options if name in config}
-        options_given = self.checked_options(given)
+        options_given = self.checked_options({**options_of_class(type(self)), **given})
         own = {name: options_given.get(name, default) for name, (default, _) in self.options.items()}
         arguments = [*list(inspect.signature(LocoEnv.__init__).parameters)[1:-1], *own]
         of_class = type(self).config

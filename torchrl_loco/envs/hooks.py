@@ -327,9 +327,9 @@ class Hooks:
         self, hook: str, arrays: Arrays, known: Mapping[str, Entry], *, by_world: bool = True
     ) -> dict[str, torch.Tensor]:
         """Returns the new rows that a hook returns, if it is the task's own, by name, each of full shape."""
-        rows = self._call(hook, arrays, steps=0 if hook == "begin" else 1) if hook in self.own else None
-        if rows is None:
+        if hook not in self.own:
             return {}
+        rows = self._call(hook, arrays, steps=0 if hook == "begin" else 1)
         if not isinstance(rows, Mapping):
             raise TypeError(f"{self._title}.{hook} must return new rows by name, got {_kind(rows)}")
         first, kind = ([self.catalog.num_envs], "memory") if by_world else ([], "shared")

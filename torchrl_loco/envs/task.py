@@ -381,6 +381,17 @@ class Task:
         """
 
 
+def options_of_class(cls: type[Task]) -> dict[str, Any]:
+    """Returns values of options that classes set as attributes, below the one that declares the option."""
+    found = {}
+    for name in cls.options:
+        *_, declares = (base for base in cls.__mro__ if name in vars(base).get("options", {}))
+        below = cls.__mro__[: cls.__mro__.index(declares)]
+        if values := [vars(base)[name] for base in below if name in vars(base)]:
+            found[name] = values[0]
+    return found
+
+
 def own_hooks(cls: type) -> frozenset[str]:
     """Returns the hooks that are plain torch in a class: of each, the most derived definition wins, torch or Warp."""
     found = set()
@@ -447,7 +458,8 @@ def _names_of(cls: type) -> set[str]:
 
 def _warn_of_misspelt_names(cls: type[Task]) -> None:
     """Warns of what a class defines by a name that is almost that of a hook or an attribute: nobody would call it."""
-    meant = {*HOOKS, *Task.__annotations__}
+    ours = [base for base in cls.__mro__ if base.__module__.startswith("torchrl_loco.tasks")]
+    meant = {*HOOKS, *Task.__annotations__, *(name for base in ours for name in vars(base).get("__annotations__", {}))}
     for base in cls.__mro__[: cls.__mro__.index(Task)]:
         if base.__module__.startswith("torchrl_loco."):
             continue

@@ -206,7 +206,10 @@ class View:
 
     @property
     def time(self) -> torch.Tensor:
-        """Time since the episode's start (s), ``(num_envs,)``: control steps times :attr:`dt`."""
+        """Time of the episode's limit that is gone (s), ``(num_envs,)``: control steps times :attr:`dt`.
+
+        That is the time since its start, but in first episodes that are staggered, as those of a training.
+        """
         return (self._arrays["elapsed_steps"] + self._steps).float() * self._catalog.ctrl_dt
 
     @property

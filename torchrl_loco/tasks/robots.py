@@ -136,9 +136,9 @@ class Robot(LocoEnv):
         """Returns the targets of the joints (rad): the home pose and a multiple of the action."""
         if self.action_scale is not None:
             return self.home(s) + self.action_scale * action
-        return (
-            self.home(s) + 0.25 * s.model("actuator_forcerange")[..., 1] / s.model("actuator_gainprm")[..., 0] * action
-        )
+        m = self.mj_model  # an action means the same in all worlds, whatever their gains are
+        limit, gain = (np.float32(numbers) for numbers in (m.actuator_forcerange[:, 1], m.actuator_gainprm[:, 0]))
+        return self.home(s) + torch.tensor((np.float32(0.25) * limit / gain).tolist(), device=s.device) * action
 
 
 def some(names: Sequence[str], which: np.ndarray) -> str:

@@ -192,7 +192,8 @@ class Velocity(Robot):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Lets sliders have the commands of its own curriculum."""
         super().__init_subclass__(**kwargs)
-        if "curriculum" in vars(cls):
+        owner = next(base for base in cls.__mro__ if "curriculum" in vars(base))
+        if owner is cls or not issubclass(owner, Velocity):  # which is mixed in
             commands.check(cls.curriculum)
             cls.command_ranges = {**cls.command_ranges, "command": commands.first(cls.curriculum)}
 
