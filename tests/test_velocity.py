@@ -548,6 +548,10 @@ def test_a_table_makes_a_task_of_a_users_robot(caplog):
 
 def test_commands_stay_within_a_curriculum_of_ones_own():
     narrow = {0: ((-1.0, 0.2), (-0.1, 0.1), (-0.3, 0.0))}
+    wider = {**narrow, 40: ((-2.0, 2.0), (-1.0, 1.0), (-1.0, 1.0))}
+    info = {"frames": 8 * 48, "num_envs": 8, "stage": {"memory": {"trained": [24.0]}}}  # by two ranks
+    low, _ = velocity.commands.reached(wider, velocity.steps_of_training(info))
+    assert [*low] == [-1.0, -0.1, -0.3]
     mixed = type("Mixed", (type("Slow", (), {"curriculum": narrow}), Table), {})
     assert [*mixed.command_ranges["command"].values()] == [*narrow[0]]
     # A wall is no floor.

@@ -132,3 +132,7 @@ def test_the_run_of_a_launch(tmp_path, monkeypatch):
     assert distributed.is_restart()
     monkeypatch.setattr(RunFolder, "is_finished", True)
     assert run_to_end(config, Given()).path == own.path  # which is not trained again
+    monkeypatch.setattr(distributed, "ranks", lambda: 2)
+    for parent, is_orphan in ((os.getppid(), False), (os.getppid() + 1, True), (0, False)):  # 0: a user's own group
+        monkeypatch.setattr(distributed, "_parent", parent)
+        assert distributed.is_orphan() == is_orphan
