@@ -53,6 +53,9 @@ words, text = session.get_modelmeta().custom_metadata_map, ("task", "protocol", 
 facts = {name: word if name in text else json.loads(word) for name, word in words.items()}
 if "velocity" not in facts:
     parser.error(f"{args.file} holds no policy that follows a velocity command, such as one of go1_velocity")
+terms = {entry["term"] for entry in facts["observation"]}
+if "action_scale" not in facts or "mjcf" not in facts or "scan" in terms:
+    parser.error(f"{args.file} is of a robot whose controls, model or scan of the ground need its own program")
 offset, scale = np.array(facts["action_offset"]), np.array(facts["action_scale"])
 low, high = (facts["velocity"][f"command_{end}"] for end in ("low", "high"))
 if not ((np.array(args.command) >= low) & (np.array(args.command) <= high)).all():  # nor is NaN

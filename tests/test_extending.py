@@ -1,5 +1,6 @@
 """A body outside the package: the worked example against C MuJoCo, and what is reported about broken plug-ins."""
 
+import dataclasses
 import os
 import shutil
 import subprocess
@@ -346,6 +347,9 @@ def test_a_name_that_is_almost_a_hook_is_said():
         Falls.check_class()
     with pytest.warns(UserWarning, match="Heavy defines weigths, which nothing reads: did you mean weights?"):
         type("Heavy", (torchrl_loco.Go1Velocity,), {"weigths": {}}).check_class()
+    config = dataclasses.replace(torchrl_loco.Go1Velocity.config, episode_length=200)
+    with pytest.warns(UserWarning, match="Brief.config has episode_length=200, but the class Velocity sets 1000"):
+        type("Brief", (torchrl_loco.Go1Velocity,), {"config": config}).check_class()
 
 
 def test_wrong_attributes_are_named(monkeypatch):

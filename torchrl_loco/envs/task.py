@@ -320,6 +320,7 @@ class Task:
             raise TypeError(f"{name} must set model: see help(torchrl_loco.LocoEnv)")
         if not isinstance(cls.config, SimConfig):
             raise TypeError(f"{name}.config must be a torchrl_loco.SimConfig, got {cls.config!r}")
+        _warn_of_a_length_that_is_not_used(cls)
         if not isinstance(cls.model, str | Path | mujoco.MjSpec):
             raise TypeError(f"{name}.model must be a path, MJCF text or a mujoco.MjSpec, got {cls.model!r}")
         lacking = [hook for hook in ("reward", "observation") if hook not in own]
@@ -468,6 +469,18 @@ def _warn_of_misspelt_names(cls: type[Task]) -> None:
             near = difflib.get_close_matches(name, meant, n=1, cutoff=0.85)
             if near:
                 warn(f"torchrl_loco: {base.__name__} defines {name}, which nothing reads: did you mean {near[0]}?")
+
+
+def _warn_of_a_length_that_is_not_used(cls: type[Task]) -> None:
+    """Warns of an episode length in a config that that of a class above hides."""
+    order: tuple[Any, ...] = cls.__mro__
+    above = next((k for k, base in enumerate(order) if vars(base).get("episode_length") is not None), 0)
+    configs = [vars(base)["config"] for base in order[:above] if "config" in vars(base)]
+    if configs and configs[0].episode_length != order[above].config.episode_length:
+        warn(
+            f"torchrl_loco: {cls.__name__}.config has episode_length={configs[0].episode_length}, but the class "
+            f"{order[above].__name__} sets {cls.episode_length}, which counts: set episode_length in {cls.__name__}"
+        )
 
 
 def folder_of(cls: type, attribute: str = "model") -> Path | None:
