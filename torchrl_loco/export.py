@@ -20,7 +20,7 @@ from torchrl_loco import storage
 from torchrl_loco.checks import check_output_file, check_packages
 from torchrl_loco.config import SimConfig, arguments_of
 from torchrl_loco.envs.hooks import own_hooks
-from torchrl_loco.envs.task import folder_of
+from torchrl_loco.envs.task import definer, folder_of
 from torchrl_loco.policy import Policy, difference, random_observations
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
@@ -249,8 +249,8 @@ def of_robot(policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
         **({"cases": dict(cases)} if cases else {}),
         **cls.facts(m, policy.info),
     }
-    first = {name: next(k for k, kind in enumerate(cls.__mro__) if name in vars(kind)) for name in ("control", "facts")}
-    if first["control"] < first["facts"]:  # the facts are of the controls of a class above
+    control, told = (cls.__mro__.index(definer(cls, name)) for name in ("control", "facts"))
+    if control < told:  # the facts are of the controls of a class above
         facts = {name: fact for name, fact in facts.items() if name not in scaled}
     return facts, reference
 

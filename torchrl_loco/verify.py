@@ -282,7 +282,7 @@ def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -
     pushes = _pushes(env, generator, steps, float(conditions.pushes or 0.0))
     is_fixed = _fix_commands(env, exported.facts.get("info", {}))
     env.set_seed(conditions.seed)  # from the first episode on, in both engines
-    set_stage(env, exported.facts.get("info", {}))
+    set_stage(env, env.stage_of(exported.facts.get("info", {})))
     td = env.reset()
     behind = torch.from_numpy(delay).to(env.device)
     if "delay" in env.world.memory and env.world.memory["delay"].ndim == 1:  # the task's hooks hold its actions back

@@ -415,9 +415,9 @@ class WorldAccess(EnvBase):
         return super().load_state_dict(state_dict, strict=strict, **kwargs)
 
 
-def set_stage(env: Any, info: Mapping[str, Any]) -> None:
-    """Lets episodes begin at the stage that a policy has reached, unless it is of another task, which the log says."""
+def set_stage(env: Any, stage: Mapping[str, Any]) -> None:
+    """Lets episodes begin at a stage of the curriculum, unless it is of another task, which the log says."""
     try:
-        env.set_stage(env.stage_of(info))
+        env.set_stage(stage)
     except ValueError as error:
         logging.getLogger("torchrl_loco").warning("episodes begin at the first stage of the curriculum: %s", error)

@@ -483,9 +483,14 @@ def _warn_of_a_length_that_is_not_used(cls: type[Task]) -> None:
         )
 
 
+def definer(cls: type, attribute: str) -> type:
+    """Returns which class of its method resolution order an attribute of a class is from."""
+    return next(base for base in cls.__mro__ if attribute in vars(base))
+
+
 def folder_of(cls: type, attribute: str = "model") -> Path | None:
     """Returns the folder of the file that sets a class's model, or another path: relative ones are meant from there."""
-    base = next(base for base in cls.__mro__ if attribute in vars(base))
+    base = definer(cls, attribute)
     file = getattr(sys.modules.get(base.__module__), "__file__", None)
     return Path(file).parent if file else None
 
@@ -495,8 +500,7 @@ def replaced_options(cls: type[Task], m: mujoco.MjModel, config: SimConfig) -> d
 
     Of defaults, which an MJCF may not have named, it is the damping alone, where there is any.
     """
-    owners = [next(each for each in cls.__mro__ if name in vars(each)) for name in ("model", "config")]
-    if all(owner.__module__.startswith("torchrl_loco.tasks") for owner in owners):
+    if all(definer(cls, name).__module__.startswith("torchrl_loco.tasks") for name in ("model", "config")):
         return {}
     of_model, default = options_of(m.opt), options_of(mujoco.MjSpec().option)
     if config.integrator != "euler" or not m.dof_damping.any():

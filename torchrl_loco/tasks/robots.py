@@ -11,6 +11,7 @@ import torch
 from torchrl_loco.checks import Interval, check_float, check_int
 from torchrl_loco.conditions import PUSH_EVERY
 from torchrl_loco.envs.base import LocoEnv
+from torchrl_loco.envs.task import definer
 from torchrl_loco.envs.vary import Vary
 from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
@@ -49,7 +50,7 @@ class Robot(LocoEnv):
             ValueError: ``verify`` would ask for more than :attr:`longest_delay`; ``action_scale`` is not positive.
         """
         if missing := [name for name in cls.table if not hasattr(cls, name)]:
-            of = next(base for base in cls.__mro__ if "table" in vars(base)).__name__
+            of = definer(cls, "table").__name__
             raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.{of})")
         super().check_class()
         if cls.action_scale is not None:

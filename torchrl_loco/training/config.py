@@ -113,7 +113,7 @@ class TrainingConfig:
     frame_stack: int = 3
     """How many pictures the actor sees at once."""
     strides: tuple[int, ...] = (2, 1, 1, 1)
-    """Stride of each convolution of the pixels."""
+    """Strides of the convolutions of the encoder of pixels, one for each; by default DrQ-v2's."""
     random_shift: int = within(COUNT, 0)
     """Pixels by which pictures are moved at random in gradient steps, at most and either way."""
     critic_from_pixels: bool = False

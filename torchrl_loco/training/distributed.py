@@ -24,8 +24,6 @@ TIMEOUT = datetime.timedelta(hours=2)
 """For how long a rank waits for another. Rank 0 evaluates and records alone; a rank that dies is noticed at once."""
 
 GRACE = 5.0  # seconds for which a rank that lost another one stays alive, so that torchrun sees first which one died
-
-
 PATIENCE = 600  # seconds for which ranks that are asked to end may still update, evaluate and write a checkpoint
 
 _joins = 0  # how often this process joined others
@@ -61,7 +59,7 @@ def _connected() -> bool:
 def launch_id() -> str | None:
     """Returns a name of the launch by torchrun that stays the same when it restarts its processes, if there is one.
 
-    A script may train several times: the name is that of the training, too.
+    A script may train several times: each training has a name of its own.
     """
     of = os.environ.get("TORCHELASTIC_RUN_ID")
     if of == "none":  # torchrun's default; the process that starts and restarts this one is unique on its machine

@@ -222,7 +222,7 @@ def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: 
     info = policy.info
     place = resolve(info["task"]), num_envs, device, seed, info["protocol"]
     env = make(*place, **{**arguments_of(info), "world_offset": 0, **settings})
-    set_stage(env, info)
+    set_stage(env, env.stage_of(info))
     return env
 
 

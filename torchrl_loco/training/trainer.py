@@ -17,6 +17,7 @@ from tqdm.auto import tqdm
 
 from torchrl_loco.checks import check_device
 from torchrl_loco.collector import RolloutCollector
+from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.imagined import STATE
 from torchrl_loco.policy import Policy
 from torchrl_loco.sim.simulation import check_memory
@@ -282,19 +283,21 @@ class Trainer:
         reward = after["reward"].mean() / config.action_repeat
         spread, ends = after["reward"].max() - after["reward"].min(), after["done"].float().mean()
         of_env = {f"reward/{name}": after["reward_terms", name].mean() / config.action_repeat for name in self._terms}
-        told = [after["metrics", name] for name in self._base.metric_names]
-        sums = [part for each in told for part in (each.nansum(), (~each.isnan()).float().sum())]
+        told = {f"metric/{name}": after["metrics", name] for name in self._base.metric_names}
+        of_env |= {name: values.nansum() for name, values in told.items()}
+        counts = [(~values.isnan()).float().sum() for values in told.values()]
         non_finite = self._base.health()["total", "non_finite"]  # before a batch that is collected ahead changes it
-        numbers = torch.cat([ended, torch.stack([non_finite, spread, ends, reward, *sums, *of_env.values()])])
+        numbers = torch.cat([ended, torch.stack([non_finite, spread, ends, reward, *counts, *of_env.values()])])
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
         self._ahead = self._collected_ahead()
         numbers = torch.cat([numbers, metrics])
         means = distributed.mean_of_ranks(numbers).tolist()
         self.episodes.take(*(mean * distributed.ranks() for mean in means[:3]))
         non_finite, spread, ends, mean_reward, *means = means[3:]
-        parts, means = means[: len(sums)], means[len(sums) :]  # a mean of means would count some steps more than others
-        parts = [total / count if count else math.nan for total, count in zip(parts[::2], parts[1::2], strict=True)]
-        means[len(of_env) : len(of_env)] = parts
+        counted, means = means[: len(counts)], means[len(counts) :]
+        row = dict(zip((*of_env, *algorithm.metric_names, *algorithm.batch_metric_names), means, strict=True))
+        for name, count in zip(told, counted, strict=True):  # over all ranks: each may have another number of steps
+            row[name] = row[name] / count if count else math.nan
         before, self._non_finite = self._non_finite, round(non_finite * distributed.ranks())
         if ends == 1.0 and self._non_finite - before >= config.frames_per_batch * distributed.ranks():
             raise NothingToLearnError(
@@ -307,15 +310,13 @@ class Trainer:
         self.iteration += 1
         seconds = time.perf_counter() - start
         self.seconds += seconds
-        of_metrics = [f"metric/{name}" for name in self._base.metric_names]
-        names = *of_env, *of_metrics, *algorithm.metric_names, *algorithm.batch_metric_names
         return {
             "iteration": self.iteration,
             "frames": self.frames,
             "seconds": round(self.seconds, 3),
             "frames_per_second": round(self.frames_per_iteration / seconds, 1),
             **self.episodes.metrics(mean_reward, self._base.config.episode_length),
-            **{name: round(value, 6) for name, value in zip(names, means, strict=True)},
+            **{name: round(value, 6) for name, value in row.items()},
         }
 
     def _collect(self) -> tuple[TensorDictBase, torch.Tensor]:
@@ -493,10 +494,7 @@ class Trainer:
             self.episodes.load_state_dict(checkpoint["episodes"], running=False)
             learnt = (checkpoint, *checkpoint.get("further_ranks", ()))[rank % before]
             self.collector.load_state_dict({"transforms": learnt["collector"].get("transforms", {})})
-            try:
-                self._base.set_stage(checkpoint.get("stage", {}))
-            except ValueError as error:  # of a task that was edited
-                logging.getLogger("torchrl_loco").warning("episodes begin at the curriculum's first stage: %s", error)
+            set_stage(self._base, checkpoint.get("stage", {}))
             return
         own = checkpoint if rank == 0 else checkpoint["further_ranks"][rank - 1]
         self.collector.load_state_dict(own["collector"])

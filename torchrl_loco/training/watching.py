@@ -40,7 +40,7 @@ class Watched:
             refuse_transforms(policy)
         else:
             policy = last_policy(self._run, self._device)
-        set_stage(self.env, policy.info)
+        set_stage(self.env, self.env.stage_of(policy.info))
         return policy
 
 

@@ -113,14 +113,13 @@ class Rough(Velocity):
         super().__init_subclass__(**kwargs)
         order, above = cls.__mro__, [base for base in cls.__mro__[1:] if "model" in vars(base)]
         laid = next((base for base in above if issubclass(base, Rough)), None)
-        is_laid = laid is not None
         # What is its own, or that of classes without a ground that are mixed in.
         given = {name for base in order[: order.index(laid) if laid else 1] for name in vars(base)}
         if "model" not in given and not above and not hasattr(cls, "robot"):
             return  # what several robots share
-        if "config" in given or not is_laid:
+        if "config" in given or laid is None:
             cls.config = dataclasses.replace(cls.config, solids_on_terrain="spheres")
-        if is_laid and given.isdisjoint(("ground", "robot", "model", "feet")):
+        if laid and given.isdisjoint(("ground", "robot", "model", "feet")):
             return
         if not hasattr(cls, "feet"):
             raise TypeError(f"{cls.__name__} must set feet: see help(torchrl_loco.Velocity)")

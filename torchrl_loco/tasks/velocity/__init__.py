@@ -15,6 +15,7 @@ from torchrl_loco.checks import NOT_NEGATIVE, Interval, check_float, check_int
 from torchrl_loco.conditions import PUSH, PUSH_EVERY
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.names import Elements
+from torchrl_loco.envs.task import definer
 from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
 from torchrl_loco.sim.compiled.collision.kinds import PLANE
@@ -192,7 +193,7 @@ class Velocity(Robot):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Lets sliders have the commands of its own curriculum."""
         super().__init_subclass__(**kwargs)
-        owner = next(base for base in cls.__mro__ if "curriculum" in vars(base))
+        owner = definer(cls, "curriculum")
         if owner is cls or not issubclass(owner, Velocity):  # which is mixed in
             commands.check(cls.curriculum)
             cls.command_ranges = {**cls.command_ranges, "command": commands.first(cls.curriculum)}
