@@ -176,9 +176,9 @@ def test_signals_that_are_left_alone():
 
 
 def test_the_command_says_how_to_continue(tmp_path, monkeypatch, capsys):
-    """Ctrl-C, or SIGTERM, by which a cluster asks a process to end."""
+    """Ctrl-C, SIGTERM, by which a cluster asks a process to end, or SIGHUP, by which a terminal does."""
     update = Algorithm.update
-    for kind in (signal.SIGINT, signal.SIGTERM):
+    for kind in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         run = made(tmp_path)
         press = lambda *args, kind=kind, **more: signal.raise_signal(kind) or update(*args, **more)  # noqa: E731
         monkeypatch.setattr(Algorithm, "update", press)

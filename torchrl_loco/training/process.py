@@ -1,4 +1,4 @@
-"""A process that trains: Ctrl-C and SIGTERM end its run after an update, and it has its folder to itself."""
+"""A process that trains: signals to end it wait for an update, and it has its folder to itself."""
 
 import contextlib
 import fcntl
@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # signals by which a process is asked to end
 _held: dict[Path, int] = {}  # file descriptors of the locks of this process, by folder
 
 
@@ -54,7 +55,7 @@ def unlock(folder: Path) -> None:
 
 @contextlib.contextmanager
 def interruptible(notice: str = "") -> Iterator[Callable[[], bool]]:
-    """Yields a function that tells whether SIGINT or SIGTERM has arrived.
+    """Yields a function that tells whether SIGINT, SIGTERM or SIGHUP, which a closed terminal sends, has arrived.
 
     The first signal does not stop the process; it prints ``notice`` on the standard error. The second one does, by a
     KeyboardInterrupt if it is SIGINT, also where a library turns that into an error of its own.
@@ -66,7 +67,7 @@ def interruptible(notice: str = "") -> Iterator[Callable[[], bool]]:
     """
     pressed, again = threading.Event(), threading.Event()
     in_main = threading.current_thread() is threading.main_thread()
-    handlers = {kind: signal.getsignal(kind) for kind in (signal.SIGINT, signal.SIGTERM) if in_main}
+    handlers = {kind: signal.getsignal(kind) for kind in ENDS if in_main}
     handlers = {kind: handler for kind, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
 
     def restore() -> None:
@@ -79,7 +80,8 @@ def interruptible(notice: str = "") -> Iterator[Callable[[], bool]]:
         if handlers.get(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, press_again)
         if notice:
-            os.write(2, f"\n{notice}\n".encode())  # print could be called while it is printing
+            with contextlib.suppress(OSError):  # the terminal may be closed; print could be called while it is printing
+                os.write(2, f"\n{notice}\n".encode())
 
     def press_again(*_: object) -> None:
         again.set()

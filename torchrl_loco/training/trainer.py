@@ -163,11 +163,11 @@ class Trainer:
         """Trains to the last frame, then evaluates the best policy, plots the learning curve and records a video.
 
         A progress bar shows the return (see :class:`torchrl_loco.training.episodes.Episodes`) and the frames per
-        second. At Ctrl-C or SIGTERM the iteration is finished and a checkpoint written before KeyboardInterrupt is
-        raised; a second one stops at once.
+        second. At Ctrl-C, SIGTERM or SIGHUP, which a terminal sends when it is closed, the iteration is finished and a
+        checkpoint written before KeyboardInterrupt is raised; a second one stops at once.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C or SIGTERM.
+            KeyboardInterrupt: one of these signals.
             OSError: a logger cannot be opened, or another process is training the run.
         """
         if distributed.is_first():
