@@ -12,6 +12,7 @@ import torch
 from for_each import for_each
 from small_runs import EPISODE, made
 from torch import nn
+from torchrl.envs import FrameSkipTransform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 import torchrl_loco
@@ -41,6 +42,7 @@ def test_evaluation_is_apart_from_training(ppo_run, shared):
             assert (one != other).any(dim=1).all()
 
 
+@pytest.mark.filterwarnings("ignore::torchrl_loco.NonFiniteWarning")
 def test_evaluation_plays_full_episodes():
     """A policy that does nothing earns what the environment pays for that until the time limit or termination."""
     env = torchrl_loco.make("walker_stand", 2, "cpu", seed=11)
@@ -67,6 +69,27 @@ def test_evaluation_plays_full_episodes():
     ended, calls = 2, []
     assert (evaluated(policy) == 0.0).all()
     assert len(calls) < EPISODE / 7  # it does not go on when all have ended
+
+
+def test_an_episode_that_the_task_cuts_off_counts_as_a_whole_one():
+    """It would earn less by what it did well; one that is terminated has nothing more to earn."""
+
+    class Crosses(torchrl_loco.WalkerStand):
+        def reward(self, s):
+            return {"first": torch.ones_like(s.time), "second": 0.5 * torch.ones_like(s.time)}
+
+        def truncated(self, s):
+            return (s.env_index == 0) & (s.time > 0.095)
+
+        def terminated(self, s):
+            return (s.env_index == 1) & (s.time > 0.095)
+
+    env = Crosses(3, "cpu", episode_length=40, reward_terms=True)
+    for own in (env, TransformedEnv(env, FrameSkipTransform(2))):
+        evaluator = Evaluator(lambda td: td.set("action", torch.zeros(3, 6)), own)
+        torch.testing.assert_close(evaluator.returns(0), torch.tensor([60.0, 6.0, 60.0]))
+        if own is env:
+            torch.testing.assert_close(evaluator.metrics["reward/first"], (40 + 4 + 40) / 3)
 
 
 @for_each("action_repeat", [1, 2])

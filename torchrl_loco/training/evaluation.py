@@ -13,13 +13,14 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import nn
-from torchrl.envs import EnvBase, step_mdp
+from torchrl.envs import EnvBase, FrameSkipTransform, step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import trange
 
 from torchrl_loco.checks import SEED, check_float, check_int, check_packages
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs import LocoEnv
+from torchrl_loco.envs.transforms import named_transforms
 from torchrl_loco.eyes.scene import to_the_horizon
 from torchrl_loco.policy import Policy, load_policy, shipped_policies
 from torchrl_loco.storage import replace_file
@@ -50,6 +51,8 @@ class Evaluator:
         self.env = env
         self.metrics: dict[str, float] = {}
         self._frames = action_repeat * max(1, PIECE // action_repeat)
+        held = [one.frame_skip for one in named_transforms(env).values() if isinstance(one, FrameSkipTransform)]
+        self._longest = math.ceil(env.config.episode_length / math.prod(held))  # steps of an episode
         self._held = _Held(policy, action_repeat)
         # A function is not watched for other weights, so it must not be recorded as if it were a module.
         held = self._held if isinstance(policy, nn.Module) else self._held.forward
@@ -61,19 +64,27 @@ class Evaluator:
         )
 
     def returns(self, seed: int) -> torch.Tensor:
-        """Returns the return of each episode, shape ``(episodes,)``; ``seed`` decides their initial states."""
+        """Returns the return of each episode, shape ``(episodes,)``; ``seed`` decides their initial states.
+
+        An episode that the task cuts off before the time limit counts as if it had gone on as it was: else a policy
+        that leaves its patch of rough ground would earn less than one that stays on it.
+        """
         self.env.set_seed(seed)
         self._collector.load_state_dict({})
         returns = torch.zeros(self.env.num_envs, 1, device=self.env.device)
         alive = torch.ones_like(returns, dtype=torch.bool)
+        steps, cut_off = torch.zeros_like(returns), torch.zeros_like(alive)
         sums, counts, earned = dict[str, torch.Tensor](), dict[str, torch.Tensor](), dict[str, torch.Tensor]()
         pieces = math.ceil(self.env.config.episode_length / self._frames)
         for _ in trange(pieces, desc="evaluation", leave=False, disable=None):  # no bar in logs
             self._held.begin()
             after = self._collector.rollout()["next"]
             metrics, terms = after.get("metrics", {}), after.get("reward_terms", {})
-            for t, (reward, done) in enumerate(zip(after["reward"].unbind(1), after["done"].unbind(1), strict=True)):
+            signals = [after[name].unbind(1) for name in ("reward", "done", "terminated")]
+            for t, (reward, done, terminated) in enumerate(zip(*signals, strict=True)):
                 returns += reward * alive
+                steps += alive
+                cut_off |= alive & done & ~terminated
                 for name, values in metrics.items():
                     counted = alive & ~values[:, t].isnan()
                     sums[name] = sums.get(name, 0.0) + torch.where(counted, values[:, t], 0.0)
@@ -83,9 +94,10 @@ class Evaluator:
                 alive &= ~done
             if not alive.any():
                 break
-        self.metrics = {f"reward/{name}": total.mean().item() for name, total in earned.items()}
+        share = torch.where(cut_off, (self._longest / steps).clamp(min=1.0), 1.0)
+        self.metrics = {f"reward/{name}": (total * share).mean().item() for name, total in earned.items()}
         self.metrics |= {f"metric/{name}": (total / counts[name]).nanmean().item() for name, total in sums.items()}
-        return returns.squeeze(-1)
+        return (returns * share).squeeze(-1)
 
 
 class _Held(nn.Module):
