@@ -13,7 +13,7 @@ from for_each import for_each
 from hook_tasks import DOG, Still, WalkBackwards, WalkBlindly
 from oracle import tolerance as numpy_tolerance
 
-from torchrl_loco import LocoEnv, SimConfig, State, Vary, WalkerWalk, training
+from torchrl_loco import HopperStand, LocoEnv, SimConfig, State, Vary, WalkerWalk, training
 from torchrl_loco.envs.fusion import trace
 from torchrl_loco.envs.fusion.rules import RULES
 from torchrl_loco.envs.hooks import own_hooks
@@ -378,6 +378,36 @@ def test_rows_that_are_returned_together_are_those_of_before():
         assert memory["a"].tolist() == [2, 2]
         assert memory["b"].tolist() == [1, 1]
         torch.testing.assert_close(memory["was"] + 0.1, env.sim.qpos)
+
+
+def test_after_a_push_sensors_of_forces_are_those_of_the_step():
+    """Found anew, they would be those of a robot without actuators; here a fused function reads them, and a hook."""
+
+    class Pushed(HopperStand):
+        memory = {"felt": 2}
+        push = torch.zeros(2, 1)
+
+        def events(self, s):
+            return {
+                "qvel": s.qvel + self.push,
+                "felt": torch.cat([s.sensor("touch_toe"), s.sensor("touch_heel")], dim=-1),
+            }
+
+        def terminated(self, s):
+            return s.felt.sum(-1) < 0  # reads it, so that it is kept
+
+    env = Pushed(2, "cpu", seed=0)
+    td = env.reset(env.get_state().branch(0), set_state=True)
+    action = torch.full((2, 4), 0.7)
+    for _ in range(60):
+        td = env.step_mdp(env.step(td.set("action", action)))
+        if (td["observation"][:, -2:] > 0).all():
+            break
+    env.push[1] = 1e-3
+    after = env.step(td.set("action", action))["next", "observation"]
+    assert (after[:, -2:] > 0).any()
+    assert (after[0] != after[1]).any()
+    torch.testing.assert_close(after[0, -2:], after[1, -2:], rtol=0, atol=0)
 
 
 def test_a_hook_that_leaves_torch_is_not_frozen(caplog):
@@ -768,8 +798,9 @@ def test_a_group_of_what_warp_observes_is_a_kernel():
 
 def test_settings_that_change_after_construction_are_told_of():
     env = WalkerWalk(2, "cpu", seed=0)
-    with pytest.warns(UserWarning, match=r"WalkerWalk\.noise_scale was read .*: make another with this setting"):
-        env.noise_scale = 0.0
+    for name in ("noise_scale", "episode_length"):
+        with pytest.warns(UserWarning, match=rf"WalkerWalk\.{name} was read .*: make another with this setting"):
+            setattr(env, name, 3)
     with pytest.warns(UserWarning, match=r"WalkerWalk\.seed was read .*: call set_seed\(\)"):
         env.seed = 7
     env.set_seed(3)

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import mujoco
+import numpy as np
 import torch
 import torch._subclasses.schema_check_mode  # noqa: F401, which closing needs: an import while garbage is collected may fail
 import warp as wp
@@ -38,6 +39,7 @@ from torchrl_loco.sim import (
     joined_to_torch,
     torch_is_recording,
 )
+from torchrl_loco.sim.models import FORCE_SENSORS
 
 if TYPE_CHECKING:
     from torchrl_loco.envs.base import LocoEnv
@@ -113,7 +115,7 @@ class World:
             self.mask.warp.fill_(True)
             self.seen = task.pixels.seen(self.sim, self.mask.torch) if task.pixels else None
 
-            self.health = Health(self.sim, task.on_overflow)
+            self.health = Health(self.sim, task.on_overflow, guarded=task.nan_dump is not None)
             self._guard = None if task.nan_dump is None else NanGuard(task.nan_dump, self, task.settings())
             self._monitors: list[Monitor] = [self.health, *([self._guard] if self._guard else [])]
 
@@ -222,7 +224,10 @@ class World:
             self.sim.reset(self.mask.warp, before=self._start, after=self._fused)
 
     def _launch_move(self) -> None:
-        self.sim.forward(self._moved.warp, after=self._fused, contacts=False)  # which belong to the step
+        self.sim.forward(self._moved.warp, contacts=False)  # which belong to the step
+
+    def _launch_look(self) -> None:
+        self.sim.apart(self._fused, self._moved.warp)
 
     def _launch_refresh(self) -> None:
         self.sim.forward(self.mask.warp, after=[*self._fused, *self._check_finite])
@@ -272,7 +277,7 @@ class World:
         launches += self._everywhere_and_begun(self._scans) if self._scans.arrays else []
         if self.seen:
             launches += [*self._everywhere_and_begun(self.seen), functools.partial(self.seen.eye.draw, [None] * 3)]
-        sim.compile(*launches, *([self._launch_move] if hooks.moves else []))
+        sim.compile(*launches, *([self._launch_move, self._launch_look] if hooks.moves else []))
         for each in kernels:
             each.record(sim)
         self.kinds = {hook: part.kind for hook, part in of_hook.items()}
@@ -284,7 +289,7 @@ class World:
         self._physics, self._settle = sim.capture(self._launch_step), sim.capture(self._launch_reset)
         self._rest = sim.capture(self._launch_rest) if own or variation else _nothing
         self._conclude = sim.capture(self._launch_conclude) if own else _nothing
-        self._move = self._keeping_what_was(sim.capture(self._launch_move)) if hooks.moves else _nothing
+        self._move = self._keeping_what_was() if hooks.moves else _nothing
         self._place = self._place_begun = _nothing
         if self.seen:
             self._place, self._place_begun = map(sim.capture, self._everywhere_and_begun(self.seen))
@@ -336,13 +341,22 @@ class World:
         arrays |= {f"out.{name}": group for name, group in self.groups.items()}
         return arrays | {f"memory.{name}": rows for name, rows in self.memory.items()}
 
-    def _keeping_what_was(self, move: Callable[[], None]) -> Callable[[], None]:
-        """Returns ``move`` such that what belongs to the step stays: a fused function's reward."""
+    def _keeping_what_was(self) -> Callable[[], None]:
+        """Returns what follows a move; what belongs to the step stays: sensors of forces, a fused function's reward."""
+        sim, m = self.sim, self.sim.mj_model
+        move = sim.capture(self._launch_move)
+        look = sim.capture(self._launch_look) if self._fused else _nothing
         rows = [self.reward.torch, self.terms.torch] if self._fused else []
+        of_force = np.repeat([kind in FORCE_SENSORS for kind in m.sensor_type], m.sensor_dim)
+        sensors = [wp.to_torch(sim.data.sensordata)] if of_force.any() else []
+        is_force = torch.as_tensor(of_force, dtype=torch.bool, device=sim.qpos.device)
 
         def moved() -> None:
-            kept = [values.clone() for values in rows]
+            felt, kept = [values.clone() for values in sensors], [values.clone() for values in rows]
             move()
+            for values, value in zip(sensors, felt, strict=True):
+                values.copy_(torch.where(is_force, value, values))
+            look()
             for values, value in zip(rows, kept, strict=True):
                 values.copy_(value)
 

@@ -212,9 +212,9 @@ class Simulation:
     def _at_rest(self) -> WorldFunc:
         return WorldFunc(put_at_rest, fill(Rest, self.data, qpos0=self.model.qpos0))
 
-    def apart(self, funcs: Sequence[WorldFunc]) -> None:
-        """Calls functions in every world, in a kernel of their own."""
-        self._kernels.launch(funcs, self._every)
+    def apart(self, funcs: Sequence[WorldFunc], mask: wp.array | None = None) -> None:
+        """Calls functions in every world, or where ``mask`` ``(nworld,)`` is set, in a kernel of their own."""
+        self._kernels.launch(funcs, self._every if mask is None else mask)
 
     def forward(self, mask: wp.array, after: Sequence[WorldFunc] = (), *, contacts: bool = True) -> None:
         """Updates poses and sensors after ``qpos``, ``qvel`` or ``numbers`` were changed.
