@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -16,7 +17,7 @@ from torchrl_loco import WalkerWalk, cli
 from torchrl_loco.conditions import Conditions
 from torchrl_loco.export import export_policy
 from torchrl_loco.policy import ObservationNorm, Policy
-from torchrl_loco.verify import Exported, play, verify
+from torchrl_loco.verify import Exported, dofs_of_robot, play, verify
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
@@ -180,6 +181,25 @@ def test_actions_are_as_late_as_asked_for_where_the_task_holds_them_back_itself(
         assert report.figures["outcomes"]["C MuJoCo"][f"delay {delay}"]["late"] == pytest.approx(delay / 4)
 
 
+class Waits(Late):
+    """Remembers a ``delay`` that is not one of actions, as ``holds`` has none."""
+
+    memory = {**Late.memory, "delay": ()}
+
+    def metrics(self, s):
+        return {"delay": s.delay}
+
+    def begin(self, s):
+        return {"delay": 7.0 + s.steps}
+
+
+def test_an_entry_named_delay_is_the_tasks_own_where_holds_has_none(tmp_path):
+    path = tmp_path / "waits.onnx"
+    export_policy(constant(torchrl_loco.registry.task_name(Waits), 1, 6, 1.0), path)
+    report = verify(path, Conditions(episodes=2), "cpu", alone=True)
+    assert report.figures["outcomes"]["C MuJoCo"]["all"]["delay"] == 7.0
+
+
 class Levels(Late):
     """Begins an episode one level above the last, and earns the level."""
 
@@ -242,6 +262,13 @@ def test_robots_are_pushed_alike_in_both_engines(standing):
         np.testing.assert_allclose(found[60].numpy()[:, :6], found[60].numpy()[:, :6])
     assert 0 < changes[0].sum() < 10
     assert torch.equal(changes[0], changes[1])
+
+
+def test_pushes_move_the_robot_and_not_what_it_plays_with():
+    free, geom = "<freejoint/>", '<geom size="0.1"/>'
+    box, robot = f"<body>{free}{geom}</body>", f'<body>{free}{geom}<body><joint name="hinge"/>{geom}</body></body>'
+    model = f"<worldbody>{box}{robot}</worldbody><actuator><motor joint='hinge'/></actuator>"
+    assert dofs_of_robot(mujoco.MjModel.from_xml_string(f"<mujoco>{model}</mujoco>")) == 6
 
 
 def test_what_cannot_be_verified(standing, tmp_path, capsys):

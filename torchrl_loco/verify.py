@@ -285,8 +285,8 @@ def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -
     set_stage(env, env.stage_of(exported.facts.get("info", {})))
     td = env.reset()
     behind = torch.from_numpy(delay).to(env.device)
-    if "delay" in env.world.memory and env.world.memory["delay"].ndim == 1:  # the task's hooks hold its actions back
-        held = behind.clamp(max=(type(env).holds.get("delay") or (0, 0))[1])  # as far as it says
+    if "delay" in env.world.memory and (most_of_task := type(env).holds.get("delay")):  # whose hooks hold actions back
+        held = behind.clamp(max=most_of_task[1])  # as far as it says
         env.world.memory["delay"].copy_(held)
         behind = behind - held
     late = torch.zeros(most + 1, n, env.mj_model.nu, device=env.device)
@@ -310,7 +310,8 @@ def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -
         if not alive.any():
             break
         if t in pushes:
-            env.sim.qvel[:, :6] += torch.from_numpy(pushes[t]).float().to(env.device)  # poses stay
+            first = dofs_of_robot(env.mj_model)
+            env.sim.qvel[:, first : first + 6] += torch.from_numpy(pushes[t]).float().to(env.device)  # poses stay
     steps_taken, falls, earned = counts.cpu().numpy()
     return Outcome(
         fell=falls > 0,
@@ -325,12 +326,24 @@ def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -
     )
 
 
+def dofs_of_robot(m: mujoco.MjModel) -> int:
+    """Returns where the velocities of the free joint begin by which the robot floats, not a ball that it plays with."""
+    free = m.jnt_dofadr[m.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    of_joints = m.actuator_trnid[m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
+    driven = m.dof_treeid[m.jnt_dofadr[of_joints]]
+    of_robot = [int(first) for first in free if m.dof_treeid[first] in driven]
+    if len(of_robot) != 1:
+        raise ValueError(
+            f"pushes need a body that floats and has actuated joints: this model has {len(of_robot)}, not one"
+        )
+    return of_robot[0]
+
+
 def _pushes(env: LocoEnv, generator: np.random.Generator, steps: int, scale: float) -> dict[int, np.ndarray]:
     """Returns changes of the bases' velocities ``(n, 6)`` (m/s, rad/s), by the control step after which they come."""
     if not scale:
         return {}
-    if env.mj_model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-        raise ValueError("pushes need a body that floats, whose free joint is the model's first")
+    dofs_of_robot(env.mj_model)
     found = dict[int, np.ndarray]()
     for i in range(env.num_envs):
         t = round(generator.uniform(*PUSH_EVERY) / env.config.ctrl_dt)

@@ -90,8 +90,8 @@ class Task:
     """What ``torchrl-loco verify`` asks for: ``falls``, the greatest share of episodes that terminate; ``return``, the
     least return; without either ``kept``, the least share of the return in the training, 0.9. And in which conditions:
     ``delay`` (least and greatest, control steps), ``friction`` (least and greatest), ``pushes`` (a multiple of
-    mjlab's), such as ``{"falls": 0.01, "delay": (0, 2), "pushes": 1.0}``. Where :attr:`memory` has ``delay``, the hooks
-    hold actions back themselves, up to that of ``holds``."""
+    mjlab's), such as ``{"falls": 0.01, "delay": (0, 2), "pushes": 1.0}``. Where :attr:`memory` has ``delay``, too,
+    the hooks hold actions back themselves, up to that of ``holds``: ``verify`` writes it."""
     command_ranges: Mapping[str, Mapping[str, tuple[float, float]]] = {}
     """Entries of :attr:`memory` that are commands: by entry, the name of each of its numbers, with its unit, and the
     least and greatest value, such as ``{"command": {"forward (m/s)": (-1.0, 2.0)}}``. With ``play=True`` they can be
