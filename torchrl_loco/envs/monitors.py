@@ -35,7 +35,7 @@ class PhysicsOverflowError(RuntimeError):
 
 
 class NonFiniteWarning(UserWarning):
-    """A world became non-finite; the state and action before that step were written to a file."""
+    """A world became non-finite. With ``nan_dump`` the state and action before that step were written to a file."""
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
@@ -116,32 +116,41 @@ class Health(Monitor):
     """Counts, for each world, the control steps in which something went wrong in the physics.
 
     What ends a control step counts (:func:`torchrl_loco.envs.episode.finish_step`): bits of ``overflow`` and, last,
-    steps that ended non-finite.
+    steps that ended non-finite; of these it warns, unless a guard does.
     """
 
-    def __init__(self, sim: Simulation, on_overflow: str) -> None:
-        self._sim, self._on_overflow = sim, on_overflow
+    def __init__(self, sim: Simulation, on_overflow: str, *, guarded: bool) -> None:
+        self._sim, self._on_overflow, self._tells_non_finite = sim, on_overflow, not guarded
         self.counter_bits = wp.array([int(bits) for bits in COUNTERS.values()], dtype=int, device=sim.device)
         self.counts = Buffer((sim.num_envs, len(COUNTERS) + 1), int, sim.device)
-        super().__init__(len(DROPPED) + 2, self.counts.torch.device)
+        super().__init__(len(DROPPED) + 3, self.counts.torch.device)
         self._next_report = 1  # world-steps in which something was dropped
 
     def numbers(self) -> torch.Tensor:
-        """Returns the steps in which constraints and contacts were dropped, and the most of each needed, ``(4,)``."""
-        dropped = self.counts.torch[:, : len(DROPPED)].sum(dim=0)
-        return torch.cat([dropped, torch.stack([*self._peaks().values()])])
+        """Returns the steps in which constraints and contacts were dropped, the most of each needed, and lost steps."""
+        dropped, lost = self.counts.torch[:, : len(DROPPED)].sum(dim=0), self.counts.torch[:, -1:].sum(dim=0)
+        return torch.cat([dropped, torch.stack([*self._peaks().values()]), lost])
 
     def _peaks(self) -> dict[str, torch.Tensor]:
         engine = self._sim.engine
         return {"constraints": engine.peak_constraints.torch.max(), "contacts": engine.peak_contacts.torch.max()}
 
     def report(self, numbers: list[int]) -> None:
-        """Warns or raises if something was dropped; warns again once it is ten times as much.
+        """Warns once of worlds that became non-finite; warns or raises if something was dropped.
+
+        That it does again once it is ten times as much.
 
         Raises:
             PhysicsOverflowError: something was dropped and ``on_overflow`` is "raise".
         """
-        dropped, needed = numbers[: len(DROPPED)], numbers[len(DROPPED) :]
+        dropped, needed, lost = numbers[: len(DROPPED)], numbers[len(DROPPED) : -1], numbers[-1]
+        if lost and self._tells_non_finite and not any(dropped):  # of which it may be a consequence
+            self._tells_non_finite = False
+            warn(
+                f"{lost} of {self._steps * self._sim.num_envs} world-steps ended an episode, as an action, a state, or "
+                "what a hook returned was not finite: nan_dump=FILE keeps what was before the first, health() counts",
+                NonFiniteWarning,
+            )
         if self._on_overflow == "ignore" or sum(dropped) < self._next_report:
             return
         self._next_report, steps = 10 * sum(dropped), self._steps * self._sim.num_envs
@@ -154,6 +163,11 @@ class Health(Monitor):
         if self._on_overflow == "raise":
             raise PhysicsOverflowError(message)
         warn(message, PhysicsOverflowWarning)
+
+    def check(self) -> None:
+        """Reports what was dropped; of a few lost steps at the end of an environment nobody needs to hear."""
+        self._tells_non_finite = False
+        super().check()
 
     def clear(self) -> None:
         """Sets all counters and peaks to zero."""
