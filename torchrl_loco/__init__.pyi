@@ -15,6 +15,7 @@ from . import training as training
 from . import wrappers as wrappers
 from .collector import RolloutCollector as RolloutCollector
 from .config import SimConfig as SimConfig
+from .envs import ActionRepeat as ActionRepeat
 from .envs import LocoEnv as LocoEnv
 from .envs import NonFiniteWarning as NonFiniteWarning
 from .envs import PhysicsOverflowError as PhysicsOverflowError

@@ -26,10 +26,10 @@ def step_by_step(env, maybe_reset):
 
 
 def play(env, moves, step_and_maybe_reset):
-    """Steps and resets, and carries another output of the policy along."""
+    """Steps and resets, and carries other outputs of the policy along, one with a name that states have, too."""
     td, trace = env.reset(), []
     for i, action in enumerate(moves):
-        td = td.set("action", action).set("loc", torch.full_like(action, i + 1.0))
+        td = td.set("action", action).set("loc", torch.full_like(action, i + 1.0)).set("memory", action + i)
         td, after = step_and_maybe_reset(td)
         trace.append(td.clone().set("carried", after.clone()))
         td = after
@@ -99,10 +99,13 @@ def test_a_step_of_no_world_changes_nothing_and_done_may_be_missing(shared):
         assert each.rollout(3, auto_reset=False, tensordict=begin, break_when_any_done=False).shape == (2, 3)
 
 
-def test_a_step_begins_without_the_last_reward(shared):
-    """A loop may go on with what is under ``next``, where a reward is."""
+def test_a_step_begins_without_the_last_reward_and_with_names(shared):
+    """A loop may go on with what is under ``next``, where a reward is. Names of dimensions stay."""
     env = shared("walker_run", 3)
-    td, after = env.step_and_maybe_reset(env.rand_action(env.reset()).set("reward", torch.ones(3, 1)))
+    td = env.rand_action(env.reset()).set("reward", torch.ones(3, 1))
+    td.names = ["world"]
+    td, after = env.step_and_maybe_reset(td)
+    assert after.names == ["world"]
     assert "reward" not in after
     assert "reward" in td["next"]
 

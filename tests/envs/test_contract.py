@@ -122,6 +122,10 @@ def test_a_policy_with_gradients_leaves_no_autograd_graph_behind(shared):
     layer = torch.nn.Linear(24, 6)
     env.rollout(3, TensorDictModule(layer, in_keys=["observation"], out_keys=["action"]))
     assert not env.world.action.torch.requires_grad
+    after = env.rand_step(env.reset())["next"]
+    loss = torch.nn.Linear(24, 1)(after["observation"]).square().sum()
+    after["reward"].mul_(0.1)  # lies beside the observation, which the gradient reads
+    loss.backward()
 
 
 def test_the_callers_default_dtype_and_inference_mode_do_not_matter():

@@ -226,7 +226,9 @@ def test_state_dict_goes_on_in_another_environment(shared, kind, actions):
     """With the seed: what is drawn at the next resets is the same too."""
     task, protocol, engine = kind
     options = {"protocol": protocol, "engine": engine, "reward_terms": True, "episode_length": 7, **coarse(task)}
-    first, second = (shared(task, seed=5 + copy, copy=copy, **options) for copy in (0, 1))
+    first, second = (
+        torchrl_loco.TransformedEnv(shared(task, seed=5 + copy, copy=copy, **options), StepCounter()) for copy in (0, 1)
+    )
     moves = actions(first, 10)
     td = first.reset()
     _, td = first.step_and_maybe_reset(td.set("action", moves[0]))
@@ -256,7 +258,10 @@ def test_a_lenient_state_dict_leaves_the_worlds_alone(shared):
     before = env.get_state()
     env.load_state_dict(shared("walker_run", 4, seed=6).state_dict(), strict=False)
     env.load_state_dict({})  # what TorchRL's Collector saves of it
+    torchrl_loco.TransformedEnv(env).load_state_dict(shared("walker_run", 4).state_dict(), strict=False)
     assert_same(env.get_state(), before)
+    with pytest.warns(UserWarning, match="set_state=True"):
+        env.reset(before)
     assert env.seed == 5
 
 

@@ -5,4 +5,5 @@ from torchrl_loco.envs.monitors import NonFiniteWarning as NonFiniteWarning
 from torchrl_loco.envs.monitors import PhysicsOverflowError as PhysicsOverflowError
 from torchrl_loco.envs.monitors import PhysicsOverflowWarning as PhysicsOverflowWarning
 from torchrl_loco.envs.state import State as State
+from torchrl_loco.envs.transforms import ActionRepeat as ActionRepeat
 from torchrl_loco.envs.transforms import TransformedEnv as TransformedEnv

@@ -35,7 +35,7 @@ from torchrl_loco.envs.hooks import Hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.pixels import Pictures, Pixels, Seen
 from torchrl_loco.envs.resets import QuickResets, rows_of
-from torchrl_loco.envs.state import without_state
+from torchrl_loco.envs.state import State, without_state
 from torchrl_loco.envs.task import BOUNDED, Task, folder_of, options_of_class, replaced_options
 from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.vary import Vary, check_randomize
@@ -45,7 +45,11 @@ from torchrl_loco.sim.simulation import set_options
 READ_ONCE = {
     "seed": "call set_seed()",
     **dict.fromkeys(
-        ("history", "noise", "noise_scale", "observation_terms", "play", "protocol", "randomize"),
+        (
+            *("action_range", "compile_hooks", "episode_length", "frame_stack", "from_pixels", "history", "nan_dump"),
+            *("noise", "noise_scale", "observation_terms", "on_overflow", "play", "protocol", "randomize"),
+            *("reward_terms", "with_metrics"),
+        ),
         "make another with this setting",
     ),
 }
@@ -345,6 +349,8 @@ class LocoEnv(Task, WorldAccess, QuickResets):
         if set_state:
             self._set_state(tensordict, mask, finite=finite)
         else:
+            if isinstance(tensordict, State) and mask is None:
+                warn("reset() begins new episodes and ignores the state that was passed: pass set_state=True, too")
             self.world.reset(mask, stagger=self.stagger and mask is None)
         everywhere = torch.ones((*self.batch_size, 1), dtype=torch.bool, device=self.device)
         look = functools.partial(Seen.begin, last=None if others else {}, restored=set_state)

@@ -50,6 +50,7 @@ class QuickResets(EnvBase):
             and tensordict.device == self.device
             and not self.run_type_checks
             and self._post_step_mdp_hooks is None
+            and not tensordict._has_names()
             and all(isinstance(value, torch.Tensor) or key in NESTED for key, value in tensordict.items())
             and "_step" not in tensordict
         )

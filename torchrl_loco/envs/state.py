@@ -68,8 +68,11 @@ torch.serialization.add_safe_globals([State])  # a file of tensors: torch.load r
 
 
 def without_state(tensordict: TensorDictBase | None, device: torch.device | None) -> TensorDictBase | None:
-    """Returns a TensorDict itself, or if it has entries of a state, a new one on ``device`` with its others."""
-    if tensordict is None or not any(key in tensordict for key in State.KEYS):
+    """Returns a TensorDict itself, or if it has a state, a new one on ``device`` with its other entries.
+
+    Without ``qpos`` and ``qvel`` it has none: an entry ``memory`` may be a recurrent policy's.
+    """
+    if tensordict is None or not ("qpos" in tensordict and "qvel" in tensordict):
         return tensordict
     kept = {key: value for key, value in tensordict.items() if key not in State.KEYS}
     return TensorDict(kept, batch_size=tensordict.batch_size, device=device)

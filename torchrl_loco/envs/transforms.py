@@ -38,6 +38,7 @@ class ActionRepeat(FrameSkipTransform):
         return next_tensordict
 
 
+BASE = "base_env."  # before the names of what the environment below transforms has in a state_dict
 PLAIN_TRANSFORMS = (
     ActionRepeat,
     *(t.ClipTransform, Compose, t.DoubleToFloat, FrameSkipTransform, t.InitTracker, t.ObservationNorm),
@@ -123,6 +124,18 @@ class TransformedEnv(TorchRLTransformedEnv):
     ``STATELESS_TRANSFORMS`` lists it. The arguments are those of TorchRL's: an environment, and a transform or a
     ``Compose`` of them.
     """
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """Returns the state of the transforms, and with ``"base_env."`` before its names that of the environment."""
+        of_env = {BASE + name: value for name, value in self.base_env.state_dict().items()}
+        return {**super().state_dict(*args, **kwargs), **of_env}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> None:
+        """Restores a ``state_dict``; without ``strict`` the worlds stay (see :meth:`LocoEnv.load_state_dict`)."""
+        of_env = {name: value for name, value in state_dict.items() if name.startswith(BASE)}
+        of_transforms = {name: value for name, value in state_dict.items() if name not in of_env}
+        super().load_state_dict(of_transforms, strict=strict, **kwargs)
+        self.base_env.load_state_dict({name.removeprefix(BASE): value for name, value in of_env.items()}, strict=strict)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns what ``step_mdp`` makes of a step, with new episodes in the worlds that were done."""

@@ -39,6 +39,9 @@ class PackedBuffers:
         self.memory = torch.zeros(self._end + flags, dtype=torch.uint8, device=device)
 
     def parts(self, memory: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns the arrays, then the flags, in :attr:`memory` or in a copy of it; all of one dimension."""
+        """Returns the arrays, then the flags, in :attr:`memory` or in a copy of it; all of one dimension.
+
+        To autograd each is a tensor of its own: a reward that is scaled in place leaves the observation as it was.
+        """
         floats = memory[: self._end].view(torch.float32).split(self._floats)
-        return *floats, memory[self._end :].view(torch.bool)
+        return *(part.data for part in floats), memory[self._end :].view(torch.bool).data

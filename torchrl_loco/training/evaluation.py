@@ -51,8 +51,8 @@ class Evaluator:
         self.env = env
         self.metrics: dict[str, float] = {}
         self._frames = action_repeat * max(1, PIECE // action_repeat)
-        held = [one.frame_skip for one in named_transforms(env).values() if isinstance(one, FrameSkipTransform)]
-        self._longest = math.ceil(env.config.episode_length / math.prod(held))  # steps of an episode
+        skips = [one.frame_skip for one in named_transforms(env).values() if isinstance(one, FrameSkipTransform)]
+        self._longest = math.ceil(env.config.episode_length / math.prod(skips))  # steps of an episode
         self._held = _Held(policy, action_repeat)
         # A function is not watched for other weights, so it must not be recorded as if it were a module.
         held = self._held if isinstance(policy, nn.Module) else self._held.forward
