@@ -8,7 +8,7 @@ import pytest
 import torch
 from for_each import for_each
 
-from torchrl_loco import HumanoidStand, LocoEnv, SimConfig, Vary, WalkerWalk
+from torchrl_loco import HumanoidStand, LocoEnv, QuadrupedWalk, SimConfig, Vary, WalkerWalk
 from torchrl_loco.cli.errors import user_errors
 
 
@@ -203,3 +203,46 @@ def test_a_pose_that_begins_with_a_quaternion_of_zeros_is_not_turned():
     env = Begins(2, "cpu", 0)
     assert env.reset()["observation"].isfinite().all()
     assert env.sim.qpos[:, 3:7].tolist() == [[1.0, 0.0, 0.0, 0.0]] * 2
+
+
+def test_forces_of_actuators_are_mujocos():
+    """Under the controls of a step, in the state after it; gears, ranges and gains of each world among them."""
+
+    class Driven(LocoEnv):
+        model = """
+<mujoco><option timestep="0.01"/><worldbody><body name="arm"><joint name="shoulder" axis="0 1 0" damping="0.5"/>
+<geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.03"/><body pos="0 0 0.5"><joint name="elbow" axis="0 1 0"/>
+<joint name="slide" type="slide" axis="0 0 1"/><geom size="0.1" pos="0 0 0.2"/></body></body></worldbody>
+<actuator><position joint="shoulder" kp="20" kv="1" gear="1.5" forcerange="-8 8"/><velocity joint="elbow" kv="0.2"/>
+<motor joint="slide" gear="-2" ctrlrange="-0.3 0.3"/><position joint="elbow" kp="3"/></actuator></mujoco>"""
+        randomize = [Vary("kp", 0.5, 2.0)]
+        action_range = (-math.inf, math.inf)
+
+        def control(self, s, action):
+            return action
+
+        def reward(self, s):
+            return dict(zip("abcd", s.actuator_force.unbind(-1), strict=True))
+
+        def observation(self, s):
+            return torch.cat([s.qpos, s.qvel], dim=-1)
+
+    action = torch.tensor([[1.0, -0.5, 2.0, 0.3], [0.01, 3.0, 0.1, -1.0], [0.05, 0.0, -0.2, 0.6]])
+    for compiles in (True, False):
+        env = Driven(3, "cpu", seed=0, reward_terms=True, compile_hooks=compiles)
+        td = env.reset()
+        for _ in range(3):
+            after = env.step(td.set("action", action))["next"]
+            td = after.exclude("reward", "reward_terms")
+        found = torch.cat([after["reward_terms", name] for name in "abcd"], dim=-1)
+        for world in range(3):
+            m = env.mujoco_model(world)
+            data = mujoco.MjData(m)
+            data.qpos[:], data.qvel[:] = after["observation"][world].double().split(m.nq)
+            data.ctrl[:] = action[world]
+            mujoco.mj_forward(m, data)
+            np.testing.assert_allclose(found[world], data.actuator_force, rtol=1e-5, atol=1e-6)
+        assert found.abs().max() == 8.0  # one is at its limit
+    lifts = type("Lift", (QuadrupedWalk,), {"reward": lambda self, s: s.actuator_force.sum(-1)})
+    with pytest.raises(ValueError, match="motors and servos at hinges and slides"):
+        lifts(1, "cpu")

@@ -457,6 +457,15 @@ def _names_of(cls: type) -> set[str]:
     return {*vars(cls), *vars(cls).get("__annotations__", {}), *(signature(begins).parameters if begins else ())}
 
 
+SAID_ELSEWHERE = {
+    **dict.fromkeys(("termination", "terminations", "is_terminated", "done"), ["terminated"]),
+    **dict.fromkeys(("compute_reward", "get_reward", "_reward"), ["reward"]),
+    **dict.fromkeys(("compute_observations", "get_observations", "get_obs", "_get_obs"), ["observation"]),
+    **dict.fromkeys(("reset_model", "reset_idx", "_reset_idx"), ["begin"]),
+}
+"""Names that other frameworks have for hooks."""
+
+
 def _warn_of_misspelt_names(cls: type[Task]) -> None:
     """Warns of what a class defines by a name that is almost that of a hook or an attribute: nobody would call it."""
     ours = [base for base in cls.__mro__ if base.__module__.startswith("torchrl_loco.tasks")]
@@ -466,7 +475,7 @@ def _warn_of_misspelt_names(cls: type[Task]) -> None:
             continue
         inherited = {name for other in base.__mro__[1:] for name in vars(other)}
         for name in vars(base).keys() - inherited - meant:
-            near = difflib.get_close_matches(name, meant, n=1, cutoff=0.85)
+            near = difflib.get_close_matches(name, meant, n=1, cutoff=0.85) or SAID_ELSEWHERE.get(name, [])
             if near:
                 warn(f"torchrl_loco: {base.__name__} defines {name}, which nothing reads: did you mean {near[0]}?")
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchrl_loco.checks import Interval, check_float, check_int
-from torchrl_loco.envs import draws, heights, sensors
+from torchrl_loco.envs import actuation, draws, heights, sensors
 from torchrl_loco.envs.names import Elements, Names
 from torchrl_loco.envs.scan import DepthRequest, RayRequest, Request, ScanRequest
 from torchrl_loco.envs.tables import Entry, Table
@@ -195,6 +195,11 @@ class View:
     def ctrl(self) -> torch.Tensor:
         """Controls of the step, ``(num_envs, nu)``; not in ``observation`` and ``begin``."""
         return self._array("ctrl")
+
+    @property
+    def actuator_force(self) -> torch.Tensor:
+        """Forces of motors and servos (N, N m) by the step's controls, in the state after it, ``(num_envs, nu)``."""
+        return actuation.force(self)
 
     @property
     def action(self) -> torch.Tensor:

@@ -193,7 +193,7 @@ def check(mj_model: mujoco.MjModel, *, own_control: bool = False) -> mujoco.MjMo
             name = mj_model.sensor(i).name
             wrong.append(
                 f"sensor {name!r} is not evaluated, only velocities, touch, accelerometers, forces and torques are: "
-                "compute it from sim.data in a kernel"
+                "hooks have s.actuator_force for what actuators do"
             )
     if wrong:
         raise ValueError("; ".join(wrong))
