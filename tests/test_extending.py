@@ -345,6 +345,8 @@ def test_a_name_that_is_almost_a_hook_is_said():
 
     with pytest.warns(UserWarning, match="Falls defines terminate, which nothing reads: did you mean terminated?"):
         Falls.check_class()
+    with pytest.warns(UserWarning, match="Ends defines termination, which nothing reads: did you mean terminated?"):
+        type("Ends", (torchrl_loco.WalkerWalk,), {"termination": lambda self, s: s.time > 1.0}).check_class()
     with pytest.warns(UserWarning, match="Heavy defines weigths, which nothing reads: did you mean weights?"):
         type("Heavy", (torchrl_loco.Go1Velocity,), {"weigths": {}}).check_class()
     config = dataclasses.replace(torchrl_loco.Go1Velocity.config, episode_length=200)

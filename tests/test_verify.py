@@ -182,9 +182,15 @@ def test_actions_are_as_late_as_asked_for_where_the_task_holds_them_back_itself(
 
 
 class Waits(Late):
-    """Remembers a ``delay`` that is not one of actions, as ``holds`` has none."""
+    """Remembers a ``delay`` that is not one of actions, as ``holds`` has none, and cuts episodes off."""
 
     memory = {**Late.memory, "delay": ()}
+
+    def terminated(self, s):
+        return s.steps < 0
+
+    def truncated(self, s):
+        return s.steps >= 9
 
     def metrics(self, s):
         return {"delay": s.delay}
@@ -197,7 +203,9 @@ def test_an_entry_named_delay_is_the_tasks_own_where_holds_has_none(tmp_path):
     path = tmp_path / "waits.onnx"
     export_policy(constant(torchrl_loco.registry.task_name(Waits), 1, 6, 1.0), path)
     report = verify(path, Conditions(episodes=2), "cpu", alone=True)
-    assert report.figures["outcomes"]["C MuJoCo"]["all"]["delay"] == 7.0
+    table = report.figures["outcomes"]["C MuJoCo"]["all"]
+    assert table["delay"] == 7.0
+    assert (table["mean_steps"], table["return"]) == (10.0, 40.0)  # 10 steps of 40, as in evaluations
 
 
 class Levels(Late):

@@ -312,6 +312,8 @@ def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -
         if t in pushes:
             first = dofs_of_robot(env.mj_model)
             env.sim.qvel[:, first : first + 6] += torch.from_numpy(pushes[t]).float().to(env.device)  # poses stay
+    cut_off = ~alive & (fell == 0)  # counts as in evaluations, as if it had gone on
+    returns *= torch.where(cut_off, steps / taken, 1.0)
     steps_taken, falls, earned = counts.cpu().numpy()
     return Outcome(
         fell=falls > 0,

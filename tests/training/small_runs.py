@@ -41,7 +41,8 @@ def small_walker():
 
 def made(out, algorithm="ppo", **overrides):
     """Returns a new run folder, in which nothing was trained yet."""
-    return RunFolder.create(preset("walker_stand", "cpu", algorithm, out=out, **{**SMALL, **overrides}))
+    settings = {"task": "walker_stand", **SMALL, **overrides}
+    return RunFolder.create(preset(settings.pop("task"), "cpu", algorithm, out=out, **settings))
 
 
 def trained(out, algorithm="ppo", **overrides):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from small_runs import EPISODE, SMALL
 from torchrl.data import Bounded, Unbounded
-from torchrl.envs import StepCounter, Transform, TransformedEnv, UnsqueezeTransform
+from torchrl.envs import FrameSkipTransform, StepCounter, Transform, TransformedEnv, UnsqueezeTransform
 
 import torchrl_loco
 from torchrl_loco.training import PPOConfig, Spaces
@@ -59,6 +59,8 @@ def test_what_cannot_be_trained_on():
         Spaces.of(env)
     env.action_spec = Unbounded((3, 6))
     assert not Spaces.of(env).bounded
+    with pytest.raises(ValueError, match="leave FrameSkipTransform out, and pass action_repeat=4"):
+        Environments(PPOConfig("walker_run"), TransformedEnv(env, FrameSkipTransform(4)))
 
 
 def test_a_held_action_ends_where_the_world_does():

@@ -242,6 +242,21 @@ def test_a_resumed_run_keeps_the_policy_of_a_better_evaluation_after_the_checkpo
     assert Policy.load(run.policy, "cpu").info["selected_by"] == 30.0
 
 
+def test_a_run_is_resumed_without_its_policy_or_to_the_frames_that_it_has(tmp_path):
+    """The policy that was moved away is selected anew; one that no evaluation has seen is evaluated."""
+    run = made(tmp_path, total_frames=768, eval_interval=128)
+    first = Trainer(run)
+    for _ in range(2):
+        run.append_metrics(first.iterate())
+        first.save()
+        if not run.policy.exists():
+            first.evaluate()
+    run.policy.unlink()
+    Trainer(run, resume=True, total_frames=256).train()
+    assert [row["frames"] for row in run.read_evaluations()] == [128, 256]
+    assert Policy.load(run.policy, "cpu").info["frames"] == 256
+
+
 @pytest.mark.slow
 def test_evaluating_draws_nothing_that_training_draws(tmp_path):
     often = trained(tmp_path / "often", "reppo", eval_interval=128)

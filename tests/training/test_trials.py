@@ -3,10 +3,13 @@
 import copy
 import itertools
 
+import pytest
+import torch
 from compare import assert_same
 from for_each import for_each
 from small_runs import made
 
+import torchrl_loco
 from torchrl_loco.training import Trainer
 
 BATCH = 4 * 8 * 4
@@ -77,6 +80,46 @@ def test_the_best_goes_on(algorithm, best, tmp_path):
     for name, parameter in trainer.algorithm.networks.named_parameters():
         assert (parameter != ended[best]["networks"][name]).any(), name
     assert trials.state_dict()["best"] is None
+
+
+class Harder(torchrl_loco.WalkerStand):
+    """Asks for more with every step of the training."""
+
+    shared = {"trained": ()}
+    episode_length = 8
+
+    def adapt(self, s):
+        return {"trained": s.trained + 1.0}
+
+    def reward(self, s):
+        return 100.0 - s.trained + torch.zeros_like(s.time)
+
+
+def test_trials_and_evaluations_are_of_one_stage_of_a_curriculum(tmp_path):
+    """A trial begins where the run began; the best policy so far plays at the stage of what it is compared with."""
+    settings = {"action_repeat": 1, "lr": 1e-9, "task": torchrl_loco.registry.task_name(Harder)}
+    run = made(tmp_path, **settings, total_frames=128, trials=2, trial_fraction=0.25, eval_interval=64)
+    Trainer(run).train()
+    means = [row["mean"] for row in run.read_evaluations()]
+    assert means[0] == means[1] > means[2]  # of two trials of one batch, and two batches more
+    info = run.load_policy("cpu").info
+    assert info["frames"] == 128
+    assert info["selected_by"] == means[-1]
+    assert info["stage"]["shared"]["trained"] == run.load_checkpoint("cpu")["stage"]["shared"]["trained"]
+
+
+def test_each_trial_begins_from_given_weights_and_with_the_first_learning_rate(tmp_path):
+    first = made(tmp_path, "ppo", total_frames=BATCH)
+    Trainer(first).train()
+    trainer = Trainer(made(tmp_path, "ppo", **THREE, init=str(first.path), target_kl=1e-9, lr=1e-3))
+    begun = copy.deepcopy(trainer.algorithm.networks.state_dict())
+    for _ in range(2):
+        trainer.iterate()
+    lr = [group["lr"] for optimizer in trainer.algorithm.optimizers.values() for group in optimizer.param_groups]
+    assert all(rate < 1e-3 for rate in lr)
+    trainer.trials.end(trainer.frames, 1.0)
+    assert_same(trainer.algorithm.networks.state_dict(), begun)
+    assert all(rate == pytest.approx(1e-3) for rate in lr)
 
 
 def test_a_run_with_trials(tmp_path, capsys):

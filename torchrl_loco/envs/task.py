@@ -458,10 +458,10 @@ def _names_of(cls: type) -> set[str]:
 
 
 SAID_ELSEWHERE = {
-    **dict.fromkeys(("termination", "terminations", "is_terminated", "done"), ["terminated"]),
-    **dict.fromkeys(("compute_reward", "get_reward", "_reward"), ["reward"]),
-    **dict.fromkeys(("compute_observations", "get_observations", "get_obs", "_get_obs"), ["observation"]),
-    **dict.fromkeys(("reset_model", "reset_idx", "_reset_idx"), ["begin"]),
+    **dict.fromkeys(("termination", "terminations", "is_terminated", "done"), "terminated"),
+    **dict.fromkeys(("compute_reward", "get_reward", "_reward"), "reward"),
+    **dict.fromkeys(("compute_observations", "get_observations", "get_obs", "_get_obs"), "observation"),
+    **dict.fromkeys(("reset_model", "reset_idx", "_reset_idx"), "begin"),
 }
 """Names that other frameworks have for hooks."""
 
@@ -475,9 +475,9 @@ def _warn_of_misspelt_names(cls: type[Task]) -> None:
             continue
         inherited = {name for other in base.__mro__[1:] for name in vars(other)}
         for name in vars(base).keys() - inherited - meant:
-            near = difflib.get_close_matches(name, meant, n=1, cutoff=0.85) or SAID_ELSEWHERE.get(name, [])
-            if near:
-                warn(f"torchrl_loco: {base.__name__} defines {name}, which nothing reads: did you mean {near[0]}?")
+            near = difflib.get_close_matches(name, meant, n=1, cutoff=0.85)
+            if hook := near[0] if near else SAID_ELSEWHERE.get(name):
+                warn(f"torchrl_loco: {base.__name__} defines {name}, which nothing reads: did you mean {hook}?")
 
 
 def _warn_of_a_length_that_is_not_used(cls: type[Task]) -> None:

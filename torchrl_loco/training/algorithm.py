@@ -233,11 +233,13 @@ class Algorithm(ABC):
     def restore(self, state: dict[str, Any]) -> None:
         """Goes back to the networks and moments of a copy of an earlier :meth:`state_dict`, in place as well.
 
-        The generator and the learning rate go on.
+        The generator goes on.
         """
         self.load_networks(state["networks"])
         for name, optimizer in self.optimizers.items():
             kept = state["optimizers"][name]["state"]
+            for group, before in zip(optimizer.param_groups, state["optimizers"][name]["param_groups"], strict=True):
+                group["lr"].copy_(torch.as_tensor(before["lr"]))
             if isinstance(optimizer, FlatAdam):
                 optimizer.load_moments(kept)
                 continue

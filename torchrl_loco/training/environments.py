@@ -80,20 +80,26 @@ def _call_to_resume(run: Path, given: tuple[str, ...]) -> str:
 
 
 class Environments:
-    """Makes the environments of a run, from its settings or after an environment that was handed in."""
+    """Makes the environments of a run, from its settings or after an environment that was handed in.
+
+    Attributes:
+        transforms: those of the environment that was handed in.
+        full_length: control steps of an episode of an evaluation.
+    """
 
     def __init__(self, config: TrainingConfig, given: EnvBase | None = None) -> None:
         self._config, self._given, self._evaluating = config, given, dict[int, LocoEnv]()
-        self.transforms: tuple[Transform, ...] = ()  # those of the environment that was handed in
+        self.transforms: tuple[Transform, ...] = ()
         if given is None:
             self._task: type[LocoEnv] = resolve(config.task)
             self._protocol: str = config.protocol
             self._arguments = {**config.of_env, "reward_terms": not is_runner(config.task)}
-            length = self._task.episode_length
-            # Control steps of the task's own episodes.
-            self.full_length = self._task.config.episode_length if length is None else length
+            self.full_length = self.length_of_task
         else:
             base, self.transforms = unwrapped(given)
+            for one in named_transforms(given).values():
+                if isinstance(one, FrameSkipTransform):  # frames are control steps
+                    raise ValueError(f"leave {type(one).__name__} out, and pass action_repeat={one.frame_skip}")
             self._task, self._protocol = type(base), base.protocol
             _refuse_further_arguments(self._task)
             self._arguments = {**dataclasses.asdict(base.config), "randomize": base.randomize, **base.options_given}
@@ -101,6 +107,12 @@ class Environments:
             self._arguments |= base.pixels.arguments if base.pixels else {}
             del self._arguments["naconmax"]  # which is for the number of its worlds
             self.full_length = base.config.episode_length
+
+    @property
+    def length_of_task(self) -> int:
+        """Control steps of the episodes of the task's class."""
+        length = self._task.episode_length
+        return self._task.config.episode_length if length is None else length
 
     @property
     def names_of_transforms(self) -> list[str]:
@@ -128,9 +140,9 @@ class Environments:
         if config.action_repeat == 1:
             return env
         # The runners' tasks end at the time limit alone, and TorchRL's transform has less to do.
-        return TransformedEnv(
-            env, (FrameSkipTransform if is_runner(config.task) else ActionRepeat)(config.action_repeat)
-        )
+        base, _ = unwrapped(env)
+        plain = is_runner(config.task) and not (base.reward_terms or base.with_metrics)
+        return TransformedEnv(env, (FrameSkipTransform if plain else ActionRepeat)(config.action_repeat))
 
     def evaluation(self, episodes: int, seed: int, info: Mapping[str, Any] | None = None) -> EnvBase:
         """Returns worlds in which a policy of the run can be played, each for an episode of the task's own length.

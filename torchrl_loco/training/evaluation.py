@@ -13,14 +13,13 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import nn
-from torchrl.envs import EnvBase, FrameSkipTransform, step_mdp
+from torchrl.envs import EnvBase, step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import trange
 
 from torchrl_loco.checks import SEED, check_float, check_int, check_packages
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.envs.transforms import named_transforms
 from torchrl_loco.eyes.scene import to_the_horizon
 from torchrl_loco.policy import Policy, load_policy, shipped_policies
 from torchrl_loco.storage import replace_file
@@ -51,8 +50,6 @@ class Evaluator:
         self.env = env
         self.metrics: dict[str, float] = {}
         self._frames = action_repeat * max(1, PIECE // action_repeat)
-        skips = [one.frame_skip for one in named_transforms(env).values() if isinstance(one, FrameSkipTransform)]
-        self._longest = math.ceil(env.config.episode_length / math.prod(skips))  # steps of an episode
         self._held = _Held(policy, action_repeat)
         # A function is not watched for other weights, so it must not be recorded as if it were a module.
         held = self._held if isinstance(policy, nn.Module) else self._held.forward
@@ -94,7 +91,7 @@ class Evaluator:
                 alive &= ~done
             if not alive.any():
                 break
-        share = torch.where(cut_off, (self._longest / steps).clamp(min=1.0), 1.0)
+        share = torch.where(cut_off, (self.env.config.episode_length / steps).clamp(min=1.0), 1.0)
         self.metrics = {f"reward/{name}": (total * share).mean().item() for name, total in earned.items()}
         self.metrics |= {f"metric/{name}": (total / counts[name]).nanmean().item() for name, total in sums.items()}
         return (returns * share).squeeze(-1)

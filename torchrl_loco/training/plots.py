@@ -23,6 +23,7 @@ IRRELEVANT: dict[str, Any] = {
     "eval_episodes": 1,
     "video_seconds": 0.0,
     "checkpoint_seconds": 0.0,
+    "keep": 1,
     "logger": (),
 }
 """Settings that do not affect learning, each with a fixed value, so that runs can be grouped without them."""

@@ -1,8 +1,10 @@
 """The training loop: collect, update, log; evaluate and save now and then; plot and record at the end."""
 
 import contextlib
+import copy
 import dataclasses
 import functools
+import json
 import logging
 import math
 import sys
@@ -19,6 +21,7 @@ from torchrl_loco.checks import check_device
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.imagined import STATE
+from torchrl_loco.envs.transforms import load_transforms, state_of_transforms
 from torchrl_loco.policy import Policy
 from torchrl_loco.sim.simulation import check_memory
 from torchrl_loco.training import distributed
@@ -134,7 +137,8 @@ class Trainer:
         terms = self.env.observation_spec.get("reward_terms", None)
         self._terms = () if terms is None else tuple(terms.keys())
         self._content = content_of(run.task, self._base)
-        self.trials = Trials(config, self.algorithm, self.frames_per_iteration)
+        self._first_worlds = self._worlds()
+        self.trials = Trials(config, self.frames_per_iteration, self._begin_trial, self._kept_of_trial, self._restore)
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
         self._ahead: tuple[TensorDictBase, torch.Tensor] | None = None
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
@@ -142,6 +146,7 @@ class Trainer:
         self._alike: float | None = None  # the reward of the last batch, if there was only one
         self._ends_at_once = False
         self._best = -math.inf  # the evaluation that selected the policy
+        self._transforms_of_best: dict[str, Any] = {}
         self._evaluator: Evaluator | None = None
         if not first:  # the networks began alike, from here on each rank draws actions of its own
             torch.manual_seed(distributed.own_seed(config.seed))
@@ -158,6 +163,33 @@ class Trainer:
         distributed.copy_from_first(self.algorithm.networks.state_dict().values())
         shared = self._base.world.shared
         self._summed = {name: shared[name].clone() for name in type(self._base).summed_over_ranks}
+
+    # What trials begin with, and go back to.
+
+    def _worlds(self) -> dict[str, Any]:
+        """Returns how far a curriculum has come, and what transforms have learned."""
+        return {"stage": self._base.get_stage(), "transforms": state_of_transforms(self.env)}
+
+    def _begin_trial(self) -> None:
+        self.algorithm.begin_anew()
+        if self.config.init:
+            begin_from(self.algorithm, Path(self.config.init), self.config.device)
+        distributed.copy_from_first(self.algorithm.networks.state_dict().values())
+        self._set_worlds(self._first_worlds)
+
+    def _kept_of_trial(self) -> dict[str, Any]:
+        return {"algorithm": copy.deepcopy(self.algorithm.state_dict()), **self._worlds()}
+
+    def _restore(self, kept: dict[str, Any]) -> None:
+        self.algorithm.restore(kept["algorithm"])
+        self._set_worlds(kept)
+
+    def _set_worlds(self, kept: dict[str, Any]) -> None:
+        """Lets next episodes begin at a stage of a curriculum, behind what transforms had learned by then."""
+        load_transforms(self.env, kept["transforms"])
+        set_stage(self._base, kept["stage"])
+        for name, values in self._summed.items():
+            values.copy_(self._base.world.shared[name])
 
     def train(self) -> None:
         """Trains to the last frame, then evaluates the best policy, plots the learning curve and records a video.
@@ -316,7 +348,7 @@ class Trainer:
             "seconds": round(self.seconds, 3),
             "frames_per_second": round(self.frames_per_iteration / seconds, 1),
             **self.episodes.metrics(mean_reward, self._base.config.episode_length),
-            **{name: round(value, 6) for name, value in row.items()},
+            **{name: float(f"{value:.7g}") for name, value in row.items()},
         }
 
     def _collect(self) -> tuple[TensorDictBase, torch.Tensor]:
@@ -355,14 +387,28 @@ class Trainer:
             of_env["stage"] = stage
         if self.environments.transforms:
             of_env["transforms"] = self.environments.names_of_transforms
+        if self.environments.full_length != self.environments.length_of_task:
+            of_env["full_length"] = self.environments.full_length
         policy = deterministic_policy(self.algorithm.actor, self.config, {**when, **of_env})
+        self._compare_at(stage)
         summary = self._summary(policy, final=False)
         assert self._evaluator is not None
         self.run.append_evaluation({**when, **summary, **self._evaluator.metrics})
         if summary["mean"] >= self._best:
             self._best = policy.info["selected_by"] = summary["mean"]
             policy.save(self.run.policy)
+            self._transforms_of_best = state_of_transforms(self.env)
         return summary
+
+    def _compare_at(self, stage: Mapping[str, Any]) -> None:
+        """Evaluates the best policy so far anew if a curriculum has gone on since: at its stage all was easier."""
+        if not (stage and self._best > -math.inf):
+            return
+        best = Policy.load(self.run.policy, self.config.device)
+        if best.info.get("stage") != json.loads(json.dumps(stage)):
+            best.info["stage"] = stage
+            self._best = best.info["selected_by"] = self._summary(best, final=False)["mean"]
+            best.save(self.run.policy)
 
     def _summary(self, policy: Policy, final: bool) -> dict[str, float]:
         """Returns what a policy earns in the episodes that select the best policy, or in those at the end."""
@@ -376,9 +422,12 @@ class Trainer:
     def _finish(self) -> None:
         """Evaluates the best policy in episodes that did not select it, plots the learning curve, records a video."""
         config = self.config
+        if all(row["frames"] != self.frames for row in self.run.read_evaluations()):  # stopped, and no frame was left
+            self.evaluate()
         recording = ", and its video is recorded" if config.video_seconds > 0 else ""
         print(f"all frames are done: the best policy plays new episodes{recording}", flush=True)
         policy = Policy.load(self.run.policy, config.device)
+        load_transforms(self.env, self._transforms_of_best)
         summary = self._summary(policy, final=True)
         plot_runs([self.run], self.run.path / "learning_curve.png")
         if config.video_seconds > 0:
@@ -389,7 +438,8 @@ class Trainer:
         policy.info["total_frames"] = config.total_frames
         policy.save(self.run.policy)  # the last thing: it marks the run as finished
         print(f"best policy, in new episodes: {describe(summary)}")
-        for note in filter(None, (shipped_return(config), self.algorithm.note(self.run.read_metrics()))):
+        shipped = "" if "full_length" in policy.info else shipped_return(config)
+        for note in filter(None, (shipped, self.algorithm.note(self.run.read_metrics()))):
             print(note)
 
     def save(self) -> None:
@@ -413,6 +463,7 @@ class Trainer:
                 "spaces": dataclasses.asdict(self.algorithm.spaces),
                 "algorithm": self.algorithm.state_dict(),
                 "trials": self.trials.state_dict(),
+                "transforms_of_best": self._transforms_of_best,
                 "stage": self._base.get_stage(),
                 "terms": list(self._terms),
             }
@@ -475,14 +526,12 @@ class Trainer:
         self.algorithm.load_state_dict(checkpoint["algorithm"], **same)
         self.trials.load_state_dict(checkpoint["trials"])
         if distributed.is_first():
-            evaluations = [] if was_edited else self.run.read_evaluations()
-            means = [row["mean"] for row in evaluations if row["frames"] <= self.frames]
-            if self.run.policy.is_file() and not was_edited:  # maybe of a later evaluation, which is repeated inexactly
+            if self.run.policy.is_file() and not was_edited:
                 try:
-                    means.append(Policy.load(self.run.policy, "cpu").info.get("selected_by", -math.inf))
+                    self._best = Policy.load(self.run.policy, "cpu").info.get("selected_by", -math.inf)
                 except ValueError as error:
                     raise ValueError(f"{error}. Move it away: the run goes on without") from error
-            self._best = max(means, default=-math.inf)
+            self._transforms_of_best = checkpoint.get("transforms_of_best", {})
         if not same_kind and distributed.is_first():
             logging.getLogger("torchrl_loco").warning(
                 "device: %s so far, %s from here on; actions and minibatches are drawn anew, and rounded otherwise",

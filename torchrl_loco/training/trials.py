@@ -1,13 +1,12 @@
 """Several beginnings of a run, of which the best goes on: often chance decides early what a policy becomes."""
 
-import copy
 import math
+from collections.abc import Callable
 from typing import Any
 
 from tqdm.auto import tqdm
 
 from torchrl_loco.training import distributed
-from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.config import TrainingConfig
 
 
@@ -15,10 +14,24 @@ class Trials:
     """Policies that are trained for the same number of frames, one after the other; the best is then trained on.
 
     With one trial nothing is compared. All ranks make the same calls. A trial has whole batches.
+
+    Args:
+        config: settings of the run.
+        frames_per_iteration: frames of a batch, over all ranks.
+        begin_anew: begins a further trial as the run began.
+        kept: returns a copy of what a trial has come to.
+        restore: goes back to what ``kept`` returned.
     """
 
-    def __init__(self, config: TrainingConfig, algorithm: Algorithm, frames_per_iteration: int) -> None:
-        self._algorithm = algorithm
+    def __init__(
+        self,
+        config: TrainingConfig,
+        frames_per_iteration: int,
+        begin_anew: Callable[[], None],
+        kept: Callable[[], dict[str, Any]],
+        restore: Callable[[dict[str, Any]], None],
+    ) -> None:
+        self._begin_anew, self._kept, self._restore = begin_anew, kept, restore
         self._count, self._total = config.trials, config.total_frames
         self._length = config.trial_frames // frames_per_iteration * frames_per_iteration
         self._ended = 0
@@ -57,14 +70,13 @@ class Trials:
         self._ended += 1
         if self.running:
             if is_best:
-                self._mean, self._best = mean, copy.deepcopy(self._algorithm.state_dict())
-            self._algorithm.begin_anew()
-            distributed.copy_from_first(self._algorithm.networks.state_dict().values())
+                self._mean, self._best = mean, self._kept()
+            self._begin_anew()
             self._began = frames
             return
         if not is_best:
             assert self._best is not None
-            self._algorithm.restore(self._best)
+            self._restore(self._best)
         self._best = None
 
     def state_dict(self) -> dict[str, Any]:
