@@ -70,14 +70,13 @@ for frame in range(first, first + clips[clip]):
         "joint_velocities": np.concatenate([data.joint(name).qvel for name in joints]),
         "last_action": action,
     }
-    for term in facts["observation"]:  # of frames ahead, where the policy sees some
-        name, _, steps = term["term"].rpartition("_")
-        if steps.isdigit():
-            ahead = ask(np.zeros(size), min(frame + int(steps), last))
-            own = turned(ahead["body_quat_w"][base])
-            rates = [own.T @ ahead[f"body_{kind}_vel_w"][base] for kind in ("lin", "ang")]
-            pose = np.concatenate([ahead["body_pos_w"][base, 2:], -own[2], *rates])
-            seen[term["term"]] = {"joints": ahead["joint_pos"], "rates": ahead["joint_vel"], "base": pose}[name]
+    seen["ahead"] = []
+    for steps in facts["tracking"]["future"]:  # of frames ahead, where the policy sees some
+        ahead = ask(np.zeros(size), min(frame + steps, last))
+        own = turned(ahead["body_quat_w"][base])
+        rates = [own.T @ ahead[f"body_{kind}_vel_w"][base] for kind in ("lin", "ang")]
+        seen["ahead"] += [ahead["joint_pos"], ahead["joint_vel"], ahead["body_pos_w"][base, 2:], -own[2], *rates]
+    seen["ahead"] = np.concatenate(seen["ahead"] or [np.zeros(0)])
     action = ask(np.concatenate([seen[term["term"]] for term in facts["observation"]]), frame)["action"]
     data.ctrl[:] = offset + scale * action
     mujoco.mj_step(model, data, round(facts["control_timestep"] / model.opt.timestep))

@@ -421,6 +421,23 @@ def test_what_hooks_see_must_fit(seen, monkeypatch):
         Blind(2, "cpu", seed=0)
 
 
+def test_rays_meet_the_underside_of_a_field():
+    model = """
+    <mujoco><asset><hfield name="raised" nrow="3" ncol="4" size="1 0.8 0.4 0.3"/></asset><worldbody>
+    <geom type="hfield" hfield="raised" pos="0 0 1" euler="0 0 30"/><site name="eye" pos="0.1 0.2 0.1"/>
+    </worldbody></mujoco>"""
+    m = mujoco.MjModel.from_xml_string(model)
+    data, geom = mujoco.MjData(m), np.zeros(1, np.int32)
+    mujoco.mj_forward(m, data)
+    directions = np.random.default_rng(3).normal([0.0, 0.0, 2.0], 1.0, (100, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    rays = Rays(m, wp.get_device("cpu"), 0, directions, 1, far=50.0)
+    rays.launch(wp.array(data.xpos[None], dtype=wp.vec3), wp.array(data.xmat.reshape(1, -1, 3, 3), dtype=wp.mat33))
+    met = np.array([mujoco.mj_ray(m, data, data.site("eye").xpos, way, None, 1, -1, geom) for way in directions])
+    assert 20 < (met > 0).sum() < 100
+    np.testing.assert_allclose(rays.distance[0], np.where(met < 0, 50.0, met), rtol=1e-4)
+
+
 def test_hooks_cast_rays():
     """From a site that turns with its body: the floor is as far below a foot as the foot is high."""
 

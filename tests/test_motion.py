@@ -93,8 +93,11 @@ def test_what_is_no_motion_is_refused(tmp_path, g1, rows):
         Motion(tmp_path / "ragged.csv", fps=50.0)
     for row in ("1,2,3,0,0,0,1,what", "#1,2,3,0,0,0,1,4"):
         (tmp_path / "words.csv").write_text(f"1,2,3,0,0,0,1,4\n{row}\n1,2,3,0,0,0,1,4\n")
-        with pytest.raises(ValueError, match="in row 1"):
+        with pytest.raises(ValueError, match=r"in line 2, column [18]"):
             Motion(tmp_path / "words.csv", fps=50.0)
+    (tmp_path / "gap.csv").write_text("1,2,3,0,0,0,1,,4\n1,2,3,0,0,0,1,4,4\n")  # is no header
+    with pytest.raises(ValueError, match="'' in line 1, column 8"):
+        Motion(tmp_path / "gap.csv", fps=50.0)
     with pytest.raises(ValueError, match="pass fps"):
         Motion(PUNCHES)
     with pytest.raises(TypeError, match="ground must be True or False"):

@@ -49,7 +49,7 @@ def test_robots_begin_above_the_ground_in_the_middle_of_their_patch(env):
     memory, ground = env.world.memory, Hills.ground
     assert len(memory["level"].unique()) > 1
     origins = memory["origin"].numpy()
-    expected = ground.origins[memory["level"].numpy() - 1, (np.arange(24) + np.arange(24) // 4) % 3]
+    expected = ground.origins[memory["level"].numpy() - 1, (np.arange(24) + np.arange(24) // 12) % 3]
     np.testing.assert_allclose(origins, expected, atol=1e-6)
     assert (env.sim.qpos[:, :2] - memory["origin"][:, :2]).abs().max() <= 0.5
     m, data = env.mj_model, mujoco.MjData(env.mj_model)
@@ -246,6 +246,16 @@ def test_what_a_subclass_sets_stays_but_for_the_ground_under_its_robot(tmp_path)
         file = tmp_path / name
         file.write_text(f"import torchrl_loco\nclass Mine(torchrl_loco.Go1Rough):\n    {sets} = 'go1.xml'\n")
         assert [each.name for each in registry.resolve(f"{file}:Mine", by_user=True).model.texts] == ["mine"]
+
+
+def test_worlds_begin_on_all_patches_of_any_ground():
+    for rows in range(1, 7):
+        for columns in range(1, 9):
+            world = torch.arange(rows * columns)
+            column = rough.column_of(world, rows, columns)
+            assert len(set(zip((world % rows).tolist(), column.tolist(), strict=True))) == rows * columns
+    world = torch.arange(200)
+    assert torch.equal(rough.column_of(world, 10, 10), (world + world // 10) % 10)
 
 
 def test_evaluations_begin_on_all_levels(env):

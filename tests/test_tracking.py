@@ -289,10 +289,11 @@ def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_p
 def test_from_a_clip_to_a_file_that_plays_without_torch(tmp_path, short, capsys):
     settings = {"num_envs": 16, "num_steps": 8, "total_frames": 256, "minibatch_size": 64, "eval_episodes": 2}
     arguments = [f"--{name}={value}" for name, value in {**settings, "video_seconds": 0}.items()]
-    cli.main(["train", "h1_tracking", "--motion", str(short), "--fps", "25", *arguments, "--out", str(tmp_path)])
+    options = ["--motion", str(short), "--fps", "25", "--future", "1", "3"]
+    cli.main(["train", "h1_tracking", *options, *arguments, "--out", str(tmp_path)])
     (run,) = tmp_path.iterdir()
     config = json.loads((run / "config.json").read_text())
-    assert config["options"] == {"motion": [str(short)], "fps": 25.0}
+    assert config["options"] == {"motion": [str(short)], "fps": 25.0, "future": [1, 3]}
     info = loco.Policy.load(run / "policy.safetensors", "cpu").info
     assert info["options"] == config["options"]
     assert "stage" not in info

@@ -6,6 +6,7 @@ import inspect
 import io
 import logging
 import math
+import re
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,6 +21,9 @@ from torchrl_loco.storage import replace_file
 
 SUFFIXES = (".csv", ".npz")  # of files that motions are read from
 BASE = "xyzxyzw"  # the base's columns of a CSV file: its position, then its quaternion
+AXES = {**{axis: axis for axis in "xyzw"}, "i": "x", "j": "y", "k": "z", "r": "w"}  # of columns, by their names
+COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")  # of the base in a pose
+TILTED, UPRIGHT = 0.9, 0.97  # mean z of the base's upright axis, read as it is, and as if w came first
 MAX_SPEED, MAX_TURN = 12.0, 40.0
 """Speed (m/s) and rate of turn (rad/s) of the base between two frames that no robot has: the motion jumps there."""
 QUICK = 40.0  # rate of a joint (rad/s) between two frames that is said
@@ -72,6 +76,7 @@ class Motion:
             raise FileNotFoundError(f"there is no file {self.path}")
         fps = None if not fps else check_float("fps", fps)
         self._joints: list[str] = []
+        self._notes: list[str] = []
         self._bodies: tuple[np.ndarray, list[str]] | None = None
         suffix = self.path.suffix.lower()
         if suffix not in SUFFIXES:
@@ -98,11 +103,12 @@ class Motion:
 
     def _from_csv(self) -> np.ndarray:
         try:
-            lines = [line for line in self.path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
+            text = self.path.read_text(encoding="utf-8-sig").splitlines()
+            numbered = [(number, line) for number, line in enumerate(text, start=1) if line.strip()]
         except UnicodeDecodeError as error:
             raise ValueError(f"{self.path} is no text: {error}") from None
-        if lines and not _is_row(lines[0]):
-            names = [name.strip().strip('"') for name in lines.pop(0).split(",")]
+        if numbered and _numbers(numbered[0][1]).count(None) * 2 > numbered[0][1].count(","):
+            names = [name.strip().strip('"') for name in numbered.pop(0)[1].split(",")]
             self._joints = names[7:]
             axes = [_axis(name) for name in names[:7]]
             if sorted(axes) == sorted(BASE) and "".join(axes) != BASE:
@@ -110,11 +116,19 @@ class Motion:
                     f"{self.path} has {', '.join(names[:7])}: the base must be in the order x, y, z and, of its "
                     "quaternion, x, y, z, w"
                 )
+            if "".join(axes) != BASE:
+                self._notes.append(f"{', '.join(names[:7])} are taken for x, y, z and the quaternion x, y, z, w")
+        lines = [line for _, line in numbered]
         try:
             table = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None) if lines else np.empty((0, 0))
         except ValueError:
             widths = sorted({line.count(",") + 1 for line in lines})
-            wrong = [f"{line[:60]!r} in row {k}" for k, line in enumerate(lines) if not _is_row(line)]
+            wrong = [
+                f"{line.split(',')[column]!r} in line {number}, column {column + 1}"
+                for number, line in numbered
+                for column, value in enumerate(_numbers(line))
+                if value is None
+            ]
             what = wrong[0] if wrong else f"rows of {widths[0]} to {widths[-1]} numbers"
             raise ValueError(f"{self.path} must have rows of as many numbers, it has {what}") from None
         if table.shape[1] < 8:
@@ -154,11 +168,13 @@ class Motion:
         if len(q) < 2:
             raise ValueError(f"{self.path} has {len(q)} frames: a motion has at least 2")
         if (bad := np.argwhere(~np.isfinite(q))).size:
-            raise ValueError(f"{self.path}: frame {bad[0, 0]} has a number that is not finite, in column {bad[0, 1]}")
+            frame, column = (int(k) for k in bad[0])
+            which = COLUMNS[column] if column < 7 else f"joint {column - 7}"
+            raise ValueError(f"{self.path}: frame {frame} has a number that is not finite, in {which}")
         lengths = np.linalg.norm(q[:, 3:7], axis=1)
         if (wrong := np.flatnonzero(np.abs(lengths - 1.0) > NORM_ERROR)).size:
             raise ValueError(
-                f"{self.path}: columns 3 to 6 of frame {wrong[0]} must be a unit quaternion, their length is "
+                f"{self.path}: the base's orientation in frame {wrong[0]} must be a unit quaternion, its length is "
                 f"{lengths[wrong[0]]:.3g}"
             )
         q[:, 3:7] /= lengths[:, None]
@@ -171,6 +187,17 @@ class Motion:
                     f"{self.path}: the base {what} at {values[frame]:.0f} {unit} after frame {frame}, more than "
                     f"{most:g}: the motion jumps there, or fps ({self.fps:g}) is not its rate"
                 )
+
+    def in_steps(self, q: np.ndarray, dt: float) -> np.ndarray:
+        """Returns its poses at every control step of ``dt`` (s).
+
+        Raises:
+            ValueError: it is shorter than two of them.
+        """
+        q = resampled(q, self.fps, dt)
+        if len(q) < 3:
+            raise ValueError(f"{self.path} takes {self.seconds:g} s, less than two control steps of {dt:g} s")
+        return q
 
     def on(self, m: mujoco.MjModel) -> tuple[np.ndarray, list[str]]:
         """Returns the poses ``(frames, nq)`` for a model, and what is to be said of them.
@@ -190,7 +217,7 @@ class Motion:
             if sorted(self._joints) != sorted(joints):
                 raise ValueError(f"{self.path} must name each joint once, it names {', '.join(sorted(self._joints))}")
             q[:, 7:] = q[:, 7:][:, [self._joints.index(name) for name in joints]]
-        said = self._compare_bodies(m, q)
+        said = [*self._notes, *self._compare_bodies(m, q)]
         low, high = np.where(m.jnt_limited[1:, None].astype(bool), m.jnt_range[1:], (-np.inf, np.inf)).T
         beyond = np.maximum(low - q[:, 7:], q[:, 7:] - high)
         frame, joint = np.unravel_index(beyond.argmax(), beyond.shape)
@@ -204,8 +231,10 @@ class Motion:
         elif beyond.max() > 1e-3:
             order = ", as if the joints were in another order" if beyond.max() > FAR_BEYOND else ""
             said.append(f"{joints[joint]} is {beyond.max():.2f} rad beyond its limit in frame {frame}{order}")
-        if (2.0 * (q[:, 4] ** 2 + q[:, 5] ** 2) > 1.0).mean() > 0.5:
-            said.append("the base is upside down most of the time, as if its quaternion were not x, y, z, w")
+        up, as_if = (1.0 - 2.0 * (q[:, [a, b]] ** 2).sum(1).mean() for a, b in ((4, 5), (5, 6)))
+        if up < 0.0 or up < TILTED < UPRIGHT < as_if:
+            tilt = math.degrees(math.acos(up))
+            said.append(f"the base is tilted by {tilt:.0f} degrees, as if its quaternion were not x, y, z, w")
         rates = np.abs(np.diff(q[:, 7:], axis=0)) * self.fps
         if rates.max() > QUICK:
             frame, joint = np.unravel_index(rates.argmax(), rates.shape)
@@ -259,17 +288,21 @@ def _bodies_of(m: mujoco.MjModel) -> list[str]:
 
 
 def _axis(column: str) -> str:
-    """Returns the axis that a column is named after, as that of ``"root_qx"`` or ``"w_quat"``; "" if none."""
-    name = column.lower()
-    first = name[:1] if not name[1:2].isalpha() else ""
-    return next((axis for axis in (name[-1:], first) if axis and axis in BASE), "")
+    """Returns the axis that a column is named after, as that of ``"root_qx [m]"`` or ``"w_quat"``; "" if none."""
+    words = re.findall(r"[a-z]+", re.sub(r"[\[(].*", "", column.lower()))
+    named = [word.removeprefix("q") for word in words if word.removeprefix("q") in AXES]
+    return AXES[named[-1]] if named else AXES.get("".join(words)[-1:], "")
 
 
-def _is_row(line: str) -> bool:
-    try:
-        return bool([float(word) for word in line.split(",")])
-    except ValueError:
-        return False
+def _numbers(line: str) -> list[float | None]:
+    """Returns the numbers of a row, ``None`` for what is none."""
+    found: list[float | None] = []
+    for word in line.split(","):
+        try:
+            found.append(float(word))
+        except ValueError:
+            found.append(None)
+    return found
 
 
 def read(motion: Any, fps: float = 0.0) -> list[Motion]:
@@ -353,9 +386,7 @@ class Frames:
             q, notes = motion.on(m)
             if notes:
                 said[motion.name] = notes
-            q = resampled(q, motion.fps, dt)
-            if len(q) < 3:
-                raise ValueError(f"{motion.path} takes {motion.seconds:g} s, less than two control steps of {dt:g} s")
+            q = motion.in_steps(q, dt)
             pos, mat = poses(m, q)
             base = mat[:, m.jnt_bodyid[0]]
             pos, mat = pos[:, ids], mat[:, ids]

@@ -82,6 +82,7 @@ def motion(
             try:
                 each = motions.Motion(**one, clip=clip, ground=ground)
                 q, said = each.on(m)
+                each.in_steps(q, cls.config.ctrl_dt)
             except ValueError as error:
                 print(f"{Path(one['path']).stem:<{width}}  WRONG: {error}")
                 wrong += 1

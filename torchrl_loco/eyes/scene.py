@@ -218,7 +218,7 @@ def of_mesh(m: mujoco.MjModel, which: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def of_field(m: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns points and triangles of a height field: its surface, cut from low x and y to high, and its walls."""
+    """Returns points and triangles of a height field: its surface, cut from low x and y to high, walls and bottom."""
     rows, columns = int(m.hfield_nrow[field]), int(m.hfield_ncol[field])
     half_x, half_y, height, base = m.hfield_size[field]
     heights = m.hfield_data[m.hfield_adr[field] :][: rows * columns] * height
@@ -230,6 +230,8 @@ def of_field(m: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
     rim = np.concatenate([number[0, :-1], number[:-1, -1], number[-1, :0:-1], number[:0:-1, 0]])
     below, after = len(top) + np.arange(len(rim)), np.roll(np.arange(len(rim)), -1)
     faces += [np.stack([rim, below, below[after]], -1), np.stack([rim, below[after], rim[after]], -1)]
+    first, second, third, fourth = below[np.cumsum([0, columns - 1, rows - 1, columns - 1])]
+    faces.append(np.array([[first, third, second], [first, fourth, third]]))
     return np.concatenate([top, np.column_stack([top[rim, :2], np.full(len(rim), -base)])]), np.concatenate(faces)
 
 

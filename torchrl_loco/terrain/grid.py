@@ -9,7 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from torchrl_loco.checks import POSITIVE, check_float, check_int, check_packages
+from torchrl_loco.checks import POSITIVE, SEED, check_float, check_int, check_packages
 from torchrl_loco.config import read_mjcf
 from torchrl_loco.terrain.kinds import DEEP, Kind, Patch
 
@@ -63,13 +63,17 @@ class Terrain:
     ) -> None:
         self.rows, self.columns = check_int("rows", rows), check_int("columns", columns)
         self.size, self.cell = check_float("size", size, POSITIVE), check_float("cell", cell, POSITIVE)
-        self.border = check_float("border", border, POSITIVE)
+        self.border, seed = check_float("border", border, POSITIVE), check_int("seed", seed, SEED)
+        if not isinstance(kinds, Mapping):
+            raise TypeError(f"kinds must be a dict of functions by name, got {kinds!r}")
+        if wrong := [name for name, kind in kinds.items() if isinstance(kind, tuple) and len(kind) != 2]:
+            raise TypeError(f"kind {wrong[0]} must be a function, or a function and its share")
         if size / 2 + border < CLEAR:
             words = f"size / 2 + border ({size:g} / 2 + {border:g}) must be at least {CLEAR:g} m"
             raise ValueError(f"{words}, as robots begin so far from the middle of a patch")
         if not kinds or len(kinds) > columns:
             raise ValueError(f"kinds must be 1 to {columns}, the number of columns, got {len(kinds)}")
-        if abs(size / cell - round(size / cell)) > 1e-6:
+        if abs(size / cell - round(size / cell)) > 1e-6 or size < cell:
             raise ValueError(f"size ({size:g}) must be a multiple of cell ({cell:g})")
         functions = {name: kind if isinstance(kind, tuple) else (kind, 1.0) for name, kind in kinds.items()}
         self.kinds = self._of_columns(
@@ -197,7 +201,10 @@ class Terrain:
         plane = spec.geom(floor)
         if plane is None or plane.type != mujoco.mjtGeom.mjGEOM_PLANE:
             planes = [geom.name for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
-            raise ValueError(f"there is no plane {floor!r} to replace: choose one of {', '.join(map(repr, planes))}")
+            choices = f"choose one of {', '.join(map(repr, planes))}" if planes else "the model has no planes"
+            raise ValueError(f"there is no plane {floor!r} to replace: {choices}")
+        if any(floor in (pair.geomname1, pair.geomname2) for pair in spec.pairs):
+            raise ValueError(f"an explicit pair names the plane {floor!r}, which the ground replaces: leave it out")
         _check_level(spec, floor)
         like = {name: copy.copy(getattr(plane, name)) for name in OF_PLANE}
         spec.delete(plane)
@@ -224,7 +231,7 @@ class Terrain:
         step = max(self.cell / 2, max(x, y) / 700)
         across, along = np.arange(-x, x, step) + step / 2, np.arange(-y, y, step) + step / 2
         seen = self.height(np.stack(np.meshgrid(across, along), axis=-1))
-        figure = Figure(figsize=(10.0, max(3.0, 9.0 * y / x)), layout="constrained")
+        figure = Figure(figsize=(10.0, min(max(3.0, 9.0 * y / x), 60.0)), layout="constrained")
         axes = figure.add_subplot()
         shown = axes.imshow(seen, origin="lower", extent=(-x, x, -y, y), cmap="terrain")
         axes.plot(*self.origins[..., :2].reshape(-1, 2).T, "k.", ms=2)

@@ -25,9 +25,8 @@ SCAN = tuple((round(0.1 * x, 1), round(0.1 * y, 1)) for y in range(-5, 6) for x 
 """Where the heights around a robot are seen, ahead of it and to its left (m)."""
 MISS, SCALE = 5.0, 0.2  # height over the ground where there is none (m), and how heights are scaled
 FIRST_LEVELS = 6  # levels among which first episodes begin
-EXPECTED, LEAST_EXPECTED = 0.5, 2.0
-"""Share of the way that commands led at which a robot still keeps its level, and from which way on it counts (m)."""
-ACROSS = 8.0  # way that commands lead by which a robot must have left its patch, which is half as far (m)
+EXPECTED, COUNTS_FROM = 0.5, 0.25
+"""Share of the way that commands led at which a robot keeps its level; which way counts, in sides of a patch."""
 EDGE = 0.3  # how near the end of the ground an episode is cut off (m)
 AROUND = ((0.4, 0.0), (-0.4, 0.0), (0.0, 0.25), (0.0, -0.25))
 """Points ahead and to the left by which the slope of the ground is judged (m)."""
@@ -185,8 +184,8 @@ class Rough(Velocity):
         return s.distance > self.ground.size / 2
 
     def is_settled(self, s: View) -> torch.Tensor:
-        """Returns whether a robot has left its patch, or its commands have led far enough to do so, ``(num_envs,)``."""
-        return self.has_left(s) | (s.commanded_distance >= ACROSS)
+        """Returns whether a robot has left its patch, or its commands have led twice as far, ``(num_envs,)``."""
+        return self.has_left(s) | (s.commanded_distance >= self.ground.size)
 
     def ahead(self, s: View) -> torch.Tensor:
         """Returns the horizontal direction in which the base looks, ``(num_envs, 2)``."""
@@ -235,7 +234,7 @@ class Rough(Velocity):
     def metrics(self, s: View) -> dict[str, torch.Tensor]:
         """Returns also the level and the best level, from 0 on, and the share of robots that leave their patch.
 
-        A robot is asked once: when it falls, when it leaves, or when its commands have led 8 m away.
+        A robot is asked once: when it falls, when it leaves, or when its commands have led a patch's side away.
         """
         asked = ~s.asked & (s.terminated | self.is_settled(s))
         return {
@@ -279,7 +278,7 @@ class Rough(Velocity):
         """Returns the next level, the best, and the column, which stays."""
         rows, columns = self.ground.rows, self.ground.columns
         up = self.has_left(s)
-        slow = (s.commanded_distance > LEAST_EXPECTED) & (
+        slow = (s.commanded_distance > COUNTS_FROM * self.ground.size) & (
             s.distance < EXPECTED * s.commanded_distance.clamp(max=self.ground.size / 2)
         )
         down = ~up & (s.fell | slow)
@@ -289,7 +288,7 @@ class Rough(Velocity):
         first = s.uniform(1.0, min(FIRST_LEVELS, rows) + 1.0).int().clamp(max=min(FIRST_LEVELS, rows))
         level = torch.where(level > rows, anywhere, level)
         level = torch.where(s.level == 0, first, level)
-        column = (s.env_index + torch.div(s.env_index, rows, rounding_mode="floor")) % columns
+        column = column_of(s.env_index, rows, columns)
         return {"level": level, "reached": torch.where(s.level == 0, level, reached), "column": column}
 
     def chosen_level(self, s: View) -> dict[str, torch.Tensor]:
@@ -303,6 +302,11 @@ class Rough(Velocity):
         row = (patch[:, 1].clamp(0.0, 1.0) * (rows - 1)).round().int()
         column = s.first_column[kind] + turn % s.columns_of[kind]
         return {"level": row + 1, "reached": row + 1, "column": column, "patch": patch, "began_patch": patch}
+
+
+def column_of(world: torch.Tensor, rows: int, columns: int) -> torch.Tensor:
+    """Returns the columns in which worlds begin, such that with row ``world % rows`` all patches occur as often."""
+    return (world + torch.div(world, math.lcm(rows, columns), rounding_mode="floor")) % columns
 
 
 def turned(vectors: torch.Tensor, ahead: torch.Tensor) -> torch.Tensor:

@@ -246,13 +246,14 @@ class Tracking(Robot):
             FileNotFoundError: a file is not there.
             ValueError: no motion is named, and the robot has none.
         """
-        paths, fps = (self.motion, self.fps) if "motion" in self.options_given else ([], OWN_RATE)
-        if not paths and not hasattr(self, "motion_folder"):
+        given, fps = (self.motion, self.fps) if "motion" in self.options_given else ([], OWN_RATE)
+        if not given and not hasattr(self, "motion_folder"):
             raise ValueError(f"{type(self).__name__} has no motions of its own: pass motion, or set motion_folder")
-        key = type(self), json.dumps(paths), fps, self.config.ctrl_dt
+        key = type(self), json.dumps(given), fps, self.config.ctrl_dt
         try:
-            named = motions.named(paths or self.motion_folder, fps)
-            stamp = [Path(one["path"]).stat().st_mtime_ns for one in named if isinstance(one, dict)]
+            named = motions.named(given or self.motion_folder, fps)
+            paths = [Path(one["path"]).resolve() for one in named if isinstance(one, dict)]
+            stamp = [(path, file.st_mtime_ns, file.st_size, file.st_ino) for path in paths for file in (path.stat(),)]
         except FileNotFoundError:
             if key not in _tables:
                 raise
@@ -294,8 +295,9 @@ class Tracking(Robot):
 
     @classmethod
     def facts(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns how actions become targets of the joints, and which bodies are followed about which."""
-        tracking = {"base": cls.base, "anchor": cls.anchor, "bodies": list(cls.bodies)}
+        """Returns how actions become targets of the joints, which bodies are followed about which, and frames ahead."""
+        tracking: dict[str, Any] = {"base": cls.base, "anchor": cls.anchor, "bodies": list(cls.bodies)}
+        tracking["future"] = [int(steps) for steps in info.get("options", {}).get("future", getattr(cls, "future", ()))]
         return {**super().facts(m, info), "tracking": tracking}
 
     # The hooks, in the order in which they are called.
@@ -483,7 +485,7 @@ def _kept(motion: Any) -> Any:
     return str(Path(motion).expanduser().absolute())
 
 
-_tables: dict[Any, tuple[list[int], motions.Frames]] = {}  # when files were changed, and what was read of them
+_tables: dict[Any, tuple[list[Any], motions.Frames]] = {}  # when files were changed, and what was read of them
 
 
 def angle(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
