@@ -12,9 +12,9 @@ class Episodes:
     """Returns and lengths of the episodes that end in training.
 
     The return of an episode that terminated is the sum of its rewards. One that was truncated is taken to go on as it
-    went: its mean reward times the task's own length, since episodes may be shorter in training. So the mean compares
-    with an evaluation, whether episodes fall or run to the time limit. An episode counts if it was seen from its start,
-    which the first of a world is not where worlds are staggered.
+    went: its mean reward times the task's own length, since episodes may be shorter in training; so is one that is
+    longer than the task's own. So the mean compares with an evaluation, whether episodes fall or run to the time limit.
+    An episode counts if it was seen from its start, which the first of a world is not where worlds are staggered.
 
     Sums of the episodes that are running lie on the device (``add``); the host keeps sums of the last batches, with
     at least 100 episodes as soon as so many have ended (``take``).
@@ -53,7 +53,8 @@ class Episodes:
         steps = position - starts + self._steps * began_before
         counts = done & (self._whole | ~began_before)
         lengths = steps * self._action_repeat
-        returns = torch.where(terminated, sums, sums * (self._full_length / lengths))
+        fell = terminated & (lengths <= self._full_length)
+        returns = torch.where(fell, sums, sums * (self._full_length / lengths))
         # The episodes that the next batch goes on with.
         last, none_ended = ends[:, -1:], ends[:, -1:] == 0
         self._sum = total[:, -1:] - total.gather(1, last) + self._sum * none_ended
