@@ -19,7 +19,8 @@ class ActionRepeat(FrameSkipTransform):
     """Holds an action for several control steps and sums their rewards, up to the step that ends a world's episode.
 
     TorchRL's FrameSkipTransform goes on stepping a world whose episode has ended, and loses the end and the true
-    terminal observation.
+    terminal observation. Until the action ends such a world is stepped on here, too, unseen: ``adapt`` and ``health()``
+    count its end more than once.
     """
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
