@@ -12,7 +12,6 @@ import tyro
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import FrameSkipTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
@@ -40,7 +39,7 @@ def layers(inputs: int, outputs: int, width: int = 256) -> MLP:
 def make_env(task: str, num_envs: int, device: str, seed: int, **options: int | bool) -> torchrl_loco.TransformedEnv:
     """Returns worlds in which an action is held for ``ACTION_REPEAT`` control steps."""
     env = torchrl_loco.make(task, num_envs, device, seed, **options)
-    return torchrl_loco.TransformedEnv(env, FrameSkipTransform(ACTION_REPEAT))
+    return torchrl_loco.TransformedEnv(env, torchrl_loco.ActionRepeat(ACTION_REPEAT))
 
 
 def make_loss(env: torchrl_loco.TransformedEnv, gamma: float) -> tuple[ProbabilisticActor, SACLoss]:

@@ -18,6 +18,7 @@ from torchrl.envs import (
     InitTracker,
     ObservationNorm,
     RewardSum,
+    StepCounter,
     VecNormV2,
 )
 from torchrl.envs.utils import ExplorationType, exploration_type
@@ -126,6 +127,32 @@ def test_its_state_has_the_seed(shared):
     second.load_state_dict(first.state_dict())
     assert (first.rollout() == second.rollout()).all()
     assert envs[1].seed == 7
+    elsewhere = shared("walker_run", 3, world_offset=4)
+    with pytest.raises(ValueError, match="the state is of 3 worlds from 0 on, not 3 from 4"):
+        RolloutCollector(elsewhere, policy(elsewhere), frames_per_batch=30).load_state_dict(first.state_dict())
+
+
+def test_after_an_interrupted_batch_the_next_begins_with_what_the_worlds_show(shared):
+    """Whether the policy fails before a step, or the step itself in its midst, after which all worlds begin anew."""
+    env = torchrl_loco.TransformedEnv(shared("walker_run", 4), StepCounter())
+    calls, act = [], policy(env)
+
+    def failing(td):
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return act(td)
+
+    collector = RolloutCollector(env, failing, frames_per_batch=4 * 5)
+    with pytest.raises(KeyboardInterrupt):
+        collector.rollout()
+    assert (collector.state_dict()["carried"]["step_count"] == 3).all()
+    assert (collector.rollout()["next", "step_count"][:, 0] == 4).all()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(env.base_env.world, "reset_masked", lambda: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            collector.rollout()
+    assert (collector.rollout()["next", "step_count"][:, 0] == 1).all()
 
 
 class Noisy(torch.nn.Module):
@@ -196,7 +223,8 @@ def test_why_batches_are_not_recorded(make):
     assert what_forbids_recording(made, cuda, chosen) is what_forbids_recording(summed, cuda, chosen) is None
     assert "'mujoco_warp'" in what_forbids_recording(made, slow, chosen)
     assert "no nn.Module" in what_forbids_recording(made, cuda, lambda td: td)
-    assert "FiniteTensorDictCheck may keep" in what_forbids_recording(checked, cuda, chosen)
+    for env in (checked, torchrl_loco.TransformedEnv(checked, RewardSum())):
+        assert "FiniteTensorDictCheck may keep" in what_forbids_recording(env, cuda, chosen)
 
 
 def on_cuda(task, wrap=False, num_envs=64, **settings):

@@ -364,6 +364,28 @@ def test_gymnasium_without_a_render_mode(gymnasium):
         wrappers.GymnasiumVectorEnv(make(), render_mode="human")
     with pytest.raises(TypeError, match="this is one world, take GymnasiumVectorEnv"):
         wrappers.GymnasiumEnv("walker_stand", num_envs=1)
+    for _ in range(2):  # what a reset opens again is closed again
+        env.reset()
+        env.close()
+        assert env.env.is_closed
+
+
+@pytest.mark.ci
+def test_pixels_are_those_of_the_camera_and_metrics_are_infos(gymnasium):
+    class Timed(torchrl_loco.WalkerStand):
+        def metrics(self, s):
+            return {"clock": s.time}
+
+    seen = {"from_pixels": True, "pixels_only": True, "size": (12, 12), "device": "cpu", "seed": 0}
+    for camera in ("side", "back"):
+        env = wrappers.GymnasiumVectorEnv(Timed, 2, camera=camera, metrics=True, **seen)
+        observations, _ = env.reset()
+        plain = torchrl_loco.make(Timed, 2, camera=camera, **seen)
+        assert np.array_equal(observations["pixels"], plain.reset()["pixels"])
+        *_, info = env.step(np.zeros((2, 6), dtype=np.float32))
+        np.testing.assert_allclose(info["metrics"]["clock"], 0.025)
+    with pytest.raises(ValueError, match="camera"):
+        wrappers.GymnasiumVectorEnv(Timed, 2, camera="nowhere", **seen)
 
 
 # RSL-RL.

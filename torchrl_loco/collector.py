@@ -19,14 +19,13 @@ from tensordict.nn import (
 from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.envs import EnvBase, Transform
-from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import SafeProbabilisticModule
 
 from torchrl_loco.checks import ANY, Interval, check_int
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.state import State
-from torchrl_loco.envs.transforms import PLAIN_TRANSFORMS, load_transforms, state_of_transforms
+from torchrl_loco.envs.transforms import PLAIN_TRANSFORMS, load_transforms, state_of_transforms, unwrap
 from torchrl_loco.sim import TorchGraph
 
 
@@ -76,7 +75,7 @@ class RolloutCollector:
                 f"frames_per_batch must be a positive multiple of the {worlds} worlds, got {frames_per_batch}"
             )
         self._env = env
-        self._base = env.base_env if isinstance(env, TorchRLTransformedEnv) else env
+        self._base, _ = unwrap(env)
         self._policy = policy
         self._steps = frames_per_batch // worlds
         self._frames_per_batch = frames_per_batch
@@ -111,8 +110,17 @@ class RolloutCollector:
         """Whether batches are collected by a recording, without the host."""
         return self._recording is not None and self._recording.works
 
-    def _take_steps(self, td: TensorDictBase) -> tuple[list[TensorDictBase], TensorDictBase]:
-        """Returns the steps of a batch that begins with ``td``, and what the next one begins with."""
+    def _take_steps(
+        self, td: TensorDictBase, interruptible: bool = False
+    ) -> tuple[list[TensorDictBase], TensorDictBase]:
+        """Returns the steps of a batch that begins with ``td``, and what the next one begins with.
+
+        Where it can be interrupted, the next batch goes on from the last whole step, or from a reset if there is half
+        of one.
+
+        Raises:
+            TypeError: the policy returns no TensorDict.
+        """
         steps = []
         for _ in range(self._steps):
             current = self._policy(td)
@@ -120,10 +128,14 @@ class RolloutCollector:
                 raise TypeError(f"policy must return the TensorDict with an action, got {type(current).__name__}")
             if current is not td:  # perhaps with the action alone
                 current = td.update(current)
+            if interruptible:
+                self._carried = None
             if steps_as_ours(self._env):
                 current, td = self._base._step_and_maybe_reset(current, self._rewritten)
             else:
                 current, td = self._env.step_and_maybe_reset(current)
+            if interruptible:
+                self._carried = td
             steps.append(current)
         return steps, td
 
@@ -134,7 +146,7 @@ class RolloutCollector:
             noted_synchronisation() if watch else contextlib.nullcontext([])
         )
         with watching as waits:
-            steps, self._carried = self._take_steps(self._carried)
+            steps, self._carried = self._take_steps(self._carried, interruptible=True)
         if waits:
             self._go_step_by_step(f"something waits for the device ({waits[0]})")
         elif watch:
@@ -178,7 +190,12 @@ class RolloutCollector:
         """Returns a copy of the state of worlds and transforms, and of the data that the next batch begins with.
 
         Of transforms it is what their ``state_dict`` holds, such as what ``VecNormV2`` has learned.
+
+        Raises:
+            TypeError: it collects in an environment of TorchRL's, such as ``SerialEnv``.
         """
+        if not isinstance(self._base, LocoEnv):
+            raise TypeError(f"the state of {type(self._base).__name__} is not known: collect in one environment")
         state: dict[str, Any] = {"transforms": state_of_transforms(self._env)}
         if self._carried is not None:
             worlds = self._base.get_state()
@@ -186,7 +203,7 @@ class RolloutCollector:
             state |= {"carried": self._carried.exclude(*again).clone().to_dict(), "env": worlds.to_dict()}
             of_env = {*self._env.observation_spec, *self._env.done_spec, *self._env.state_spec}
             state["remembered"] = [key for key in self._carried.keys() if key not in of_env]  # noqa: SIM118, no dict
-            state["seed"] = self._base.seed
+            state |= {"seed": self._base.seed, "first_world": self._base.world_offset or 0}
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -197,9 +214,15 @@ class RolloutCollector:
         Without the entries of worlds they begin anew, with a reset of all; without that of transforms, those go on as
         they are. If the environment returns other entries by now, such as other terms of the reward, it is those that
         the next batch begins with.
+
+        Raises:
+            ValueError: the state is of other worlds.
         """
         self._carried = None
         if "carried" in state:
+            worlds = [len(state["env"]["elapsed_steps"]), state.get("first_world", self._base.world_offset or 0)]
+            if worlds != (own := [self._base.num_envs, self._base.world_offset or 0]):
+                raise ValueError(f"the state is of {worlds[0]} worlds from {worlds[1]} on, not {own[0]} from {own[1]}")
             size, device = self._env.batch_size, self._env.device
             begin = self._env.reset(State(state["env"], batch_size=size, device=device), set_state=True)
             carried = TensorDict(state["carried"], batch_size=size, device=device)
@@ -308,8 +331,7 @@ def what_forbids_recording(env: EnvBase, base: LocoEnv, policy: Any) -> str | No
         return f"engine {base.engine!r} launches too many kernels to gain from it"
     if not isinstance(policy, nn.Module):
         return "the policy is no nn.Module, so it would not be noticed if its weights were replaced"
-    transforms = env.transform.modules() if isinstance(env, TorchRLTransformedEnv) else ()
-    for transform in transforms:
+    for transform in (part for each in unwrap(env)[1] for part in each.modules()):
         if isinstance(transform, Transform) and type(transform) not in PLAIN_TRANSFORMS:
             return f"{type(transform).__name__} may keep something on the host from step to step"
     return None

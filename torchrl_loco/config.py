@@ -153,6 +153,7 @@ CONVERGED: dict[str, Any] = {"iterations": 100, "ls_iterations": 50, "euler_damp
 
 
 NO_ARGUMENTS = {
+    "max_episode_steps": "pass episode_length, the control steps of an episode",
     "frame_skip": "pass ctrl_dt, the time between two actions, or use torchrl_loco.ActionRepeat",
     "render_mode": "call env.render(); the Gymnasium wrapper in torchrl_loco.wrappers takes a render_mode",
 }

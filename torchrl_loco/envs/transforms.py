@@ -23,8 +23,16 @@ class ActionRepeat(FrameSkipTransform):
     count its end more than once.
     """
 
+    _said = False
+
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         parent: Any = self.parent
+        if not self._said and "adapt" in getattr(unwrap(parent)[0].hooks, "own", ()):
+            self._said = True
+            logging.getLogger("torchrl_loco").warning(
+                "adapt() counts an episode that ends within an action of ActionRepeat more than once: pass a longer "
+                "ctrl_dt instead"
+            )
         for _ in range(self.frame_skip - 1):
             before, after = next_tensordict, parent._step(tensordict)
             over = before.get("done")

@@ -61,6 +61,12 @@ def groups_of(env: EnvBase) -> list[str]:
     return groups
 
 
+def named_numbers(after: TensorDictBase) -> dict[str, Any]:
+    """Returns terms of the reward and metrics of a step, where they were asked for, each ``(num_envs,)`` by name."""
+    kinds = [kind for kind in ("reward_terms", "metrics") if kind in after]
+    return {kind: {name: values.squeeze(-1) for name, values in after[kind].items()} for kind in kinds}
+
+
 def to_numpy(data: Any) -> Any:
     """Returns copies of a tensor, or of those of a dictionary, as arrays on the host."""
     if isinstance(data, dict):
@@ -80,13 +86,21 @@ class Wrapped:
     """What wrappers share that make pictures: the environment, its groups of observations and its camera."""
 
     def _wrap(
-        self, env: Any, num_envs: int | None, settings: dict[str, Any], mode: str | None, picture: tuple[str, int, int]
+        self,
+        env: Any,
+        num_envs: int | None,
+        settings: dict[str, Any],
+        mode: str | None,
+        picture: tuple[str | None, int, int],
     ) -> None:
         self.render_mode = None if mode is None else check_choice("render_mode", mode, RENDER_MODES)
-        self.env, self._picture = made(env, num_envs, settings), picture
+        camera, width, height = picture
+        if camera is not None and (settings.get("from_pixels") or settings.get("depth")):
+            settings["camera"] = camera
+        self.env, self._picture = made(env, num_envs, settings), (camera or "side", width, height)
         self._groups = groups_of(self.env)
-        if mode is not None:
-            base_of(self.env).check_picture(*picture)
+        if mode is not None or camera is not None:
+            base_of(self.env).check_picture(*self._picture)
 
     def _render_metadata(self) -> dict[str, Any]:
         skipping = [part for part in named_transforms(self.env).values() if isinstance(part, FrameSkipTransform)]

@@ -52,12 +52,14 @@ class GymnasiumEnv(common.Wrapped, Env):
         ValueError: the environment has several worlds.
     """
 
+    metadata: dict[str, Any] = {"render_modes": list(common.RENDER_MODES)}  # noqa: RUF012, as Gymnasium has it
+
     def __init__(
         self,
         env: str | type[LocoEnv] | EnvBase,
         *,
         render_mode: str | None = None,
-        camera: str = "side",
+        camera: str | None = None,
         width: int = 320,
         height: int = 240,
         **settings: Any,
@@ -75,7 +77,7 @@ class GymnasiumEnv(common.Wrapped, Env):
         """Begins a new episode.
 
         Args:
-            seed: decides all later draws too; ``None`` goes on with the random stream.
+            seed: decides all later draws too; ``None`` goes on with the random stream. A curriculum goes on.
             options: ignored.
 
         Returns:
@@ -92,7 +94,7 @@ class GymnasiumEnv(common.Wrapped, Env):
 
         Returns:
             Observation, reward, whether the episode terminated or was truncated, and the infos, which have
-            ``reward_terms`` by name with ``reward_terms=True``.
+            ``reward_terms`` by name with ``reward_terms=True``, and ``metrics`` with ``metrics=True``.
 
         Raises:
             gymnasium.error.ResetNeeded: ``reset()`` was never called, or the episode is over.
@@ -103,9 +105,8 @@ class GymnasiumEnv(common.Wrapped, Env):
         after = self.env.step(self._td.set("action", action.unsqueeze(0)))["next"]
         terminated, truncated = bool(after["terminated"]), bool(after["truncated"])
         self._td = None if terminated or truncated else after.exclude("reward")
-        infos = {}
-        if "reward_terms" in after:
-            infos["reward_terms"] = {name: float(term) for name, term in after["reward_terms"].items()}
+        told = common.named_numbers(after)
+        infos = {kind: {name: float(values[0]) for name, values in of_kind.items()} for kind, of_kind in told.items()}
         return self._observation(after), float(after["reward"]), terminated, truncated, infos
 
     def _observation(self, td: TensorDictBase) -> Any:
@@ -130,7 +131,8 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
     - with ``arrays="torch"`` in every step, in the form of an observation, batch ``(num_envs,)``, because only the
       device knows which worlds are done. In the other worlds it equals the observation.
 
-    With ``reward_terms=True``, ``info["reward_terms"]`` has the terms of the step by name, each ``(num_envs,)``.
+    With ``reward_terms=True``, ``info["reward_terms"]`` has the terms of the step by name, each ``(num_envs,)``; so has
+    ``info["metrics"]`` with ``metrics=True``.
 
     Args:
         env: an id, a class, or an environment that is made already, with TorchRL's transforms or without.
@@ -138,7 +140,7 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
         arrays: what is returned: ``"numpy"`` arrays on the host, which Gymnasium's wrappers expect, or ``"torch"``
             tensors on the device, for which nothing waits. Actions may be either.
         render_mode: ``"rgb_array"`` if ``render()`` is to return pixels, else ``None``.
-        camera: name of the camera.
+        camera: name of the camera of these pixels, "side" by default, and of those of ``from_pixels``.
         width: pixels in a row.
         height: rows.
         settings: arguments of :func:`torchrl_loco.make`, for an id or a class.
@@ -160,7 +162,7 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
         *,
         arrays: str = "numpy",
         render_mode: str | None = None,
-        camera: str = "side",
+        camera: str | None = None,
         width: int = 320,
         height: int = 240,
         **settings: Any,
@@ -179,7 +181,7 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
         """Begins new episodes.
 
         Args:
-            seed: decides all later draws too; ``None`` goes on with the random streams.
+            seed: decides all later draws too; ``None`` goes on with the random streams. A curriculum goes on.
             options: ``{"reset_mask": mask}``, bool ``(num_envs,)``, resets the worlds of the mask alone.
 
         Returns:
@@ -189,6 +191,7 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
             ValueError: there is no such option, or the mask has another shape or type.
         """
         super().reset(seed=seed)
+        self.closed = False  # else Gymnasium would not close again what a reset opens again
         if seed is not None:
             self.env.set_seed(seed)
         for name in options or ():
@@ -223,8 +226,7 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
         if self._torch or done.any():
             last = self._convert(self._seen(after))
             infos = {"final_obs": last if self._torch else common.rows_as_objects(last, done), "_final_obs": done}
-        if "reward_terms" in after:
-            infos["reward_terms"] = {k: self._convert(x.squeeze(-1)) for k, x in after["reward_terms"].items()}
+        infos |= {kind: self._convert(of_kind) for kind, of_kind in common.named_numbers(after).items()}
         return self._convert(self._seen(self._td)), rewards, terminations, truncations, infos
 
     def _convert(self, data: Any) -> Any:

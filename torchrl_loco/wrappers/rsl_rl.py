@@ -8,7 +8,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.wrappers.common import base_of, groups_of, made, step_worlds
+from torchrl_loco.wrappers.common import base_of, groups_of, made, named_numbers, step_worlds
 
 
 class RslRlVecEnv(VecEnv):
@@ -23,7 +23,7 @@ class RslRlVecEnv(VecEnv):
     - ``time_outs``, bool ``(num_envs,)``: the worlds that were truncated and not terminated;
     - ``final_observations``: in the form of the observations, the true last ones in worlds that are done, and the
       same as the observations in the others;
-    - ``log``, with ``reward_terms=True``: the mean of each term of the reward, which RSL-RL logs.
+    - ``log``, with ``reward_terms=True`` or ``metrics=True``: the mean of each over the worlds, which RSL-RL logs.
 
     Arguments and errors are those of :class:`.GymnasiumVectorEnv`, but for what it says of arrays and pictures.
 
@@ -54,7 +54,9 @@ class RslRlVecEnv(VecEnv):
     @episode_length_buf.setter
     def episode_length_buf(self, steps: torch.Tensor) -> None:
         state = base_of(self.env).get_state()
-        self._td = self.env.reset(state.set("elapsed_steps", steps), set_state=True)
+        if steps.shape != state["elapsed_steps"].shape:
+            raise ValueError(f"episode_length_buf must have shape ({self.num_envs},), got {tuple(steps.shape)}")
+        self._td = self.env.reset(state.set("elapsed_steps", steps.to(torch.int32)), set_state=True)
 
     def get_observations(self) -> TensorDict:
         """Returns the current observations, batch ``(num_envs,)``."""
@@ -75,8 +77,9 @@ class RslRlVecEnv(VecEnv):
         after, self._td = step_worlds(self.env, self._td, actions)
         time_outs = after["truncated"] & ~after["terminated"]
         extras = {"time_outs": time_outs.squeeze(-1), "final_observations": self._observations(after)}
-        if "reward_terms" in after:
-            extras["log"] = {f"/reward_terms/{name}": term.mean() for name, term in after["reward_terms"].items()}
+        if told := named_numbers(after):
+            means = {(kind, name): values.nanmean() for kind in told for name, values in told[kind].items()}
+            extras["log"] = {f"/{kind}/{name}": mean for (kind, name), mean in means.items()}
         return self.get_observations(), after["reward"].squeeze(-1), after["done"].squeeze(-1), extras
 
     def close(self) -> None:

@@ -19,7 +19,8 @@ class StableBaselines3VecEnv(common.Wrapped, VecEnv):
     them, for ``MultiInputPolicy``. Stable-Baselines3 refuses actions without bounds.
 
     The infos of a world that is done have ``terminal_observation``, the true last one, and ``TimeLimit.truncated``,
-    whether it was truncated and not terminated.
+    whether it was truncated and not terminated. They have no terms of the reward and no metrics: a dictionary of these
+    for each world would take longer than a step.
 
     Arguments, attributes and errors are those of :class:`.GymnasiumVectorEnv`.
     """
@@ -32,7 +33,7 @@ class StableBaselines3VecEnv(common.Wrapped, VecEnv):
         num_envs: int | None = None,
         *,
         render_mode: str | None = None,
-        camera: str = "side",
+        camera: str | None = None,
         width: int = 320,
         height: int = 240,
         **settings: Any,
@@ -86,8 +87,7 @@ class StableBaselines3VecEnv(common.Wrapped, VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Returns the attribute once for each world of ``indices``."""
-        worlds = range(self.num_envs) if indices is None else [indices] if isinstance(indices, int) else indices
-        return [getattr(self, attr_name) for _ in worlds]
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Raises NotImplementedError."""
