@@ -7,6 +7,7 @@ On a robot, ``Robot`` is what reads its sensors and sends the targets of its joi
 """
 
 import argparse
+import collections
 import json
 
 import mujoco
@@ -61,10 +62,15 @@ low, high = (facts["velocity"][f"command_{end}"] for end in ("low", "high"))
 if not ((np.array(args.command) >= low) & (np.array(args.command) <= high)).all():  # nor is NaN
     parser.error(f"the policy was trained for commands from {low} to {high}, and may fall beyond")
 robot, action = Robot(facts), np.zeros(len(scale))
+if unknown := terms - robot.read(action, args.command).keys():
+    parser.error(f"{args.file} observes {', '.join(sorted(unknown))}, which this program does not know")
+past = collections.deque(maxlen=facts["history"])  # of observations, the oldest first
 for step in range(round(args.seconds / facts["control_timestep"])):
     if step % facts["action_repeat"] == 0:
         seen = robot.read(action, args.command)
-        observation = np.concatenate([seen[term["term"]] for term in facts["observation"]])
+        newest = np.concatenate([seen[term["term"]] for term in facts["observation"]])
+        past.extend([newest] * (past.maxlen if not past else 1))
+        observation = np.concatenate(past)
         action = session.run(["action"], {"observation": observation[None].astype(np.float32)})[0][0]
     robot.send(offset + scale * action)
 print("base at", *robot.data.qpos[:3].round(2), "m; targets (rad):")

@@ -11,9 +11,10 @@ from for_each import for_each
 from torch import nn
 
 import torchrl_loco
-from torchrl_loco import cli
+from torchrl_loco import cli, export
+from torchrl_loco.config import arguments_of
 from torchrl_loco.export import TOLERANCE, export_policy, of_robot
-from torchrl_loco.policy import ObservationNorm, Policy
+from torchrl_loco.policy import ObservationNorm, Policy, check_terms
 
 INFO = {"task": "walker_stand", "protocol": "dm_control", "action_repeat": 2, "mean": 12.5}
 
@@ -182,3 +183,21 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(["export", "walker_walk", "--format", "torch", "--out", "other.pt2"])
     assert "already exists" in capsys.readouterr().err
+
+
+def test_terms_in_another_order_are_refused(caplog):
+    trained = [["pose", 4], ["velocities", 4]]
+    check_terms(trained, {"pose": 4, "velocities": 4}, "task")
+    check_terms((), {"pose": 4}, "task")
+    assert not caplog.records
+    check_terms(trained, {"pose": 4, "speeds": 4}, "task")
+    assert "trained on pose, velocities, task observes pose, speeds" in caplog.text
+    with pytest.raises(ValueError, match="task observes velocities, pose: another order"):
+        check_terms(trained, {"velocities": 4, "pose": 4}, "task")
+
+
+def test_settings_of_a_training_that_a_file_tells():
+    """Also of a checkpoint, which does not say the rate, and of a training without variation."""
+    info = {"task": "walker_walk", "protocol": "playground", "sim": {"ctrl_dt": 0.05, "sim_dt": None}}
+    assert export._control_timestep(info) == 0.05
+    assert arguments_of({**info, "randomize": False}) == {"ctrl_dt": 0.05, "randomize": ()}

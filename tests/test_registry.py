@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import importlib
 import itertools
 import json
 import runpy
@@ -270,3 +271,19 @@ def test_naconmax_grows_with_the_worlds():
     for num_envs, expected in ((1, 1024), (2048, 50_000), (4096, 100_000)):
         assert sim_config(CONFIGS["walker"], "playground", num_envs, {}).naconmax == expected
     assert make("walker_stand", 100, "cpu", engine="mujoco_warp").sim.data.naconmax == 2442
+
+
+def test_modules_beside_a_file_are_its_own(tmp_path, monkeypatch):
+    """Whatever another task or the working directory has of that name."""
+    body = "import common\nimport torchrl_loco\nclass Own{0}(torchrl_loco.WalkerStand):\n    k = common.K\n"
+    for folder, number in (("here", 0), ("a", 1), ("b", 2)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "common.py").write_text(f"K = {number}\n")
+        (tmp_path / folder / f"task_{folder}.py").write_text(body.format(folder))
+    monkeypatch.syspath_prepend(tmp_path / "here")
+    assert importlib.import_module("common").K == 0
+    found = [registry.resolve(f"{tmp_path}/{of}/task_{of}.py:Own{of}", by_user=True).k for of in ("a", "b")]
+    assert found == [1, 2]
+    assert importlib.import_module("common").K == 0
+    for name in ("common", *(name for name in sys.modules if name.startswith(("task_a_", "task_b_")))):
+        monkeypatch.delitem(sys.modules, name)

@@ -18,10 +18,10 @@ from torch import nn
 import torchrl_loco
 from torchrl_loco import storage
 from torchrl_loco.checks import check_output_file, check_packages
-from torchrl_loco.config import SimConfig, arguments_of
+from torchrl_loco.config import SimConfig, arguments_of, sim_config
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.task import definer, folder_of
-from torchrl_loco.policy import Policy, difference, random_observations
+from torchrl_loco.policy import Policy, check_terms, difference, random_observations
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
 from torchrl_loco.sim.corners import stand_on_corners
@@ -80,8 +80,7 @@ def export_policy(policy: Policy, path: Path) -> float:
         "action_size": expected.shape[-1],
         "action_low": -1.0 if policy.is_bounded else None,
         "action_high": 1.0 if policy.is_bounded else None,
-        # Older files do not say it.
-        "control_timestep": info.get("control_timestep") or resolve(info["task"]).config.ctrl_dt,
+        "control_timestep": info.get("control_timestep") or _control_timestep(info),
         "action_repeat": info["action_repeat"],
         "torchrl_loco": torchrl_loco.__version__,
         "info": info,
@@ -234,6 +233,7 @@ def of_robot(policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
             f"the policy has observations of shape {sizes[0]} and {sizes[1]} actions, {policy.info['task']} has "
             f"{asked[0]} and {asked[1]}: it was edited since the training, or it is another task"
         )
+    check_terms(policy.info.get("terms", ()), terms, policy.info["task"])
     spec = _stepped(models.specification(cls.model, folder_of(cls)), env.config)
     m = spec.compile()
     low, high = m.actuator_ctrlrange.T
@@ -253,6 +253,12 @@ def of_robot(policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
     if control < told:  # the facts are of the controls of a class above
         facts = {name: fact for name, fact in facts.items() if name not in scaled}
     return facts, reference
+
+
+def _control_timestep(info: Mapping[str, Any]) -> float:
+    """Returns that of a policy's task: older files, and checkpoints, do not say it."""
+    given = {name: value for name, value in info.get("sim", {}).items() if value is not None}
+    return sim_config(resolve(info["task"]).config, info["protocol"], 1, given).ctrl_dt
 
 
 def _stepped(spec: mujoco.MjSpec, config: SimConfig) -> mujoco.MjSpec:
@@ -290,9 +296,6 @@ def _actuators(m: mujoco.MjModel) -> dict[str, Any]:
 
 def _text(spec: mujoco.MjSpec) -> dict[str, str]:
     """Returns the MJCF of a model, unless it cannot be compiled without further files, such as meshes."""
-    text = spec.to_xml()
-    try:
-        mujoco.MjModel.from_xml_string(text)
-    except ValueError:
-        return {}
-    return {"mjcf": text}
+    files = [part.file for part in (*spec.meshes, *spec.textures, *spec.hfields, *spec.skins)]
+    files += [file for texture in spec.textures for file in texture.cubefiles]
+    return {} if any(files) else {"mjcf": spec.to_xml()}

@@ -2,7 +2,9 @@
 
 import copy
 import inspect
+import logging
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +155,26 @@ class Policy(TensorDictModule):
 
 
 SCALE = ".scale"  # what a file adds to the name of weights in 8 bits, for what to multiply them with
+
+
+def check_terms(trained: Iterable[Sequence[Any]], now: Mapping[str, int], task: str) -> None:
+    """Checks that a task observes in the order in which a policy was trained; other names are told in the log.
+
+    Args:
+        trained: names and sizes of the terms that the policy was trained on; none are known of older files.
+        now: sizes of those of the task, by name.
+        task: name of the task, for messages.
+
+    Raises:
+        ValueError: they come in another order.
+    """
+    before, own = [(str(name), int(size)) for name, size in trained], list(now.items())
+    if not before or not own or before == own:
+        return
+    words = [", ".join(name for name, _ in terms) for terms in (before, own)]
+    if sorted(before) == sorted(own):
+        raise ValueError(f"the policy was trained on {words[0]}, {task} observes {words[1]}: another order")
+    logging.getLogger("torchrl_loco").warning("the policy was trained on %s, %s observes %s", words[0], task, words[1])
 
 
 def _in_8_bits(name: str, weight: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -313,9 +313,16 @@ def _module_of_file(path: Path) -> ModuleType:
     name = _name_of(path)
     if known_files.is_kept(path):
         sys.dont_write_bytecode = True  # only sources are compared with those that are known
-    if str(path.parent) not in sys.path:
-        sys.path.append(str(path.parent))
+    folder = str(path.parent)
+    if folder not in sys.path:
+        sys.path.append(folder)
         _folders.add(path.parent)
+    # Modules beside it are its own, whatever is called so in the working directory, or was loaded beside another file.
+    beside = {file.stem: file for file in known_files.with_imports(path) if file != path}
+    others = {name: module for name in beside if (module := sys.modules.get(name)) and _file(module) != beside[name]}
+    for each in others:
+        del sys.modules[each]
+    sys.path.insert(0, folder)
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
@@ -330,6 +337,8 @@ def _module_of_file(path: Path) -> ModuleType:
         raise ImportError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from error
     finally:
         _reading.remove(path)
+        sys.path.remove(folder)
+        sys.modules.update(others)
     return module
 
 

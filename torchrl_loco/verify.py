@@ -22,6 +22,7 @@ from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.task import folder_of
 from torchrl_loco.envs.vary import Vary
+from torchrl_loco.policy import check_terms
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
 
@@ -203,6 +204,8 @@ def _worlds(
     ):
         if size != asked:
             raise ValueError(f"the policy has {size} numbers of the {name}, {facts['task']} has {asked}")
+    terms = [(each["term"], each["size"]) for each in facts.get("observation", ())]
+    check_terms(terms, env.observation_layout.get(exported.reads, {}), facts["task"])
     return env
 
 

@@ -255,6 +255,9 @@ def test_a_run_is_resumed_without_its_policy_or_to_the_frames_that_it_has(tmp_pa
     Trainer(run, resume=True, total_frames=256).train()
     assert [row["frames"] for row in run.read_evaluations()] == [128, 256]
     assert Policy.load(run.policy, "cpu").info["frames"] == 256
+    run.policy.unlink()  # of a run that is complete
+    Trainer(run, resume=True).train()
+    assert Policy.load(run.policy, "cpu").info["frames"] == 256
 
 
 @pytest.mark.slow

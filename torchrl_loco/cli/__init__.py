@@ -5,6 +5,7 @@ Modules that take seconds to import are imported where they are used, so that he
 
 import atexit
 import gc
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -37,6 +38,8 @@ def main(args: Sequence[str] | None = None) -> int:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         print(f"{process_name()}: interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # as of `torchrl-loco list | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 
 

@@ -47,7 +47,7 @@ def diagnose(
                 print(f"{name:<9} up to {needed} needed under random actions, {advised} advised")
         return
     problems = []
-    with user_errors(ValueError):
+    with user_errors(ValueError, ImportError, OSError):
         if (num_envs, device) != (None, None):
             raise ValueError("--num_envs and --device are for --size: without it all devices are tested")
         for finding in doctor.diagnose(body):

@@ -32,6 +32,8 @@ from torchrl_loco.known_files import place_of
 from torchrl_loco.registry import label, resolve, task_name
 from torchrl_loco.viewer.settings import LOOPBACK, PORT, PORTS, SHARE, WORLDS, check_host, check_viewer
 
+EARNED = ("mean", "std", "min", "max", "episodes", "selected_by")  # of a policy's info, in the task of its training
+
 CONTAINERS = (".mp4", ".mkv", ".mov")  # suffixes of a video
 
 RunOrTask = Annotated[
@@ -98,7 +100,11 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
         return training.watching.last_policy(training.RunFolder(source.parent, task), device, source), source
     if not source.is_dir():
         policy = torchrl_loco.Policy.load(source, device)
-        policy.info["task"] = task or place_of(policy.info["task"], source.parent)
+        trained = policy.info["task"]
+        policy.info["task"] = task or place_of(trained, source.parent)
+        if policy.info["task"].rpartition(":")[2] != trained.rpartition(":")[2]:
+            for figure in EARNED:  # what it earned is of another task
+                policy.info.pop(figure, None)
         return policy, source
     run = training.RunFolder(source, task)
     if run.policy.is_file() or run.given or not run.has_checkpoint:
@@ -416,7 +422,10 @@ def verify(
         report = verification.verify(path, conditions, device, alone=alone, task=named, options=which.given)
         print(*report.lines, sep="\n")
         if out is not None:
-            storage.replace_file(out, f"{json.dumps(report.figures, indent=2)}\n".encode())
-            print(out)
+            try:
+                storage.replace_file(out, f"{json.dumps(report.figures, indent=2)}\n".encode())
+                print(out)
+            except OSError as error:  # which says nothing of the policy
+                print(f"torchrl-loco: the figures were not written: {error}", file=sys.stderr)
     if not report.holds:
         raise SystemExit(1)

@@ -83,6 +83,8 @@ class Spaces:
                 unbounded.
         """
         spec = env.observation_spec
+        if not env.action_spec.shape[-1]:
+            raise ValueError("the model has no actuators: there is nothing to train")
         sizes = {}
         for key in ("observation", "privileged"):
             if key not in spec.keys():  # noqa: SIM118

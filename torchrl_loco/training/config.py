@@ -236,7 +236,7 @@ class TrainingConfig:
     @property
     def of_env(self) -> dict[str, Any]:
         """Arguments of the environments of the run, beside task, worlds, device, seed and protocol."""
-        return arguments_of(dataclasses.asdict(self)) | ({} if self.randomize else {"randomize": ()})
+        return arguments_of(dataclasses.asdict(self))
 
     @property
     def frames_per_batch(self) -> int:

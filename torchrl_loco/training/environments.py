@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import mujoco
+import numpy as np
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 
 from torchrl_loco.config import arguments_of
@@ -17,7 +19,7 @@ from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.imagined import showing_states
 from torchrl_loco.envs.transforms import ActionRepeat, TransformedEnv, named_transforms, unwrap
-from torchrl_loco.policy import Policy
+from torchrl_loco.policy import Policy, check_terms
 from torchrl_loco.registry import make, resolve
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
@@ -208,6 +210,10 @@ def content_of(task: str, env: LocoEnv) -> str:
         if file is not None and Path(file).is_file():
             for each in files_of(cls, Path(file)):
                 digest.update(each.read_bytes())
+    if isinstance(getattr(type(env), "model", None), mujoco.MjSpec):  # made of files that nobody names
+        model = np.empty(mujoco.mj_sizeModel(env.mj_model), dtype=np.uint8)
+        mujoco.mj_saveModel(env.mj_model, None, model)
+        digest.update(model.data)
     assert env.hooks is not None
     for table in env.hooks.catalog.constants.values():
         digest.update(table.cpu().numpy().tobytes())
@@ -234,6 +240,7 @@ def make_for(policy: Policy, num_envs: int, device: Any, seed: int, **settings: 
     info = policy.info
     place = resolve(info["task"]), num_envs, device, seed, info["protocol"]
     env = make(*place, **{**arguments_of(info), "world_offset": 0, **settings})
+    check_terms(info.get("terms", ()), env.observation_layout.get(policy.in_keys[0], {}), info["task"])
     set_stage(env, env.stage_of(info))
     return env
 

@@ -48,6 +48,8 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
     for config, group in grouped(runs).items():
         label = f"{config.label}, {config.algorithm}, {config.protocol}, {config.num_envs} worlds"
         metrics = [run.read_metrics() for run in group]
+        if damaged := [run.path for run, table in zip(group, metrics, strict=True) if "return" not in table]:
+            raise ValueError(f"{damaged[0] / 'metrics.csv'} is damaged: it has no column return")
         whole = [m for m in metrics if is_whole(m["frames"], config.total_frames)] or metrics
         frames, returns = shared_curve(whole)
         millions = frames / 1e6

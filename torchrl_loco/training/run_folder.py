@@ -45,7 +45,7 @@ def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
     Raises:
         ValueError: it is damaged: a value is no number, or no column is named frames.
     """
-    rows = csv.DictReader(path.read_text(errors="replace").split("\n")[:-1] if path.exists() else [])
+    rows = csv.DictReader(path.read_text(encoding="utf-8", errors="replace").split("\n")[:-1] if path.exists() else [])
     columns, found = list(rows.fieldnames or ()), [dict[Any, Any](row) for row in rows]
     if longer := [row for row in found if None in row]:
         count = len(columns) + len(longer[0][None])
@@ -297,7 +297,7 @@ class RunFolder:
 
     def _append(self, name: str, row: dict[str, Any]) -> None:
         path = self.path / name
-        with path.open("a+", newline="") as file:
+        with path.open("a+", newline="", encoding="utf-8") as file:
             file.seek(0)
             columns = next(csv.reader(file), [])
             if row.keys() <= set(columns):

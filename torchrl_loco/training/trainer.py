@@ -385,10 +385,12 @@ class Trainer:
         of_env: dict[str, Any] = {"trained_on": self.device_name, "control_timestep": self._base.config.ctrl_dt}
         if stage := self._base.stage_of({"stage": self._base.get_stage()}):
             of_env["stage"] = stage
-        if self.environments.transforms:
-            of_env["transforms"] = self.environments.names_of_transforms
         if self.environments.full_length != self.environments.length_of_task:
             of_env["full_length"] = self.environments.full_length
+        if self.environments.transforms:
+            of_env["transforms"] = self.environments.names_of_transforms
+        elif terms := self._base.observation_layout.get(self.algorithm.spaces.actor_key):
+            of_env["terms"] = list(terms.items())
         policy = deterministic_policy(self.algorithm.actor, self.config, {**when, **of_env})
         self._compare_at(stage)
         summary = self._summary(policy, final=False)
@@ -422,7 +424,8 @@ class Trainer:
     def _finish(self) -> None:
         """Evaluates the best policy in episodes that did not select it, plots the learning curve, records a video."""
         config = self.config
-        if all(row["frames"] != self.frames for row in self.run.read_evaluations()):  # stopped, and no frame was left
+        last = [row for row in self.run.read_evaluations() if row["frames"] == self.frames]
+        if not (last and self.run.policy.is_file()):  # it was stopped, and no frame was left
             self.evaluate()
         recording = ", and its video is recorded" if config.video_seconds > 0 else ""
         print(f"all frames are done: the best policy plays new episodes{recording}", flush=True)
@@ -472,8 +475,10 @@ class Trainer:
 
     def _identity(self) -> dict[str, Any]:
         """Returns the settings that must not change while a run is stopped."""
-        names = "algorithm", "task", "protocol", "num_envs", "hidden", "strides", "action_bound"
-        return {name: getattr(self.config, name) for name in names if hasattr(self.config, name)}
+        names = ["algorithm", "task", "protocol", "num_envs", "hidden", "strides", "action_bound", "action_repeat"]
+        names += ["randomize", "sim"]
+        settings = dataclasses.asdict(self.config)
+        return {name: settings[name] for name in names if name in settings}
 
     def _load(self, checkpoint: dict[str, Any], total_frames: float) -> None:
         for name, value in self._identity().items():
