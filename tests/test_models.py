@@ -10,6 +10,7 @@ from oracle import reference_model
 
 import torchrl_loco
 from torchrl_loco.sim import models
+from torchrl_loco.sim.mujoco_warp import stepped_wrongly
 
 SECTIONS = {"names", "sizes", "option", "source"}
 INDICES = {"sensor_objid"}
@@ -151,3 +152,18 @@ def test_actions_are_scaled_to_the_range_of_the_controls(shared):
     expected = np.stack([low, low + 0.75 * (high - low), high])
     np.testing.assert_allclose(env.sim.ctrl, expected, atol=1e-6)
     np.testing.assert_allclose(models.control(env.mj_model, action.numpy()), expected, atol=1e-6)
+
+
+def test_what_mujoco_warp_would_step_wrongly_from_reset_to_reset():
+    joint = '<joint name="hinge" axis="0 1 0" stiffness="1" springyield="0.05"/>'
+    body = f'<worldbody><body>{joint}<geom size="0.1" pos="0 0 0.2"/><site name="here"/></body></worldbody>'
+    motor = '<actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator>'
+    sensor = '<sensor><gyro site="here" interval="0.05"/></sensor>'
+    for option, more, words in (
+        ('<flag sleep="enable"/>', "", "bodies that sleep"),
+        ("", sensor, "sensors with a delay or an interval"),
+    ):
+        m = mujoco.MjModel.from_xml_string(f"<mujoco><option>{option}</option>{body}{motor}{more}</mujoco>")
+        assert [what.startswith(words) for what in stepped_wrongly(m)] == [True]
+        with pytest.raises(ValueError, match="plastic joints are not supported"):
+            models.check(m)

@@ -287,3 +287,13 @@ def test_modules_beside_a_file_are_its_own(tmp_path, monkeypatch):
     assert importlib.import_module("common").K == 0
     for name in ("common", *(name for name in sys.modules if name.startswith(("task_a_", "task_b_")))):
         monkeypatch.delitem(sys.modules, name)
+
+
+def test_classes_of_one_name_stay_apart():
+    """Of a loop, or of a cell that is run again: the name that a class is given leads to it."""
+    made = [type("Same", (torchrl_loco.WalkerStand,), {"gain": gain}) for gain in (1, 2)]
+    for one in made:
+        one.__qualname__ = "test_classes_of_one_name_stay_apart.<locals>.Same"
+    names = [registry.task_name(one) for one in made]
+    assert names[1] == f"{names[0]}~2"
+    assert [registry.resolve(name) for name in names] == made == [registry.resolve(registry.task_name(x)) for x in made]

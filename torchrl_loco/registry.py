@@ -195,8 +195,8 @@ def task_name(task: "str | type[LocoEnv]", by_user: bool = False) -> str:
 
     It is the id, where every process knows it; else ``"/absolute/path/file.py:Class"`` if the class is in a script, in
     a file that was named by its path, or in one beside them; else ``"module:Class"``. A class of a notebook or
-    of a function is found in this process only. A file is run again where it is looked up: what a script does beside
-    defining classes belongs under ``if __name__ == "__main__"``.
+    of a function is found in this process only; ``~2`` follows its name where another class has it. A file is run again
+    where it is looked up: what a script does beside defining classes belongs under ``if __name__ == "__main__"``.
 
     Arguments and errors are those of :func:`resolve`.
     """
@@ -210,6 +210,13 @@ def task_name(task: "str | type[LocoEnv]", by_user: bool = False) -> str:
     file = _file(sys.modules.get(cls.__module__))
     by_path = file is not None and (cls.__module__ in (*MAIN, _name_of(file)) or _only_here(cls.__module__, file))
     name = f"{file}:{cls.__qualname__}" if by_path else _target(cls)
+    # Another class may have its name: one of a loop, or one that was defined in its place since.
+    present, plain, count = _attribute(sys.modules.get(cls.__module__), cls.__qualname__), name, 1
+    while (count == 1 and present not in (None, cls)) or _named.get(name, cls) is not cls:
+        if count == 1 and present is cls:
+            break  # it has taken the place of the other
+        count += 1
+        name = f"{plain}~{count}"
     _named[name] = cls
     return name
 

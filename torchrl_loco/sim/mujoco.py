@@ -168,7 +168,8 @@ class MujocoEngine(Engine):
             mujoco.mj_resetData(m, d)
             self._load(i, self._state)
             mujoco.mj_forward(self._passive if self._varied is None else _without_actuation(m), d)
-            d.qacc_warmstart[:] = self._state["qacc_warmstart"][i]
+            if m.nv:
+                d.qacc_warmstart[:] = self._state["qacc_warmstart"][i]
             if contacts and self._geoms:
                 for row in range(self._rows):
                     self._add_up_forces(i, row)

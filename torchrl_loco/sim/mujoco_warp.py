@@ -1,6 +1,7 @@
 """The engine that calls MuJoCo-Warp: its tuning, the order of a control step, and what it needs in memory."""
 
 import contextlib
+import copy
 import dataclasses
 import logging
 import math
@@ -8,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import mujoco
+import numpy as np
 import warp as wp
 from typing_extensions import override
 
@@ -86,6 +88,7 @@ def record_peaks(
 
 
 ROOM = {"constraints": "njmax", "contacts": "naconmax"}  # the settings that make room for constraint rows and contacts
+MINMU = 1e-5  # MuJoCo's mjMINMU, the least friction
 MARGIN = 1.25  # advised setting divided by the largest need
 
 
@@ -110,13 +113,18 @@ class MujocoWarpEngine(Engine):
                 "MuJoCo-Warp has at most 4 contacts of a geom with a height field, where MuJoCo has one for each prism "
                 "that it touches: what lies on uneven ground moves otherwise"
             )
+        if wrong := stepped_wrongly(mj_model):
+            raise ValueError(f"MuJoCo-Warp steps {', '.join(wrong)} wrongly: pass engine='mujoco'")
         with wp.ScopedDevice(device):
+            slippery = copy.copy(mj_model)  # as C MuJoCo has it: without any friction it divides by 0
+            for friction in (slippery.geom_friction, slippery.pair_friction):
+                np.maximum(friction, MINMU, out=friction)
             try:
-                self.model = mjw.put_model(mj_model)
+                self.model = mjw.put_model(slippery)
             except NotImplementedError as error:
                 is_pgs = mj_model.opt.solver == mujoco.mjtSolver.mjSOL_PGS
-                instead = ' Write <option solver="Newton"/>, or leave solver out' if is_pgs else ""
-                raise ValueError(f"MuJoCo-Warp cannot step this model: {error}{instead}") from error
+                instead = 'Write <option solver="Newton"/>, or leave solver out' if is_pgs else "pass engine='mujoco'"
+                raise ValueError(f"MuJoCo-Warp cannot step this model: {error}. {instead}") from error
             self.data = mjw.make_data(
                 with_every_row(mj_model, varied), nworld=num_envs, naconmax=config.naconmax, njmax=config.njmax
             )
@@ -245,6 +253,17 @@ class MujocoWarpEngine(Engine):
         if contacts and self.contact_forces is not None:
             self.contact_forces.update(model, data, mask)
         self._launch(restore_others, [mask, sensordata, overflow], [data.sensordata, data.overflow])
+
+
+def stepped_wrongly(m: mujoco.MjModel) -> list[str]:
+    """Returns what a model has that MuJoCo-Warp takes, but steps otherwise than MuJoCo from reset to reset."""
+    exact = (m.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_FILTEREXACT)).any()
+    found = {
+        "bodies that sleep (<flag sleep>)": m.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP),
+        "sensors with a delay or an interval": m.sensor_delay.any() or m.sensor_interval.any(),
+        "filterexact activations by RK4": exact and m.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4),
+    }
+    return [what for what, is_there in found.items() if is_there]
 
 
 def data_bytes(setup: Setup) -> int:

@@ -69,7 +69,8 @@ class Given:
 
     def way_to_resume(self, run: Path, ranks: int) -> str:
         """Returns the call, or the command with the same number of ranks, that continues a run."""
-        if self.names:
+        task = RunFolder(run).load_config().task
+        if self.names or task.startswith("__main__:") or "<locals>" in task:  # which no other process finds
             return _call_to_resume(run, self.names)
         if ranks > 1 and os.environ.get("LOCAL_WORLD_SIZE") != str(ranks):
             return f"torchrun, with the options of this launch, -m torchrl_loco resume {shlex.quote(str(run))}"

@@ -147,7 +147,7 @@ def resumed(resume: RunFolder | Path | str, task: Any) -> RunFolder:
     run = resume if isinstance(resume, RunFolder) else RunFolder(Path(resume))
     named, of = task_name(task, by_user=True), run.load_config().task
     moved = is_place(named) and is_place(of) and named.rpartition(":")[2] == of.rpartition(":")[2]
-    if named != of and not moved:
+    if named.partition("~")[0] != of.partition("~")[0] and not moved:  # another class of a notebook may have the name
         raise ValueError(f"{run.path} is a run of {of}, but task is {named}")
     return RunFolder(run.path, named)
 
