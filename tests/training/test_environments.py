@@ -9,7 +9,7 @@ from torchrl.data import Bounded, Unbounded
 from torchrl.envs import FrameSkipTransform, StepCounter, Transform, TransformedEnv, UnsqueezeTransform
 
 import torchrl_loco
-from torchrl_loco.training import PPOConfig, Spaces
+from torchrl_loco.training import PPOConfig, Spaces, environments
 from torchrl_loco.training.environments import ActionRepeat, Environments
 
 
@@ -148,3 +148,25 @@ def test_evaluations_return_what_an_environment_returns_that_was_handed_in():
         assert other.observation_spec == base.observation_spec
         assert other.pixels == base.pixels
         assert (other.noise_scale, other.compile_hooks) == (base.noise_scale, base.compile_hooks)
+
+
+def test_evaluations_that_read_other_attributes_are_told_of_and_edits_of_a_notebook_noticed(caplog, monkeypatch):
+    monkeypatch.setattr(environments.inspect, "getsourcefile", lambda cls: None)  # as of a cell
+
+    def made(factor):
+        return type(
+            "Gains", (torchrl_loco.WalkerStand,), {"gain": 1.0, "reward": lambda self, s: self.gain * factor * s.time}
+        )
+
+    env = made(1.0)(2, "cpu", seed=0)
+    env.close()
+    env.gain = 5.0
+    env.reset()
+    config = PPOConfig("walker_stand", num_envs=2, num_steps=4, minibatch_size=8, total_frames=100)
+    Environments(config, env).evaluation(2, seed=0)
+    assert "hooks read gain, which is 5.0 in the environment that trains and 1.0 in its evaluations" in caplog.text
+    names = [torchrl_loco.registry.task_name(made(1.0)) for _ in range(2)]
+    first, second = (environments.content_of(name, env) for name in names)
+    assert first == second
+    other = type("Gains", (torchrl_loco.WalkerStand,), {"gain": 1.0, "reward": lambda self, s: 2.0 * s.time})
+    assert environments.content_of(torchrl_loco.registry.task_name(other), env) != first

@@ -4,14 +4,17 @@ import copy
 import dataclasses
 import hashlib
 import inspect
+import logging
 import os
 import shlex
-from collections.abc import Mapping
+import types
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+import torch
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 
 from torchrl_loco.config import arguments_of
@@ -69,7 +72,7 @@ class Given:
 
     def way_to_resume(self, run: Path, ranks: int) -> str:
         """Returns the call, or the command with the same number of ranks, that continues a run."""
-        task = RunFolder(run).load_config().task
+        task = RunFolder(Path(run)).load_config().task if Path(run, "config.json").is_file() else ""
         if self.names or task.startswith("__main__:") or "<locals>" in task:  # which no other process finds
             return _call_to_resume(run, self.names)
         if ranks > 1 and os.environ.get("LOCAL_WORLD_SIZE") != str(ranks):
@@ -158,6 +161,8 @@ class Environments:
         worlds = self._config.num_envs if self.transforms else episodes
         if worlds not in self._evaluating:
             self._evaluating[worlds] = self._made(worlds, seed)
+            if self._given is not None:
+                _warn_of_other_attributes(unwrapped(self._given)[0], self._evaluating[worlds])
         own = self._evaluating[worlds]
         own.set_seed(seed)
         own.set_stage(own.stage_of(info or {}))
@@ -211,6 +216,8 @@ def content_of(task: str, env: LocoEnv) -> str:
         if file is not None and Path(file).is_file():
             for each in files_of(cls, Path(file)):
                 digest.update(each.read_bytes())
+        else:
+            digest.update("\n".join(_written(cls)).encode())
     if isinstance(getattr(type(env), "model", None), mujoco.MjSpec):  # made of files that nobody names
         model = np.empty(mujoco.mj_sizeModel(env.mj_model), dtype=np.uint8)
         mujoco.mj_saveModel(env.mj_model, None, model)
@@ -219,6 +226,40 @@ def content_of(task: str, env: LocoEnv) -> str:
     for table in env.hooks.catalog.constants.values():
         digest.update(table.cpu().numpy().tobytes())
     return digest.hexdigest()
+
+
+def _written(cls: type) -> Iterator[str]:
+    """Yields what a class and those above say that are in no file: names, numbers, texts and the code of functions."""
+    for base in cls.__mro__:
+        if base is LocoEnv:
+            return
+        for name, value in sorted(vars(base).items()):
+            if isinstance(value, types.FunctionType):
+                yield f"{name} {_steps(value.__code__)}"
+            elif isinstance(value, bool | int | float | str | tuple | list | dict) and not name.startswith("__"):
+                yield f"{name} {value!r}"
+
+
+def _steps(code: types.CodeType) -> str:
+    """Returns what a function does, wherever it is written."""
+    constants = [_steps(each) if isinstance(each, types.CodeType) else repr(each) for each in code.co_consts]
+    return f"{code.co_code.hex()} {code.co_names} {constants}"
+
+
+def _warn_of_other_attributes(given: LocoEnv, own: LocoEnv) -> None:
+    """Warns where hooks read something else in evaluations than in the environment that was handed in."""
+    for name in sorted(set().union(*given.hooks.read.values())):
+        values = [getattr(env, name, None) for env in (given, own)]
+        tensors = [value for value in values if isinstance(value, torch.Tensor)]
+        if len(tensors) == 2:
+            same = tensors[0].shape == tensors[1].shape and bool((tensors[0] == tensors[1].to(given.device)).all())
+        else:
+            same = not all(isinstance(value, bool | int | float | str) for value in values) or values[0] == values[1]
+        if not same:
+            logging.getLogger("torchrl_loco").warning(
+                "hooks read %s, which is %s in the environment that trains and %s in its evaluations, as %s has it",
+                *(name, *values, type(given).__name__),
+            )
 
 
 def unwrapped(env: EnvBase) -> tuple[LocoEnv, tuple[Transform, ...]]:
