@@ -21,6 +21,12 @@ FORCES = {"hopper": np.r_[13:15], "quadruped": np.r_[48:51, 54:78]}
 after it."""
 
 
+def arrays(name):
+    """Returns the arrays of a recording in tests/data by name."""
+    with np.load(DATA / f"{name}.npz") as file:
+        return dict(file)
+
+
 def without_forces(body, observation):
     """Returns the entries that follow from the state."""
     return np.delete(np.asarray(observation), FORCES.get(body, []), axis=-1)
@@ -32,7 +38,7 @@ def reference_model(body):
 
 def recorded(task):
     """The rollout of a task that dm_control recorded: arrays of 192 control steps."""
-    return dict(np.load(DATA / f"{task}_dm_control.npz"))
+    return arrays(f"{task}_dm_control")
 
 
 def tolerance(x, lower=0.0, upper=0.0, margin=0.0, sigmoid="gaussian", value=0.1):

@@ -29,11 +29,16 @@ def written(folder, table, name="clip.csv", header=""):
     return folder / name
 
 
+def tables_of(path):
+    with np.load(path) as file:
+        return dict(file)
+
+
 def as_npz(folder, m, rows, **changes):
     """Returns an npz of a motion's rows, with some arrays changed."""
     path = folder / "clip.npz"
     motions.save(path, rows[:, [0, 1, 2, 6, 3, 4, 5, *range(7, 36)]], 50.0, m)
-    tables = dict(np.load(path))
+    tables = tables_of(path)
     np.savez(path, **{**{key: value for key, value in tables.items() if key not in changes}, **changes})
     return path
 
@@ -120,7 +125,7 @@ def test_an_npz_that_does_not_fit_is_refused(tmp_path, g1, rows):
     path = as_npz(tmp_path, g1, rows, joint_pos=joints, joint_names=names)
     with pytest.raises(ValueError, match=r"lies .* m from where the joints put it .* another order"):
         Motion(path).on(g1)
-    fewer = {key: value[:, :20] for key, value in np.load(path).items() if key.startswith("body_") and value.ndim > 2}
+    fewer = {key: value[:, :20] for key, value in tables_of(path).items() if key.startswith("body_") and value.ndim > 2}
     few = np.array([g1.body(i).name for i in range(1, 21)])
     mixed = Motion(as_npz(tmp_path, g1, rows, joint_pos=joints, joint_names=names, body_names=few, **fewer))
     with pytest.raises(ValueError, match=r"lies .* another order"):  # by the names of its bodies
@@ -135,7 +140,7 @@ def test_an_npz_that_does_not_fit_is_refused(tmp_path, g1, rows):
             Motion(tmp_path / "broken.npz")
     with pytest.raises(ValueError, match=r"body_quat_w \(frames, bodies, 4\)"):
         Motion(as_npz(tmp_path, g1, rows, body_quat_w=np.zeros((len(rows), 30, 3))))
-    tables = {key: value for key, value in np.load(path).items() if key != "body_quat_w"}
+    tables = {key: value for key, value in tables_of(path).items() if key != "body_quat_w"}
     np.savez(path, **tables)
     with pytest.raises(ValueError, match="lacks body_quat_w"):
         Motion(path)

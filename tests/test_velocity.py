@@ -12,7 +12,7 @@ import pytest
 import torch
 from contact_forces import net_forces
 from for_each import for_each
-from oracle import DATA, reference_model
+from oracle import arrays, reference_model
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_loco import registry
@@ -91,7 +91,7 @@ def test_model_has_the_figures_of_the_robot(name):
 
 @for_each("name", ROBOTS)
 def test_a_control_step_ends_where_c_mujoco_does(name):
-    cls, steps = ROBOTS[name], np.load(DATA / f"{name}_steps.npz")
+    cls, steps = ROBOTS[name], arrays(f"{name}_steps")
     m = models.load(cls.model)
     m.opt.tolerance = 1e-12
     config = dataclasses.replace(cls.config, iterations=200, ls_iterations=100, engine="compiled")

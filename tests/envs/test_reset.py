@@ -6,7 +6,7 @@ import pytest
 import torch
 from cases import KINDS, MODELS
 from for_each import for_each
-from oracle import DATA, FORCES, Oracle
+from oracle import FORCES, Oracle, arrays
 from tensordict import TensorDict
 
 import torchrl_loco
@@ -97,7 +97,7 @@ def test_planar_bodies_start_uniformly(draws, task):
         assert distance < critical
     correlation = np.corrcoef(qpos[:, 2:].T) - np.eye(model.nq - 2)
     assert np.abs(correlation).max() < 5 / np.sqrt(len(qpos))
-    assert from_one_distribution(qpos[:, 2:], np.load(DATA / f"{body}_resets_dm_control.npz")["qpos"][:, 2:])
+    assert from_one_distribution(qpos[:, 2:], arrays(f"{body}_resets_dm_control")["qpos"][:, 2:])
 
 
 def test_a_hopper_feels_the_ground_before_its_first_step(shared, engine):
@@ -136,7 +136,7 @@ def test_quadruped_starts_just_above_the_floor(draws):
     free, touching = np.split(np.array(contacts), 2)
     assert (free == 0).all()
     assert (touching > 0).all()
-    assert from_one_distribution(qpos[:, 2:7], np.load(DATA / "quadruped_resets_dm_control.npz")["qpos"][:, 2:7])
+    assert from_one_distribution(qpos[:, 2:7], arrays("quadruped_resets_dm_control")["qpos"][:, 2:7])
 
 
 @pytest.mark.slow
@@ -151,7 +151,7 @@ def test_humanoid_starts_free_of_contact(draws):
         assert data.ncon == 0
     assert (qpos[:, :3] == [0, 0, 1.5]).all()
     np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1, atol=1e-6)
-    recorded = np.load(DATA / "humanoid_resets_dm_control.npz")["qpos"]
+    recorded = arrays("humanoid_resets_dm_control")["qpos"]
     assert from_one_distribution(qpos[:, 3:], recorded[:, 3:])
 
 
@@ -159,7 +159,7 @@ def test_humanoid_starts_free_of_contact(draws):
 def test_cheetah_starts_settled(shared, engine):
     """It stands on the floor, nearly at rest, with the distribution that dm_control recorded."""
     env = shared("cheetah_run", 64, protocol="dm_control", engine=engine)
-    states, record = env.initial_states(), np.load(DATA / "cheetah_resets_dm_control.npz")
+    states, record = env.initial_states(), arrays("cheetah_resets_dm_control")
     assert from_one_distribution(states, np.concatenate([record["qpos"], record["qvel"]], axis=1))
     observation, start = env.reset()["observation"], env.get_state()
     assert torch.equal(observation, torch.cat([start["qpos"][:, 1:], start["qvel"]], dim=1))
