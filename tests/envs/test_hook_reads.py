@@ -229,7 +229,7 @@ def test_forces_of_actuators_are_mujocos():
 
     action = torch.tensor([[1.0, -0.5, 2.0, 0.3], [0.01, 3.0, 0.1, -1.0], [0.05, 0.0, -0.2, 0.6]])
     for compiles in (True, False):
-        env = Driven(3, "cpu", seed=0, reward_terms=True, compile_hooks=compiles)
+        env = Driven(3, "cpu", seed=0, reward_terms=True, compile_hooks=compiles, engine="mujoco")
         td = env.reset()
         for _ in range(3):
             after = env.step(td.set("action", action))["next"]
@@ -245,4 +245,4 @@ def test_forces_of_actuators_are_mujocos():
         assert found.abs().max() == 8.0  # one is at its limit
     lifts = type("Lift", (QuadrupedWalk,), {"reward": lambda self, s: s.actuator_force.sum(-1)})
     with pytest.raises(ValueError, match="motors and servos at hinges and slides"):
-        lifts(1, "cpu")
+        lifts(1, "cpu", engine="mujoco")

@@ -396,7 +396,7 @@ def test_after_a_push_sensors_of_forces_are_those_of_the_step():
         def terminated(self, s):
             return s.felt.sum(-1) < 0  # reads it, so that it is kept
 
-    env = Pushed(2, "cpu", seed=0)
+    env = Pushed(2, "cpu", seed=0, engine="mujoco", compile_hooks=False)
     td = env.reset(env.get_state().branch(0), set_state=True)
     action = torch.full((2, 4), 0.7)
     for _ in range(60):

@@ -158,7 +158,7 @@ def test_evaluations_that_read_other_attributes_are_told_of_and_edits_of_a_noteb
             "Gains", (torchrl_loco.WalkerStand,), {"gain": 1.0, "reward": lambda self, s: self.gain * factor * s.time}
         )
 
-    env = made(1.0)(2, "cpu", seed=0)
+    env = made(1.0)(2, "cpu", seed=0, engine="mujoco", compile_hooks=False)
     env.close()
     env.gain = 5.0
     env.reset()

@@ -91,7 +91,7 @@ def test_an_episode_that_the_task_cuts_off_counts_as_a_whole_one():
         def terminated(self, s):
             return (s.env_index == 1) & (s.time > 0.095)
 
-    env = Crosses(3, "cpu", episode_length=40, reward_terms=True)
+    env = Crosses(3, "cpu", episode_length=40, reward_terms=True, engine="mujoco", compile_hooks=False)
     evaluator = Evaluator(lambda td: td.set("action", torch.zeros(3, 6)), env)
     torch.testing.assert_close(evaluator.returns(0), torch.tensor([60.0, 6.0, 60.0]))
     torch.testing.assert_close(evaluator.metrics["reward/first"], (40 + 4 + 40) / 3)
