@@ -147,7 +147,7 @@ class Environments:
             return env
         # The runners' tasks end at the time limit alone, and TorchRL's transform has less to do.
         base, _ = unwrapped(env)
-        plain = is_runner(config.task) and not (base.reward_terms or base.with_metrics)
+        plain = is_runner(config.task) and not (base.reward_terms or base.metric_names)
         return TransformedEnv(env, (FrameSkipTransform if plain else ActionRepeat)(config.action_repeat))
 
     def evaluation(self, episodes: int, seed: int, info: Mapping[str, Any] | None = None) -> EnvBase:
