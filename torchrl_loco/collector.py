@@ -220,8 +220,9 @@ class RolloutCollector:
         """
         self._carried = None
         if "carried" in state:
-            worlds = [len(state["env"]["elapsed_steps"]), state.get("first_world", self._base.world_offset or 0)]
-            if worlds != (own := [self._base.num_envs, self._base.world_offset or 0]):
+            own = [self._base.num_envs, self._base.world_offset or 0]
+            worlds = [len(state["env"]["elapsed_steps"]), state.get("first_world", own[1])]
+            if worlds != own:
                 raise ValueError(f"the state is of {worlds[0]} worlds from {worlds[1]} on, not {own[0]} from {own[1]}")
             size, device = self._env.batch_size, self._env.device
             begin = self._env.reset(State(state["env"], batch_size=size, device=device), set_state=True)

@@ -185,14 +185,18 @@ def sim_config(
     return dataclasses.replace(config, naconmax=min(max(scaled, NACONMAX_FLOOR), NACONMAX_CEILING))
 
 
+def sim_of(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the arguments of the simulation that settings of a training name, or a policy's information."""
+    return {name: value for name, value in info.get("sim", {}).items() if value is not None}
+
+
 def arguments_of(info: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the arguments of an environment that settings of a training name, or a policy's information.
 
     They are those of the simulation, options of the task, pixels, the length of its episodes if it is another, and no
     variation if it was switched off.
     """
-    arguments = {name: value for name, value in info.get("sim", {}).items() if value is not None}
-    arguments |= info.get("options", {})
+    arguments = sim_of(info) | info.get("options", {})
     arguments |= {"episode_length": info["full_length"]} if "full_length" in info else {}
     arguments |= {"randomize": ()} if info.get("randomize") is False else {}
     if info.get("from_pixels"):

@@ -18,7 +18,7 @@ from torch import nn
 import torchrl_loco
 from torchrl_loco import storage
 from torchrl_loco.checks import check_output_file, check_packages
-from torchrl_loco.config import SimConfig, arguments_of, sim_config
+from torchrl_loco.config import SimConfig, arguments_of, sim_config, sim_of
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.task import definer, folder_of
 from torchrl_loco.policy import Policy, check_terms, difference, random_observations
@@ -257,8 +257,7 @@ def of_robot(policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _control_timestep(info: Mapping[str, Any]) -> float:
     """Returns that of a policy's task: older files, and checkpoints, do not say it."""
-    given = {name: value for name, value in info.get("sim", {}).items() if value is not None}
-    return sim_config(resolve(info["task"]).config, info["protocol"], 1, given).ctrl_dt
+    return sim_config(resolve(info["task"]).config, info["protocol"], 1, sim_of(info)).ctrl_dt
 
 
 def _stepped(spec: mujoco.MjSpec, config: SimConfig) -> mujoco.MjSpec:

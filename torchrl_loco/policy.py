@@ -154,9 +154,6 @@ class Policy(TensorDictModule):
         return cls(network.to(device).requires_grad_(False), info)
 
 
-SCALE = ".scale"  # what a file adds to the name of weights in 8 bits, for what to multiply them with
-
-
 def check_terms(trained: Iterable[Sequence[Any]], now: Mapping[str, int], task: str) -> None:
     """Checks that a task observes in the order in which a policy was trained; other names are told in the log.
 
@@ -175,6 +172,9 @@ def check_terms(trained: Iterable[Sequence[Any]], now: Mapping[str, int], task: 
     if sorted(before) == sorted(own):
         raise ValueError(f"the policy was trained on {words[0]}, {task} observes {words[1]}: another order")
     logging.getLogger("torchrl_loco").warning("the policy was trained on %s, %s observes %s", words[0], task, words[1])
+
+
+SCALE = ".scale"  # what a file adds to the name of weights in 8 bits, for what to multiply them with
 
 
 def _in_8_bits(name: str, weight: torch.Tensor) -> dict[str, torch.Tensor]:

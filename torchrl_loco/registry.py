@@ -212,11 +212,10 @@ def task_name(task: "str | type[LocoEnv]", by_user: bool = False) -> str:
     name = f"{file}:{cls.__qualname__}" if by_path else _target(cls)
     # Another class may have its name: one of a loop, or one that was defined in its place since.
     present, plain, count = _attribute(sys.modules.get(cls.__module__), cls.__qualname__), name, 1
-    while (count == 1 and present not in (None, cls)) or _named.get(name, cls) is not cls:
-        if count == 1 and present is cls:
-            break  # it has taken the place of the other
-        count += 1
-        name = f"{plain}~{count}"
+    if present is not cls:  # else it has taken the place of the other
+        while (name == plain and present is not None) or _named.get(name, cls) is not cls:
+            count += 1
+            name = f"{plain}~{count}"
     _named[name] = cls
     return name
 

@@ -283,6 +283,7 @@ def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -
     least, most = conditions.delay
     delay = generator.permutation(least + np.arange(n) % (most - least + 1))
     pushes = _pushes(env, generator, steps, float(conditions.pushes or 0.0))
+    first = dofs_of_robot(env.mj_model) if conditions.pushes else 0
     is_fixed = _fix_commands(env, exported.facts.get("info", {}))
     env.set_seed(conditions.seed)  # from the first episode on, in both engines
     set_stage(env, env.stage_of(exported.facts.get("info", {})))
@@ -313,7 +314,6 @@ def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -
         if not alive.any():
             break
         if t in pushes:
-            first = dofs_of_robot(env.mj_model)
             env.sim.qvel[:, first : first + 6] += torch.from_numpy(pushes[t]).float().to(env.device)  # poses stay
     cut_off = ~alive & (fell == 0)  # counts as in evaluations, as if it had gone on
     returns *= torch.where(cut_off, steps / taken, 1.0)
@@ -348,7 +348,6 @@ def _pushes(env: LocoEnv, generator: np.random.Generator, steps: int, scale: flo
     """Returns changes of the bases' velocities ``(n, 6)`` (m/s, rad/s), by the control step after which they come."""
     if not scale:
         return {}
-    dofs_of_robot(env.mj_model)
     found = dict[int, np.ndarray]()
     for i in range(env.num_envs):
         t = round(generator.uniform(*PUSH_EVERY) / env.config.ctrl_dt)

@@ -88,7 +88,6 @@ def record_peaks(
 
 
 ROOM = {"constraints": "njmax", "contacts": "naconmax"}  # the settings that make room for constraint rows and contacts
-MINMU = 1e-5  # MuJoCo's mjMINMU, the least friction
 MARGIN = 1.25  # advised setting divided by the largest need
 
 
@@ -118,7 +117,7 @@ class MujocoWarpEngine(Engine):
         with wp.ScopedDevice(device):
             slippery = copy.copy(mj_model)  # as C MuJoCo has it: without any friction it divides by 0
             for friction in (slippery.geom_friction, slippery.pair_friction):
-                np.maximum(friction, MINMU, out=friction)
+                np.maximum(friction, mujoco.mjMINMU, out=friction)
             try:
                 self.model = mjw.put_model(slippery)
             except NotImplementedError as error:

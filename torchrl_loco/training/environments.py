@@ -70,9 +70,8 @@ class Given:
             f"continue it in Python with {_call_to_resume(run.path, run.given)}"
         )
 
-    def way_to_resume(self, run: Path, ranks: int) -> str:
-        """Returns the call, or the command with the same number of ranks, that continues a run."""
-        task = RunFolder(Path(run)).load_config().task if Path(run, "config.json").is_file() else ""
+    def way_to_resume(self, run: Path, ranks: int, task: str = "") -> str:
+        """Returns the call, or the command with the same number of ranks, that continues a run of a task."""
         if self.names or task.startswith("__main__:") or "<locals>" in task:  # which no other process finds
             return _call_to_resume(run, self.names)
         if ranks > 1 and os.environ.get("LOCAL_WORLD_SIZE") != str(ranks):

@@ -10,7 +10,7 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
-from torchrl_loco.config import sim_config
+from torchrl_loco.config import sim_config, sim_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.registry import check_is_run, is_place, task_name
 from torchrl_loco.training import distributed
@@ -135,7 +135,7 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
 def _check_same(run: RunFolder, env: EnvBase) -> None:
     """Checks that a run that is resumed goes on in an environment as that in which it was begun."""
     stored = dataclasses.asdict(run.load_config())
-    stored["sim"] = {name: value for name, value in stored["sim"].items() if value is not None}
+    stored["sim"] = sim_of(stored)
     found = {"options": {}, "sim": {}, **_settings_of(env, {})}
     for name in ("protocol", "options", "sim", "from_pixels", "camera", "size", "frame_stack"):
         if name in found and found[name] != stored[name]:
@@ -198,7 +198,7 @@ def train_to_end(trainer: Trainer, given: Given, errors: Callable[..., Any] = as
             trainer.train()
     except (KeyboardInterrupt, SystemExit):
         if first and trainer.run.has_checkpoint:
-            print(f"to continue: {given.way_to_resume(trainer.run.path, ranks)}", file=sys.stderr)
+            print(f"to continue: {given.way_to_resume(trainer.run.path, ranks, trainer.config.task)}", file=sys.stderr)
         raise
     finally:
         if given.env is None:

@@ -137,7 +137,7 @@ class Trainer:
         terms = self.env.observation_spec.get("reward_terms", None)
         self._terms = () if terms is None else tuple(terms.keys())
         self._content = content_of(run.task, self._base)
-        self._first_worlds = self._worlds()
+        self._progress_at_start = self._progress()
         self.trials = Trials(config, self.frames_per_iteration, self._begin_trial, self._kept_of_trial, self._restore)
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
         self._ahead: tuple[TensorDictBase, torch.Tensor] | None = None
@@ -166,7 +166,7 @@ class Trainer:
 
     # What trials begin with, and go back to.
 
-    def _worlds(self) -> dict[str, Any]:
+    def _progress(self) -> dict[str, Any]:
         """Returns how far a curriculum has come, and what transforms have learned."""
         return {"stage": self._base.get_stage(), "transforms": state_of_transforms(self.env)}
 
@@ -175,17 +175,17 @@ class Trainer:
         if self.config.init:
             begin_from(self.algorithm, Path(self.config.init), self.config.device)
         distributed.copy_from_first(self.algorithm.networks.state_dict().values())
-        self._set_worlds(self._first_worlds)
+        self._set_progress(self._progress_at_start)
 
     def _kept_of_trial(self) -> dict[str, Any]:
-        return {"algorithm": copy.deepcopy(self.algorithm.state_dict()), **self._worlds()}
+        return {"algorithm": copy.deepcopy(self.algorithm.state_dict()), **self._progress()}
 
     def _restore(self, kept: dict[str, Any]) -> None:
         self.algorithm.restore(kept["algorithm"])
-        self._set_worlds(kept)
+        self._set_progress(kept)
 
-    def _set_worlds(self, kept: dict[str, Any]) -> None:
-        """Lets next episodes begin at a stage of a curriculum, behind what transforms had learned by then."""
+    def _set_progress(self, kept: dict[str, Any]) -> None:
+        """Goes back to what :meth:`_progress` returned: the next episodes begin at its stage of the curriculum."""
         load_transforms(self.env, kept["transforms"])
         set_stage(self._base, kept["stage"])
         for name, values in self._summed.items():

@@ -78,8 +78,7 @@ class RslRlVecEnv(VecEnv):
         time_outs = after["truncated"] & ~after["terminated"]
         extras = {"time_outs": time_outs.squeeze(-1), "final_observations": self._observations(after)}
         if told := named_numbers(after):
-            means = {(kind, name): values.nanmean() for kind in told for name, values in told[kind].items()}
-            extras["log"] = {f"/{kind}/{name}": mean for (kind, name), mean in means.items()}
+            extras["log"] = {f"/{kind}/{k}": v.nanmean() for kind, values in told.items() for k, v in values.items()}
         return self.get_observations(), after["reward"].squeeze(-1), after["done"].squeeze(-1), extras
 
     def close(self) -> None:

@@ -16,7 +16,6 @@ from torchrl_loco.sim.compiled.ir.symbols import Scalar, select
 from torchrl_loco.sim.compiled.physics.dynamics import MINVAL
 from torchrl_loco.sim.models import NEVER
 
-MINMU = 1e-5  # MuJoCo's mjMINMU
 SLIPPERY, LEAST = 0.03, 1e-4
 """Up to this friction the regularisation of a contact is no less than this share of the bodies' inverse inertia."""
 
@@ -207,7 +206,8 @@ def _with_parameters(
 ) -> Pair:
     """Returns a pair with coefficients of friction ``(5,)``: of two tangents, and about all axes of the contact."""
     sliding, second, torsional, rolling, second_rolling = (
-        largest(x, MINMU) if condim >= least else 0.0 for x, least in zip(frictions, (3, 3, 4, 6, 6), strict=True)
+        largest(x, mujoco.mjMINMU) if condim >= least else 0.0
+        for x, least in zip(frictions, (3, 3, 4, 6, 6), strict=True)
     )
     weight = m.body_invweight0[m.geom_bodyid[list(geoms)], 0].sum()
     ratios = (1.0 if x == y else x / y for x, y in ((second, sliding), (second_rolling, rolling)))
