@@ -1,6 +1,7 @@
 """Tasks in plain torch: what hooks see, what becomes of what they return, and what is said where they are wrong."""
 
 import contextlib
+import functools
 import json
 import math
 
@@ -322,12 +323,16 @@ def test_the_most_derived_definition_wins_hook_by_hook():
     assert torch.equal(env.sim.qpos, torch.tensor(env.mj_model.qpos0).float().expand(2, -1))
 
 
-@pytest.mark.parametrize("way", ["kernel", pytest.param("torch.compile", marks=pytest.mark.ci)])
-def test_compiled_hooks_do_the_same(actions, monkeypatch, way):
+@pytest.mark.parametrize(
+    ("way", "backend"),
+    [("kernel", None), ("torch.compile", "eager"), pytest.param("torch.compile", "inductor", marks=pytest.mark.ci)],
+)
+def test_compiled_hooks_do_the_same(actions, monkeypatch, way, backend):
     """With the same random numbers, up to rounding; torch.compile takes over on CUDA where there can be no kernel."""
     plain = WalkBackwardsInNoise(5, "cpu", seed=0, episode_length=20, compile_hooks=False)
     if way == "torch.compile":
         monkeypatch.setattr(Part, "compile", lambda self, num_envs, device: by_torch(self))
+        monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
     compiled = WalkBackwardsInNoise(5, "cpu", seed=0, episode_length=20)
     assert {part.kind for part in (compiled.world._judge, compiled.world._observe, compiled.world._begin)} == {way}
     assert plain.world._judge.kind == "plain torch"

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 import warp as wp
+from torch.fx._lazy_graph_module import _LazyGraphModule
 
 import torchrl_loco
 from torchrl_loco.envs.fusion import CannotFuse, ReachedError, fuse, trace
@@ -170,6 +171,7 @@ class Part:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # those of torch's own code
+                _LazyGraphModule.force_recompile(traced)  # writes its Python, which torch.compile cannot call for
                 compiled = torch.compile(traced, fullgraph=True, dynamic=False)
                 compiled(*self._arrays.values())
             self._compare(lambda: compiled(*self._arrays.values()), COMPILED)
