@@ -55,7 +55,8 @@ INLINE void add_contact(bool touches, const bool friction, int pair, int number,
   const int id = pair << Model::POINT_BITS | number;
   const int left = Model::JACOBIAN_ROWS - DIRECTIONS * frictional;
   const int places = friction ? Model::FRICTIONAL : left < Model::FRICTIONLESS ? left : Model::FRICTIONLESS;
-  int& count = friction ? frictional : frictionless;
+  // Not a reference to either: then all of Step would lie in memory, and shared memory be read as any other.
+  int count = friction ? frictional : frictionless;
   const unsigned hits = ballot(touches);
   int place = count + bits(hits & lanes_below());
   count += bits(hits);
@@ -65,6 +66,8 @@ INLINE void add_contact(bool touches, const bool friction, int pair, int number,
     place = make_room(touches, w.contacts + (friction ? 0 : Model::FRICTIONAL), place, places, id,
                       distance - Model::margin(pair));
   }
+  if (friction) frictional = count;
+  else frictionless = count;
   if (!touches || place >= places) return;
   w.contacts[friction ? place : Model::FRICTIONAL + place] = {point, distance - Model::margin(pair), normal, id};
   if (!friction) return;

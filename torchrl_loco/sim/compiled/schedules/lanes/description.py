@@ -44,6 +44,9 @@ MULTIPROCESSOR_BYTES, SYSTEM_BYTES = 228 * 1024, 1024
 """Shared memory of a multiprocessor of an H100 or H200, and what the system takes of it for each block."""
 SCHEDULERS, REGISTERS = 4, 16 * 1024
 """Of a multiprocessor, and the registers of each, which it deals out to whole warps."""
+LEAST_REGISTERS = 128
+"""Of a thread, where moving geoms may touch each other: with fewer a step keeps numbers in memory, and 20 worlds of a
+multiprocessor are slower than 16 without that."""
 MOST_WORLDS = 4  # worlds of a block, at most
 ENOUGH_FRICTIONAL, MOST_FRICTIONAL, MOST_FRICTIONLESS = 10, 28, 16
 """Places for contacts with friction, which a world should have and may have, and for those without.
@@ -321,10 +324,14 @@ class Description:
         return min(MOST_WORLDS, 1 << int(math.log2(fit)))
 
     def registers(self) -> int:
-        """Returns how many registers of a thread leave a multiprocessor as many worlds as its shared memory does."""
+        """Returns how many registers of a thread leave a multiprocessor as many worlds as its shared memory does.
+
+        But at least as many as a step needs.
+        """
         worlds = self.worlds_per_block()
         worlds *= MULTIPROCESSOR_BYTES // (worlds * (self.layout.bytes + WARP_BYTES) + SYSTEM_BYTES)
-        return min(REGISTERS // (LANES * math.ceil(worlds / SCHEDULERS)) // 8 * 8, 255)
+        least = 0 if all(map(self.is_ground, self.pairs)) else LEAST_REGISTERS
+        return min(max(REGISTERS // (LANES * math.ceil(worlds / SCHEDULERS)) // 8 * 8, least), 255)
 
     def elimination(self) -> str:
         """Returns calls that eliminate all rows, in blocks of four: first those of which a lane has several."""

@@ -27,6 +27,25 @@ INLINE void find_near_ground() {
 INLINE bool is_near_ground(int g) const {  // for all lanes together
   return LANES > 1 ? read(lane_near, g % LANES) >> g / LANES & 1 : reaches_down(g);
 }
+
+// Of a pair with the ground; round geoms come before boxes of the ground, the others behind them.
+static INLINE int moving(const bool first, int pair) {
+  return first ? Model::first_geom(pair) : Model::second_geom(pair);
+}
+
+// Lists the pairs from one to another that have a geom near the ground, and returns how many there are.
+INLINE int list_near(const bool first, const int begin, const int end) {
+  int count = 0;
+  ROLLED_FOR(int base = begin; base < end; base += LANES) {
+    const OwnPair own = own_pair(base, end);
+    const bool near = is_near_ground(moving(first, own.pair)) && own.valid;
+    const unsigned hits = ballot(near);
+    if (near) w.near_pairs[count + bits(hits & lanes_below())] = (unsigned short)own.pair;
+    count += bits(hits);
+  }
+  sync();
+  return count;
+}
 #endif
 
 #if WITH_ROUND_ON_FIELD
@@ -292,24 +311,23 @@ INLINE void collide_round_on_field(const bool friction) {
   ROLLED_FOR(int field = 0; field < Model::FIELDS; ++field) {
     const int begin = Model::field_pair(4 * field + 2 * friction),
               end = Model::field_pair(4 * field + 2 * friction + 1);
+    const int listed = list_near(false, begin, end);
     // Lists prisms that geoms may touch, and looks at them together when the list is full, and at last.
-    int count = 0, base = begin - LANES, before = 0, all = 0, next = 0;
-    ROLLED_FOR(bool is_last = false; !is_last;) {
+    int count = 0, base = -LANES, before = 0, all = 0, next = 0;
+    ROLLED_FOR(bool is_last = listed == 0; !is_last;) {
       if (next >= all) {
         base += LANES;
-        const int pair = base + lane < end ? base + lane : begin;
-        const bool near = is_near_ground(Model::second_geom(pair)) && base + lane < end;
+        is_last = base >= listed;
         all = next = 0;
-        if (ballot(near)) {
-          const int prisms = near ? over(field, pair).prisms() : 0;
+        if (!is_last) {
+          const int prisms = base + lane < listed ? over(field, w.near_pairs[base + lane]).prisms() : 0;
           before = sum_below(prisms);
           all = read(before + prisms, LANES - 1);
         }
-        is_last = base >= end;
       }
       if (next < all) {
         const Item item = dealt(before, all, next + lane);
-        const int own = item.exists ? base + item.owner : begin, k = item.exists ? item.number : 0;
+        const int own = item.exists ? w.near_pairs[base + item.owner] : begin, k = item.exists ? item.number : 0;
         const bool near = item.exists && reaches(field, own, k);
         const unsigned hits = ballot(near);
         if (near) w.near_ground[count + bits(hits & lanes_below())] = (unsigned)own << 16 | (unsigned)k;

@@ -68,9 +68,9 @@ class Layout:
         before = 32 * contacts + 12 * (self.frictional + 1)
         quads = self.stride // 4
         solving = 4 * max(16 * (quads | 1) + 8 + 12 * quads, self.limb_numbers, self.rows)
-        kinematics = (
-            32 * self.dofs + 112 * self.links + 32 * (self.geoms + 1) + 4 * self.near_ground + 2 * self.candidates
-        )
+        kinematics = 32 * self.dofs + 112 * self.links + 32 * (self.geoms + 1) + 2 * self.candidates
+        if self.near_ground:
+            kinematics += 4 * self.near_ground + 2 * (self.geoms + 1)
         total = 4 * vectors + pad(max(before, solving, 32 * self.links), 16)
         total = pad(total + 4 * self.jacobian_rows, 16)
         total += pad(max(kinematics, 4 * self.jacobian_rows * self.stride), 16)

@@ -23,10 +23,6 @@ static INLINE int cell_along(float x, float corner, int cells) {
   return (int)clamp(floorf(divide(x - corner, Model::grid_cell())), 0.0f, (float)(cells - 1));
 }
 
-static INLINE int moving(const bool round, int pair) {
-  return round ? Model::first_geom(pair) : Model::second_geom(pair);
-}
-
 // How far a geom that is no box, or is one, reaches from its center along the axes of the world.
 INLINE Vec reach_of(const bool round, int pair) const {
   const int g = moving(round, pair);
@@ -80,26 +76,27 @@ INLINE Bounds bounds_of(const bool round, int pair) const {
 
 // Lists boxes whose bounds meet those of geoms, and looks at them together when the list is full, and at last.
 INLINE void look_up_boxes(const bool round, const int first, const int end, const int kind, const bool friction) {
-  int count = 0, base = first - LANES, before = 0, all = 0, next = 0, at = 0, last = 0, pair = first, row = 0,
-      column = 0;
-  ROLLED_FOR(bool is_last = false; !is_last;) {
+  const int listed = list_near(round, first, end);
+  int count = 0, base = -LANES, before = 0, all = 0, next = 0, at = 0, last = 0, pair = first, row = 0, column = 0;
+  ROLLED_FOR(bool is_last = listed == 0; !is_last;) {
     if (!ballot(at < last)) {  // the next cells of these geoms, or the next geoms
       if (next >= all) {
         base += LANES;
-        const int of = base + lane < end ? base + lane : first;
-        const bool near = is_near_ground(moving(round, of)) && base + lane < end;
+        is_last = base >= listed;
         all = next = 0;
-        if (ballot(near)) {
-          const Bounds b = bounds_of(round, of);
-          const int cells = near ? b.columns * b.rows : 0;
+        if (!is_last) {
+          int cells = 0;
+          if (base + lane < listed) {
+            const Bounds b = bounds_of(round, w.near_pairs[base + lane]);
+            cells = b.columns * b.rows;
+          }
           before = sum_below(cells);
           all = read(before + cells, LANES - 1);
         }
-        is_last = base >= end;
       }
       if (next < all) {
         const Item item = dealt(before, all, next + lane);
-        pair = item.exists ? base + item.owner : first;
+        pair = item.exists ? w.near_pairs[base + item.owner] : first;
         const Bounds b = bounds_of(round, pair);
         row = b.row + item.number / b.columns;
         column = b.column + item.number % b.columns;

@@ -173,6 +173,7 @@ struct alignas(16) World {
       Geom geoms[Model::GEOMS + 1];
 #if WITH_GROUND
       unsigned near_ground[Model::NEAR_GROUND];
+      unsigned short near_pairs[Model::GEOMS + 1];
 #endif
       unsigned short candidates[Model::CANDIDATES];
     };
