@@ -76,33 +76,27 @@ def _why_not(name: str, m: mujoco.MjModel, i: int) -> str | None:
     """Returns why an element cannot have a field that varies, if it cannot."""
     if FIELDS[name].of == "body" and i == 0:
         return "the world has neither mass nor inertia"
-    if name == "kp" and not _is_position(m, i):
-        return "kp is of position actuators"
-    if name == "kv" and not (_is_position(m, i) or _is_velocity(m, i)):
-        return "kv is of position and velocity actuators"
+    if name in ("kp", "kv") and name not in _gains(m, i):
+        return f"{name} is of {'position' if name == 'kp' else 'position and velocity'} actuators"
     return why_not(m, name, i)
 
 
-def _is_affine(m: mujoco.MjModel, i: int) -> bool:
+def _gains(m: mujoco.MjModel, i: int) -> tuple[str, ...]:
+    """Returns which gains an actuator has: a position actuator both, a velocity actuator ``kv``, any other none."""
     fixed, affine = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
-    kinds = m.actuator_gaintype[i] == fixed and m.actuator_biastype[i] == affine
-    return bool(kinds and m.actuator_gainprm[i, 0] != 0)
-
-
-def _is_position(m: mujoco.MjModel, i: int) -> bool:
-    return _is_affine(m, i) and bool(m.actuator_biasprm[i, 1] == -m.actuator_gainprm[i, 0])
-
-
-def _is_velocity(m: mujoco.MjModel, i: int) -> bool:
-    bias = m.actuator_biasprm[i]
-    return _is_affine(m, i) and bool(bias[1] == 0 and bias[2] == -m.actuator_gainprm[i, 0])
+    gain, bias = m.actuator_gainprm[i, 0], m.actuator_biasprm[i]
+    if m.actuator_gaintype[i] != fixed or m.actuator_biastype[i] != affine or gain == 0:
+        return ()
+    if bias[1] == -gain:
+        return "kp", "kv"
+    return ("kv",) if bias[1] == 0 and bias[2] == -gain else ()
 
 
 def _places(name: str, m: mujoco.MjModel, i: int) -> list[list[tuple[str, int, float]]]:
     """Returns where each number of an element is: fields, indices of their flattened arrays, signs."""
     if name in ("kp", "kv"):
         gain, bias = ("actuator_gainprm", 10 * i, 1.0), ("actuator_biasprm", 10 * i + 1 + (name == "kv"), -1.0)
-        return [[gain, bias] if name == "kp" or _is_velocity(m, i) else [bias]]
+        return [[gain, bias] if _gains(m, i)[0] == name else [bias]]  # which the gain of the actuator is
     if name.startswith("dof_"):
         return [[(name, int(dof), 1.0) for dof in np.flatnonzero(m.dof_jntid == i)]]
     size = FIELDS[name].size
@@ -239,26 +233,26 @@ class Variation:
 
         It is the element's field, its first impossible numbers, and what must be true of them.
         """
-        valid = FIELDS[change.vary.field].valid
-        if valid in ("rising", "inertia"):
-            name = change.vary.field
-            size = FIELDS[name].size
-            for element in sorted({index // size for _, index in change.places}):
-                rows = np.stack([self._column(numbers, name, size * element + k) for k in range(size)], axis=1)
-                if valid == "rising":
-                    wrong = rows[:, 0] >= rows[:, 1]
-                else:
-                    had = self._mj_model.body_inertia[element] > 0
-                    wrong = ((rows < 0) | (rows == 0) & had).any(1) | (2 * rows.max(1) > rows.sum(1) * (1 + 1e-6))
-                if wrong.any():
-                    return self._described(change, name, element, rows[wrong][0])
-        elif valid != "finite":
-            for (name, index), sign in zip(change.places, change.signs, strict=True):
-                rows, positive = sign * self._column(numbers, name, index), valid == "positive"
-                had = sign * float(array_of(self._mj_model, name).flat[index]) > 0
-                wrong = rows <= 0 if positive and had else rows < 0
-                if wrong.any():
-                    return self._described(change, name, index // FIELDS[name].size, rows[wrong][:1])
+        field = FIELDS[change.vary.field]
+        if field.valid == "finite":
+            return None
+        together = field.valid in ("rising", "inertia")  # the numbers of an element; of others each for itself
+        size = field.size if together else 1
+        groups = {(name, index // size): sign for (name, index), sign in zip(change.places, change.signs, strict=True)}
+        for (name, group), sign in groups.items():
+            indices = range(size * group, size * (group + 1))
+            rows = sign * np.stack([self._column(numbers, name, index) for index in indices], axis=1)
+            had = sign * array_of(self._mj_model, name).flat[indices] > 0
+            wrong = rows < 0 if field.valid == "not negative" else (rows < 0) | (rows == 0) & had
+            wrong = rows[:, 0] >= rows[:, 1] if field.valid == "rising" else wrong.any(1)
+            if field.valid == "inertia":
+                wrong |= 2 * rows.max(1) > rows.sum(1) * (1 + 1e-6)
+            if wrong.any():
+                element = indices[0] // FIELDS[name].size
+                element = int(self._mj_model.dof_jntid[element]) if name.startswith("dof_") else element
+                of = self._elements.names(field.of)[element] or f"{field.of} {element}"
+                values = ", ".join(f"{number:.3g}" for number in rows[wrong][0])
+                return f"{change.vary.field} of {of}", values, VALID[field.valid]
         return None
 
     def _column(self, numbers: np.ndarray, name: str, index: int) -> np.ndarray:
@@ -266,12 +260,6 @@ class Variation:
         if (name, index) in self._columns:
             return numbers[:, self._columns[name, index]]
         return np.full(len(numbers), array_of(self._mj_model, name).flat[index])
-
-    def _described(self, change: Change, name: str, element: int, numbers: np.ndarray) -> tuple[str, str, str]:
-        field = FIELDS[change.vary.field]
-        element = int(self._mj_model.dof_jntid[element]) if name.startswith("dof_") else element
-        of = self._elements.names(field.of)[element] or f"{field.of} {element}"
-        return f"{change.vary.field} of {of}", ", ".join(f"{number:.3g}" for number in numbers), VALID[field.valid]
 
     # What is shown of them.
 
