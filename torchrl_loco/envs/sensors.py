@@ -10,34 +10,6 @@ from torchrl_loco.sim.corners import axes_of
 FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 Sensor, Object = mujoco.mjtSensor, mujoco.mjtObj
 
-# Velocities of bodies: MuJoCo's cvel is that of the point at the center of mass of the body's tree.
-
-
-def _free_joint(m: mujoco.MjModel, body: int) -> int:
-    """Returns the first dof of a body that floats, and -1 for any other."""
-    floats = m.body_parentid[body] == 0 and m.body_jntnum[body] == 1 and m.jnt_type[m.body_jntadr[body]] == FREE
-    return int(m.body_dofadr[body]) if body and floats else -1
-
-
-def linear_velocity(s: Any, bodies: list[int], one: bool) -> torch.Tensor:
-    """Returns velocities of the origins of bodies, world frame (m/s), ``(num_envs, 3)`` or ``(num_envs, count, 3)``."""
-    m, pick = s._catalog.mj_model, s._catalog.pick
-    if one and (dof := _free_joint(m, bodies[0])) >= 0:
-        return s.qvel[:, dof : dof + 3]
-    velocity = pick(s._array("cvel"), bodies, one)
-    center = pick(s._array("subtree_com"), [int(m.body_rootid[body]) for body in bodies], one)
-    lever = pick(s._array("xpos"), bodies, one) - center
-    return velocity[..., 3:] + torch.linalg.cross(velocity[..., :3], lever)
-
-
-def angular_velocity(s: Any, bodies: list[int], one: bool) -> torch.Tensor:
-    """Returns angular velocities of bodies, world frame (rad/s), shaped as :func:`linear_velocity`."""
-    m = s._catalog.mj_model
-    if one and (dof := _free_joint(m, bodies[0])) >= 0:  # that of a free joint is in the body's frame
-        xmat = s._catalog.pick(s._array("xmat"), bodies, one)
-        return (xmat * s.qvel[:, None, dof + 3 : dof + 6]).sum(-1)
-    return s._catalog.pick(s._array("cvel"), bodies, one)[..., :3]
-
 
 class Frames:
     """Frames of bodies, or of what is attached to them: a kind of ``"body"``, ``"site"``, ``"geom"`` or ``"inertia"``.
@@ -84,13 +56,27 @@ class Frames:
     @property
     def velocity(self) -> torch.Tensor:
         """Velocities, world frame (m/s), shaped as their positions."""
-        velocity = linear_velocity(self._s, self._bodies, self._one)
+        if (dof := self._free_joint()) >= 0:
+            velocity = self._s.qvel[:, dof : dof + 3]
+        else:  # MuJoCo's cvel is that of the point at the center of mass of the body's tree
+            catalog, cvel = self._s._catalog, self._pick("cvel")
+            roots = [int(catalog.mj_model.body_rootid[body]) for body in self._bodies]
+            center = catalog.pick(self._s._array("subtree_com"), roots, self._one)
+            velocity = cvel[..., 3:] + torch.linalg.cross(cvel[..., :3], self._pick("xpos") - center)
         return velocity if self._kind == "body" else velocity + torch.linalg.cross(self.rotation, self._lever())
 
     @property
     def rotation(self) -> torch.Tensor:
         """Angular velocities, world frame (rad/s), shaped as their positions."""
-        return angular_velocity(self._s, self._bodies, self._one)
+        if (dof := self._free_joint()) >= 0:  # that of a free joint is in the body's frame
+            return (self._pick("xmat") * self._s.qvel[:, None, dof + 3 : dof + 6]).sum(-1)
+        return self._pick("cvel")[..., :3]
+
+    def _free_joint(self) -> int:
+        """Returns the first dof of one body that floats, else -1."""
+        m, body = self._s._catalog.mj_model, self._bodies[0]
+        floats = m.body_parentid[body] == 0 and m.body_jntnum[body] == 1 and m.jnt_type[m.body_jntadr[body]] == FREE
+        return int(m.body_dofadr[body]) if self._one and body and floats else -1
 
 
 # Sensors.
@@ -119,25 +105,20 @@ def evaluate(s: Any, sensor: int) -> torch.Tensor | None:
 def _evaluate(s: Any, kind: int, sensor: int) -> torch.Tensor | None:
     m = s._catalog.mj_model
     index, of = int(m.sensor_objid[sensor]), int(m.sensor_objtype[sensor])
-    if kind in (Sensor.mjSENS_JOINTPOS, Sensor.mjSENS_JOINTVEL):
-        address = m.jnt_qposadr if kind == Sensor.mjSENS_JOINTPOS else m.jnt_dofadr
-        values = s.qpos if kind == Sensor.mjSENS_JOINTPOS else s.qvel
-        return values[:, int(address[index])].unsqueeze(-1)
-    if of not in FRAMES:
+    reference, of_reference = int(m.sensor_refid[sensor]), int(m.sensor_reftype[sensor])
+    if kind == Sensor.mjSENS_JOINTPOS:
+        return s.qpos[:, int(m.jnt_qposadr[index])].unsqueeze(-1)
+    if kind == Sensor.mjSENS_JOINTVEL:
+        return s.qvel[:, int(m.jnt_dofadr[index])].unsqueeze(-1)
+    if of not in FRAMES or (reference >= 0 and of_reference not in FRAMES):
         return None
     frame = Frames(s, FRAMES[of], [index], True)
     if kind == Sensor.mjSENS_GYRO:
         return into_frame(frame.axes, frame.rotation)
     if kind == Sensor.mjSENS_VELOCIMETER:
         return into_frame(frame.axes, frame.velocity)
-    reference = int(m.sensor_refid[sensor])
-    if reference >= 0 and int(m.sensor_reftype[sensor]) not in FRAMES:
-        return None
-    base = Frames(s, FRAMES[int(m.sensor_reftype[sensor])], [reference], True) if reference >= 0 else None
-    return _of_frames(kind, frame, base)
+    base = Frames(s, FRAMES[of_reference], [reference], True) if reference >= 0 else None
 
-
-def _of_frames(kind: int, frame: Frames, base: Frames | None) -> torch.Tensor | None:
     def seen(vector: torch.Tensor) -> torch.Tensor:
         return vector if base is None else into_frame(base.axes, vector)
 
@@ -146,8 +127,7 @@ def _of_frames(kind: int, frame: Frames, base: Frames | None) -> torch.Tensor | 
     if kind in AXES:
         return seen(frame.axes[..., AXES[kind]])
     if kind == Sensor.mjSENS_FRAMEQUAT:
-        axes = frame.axes if base is None else base.axes.transpose(-1, -2) @ frame.axes
-        return to_quaternion(axes)
+        return to_quaternion(frame.axes if base is None else base.axes.transpose(-1, -2) @ frame.axes)
     if kind == Sensor.mjSENS_FRAMEANGVEL:
         return seen(frame.rotation if base is None else frame.rotation - base.rotation)
     if kind == Sensor.mjSENS_FRAMELINVEL:

@@ -21,6 +21,7 @@ from torchrl_loco.eyes.scene import for_rays
 from torchrl_loco.eyes.shapes import MISS
 from torchrl_loco.sim import models
 from torchrl_loco.sim.simulation import check_memory
+from torchrl_loco.sim.varied import subtree_masses
 
 DISTANCES = Interval(0, float(MISS), with_low=False)  # that can be seen (m): what is not met is farther
 OF_A_STEP = frozenset({"action", "ctrl"})
@@ -96,8 +97,9 @@ class Catalog(Elements):
         if self.variation is not None and name in self.variation.varied.places:
             return self.variation.field(name, numbers())
         if name == "body_subtreemass" and self.variation is not None and "body_mass" in self.variation.varied.places:
-            masses = self.variation.field("body_mass", numbers())
-            return (masses.unsqueeze(-1) * self.derived("subtrees", lambda: subtrees(self.mj_model))).sum(1)
+            masses, m = self.variation.field("body_mass", numbers()), self.mj_model
+            of_each = self.derived("subtrees", lambda: subtree_masses(m, np.eye(m.nbody)).T)  # of each body's mass
+            return (masses.unsqueeze(-1) * of_each).sum(1)
         values = self.constant(name)
         return values.expand(self.num_envs, *values.shape)
 
@@ -309,31 +311,40 @@ class View:
 
     def xpos(self, bodies: Names) -> torch.Tensor:
         """Returns positions of bodies (m), ``(num_envs, 3)``, or ``(num_envs, count, 3)`` for several."""
-        return self._catalog.pick(self._array("xpos"), *self._catalog.ids("body", bodies))
+        return self._frames("body", bodies).position
 
     def xmat(self, bodies: Names) -> torch.Tensor:
         """Returns orientations of bodies, ``(num_envs, 3, 3)``, or ``(num_envs, count, 3, 3)`` for several."""
-        return self._catalog.pick(self._array("xmat"), *self._catalog.ids("body", bodies))
+        return self._frames("body", bodies).axes
 
     def linvel(self, bodies: Names) -> torch.Tensor:
         """Returns velocities of the origins of bodies in the world's frame (m/s), shaped as :meth:`xpos`."""
-        return sensors.linear_velocity(self, *self._catalog.ids("body", bodies))
+        return self._frames("body", bodies).velocity
 
     def angvel(self, bodies: Names) -> torch.Tensor:
         """Returns angular velocities of bodies in the world's frame (rad/s), shaped as :meth:`xpos`."""
-        return sensors.angular_velocity(self, *self._catalog.ids("body", bodies))
+        return self._frames("body", bodies).rotation
 
     def site_xpos(self, sites: Names) -> torch.Tensor:
         """Returns positions of sites (m), shaped as :meth:`xpos`."""
-        return sensors.Frames(self, "site", *self._catalog.ids("site", sites)).position
+        return self._frames("site", sites).position
 
     def site_xmat(self, sites: Names) -> torch.Tensor:
         """Returns orientations of sites, shaped as :meth:`xmat`."""
-        return sensors.Frames(self, "site", *self._catalog.ids("site", sites)).axes
+        return self._frames("site", sites).axes
 
     def site_linvel(self, sites: Names) -> torch.Tensor:
         """Returns velocities of sites in the world's frame (m/s), shaped as :meth:`xpos`."""
-        return sensors.Frames(self, "site", *self._catalog.ids("site", sites)).velocity
+        return self._frames("site", sites).velocity
+
+    def geom_xpos(self, geoms: Names) -> torch.Tensor:
+        """Returns positions of the centers of geoms (m), shaped as :meth:`xpos`."""
+        return self._frames("geom", geoms).position
+
+    def _frames(self, kind: str, names: Names) -> sensors.Frames:
+        return sensors.Frames(self, kind, *self._catalog.ids(kind, names))
+
+    # The ground, and what is seen.
 
     def terrain_height(self, points: torch.Tensor) -> torch.Tensor:
         """Returns the height of the ground below points, as a ray from above finds it, ``(num_envs, ...)`` (m).
@@ -456,9 +467,7 @@ class View:
             raise ValueError(f"{self._hook}() did not ask for this scan when it was first called: it is not computed")
         return self._array(name)
 
-    def geom_xpos(self, geoms: Names) -> torch.Tensor:
-        """Returns positions of the centers of geoms (m), shaped as :meth:`xpos`."""
-        return sensors.Frames(self, "geom", *self._catalog.ids("geom", geoms)).position
+    # Joints.
 
     def joint_qpos(self, joints: Names) -> torch.Tensor:
         """Returns positions of joints: ``(num_envs, count)`` for several hinges and slides (rad, m).
@@ -581,14 +590,6 @@ class View:
             )
         first, self._drawn = self._drawn, self._drawn + count
         return draws.mix(self._stream + self._catalog.places(first, count))
-
-
-def subtrees(m: mujoco.MjModel) -> np.ndarray:
-    """Returns which bodies are in whose subtree, ``(nbody, nbody)``, with a column for each subtree."""
-    found = np.eye(m.nbody)
-    for body in range(m.nbody - 1, 0, -1):  # children come after their parents
-        found[:, m.body_parentid[body]] += found[:, body]
-    return found
 
 
 def usable(action: torch.Tensor, bounded: bool) -> torch.Tensor:
