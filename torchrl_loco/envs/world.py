@@ -19,7 +19,7 @@ import warp as wp
 
 from torchrl_loco.envs import episode
 from torchrl_loco.envs.body_funcs import check_pair, check_rows, of_package
-from torchrl_loco.envs.hooks import PARTS, Arrays, Hooks, reads_of
+from torchrl_loco.envs.hooks import PARTS, Arrays, reads_of
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.pixels import Seen
@@ -238,14 +238,13 @@ class World:
         sim, hooks, own, variation = self.sim, task.hooks, self._own, self._variation
         self._moved = Buffer(task.num_envs, bool, sim.device)
         self._scans = Scans(sim, hooks.catalog.scans, lambda: hooks.catalog.ground)
-        streams = self._streams(task)
-        arrays = {**streams, **self._arrays(hooks), **self._scans.arrays}
+        arrays = self._arrays(task)
 
         parts: dict[Part, set[str]] = {}  # and what attributes of the task each reads
         of_hook: dict[str, Part] = {}
         said: set[str] = set()  # an observation is part of a step and of a reset
 
-        def made(work: Callable[[Arrays], None], arrays: dict[str, torch.Tensor], title: str, fixed: Any = ()) -> Part:
+        def made(work: Callable[[Arrays], None], title: str, fixed: Any = (), arrays: Any = arrays) -> Part:
             one = Part(work, arrays, f"{self._title}: {title}", fixed, said)
             parts[one] = set()
             return one
@@ -254,13 +253,13 @@ class World:
             if not own & set(PARTS[name] if needed is None else needed):
                 return _nothing
             called = [hook for hook in PARTS[name] if hook in own] or [name]
-            one = made(getattr(hooks, name), arrays, ", ".join(called), hooks.catalog.fixed())
+            one = made(getattr(hooks, name), ", ".join(called), hooks.catalog.fixed())
             parts[one] = set().union(*(hooks.read.get(hook, ()) for hook in called))
             of_hook.update({hook: one for hook in called if hook in own and hook not in of_hook})
             return one
 
-        self._vary = made(variation.vary, streams, "randomize", variation.fixed()) if variation else _nothing
-        self._keep = made(self._guard.keep, self._guard.arrays, "NaN guard") if self._guard else _nothing
+        self._vary = made(variation.vary, "randomize", variation.fixed()) if variation else _nothing
+        self._keep = made(self._guard.keep, "NaN guard", arrays=self._guard.arrays) if self._guard else _nothing
         self._control, self._judge = part("control"), part("judge", own if hooks.commands else None)
         self._adapt = part("adapt")
         self._observe = part("observe", own)  # it looks for what is not finite, too
@@ -308,23 +307,14 @@ class World:
         """Returns launches of scans, or of what pixels need, in all worlds, and in those in which episodes begin."""
         return [what.launch, functools.partial(what.launch, self.mask.warp)]
 
-    def _streams(self, task: "LocoEnv") -> dict[str, torch.Tensor]:
-        """Returns the arrays that tell where random streams begin, and the numbers of the model that vary."""
-        first = task.world_offset or 0
-        numbers = {"numbers": self.sim.numbers} if self._variation is not None else {}
-        return {
-            **numbers,
-            "qpos": self.sim.qpos,
-            "seed": self._seed_of_hooks,
-            "world": torch.arange(first, first + task.num_envs, device=task.device),
-            "episode": self.episode.torch,
-            "mask": self.mask.torch,
-        }
-
-    def _arrays(self, hooks: Hooks) -> dict[str, torch.Tensor]:
-        """Returns the other arrays that hooks read and write, by name."""
-        sim, catalog = self.sim, hooks.catalog
-        arrays = {name: getattr(sim, name) for name in ("qvel", "ctrl", "xpos", "xmat")}
+    def _arrays(self, task: "LocoEnv") -> dict[str, torch.Tensor]:
+        """Returns the arrays that hooks and draws of numbers read and write, by name."""
+        sim, catalog, first = self.sim, task.hooks.catalog, task.world_offset or 0
+        arrays = {"numbers": sim.numbers} if self._variation is not None else {}
+        arrays |= {"qpos": sim.qpos, "seed": self._seed_of_hooks}
+        arrays |= {"world": torch.arange(first, first + task.num_envs, device=task.device)}
+        arrays |= {"episode": self.episode.torch, "mask": self.mask.torch}
+        arrays |= {name: getattr(sim, name) for name in ("qvel", "ctrl", "xpos", "xmat")}
         arrays |= {name: getattr(sim, name) for name in ("cvel", "subtree_com") if name in catalog.arrays}
         if "warp" in catalog.arrays:
             observation, reward, _ = self._kept_alive
@@ -339,7 +329,7 @@ class World:
         arrays |= {"metrics": self.metrics, "overflow": sim.overflow}
         arrays |= {f"shared.{name}": values for name, values in self.shared.items()}
         arrays |= {f"out.{name}": group for name, group in self.groups.items()}
-        return arrays | {f"memory.{name}": rows for name, rows in self.memory.items()}
+        return {**arrays, **{f"memory.{name}": rows for name, rows in self.memory.items()}, **self._scans.arrays}
 
     def _keeping_what_was(self) -> Callable[[], None]:
         """Returns what follows a move; what belongs to the step stays: sensors of forces, a fused function's reward."""
