@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple, NoReturn
 import torch
 
 from torchrl_loco.envs.base import LocoEnv
-from torchrl_loco.envs.fusion.trace import NumbersTaken, NumberTakenError, Tracer
+from torchrl_loco.envs.fusion.trace import NumberTakenError, trace
 from torchrl_loco.envs.hooks import ENDS, beyond, by_world
 from torchrl_loco.envs.kinematics import Kinematics
 from torchrl_loco.envs.tables import Entry, entries
@@ -292,8 +292,7 @@ class Imagined:
             of_memory = {f"memory.{name}": row for name, row in rows.items()}
             a.update({name: row.to(self._rest[name].dtype) for name, row in of_memory.items() if name in self._rest})
 
-        if "update" in hooks.own:
-            remember(hooks._rows("update", a, hooks.catalog.memory))
+        remember(hooks._rows("update", a, hooks.catalog.memory))
         terms = hooks._call("reward", a, steps=1)
         reward: Any = sum(term.float() for term in terms.values()) if isinstance(terms, Mapping) else terms.float()
         ended, cut = (hooks._call(hook, a, steps=1) if hook in hooks.own else a["ended"] for hook in ENDS)
@@ -347,12 +346,10 @@ def traced(
 
     Products of matrices of at most 4 x 4 become sums, which join the kernels around them.
     """
-    tracer = Tracer({str(i): each.detach() for i, each in enumerate(inputs)}, fixed)
-    with torch.no_grad(), NumbersTaken(tracer), tracer:
-        results = function(*tracer.arrays)
-    graph = tracer.graph
-    graph.output(tuple(tracer.argument(result) for result in results))
-    graph.eliminate_dead_code()
+    arrays = {str(i): each.detach() for i, each in enumerate(inputs)}
+    with torch.no_grad():
+        module = trace(lambda given: tuple(function(*given.values())), arrays, fixed)
+    graph = module.graph
     for node in [node for node in graph.nodes if node.target is aten.bmm.default]:
         if max(node.meta["val"].shape[1:]) > 4:
             continue
@@ -362,4 +359,4 @@ def traced(
             products = graph.call_function(aten.mul.Tensor, (one, other))
             node.replace_all_uses_with(graph.call_function(aten.sum.dim_IntList, (products, [-2])))
         graph.erase_node(node)
-    return torch.fx.GraphModule(tracer.constants, graph)
+    return torch.fx.GraphModule(module, graph)

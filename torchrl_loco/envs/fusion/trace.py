@@ -73,8 +73,7 @@ class Tracer(TorchDispatchMode):
         self._device = next(iter(arrays.values())).device
         self._fixed = {tensor.data_ptr() for tensor in fixed}
         self._known: set[torch.fx.Node] = set()  # whose numbers are the same in each run
-        self.arrays = list(arrays.values())
-        self._kept = list(self.arrays)  # arrays and constants: no other tensor gets their ids meanwhile
+        self._kept = list(arrays.values())  # arrays and constants: no other tensor gets their ids meanwhile
         self._nodes = {id(array): self.graph.placeholder(f"arg{i}") for i, array in enumerate(self._kept)}
 
     @classmethod
@@ -164,12 +163,14 @@ class NumbersTaken(TorchFunctionMode):
 
 
 def trace(
-    work: Callable[[dict[str, torch.Tensor]], None],
+    work: Callable[[dict[str, torch.Tensor]], Any],
     arrays: dict[str, torch.Tensor],
     fixed: Iterable[torch.Tensor] = (),
     stop: str | None = None,
 ) -> torch.fx.GraphModule:
-    """Returns what a function, called once, does to arrays in place: a module that takes them one after another.
+    """Returns what a function, called once, does to arrays in place, and what it returns of them.
+
+    It is a module that takes them one after another.
 
     Raises:
         ReachedError: the function calls the operator whose node has the name ``stop``.
@@ -177,8 +178,8 @@ def trace(
     """
     tracer = Tracer(arrays, fixed, stop)
     with NumbersTaken(tracer), tracer:
-        work(arrays)
-    tracer.graph.output(None)
+        results = work(arrays)
+    tracer.graph.output(torch.fx.node.map_aggregate(results, tracer.argument))
     tracer.graph.eliminate_dead_code()
     with _use_lazy_graph_module(True):  # its Python is written when it is called, which it seldom is
         return _make_graph_module(tracer.constants, tracer.graph)
