@@ -21,16 +21,10 @@ def check_pair(method: str, returned: Any) -> tuple[wp.Function, Any]:
 
 
 def check_rows(func: wp.Function, inputs: Any, world: int, size: int, terms: int, device: wp.Device) -> None:
-    """Checks that a body's function writes the rows of observation and terms: every number, and none beyond.
-
-    A write beyond a row would change the data of another world, or crash. The function runs twice for one world, with
-    rows in memory of their own: one with a high index tells the row of a world from the memory of all. What it writes
-    into its inputs stays.
-
-    Raises:
-        TypeError: the function has other parameters than it must.
-        ValueError: the function writes too much or too little; the message says at which indices.
-    """
+    """Checks that a body's function writes the rows of observation and terms: every number, and none beyond."""
+    # A write beyond a row would change the data of another world, or crash. The function runs twice for one world, with
+    # rows in memory of their own: one with a high index tells the row of a world from the memory of all. What it writes
+    # into its inputs stays.
     required = [name for name in func.input_types if name not in func.defaults]
     if not len(required) <= 4 <= len(func.input_types):
         raise TypeError(

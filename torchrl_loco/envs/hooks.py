@@ -66,10 +66,6 @@ class Hooks:
 
     If there are any, they are called once when this is made, in worlds at rest in the home pose, which tells what they
     return and what of the physics they ask for. No reference that would keep the environment alive is kept.
-
-    Raises:
-        TypeError: a hook returns something of the wrong type.
-        ValueError: a hook returns something of the wrong shape, name or value.
     """
 
     view: type[View] = View

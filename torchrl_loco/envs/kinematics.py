@@ -184,11 +184,9 @@ class Kinematics:
         return {"xpos": pos, "xmat": mat, "cvel": torch.cat([ang, of_tree], dim=-1), "subtree_com": pos}
 
     def launch(self, tensors: Sequence[torch.Tensor], slopes: Sequence[torch.Tensor] = ()) -> None:
-        """Launches the kernel on torch's current stream; with ``slopes``, its adjoint.
+        """Launches the kernel on torch's current stream; with ``slopes``, its adjoint, which adds gradients to them.
 
-        Args:
-            tensors: qpos and qvel, for each chain, ``(worlds, chains, ...)``, and what is found of links.
-            slopes: the gradients with regard to them, which are added to.
+        Tensors are qpos and qvel, for each chain, ``(worlds, chains, ...)``, and what is found of links.
         """
         arrays, gradients = (
             [wp.from_torch(each.detach(), dtype=kind) for each, kind in zip(every, TYPES, strict=False)]

@@ -136,13 +136,7 @@ class Health(Monitor):
         return {"constraints": engine.peak_constraints.torch.max(), "contacts": engine.peak_contacts.torch.max()}
 
     def report(self, numbers: list[int]) -> None:
-        """Warns once of worlds that became non-finite; warns or raises if something was dropped.
-
-        That it does again once it is ten times as much.
-
-        Raises:
-            PhysicsOverflowError: something was dropped and ``on_overflow`` is "raise".
-        """
+        """Warns once of worlds that became non-finite; warns or raises at what was dropped, and at ten times that."""
         dropped, needed, lost = numbers[: len(DROPPED)], numbers[len(DROPPED) : -1], numbers[-1]
         if lost and self._tells_non_finite and not any(dropped):  # of which it may be a consequence
             self._tells_non_finite = False

@@ -32,11 +32,7 @@ class Elements:
         return self._names[kind]
 
     def ids(self, kind: str, names: Names) -> tuple[list[int], bool]:
-        """Returns the ids of elements, and whether one was named, so that results need no dimension for several.
-
-        Raises:
-            torchrl_loco.checks.UnknownNameError: a name or pattern matches none; the message names the nearest.
-        """
+        """Returns the ids of elements, and whether one was named, so that results need no dimension for several."""
         several = [names] if isinstance(names, str) else names
         key = kind, names if isinstance(names, str) else tuple(names)
         if not (key[1] and all(several)):

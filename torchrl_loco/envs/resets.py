@@ -39,10 +39,7 @@ class QuickResets(EnvBase):
         return tensordict, begin
 
     def _is_plain(self, tensordict: TensorDictBase) -> bool:
-        """Returns whether a step needs none of TorchRL's further features, nor a subclass's own step or reset.
-
-        Those are partial steps, results given in advance, nested entries, checks of types, hooks.
-        """
+        """Returns whether a step needs none of TorchRL's further features, nor a subclass's own step or reset."""
         return (
             self._steps_as_base
             and type(tensordict) is TensorDict
@@ -68,17 +65,9 @@ def rows_of(mask: torch.Tensor, entry: torch.Tensor) -> torch.Tensor:
 
 
 def reset_done_worlds(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:
-    """Does what TorchRL's ``maybe_reset`` does, without reading from the device.
+    """Returns what TorchRL's ``maybe_reset`` does, without reading from the device.
 
-    What is left out is TorchRL's check that no world is done after its reset; the environments of this package cannot
-    be.
-
-    Args:
-        env: an environment of this package, or one around it.
-        tensordict: what ``step_mdp`` makes of a step, batch ``(num_envs,)``.
-
-    Returns:
-        The same, with the first observation of the next episode in the worlds that were done.
+    What is left out is TorchRL's check that no world is done after its reset; those of this package cannot be.
     """
     if isinstance(tensordict, LazyStackedTensorDict):  # what follows is by entry, not by world
         tensordict = tensordict.contiguous()

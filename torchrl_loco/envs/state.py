@@ -85,13 +85,7 @@ def checked_state(
     *,
     finite: bool = True,
 ) -> dict[Any, torch.Tensor]:
-    """Returns the entries of a state that can be written into the worlds of a mask.
-
-    Targets are the tensors of all worlds by key of :class:`State`. ``finite`` tells whether numbers must be finite.
-
-    Raises:
-        ValueError: qpos or qvel is missing, a shape is wrong, or a value is not finite.
-    """
+    """Returns the entries of a state that can be written into ``targets``, all worlds' by key, where a mask is set."""
     given: dict[Any, Any] = {key: None if state is None else state.get(key, None) for key in targets}
     for group, owner in (("memory", "the task"), ("shared", "the task"), ("model", "randomize")):
         entries = None if state is None else state.get(group, None)

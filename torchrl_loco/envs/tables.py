@@ -124,10 +124,7 @@ Note = Callable[[torch.Tensor, bool], None]
 def lookup(table: torch.Tensor, index: Any, note: Note) -> torch.Tensor:
     """Returns ``table[index]``, in which indices may be of each world: the first dimension of those is the world.
 
-    ``note`` is told of indices that are out of range.
-
-    Returns:
-        What torch returns, NaN (or of integers the first) where an index is out of range.
+    It is NaN (or of integers the first) where an index is out of range, of which ``note`` is told.
 
     Raises:
         IndexError: a mask is beside an index.

@@ -307,13 +307,7 @@ class Task:
 
     @classmethod
     def check_class(cls) -> None:
-        """Checks what a subclass has set.
-
-        Raises:
-            TypeError: an attribute or a hook is missing or has the wrong type, or a table of initial states would not
-                be used.
-            ValueError: ``observation_size`` is less than 1, or an attribute is none of the valid values.
-        """
+        """Checks what a subclass has set."""
         name, own = cls.__name__, own_hooks(cls)
         _warn_of_misspelt_names(cls)
         if not hasattr(cls, "model"):
@@ -364,11 +358,7 @@ class Task:
 
     @classmethod
     def checked_options(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns values of :attr:`options` that are given, as a run keeps them: as JSON can hold them.
-
-        Raises:
-            ValueError: there is no such option.
-        """
+        """Returns values of :attr:`options` that are given, as a run keeps them: as JSON can hold them."""
         if given and not cls.options:
             raise ValueError(f"{cls.__name__} has no options, and so no {', '.join(given)}")
         return {check_choice("option", name, cls.options): value for name, value in given.items()}

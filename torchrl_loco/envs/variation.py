@@ -107,9 +107,6 @@ class Variation:
     """The numbers of a model that differ from world to world, one Vary after another, and their draws.
 
     ``varied`` says which they are, and where they are in the row of a world.
-
-    Raises:
-        ValueError: a name is not in the model, nothing is left that varies, or a number could become impossible.
     """
 
     def __init__(self, varys: Sequence[Vary], mj_model: mujoco.MjModel, device: torch.device) -> None:

@@ -150,11 +150,7 @@ class View:
         self._lost: dict[bool, torch.Tensor] = {}
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Refuses to set what a hook sees.
-
-        Raises:
-            AttributeError: always, but for the view's own.
-        """
+        """Refuses to set what a hook sees."""
         if not name.startswith("_"):
             raise AttributeError(
                 f"s.{name} cannot be set: return {{{name!r}: ...}} from update, events, adapt or begin"
@@ -444,11 +440,7 @@ class View:
         return ids[0]
 
     def _scanned(self, asked: Request, shape: tuple[int, ...]) -> torch.Tensor:
-        """Returns the array of a scan, depths or rays, of a shape in each world: at the first call, numbers like them.
-
-        Raises:
-            ValueError: the hook did not ask for it at its first call.
-        """
+        """Returns the array of a scan, depths or rays, of a shape in each world: at first, numbers like them."""
         self._refuse_in_begin("what is seen of the ground")
         scans = self._catalog.scans
         name = next((name for name, other in scans.items() if other == asked), f"scan.{len(scans)}")

@@ -58,21 +58,14 @@ class World:
             controls that they became.
         outputs: the memory of what a step returns: each group of the observation, reward, terms; done, terminated and
             truncated.
-        groups: the groups of the observation by name, tensors ``(nworld, *row)``.
-        reward: rewards, ``(nworld,)``.
-        terms: terms of the rewards, ``(nworld, len(term_names))``.
-        metrics: numbers for the log, ``(nworld, count)``.
-        memory: entries of the task's memory by name, tensors ``(nworld, *row)``.
+        groups, memory: groups of the observation and entries of the memory by name, tensors ``(nworld, *row)``.
         shared: what worlds share, by name.
-        mask: worlds to reset, ``(nworld,)``.
-        stream: start of the random stream of the current episode, ``(nworld,)`` uint32.
-        episode: episodes drawn so far, ``(nworld,)``.
-        elapsed_steps: control steps since the world's reset, ``(nworld,)``.
-        non_finite: whether the world is non-finite, ``(nworld,)``.
+        reward, terms, metrics: ``(nworld,)``, ``(nworld, len(term_names))`` and ``(nworld, count)``.
+        stream, episode, elapsed_steps: start of the random stream of the episode (uint32), episodes drawn so far, and
+            control steps since the reset, ``(nworld,)``.
+        mask, non_finite: which worlds to reset, and which are not finite, ``(nworld,)``.
         ended, cut_off: whether the task's hooks terminate or truncate the episode, ``(nworld,)``.
-        done: terminated or truncated, ``(nworld,)``.
-        terminated: whether the episode ended by the task's hook, or because the world is not finite, ``(nworld,)``.
-        truncated: whether the episode reached the time limit, or the task's hook cut it off, ``(nworld,)``.
+        done, terminated, truncated: how the episode ends, by the hooks, the time limit, or as the world is not finite.
         seed: seed of all random streams, ``(1,)``.
         seen: what draws the pixels, if the environment returns any.
         health: counts what went wrong in the physics.

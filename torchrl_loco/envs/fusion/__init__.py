@@ -31,17 +31,8 @@ def fuse(
     """Returns a function that does what a traced one does to arrays, in one launch on Warp's current stream.
 
     Tensors that it uses are read from memory at each launch, so what is changed in place is seen. The tensors live as
-    long as the returned function.
-
-    Args:
-        traced: of a function of ``arrays`` that changes them in place, by :func:`trace`.
-        arrays: tensors by name, ``(num_envs, ...)`` in any order of memory; others are read only, and so is ``seed``.
-        num_envs: number of worlds.
-        device: where they live.
-        fixed: further tensors that it uses and that never change: they alone can be indices.
-
-    Raises:
-        CannotFuse: the graph has an operator, type or shape that cannot be written as the code of one world.
+    long as the returned function. Arrays are ``(num_envs, ...)`` in any order of memory; others are read only, and so
+    is ``seed``. The tensors ``fixed``, which it uses too, never change: they alone can be indices.
     """
     given = arrays, num_envs, torch.device(wp.device_to_torch(device)), RULES, fixed
     constants = functools.partial(getattr, traced)

@@ -73,14 +73,9 @@ def offsets_of(shape: Sequence[int], steps: Sequence[int]) -> np.ndarray:
 class Program:
     """A traced graph as C++.
 
-    Args:
-        arrays: what it is called with; of ``num_envs`` worlds on ``device``.
-        rules: by operator's name without overload, a function of the program and the operator's arguments.
-        fixed: tensors that never change: they are constants, and can be indices and tables.
-        long: rows of a user's tensor from which it is taken for one of the worlds, if there are as many worlds.
-
-    Attributes:
-        tensors: what it reads and writes.
+    It is called with ``arrays``, and reads and writes ``tensors``. A rule, by operator's name without overload, is a
+    function of the program and the operator's arguments. Tensors that are ``fixed`` are constants, and can be indices
+    and tables. From ``long`` rows on a user's tensor is taken for one of the worlds, if there are as many.
     """
 
     def __init__(

@@ -39,11 +39,7 @@ Store = tuple[Node, Node]  # a number in memory, and what is written there
 
 
 class Source:
-    """C++ of stores: the statements of one world, which find the tensors ``used`` in ``args.p0``, ``args.p1``, ...
-
-    Raises:
-        CannotFuse: it is too much, or reads what it writes elsewhere.
-    """
+    """C++ of stores: the statements of one world, which find the tensors ``used`` in ``args.p0``, ``args.p1``, ..."""
 
     def __init__(self, stores: list[Store], tensors: Sequence[torch.Tensor]) -> None:
         self._names: dict[Node, str] = {}

@@ -57,11 +57,6 @@ class Tracer(TorchDispatchMode):
     """Notes each operator while it runs.
 
     A result bears its node as an attribute, which is dropped with it: all results together may not fit in memory.
-
-    Args:
-        arrays: what differs in each run, by name.
-        fixed: further tensors that never change; numbers of others must not be read, as they would stay what they are.
-        stop: name of the operator's node at which to raise ``ReachedError``.
     """
 
     def __init__(
@@ -170,11 +165,8 @@ def trace(
 ) -> torch.fx.GraphModule:
     """Returns what a function, called once, does to arrays in place, and what it returns of them.
 
-    It is a module that takes them one after another.
-
-    Raises:
-        ReachedError: the function calls the operator whose node has the name ``stop``.
-        NumberTakenError: what it does depends on a number of an array, or of a tensor that is not among ``fixed``.
+    It is a module that takes them one after another. What it does must not depend on a number of an array, or of a
+    tensor that is not among ``fixed``. ``stop`` names the node of an operator at which to raise ``ReachedError``.
     """
     tracer = Tracer(arrays, fixed, stop)
     with NumbersTaken(tracer), tracer:
