@@ -160,15 +160,7 @@ def to_quaternion(axes: torch.Tensor) -> torch.Tensor:
     a, b, c = (axes[..., i, j] - axes[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
     d, e, f = (axes[..., i, j] + axes[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
     w2, x2, y2, z2 = (4 * squares).unbind(-1)
-    rows = torch.stack(
-        [
-            torch.stack([w2, a, b, c], dim=-1),
-            torch.stack([a, x2, d, e], dim=-1),
-            torch.stack([b, d, y2, f], dim=-1),
-            torch.stack([c, e, f, z2], dim=-1),
-        ],
-        dim=-2,
-    )
+    rows = torch.stack([w2, a, b, c, a, x2, d, e, b, d, y2, f, c, e, f, z2], dim=-1).unflatten(-1, (4, 4))
     largest = squares.argmax(dim=-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
     found: Any = rows.gather(-2, largest).squeeze(-2)
     found = found / found.norm(dim=-1, keepdim=True)

@@ -61,7 +61,13 @@ class Source:
             for arg in node.args:
                 self._users[arg].append(node)
         if mask is None:
-            self._store_together(stores)
+            value = dict(stores)
+            pieces = {piece[0]: (f"out{k}", piece) for k, piece in enumerate(_pieces(list(value)))}
+            follow = {target for _, piece in pieces.values() for target in piece[1:]}
+            for first in value:
+                if first not in follow:
+                    row, piece = pieces.get(first, ("", [first]))
+                    self._store([(target, value[target]) for target in piece], row)
             for condition, constants in late.items():
                 self._compute(condition)
                 writes = " ".join(f"{target.text} = {constant.text};" for target, constant in constants)
@@ -69,35 +75,24 @@ class Source:
         else:  # few worlds, so each thread for itself
             self._compute(mask)
             self._lines.append(f"if (!{self._names[mask]}) return;")
-            for target, node in stores:
-                self._store(target, node)
+            for store in stores:
+                self._store([store])
         self.text = "\n".join([ROWS, *_pointers(tensors, places), *self._lines, ""])
 
-    def _store_together(self, stores: list[Store]) -> None:
-        value = dict(stores)
-        pieces = _pieces(list(value))
-        piece_of = {target: k for k, piece in enumerate(pieces) for target in piece}
-        for target, node in stores:
-            if target not in piece_of:
-                self._store(target, node)
-            elif target is pieces[piece_of[target]][0]:
-                self._store_piece(f"out{piece_of[target]}", [(each, value[each]) for each in pieces[piece_of[target]]])
-
-    def _store(self, target: Node, node: Node) -> None:
-        self._compute(node)
-        if target in self._needed:  # the old value, which is used later
-            self._compute(target)
-        self._lines.append(f"{target.text} = {self._names[node]};")
-
-    def _store_piece(self, row: str, piece: list[Store]) -> None:
+    def _store(self, piece: list[Store], row: str = "") -> None:
+        """Appends statements that store a number, or a piece of a row by the name ``row``."""
         for target, node in piece:
             self._compute(node)
-            if target in self._needed:
+            if target in self._needed:  # the old value, which is used later
                 self._compute(target)
-        values = ", ".join(self._names[node] for _, node in piece)
-        self._lines.append(f"const float {row}[] = {{{values}}};")
-        index, first, step = piece[0][0].place
-        self._lines.append(f"WRITE_ROW({row}, {_pointer(index, step)} + {first}, {len(piece)}, {step})")
+        values = [self._names[node] for _, node in piece]
+        first = piece[0][0]
+        if not row:
+            self._lines.append(f"{first.text} = {values[0]};")
+            return
+        index, start, step = first.place
+        self._lines.append(f"const float {row}[] = {{{', '.join(values)}}};")
+        self._lines.append(f"WRITE_ROW({row}, {_pointer(index, step)} + {start}, {len(piece)}, {step})")
 
     def _compute(self, node: Node) -> None:
         """Appends statements for a node and its parts, each once."""
