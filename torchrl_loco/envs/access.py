@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import mujoco
 import torch
@@ -15,14 +15,12 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_loco.checks import ANY, Interval, check_choice, check_int
-from torchrl_loco.config import SimConfig
 from torchrl_loco.envs.hooks import Hooks
 from torchrl_loco.envs.pixels import checked_camera
 from torchrl_loco.envs.rotations import check_quaternions
 from torchrl_loco.envs.state import State, checked_state, write_state
-from torchrl_loco.envs.task import folder_of
+from torchrl_loco.envs.task import Task, folder_of
 from torchrl_loco.envs.variation import Variation
-from torchrl_loco.envs.vary import Vary
 from torchrl_loco.envs.world import World
 from torchrl_loco.eyes.pictures import LOOKS_WELL, OPACITY, Poses, with_ghost
 from torchrl_loco.eyes.tracer import KINDS, Eye
@@ -31,20 +29,16 @@ from torchrl_loco.sim import Simulation, models
 STAGE_WORLDS = 64  # of how many worlds a stage keeps the memory, at most
 
 
-class WorldAccess(EnvBase):
+class WorldAccess(Task, EnvBase):
     """The part of an environment that holds its worlds."""
 
     num_envs: int
     seed: int
     world_offset: int | None
     protocol: str
-    config: SimConfig
-    body: ClassVar[str]
-    mj_model: mujoco.MjModel
     hooks: Hooks
     options_given: dict[str, Any]
     play: bool
-    randomize: Sequence[Vary]
     variation: Variation | None
     _pid: int
     _stepped_model: mujoco.MjModel

@@ -36,7 +36,7 @@ from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.pixels import Pictures, Pixels, Seen
 from torchrl_loco.envs.resets import QuickResets, rows_of
 from torchrl_loco.envs.state import State, without_state
-from torchrl_loco.envs.task import BOUNDED, Task, folder_of, options_of_class, replaced_options
+from torchrl_loco.envs.task import BOUNDED, folder_of, options_of_class, replaced_options
 from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.vary import Vary, check_randomize
 from torchrl_loco.sim import models
@@ -56,7 +56,7 @@ READ_ONCE = {
 """Attributes from which an environment is made, and what to do to change them."""
 
 
-class LocoEnv(Task, WorldAccess, QuickResets):
+class LocoEnv(WorldAccess, QuickResets):
     """Base of the locomotion environments: batched worlds of one body on one device.
 
     A task is a subclass: class attributes, and hooks in plain torch, of which :meth:`reward` and :meth:`observation`

@@ -62,7 +62,7 @@ class Catalog(Elements):
         self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}  # in sensordata
         self.home = self._tensor(models.home_pose(mj_model))  # (nq,)
         self._index: dict[tuple[int, ...], torch.Tensor] = {}
-        self._constants: dict[Any, torch.Tensor] = {}
+        self.of_model: dict[Any, torch.Tensor] = {}  # numbers of the model that were asked for
         self._tables: dict[Any, torch.Tensor] = {}
         self._places: dict[tuple[int, int], torch.Tensor] = {}
 
@@ -88,10 +88,6 @@ class Catalog(Elements):
             self._index[key] = torch.tensor(ids, device=self.device)
         return values.index_select(1, self._index[key])
 
-    def constant(self, field: str) -> torch.Tensor:
-        """Returns the numbers of a field of the model, float32."""
-        return self.derived(field, lambda: constant_of(self.mj_model, field))
-
     def field(self, name: str, numbers: Callable[[], torch.Tensor]) -> torch.Tensor:
         """Returns a field in all worlds, ``(num_envs, *shape)``; one that varies, by their ``numbers()``."""
         if self.variation is not None and name in self.variation.varied.places:
@@ -100,18 +96,13 @@ class Catalog(Elements):
             masses, m = self.variation.field("body_mass", numbers()), self.mj_model
             of_each = self.derived("subtrees", lambda: subtree_masses(m, np.eye(m.nbody)).T)  # of each body's mass
             return (masses.unsqueeze(-1) * of_each).sum(1)
-        values = self.constant(name)
+        values = self.derived(name, lambda: constant_of(self.mj_model, name))
         return values.expand(self.num_envs, *values.shape)
 
     def fixed(self) -> list[torch.Tensor]:
         """Returns tensors that never change: of indices, and the task's tables."""
         variation = self.variation.fixed() if self.variation else []
         return [*self._index.values(), *self.constants.values(), *self._tables.values(), *variation]
-
-    @property
-    def of_model(self) -> Mapping[Any, torch.Tensor]:
-        """The numbers of the model that were asked for."""
-        return self._constants
 
     def places(self, first: int, count: int) -> torch.Tensor:
         """Returns places of random streams, which torch.compile would compute wrongly: they wrap around 64 bits."""
@@ -127,9 +118,9 @@ class Catalog(Elements):
 
     def derived(self, key: Any, make: Any) -> torch.Tensor:
         """Returns a tensor made by ``make()`` from the model when it is first asked for."""
-        if key not in self._constants:
-            self._constants[key] = self._tensor(make())
-        return self._constants[key]
+        if key not in self.of_model:
+            self.of_model[key] = self._tensor(make())
+        return self.of_model[key]
 
     def _tensor(self, values: Any) -> torch.Tensor:
         return torch.tensor(np.array(values), dtype=torch.float32, device=self.device)

@@ -304,7 +304,14 @@ class Program:
                     raise CannotFuse(str(error).replace("{op}", str(node.target)), node.name) from None
                 except Exception as error:  # operands that its rule did not foresee
                     raise CannotFuse(f"the rule of {node.target} fails: {error}", node.name) from error
-        return self._source()
+        stores: list[tuple[Node, Node]] = []  # what has changed, and how it is computed
+        for _, value, before in self._sources.values():
+            for old, new in zip(before.flat, value.array.flat, strict=True):
+                if new is not old:
+                    if value.world is None:
+                        raise CannotFuse("a tensor that has no worlds is changed")
+                    stores.append((old, new))
+        return Source(stores, self.tensors)
 
     def _constant(self, node: torch.fx.Node, tensor: torch.Tensor) -> Any:
         fresh = all(user.target is torch.ops.aten.lift_fresh_copy.default for user in node.users)
@@ -326,7 +333,7 @@ class Program:
         args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda arg: found[arg])
         if target is operator.getitem:
             return args[0][args[1]]
-        name, self._meta = _name(target), node.meta.get("val")
+        name, self._meta = target._schema.name.split("::")[-1], node.meta.get("val")  # of one in place, it ends with _
         if torch.Tag.nondeterministic_seeded in target.tags:
             raise CannotFuse("{op} draws numbers that are no function of the world: use s.uniform or s.normal")
         leaves = torch.utils._pytree.tree_leaves((args, kwargs))
@@ -358,19 +365,3 @@ class Program:
         if world != target.world:
             raise CannotFuse("{op} mixes worlds")
         target.array[...] = source.array
-
-    def _source(self) -> Source:
-        """Returns the C++ that computes what has changed, and writes it."""
-        stores: list[tuple[Node, Node]] = []
-        for _, value, before in self._sources.values():
-            for old, new in zip(before.flat, value.array.flat, strict=True):
-                if new is not old:
-                    if value.world is None:
-                        raise CannotFuse("a tensor that has no worlds is changed")
-                    stores.append((old, new))
-        return Source(stores, self.tensors)
-
-
-def _name(target: Any) -> str:
-    """Returns the name of an operator without its overload: that of one in place ends with an underscore."""
-    return target._schema.name.split("::")[-1] if hasattr(target, "_schema") else str(target)
