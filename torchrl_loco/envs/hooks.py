@@ -136,10 +136,8 @@ class Hooks:
                 raise ValueError(f"{self._title}.{hook} writes to {name!r} of the model: work on a clone")
         for name, value in vars(env).items():
             if own.get(name, own) is not value:
-                raise ValueError(
-                    f"{self._title}.{hook} sets self.{name}, but hooks are pure: declare it in memory, and return it "
-                    "from update() or events()"
-                )
+                instead = "declare it in memory, and return it from update() or events()"
+                raise ValueError(f"{self._title}.{hook} sets self.{name}, but hooks are pure: {instead}")
         return returned
 
     def _count_lost(self, a: Arrays, lost: Mapping[bool, torch.Tensor], *, masked: bool) -> None:

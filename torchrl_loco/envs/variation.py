@@ -206,9 +206,7 @@ class Variation:
         for change in self._changes:
             if wrong := self._impossible(change, numbers):
                 what, values, rule = wrong
-                raise ValueError(
-                    f"{change.vary}: {what} could become {values}, but it {rule}: choose other low and high"
-                )
+                raise ValueError(f"{change.vary}: {what} could become {values}, but it {rule}: change low or high")
 
     def _touched(self, change: Change) -> set[tuple[str, int]]:
         """Returns the elements that a change is about; gain and bias of an actuator belong together."""
@@ -278,7 +276,6 @@ def constant_of(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "biuf":
         arrays = [key for key in dir(mj_model) if isinstance(getattr(mj_model, key, None), np.ndarray)]
         near = difflib.get_close_matches(name, [*arrays, "gravity"], n=3)
-        raise AttributeError(
-            f"MjModel has no array {name!r}" + (f": did you mean {' or '.join(near)}?" if near else "")
-        )
+        hint = f": did you mean {' or '.join(near)}?" if near else ""
+        raise AttributeError(f"MjModel has no array {name!r}{hint}")
     return values

@@ -271,9 +271,8 @@ class View:
         entries = [*catalog.memory, *catalog.shared, *catalog.constants]
         near = difflib.get_close_matches(name, [*public, *entries], n=1)
         hint = f", did you mean s.{near[0]}?" if near else ""
-        raise AttributeError(
-            f"s has no {name!r}{hint}: memory, shared and constants have {', '.join(entries) or 'no entries'}"
-        )
+        known = ", ".join(entries) or "no entries"
+        raise AttributeError(f"s has no {name!r}{hint}: memory, shared and constants have {known}")
 
     def _note(self, lost: torch.Tensor, gave_nan: bool) -> None:
         if lost.shape[0] not in (1, self.num_envs):  # of an index that is the same in all worlds

@@ -140,9 +140,8 @@ class Program:
             dtype = {bool: torch.bool, int: torch.int64, float: torch.float32}[type(x)]
             return Value(np.asarray(self.constant(x, dtype), dtype=object), dtype, None)
         if not isinstance(x, torch.Tensor) or x.dtype not in TYPES or x.numel() > MOST_NUMBERS:
-            raise CannotFuse(
-                f"{{op}} takes {f'a large tensor of {x.dtype}' if isinstance(x, torch.Tensor) else repr(x)}"
-            )
+            what = f"a large tensor of {x.dtype}" if isinstance(x, torch.Tensor) else repr(x)
+            raise CannotFuse(f"{{op}} takes {what}")
         array: Any = np.empty(x.shape, dtype=object)
         numbers = x.flatten().tolist()
         keys = list(zip(numbers, np.signbit(numbers).tolist(), strict=True))  # 0.0 == -0.0
