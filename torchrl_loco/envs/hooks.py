@@ -98,7 +98,7 @@ class Hooks:
         self.groups: dict[str, tuple[int, ...]] = {}  # shapes of rows; empty if a Warp function observes
         self.terms: dict[str, dict[str, int]] = {}  # by group, sizes of its terms in their order, if they have names
         self.history: dict[str, int] = {}  # by group, how many of the last ones it has, where it is more than one
-        self._shapes: dict[tuple[str, str], tuple[int, ...]] = {}
+        self._shapes: dict[str, dict[str, tuple[int, ...]]] = {}  # by group, those of its terms
         self._noise_scale = env.noise_scale
         self._noise: dict[tuple[str, str], tuple[float, str | None]] = {}
         self.term_names: tuple[str, ...] | None = None  # those of the reward; None if a Warp function rewards
@@ -212,25 +212,20 @@ class Hooks:
     def _declare_noise_and_history(self) -> None:
         env = self._env()
         assert env is not None
-        seen = {name: sizes or {name: 0} for name, sizes in self.terms.items() if name != CRITIC}
-        known = list(dict.fromkeys(term for sizes in seen.values() for term in sizes))
+        seen, memory = {name: shapes for name, shapes in self._shapes.items() if name != CRITIC}, self.catalog.memory
+        known = list(dict.fromkeys(term for shapes in seen.values() for term in shapes))
         for term, value in env.noise.items():
-            what = check_choice(f"{self._title}.noise", term, known)
+            check_choice(f"{self._title}.noise", term, known)
+            title = f"{self._title}.noise[{term!r}]"
             most, entry = value if isinstance(value, tuple) else (value, None)
-            check_float(f"{self._title}.noise[{term!r}]", most, Interval(0.0, MAX_VALUE))
+            check_float(title, most, Interval(0.0, MAX_VALUE))
             if entry is not None:
-                check_choice(f"{self._title}.noise[{term!r}]", entry, list(self.catalog.memory))
-                has = self.catalog.memory[entry].shape
-                if wrong := [shape for group in seen if (shape := self._shapes.get((group, term), has)) != has]:
-                    raise ValueError(
-                        f"{self._title}.noise[{term!r}]: {entry!r} must have the term's shape {wrong[0]}, not {has}"
-                    )
-            if env.noise_scale:
-                self._noise |= {
-                    (group, what): (env.noise_scale * float(most), entry)
-                    for group, sizes in seen.items()
-                    if what in sizes
-                }
+                check_choice(title, entry, list(memory))
+            for group, shape in ((group, shapes[term]) for group, shapes in seen.items() if term in shapes):
+                if entry is not None and (has := memory[entry].shape) != shape:
+                    raise ValueError(f"{title}: {entry!r} must have the term's shape {shape}, not {has}")
+                if env.noise_scale:
+                    self._noise[group, term] = env.noise_scale * float(most), entry
         for group, count in env.history.items():
             check_choice(f"{self._title}.history", group, list(self.groups))
             if len(self.groups[group]) != 1:
@@ -280,7 +275,7 @@ class Hooks:
                 raise ValueError(f"{self._title}.observation: {group!r} has no terms")
             for term, rows in terms.items():
                 self._check_term(group, term, rows)
-                self._shapes[group, term] = tuple(rows.shape[1:])
+            self._shapes[group] = {term: tuple(rows.shape[1:]) for term, rows in terms.items()}
             named = isinstance(values, Mapping)
             self.terms[group] = {term: rows[0].numel() for term, rows in terms.items()} if named else {}
         found = []

@@ -26,14 +26,9 @@ OBSERVATION = "observation"  # the group that actors read
 
 
 def showing_states(cls: type[LocoEnv]) -> type[LocoEnv]:
-    """Returns a task that differs from another one by a further group of its observation, ``state_of_world``.
-
-    Its rows are positions, velocities, control steps so far, number of the env, numbers of the model, memory, and what
-    events found.
-
-    Raises:
-        ValueError: a Warp function makes the reward or the observation of the task, or its memory has long integers.
-    """
+    """Returns a task that differs from another one by a further group of its observation, ``state_of_world``."""
+    # Its rows are positions, velocities, control steps so far, number of the env, numbers of the model, memory, and
+    # what events found.
     for name in ("reward", "observation"):
         if getattr(cls, name) is getattr(Task, name):
             raise ValueError(f"{cls.__name__} cannot be imagined: its {name} is a Warp function, no hook: {INSTEAD}")
@@ -190,14 +185,9 @@ class Imagined:
         A world in which a number of the state, or of what the actor sees, is not finite terminates, without a reward,
         as a simulated one does.
 
-        Args:
-            qpos: positions after it, ``(worlds, nq)``.
-            qvel: velocities after it, ``(worlds, nv)``.
-            action: the actions, ``(worlds, nu)``.
-            rest: the rest of the states before the step, as :meth:`unpacked` returns it.
-            start: states, ``(worlds, size)``, to which worlds go back that are over: nothing runs away there.
-            over: which were before, bool ``(worlds,)``.
-            units: random numbers in [0, 1), ``(worlds, drawn)``.
+        Positions and velocities are those after it, ``rest`` is of the states before it, as :meth:`unpacked` returns
+        it. Worlds that are over, ``over`` ``(worlds,)`` of them before it, go back to the states ``start``
+        ``(worlds, size)``: nothing runs away there. ``units`` are random numbers in [0, 1), ``(worlds, drawn)``.
         """
         inputs = [qpos, qvel, *self.kinematics(qpos, qvel), action, units, *rest]
         ended, cut, over, gone, observation, qpos, qvel, *after = self._say(over, start, *inputs)

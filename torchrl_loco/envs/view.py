@@ -562,16 +562,13 @@ class View:
 
     def _units(self, count: int) -> torch.Tensor:
         """Returns draws from [0, 1), ``(num_envs, count)``."""
-        return draws.to_unit(self._draw(count))
-
-    def _draw(self, count: int) -> torch.Tensor:
         if self._stream is None:
             a = self._arrays
             self._stream = draws.stream(
                 a["seed"], a["world"], a["episode"], a["elapsed_steps"] + self._steps, self._hook
             )
         first, self._drawn = self._drawn, self._drawn + count
-        return draws.mix(self._stream + self._catalog.places(first, count))
+        return draws.to_unit(draws.mix(self._stream + self._catalog.places(first, count)))
 
 
 def usable(action: torch.Tensor, bounded: bool) -> torch.Tensor:
