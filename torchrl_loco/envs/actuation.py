@@ -1,6 +1,5 @@
 """The force of actuators, from controls, positions and velocities."""
 
-import functools
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -26,13 +25,12 @@ def force(s: "View") -> torch.Tensor:
     constant, stiffness, damping = s.model("actuator_biasprm")[..., :3].unbind(-1)
     bias = constant + stiffness * position + damping * velocity
     is_servo = catalog.derived("is_servo", lambda: m.actuator_biastype == AFFINE)
-    limit = functools.partial(_limited, s, m)
-    return limit("force", gain * limit("ctrl", s.ctrl) + is_servo * bias)
+    return _limited(s, "force", gain * _limited(s, "ctrl", s.ctrl) + is_servo * bias)
 
 
-def _limited(s: "View", m: mujoco.MjModel, name: str, values: torch.Tensor) -> torch.Tensor:
+def _limited(s: "View", name: str, values: torch.Tensor) -> torch.Tensor:
     """Returns controls or forces within their ranges, where they have one."""
-    limited = getattr(m, f"actuator_{name}limited").astype(bool)
+    limited = getattr(s._catalog.mj_model, f"actuator_{name}limited").astype(bool)
     if not limited.any():
         return values
     low, high = s.model(f"actuator_{name}range").unbind(-1)

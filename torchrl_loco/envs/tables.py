@@ -8,6 +8,7 @@ import torch
 
 DTYPES = (torch.float32, torch.int32, torch.int64, torch.bool)
 """Types of entries and tables: those that kernels of hooks know."""
+CHOICES = ", ".join(map(str, DTYPES))
 
 
 class Entry(NamedTuple):
@@ -44,7 +45,7 @@ def entries(cls: type, attribute: str, taken: Collection[str]) -> dict[str, Entr
         if any(n < 1 for n in sizes):
             raise ValueError(f"{title}[{name!r}] must have sizes of 1 or more, got {value!r}")
         if dtype not in DTYPES:
-            raise ValueError(f"{title}[{name!r}] must be of {_choices()}, got {dtype}")
+            raise ValueError(f"{title}[{name!r}] must be of {CHOICES}, got {dtype}")
         found[name] = Entry(tuple(sizes), dtype)
     return found
 
@@ -61,7 +62,7 @@ def constants(title: str, declared: Any, taken: Collection[str], device: torch.d
         except (TypeError, ValueError) as error:
             raise TypeError(f"{title}.constants[{name!r}] must be an array of numbers: {error}") from None
         if table.is_complex():
-            raise TypeError(f"{title}.constants[{name!r}] must be of {_choices()}, got {table.dtype}")
+            raise TypeError(f"{title}.constants[{name!r}] must be of {CHOICES}, got {table.dtype}")
         if table.dtype not in DTYPES:
             table = table.to(torch.float32 if table.is_floating_point() else torch.int64)
         found[name] = table.to(device).contiguous().clone()
@@ -73,10 +74,6 @@ def _check_name(title: str, name: Any, taken: Collection[str]) -> None:
         raise ValueError(f"{title}: {name!r} is no name of an attribute")
     if name in taken:
         raise ValueError(f"{title}: {name!r} is taken, since s.{name} is something else: rename it")
-
-
-def _choices() -> str:
-    return ", ".join(str(dtype) for dtype in DTYPES)
 
 
 class Table(torch.Tensor):

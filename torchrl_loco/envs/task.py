@@ -431,20 +431,17 @@ def check_commands(cls: type[Task], memory: Mapping[str, Entry]) -> None:
 
 def check_options(cls: type[Task]) -> None:
     """Checks the options that a class declares."""
-    packages = "torchrl_loco.envs.", "torchrl.", "torch."
-    of_environments = [_names_of(base) for base in cls.__mro__ if base.__module__.startswith(packages)]
+    taken = {*SimConfig.__dataclass_fields__}  # and all that environments have, and take
+    for base in cls.__mro__:
+        if base.__module__.startswith(("torchrl_loco.envs.", "torchrl.", "torch.")):
+            begins = vars(base).get("__init__")
+            taken |= {*vars(base), *vars(base).get("__annotations__", {})}
+            taken |= signature(begins).parameters.keys() if begins else set()
     for name, entry in cls.options.items():
         if not (isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[1], str)):
             raise TypeError(f"{cls.__name__}.options[{name!r}] must be a value and what it is for, got {entry!r}")
-        taken = name in SimConfig.__dataclass_fields__ or any(name in names for names in of_environments)
-        if taken or not str(name).isidentifier() or str(name).startswith("_"):
+        if name in taken or not str(name).isidentifier() or str(name).startswith("_"):
             raise ValueError(f"{cls.__name__}.options: {name!r} is no name that an option can have")
-
-
-def _names_of(cls: type) -> set[str]:
-    """Returns the names of a class's attributes, and of what makes an instance."""
-    begins = vars(cls).get("__init__")
-    return {*vars(cls), *vars(cls).get("__annotations__", {}), *(signature(begins).parameters if begins else ())}
 
 
 SAID_ELSEWHERE = {

@@ -92,7 +92,7 @@ class Source:
             return
         index, start, step = first.place
         self._lines.append(f"const float {row}[] = {{{', '.join(values)}}};")
-        self._lines.append(f"WRITE_ROW({row}, {_pointer(index, step)} + {start}, {len(piece)}, {step})")
+        self._lines.append(f"WRITE_ROW({row}, p{index}_{step} + {start}, {len(piece)}, {step})")
 
     def _compute(self, node: Node) -> None:
         """Appends statements for a node and its parts, each once."""
@@ -168,24 +168,13 @@ def _pieces(targets: list[Node]) -> list[list[Node]]:
     return [piece for piece in pieces if len(piece) >= LEAST_TOGETHER]
 
 
-def _pointer(index: int, step: int) -> str:
-    return f"p{index}_{step}"
-
-
 def _pointers(tensors: Sequence[torch.Tensor], places: set[tuple[int, int, int]]) -> list[str]:
     """Returns statements that find the rows of a world."""
     lines = []
     for index, step in sorted({(place[0], place[2]) for place in places}):
         kind = f"{TYPES[tensors[index].dtype]}*"
-        lines.append(
-            f"{kind} const {_pointer(index, step)} = reinterpret_cast<{kind}>(args.p{index}) + world * {step}LL;"
-        )
+        lines.append(f"{kind} const p{index}_{step} = reinterpret_cast<{kind}>(args.p{index}) + world * {step}LL;")
     return lines
-
-
-def span(tensor: torch.Tensor) -> int:
-    """Returns over how many elements a tensor extends in memory."""
-    return 1 + sum((size - 1) * step for size, step in zip(tensor.shape, tensor.stride(), strict=True))
 
 
 def _check_overlap(tensors: Sequence[torch.Tensor], used: list[int], written: set[int]) -> None:
@@ -193,7 +182,8 @@ def _check_overlap(tensors: Sequence[torch.Tensor], used: list[int], written: se
 
     def ends(index: int) -> tuple[int, int]:
         first, tensor = tensors[index].data_ptr(), tensors[index]
-        return first, first + span(tensor) * tensor.element_size() * bool(tensor.numel())
+        span = 1 + sum((size - 1) * step for size, step in zip(tensor.shape, tensor.stride(), strict=True))
+        return first, first + span * tensor.element_size() * bool(tensor.numel())
 
     for one in written:
         first, last = ends(one)
