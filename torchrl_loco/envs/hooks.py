@@ -3,7 +3,7 @@
 import contextlib
 import weakref
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import torch
@@ -15,8 +15,8 @@ from torchrl_loco.envs.resets import NESTED
 from torchrl_loco.envs.rotations import unit_quaternions
 from torchrl_loco.envs.state import State
 from torchrl_loco.envs.tables import Entry, constants
-from torchrl_loco.envs.task import Task, declared, draws_by_warp, draws_states, own_hooks
-from torchrl_loco.envs.view import CONTACT_HISTORY, Catalog, View, usable
+from torchrl_loco.envs.task import Task, declared, draws_by_warp, own_hooks
+from torchrl_loco.envs.view import CONTACT_HISTORY, PUBLIC, Catalog, View, usable
 from torchrl_loco.sim import models
 from torchrl_loco.sim.overflow import Overflow
 
@@ -37,28 +37,21 @@ PARTS = {
 ENDS = {"terminated": "ended", "truncated": "cut_off"}  # the hooks that end an episode, and the flag that each writes
 
 
-def _noting(cls: Any) -> type:
-    """Returns a class that adds to ``_noted`` of an object the name of each attribute that is read."""
-
-    def __getattribute__(self: Any, name: str) -> Any:  # noqa: N807
-        object.__getattribute__(self, "_noted").add(name)
-        return cls.__getattribute__(self, name)
-
-    names = {"__getattribute__": __getattribute__, "__module__": cls.__module__, "__qualname__": cls.__qualname__}
-    return type(cls)(cls.__name__, (cls,), names)
-
-
 @contextlib.contextmanager
 def reads_of(env: Any) -> Iterator[set[str]]:
     """Yields the names of the attributes of an environment that are read, by whomever, in full at the end."""
-    found, cls = set[str](), type(env)
-    env.__dict__["_noted"] = found
-    object.__setattr__(env, "__class__", _noting(cls))
+    found, cls = set[str](), cast("Any", type(env))
+
+    def __getattribute__(self: Any, name: str) -> Any:  # noqa: N807
+        found.add(name)
+        return cls.__getattribute__(self, name)
+
+    names = {"__getattribute__": __getattribute__, "__module__": cls.__module__, "__qualname__": cls.__qualname__}
+    object.__setattr__(env, "__class__", type(cls)(cls.__name__, (cls,), names))
     try:
         yield found
     finally:
         object.__setattr__(env, "__class__", cls)
-        del env.__dict__["_noted"]
 
 
 class Hooks:
@@ -76,18 +69,17 @@ class Hooks:
         self._env = weakref.ref(env)
         self._title = type(env).__name__
         self.own = own_hooks(type(env))  # their names
-        if models.has_home(mj_model) and not draws_states(type(env)):
-            self.own |= {"begin"}
         self._substeps, (memory, shared) = env.config.substeps, declared(type(env))
         self.catalog = Catalog(env, mj_model, memory, shared)
+        self.catalog.draws_states = draws_by_warp(type(env))
+        if models.has_home(mj_model) and type(env).begin is Task.begin and not self.catalog.draws_states:
+            self.own |= {"begin"}
         if type(env).observation_func is not Task.observation_func:
             self.catalog.warp_outputs = type(env).observation_size
-        self.catalog.draws_states = draws_by_warp(type(env))
         starts = {name: value for name, value in type(env).shared.items() if isinstance(value, torch.Tensor)}
         self.catalog.starts = {name: value.detach().to(env.device) for name, value in starts.items()}
         own_tables = env.constants() if callable(env.constants) else env.constants
-        taken = {*(name for name in vars(View) if not name.startswith("_")), *memory, *shared}
-        self.catalog.constants = constants(self._title, own_tables, taken, env.device)
+        self.catalog.constants = constants(self._title, own_tables, {*PUBLIC, *memory, *shared}, env.device)
         if not env.with_metrics:
             self.own -= {"metrics"}
         kept: dict[str, Any] = {"device": env.device}

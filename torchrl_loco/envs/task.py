@@ -21,7 +21,7 @@ from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.monitors import warn
 from torchrl_loco.envs.tables import Entry, entries
 from torchrl_loco.envs.vary import Vary, check_randomize
-from torchrl_loco.envs.view import View
+from torchrl_loco.envs.view import PUBLIC, View
 from torchrl_loco.sim import fill, models
 from torchrl_loco.sim.sampling import Table, draw_from_table
 
@@ -395,11 +395,6 @@ def own_hooks(cls: type) -> frozenset[str]:
     return frozenset(found)
 
 
-def draws_states(cls: type[Task]) -> bool:
-    """Returns whether a class has a hook, a Warp function or a table that begins its episodes."""
-    return cls.begin is not Task.begin or draws_by_warp(cls)
-
-
 def draws_by_warp(cls: type[Task]) -> bool:
     """Returns whether a class has a Warp function or a table that begins its episodes."""
     return any(getattr(cls, name) is not getattr(Task, name) for name in FUSED["begin"])
@@ -407,9 +402,8 @@ def draws_by_warp(cls: type[Task]) -> bool:
 
 def declared(cls: type[Task]) -> tuple[dict[str, Entry], dict[str, Entry]]:
     """Returns the entries of ``memory`` and of ``shared`` that a class declares."""
-    taken = {name for name in vars(View) if not name.startswith("_")}
-    memory = entries(cls, "memory", taken)
-    return memory, entries(cls, "shared", {*taken, *memory})
+    memory = entries(cls, "memory", PUBLIC)
+    return memory, entries(cls, "shared", {*PUBLIC, *memory})
 
 
 def check_commands(cls: type[Task], memory: Mapping[str, Entry]) -> None:

@@ -267,9 +267,8 @@ class View:
             return Table.of(self._arrays[f"shared.{name}"], self._note)
         if name in catalog.constants:
             return Table.of(catalog.constants[name], self._note)
-        public = [key for key in vars(View) if not key.startswith("_")]
         entries = [*catalog.memory, *catalog.shared, *catalog.constants]
-        near = difflib.get_close_matches(name, [*public, *entries], n=1)
+        near = difflib.get_close_matches(name, [*PUBLIC, *entries], n=1)
         hint = f", did you mean s.{near[0]}?" if near else ""
         known = ", ".join(entries) or "no entries"
         raise AttributeError(f"s has no {name!r}{hint}: memory, shared and constants have {known}")
@@ -569,6 +568,10 @@ class View:
             )
         first, self._drawn = self._drawn, self._drawn + count
         return draws.to_unit(draws.mix(self._stream + self._catalog.places(first, count)))
+
+
+PUBLIC = [name for name in vars(View) if not name.startswith("_")]
+"""Names that ``s`` has in all tasks."""
 
 
 def usable(action: torch.Tensor, bounded: bool) -> torch.Tensor:
