@@ -387,11 +387,11 @@ class WorldAccess(Task, EnvBase):
 
     def _identity(self) -> dict[str, Any]:
         """Returns what two environments must share to exchange their ``state_dict``."""
-        settings = self.settings()
-        same = {name: settings[name] for name in ("protocol", "world_offset")}
+        same: dict[str, Any] = {"body": self.body or type(self).__name__, "batch_size": list(self.batch_size)}
+        same |= {"protocol": self.protocol, "world_offset": self.world_offset or 0}
         if cases := self.cases():  # the memory of another set of motions points elsewhere
             same["cases"] = dict(cases)
-        return {"body": self.body or type(self).__name__, "batch_size": list(self.batch_size), **same}
+        return same
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> Any:
         """Restores a ``state_dict``; see :meth:`set_extra_state`.

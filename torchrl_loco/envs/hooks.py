@@ -13,7 +13,7 @@ from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.fixed_order import fixed_order
 from torchrl_loco.envs.resets import NESTED
 from torchrl_loco.envs.rotations import unit_quaternions
-from torchrl_loco.envs.state import State
+from torchrl_loco.envs.state import State, by_world
 from torchrl_loco.envs.tables import Entry, constants
 from torchrl_loco.envs.task import Task, declared, draws_by_warp, own_hooks
 from torchrl_loco.envs.view import CONTACT_HISTORY, PUBLIC, Catalog, View, usable
@@ -458,11 +458,6 @@ def beyond(*arrays: torch.Tensor) -> torch.Tensor:
     """Returns in which worlds a number of arrays ``(num_envs, ...)`` is not finite, or as good as that."""
     finite = [(values.flatten(1) if values.ndim > 1 else values.unsqueeze(1)).abs() < MAX_VALUE for values in arrays]
     return ~torch.stack([part.all(-1) for part in finite]).all(0)
-
-
-def by_world(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    """Returns a mask of worlds in a shape that broadcasts with ``(num_envs, ...)``."""
-    return mask.view(-1, *[1] * (values.ndim - 1))
 
 
 def _broadcasts(shape: torch.Size, target: tuple[int, ...]) -> bool:

@@ -9,8 +9,9 @@ import torch
 
 from torchrl_loco.envs.base import LocoEnv
 from torchrl_loco.envs.fusion.trace import NumberTakenError, trace
-from torchrl_loco.envs.hooks import ENDS, beyond, by_world
+from torchrl_loco.envs.hooks import ENDS, beyond
 from torchrl_loco.envs.kinematics import Kinematics
+from torchrl_loco.envs.state import by_world
 from torchrl_loco.envs.tables import Entry, entries
 from torchrl_loco.envs.task import Task, folder_of
 from torchrl_loco.envs.view import View, usable
@@ -104,21 +105,13 @@ class Imagined:
 
     Contacts and sensors of forces are zeros there; what events do to positions and velocities does not happen, nothing
     is added to ``shared``, which is what it was at the last ``refresh()``, no time limit ends an episode, and random
-    numbers are given.
-
-    Args:
-        env: an environment of a task that shows its states.
-        worlds: how many states are judged at once.
-        steps: after how many steps it is asked what they have earned.
-        compiled: makes something faster of a module of tensors; ``None`` leaves it as it is.
+    numbers are given. The task shows its states, of which ``worlds`` are judged at once; after ``steps`` steps it is
+    asked what they have earned. ``compiled`` makes something faster of a module of tensors.
 
     Attributes:
         unknown: names of the arrays that the hooks read and that are zeros.
         size: length of a state, which is the first part of ``state_of_world``.
         drawn: how many random numbers of each world hooks draw in a step.
-
-    Raises:
-        ValueError: the hooks depend on what is not predicted.
     """
 
     def __init__(self, env: LocoEnv, worlds: int, steps: int = 1, compiled: Callable[[Any], Any] | None = None) -> None:

@@ -16,7 +16,7 @@ import warp as wp
 from tensordict import TensorDict
 
 from torchrl_loco import known_files, storage
-from torchrl_loco.envs.state import State
+from torchrl_loco.envs.state import State, by_world
 from torchrl_loco.sim import Buffer, Overflow, Simulation
 
 INTERVAL = 100  # control steps between two reads
@@ -188,10 +188,8 @@ NEVER = torch.iinfo(torch.long).max  # where no world was lost
 class NanGuard(Monitor):
     """Writes the state and action before the first step that made a world non-finite to a file, a NaN dump.
 
-    The file is never overwritten; no reference to the :class:`.world.World` is kept.
-
-    Attributes:
-        arrays: what :meth:`keep` reads and writes, by name.
+    The file is never overwritten; no reference to the :class:`.world.World` is kept. By name, ``arrays`` are what
+    :meth:`keep` reads and writes.
     """
 
     def __init__(self, path: Path, world: Any, settings: dict[str, Any]) -> None:
@@ -214,7 +212,7 @@ class NanGuard(Monitor):
         goes_on = a["lost"] == 0
         for name in self._kept:
             kept = a[f"kept.{name}"]
-            kept.copy_(torch.where(goes_on.view(-1, *[1] * (kept.ndim - 1)), a[name], kept))
+            kept.copy_(torch.where(by_world(goes_on, kept), a[name], kept))
         a["steps"].add_(goes_on)
 
     def numbers(self) -> torch.Tensor:

@@ -133,5 +133,9 @@ def write_state(
             continue
         of_history = key[0] == "memory" and key[1].endswith(".history")  # NaN where a state has none
         value = new[key] if key in new else torch.full_like(target, float("nan") if of_history else 0)
-        rows = mask.view(-1, *[1] * (target.ndim - 1))
-        target.copy_(torch.where(rows, value.to(target.dtype), target))
+        target.copy_(torch.where(by_world(mask, target), value.to(target.dtype), target))
+
+
+def by_world(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """Returns a mask of worlds in a shape that broadcasts with ``(num_envs, ...)``."""
+    return mask.view(-1, *[1] * (values.ndim - 1))
