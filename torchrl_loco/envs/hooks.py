@@ -231,10 +231,8 @@ class Hooks:
         """Returns whether ``begin`` makes something else of an entry of memory where it held something else."""
         key = f"memory.{name}"
         held = arrays[key]
-        others = (
-            [~held] if held.dtype == torch.bool else [held + by for by in (1, 3, 10, 100, -1)]
-        )  # some may be clamped
-        for other in others:
+        # Of several numbers some may be clamped.
+        for other in [~held] if held.dtype == torch.bool else [held + by for by in (1, 3, 10, 100, -1)]:
             try:
                 again = self._call("begin", {**arrays, key: other})[name]
             except Exception:  # it refuses that number, so it reads it

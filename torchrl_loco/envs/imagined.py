@@ -116,13 +116,12 @@ class Imagined:
 
     def __init__(self, env: LocoEnv, worlds: int, steps: int = 1, compiled: Callable[[Any], Any] | None = None) -> None:
         self._title, asked, m = type(env).__name__, env.hooks.catalog, env.mj_model
-        for is_so, what in (
-            (bool(asked.scans), "it scans the ground, depths or rays"),
-            (bool(env.hooks.history), "its observation has a history"),
-            (any(name.startswith("warp") for name in asked.arrays), "a hook of it calls a Warp function"),
-        ):
-            if is_so:
-                self._refuse(what)
+        if asked.scans:
+            self._refuse("it scans the ground, depths or rays")
+        if env.hooks.history:
+            self._refuse("its observation has a history")
+        if any(name.startswith("warp") for name in asked.arrays):
+            self._refuse("a hook of it calls a Warp function")
         self._hooks = copy.copy(env.hooks)
         self._hooks.catalog = catalog = copy.copy(asked)
         self._hooks.view = WithUnits

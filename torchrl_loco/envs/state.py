@@ -109,11 +109,10 @@ def checked_state(
         if targets[key].dtype.is_floating_point:
             if finite and not value[mask].to(targets[key].dtype).isfinite().all():
                 raise ValueError(f"{key} must be finite")
-        elif (
-            key in ("elapsed_steps", "episode")
-            and not ((value[mask].long() >= 0) & (value[mask].long() < 2**31 - 1)).all()
-        ):  # it will be counted up
-            raise ValueError(f"{key} must lie in [0, 2**31 - 1)")
+        elif key in ("elapsed_steps", "episode"):
+            counts = value[mask].long()
+            if not ((counts >= 0) & (counts < 2**31 - 1)).all():  # it will be counted up
+                raise ValueError(f"{key} must lie in [0, 2**31 - 1)")
     return new
 
 

@@ -488,11 +488,9 @@ class World:
         if self._closed or os.getpid() != self._pid:  # in a forked process: the parent reports
             return
         self._closed = True
-        # A mode of torch may be active where this world is collected: what it does is not to be traced.
-        with (
-            torch.utils._python_dispatch._disable_current_modes(),
-            contextlib.ExitStack() as stack,
-        ):  # if one monitor raises, the others report all the same
+        # A mode of torch may be active where this world is collected: what it does is not to be traced. If one monitor
+        # raises, the others report all the same.
+        with torch.utils._python_dispatch._disable_current_modes(), contextlib.ExitStack() as stack:
             stack.callback(self.__dict__.update, {"_closed": True})
             stack.callback(self.__dict__.clear)  # an exception may keep a reference to this world
             for monitor in self._monitors:

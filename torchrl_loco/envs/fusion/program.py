@@ -313,10 +313,9 @@ class Program:
         return Source(stores, self.tensors)
 
     def _constant(self, node: torch.fx.Node, tensor: torch.Tensor) -> Any:
+        # Of torch.tensor(...) in a hook, or a copy that was made when it was traced.
         fresh = all(user.target is torch.ops.aten.lift_fresh_copy.default for user in node.users)
-        if (
-            fresh or tensor.device != self._device
-        ):  # torch.tensor(...) in a hook, or a copy that was made when it was traced
+        if fresh or tensor.device != self._device:
             return tensor.detach().cpu()
         if tensor.data_ptr() in self._fixed and tensor.numel():
             copy = tensor.detach().cpu()
