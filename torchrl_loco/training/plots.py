@@ -4,7 +4,6 @@ import dataclasses
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,18 +14,11 @@ from torchrl_loco.training.run_folder import RunFolder
 
 check_packages("a plot", ["matplotlib"], "train")  # so that a run fails at its start, though it imports it at its end
 
-IRRELEVANT: dict[str, Any] = {
-    "seed": 0,
-    "out": Path(),
-    "device": "cpu",
-    "eval_interval": 0,
-    "eval_episodes": 1,
-    "video_seconds": 0.0,
-    "checkpoint_seconds": 0.0,
-    "keep": 1,
-    "logger": (),
-}
-"""Settings that do not affect learning, each with a fixed value, so that runs can be grouped without them."""
+IRRELEVANT = (
+    *("seed", "out", "device", "eval_interval", "eval_episodes", "video_seconds", "checkpoint_seconds"),
+    *("keep", "logger"),
+)
+"""Settings that do not affect learning."""
 
 
 def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
@@ -87,8 +79,9 @@ def plot_runs(runs: Sequence[RunFolder], picture: Path) -> None:
 def grouped(runs: Sequence[RunFolder]) -> dict[TrainingConfig, list[RunFolder]]:
     """Returns the runs that share a line, by their settings without those that do not change learning."""
     groups: dict[TrainingConfig, list[RunFolder]] = {}
+    defaults = {name: getattr(TrainingConfig, name) for name in IRRELEVANT}
     for run in runs:
-        groups.setdefault(dataclasses.replace(run.load_config(), **IRRELEVANT), []).append(run)
+        groups.setdefault(dataclasses.replace(run.load_config(), **defaults), []).append(run)
     return groups
 
 
