@@ -9,9 +9,10 @@ import numpy as np
 import tyro
 
 import torchrl_loco
-from torchrl_loco.checks import check_choice, check_output_file, check_packages
+from torchrl_loco.checks import check_choice, check_output_file
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.registry import resolve
+from torchrl_loco.training.config import check_video
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +65,7 @@ def motion(
         if out is not None:
             check_output_file("out", out, (".mp4", ".npz"))
             if out.suffix == ".mp4":
-                check_packages("a video", ("imageio", "av"), "train")
+                check_video()
         if not files:
             raise ValueError("name a CSV or npz file, a folder or a glob")
         from torchrl_loco.envs.task import folder_of

@@ -14,22 +14,14 @@ import tyro
 
 import torchrl_loco
 from torchrl_loco import training
-from torchrl_loco.checks import (
-    SEED,
-    check_device,
-    check_float,
-    check_int,
-    check_output_file,
-    check_packages,
-    check_run,
-    is_run,
-)
+from torchrl_loco.checks import SEED, check_device, check_float, check_int, check_output_file, check_run, is_run
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.cli.motions import Motions
 from torchrl_loco.cli.options import Flat, OtherTask
 from torchrl_loco.conditions import DEFAULT, Conditions
 from torchrl_loco.known_files import place_of
 from torchrl_loco.registry import label, resolve, task_name
+from torchrl_loco.training.config import check_video
 from torchrl_loco.viewer.settings import LOOPBACK, PORT, PORTS, SHARE, WORLDS, check_host, check_viewer
 
 EARNED = ("mean", "std", "min", "max", "episodes", "selected_by")  # of a policy's info, in the task of its training
@@ -170,10 +162,6 @@ class Video:
         if self.out is not None:
             check_output_file("out", self.out, CONTAINERS)
 
-    def check_encoder(self) -> None:
-        """Checks that a video can be written."""
-        check_packages("a video", ("imageio", "av"), "train")
-
     def make(self, policy: "torchrl_loco.Policy", beside: Path) -> None:
         """Records the policy into ``out``, or a new file ``beside`` that of the policy, and prints the path."""
         from torchrl_loco import storage
@@ -237,7 +225,7 @@ def record(run_or_task: RunOrTask, /, which: Flat[Which] = Which(), video: Flat[
     """
     with user_errors():
         video.check()
-        video.check_encoder()
+        check_video()
         played, beside = which.load(run_or_task, video.device)
         video.make(played, beside)
 
@@ -271,10 +259,10 @@ def play(
         if viewer == "window" and not training.has_display():
             raise ValueError("there is no display for a window: pass --viewer browser or --viewer video")
         if viewer == "video":
-            video.check_encoder()
+            check_video()
         played, beside = which.load(run_or_task, video.device)
         if viewer == "auto":
-            viewer = _default_viewer(browser, video)
+            viewer = _default_viewer(browser)
         info, about = played.info, ("algorithm", "protocol", "seed", "frames", "seconds", "trained_on")
         print(info["task"], *(f"{key} {info[key]}" for key in about if key in info), sep=", ")
         if "mean" in info:
@@ -289,7 +277,7 @@ def play(
             video.make(played, beside)
 
 
-def _default_viewer(browser: Browser, video: Video) -> Literal["window", "browser", "video"]:
+def _default_viewer(browser: Browser) -> Literal["window", "browser", "video"]:
     """Returns where a policy is shown: in a window if there is a display, else in the browser, if that is installed."""
     if training.has_display():
         return "window"
@@ -297,7 +285,7 @@ def _default_viewer(browser: Browser, video: Video) -> Literal["window", "browse
         browser.check()
     except ImportError as error:
         print(f"torchrl-loco: there is no display for a window, and {error}. A video is recorded.", file=sys.stderr)
-        video.check_encoder()
+        check_video()
         return "video"
     return "browser"
 

@@ -483,10 +483,15 @@ def _stored_name(task: Any) -> str:
     return f"{Path(source).expanduser().resolve()}:{name}" if source.endswith(".py") else task
 
 
+def check_video(purpose: str = "a video") -> None:
+    """Checks that what writes videos is installed."""
+    check_packages(purpose, ("imageio", "av"), "train")
+
+
 def check_packages_of(config: TrainingConfig) -> None:
     """Checks that what writes a training's video and logs is installed: a video is drawn at its end."""
     if config.video_seconds > 0:
-        check_packages("a video (none with video_seconds=0)", VIDEO, "train")
+        check_video("a video (none with video_seconds=0)")
     for name in config.logger:
         if name != "csv":
             check_packages(f"the logger {name}", [name], "train" if name == "tensorboard" else name)
@@ -504,7 +509,6 @@ def config_from_json(values: dict[str, Any]) -> TrainingConfig:
     return CONFIGS[algorithm](**fields)
 
 
-VIDEO = ("imageio", "av")  # packages that write one
 RUNNERS = ("walker", "humanoid", "cheetah", "hopper", "quadruped")  # bodies of dm_control's runners
 
 

@@ -17,14 +17,14 @@ from torchrl.envs import EnvBase, step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import trange
 
-from torchrl_loco.checks import SEED, check_float, check_int, check_packages
+from torchrl_loco.checks import SEED, check_float, check_int
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.eyes.scene import to_the_horizon
 from torchrl_loco.policy import Policy, load_policy, shipped_policies
 from torchrl_loco.storage import replace_file
 from torchrl_loco.training.algorithm import settings_for_small_networks
-from torchrl_loco.training.config import VIDEO, TrainingConfig
+from torchrl_loco.training.config import TrainingConfig, check_video
 from torchrl_loco.training.environments import make_for
 from torchrl_loco.training.run_folder import RunFolder
 
@@ -236,7 +236,7 @@ def record(
 
 def write_video(path: Path | str, frames: Iterable[torch.Tensor], frame_rate: float) -> None:
     """Writes frames, uint8 ``(height, width, 3)``, as a video file, whole or not at all, as :func:`record` does."""
-    check_packages("a video", VIDEO, "train")
+    check_video()
     import imageio.v3 as imageio
 
     content = io.BytesIO()
