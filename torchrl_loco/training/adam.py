@@ -90,8 +90,9 @@ class FlatAdam:
         return {"state": dict(enumerate(states)), "param_groups": groups}
 
     @torch.no_grad()
-    def load_moments(self, states: dict[int, dict[str, Tensor]]) -> None:
-        """Copies moments and steps, by the number of the parameter; those that ``states`` lacks begin at zero."""
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continues from a state, which is copied, in place; moments that it lacks begin at zero."""
+        states = state_dict["state"]
         for number, state in self.state_dict()["state"].items():
             loaded = states.get(number, {})
             for name in ("exp_avg", "exp_avg_sq"):
@@ -99,10 +100,6 @@ class FlatAdam:
         step = max((float(loaded["step"]) for loaded in states.values() if "step" in loaded), default=0.0)
         for vectors in self._vectors:
             vectors.restart(step)
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continues from a state, which is copied."""
-        self.load_moments(state_dict["state"])
         for group, loaded in zip(self.param_groups, state_dict["param_groups"], strict=True):
             group["lr"].copy_(torch.as_tensor(loaded["lr"]))
 

@@ -136,7 +136,7 @@ class Algorithm(ABC):
                 # A remainder smaller than a minibatch is left out: it would weigh as much as a full one.
                 self._order = self._order.new_zeros(len(data) // config.minibatch_size * config.minibatch_size)
             else:
-                self._data.fill(data)
+                self._data.steps.update_(data)
         self._totals.zero_()
         for _ in range(config.epochs):
             order = torch.randperm(len(data), generator=self.generator, device=self.device)
@@ -237,15 +237,15 @@ class Algorithm(ABC):
         """
         self.load_networks(state["networks"])
         for name, optimizer in self.optimizers.items():
-            kept = state["optimizers"][name]["state"]
-            for group, before in zip(optimizer.param_groups, state["optimizers"][name]["param_groups"], strict=True):
-                group["lr"].copy_(torch.as_tensor(before["lr"]))
+            kept = state["optimizers"][name]
             if isinstance(optimizer, FlatAdam):
-                optimizer.load_moments(kept)
+                optimizer.load_state_dict(kept)
                 continue
+            for group, before in zip(optimizer.param_groups, kept["param_groups"], strict=True):
+                group["lr"].copy_(torch.as_tensor(before["lr"]))
             for index, of_one in optimizer.state_dict()["state"].items():  # one of torch's, of a user's algorithm
                 for key, value in of_one.items():
-                    value.copy_(kept[index][key]) if index in kept else value.zero_()
+                    value.copy_(kept["state"][index][key]) if index in kept["state"] else value.zero_()
 
     def load_networks(self, state: Mapping[str, torch.Tensor]) -> None:
         """Copies the parameters of networks, also of runs whose networks in bfloat16 were one level deeper."""
@@ -335,12 +335,7 @@ class Packed:
             self._entries.append((key, slice(end, end + size), entry.dtype, entry.shape[1:]))
             end += -(-size // ROW_ALIGNED) * ROW_ALIGNED
         self._rows = entry.new_zeros(len(steps), end, dtype=torch.uint8)
-        self.steps = self._views(self._rows)
-        self.fill(steps)
-
-    def fill(self, steps: TensorDictBase) -> None:
-        """Copies other steps of the same entries."""
-        self.steps.update_(steps)
+        self.steps = self._views(self._rows).update_(steps)
 
     def __getitem__(self, order: torch.Tensor) -> TensorDictBase:
         """Returns the steps with the numbers ``order``, as views of one new matrix."""
