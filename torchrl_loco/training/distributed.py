@@ -237,12 +237,9 @@ def add_changes(values: torch.Tensor, before: torch.Tensor) -> None:
     before.copy_(values)
 
 
-def extremes_of_ranks(least: torch.Tensor, largest: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the least and the largest number of all ranks from those of each, which are scalars."""
-    if ranks() == 1:
-        return least, largest
-    both = _reduced(torch.stack([-least, largest]), largest=True)
-    return -both[0], both[1]
+def largest_of_ranks(values: torch.Tensor) -> torch.Tensor:
+    """Returns the largest over the ranks of each of ``values``, of any shape ``(...)``."""
+    return values if ranks() == 1 else _reduced(values.clone(), largest=True)
 
 
 def any_rank(*flags: bool) -> list[bool]:

@@ -102,9 +102,10 @@ class REPPO(Algorithm):
     def batch_metrics(self, data: TensorDictBase) -> torch.Tensor:
         """Returns least and largest return of a batch, and the fraction beyond the critic's bins by more than a bin."""
         returns, bins = data["returns"], self.critic.bins
-        least, largest = distributed.extremes_of_ranks(*returns.aminmax())
+        least, largest = returns.aminmax()
+        below, largest = distributed.largest_of_ranks(torch.stack([-least, largest]))
         beyond = (returns < bins.low - bins.width) | (returns > bins.high + bins.width)
-        return torch.stack([least, largest, beyond.float().mean()])
+        return torch.stack([-below, largest, beyond.float().mean()])
 
     def note(self, metrics: Mapping[str, Sequence[float]]) -> str:
         """Returns which returns the critic could not represent, and which settings change that, if there were any."""
