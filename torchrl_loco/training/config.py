@@ -184,8 +184,11 @@ class TrainingConfig:
         object.__setattr__(self, "device", str(self.device))
         object.__setattr__(self, "out", Path(self.out))
         for field in (*self.widths, "strides"):
-            what = "stride" if field == "strides" else "width"
-            object.__setattr__(self, field, _checked_layers(field, getattr(self, field), what))
+            what, value = "stride" if field == "strides" else "width", getattr(self, field)
+            several = value if isinstance(value, list | tuple) else [value]
+            if not several:
+                raise ValueError(f"{field} must name the {what} of at least one layer")
+            object.__setattr__(self, field, tuple(check_int(f"each {what} of {field}", each) for each in several))
         object.__setattr__(self, "size", checked_size(self.size))
         if not isinstance(self.sim, Sim):
             if not isinstance(self.sim, Mapping):
@@ -462,14 +465,6 @@ class SVGConfig(TrainingConfig):
             raise ValueError("trials must be 1: svg begins one policy")
         if self.action_repeat > 1:
             raise ValueError("action_repeat must be 1: svg imagines single control steps")
-
-
-def _checked_layers(name: str, values: Any, what: str) -> tuple[int, ...]:
-    """Returns a width or a stride for each layer."""
-    several = tuple(values) if isinstance(values, list | tuple) else (values,)
-    if not several:
-        raise ValueError(f"{name} must name the {what} of at least one layer")
-    return tuple(check_int(f"each {what} of {name}", value) for value in several)
 
 
 def _stored_name(task: Any) -> str:
