@@ -77,7 +77,7 @@ class PPO(Algorithm):
 
     def _read(self, td: TensorDictBase, key: str) -> torch.Tensor:
         """Returns pixels as they are; other entries normalised, with zeros up to the length of the rows of weights."""
-        return normalised(td[key], self.norms[key], self._dtype, ALIGNED) if key in self.norms else td[key]
+        return normalised(td[key], self.norms[key], self._dtype) if key in self.norms else td[key]
 
     def _std(self) -> torch.Tensor:
         """Returns the standard deviations of actions, the same in all states, shape ``(nu,)``."""
@@ -144,13 +144,7 @@ class PPO(Algorithm):
             value = self._value(minibatch[self.spaces.critic_key], weights)
         outputs = self._mean(self.observed(minibatch), weights), self._std(), value
         self.join()
-        *slopes, metrics = clipped_loss(
-            *outputs,
-            minibatch,
-            clip_epsilon=config.clip_epsilon,
-            entropy_coeff=config.entropy_coeff,
-            bounded=self.spaces.bounded,
-        )
+        *slopes, metrics = clipped_loss(*outputs, minibatch, config, self.spaces.bounded)
         self.optimizer.zero_grad()
         torch.autograd.backward(outputs, slopes)
         if config.target_kl:
@@ -195,10 +189,10 @@ def normalise_of(dtype: torch.dtype) -> wp.Kernel:
 
 
 @torch.no_grad()
-def normalised(rows: torch.Tensor, norm: ObservationNorm, dtype: torch.dtype, aligned: int) -> torch.Tensor:
-    """Returns what ``norm`` makes of rows of shape ``(..., n)``, with zeros up to a multiple of ``aligned``."""
+def normalised(rows: torch.Tensor, norm: ObservationNorm, dtype: torch.dtype) -> torch.Tensor:
+    """Returns what ``norm`` makes of rows of shape ``(..., n)``, with zeros up to a multiple of ``ALIGNED``."""
     norm.check(rows)
-    wide = rows.new_empty(*rows.shape[:-1], -(-rows.shape[-1] // aligned) * aligned, dtype=dtype)
+    wide = rows.new_empty(*rows.shape[:-1], -(-rows.shape[-1] // ALIGNED) * ALIGNED, dtype=dtype)
     flat, out = rows.reshape(-1, rows.shape[-1]), wide.view(-1, wide.shape[-1])
     launch(normalise_of(dtype), tuple(out.shape), [flat, norm.mean, norm.var, norm.limit], [out])
     return wide
@@ -328,24 +322,16 @@ def clipped_loss(
     std: torch.Tensor,
     value: torch.Tensor,
     data: Mapping[str, torch.Tensor],
-    *,
-    clip_epsilon: float,
-    entropy_coeff: float,
+    config: PPOConfig,
     bounded: bool,
 ) -> tuple[torch.Tensor, ...]:
     """Computes the slopes of PPO's loss: clipped objective, smooth L1 error of the critic and entropy bonus.
 
-    It is the loss of TorchRL's ``ClipPPOLoss`` with advantages normalised by minibatch.
-
-    Args:
-        mean: of the actions, shape ``(n, nu)``; before tanh, if they are bounded.
-        std: their standard deviations in all states, shape ``(nu,)``.
-        value: what the critic expects, shape ``(n, 1)``.
-        data: of each step ``action``, before tanh too, shape ``(n, nu)``, ``log_prob`` of that when it was drawn,
-            shape ``(n,)``, ``advantage`` and ``value_target``, shape ``(n, 1)``.
-        clip_epsilon: range of the ratio of probabilities that is not clipped.
-        entropy_coeff: weight of the entropy.
-        bounded: whether actions are bounded by tanh; their entropy is that of one sample then.
+    It is the loss of TorchRL's ``ClipPPOLoss`` with advantages normalised by minibatch. ``mean``, ``(n, nu)``, and
+    ``std``, ``(nu,)`` in all states, are those of the actions, before tanh, if they are bounded by it: their entropy is
+    that of one sample then. ``value`` is what the critic expects, ``(n, 1)``. ``data`` has of each step ``action``,
+    before tanh too, ``(n, nu)``, ``log_prob`` of that when it was drawn, ``(n,)``, ``advantage`` and ``value_target``,
+    ``(n, 1)``.
 
     Returns:
         The slopes by means, deviations and values, in their shapes; and of the metrics ``(5,)`` the means over the
@@ -358,8 +344,8 @@ def clipped_loss(
     numbers = [data[name].reshape(steps) for name in ("log_prob", "advantage", "value_target")]
     inputs = [mean, std, value, data["action"], *numbers, noise, spread.view(1), center.view(1)]
     slopes = torch.empty_like(mean), torch.empty_like(value), std.new_empty(steps, METRICS + nu)
-    bounds = math.log1p(-clip_epsilon), math.log1p(clip_epsilon)
-    launch(loss_of(nu, bounded, mean.dtype), steps, [*inputs, *bounds, entropy_coeff], slopes)
+    bounds = math.log1p(-config.clip_epsilon), math.log1p(config.clip_epsilon)
+    launch(loss_of(nu, bounded, mean.dtype), steps, [*inputs, *bounds, config.entropy_coeff], slopes)
     means = slopes[2].mean(0)
     return slopes[0], means[METRICS:], slopes[1], means[:METRICS]
 
