@@ -119,6 +119,9 @@ def test_the_run_of_a_launch(tmp_path, monkeypatch):
     own = made(tmp_path)
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "job 7")
     config = own.load_config()
+    assert not distributed.is_restart()
+    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
+    assert distributed.is_restart()
     assert RunFolder.of_launch(config) is None
     made(tmp_path)
     second = made(tmp_path)
@@ -126,10 +129,7 @@ def test_the_run_of_a_launch(tmp_path, monkeypatch):
     assert RunFolder.of_launch(config).path == second.path
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
     assert RunFolder.of_launch(config).path == own.path
-    assert not distributed.is_restart()
     assert RunFolder.of_launch(dataclasses.replace(config, seed=config.seed + 1)) is None  # of a script with several
-    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
-    assert distributed.is_restart()
     monkeypatch.setattr(RunFolder, "is_finished", True)
     assert run_to_end(config, Given()).path == own.path  # which is not trained again
     monkeypatch.setattr(distributed, "ranks", lambda: 2)

@@ -157,7 +157,9 @@ class RunFolder:
 
     @classmethod
     def of_launch(cls, config: TrainingConfig) -> "RunFolder | None":
-        """Returns the run of these settings that this launch by torchrun has begun, if any; the newest of several."""
+        """Returns the run of these settings that this launch began before torchrun started the ranks anew, if any."""
+        if not distributed.is_restart():
+            return None
         files = [file for file in config.out.glob("*/launch.txt") if file.read_text() == distributed.launch_id()]
         newest = sorted(files, key=lambda file: file.stat().st_mtime, reverse=True)
         return next((run for run in map(cls, (file.parent for file in newest)) if run.load_config() == config), None)

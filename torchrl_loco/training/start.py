@@ -176,14 +176,9 @@ def run_to_end(
         return trainer.run
 
 
-def _begun_before(config: TrainingConfig) -> RunFolder | None:
-    """Returns the run of these settings that was begun before torchrun started the ranks anew, if there is one."""
-    return RunFolder.of_launch(config) if distributed.is_restart() else None
-
-
 def _finished_before(config: TrainingConfig) -> Path | None:
     """Returns the folder of a run that was complete when torchrun started the ranks anew, of a script with several."""
-    began = _begun_before(config) if distributed.is_first() else None
+    began = RunFolder.of_launch(config) if distributed.is_first() else None
     if began is None or not began.is_finished:
         return None
     print(f"run folder: {began.path}, which is complete", flush=True)
@@ -218,7 +213,7 @@ def begin(config: TrainingConfig, given: "Given | None" = None) -> Trainer:
     given = given or Given()
     path, continues = Path(), ""
     if distributed.is_first():
-        began = _begun_before(config)
+        began = RunFolder.of_launch(config)
         if began is None and given.env is None and (note := tuning_note(config)):
             print(note)
         path = (began or RunFolder.create(config, given.names)).path
