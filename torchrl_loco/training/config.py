@@ -41,14 +41,9 @@ OF_PIXELS = ("camera", "size", "frame_stack", "strides", "random_shift", "critic
 Settings = dict[str, Any]  # fields of a config, by name
 
 _OPTIONAL: Any = [(field.name, field.type | None, None) for field in dataclasses.fields(SimConfig)]  # type: ignore[operator]
-Sim: Any = dataclasses.make_dataclass(
-    "Sim",
-    [field for field in _OPTIONAL if field[0] != "episode_length"],
-    namespace={
-        "__doc__": "Fields of :class:`torchrl_loco.SimConfig` that a run replaces; ``None`` is as the task says."
-    },
-    frozen=True,
-)
+_OPTIONAL = [field for field in _OPTIONAL if field[0] != "episode_length"]  # of which a run has a setting of its own
+Sim: Any = dataclasses.make_dataclass("Sim", _OPTIONAL, frozen=True)
+Sim.__doc__ = "Fields of :class:`torchrl_loco.SimConfig` that a run replaces; ``None`` is as the task says."
 AS_THE_TASK = Sim()
 
 

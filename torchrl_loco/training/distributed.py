@@ -246,8 +246,7 @@ def any_rank(*flags: bool) -> list[bool]:
     """Returns for each flag whether it is set on some rank."""
     if ranks() == 1:
         return list(flags)
-    counts = _reduced(torch.tensor(flags, dtype=torch.float32, device=_device()))
-    return [count > 0 for count in counts.tolist()]
+    return largest_of_ranks(torch.tensor(flags, dtype=torch.float32, device=_device())).bool().tolist()
 
 
 def copy_from_first(tensors: Iterable[torch.Tensor]) -> None:
