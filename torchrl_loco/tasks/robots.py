@@ -134,7 +134,14 @@ class Robot(LocoEnv):
         return beyond.clamp(min=0.0).sum(-1)
 
     def control(self, s: View, action: torch.Tensor) -> torch.Tensor:
-        """Returns the targets of the joints (rad): the home pose and a multiple of the action."""
+        """Returns the targets of the joints (rad): the home pose and a multiple of the action that arrives.
+
+        That is the one of ``s.delay`` control steps ago; ``earlier_actions`` go on from ``last_action``, newest first.
+        """
+        earlier = [s.last_action] if self.longest_delay else []
+        earlier += s.earlier_actions.unbind(1) if self.longest_delay > 1 else ()
+        for steps, before in enumerate(earlier, start=1):
+            action = torch.where(s.delay.unsqueeze(-1) < steps, action, before)
         if self.action_scale is not None:
             return self.home(s) + self.action_scale * action
         m = self.mj_model  # an action means the same in all worlds, whatever their gains are
@@ -180,14 +187,6 @@ def either(
 ) -> dict[str, torch.Tensor]:
     """Returns rows by name: the new ones in the worlds of a mask ``(num_envs,)``, else the old ones."""
     return {name: torch.where(mask.view(-1, *[1] * (row.ndim - 1)), row, old[name]) for name, row in new.items()}
-
-
-def arriving(s: View, action: torch.Tensor, *earlier: torch.Tensor) -> torch.Tensor:
-    """Returns the actions that arrive: of ``s.delay`` control steps ago, where ``earlier`` has the newest first."""
-    delay, arrived = s.delay.unsqueeze(-1), action
-    for steps, before in enumerate(earlier, start=1):
-        arrived = torch.where(delay < steps, arrived, before)
-    return arrived
 
 
 def hard_contacts(s: View, geoms: str) -> torch.Tensor:

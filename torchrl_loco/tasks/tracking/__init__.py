@@ -13,8 +13,8 @@ import torch
 from torchrl_loco import motion as motions
 from torchrl_loco.checks import Interval, check_int
 from torchrl_loco.conditions import PUSH_EVERY
-from torchrl_loco.envs.rotations import product
-from torchrl_loco.tasks.robots import Robot, actuated, arriving, either, hard_contacts, pushed, squares
+from torchrl_loco.envs.rotations import product, small_turn
+from torchrl_loco.tasks.robots import Robot, actuated, either, hard_contacts, pushed, squares
 from torchrl_loco.tasks.velocity import G1Velocity, H1Velocity
 
 if TYPE_CHECKING:
@@ -302,10 +302,6 @@ class Tracking(Robot):
 
     # The hooks, in the order in which they are called.
 
-    def control(self, s: "View", action: torch.Tensor) -> torch.Tensor:
-        """Returns the targets of the joints (rad): the home pose and a multiple of the action that arrives."""
-        return super().control(s, arriving(s, action, s.last_action))
-
     def reward(self, s: "View") -> dict[str, torch.Tensor]:
         """Returns the terms of the reward."""
         wrong = self.errors(s)
@@ -415,8 +411,7 @@ class Tracking(Robot):
         rows = self.at(s, frame)
         root, joints = rows["qpos"][:, :7], rows["qpos"][:, 7:] + s.uniform(-BEND, BEND, len(self.joints))
         place = root[:, :3] + s.uniform(-1.0, 1.0, 3) * torch.tensor(NEAR, device=s.device)
-        half = 0.5 * s.uniform(-1.0, 1.0, 3) * torch.tensor(TILT, device=s.device)
-        small = torch.cat([(1.0 - squares(half)).sqrt().unsqueeze(-1), half], dim=-1)
+        small = small_turn(s.uniform(-1.0, 1.0, 3) * torch.tensor(TILT, device=s.device))
         low, high = self.limits(s)
         push = s.uniform(-1.0, 1.0, 6) * torch.tensor(PUSH, device=s.device)
         return {

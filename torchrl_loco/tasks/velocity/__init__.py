@@ -19,18 +19,7 @@ from torchrl_loco.envs.task import definer
 from torchrl_loco.envs.view import View
 from torchrl_loco.sim import models
 from torchrl_loco.sim.compiled.collision.kinds import PLANE
-from torchrl_loco.tasks.robots import (
-    FREE,
-    Robot,
-    arriving,
-    com,
-    either,
-    hard_contacts,
-    pushed,
-    sliding,
-    soft,
-    squares,
-)
+from torchrl_loco.tasks.robots import FREE, Robot, com, either, hard_contacts, pushed, sliding, soft, squares
 from torchrl_loco.tasks.velocity import commands
 
 FOLDER = Path(__file__).parent
@@ -291,10 +280,6 @@ class Velocity(Robot):
         return {"command": [[0.0, 0.0, 0.0], *alone, high, low]}
 
     # The hooks, in the order in which they are called.
-
-    def control(self, s: View, action: torch.Tensor) -> torch.Tensor:
-        """Returns the targets of the joints (rad): the home pose and a multiple of the action that arrives."""
-        return super().control(s, arriving(s, action, s.last_action, *s.earlier_actions.unbind(1)))
 
     def update(self, s: View) -> dict[str, torch.Tensor]:
         """Returns the greatest height of each foot since it left the ground."""
